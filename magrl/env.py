@@ -1,0 +1,376 @@
+"""The navigation environment: a batch of vehicles that read the magnetic field and move.
+
+It speaks physical units and gives the paper's base reward (arrival and proximity). Everything else (guidance,
+scaling, concatenation) is a transform on top of it. The state lives in the TensorDict; the env itself holds only
+its options and, per vehicle, the number of the journey that it is on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from magrl import guidance
+from magrl.fields import IGRF, Date, FieldModel, RegionalField, elements_at
+from magrl.geodesy import move, wrap_angle
+from magrl.tasks import (
+    KM_PER_DEGREE,
+    PAPER_DISTANCE_KM,
+    PAPER_REGION,
+    Region,
+    Tasks,
+    check_distance_range,
+    check_tasks,
+    counter_uniform,
+    sample_tasks,
+)
+
+PAPER_DATE = "2022-01-01"
+PAPER_GENERATION = 13
+PRIVILEGED_KEYS = (
+    "position",
+    "target_position",
+    "start_position",
+    "objective",
+    "objective_weights",
+    "success",
+)
+"""What no policy that claims to navigate by the field may read."""
+
+_HEADING_STREAM = -1  # the counter that sets a start heading apart from the attempts at placing a task
+
+
+def paper_field(
+    region: Region = PAPER_REGION,
+    margin_deg: float = 5.0,
+    max_move_km: float = 50.0,
+    date: Date = PAPER_DATE,
+    generation: int = PAPER_GENERATION,
+) -> RegionalField:
+    """IGRF on a region and on the margin into which a vehicle can stray.
+
+    Args:
+        region: where tasks lie.
+        margin_deg: how far beyond it a vehicle may be before it is lost [deg].
+        max_move_km: longest move, so that the place where a vehicle is lost is still inside [km].
+        date: see :data:`magrl.fields.Date`.
+        generation: of IGRF, 13 or 14.
+
+    Raises:
+        ValueError: for a date outside the model, or a box too large for the expansion.
+
+    Example:
+        >>> paper_field().latitude
+        (-15.5, 5.5)
+    """
+    box = flown_box(region, margin_deg, max_move_km)
+    return RegionalField(IGRF(date, generation), box.latitude, box.longitude)
+
+
+def flown_box(region: Region, margin_deg: float, max_move_km: float) -> Region:
+    """Every place that a vehicle can reach: the region, its margin, and one move beyond, to the next half degree."""
+    edge = region.expanded(margin_deg)
+    widest = math.cos(math.radians(min(max(abs(x) for x in edge.latitude) + max_move_km / KM_PER_DEGREE, 89.0)))
+    south_north = math.ceil(max_move_km / KM_PER_DEGREE * 2) / 2
+    west_east = math.ceil(max_move_km / KM_PER_DEGREE / widest * 2) / 2
+    (south, north), (west, east) = edge.latitude, edge.expanded(west_east).longitude
+    return Region((max(south - south_north, -90), min(north + south_north, 90)), (west, east))
+
+
+class GeomagneticNavEnv(EnvBase):
+    """Vehicles that cross a region to a place of which they know only the magnetic elements.
+
+    Each vehicle reads D, I, B_H where it is, knows those of its destination, its own heading from true north and
+    its last move; it chooses how far to go and how far to turn first. It has arrived once the objective F (Eq. 2-6)
+    is under ``zeta``. Leaving the region by more than ``margin_deg`` loses it: the episode ends as a failure.
+
+    Args:
+        num_envs: vehicles in the batch.
+        region: where tasks lie.
+        distance_range_km: shortest and longest journey [km].
+        tasks: a frozen set to fly instead of random tasks: in episode k, vehicle i flies task ``i + k * num_envs``,
+            counted around the set.
+        field: field model; by default :func:`paper_field` of the region.
+        max_steps: moves after which an episode is truncated.
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn to either side before a move [rad].
+        zeta: arrival threshold on the objective.
+        start_heading: ``"north"``, or ``"random"`` for any heading.
+        objective_floors: least differences that Eq. 2-6 divides by: D [deg], I [deg], B_H [nT].
+        destination_weight: reward at arrival, zeta_1.
+        proximity_weight: reward per unit of the objective, zeta_2.
+        margin_deg: how far beyond the region a vehicle may stray [deg].
+        seed: of tasks and start headings; random if None.
+        device: where the batch lives.
+
+    Raises:
+        ValueError: for any option out of its range, naming it and its value.
+
+    Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
+    move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
+    ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
+    ``objective_weights`` ``(N, 3)``. Action ``(N, 2)``: distance [km], turn [rad].
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=4, seed=0)
+        >>> env.rollout(3)["next", "field"].shape
+        torch.Size([4, 3, 3])
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        *,
+        num_envs: int = 1,
+        region: Region = PAPER_REGION,
+        distance_range_km: tuple[float, float] = PAPER_DISTANCE_KM,
+        tasks: Tasks | None = None,
+        field: FieldModel | None = None,
+        max_steps: int = 50,
+        max_move_km: float = 50.0,
+        max_turn_rad: float = math.pi / 2,
+        zeta: float = 0.01,
+        start_heading: str = "north",
+        objective_floors: Sequence[float] = guidance.OBJECTIVE_FLOORS,
+        destination_weight: float = 200.0,
+        proximity_weight: float = 10.0,
+        margin_deg: float = 5.0,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        _check_positive_int(num_envs=num_envs, max_steps=max_steps)
+        _check_positive(max_move_km=max_move_km, max_turn_rad=max_turn_rad, zeta=zeta)
+        _check_non_negative(
+            destination_weight=destination_weight, proximity_weight=proximity_weight, margin_deg=margin_deg
+        )
+        if max_move_km > 1000:
+            raise ValueError(f"max_move_km must be at most 1000, got {max_move_km}: a move is one short leg")
+        if max_turn_rad > math.pi:
+            raise ValueError(f"max_turn_rad must be at most pi, got {max_turn_rad}")
+        if start_heading not in ("north", "random"):
+            raise ValueError(f"start_heading must be 'north' or 'random', got {start_heading!r}")
+        if len(objective_floors) != 3 or not all(math.isfinite(x) and x > 0 for x in objective_floors):
+            raise ValueError(f"objective_floors must be three positive numbers (deg, deg, nT), got {objective_floors}")
+        if tasks is None:
+            check_distance_range(region, distance_range_km)
+        super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
+        self.num_envs, self.max_steps, self.zeta = num_envs, max_steps, float(zeta)
+        self.region, self.edge = region, region.expanded(margin_deg)
+        self.distance_range_km = (float(distance_range_km[0]), float(distance_range_km[1]))
+        self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
+        self.start_heading = start_heading
+        self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
+        self.tasks = None if tasks is None else Tasks(*(x.to(self.device) for x in check_tasks(tasks, self.edge)))
+        if field is None:
+            field = paper_field(region, margin_deg, max_move_km)
+        self.field = field.to(self.device) if isinstance(field, torch.nn.Module) else field
+        float64: dict[str, Any] = {"dtype": torch.float64, "device": self.device}
+        self.register_buffer("objective_floors", torch.tensor(tuple(objective_floors), **float64))
+        self.register_buffer("action_low", torch.tensor((0.0, -self.max_turn_rad), **float64))
+        self.register_buffer("action_high", torch.tensor((self.max_move_km, self.max_turn_rad), **float64))
+        self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
+        self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
+        self._make_specs(flown_box(region, margin_deg, max_move_km))
+        self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+
+    # Specs
+
+    def _make_specs(self, box: Region) -> None:
+        low, high = self._field_bounds(box)
+        turn = torch.tensor(self.max_turn_rad, dtype=torch.float32)
+        distance = torch.tensor(self.max_move_km, dtype=torch.float32)
+        observation = Composite(
+            field=self._bounded(low, high),
+            target_field=self._bounded(low, high),
+            move=self._bounded(torch.stack((0 * distance, -turn)), torch.stack((distance, turn))),
+            heading=self._bounded(torch.tensor([-math.pi]), torch.tensor([math.pi])),
+            step_count=Unbounded((self.num_envs, 1), dtype=torch.int64),
+            position=self._position_spec(),
+            target_position=self._position_spec(),
+            start_position=self._position_spec(),
+            objective=Unbounded((self.num_envs, 1)),
+            objective_weights=Unbounded((self.num_envs, 3)),
+            success=Binary(1, (self.num_envs, 1), dtype=torch.bool),
+            shape=(self.num_envs,),
+        ).to(self.device)
+        self.observation_spec = observation
+        self.state_spec = observation.clone()
+        self.action_spec = self._bounded(self.action_low.float(), self.action_high.float())
+        self.reward_spec = Unbounded((self.num_envs, 1), device=self.device)
+        flag = Binary(1, (self.num_envs, 1), dtype=torch.bool, device=self.device)
+        self.full_done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(self.num_envs,), device=self.device
+        )
+
+    def _bounded(self, low: Tensor, high: Tensor) -> Bounded:
+        shape = (self.num_envs, *low.shape)
+        return Bounded(low.float().expand(shape), high.float().expand(shape), shape, device=self.device)
+
+    def _position_spec(self) -> Bounded:
+        high = torch.tensor((90.0, 180.0), dtype=torch.float64).expand(self.num_envs, 2)
+        return Bounded(-high, high, high.shape, dtype=torch.float64, device=self.device)
+
+    def _field_bounds(self, box: Region) -> tuple[Tensor, Tensor]:
+        """Bounds of D, I, B_H over every place that can be reached, ``(3,)`` each, from a grid and 5 % of slack."""
+        latitude = torch.linspace(*box.latitude, 81, dtype=torch.float64, device=self.device)
+        longitude = torch.linspace(*box.longitude, 81, dtype=torch.float64, device=self.device)
+        grid = torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
+        values = elements_at(self.field, grid).flatten(0, 1)
+        if not torch.isfinite(values).all():
+            raise ValueError(f"the field is not defined on all of {box}, which vehicles of these options can reach")
+        low, high = values.amin(0), values.amax(0)
+        slack = 0.05 * (high - low)
+        limit = torch.tensor((180.0, 90.0, math.inf), dtype=torch.float64, device=self.device)
+        return (low - slack).maximum(-limit), (high + slack).minimum(limit)
+
+    # Reset
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            raise ValueError("seed must be an integer, got None")
+        self.seed = int(seed)
+        self.episode.zero_()
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        """Starts the next journey of every vehicle that is named by ``_reset``, or of all."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            return self._started(self.vehicle)
+        mask = mask.reshape(self.num_envs)
+        chosen = mask.nonzero().squeeze(-1)
+        # The rows of the others are placeholders: the base class puts their running state back.
+        row_of = (mask.cumsum(0) - 1).clamp_min(0)
+        return self._started(chosen)[row_of]
+
+    def _started(self, vehicle: Tensor) -> TensorDict:
+        """The first observation of the next journey of some vehicles, ``(P,)``."""
+        episode = self.episode[vehicle]
+        tasks = self._tasks(vehicle, episode)
+        field, target_field = elements_at(self.field, torch.stack(tasks))
+        weights = guidance.objective_weights(field, target_field, self.objective_floors)
+        zeros = field.new_zeros(len(vehicle), 2)
+        # Counted out of place: a rollout or a checkpoint may hold the old tensor.
+        self.episode = self.episode.index_add(0, vehicle, torch.ones_like(vehicle))
+        flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        return TensorDict(
+            {
+                "field": field.float(),
+                "target_field": target_field.float(),
+                "move": zeros.float(),
+                "heading": self._start_heading(vehicle, episode).float(),
+                "step_count": torch.zeros_like(vehicle).unsqueeze(-1),
+                "position": tasks.start,
+                "target_position": tasks.target,
+                "start_position": tasks.start,
+                "objective": guidance.objective(field, target_field, weights).float(),
+                "objective_weights": weights.float(),
+                "success": flags["done"].clone(),
+                **flags,
+            },
+            batch_size=vehicle.shape,
+            device=self.device,
+        )
+
+    def _tasks(self, vehicle: Tensor, episode: Tensor) -> Tasks:
+        if self.tasks is None:
+            return sample_tasks(self.region, self.distance_range_km, self.seed, vehicle, episode)
+        index = (vehicle + episode * self.num_envs) % len(self.tasks.start)
+        return Tasks(self.tasks.start[index], self.tasks.target[index])
+
+    def _start_heading(self, vehicle: Tensor, episode: Tensor) -> Tensor:
+        if self.start_heading == "north":
+            return torch.zeros(len(vehicle), 1, dtype=torch.float64, device=self.device)
+        stream = torch.full_like(vehicle, _HEADING_STREAM)
+        uniform = counter_uniform(self.seed, torch.stack((vehicle, episode, stream), -1), 1)
+        return wrap_angle(2 * math.pi * uniform)
+
+    # Step
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._checked_action(tensordict["action"])
+        distance, turn = action.unbind(-1)
+        before = tensordict["position"]
+        heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
+        position = torch.stack(move(*before.unbind(-1), heading, distance), -1)
+        position = torch.where(self.edge.contains(before), position, before)  # the lost stay where they were lost
+        lost = ~self.edge.contains(position)
+
+        field = elements_at(self.field, position)
+        weights = tensordict["objective_weights"].double()
+        objective = guidance.objective(field, tensordict["target_field"].double(), weights)
+        arrived = (objective < self.zeta) & ~lost
+        step = tensordict["step_count"] + 1
+        terminated = arrived | lost
+        truncated = (step >= self.max_steps) & ~terminated
+        proximity = guidance.proximity_reward(tensordict["objective"].double(), objective, self.proximity_weight)
+        reward = guidance.destination_reward(arrived, self.destination_weight) + guidance.late_decay(
+            proximity, step, self.max_steps
+        )
+        return TensorDict(
+            {
+                "field": field.float(),
+                "target_field": tensordict["target_field"],
+                "move": action.float(),
+                "heading": heading.float().unsqueeze(-1),
+                "step_count": step,
+                "position": position,
+                "target_position": tensordict["target_position"],
+                "start_position": tensordict["start_position"],
+                "objective": objective.float(),
+                "objective_weights": tensordict["objective_weights"],
+                "success": arrived,
+                "reward": reward.float(),
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            batch_size=tensordict.batch_size,
+            device=self.device,
+        )
+
+    def _checked_action(self, action: Tensor) -> Tensor:
+        """The action in float64, rounded into its bounds.
+
+        Raises:
+            ValueError: naming the vehicles whose action is not finite or beyond the bounds by more than rounding.
+        """
+        action = action.double()
+        slack = 1e-5 * (self.action_high - self.action_low)
+        sound = (action >= self.action_low - slack) & (action <= self.action_high + slack)
+        if torch.compiler.is_compiling() or action.is_cuda:
+            torch._assert_async(sound.all(), "GeomagneticNavEnv: an action is not finite or out of bounds")
+        elif not sound.all():
+            bad = (~sound.all(-1)).nonzero().squeeze(-1)
+            raise ValueError(
+                f"GeomagneticNavEnv: actions of vehicles {bad[:8].tolist()} are not finite or out of bounds: "
+                f"{action[bad[:8]].tolist()}; distance [km] must be in [0, {self.max_move_km}] and turn [rad] in "
+                f"[-{self.max_turn_rad:.4f}, {self.max_turn_rad:.4f}]"
+            )
+        return action.clamp(self.action_low, self.action_high)
+
+
+def _check_positive_int(**options: int) -> None:
+    for name, value in options.items():
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+            raise ValueError(f"{name} must be a whole number from 1 on, got {value!r}")
+
+
+def _check_positive(**options: float) -> None:
+    for name, value in options.items():
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be positive and finite, got {value}")
+
+
+def _check_non_negative(**options: float) -> None:
+    for name, value in options.items():
+        if not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"{name} must be finite and not negative, got {value}")

@@ -1,0 +1,233 @@
+"""Positions, moves, distances and bearings on the WGS84 ellipsoid.
+
+Latitudes and longitudes are geodetic and in degrees, distances in kilometres, headings and bearings in
+radians clockwise from true north. Every function is pure, batched by broadcasting, and smooth across the
+antimeridian; nothing here divides by the cosine of the latitude, so the poles are ordinary points.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+WGS84_A_KM = 6378.137
+"""Semi-major axis of the WGS84 ellipsoid [km]."""
+WGS84_F = 1 / 298.257223563
+"""Flattening of the WGS84 ellipsoid."""
+WGS84_E2 = WGS84_F * (2 - WGS84_F)
+"""First eccentricity squared of the WGS84 ellipsoid."""
+WGS84_B_KM = WGS84_A_KM * (1 - WGS84_F)
+"""Semi-minor axis of the WGS84 ellipsoid [km]."""
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """Wraps an angle to the half-open turn (-pi, pi].
+
+    Args:
+        angle: any shape [rad].
+
+    Returns:
+        The same shape [rad], in (-pi, pi].
+
+    Example:
+        >>> wrap_angle(torch.tensor([3.5 * math.pi, -math.pi])) / math.pi
+        tensor([-0.5000,  1.0000])
+    """
+    wrapped = math.pi - torch.remainder(math.pi - angle, 2 * math.pi)
+    # In float32 the remainder of a tiny negative number rounds up to the full turn.
+    return torch.where(wrapped <= -math.pi, wrapped + 2 * math.pi, wrapped)
+
+
+def wrap_longitude(longitude: Tensor) -> Tensor:
+    """Wraps a longitude to (-180, 180] degrees.
+
+    Args:
+        longitude: any shape [deg].
+
+    Returns:
+        The same shape [deg].
+
+    Example:
+        >>> wrap_longitude(torch.tensor([181.0, -180.0, 540.0]))
+        tensor([-179.,  180.,  180.])
+    """
+    wrapped = 180 - torch.remainder(180 - longitude, 360)
+    return torch.where(wrapped <= -180, wrapped + 360, wrapped)
+
+
+def curvature_radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
+    """Principal radii of curvature of the ellipsoid.
+
+    Args:
+        latitude: ``(...)`` [deg].
+
+    Returns:
+        The radius along the meridian and the radius across it (the prime vertical), each ``(...)`` [km].
+
+    Example:
+        >>> [round(float(r), 3) for r in curvature_radii(torch.zeros((), dtype=torch.float64))]
+        [6335.439, 6378.137]
+    """
+    w2 = 1 - WGS84_E2 * torch.sin(torch.deg2rad(latitude)) ** 2
+    prime_vertical = WGS84_A_KM / torch.sqrt(w2)
+    return prime_vertical * (1 - WGS84_E2) / w2, prime_vertical
+
+
+def local_frame(latitude: Tensor, longitude: Tensor) -> Tensor:
+    """The north, east and down unit vectors in Earth-centred, Earth-fixed axes.
+
+    Args:
+        latitude: ``(...)`` [deg].
+        longitude: ``(...)`` [deg]; at a pole it says which meridian "north" follows.
+
+    Returns:
+        ``(..., 3, 3)``: its rows are north, east, down, so that ``frame @ v_ecef`` is ``v_ned``.
+
+    Example:
+        >>> local_frame(torch.tensor(0.0), torch.tensor(0.0)).round()
+        tensor([[-0., -0.,  1.],
+                [-0.,  1.,  0.],
+                [-1., -0., -0.]])
+    """
+    phi, lam = torch.deg2rad(latitude), torch.deg2rad(longitude)
+    sp, cp, sl, cl = torch.sin(phi), torch.cos(phi), torch.sin(lam), torch.cos(lam)
+    sp, cp, sl, cl = torch.broadcast_tensors(sp, cp, sl, cl)
+    rows = (-sp * cl, -sp * sl, cp, -sl, cl, torch.zeros_like(sl), -cp * cl, -cp * sl, -sp)
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def to_ecef(latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float = 0.0) -> Tensor:
+    """Geodetic position to Earth-centred, Earth-fixed coordinates.
+
+    Args:
+        latitude: ``(...)`` [deg].
+        longitude: ``(...)`` [deg].
+        altitude_km: height over the ellipsoid, ``(...)`` or a number [km].
+
+    Returns:
+        ``(..., 3)`` [km]: x towards (0, 0), y towards (0, 90 E), z towards the north pole.
+
+    Example:
+        >>> to_ecef(torch.tensor(0.0), torch.tensor(90.0)).round()
+        tensor([  -0., 6378.,    0.])
+    """
+    phi, lam = torch.deg2rad(latitude), torch.deg2rad(longitude)
+    _, prime_vertical = curvature_radii(latitude)
+    horizontal = (prime_vertical + altitude_km) * torch.cos(phi)
+    z = ((1 - WGS84_E2) * prime_vertical + altitude_km) * torch.sin(phi)
+    parts = torch.broadcast_tensors(horizontal * torch.cos(lam), horizontal * torch.sin(lam), z)
+    return torch.stack(parts, -1)
+
+
+def from_ecef_surface(ecef: Tensor) -> tuple[Tensor, Tensor]:
+    """Geodetic latitude and longitude of a point on or very near the ellipsoid.
+
+    One step of Bowring (1976), exact on the surface and within 1e-9 degrees for heights below 10 km.
+
+    Args:
+        ecef: ``(..., 3)`` [km].
+
+    Returns:
+        Latitude and longitude, each ``(...)`` [deg], the longitude in [-180, 180].
+
+    Example:
+        >>> lat, lon = from_ecef_surface(to_ecef(torch.tensor(-8.0), torch.tensor(164.0)))
+        >>> round(float(lat), 3), round(float(lon), 3)
+        (-8.0, 164.0)
+    """
+    x, y, z = ecef.unbind(-1)
+    horizontal = torch.hypot(x, y)
+    reduced = torch.atan2(z * WGS84_A_KM, horizontal * WGS84_B_KM)
+    top = z + WGS84_E2 / (1 - WGS84_E2) * WGS84_B_KM * torch.sin(reduced) ** 3
+    bottom = horizontal - WGS84_E2 * WGS84_A_KM * torch.cos(reduced) ** 3
+    return torch.rad2deg(torch.atan2(top, bottom)), torch.rad2deg(torch.atan2(y, x))
+
+
+def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tensor) -> tuple[Tensor, Tensor]:
+    """Where a short leg at a heading leads (Eq. 2-3 on the ellipsoid).
+
+    The leg is the circle that osculates the geodesic at its start, with Euler's radius for that heading. It is
+    within 5 mm of the geodesic at 50 km and within 5 m at 500 km, and works at the poles and across the
+    antimeridian.
+
+    Args:
+        latitude: ``(...)`` [deg].
+        longitude: ``(...)`` [deg].
+        heading: ``(...)`` at the start of the leg [rad, clockwise from true north].
+        distance_km: ``(...)`` [km].
+
+    Returns:
+        Latitude and longitude at the end, each ``(...)`` [deg], the longitude in [-180, 180].
+
+    Example:
+        >>> lat, lon = move(*torch.tensor([0.0, 179.9, math.pi / 2, 50.0], dtype=torch.float64))
+        >>> round(float(lat), 4), round(float(lon), 4)
+        (0.0, -179.6508)
+    """
+    sin, cos = torch.sin(heading), torch.cos(heading)
+    meridian, prime_vertical = curvature_radii(latitude)
+    radius = 1 / (cos**2 / meridian + sin**2 / prime_vertical)
+    arc = distance_km / radius
+    along, fall = radius * torch.sin(arc), 2 * radius * torch.sin(arc / 2) ** 2
+    step_ned = torch.stack(torch.broadcast_tensors(along * cos, along * sin, fall), -1)
+    frame = local_frame(latitude, longitude)
+    step = (frame * step_ned.unsqueeze(-1)).sum(-2)
+    return from_ecef_surface(to_ecef(latitude, longitude) + step)
+
+
+def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude2: Tensor) -> tuple[Tensor, Tensor]:
+    """Length and first bearing of the geodesic from one point to another.
+
+    Vincenty's inverse formula with a fixed number of iterations: within 1 mm, but for pairs within about one
+    degree of being antipodal, where it does not converge and the answer is NaN.
+
+    Args:
+        latitude1: ``(...)`` of the start [deg].
+        longitude1: ``(...)`` of the start [deg].
+        latitude2: ``(...)`` of the end [deg].
+        longitude2: ``(...)`` of the end [deg].
+
+    Returns:
+        The distance [km] and the bearing at the start [rad, clockwise from true north, (-pi, pi]], each ``(...)``;
+        zero and zero for coincident points.
+
+    Source:
+        T. Vincenty, Direct and inverse solutions of geodesics on the ellipsoid, Survey Review 23 (1975).
+
+    Example:
+        >>> d, b = geodesic(*torch.tensor([-2.0, 162.0, -8.0, 164.0], dtype=torch.float64))
+        >>> round(float(d), 3), round(float(torch.rad2deg(b)), 3)
+        (699.56, 161.594)
+    """
+    inputs = (latitude1, longitude1, latitude2, longitude2)
+    lat1, lon1, lat2, lon2 = (torch.deg2rad(x.double()) for x in torch.broadcast_tensors(*inputs))
+    u1, u2 = (torch.atan2((1 - WGS84_F) * torch.sin(lat), torch.cos(lat)) for lat in (lat1, lat2))
+    su1, cu1, su2, cu2 = torch.sin(u1), torch.cos(u1), torch.sin(u2), torch.cos(u2)
+    difference = wrap_angle(lon2 - lon1)
+    lam, change = difference, torch.zeros_like(difference)
+    for _ in range(20):
+        # atan2 keeps its accuracy where the arc is tiny, which the cosine of it does not.
+        x, y = cu2 * torch.sin(lam), cu1 * su2 - su1 * cu2 * torch.cos(lam)
+        sin_sigma = torch.hypot(x, y)
+        cos_sigma = su1 * su2 + cu1 * cu2 * torch.cos(lam)
+        sigma = torch.atan2(sin_sigma, cos_sigma)
+        sin_alpha = cu1 * cu2 * torch.sin(lam) / sin_sigma.clamp_min(1e-300)
+        cos2_alpha = (1 - sin_alpha**2).clamp_min(0)
+        mid = cos_sigma - 2 * su1 * su2 / cos2_alpha.clamp_min(1e-15)
+        mid = torch.where(cos2_alpha < 1e-14, torch.zeros_like(mid), mid)  # an equatorial line has no midpoint term
+        c = WGS84_F / 16 * cos2_alpha * (4 + WGS84_F * (4 - 3 * cos2_alpha))
+        series = sigma + c * sin_sigma * (mid + c * cos_sigma * (2 * mid**2 - 1))
+        previous, lam = lam, difference + (1 - c) * WGS84_F * sin_alpha * series
+        change = (lam - previous).abs()
+    k = cos2_alpha * (WGS84_A_KM**2 / WGS84_B_KM**2 - 1)
+    a = 1 + k / 16384 * (4096 + k * (-768 + k * (320 - 175 * k)))
+    b = k / 1024 * (256 + k * (-128 + k * (74 - 47 * k)))
+    inner = cos_sigma * (2 * mid**2 - 1) - b / 6 * mid * (4 * sin_sigma**2 - 3) * (4 * mid**2 - 3)
+    distance = WGS84_B_KM * a * (sigma - b * sin_sigma * (mid + b / 4 * inner))
+    converged = (change < 1e-11) & (lam.abs() <= math.pi)
+    nan = torch.full_like(distance, float("nan"))
+    bearing = wrap_angle(torch.atan2(x, y))
+    dtype = torch.result_type(latitude1, longitude2)
+    return torch.where(converged, distance, nan).to(dtype), torch.where(converged, bearing, nan).to(dtype)

@@ -1,0 +1,162 @@
+"""The paper's equations as pure functions of tensors: objective, rewards and the parallel approach.
+
+Nothing here knows of environments or keys. Shapes broadcast over leading dimensions; angles are in radians
+clockwise from true north unless a name says otherwise; the last dimension of a ``field`` is the element
+(D [deg], I [deg], B_H [nT]).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from magrl.geodesy import wrap_angle
+
+OBJECTIVE_FLOORS = (0.05, 0.4, 15.0)
+"""Least |B_T - B_0| of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 25 km of travel each."""
+
+
+def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Tensor:
+    """The weights 1 / (B_T - B_0)^2 of Eq. 2-6, with each difference floored so that none is infinite.
+
+    Args:
+        field: ``(..., E)`` elements where the journey starts.
+        target_field: ``(..., E)`` elements at the destination.
+        floors: ``(E,)`` least absolute difference, in the element's unit.
+
+    Returns:
+        ``(..., E)`` weights, per squared unit.
+
+    Example:
+        >>> objective_weights(torch.tensor([8.0, -16.0]), torch.tensor([10.0, -16.0]), torch.tensor([0.05, 0.5]))
+        tensor([0.2500, 4.0000])
+    """
+    return (target_field - field).abs().maximum(floors).square().reciprocal()
+
+
+def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
+    """The normalised distance to the destination in field space, F of Eq. 2-6.
+
+    Args:
+        field: ``(..., E)`` elements here.
+        target_field: ``(..., E)`` elements at the destination.
+        weights: ``(..., E)`` from :func:`objective_weights` at the start.
+
+    Returns:
+        ``(..., 1)``, dimensionless: at most E at the start, 0 at the destination.
+
+    Example:
+        >>> objective(torch.tensor([9.0, -16.0]), torch.tensor([10.0, -16.0]), torch.tensor([0.25, 4.0]))
+        tensor([0.2500])
+    """
+    return (weights * (target_field - field).square()).sum(-1, keepdim=True)
+
+
+def destination_reward(arrived: Tensor, weight: float) -> Tensor:
+    """Eq. 3-3, first term: ``weight`` at arrival, 0 elsewhere.
+
+    Example:
+        >>> destination_reward(torch.tensor([True, False]), 200.0)
+        tensor([200.,   0.])
+    """
+    return weight * arrived
+
+
+def proximity_reward(objective_before: Tensor, objective_after: Tensor, weight: float) -> Tensor:
+    """Eq. 3-5: pays for what a move takes off the objective.
+
+    Args:
+        objective_before: ``(...)`` F where the move was chosen.
+        objective_after: ``(...)`` F where it led.
+        weight: zeta_2.
+
+    Returns:
+        ``(...)``: positive for an approach.
+
+    Example:
+        >>> proximity_reward(torch.tensor(2.0), torch.tensor(1.5), 10.0)
+        tensor(5.)
+    """
+    return -weight * (objective_after - objective_before)
+
+
+def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
+    """The decay of late proximity rewards, which the paper describes without a formula.
+
+    Past half of the step limit, ``(n / n_max) |R|`` is taken off: gains shrink and losses grow.
+
+    Args:
+        proximity: ``(...)`` from :func:`proximity_reward`.
+        step: ``(...)`` number of the move, counted from 1.
+        max_steps: the step limit n_max.
+
+    Returns:
+        ``(...)``.
+
+    Example:
+        >>> late_decay(torch.tensor([4.0, 4.0, -4.0]), torch.tensor([25, 40, 40]), 50)
+        tensor([ 4.0000,  0.8000, -7.2000])
+    """
+    late = step > max_steps / 2
+    return proximity - late * (step / max_steps) * proximity.abs()
+
+
+def alignment_reward(angle: Tensor, reference: Tensor, weight: float, offset: float = math.pi / 4) -> Tensor:
+    """Eq. 3-6: pays for holding an angle close to a reference.
+
+    Args:
+        angle: ``(...)`` heading of the move just made [rad].
+        reference: ``(...)`` theoretical heading where it was chosen [rad].
+        weight: zeta_3 [1/rad].
+        offset: deviation at which the term changes sign [rad]. The paper's pi/4 pays an aligned vehicle for every
+            step it takes, the last ones included; an offset of 0 only ever takes away.
+
+    Returns:
+        ``(...)``: from ``weight * offset`` down to ``weight * (offset - pi)``.
+
+    Example:
+        >>> alignment_reward(torch.tensor(math.pi), torch.tensor(-math.pi), 3.0) / 3.0 / math.pi  # the same heading
+        tensor(0.2500)
+    """
+    return weight * (offset - wrap_angle(angle - reference).abs())
+
+
+def parallel_approach(
+    field: Tensor, target_field: Tensor, gradient: Tensor, min_crossing: float = math.radians(2.0)
+) -> tuple[Tensor, Tensor]:
+    """The heading on which two elements approach their targets in proportion (Eq. 3-15, unambiguous).
+
+    The paper's arctan of a quotient leaves two opposite headings. The one that is meant is the direction of
+    ``J^-1 (B_T - B)``; with the adjugate for the inverse it needs no division, only the sign of the determinant.
+
+    Args:
+        field: ``(..., 2)`` two elements here.
+        target_field: ``(..., 2)`` the same at the destination.
+        gradient: ``(..., 2, 2)`` their derivatives northward and eastward [element unit / km].
+        min_crossing: least angle at which the two gradients must cross [rad].
+
+    Returns:
+        The heading ``(..., 1)`` [rad, (-pi, pi]] and a mask ``(..., 1)``: False, with heading 0, where the gradients
+        are nearer to parallel than ``min_crossing``, where one vanishes, or where both elements are on target.
+
+    Source:
+        Eqs. 3-12 to 3-15, after the bionic navigation of Wang et al. (2018).
+
+    Example:
+        >>> gradient = torch.tensor([[0.0, 2.0], [1.0, 0.0]])  # the first element grows eastward, the second northward
+        >>> heading, valid = parallel_approach(torch.zeros(2), torch.tensor([2.0, 1.0]), gradient)
+        >>> round(float(torch.rad2deg(heading)), 3), bool(valid)
+        (45.0, True)
+    """
+    (g1n, g1e), (g2n, g2e) = (row.unbind(-1) for row in gradient.unbind(-2))
+    e1, e2 = (target_field - field).unbind(-1)
+    determinant = g1n * g2e - g1e * g2n
+    north, east = g2e * e1 - g1e * e2, g1n * e2 - g2n * e1
+    lengths = torch.hypot(g1n, g1e) * torch.hypot(g2n, g2e)
+    crosses = determinant.abs() > lengths * math.sin(min_crossing)
+    valid = crosses & ((north != 0) | (east != 0))
+    sign = torch.sign(determinant)
+    heading = torch.atan2(torch.where(valid, sign * east, 0.0), torch.where(valid, sign * north, 1.0))
+    return wrap_angle(heading).unsqueeze(-1), valid.unsqueeze(-1)

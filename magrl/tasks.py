@@ -1,0 +1,251 @@
+"""Where journeys start and end: regions, random tasks, and frozen sets of them.
+
+Random tasks are a pure function of (seed, vehicle, episode) through a counter-based generator: a vehicle's
+journeys depend neither on how many others fly beside it nor on when those are reset, they are the same on every
+device, and no generator state has to be saved to repeat them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magrl.fields import check_box, check_positions
+from magrl.geodesy import geodesic, move, wrap_longitude
+
+MEAN_RADIUS_KM = 6371.0
+KM_PER_DEGREE = MEAN_RADIUS_KM * math.pi / 180
+MAX_ROUNDS = 10_000
+"""Rounds of rejection sampling before a region is held to be too small for its distances."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A latitude-longitude box.
+
+    Args:
+        latitude: southern and northern edge [deg].
+        longitude: western and eastern edge [deg], rising; (170, 190) crosses the antimeridian.
+
+    Raises:
+        ValueError: for an empty, reversed or impossible box.
+
+    Example:
+        >>> Region((-10, 0), (160, 170)).expanded(5)
+        Region(latitude=(-15.0, 5.0), longitude=(155.0, 175.0))
+    """
+
+    latitude: tuple[float, float]
+    longitude: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        check_box(self.latitude, self.longitude)
+        object.__setattr__(self, "latitude", tuple(float(x) for x in self.latitude))
+        object.__setattr__(self, "longitude", tuple(float(x) for x in self.longitude))
+
+    def contains(self, position: Tensor) -> Tensor:
+        """Whether positions lie in the box.
+
+        Args:
+            position: ``(..., 2)`` latitude, longitude [deg].
+
+        Returns:
+            ``(..., 1)`` bool, edges included.
+        """
+        latitude, longitude = position.unbind(-1)
+        south, north = self.latitude
+        half = (self.longitude[1] - self.longitude[0]) / 2
+        offset = wrap_longitude(longitude - (self.longitude[0] + half))
+        return ((latitude >= south) & (latitude <= north) & (offset.abs() <= half)).unsqueeze(-1)
+
+    def expanded(self, margin_deg: float) -> Region:
+        """The box with a margin on each side, cut at the poles and at a full turn [deg]."""
+        (south, north), (west, east) = self.latitude, self.longitude
+        spare = min(margin_deg, (360 - (east - west)) / 2)
+        return Region((max(south - margin_deg, -90), min(north + margin_deg, 90)), (west - spare, east + spare))
+
+    def longest_km(self) -> float:
+        """A length that no distance in the box exceeds, tight for boxes up to a quarter of the globe [km]."""
+        if self.longitude[1] - self.longitude[0] > 90 or self.latitude[1] - self.latitude[0] > 90:
+            return math.pi * MEAN_RADIUS_KM * 1.01
+        lat = torch.tensor((*self.latitude, *self.latitude, 0.0), dtype=torch.float64).clamp(*self.latitude)
+        lon = torch.tensor(self.longitude, dtype=torch.float64)
+        west, east = (x.expand(len(lat), len(lat)) for x in lon)
+        return float(geodesic(lat.unsqueeze(-1).expand_as(west), west, lat.expand_as(east), east)[0].max())
+
+
+PAPER_REGION = Region((-10.0, 0.0), (160.0, 170.0))
+"""The paper's box: 10 S to 0, 160 E to 170 E, north-east of Australia."""
+PAPER_DISTANCE_KM = (300.0, 500.0)
+
+
+class Tasks(NamedTuple):
+    """Journeys: where they start and end, each ``(..., 2)`` latitude, longitude [deg], float64."""
+
+    start: Tensor
+    target: Tensor
+
+
+def counter_uniform(seed: int, counters: Tensor, draws: int) -> Tensor:
+    """Uniform numbers that are a pure function of a seed and counters.
+
+    Args:
+        seed: any 64-bit integer.
+        counters: ``(..., C)`` int64; each distinct row names a stream of its own.
+        draws: numbers wanted from each stream.
+
+    Returns:
+        ``(..., draws)`` float64 in [0, 1).
+
+    Source:
+        The finaliser of SplitMix64 (Steele, Lea and Flood, Fast splittable pseudorandom number generators, 2014).
+
+    Example:
+        >>> rows = torch.tensor([[0, 0], [0, 1]])
+        >>> bool((counter_uniform(7, rows, 2)[1] == counter_uniform(7, rows[1:], 2)[0]).all())
+        True
+    """
+    key = _mix(torch.full(counters.shape[:-1], _signed(seed), dtype=torch.int64, device=counters.device))
+    for counter in counters.unbind(-1):
+        key = _mix(key ^ _mix(counter + _signed(0x9E3779B97F4A7C15)))
+    steps = torch.arange(1, draws + 1, device=counters.device) * _signed(0x9E3779B97F4A7C15)
+    return _shift(_mix(key.unsqueeze(-1) + steps), 11).double() * 2.0**-53
+
+
+def _signed(value: int) -> int:
+    """The two's complement reading of a 64-bit pattern."""
+    value &= 0xFFFFFFFFFFFFFFFF
+    return value - (1 << 64) if value >> 63 else value
+
+
+def _shift(value: Tensor, bits: int) -> Tensor:
+    """Logical right shift, which int64 lacks."""
+    return (value >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _mix(value: Tensor) -> Tensor:
+    value = (value ^ _shift(value, 30)) * _signed(0xBF58476D1CE4E5B9)
+    value = (value ^ _shift(value, 27)) * _signed(0x94D049BB133111EB)
+    return value ^ _shift(value, 31)
+
+
+def check_distance_range(region: Region, distance_range_km: tuple[float, float]) -> None:
+    """Refuses distances that are no range, or that the region cannot hold.
+
+    Raises:
+        ValueError: with the values.
+    """
+    shortest, longest = distance_range_km
+    if not (0 <= shortest < longest < math.inf):
+        raise ValueError(f"distance_range_km {distance_range_km} must be two rising finite numbers from 0 on")
+    held = region.longest_km()
+    if shortest >= held:
+        raise ValueError(
+            f"distance_range_km {distance_range_km}: no two points of {region} are more than {held:.0f} km apart"
+        )
+
+
+def sample_tasks(
+    region: Region, distance_range_km: tuple[float, float], seed: int, vehicle: Tensor, episode: Tensor
+) -> Tasks:
+    """Random journeys: start and end uniform over the region, given that their distance is in the range.
+
+    Args:
+        region: the box that holds both ends.
+        distance_range_km: shortest and longest geodesic distance [km].
+        seed: of the whole family of tasks.
+        vehicle: ``(P,)`` int64, the vehicle.
+        episode: ``(P,)`` int64, the number of its journey.
+
+    Returns:
+        ``P`` tasks, each a function of (seed, vehicle, episode) alone.
+
+    Raises:
+        ValueError: for a range that is none, or that the region cannot hold.
+        RuntimeError: if a range at the edge of what the region holds leaves a task without a place.
+
+    Example:
+        >>> tasks = sample_tasks(PAPER_REGION, (300, 500), 0, torch.arange(4), torch.zeros(4, dtype=torch.int64))
+        >>> d = geodesic(*tasks.start.unbind(-1), *tasks.target.unbind(-1))[0]
+        >>> bool(((d >= 300) & (d <= 500)).all())
+        True
+    """
+    check_distance_range(region, distance_range_km)
+    start = torch.empty(len(vehicle), 2, dtype=torch.float64, device=vehicle.device)
+    target = torch.empty_like(start)
+    waiting = torch.arange(len(vehicle), device=vehicle.device)
+    for attempt in range(MAX_ROUNDS):
+        tries = torch.full_like(vehicle[waiting], attempt)
+        counters = torch.stack((vehicle[waiting], episode[waiting], tries), -1)
+        candidate = _candidates(region, distance_range_km, counter_uniform(seed, counters, 4))
+        distance, _ = geodesic(*candidate.start.unbind(-1), *candidate.target.unbind(-1))
+        in_range = (distance >= distance_range_km[0]) & (distance <= distance_range_km[1])
+        fits = in_range & region.contains(candidate.target).squeeze(-1)
+        start[waiting[fits]], target[waiting[fits]] = candidate.start[fits], candidate.target[fits]
+        waiting = waiting[~fits]
+        if not len(waiting):
+            return Tasks(start, target)
+    raise RuntimeError(
+        f"no task was found in {MAX_ROUNDS} tries: {region} all but cannot hold distances of {distance_range_km} km"
+    )
+
+
+def _candidates(region: Region, distance_range_km: tuple[float, float], uniform: Tensor) -> Tasks:
+    """Starts uniform over the box's area, ends uniform over the ring about them; ``uniform`` is ``(P, 4)``."""
+    south, north = (math.sin(math.radians(x)) for x in region.latitude)
+    near, far = (math.cos(min(x / MEAN_RADIUS_KM, math.pi)) for x in distance_range_km)
+    west, east = region.longitude
+    latitude = torch.rad2deg(torch.asin(south + (north - south) * uniform[:, 0]))
+    longitude = wrap_longitude(west + (east - west) * uniform[:, 1])
+    distance = MEAN_RADIUS_KM * torch.acos(near + (far - near) * uniform[:, 2])
+    end = move(latitude, longitude, 2 * math.pi * uniform[:, 3], distance)
+    return Tasks(torch.stack((latitude, longitude), -1), torch.stack(end, -1))
+
+
+def task_set(
+    num_tasks: int,
+    seed: int,
+    region: Region = PAPER_REGION,
+    distance_range_km: tuple[float, float] = PAPER_DISTANCE_KM,
+) -> Tasks:
+    """A frozen set of tasks: the first journey of each of ``num_tasks`` vehicles.
+
+    Raises:
+        ValueError: for less than one task, or a range that the region cannot hold.
+
+    Example:
+        >>> task_set(100, seed=1).start.shape
+        torch.Size([100, 2])
+    """
+    if num_tasks < 1:
+        raise ValueError(f"num_tasks must be at least 1, got {num_tasks}")
+    vehicle = torch.arange(num_tasks)
+    return sample_tasks(region, distance_range_km, seed, vehicle, torch.zeros_like(vehicle))
+
+
+def check_tasks(tasks: Tasks, within: Region) -> Tasks:
+    """Tasks as float64, once they are found to be sound.
+
+    Args:
+        tasks: start and target, each ``(M, 2)`` latitude, longitude [deg].
+        within: where every start and target must lie.
+
+    Raises:
+        ValueError: for other shapes, an empty set, positions that are not on Earth, or outside ``within``.
+    """
+    start, target = (torch.as_tensor(x, dtype=torch.float64) for x in tasks)
+    if start.shape != target.shape or start.ndim != 2 or start.shape[-1] != 2 or not len(start):
+        raise ValueError(
+            f"tasks must be two (M, 2) tensors with M >= 1, got {tuple(start.shape)} and {tuple(target.shape)}"
+        )
+    for name, position in (("start", start), ("target", target)):
+        check_positions(*position.unbind(-1))
+        outside = ~within.contains(position).squeeze(-1)
+        if outside.any():
+            index = int(outside.nonzero()[0])
+            raise ValueError(f"the {name} of task {index}, {position[index].tolist()}, lies outside {within}")
+    return Tasks(start, target)
