@@ -8,6 +8,7 @@ nanotesla, ``(..., 3)``; ``model.value_and_gradient`` adds the exact derivative 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from functools import cache
 from typing import Protocol
@@ -15,6 +16,7 @@ from typing import Protocol
 import numpy as np
 import torch
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from magrl import harmonics
 from magrl.elements import elements_gradient, measured_elements
@@ -109,7 +111,14 @@ def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
     return torch.from_numpy((1 - weight) * table[right - 1] + weight * table[right])
 
 
-class SphericalHarmonicField(nn.Module):
+class _Float64Module(nn.Module):
+    """A module that follows device moves but keeps its dtype: float32 coefficients would cost metres."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        return super()._apply(lambda tensor: fn(tensor).to(tensor.dtype), recurse)
+
+
+class SphericalHarmonicField(_Float64Module):
     """The field of a Schmidt semi-normalised spherical harmonic expansion, on the WGS84 ellipsoid.
 
     Args:
@@ -138,10 +147,6 @@ class SphericalHarmonicField(nn.Module):
         gauss = gauss.to(torch.complex128)
         self.register_buffer("value_table", harmonics.field_table(gauss))
         self.register_buffer("gradient_table", harmonics.gradient_table(gauss))
-
-    def _apply(self, fn, recurse=True):  # noqa: ANN001, ANN202 - the signature is torch's
-        """Follows device moves, but stays in float64: float32 coefficients would cost metres."""
-        return super()._apply(lambda t: (moved := fn(t)).to(t.dtype) if t.is_floating_point() else moved, recurse)
 
     def forward(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None) -> Tensor:
         """The field vector.
@@ -254,7 +259,7 @@ class IGRF(SphericalHarmonicField):
         return f"date={self.date.isoformat()}, generation={self.generation}, altitude_km={self.altitude_km}"
 
 
-class RegionalField(nn.Module):
+class RegionalField(_Float64Module):
     """A field model on a latitude-longitude box, as a two-dimensional Chebyshev expansion.
 
     Value and gradient are two small contractions, which is what makes a simulation step cheap. The expansion is
@@ -307,8 +312,6 @@ class RegionalField(nn.Module):
                 f"the expansion of degree {degree} misses the model by {self.error_nt:.3g} nT on latitudes {latitude}, "
                 f"longitudes {longitude}; the tolerance is {tolerance_nt:.3g} nT: raise the degree or shrink the box"
             )
-
-    _apply = SphericalHarmonicField._apply
 
     def forward(self, latitude: Tensor, longitude: Tensor) -> Tensor:
         """The field vector.

@@ -207,7 +207,7 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
     su1, cu1, su2, cu2 = torch.sin(u1), torch.cos(u1), torch.sin(u2), torch.cos(u2)
     difference = wrap_angle(lon2 - lon1)
     lam, change = difference, torch.zeros_like(difference)
-    for _ in range(20):
+    for _ in range(8):
         # atan2 keeps its accuracy where the arc is tiny, which the cosine of it does not.
         x, y = cu2 * torch.sin(lam), cu1 * su2 - su1 * cu2 * torch.cos(lam)
         sin_sigma = torch.hypot(x, y)

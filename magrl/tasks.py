@@ -19,7 +19,8 @@ from magrl.geodesy import geodesic, move, wrap_longitude
 
 MEAN_RADIUS_KM = 6371.0
 KM_PER_DEGREE = MEAN_RADIUS_KM * math.pi / 180
-MAX_ROUNDS = 10_000
+TRIES_PER_ROUND = 8
+MAX_ROUNDS = 1000
 """Rounds of rejection sampling before a region is held to be too small for its distances."""
 
 
@@ -179,30 +180,32 @@ def sample_tasks(
     target = torch.empty_like(start)
     waiting = torch.arange(len(vehicle), device=vehicle.device)
     for attempt in range(MAX_ROUNDS):
-        tries = torch.full_like(vehicle[waiting], attempt)
-        counters = torch.stack((vehicle[waiting], episode[waiting], tries), -1)
-        candidate = _candidates(region, distance_range_km, counter_uniform(seed, counters, 4))
+        tries = torch.arange(TRIES_PER_ROUND, device=vehicle.device) + attempt * TRIES_PER_ROUND
+        rows = torch.broadcast_tensors(vehicle[waiting].unsqueeze(-1), episode[waiting].unsqueeze(-1), tries)
+        candidate = _candidates(region, distance_range_km, counter_uniform(seed, torch.stack(rows, -1), 4))
         distance, _ = geodesic(*candidate.start.unbind(-1), *candidate.target.unbind(-1))
         in_range = (distance >= distance_range_km[0]) & (distance <= distance_range_km[1])
         fits = in_range & region.contains(candidate.target).squeeze(-1)
-        start[waiting[fits]], target[waiting[fits]] = candidate.start[fits], candidate.target[fits]
-        waiting = waiting[~fits]
+        placed, first = fits.max(-1)
+        chosen = (placed.nonzero().squeeze(-1), first[placed])
+        start[waiting[placed]], target[waiting[placed]] = candidate.start[chosen], candidate.target[chosen]
+        waiting = waiting[~placed]
         if not len(waiting):
             return Tasks(start, target)
     raise RuntimeError(
-        f"no task was found in {MAX_ROUNDS} tries: {region} all but cannot hold distances of {distance_range_km} km"
+        f"no task was found in {MAX_ROUNDS * TRIES_PER_ROUND} tries: {region} all but cannot hold distances of {distance_range_km} km"
     )
 
 
 def _candidates(region: Region, distance_range_km: tuple[float, float], uniform: Tensor) -> Tasks:
-    """Starts uniform over the box's area, ends uniform over the ring about them; ``uniform`` is ``(P, 4)``."""
+    """Starts uniform over the box's area, ends uniform over the ring about them; ``uniform`` is ``(..., 4)``."""
     south, north = (math.sin(math.radians(x)) for x in region.latitude)
     near, far = (math.cos(min(x / MEAN_RADIUS_KM, math.pi)) for x in distance_range_km)
     west, east = region.longitude
-    latitude = torch.rad2deg(torch.asin(south + (north - south) * uniform[:, 0]))
-    longitude = wrap_longitude(west + (east - west) * uniform[:, 1])
-    distance = MEAN_RADIUS_KM * torch.acos(near + (far - near) * uniform[:, 2])
-    end = move(latitude, longitude, 2 * math.pi * uniform[:, 3], distance)
+    latitude = torch.rad2deg(torch.asin(south + (north - south) * uniform[..., 0]))
+    longitude = wrap_longitude(west + (east - west) * uniform[..., 1])
+    distance = MEAN_RADIUS_KM * torch.acos(near + (far - near) * uniform[..., 2])
+    end = move(latitude, longitude, 2 * math.pi * uniform[..., 3], distance)
     return Tasks(torch.stack((latitude, longitude), -1), torch.stack(end, -1))
 
 
