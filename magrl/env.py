@@ -8,6 +8,7 @@ its options and, per vehicle, the number of the journey that it is on.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
-from magrl.fields import IGRF, Date, FieldModel, RegionalField, elements_at
+from magrl.fields import IGRF, Date, FieldModel, RegionalField, elements_at, elements_range
 from magrl.geodesy import move, wrap_angle
 from magrl.tasks import (
     KM_PER_DEGREE,
@@ -126,6 +127,7 @@ class GeomagneticNavEnv(EnvBase):
     """
 
     batch_locked = True
+    episode: Tensor
 
     def __init__(
         self,
@@ -174,6 +176,7 @@ class GeomagneticNavEnv(EnvBase):
             field = paper_field(region, margin_deg, max_move_km)
         self.field = field.to(self.device) if isinstance(field, torch.nn.Module) else field
         float64: dict[str, Any] = {"dtype": torch.float64, "device": self.device}
+        self._track: deque[tuple[Tensor, Tensor, Tensor]] = deque(maxlen=max_steps + 1)
         self.register_buffer("objective_floors", torch.tensor(tuple(objective_floors), **float64))
         self.register_buffer("action_low", torch.tensor((0.0, -self.max_turn_rad), **float64))
         self.register_buffer("action_high", torch.tensor((self.max_move_km, self.max_turn_rad), **float64))
@@ -221,13 +224,11 @@ class GeomagneticNavEnv(EnvBase):
 
     def _field_bounds(self, box: Region) -> tuple[Tensor, Tensor]:
         """Bounds of D, I, B_H over every place that can be reached, ``(3,)`` each, from a grid and 5 % of slack."""
-        latitude = torch.linspace(*box.latitude, 81, dtype=torch.float64, device=self.device)
-        longitude = torch.linspace(*box.longitude, 81, dtype=torch.float64, device=self.device)
-        grid = torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
-        values = elements_at(self.field, grid).flatten(0, 1)
-        if not torch.isfinite(values).all():
+        low, high = elements_range(self.field, box.grid(81).to(self.device))
+        if not torch.isfinite(low + high).all():
             raise ValueError(f"the field is not defined on all of {box}, which vehicles of these options can reach")
-        low, high = values.amin(0), values.amax(0)
+        if high[0] - low[0] > 180:
+            raise ValueError(f"the declination turns through south in {box}: D jumps from 180 to -180 degrees there")
         slack = 0.05 * (high - low)
         limit = torch.tensor((180.0, 90.0, math.inf), dtype=torch.float64, device=self.device)
         return (low - slack).maximum(-limit), (high + slack).minimum(limit)
@@ -238,18 +239,19 @@ class GeomagneticNavEnv(EnvBase):
         if seed is None:
             raise ValueError("seed must be an integer, got None")
         self.seed = int(seed)
-        self.episode.zero_()
+        self.episode = torch.zeros_like(self.episode)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         """Starts the next journey of every vehicle that is named by ``_reset``, or of all."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            return self._started(self.vehicle)
-        mask = mask.reshape(self.num_envs)
-        chosen = mask.nonzero().squeeze(-1)
-        # The rows of the others are placeholders: the base class puts their running state back.
-        row_of = (mask.cumsum(0) - 1).clamp_min(0)
-        return self._started(chosen)[row_of]
+            start = self._started(self.vehicle)
+        else:
+            mask = mask.reshape(self.num_envs)
+            # The rows of the others are placeholders: the base class puts their running state back.
+            start = self._started(mask.nonzero().squeeze(-1))[(mask.cumsum(0) - 1).clamp_min(0)]
+        self._remember(start, mask)
+        return start
 
     def _started(self, vehicle: Tensor) -> TensorDict:
         """The first observation of the next journey of some vehicles, ``(P,)``."""
@@ -300,7 +302,8 @@ class GeomagneticNavEnv(EnvBase):
         distance, turn = action.unbind(-1)
         before = tensordict["position"]
         heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
-        position = torch.stack(move(*before.unbind(-1), heading, distance), -1)
+        latitude, longitude = before.unbind(-1)
+        position = torch.stack(move(latitude, longitude, heading, distance), -1)
         position = torch.where(self.edge.contains(before), position, before)  # the lost stay where they were lost
         lost = ~self.edge.contains(position)
 
@@ -315,7 +318,7 @@ class GeomagneticNavEnv(EnvBase):
         reward = guidance.destination_reward(arrived, self.destination_weight) + guidance.late_decay(
             proximity, step, self.max_steps
         )
-        return TensorDict(
+        after = TensorDict(
             {
                 "field": field.float(),
                 "target_field": tensordict["target_field"],
@@ -336,6 +339,8 @@ class GeomagneticNavEnv(EnvBase):
             batch_size=tensordict.batch_size,
             device=self.device,
         )
+        self._remember(after)
+        return after
 
     def _checked_action(self, action: Tensor) -> Tensor:
         """The action in float64, rounded into its bounds.
@@ -356,6 +361,56 @@ class GeomagneticNavEnv(EnvBase):
                 f"[-{self.max_turn_rad:.4f}, {self.max_turn_rad:.4f}]"
             )
         return action.clamp(self.action_low, self.action_high)
+
+    # Pictures
+
+    def _remember(self, state: TensorDictBase, mask: Tensor | None = None) -> None:
+        """Keeps the positions of the running episodes for :meth:`render`; only rows in ``mask`` are new."""
+        if torch.compiler.is_compiling():
+            return
+        position, step, target = state["position"], state["step_count"], state["target_position"]
+        if mask is not None and self._track:
+            keep = ~mask.unsqueeze(-1)
+            last = self._track[-1]
+            position, step, target = (
+                torch.where(keep, old, new) for old, new in zip(last, (position, step, target), strict=True)
+            )
+        self._track.append((position, step, target))
+
+    def track(self, vehicle: int) -> Tensor:
+        """Where a vehicle has been in its running episode, start first: ``(T, 2)`` latitude, longitude [deg].
+
+        Raises:
+            RuntimeError: before the first reset.
+            IndexError: for a vehicle that the batch does not hold.
+        """
+        if not self._track:
+            raise RuntimeError("there is no episode to show yet: call reset() first")
+        if not 0 <= vehicle < self.num_envs:
+            raise IndexError(f"vehicle {vehicle} is not one of the {self.num_envs} in the batch")
+        since = int(self._track[-1][1][vehicle])
+        return torch.stack([entry[0][vehicle] for entry in list(self._track)[-(since + 1) :]])
+
+    def render(self, vehicles: Sequence[int] | None = None, *, size_px: int = 700) -> np.ndarray:
+        """A picture of the running episodes over the field's contours.
+
+        Args:
+            vehicles: which to draw; the first 16 by default.
+            size_px: height and width [pixels].
+
+        Returns:
+            ``(size_px, size_px, 3)`` uint8 RGB.
+
+        Raises:
+            RuntimeError: before the first reset.
+            IndexError: for a vehicle that the batch does not hold.
+        """
+        from magrl import plots  # matplotlib is heavy, and only needed for pictures
+
+        chosen = range(min(self.num_envs, 16)) if vehicles is None else vehicles
+        paths = [self.track(vehicle).cpu() for vehicle in chosen]
+        targets = self._track[-1][2][list(chosen)].cpu()
+        return plots.rgb_array(plots.draw_journeys, size_px, self.field, self.region, paths, targets)
 
 
 def _check_positive_int(**options: int) -> None:

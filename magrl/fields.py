@@ -423,6 +423,20 @@ def elements_at(field: FieldModel, position: Tensor) -> Tensor:
     return measured_elements(field(position[..., 0], position[..., 1]))
 
 
+def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and greatest D, I, B_H over positions.
+
+    Args:
+        field: any model of this module.
+        position: ``(..., 2)`` latitude, longitude [deg], for example :meth:`magrl.tasks.Region.grid`.
+
+    Returns:
+        Two ``(3,)``: D [deg], I [deg], B_H [nT].
+    """
+    values = elements_at(field, position).reshape(-1, 3)
+    return values.amin(0), values.amax(0)
+
+
 def elements_gradient_at(field: FieldModel, position: Tensor) -> Tensor:
     """Horizontal gradient of D, I, B_H at positions.
 

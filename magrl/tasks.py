@@ -69,6 +69,12 @@ class Region:
         spare = min(margin_deg, (360 - (east - west)) / 2)
         return Region((max(south - margin_deg, -90), min(north + margin_deg, 90)), (west - spare, east + spare))
 
+    def grid(self, points: int) -> Tensor:
+        """An even grid of positions, edges included: ``(points, points, 2)`` latitude, longitude [deg]."""
+        latitude = torch.linspace(*self.latitude, points, dtype=torch.float64)
+        longitude = torch.linspace(*self.longitude, points, dtype=torch.float64)
+        return torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
+
     def longest_km(self) -> float:
         """A length that no distance in the box exceeds, tight for boxes up to a quarter of the globe [km]."""
         if self.longitude[1] - self.longitude[0] > 90 or self.latitude[1] - self.latitude[0] > 90:
@@ -193,7 +199,8 @@ def sample_tasks(
         if not len(waiting):
             return Tasks(start, target)
     raise RuntimeError(
-        f"no task was found in {MAX_ROUNDS * TRIES_PER_ROUND} tries: {region} all but cannot hold distances of {distance_range_km} km"
+        f"no task was found in {MAX_ROUNDS * TRIES_PER_ROUND} tries: {region} can hardly hold distances of "
+        f"{distance_range_km} km"
     )
 
 

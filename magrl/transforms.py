@@ -29,7 +29,7 @@ Keys = Sequence[NestedKey]
 class _ObservationTransform(Transform):
     """What the transforms that add an observation share: they also run at reset, and on plain TensorDicts."""
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -278,6 +278,47 @@ class AngleVector(_ObservationTransform):
                 raise ValueError(f"AngleVector reads angles of shape (..., 1); {in_key!r} is {tuple(leaf.shape)}")
             shape = (*leaf.shape[:-1], 2)
             observation_spec[out_key] = Bounded(-1.0, 1.0, shape, device=leaf.device, dtype=leaf.dtype)
+        return observation_spec
+
+
+class TargetDifference(_ObservationTransform):
+    """What is left to the target: the target's values less the values here.
+
+    A linear map of what is observed anyway, but one that a network need not learn, and that can be scaled to the
+    length of a journey instead of the size of a region.
+
+    Args:
+        in_keys: values here and values at the target, each ``(..., E)``.
+        out_keys: one difference ``(..., E)``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict(field=torch.tensor([8.0, -16.0]), target_field=torch.tensor([9.0, -20.0]))
+        >>> TargetDifference()(td)["field_difference"]
+        tensor([ 1., -4.])
+    """
+
+    def __init__(
+        self, in_keys: Keys = ("field", "target_field"), out_keys: NestedKey | Keys = ("field_difference",)
+    ) -> None:
+        super().__init__(in_keys=[unravel_key(k) for k in in_keys], out_keys=_key_list(out_keys))
+        _expect_keys(self, 2, 1)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
+        if values is not None:
+            next_tensordict.set(self.out_keys[0], values[1] - values[0])
+        return next_tensordict
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        value, target = (self._leaf(observation_spec, key) for key in self.in_keys)
+        if value.shape != target.shape:
+            raise ValueError(f"{self.in_keys} must have one shape, got {tuple(value.shape)} and {tuple(target.shape)}")
+        spec: TensorSpec = Unbounded(value.shape, device=value.device, dtype=value.dtype)
+        if isinstance(value, Bounded) and isinstance(target, Bounded):
+            low, high = target.space.low - value.space.high, target.space.high - value.space.low
+            spec = Bounded(low, high, value.shape, device=value.device, dtype=value.dtype)
+        observation_spec[self.out_keys[0]] = spec
         return observation_spec
 
 

@@ -1,0 +1,152 @@
+"""From a rollout to the measures of each episode, and from those to a summary.
+
+Every measure comes from positions, moves and flags of the environment, never from a shaped reward. Angles are in
+degrees here, because people read them; distances in kilometres.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from magrl.geodesy import geodesic, wrap_angle
+
+WITHIN_KM = (10, 25)
+"""Distances at which a second, field-free success rate is reported [km]."""
+
+
+def flown(done: Tensor) -> Tensor:
+    """Which steps belong to the first episode.
+
+    Args:
+        done: ``(M, T)`` or ``(M, T, 1)`` bool.
+
+    Returns:
+        ``(M, T)`` bool: True up to and including the first done.
+
+    Example:
+        >>> flown(torch.tensor([[False, True, True]]))
+        tensor([[ True,  True, False]])
+    """
+    done = done.reshape(done.shape[:2])
+    return done.long().cumsum(1) - done.long() == 0
+
+
+def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
+    """The measures of the first episode of each vehicle.
+
+    Args:
+        rollout: ``(M, T)`` from ``env.rollout``, with the keys of :class:`magrl.env.GeomagneticNavEnv`.
+
+    Returns:
+        Tensors ``(M,)``: ``success`` bool; ``steps``; ``shortest_km``, the geodesic from start to destination;
+        ``length_km``, the path flown; ``navigation_error_km``, what was left at the end; ``spl`` in [0, 1];
+        ``smoothness_deg``, the mean interior angle at way-points (180 is straight, NaN without way-points);
+        ``heading_mae_deg`` and ``heading_rmse_deg``, from the bearing to the destination at each move of some
+        length (NaN without any).
+
+    Source:
+        SPL: Anderson et al., On evaluation of embodied navigation agents (2018).
+    """
+    valid = flown(rollout["next", "done"])
+    steps = valid.sum(1)
+    last = (steps - 1).unsqueeze(-1)
+    success = rollout["next", "success"].squeeze(-1).gather(1, last).squeeze(-1)
+    moves = rollout["next", "move"][..., 0].double() * valid
+    start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
+    end = rollout["next", "position"].gather(1, last.unsqueeze(-1).expand(-1, 1, 2)).squeeze(1)
+    shortest, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
+    length = moves.sum(1)
+    deviation = _heading_deviation(rollout, valid)
+    return {
+        "success": success,
+        "steps": steps,
+        "shortest_km": shortest,
+        "length_km": length,
+        "navigation_error_km": geodesic(*end.unbind(-1), *target.unbind(-1))[0],
+        "spl": success * shortest / torch.maximum(length, shortest),
+        "smoothness_deg": 180 - _mean(_turns(rollout, valid)),
+        "heading_mae_deg": _mean(deviation),
+        "heading_rmse_deg": _mean(deviation**2).sqrt(),
+    }
+
+
+def _moving(rollout: TensorDictBase, valid: Tensor) -> Tensor:
+    """Moves that have a direction: those of some length, ``(M, T)``."""
+    return valid & (rollout["next", "move"][..., 0] > 1e-6)
+
+
+def _heading_deviation(rollout: TensorDictBase, valid: Tensor) -> Tensor:
+    """Angle between each move and the bearing to the destination where it began, ``(M, T)`` [deg], NaN where none."""
+    _, bearing = geodesic(*rollout["position"].unbind(-1), *rollout["target_position"].unbind(-1))
+    angle = wrap_angle(rollout["next", "heading"].squeeze(-1).double() - bearing).abs()
+    return torch.where(_moving(rollout, valid), torch.rad2deg(angle), math.nan)
+
+
+def _turns(rollout: TensorDictBase, valid: Tensor) -> Tensor:
+    """Turn between a move and the last one before it that went anywhere, ``(M, T)`` [deg], NaN where there is none."""
+    heading = rollout["next", "heading"].squeeze(-1).double()
+    moving = _moving(rollout, valid)
+    index = torch.arange(heading.shape[1], device=heading.device).expand_as(heading)
+    latest = torch.where(moving, index, -1).cummax(1).values
+    previous = torch.cat((torch.full_like(latest[:, :1], -1), latest[:, :-1]), 1)
+    turn = wrap_angle(heading - heading.gather(1, previous.clamp_min(0))).abs()
+    return torch.where(moving & (previous >= 0), torch.rad2deg(turn), math.nan)
+
+
+def _mean(values: Tensor) -> Tensor:
+    return values.nanmean(1)
+
+
+def summarise(episodes: dict[str, Tensor]) -> dict[str, float]:
+    """A summary of episodes, in the paper's units.
+
+    Args:
+        episodes: from :func:`episode_measures`.
+
+    Returns:
+        ``success_rate`` [%] with its Wilson 95 % interval ``success_rate_low`` and ``_high``; ``success_rate_within_10km``
+        and ``_25km`` [%], the share that ends so near whatever the field says; ``spl`` [%] with the half width of its
+        95 % interval ``spl_ci``; ``trajectory_length_m`` and ``steps`` over successes, as the paper seems to, and
+        ``_all`` over all; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg``, ``heading_rmse_deg`` over
+        successes; ``num_tasks``. Means over no success at all are NaN.
+    """
+    success = episodes["success"]
+    count = len(success)
+    rate = success.double().mean().item()
+    low, high = wilson_interval(rate, count)
+    error, spl = episodes["navigation_error_km"], episodes["spl"]
+    summary = {"success_rate": 100 * rate, "success_rate_low": 100 * low, "success_rate_high": 100 * high}
+    summary |= {f"success_rate_within_{d}km": 100 * (error <= d).double().mean().item() for d in WITHIN_KM}
+    summary |= {"spl": 100 * spl.mean().item(), "spl_ci": 196 * spl.std(correction=0).item() / math.sqrt(count)}
+    summary["trajectory_length_m"] = 1000 * episodes["length_km"][success].mean().item()
+    summary["trajectory_length_m_all"] = 1000 * episodes["length_km"].mean().item()
+    summary["steps"] = episodes["steps"][success].double().mean().item()
+    summary["steps_all"] = episodes["steps"].double().mean().item()
+    for name in ("navigation_error_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"):
+        summary[name] = episodes[name][success].nanmean().item()
+    return summary | {"num_tasks": count}
+
+
+def wilson_interval(rate: float, count: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's score interval of a proportion.
+
+    Args:
+        rate: observed proportion, in [0, 1].
+        count: number of trials.
+        z: normal quantile; 1.96 for 95 %.
+
+    Source:
+        E. B. Wilson, Probable inference, the law of succession, and statistical inference, JASA 22 (1927).
+
+    Example:
+        >>> [round(x, 4) for x in wilson_interval(1.0, 100)]
+        [0.963, 1.0]
+    """
+    centre = rate + z**2 / (2 * count)
+    half = z * math.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
+    scale = 1 + z**2 / count
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
