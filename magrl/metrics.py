@@ -7,6 +7,7 @@ degrees here, because people read them; distances in kilometres.
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import torch
 from tensordict import TensorDictBase
@@ -108,11 +109,12 @@ def summarise(episodes: dict[str, Tensor]) -> dict[str, float]:
         episodes: from :func:`episode_measures`.
 
     Returns:
-        ``success_rate`` [%] with its Wilson 95 % interval ``success_rate_low`` and ``_high``; ``success_rate_within_10km``
-        and ``_25km`` [%], the share that ends so near whatever the field says; ``spl`` [%] with the half width of its
-        95 % interval ``spl_ci``; ``trajectory_length_m`` and ``steps`` over successes, as the paper seems to, and
-        ``_all`` over all; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg``, ``heading_rmse_deg`` over
-        successes; ``num_tasks``. Means over no success at all are NaN.
+        ``success_rate`` [%] with its Wilson 95 % interval ``success_rate_low`` and ``_high``;
+        ``success_rate_within_10km`` and ``_25km`` [%], the share that ends so near whatever the field says;
+        ``spl`` [%] with the half width ``spl_ci`` of its 95 % interval;
+        ``trajectory_length_m`` and ``steps`` over successes, as the paper seems to, and ``_all`` over all;
+        ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg``, ``heading_rmse_deg`` over successes;
+        ``num_tasks``. Means over no success at all are NaN.
     """
     success = episodes["success"]
     count = len(success)
@@ -150,3 +152,49 @@ def wilson_interval(rate: float, count: int, z: float = 1.96) -> tuple[float, fl
     half = z * math.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
     scale = 1 + z**2 / count
     return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
+
+
+class TrainingTally:
+    """Counts frames and episodes while they are collected, and averages rewards and the last episodes.
+
+    Args:
+        destination_weight: the env's reward at arrival, which is told from the rest of the base reward by it.
+        reward_scale: factor that the collected reward carries.
+        window: episodes that ``return`` and ``success_rate`` are averaged over, as in Figs. 4-2 and 4-3.
+    """
+
+    def __init__(self, destination_weight: float, reward_scale: float, window: int = 200) -> None:
+        self.destination_weight, self.reward_scale = destination_weight, reward_scale
+        self.frames = self.episodes = 0
+        self._returns: deque[float] = deque(maxlen=window)
+        self._successes: deque[float] = deque(maxlen=window)
+        self._terms: list[tuple[float, float, float]] = []
+
+    def add(self, batch: TensorDictBase, alignment: Tensor | None) -> None:
+        """Counts a batch of transitions.
+
+        Args:
+            batch: ``(B,)`` with ``next``: ``reward``, ``episode_reward``, ``success`` and ``done``.
+            alignment: ``(B, 1)`` the alignment term in the reward, or None.
+        """
+        ended, success = batch["next", "done"], batch["next", "success"]
+        self.frames += batch.numel()
+        self.episodes += int(ended.sum())
+        self._returns.extend(batch["next", "episode_reward"][ended].tolist())
+        self._successes.extend(success[ended].double().tolist())
+        destination = self.destination_weight * success.double().mean().item()
+        aligned = 0.0 if alignment is None else alignment.double().mean().item()
+        total = batch["next", "reward"].double().mean().item() / self.reward_scale
+        self._terms.append((destination, total - destination - aligned, aligned))
+
+    def row(self) -> dict[str, float]:
+        """The averages, and a fresh start for those of the reward's terms; NaN where nothing ended yet."""
+        terms = torch.tensor(self._terms, dtype=torch.float64).reshape(-1, 3).mean(0).tolist()
+        self._terms = []
+        names = ("reward_destination", "reward_proximity", "reward_alignment")
+        count = len(self._returns)
+        return {
+            "return": sum(self._returns) / count if count else math.nan,
+            "success_rate": 100 * sum(self._successes) / count if count else math.nan,
+            **dict(zip(names, terms, strict=True)),
+        }

@@ -13,15 +13,28 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.elements import NAMES, UNITS
 from magrl.fields import FieldModel, elements_at
 from magrl.geodesy import wrap_longitude
+from magrl.metrics import flown
 from magrl.tasks import Region
 
 ELEMENT_COLOURS = {"D": "#E69F00", "I": "#0072B2", "B_H": "#009E73"}
 PATH, START, TARGET = "#404040", "#D55E00", "#CC79A7"
+LINES = ("#0072B2", "#D55E00", "#009E73")
+TRAINING_PANELS = {
+    "return of the last 200 episodes": {"return": "return"},
+    "mean reward of a step": {f"reward_{term}": term for term in ("destination", "proximity", "alignment")},
+    "success [%]": {
+        "success_rate": "SR, last 200 episodes",
+        "eval_success_rate": "SR, evaluation",
+        "eval_spl": "SPL, evaluation",
+    },
+    "loss": {"loss_critic": "critics", "loss_actor": "actor"},
+}
 SYMBOLS = {"D": "D", "I": "I", "B_H": "$B_H$"}
 
 
@@ -88,7 +101,8 @@ def draw_journeys(
     points = torch.cat([*unwrapped, ends])
     shown = region if zoom else _around(region, points)
     draw_contours(axes, field, shown)
-    for path in unwrapped:
+    for path, end in zip(unwrapped, ends, strict=True):
+        axes.plot(*torch.stack((path[0], end)).flip(-1).T, ":", color=TARGET, lw=0.8)
         axes.plot(path[:, 1], path[:, 0], "-", color=PATH, lw=1, marker=".", ms=3, alpha=0.8)
     starts = torch.stack([path[0] for path in unwrapped])
     axes.plot(starts[:, 1], starts[:, 0], "s", color=START, ms=5, label="start")
@@ -103,35 +117,46 @@ def _around(region: Region, points: Tensor) -> Region:
     return Region((min(south, low[0]), max(north, high[0])), (min(west, low[1]), max(east, high[1])))
 
 
-def draw_training(figure: Figure, rows: Sequence[Mapping[str, float]]) -> None:
-    """Curves of one training: return and its terms, success, SPL on the small task set, losses.
+def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
+    """Curves of one training: return, reward terms, success and SPL, losses.
 
     Args:
-        figure: an empty figure.
-        rows: the rows of a ``train.csv``; values that are missing are NaN.
+        rows: of a ``train.csv``; values that are missing or NaN are left out.
     """
+    figure = Figure(figsize=(10, 7), layout="constrained")
     frames = np.array([row["frames"] for row in rows])
-    panels: tuple[tuple[str, dict[str, str], str], ...] = (
-        ("return of an episode", {"return": "return"}, "#0072B2"),
-        ("mean reward of a step", {f"reward_{x}": x for x in ("destination", "proximity", "alignment")}, ""),
-        (
-            "success [%]",
-            {"success_rate": "last 200 episodes", "eval_success_rate": "small set", "eval_spl": "SPL, small set"},
-            "",
-        ),
-        ("loss", {"loss_critic": "critic", "loss_actor": "actor"}, ""),
-    )
-    for axes, (title, columns, _) in zip(figure.subplots(2, 2, sharex=True).flat, panels, strict=True):
-        for colour, (column, label) in zip(("#0072B2", "#D55E00", "#009E73"), columns.items(), strict=False):
+    for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, TRAINING_PANELS.items(), strict=True):
+        for colour, (column, label) in zip(LINES, columns.items(), strict=False):
             values = np.array([row.get(column, np.nan) for row in rows], dtype=float)
             known = np.isfinite(values)
             axes.plot(frames[known], values[known], color=colour, lw=1.2, label=label)
-        axes.set(title=title)
+        axes.set_title(title)
         axes.grid(alpha=0.3)
         if len(columns) > 1:
             axes.legend(fontsize=8)
     for axes in figure.axes[2:]:
         axes.set_xlabel("frames (vehicle-steps)")
+    return figure
+
+
+def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Region, journeys: int = 24) -> Figure:
+    """The first journeys of a rollout over the field's contours.
+
+    Args:
+        rollout: ``(M, T)`` from the environment.
+        field: any model of :mod:`magrl.fields`.
+        region: where tasks lie.
+        journeys: how many to show.
+    """
+    shown = rollout[:journeys].cpu()
+    steps = flown(shown["next", "done"]).sum(1)
+    paths = [
+        torch.cat((row["position"][:1], row["next", "position"][:count]))
+        for row, count in zip(shown, steps.tolist(), strict=True)
+    ]
+    figure = Figure(figsize=(8, 8.4), layout="constrained")
+    draw_journeys(figure.subplots(), field, region, paths, shown["target_position"][:, 0])
+    return figure
 
 
 def _device(field: FieldModel) -> torch.device:

@@ -58,7 +58,7 @@ def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
 
 def _key_list(keys: NestedKey | Keys) -> list[NestedKey]:
     """One key or several, as a list; a tuple of strings is one nested key."""
-    if isinstance(keys, str) or (isinstance(keys, tuple) and all(isinstance(k, str) for k in keys)):
+    if isinstance(keys, str) or (isinstance(keys, tuple) and keys and all(isinstance(k, str) for k in keys)):
         return [unravel_key(keys)]
     return [unravel_key(key) for key in keys]
 
