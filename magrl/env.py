@@ -176,7 +176,7 @@ class GeomagneticNavEnv(EnvBase):
             field = paper_field(region, margin_deg, max_move_km)
         self.field = field.to(self.device) if isinstance(field, torch.nn.Module) else field
         float64: dict[str, Any] = {"dtype": torch.float64, "device": self.device}
-        self._track: deque[tuple[Tensor, Tensor, Tensor]] = deque(maxlen=max_steps + 1)
+        self._track: deque[tuple[Tensor, ...]] = deque(maxlen=max_steps + 1)
         self.register_buffer("objective_floors", torch.tensor(tuple(objective_floors), **float64))
         self.register_buffer("action_low", torch.tensor((0.0, -self.max_turn_rad), **float64))
         self.register_buffer("action_high", torch.tensor((self.max_move_km, self.max_turn_rad), **float64))
@@ -365,17 +365,15 @@ class GeomagneticNavEnv(EnvBase):
     # Pictures
 
     def _remember(self, state: TensorDictBase, mask: Tensor | None = None) -> None:
-        """Keeps the positions of the running episodes for :meth:`render`; only rows in ``mask`` are new."""
+        """Keeps the positions of the running episodes for :meth:`render`; rows in ``mask`` start anew."""
         if torch.compiler.is_compiling():
             return
-        position, step, target = state["position"], state["step_count"], state["target_position"]
+        entry = (state["position"], state["step_count"], state["target_position"])
         if mask is not None and self._track:
-            keep = ~mask.unsqueeze(-1)
-            last = self._track[-1]
-            position, step, target = (
-                torch.where(keep, old, new) for old, new in zip(last, (position, step, target), strict=True)
-            )
-        self._track.append((position, step, target))
+            started = mask.unsqueeze(-1)
+            last = self._track.pop()
+            entry = tuple(torch.where(started, new, old) for new, old in zip(entry, last, strict=True))
+        self._track.append(entry)
 
     def track(self, vehicle: int) -> Tensor:
         """Where a vehicle has been in its running episode, start first: ``(T, 2)`` latitude, longitude [deg].

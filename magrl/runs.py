@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -85,21 +86,26 @@ class RunLog:
 
             self._wandb.experiment.log({f"figures/{name}": wandb.Image(str(self.folder / f"{name}.png"))})
 
-    def result(self, result: Mapping[str, Any]) -> None:
+    def result(self, result: Mapping[str, float]) -> None:
         """Writes ``eval.json``; wandb gets a table and its summary."""
         write_json(self.folder / "eval.json", result)
         if self._wandb:
             import wandb
 
-            rows = [[key, value] for key, value in result.items() if isinstance(value, (int, float))]
-            self._wandb.experiment.log({"eval/table": wandb.Table(columns=["measure", "value"], data=rows)})
-            self._wandb.experiment.summary.update({f"final/{k}": v for k, v in rows})
+            # A wandb.Table would be staged as an artifact, with the absolute path of its staging folder in the run.
+            rows = "".join(f"<tr><td>{key}</td><td>{value:.6g}</td></tr>" for key, value in result.items())
+            self._wandb.experiment.log({"final/table": wandb.Html(f"<table>{rows}</table>", inject=False)})
+            self._wandb.experiment.summary.update({f"final/{key}": value for key, value in result.items()})
 
     def close(self) -> None:
-        """Closes the files and the wandb run."""
+        """Closes the files and the wandb run, whose own debug logs, full of this machine's paths, are removed."""
         self._file.close()
         if self._wandb:
             self._wandb.experiment.finish()
+            for link in (self.folder / "wandb").glob("debug*.log"):
+                link.unlink()
+            for logs in (self.folder / "wandb").glob("*run-*/logs"):
+                shutil.rmtree(logs)
 
 
 def _panel(key: str) -> str:

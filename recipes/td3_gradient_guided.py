@@ -40,7 +40,7 @@ from magrl.metrics import TrainingTally, episode_measures, summarise
 from magrl.runs import RunLog, create_run_folder
 from magrl.tasks import task_set
 
-FINAL_TASKS_SEED, SMALL_TASKS_SEED = 2_000_000_011, 2_000_000_012
+SMALL_TASKS_SEED, FINAL_TASKS_SEED = 2_000_000_011, 2_000_000_012
 """Seeds of the evaluation tasks, which training refuses."""
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
@@ -128,19 +128,18 @@ class Config:
     """Tasks of the final evaluation."""
 
     def __post_init__(self) -> None:
-        whole = ("num_envs", "total_frames", "updates_per_batch", "batch_size", "buffer_size", "policy_delay")
-        for name in (*whole, "eval_every", "eval_tasks_small", "eval_tasks"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0 <= self.seed < SMALL_TASKS_SEED - 1000:
-            raise ValueError(f"seed must be in [0, {SMALL_TASKS_SEED - 1000}), got {self.seed}")
-        if not 0 <= self.gamma < 1:
-            raise ValueError(f"gamma must be in [0, 1), got {self.gamma}")
-        if self.init_random_frames < 0 or self.buffer_size < self.batch_size:
-            raise ValueError(
-                f"init_random_frames {self.init_random_frames} must not be negative, and buffer_size "
-                f"{self.buffer_size} must hold one batch of {self.batch_size}"
-            )
+        counts = ("num_envs", "total_frames", "updates_per_batch", "batch_size", "buffer_size", "policy_delay")
+        counts += ("eval_every", "eval_tasks_small", "eval_tasks")
+        positive = ("learning_rate", "final_learning_rate", "tau", "reward_scale")
+        ranges = dict.fromkeys(counts, (1, math.inf)) | dict.fromkeys(positive, (1e-12, math.inf))
+        ranges |= {"tau": (1e-12, 1), "gamma": (0, 1 - 1e-12), "seed": (0, SMALL_TASKS_SEED - 1000)}
+        ranges |= dict.fromkeys(("exploration_noise", "final_exploration_noise", "policy_noise"), (0, 10))
+        ranges |= dict.fromkeys(("noise_clip", "saturation_weight", "init_random_frames"), (0, math.inf))
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} must be between {low} and {high}, got {getattr(self, name)}")
+        if self.buffer_size < self.batch_size:
+            raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
 
 
 PRESETS = {

@@ -1,0 +1,91 @@
+"""Pictures: drawn from the data that they are given."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from magrl import plots
+from magrl.env import GeomagneticNavEnv
+from magrl.metrics import flown
+from magrl.tasks import Region, Tasks
+
+
+@pytest.fixture(scope="module")
+def env() -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(num_envs=4, seed=0)
+
+
+def test_render_shows_the_running_episode(env) -> None:
+    env.reset()
+    before = env.render()
+    env.rollout(5)
+    after = env.render()
+    assert before.shape == after.shape == (700, 700, 3)
+    assert before.dtype == np.uint8
+    assert (before != after).any()
+    assert env.render([0], size_px=300).shape == (300, 300, 3)
+
+
+def test_track_is_the_path_of_the_running_episode(env) -> None:
+    torch.manual_seed(0)
+    rollout = env.rollout(6)
+    for vehicle in range(4):
+        expected = torch.cat((rollout["position"][vehicle, :1], rollout["next", "position"][vehicle]))
+        assert torch.equal(env.track(vehicle), expected)
+
+
+def test_track_after_a_partial_reset(env) -> None:
+    state = env.rollout(3)["next"][:, -1].exclude("reward")
+    kept = env.track(0)
+    mask = torch.tensor([[False], [True], [False], [False]])
+    started = env.reset(state.set("_reset", mask))
+    assert torch.equal(env.track(0), kept)
+    assert torch.equal(env.track(1), started["position"][1:2])
+
+
+def test_render_before_reset_and_of_a_stranger() -> None:
+    env = GeomagneticNavEnv(num_envs=2, seed=0)
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.render()
+    env.reset()
+    with pytest.raises(IndexError, match="vehicle 2"):
+        env.render([2])
+
+
+def test_training_figure_leaves_out_what_is_missing() -> None:
+    rows = [{"frames": 1.0, "return": math.nan}, {"frames": 2.0, "return": 5.0, "eval_spl": 90.0}]
+    figure = plots.training_figure(rows)
+    line = figure.axes[0].lines[0]
+    assert line.get_xdata().tolist() == [2.0]
+    assert [axes.get_xlabel() for axes in figure.axes[2:]] == ["frames (vehicle-steps)"] * 2
+
+
+def test_trajectories_end_where_the_episode_did(env) -> None:
+    torch.manual_seed(1)
+    rollout = env.rollout(10, break_when_any_done=False)
+    figure = plots.trajectories_figure(rollout, env.field, env.region, journeys=2)
+    axes = figure.axes[0]
+    ends = {
+        tuple(np.round((line.get_xdata()[-1], line.get_ydata()[-1]), 6)) for line in axes.lines if len(line.get_xdata())
+    }
+    last = flown(rollout["next", "done"]).sum(1)[0] - 1
+    latitude, longitude = rollout["next", "position"][0, last].tolist()
+    assert (round(longitude, 6), round(latitude, 6)) in ends
+    assert "deg" in axes.get_legend().get_texts()[0].get_text()
+
+
+def test_paths_across_the_antimeridian_do_not_jump() -> None:
+    region = Region((-5.0, 5.0), (175.0, 185.0))
+    start, target = torch.tensor([[0.0, 179.0]]), torch.tensor([[0.0, -178.0]])
+    from magrl.fields import IGRF
+
+    env = GeomagneticNavEnv(region=region, tasks=Tasks(start, target), max_steps=4, seed=0)
+    state = env.reset()
+    for _ in range(3):
+        state["action"] = torch.tensor([[50.0, math.pi / 4]])
+        state = env.step(state)["next"].exclude("reward")
+    figure = plots.Figure()
+    plots.draw_journeys(figure.subplots(), IGRF(2025.0), region, [env.track(0)], target)
+    assert max(abs(np.diff(line.get_xdata())).max() for line in figure.axes[0].lines if len(line.get_xdata()) > 1) < 5
