@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "IGRF": "fields",
-    "RegionalField": "fields",
+    "RegionalField": "regional",
     "SphericalHarmonicField": "fields",
     "GeomagneticNavEnv": "env",
     "Region": "tasks",

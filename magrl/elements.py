@@ -59,7 +59,7 @@ def seven_elements(b_ned: Tensor) -> Elements:
     """
     north, east, down = b_ned.unbind(-1)
     horizontal = torch.hypot(north, east)
-    declination = torch.rad2deg(torch.atan2(east, north))
+    declination = torch.rad2deg(torch.atan2(east + 0.0, north + 0.0))  # adding zero takes the sign off a zero
     inclination = torch.rad2deg(torch.atan2(down, horizontal))
     return Elements(declination, inclination, horizontal, north, east, down, torch.hypot(horizontal, down))
 

@@ -20,8 +20,9 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
-from magrl.fields import IGRF, Date, FieldModel, RegionalField, elements_at, elements_range
+from magrl.fields import IGRF, Date, FieldModel, elements_at, elements_range
 from magrl.geodesy import move, wrap_angle
+from magrl.regional import RegionalField
 from magrl.tasks import (
     KM_PER_DEGREE,
     PAPER_DISTANCE_KM,
@@ -368,7 +369,7 @@ class GeomagneticNavEnv(EnvBase):
         """Keeps the positions of the running episodes for :meth:`render`; rows in ``mask`` start anew."""
         if torch.compiler.is_compiling():
             return
-        entry = (state["position"], state["step_count"], state["target_position"])
+        entry: tuple[Tensor, ...] = (state["position"], state["step_count"], state["target_position"])
         if mask is not None and self._track:
             started = mask.unsqueeze(-1)
             last = self._track.pop()

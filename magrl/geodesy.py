@@ -8,6 +8,7 @@ antimeridian; nothing here divides by the cosine of the latitude, so the poles a
 from __future__ import annotations
 
 import math
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -180,7 +181,7 @@ def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tens
 def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude2: Tensor) -> tuple[Tensor, Tensor]:
     """Length and first bearing of the geodesic from one point to another.
 
-    Vincenty's inverse formula with a fixed number of iterations: within 1 mm, but for pairs within about one
+    Vincenty's inverse formula, at most 30 iterations: within 1 mm, but for pairs within about one
     degree of being antipodal, where it does not converge and the answer is NaN.
 
     Args:
@@ -207,7 +208,7 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
     su1, cu1, su2, cu2 = torch.sin(u1), torch.cos(u1), torch.sin(u2), torch.cos(u2)
     difference = wrap_angle(lon2 - lon1)
     lam, change = difference, torch.zeros_like(difference)
-    for _ in range(8):
+    for _ in range(30):
         # atan2 keeps its accuracy where the arc is tiny, which the cosine of it does not.
         x, y = cu2 * torch.sin(lam), cu1 * su2 - su1 * cu2 * torch.cos(lam)
         sin_sigma = torch.hypot(x, y)
@@ -221,6 +222,8 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
         series = sigma + c * sin_sigma * (mid + c * cos_sigma * (2 * mid**2 - 1))
         previous, lam = lam, difference + (1 - c) * WGS84_F * sin_alpha * series
         change = (lam - previous).abs()
+        if bool((change < 1e-12).all()):
+            break
     k = cos2_alpha * (WGS84_A_KM**2 / WGS84_B_KM**2 - 1)
     a = 1 + k / 16384 * (4096 + k * (-768 + k * (320 - 175 * k)))
     b = k / 1024 * (256 + k * (-128 + k * (74 - 47 * k)))
@@ -229,5 +232,5 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
     converged = (change < 1e-11) & (lam.abs() <= math.pi)
     nan = torch.full_like(distance, float("nan"))
     bearing = wrap_angle(torch.atan2(x, y))
-    dtype = torch.result_type(latitude1, longitude2)
+    dtype = reduce(torch.promote_types, (x.dtype for x in inputs), torch.float32)
     return torch.where(converged, distance, nan).to(dtype), torch.where(converged, bearing, nan).to(dtype)

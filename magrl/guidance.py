@@ -100,7 +100,7 @@ def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
         tensor([ 4.0000,  0.8000, -7.2000])
     """
     late = step > max_steps / 2
-    return proximity - late * (step / max_steps) * proximity.abs()
+    return proximity - late * (step.to(proximity.dtype) / max_steps) * proximity.abs()
 
 
 def alignment_reward(angle: Tensor, reference: Tensor, weight: float, offset: float = math.pi / 4) -> Tensor:

@@ -44,8 +44,8 @@ def differentiate(table: Tensor) -> Tensor:
     table = torch.where(m <= n, table, torch.zeros_like(table))
     table = torch.where(m == 0, table.real.to(table.dtype), table)
     # Ratios of Schmidt norms; the factor sqrt(2) is where the order 0 is entered or left.
-    leaves_zero = torch.where(m == 0, 1 / math.sqrt(2.0), 1.0)
-    enters_zero = torch.where(m == 1, math.sqrt(2.0), 1.0)
+    leaves_zero = torch.where(m == 0, 1 / math.sqrt(2.0), torch.ones_like(m))
+    enters_zero = torch.where(m == 1, math.sqrt(2.0), torch.ones_like(m))
     up = torch.sqrt((n + m + 1) * (n + m + 2)) * leaves_zero
     down = torch.sqrt(((n - m + 1) * (n - m + 2)).clamp_min(0)) * enters_zero * (m > 0)
     level = torch.sqrt(((n - m + 1) * (n + m + 1)).clamp_min(0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -61,13 +62,15 @@ class Region:
         south, north = self.latitude
         half = (self.longitude[1] - self.longitude[0]) / 2
         offset = wrap_longitude(longitude - (self.longitude[0] + half))
+        half += 1e-9  # a tenth of a millimetre: the centre is rounded, and the edges belong to the box
         return ((latitude >= south) & (latitude <= north) & (offset.abs() <= half)).unsqueeze(-1)
 
     def expanded(self, margin_deg: float) -> Region:
         """The box with a margin on each side, cut at the poles and at a full turn [deg]."""
         (south, north), (west, east) = self.latitude, self.longitude
-        spare = min(margin_deg, (360 - (east - west)) / 2)
-        return Region((max(south - margin_deg, -90), min(north + margin_deg, 90)), (west - spare, east + spare))
+        west -= min(margin_deg, (360 - (east - west)) / 2)
+        east = min(east + margin_deg, west + 360)
+        return Region((max(south - margin_deg, -90), min(north + margin_deg, 90)), (west, east))
 
     def grid(self, points: int) -> Tensor:
         """An even grid of positions, edges included: ``(points, points, 2)`` latitude, longitude [deg]."""
@@ -77,12 +80,17 @@ class Region:
 
     def longest_km(self) -> float:
         """A length that no distance in the box exceeds, tight for boxes up to a quarter of the globe [km]."""
-        if self.longitude[1] - self.longitude[0] > 90 or self.latitude[1] - self.latitude[0] > 90:
-            return math.pi * MEAN_RADIUS_KM * 1.01
-        lat = torch.tensor((*self.latitude, *self.latitude, 0.0), dtype=torch.float64).clamp(*self.latitude)
-        lon = torch.tensor(self.longitude, dtype=torch.float64)
-        west, east = (x.expand(len(lat), len(lat)) for x in lon)
-        return float(geodesic(lat.unsqueeze(-1).expand_as(west), west, lat.expand_as(east), east)[0].max())
+        return _longest_km(self)
+
+
+@cache
+def _longest_km(region: Region) -> float:
+    (south, north), (west, east) = region.latitude, region.longitude
+    if east - west > 90 or north - south > 90:
+        return math.pi * MEAN_RADIUS_KM
+    latitude = torch.tensor((south, min(max(0.0, south), north), north), dtype=torch.float64)
+    corners = torch.tensor((west, east), dtype=torch.float64)
+    return float(geodesic(latitude.unsqueeze(-1), corners[0], latitude, corners[1])[0].max())
 
 
 PAPER_REGION = Region((-10.0, 0.0), (160.0, 170.0))
@@ -207,7 +215,8 @@ def sample_tasks(
 def _candidates(region: Region, distance_range_km: tuple[float, float], uniform: Tensor) -> Tasks:
     """Starts uniform over the box's area, ends uniform over the ring about them; ``uniform`` is ``(..., 4)``."""
     south, north = (math.sin(math.radians(x)) for x in region.latitude)
-    near, far = (math.cos(min(x / MEAN_RADIUS_KM, math.pi)) for x in distance_range_km)
+    held = 1.01 * region.longest_km()  # beyond this, the ring holds nothing but misses
+    near, far = (math.cos(min(x, held) / MEAN_RADIUS_KM) for x in distance_range_km)
     west, east = region.longitude
     latitude = torch.rad2deg(torch.asin(south + (north - south) * uniform[..., 0]))
     longitude = wrap_longitude(west + (east - west) * uniform[..., 1])

@@ -1,0 +1,51 @@
+"""Imports run one way, as docs/architecture.md draws them."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "magrl"
+LEVELS = (
+    {"geodesy", "harmonics", "elements", "guidance"},
+    {"fields", "regional", "tasks", "metrics", "plots"},
+    {"env", "transforms"},
+    {"td3", "runs"},
+)
+LEVEL = {module: level for level, modules in enumerate(LEVELS) for module in modules}
+
+
+def imported(path: Path) -> set[str]:
+    """Modules of the package that a file imports, inside functions too."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == "magrl":
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("magrl."):
+            names.add(node.module.split(".")[1])
+    return names
+
+
+def test_every_module_has_its_level() -> None:
+    assert {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"} == set(LEVEL)
+
+
+@pytest.mark.parametrize("module", sorted(LEVEL))
+def test_nothing_points_up(module: str) -> None:
+    above = {name for name in imported(PACKAGE / f"{module}.py") if LEVEL[name] > LEVEL[module]}
+    assert not above, f"{module} imports {above}"
+
+
+def test_nothing_runs_in_a_circle() -> None:
+    graph = {module: imported(PACKAGE / f"{module}.py") for module in LEVEL}
+    while graph:
+        free = {module for module, needs in graph.items() if not needs & graph.keys()}
+        assert free, f"a circle among {sorted(graph)}"
+        graph = {module: needs for module, needs in graph.items() if module not in free}
+
+
+def test_importing_the_package_is_light() -> None:
+    code = "import sys, magrl; print(any(m in sys.modules for m in ('torch', 'wandb', 'matplotlib', 'pandas')))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"

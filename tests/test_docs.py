@@ -1,0 +1,53 @@
+"""What the documents say exists."""
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+THEORY = (ROOT / "docs" / "theory.md").read_text()
+
+
+def test_equations_have_functions_and_tests() -> None:
+    rows = [line for line in THEORY.splitlines() if re.match(r"\| (\d-\d|Table|Fig)", line)]
+    assert len(rows) >= 18
+    for row in rows:
+        assert "`" in row.split("|")[3], row
+        assert re.search(r"`tests/test_\w+\.py::\w+`", row), row
+
+
+@pytest.mark.parametrize("name", sorted(set(re.findall(r"`(magrl(?:\.\w+){2})`", THEORY))))
+def test_named_functions_exist(name: str) -> None:
+    module, _, attribute = name.rpartition(".")
+    assert hasattr(importlib.import_module(module), attribute)
+
+
+@pytest.mark.parametrize("name", sorted(set(re.findall(r"`(tests/test_\w+\.py(?:::\w+)?)`", THEORY))))
+def test_named_tests_exist(name: str) -> None:
+    path, _, test = name.partition("::")
+    assert re.search(rf"^(def|class) {test}\b" if test else "", (ROOT / path).read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+        assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_examples_run(page: Path) -> None:
+    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
+        exec(compile(block, str(page), "exec"), {})
+
+
+def test_every_option_of_the_environment_is_documented() -> None:
+    import inspect
+
+    from magrl.env import GeomagneticNavEnv
+
+    text = (ROOT / "docs" / "environment.md").read_text()
+    for option in set(inspect.signature(GeomagneticNavEnv.__init__).parameters) - {"self"}:
+        assert f"`{option}`" in text, option

@@ -1,0 +1,164 @@
+"""The magnetic elements of Eq. 2-1: signs, limits, inverse and Jacobian."""
+
+import math
+
+import pytest
+import torch
+
+from magrl.elements import (
+    NAMES,
+    UNITS,
+    Elements,
+    element_index,
+    elements_gradient,
+    elements_jacobian,
+    field_vector,
+    measured_elements,
+    seven_elements,
+)
+
+SHAPES = ((), (3,), (2, 3), (0,))
+DTYPES = (torch.float32, torch.float64)
+
+
+def f64(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def random_fields(*shape, seed=0):
+    """Field vectors of the Earth's size in every direction."""
+    generator = torch.Generator().manual_seed(seed)
+    return 3e4 * torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("north", "declination_north"), [(1, 0), (-1, 180)])
+@pytest.mark.parametrize("east", [1, -1])
+@pytest.mark.parametrize("down", [1, -1])
+def test_signs_in_every_octant(north, declination_north, east, down):
+    """3, 4, 12: B_H is 5, B_F is 13; the angle from the north-south line is atan(4/3), the dip atan(12/5)."""
+    found = seven_elements(f64(3.0 * north, 4.0 * east, 12.0 * down))
+    from_axis = math.degrees(math.atan2(4, 3))
+    declination = east * (from_axis if declination_north == 0 else 180 - from_axis)
+    inclination = down * math.degrees(math.atan2(12, 5))
+    expected = (declination, inclination, 5.0, 3.0 * north, 4.0 * east, 12.0 * down, 13.0)
+    torch.testing.assert_close(torch.stack(found), f64(*expected), rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("b_ned", "declination", "inclination"),
+    [
+        ((1.0, 0.0, 0.0), 0.0, 0.0),
+        ((0.0, 1.0, 0.0), 90.0, 0.0),
+        ((-1.0, 0.0, 0.0), 180.0, 0.0),
+        ((-1.0, -0.0, 0.0), 180.0, 0.0),
+        ((0.0, -1.0, 0.0), -90.0, 0.0),
+        ((1.0, 0.0, -1.0), 0.0, -45.0),
+    ],
+)
+def test_angles_on_the_axes(b_ned, declination, inclination):
+    """D is in (-180, 180]: due south is +180, however its zero is signed."""
+    found = seven_elements(f64(*b_ned))
+    assert float(found.D) == pytest.approx(declination, abs=1e-13)
+    assert float(found.I) == pytest.approx(inclination, abs=1e-13)
+
+
+@pytest.mark.parametrize("down", [5e4, -5e4])
+@pytest.mark.parametrize("north", [0.0, -0.0])
+@pytest.mark.parametrize("east", [0.0, -0.0])
+def test_declination_is_zero_at_a_magnetic_pole(north, east, down):
+    b_ned = f64(north, east, down)
+    assert measured_elements(b_ned).tolist() == [0.0, math.copysign(90.0, down), 0.0]
+    assert float(seven_elements(b_ned).B_F) == 5e4
+
+
+def test_no_field_at_all_is_no_nan():
+    nothing = torch.zeros(3, dtype=torch.float64)
+    assert torch.equal(torch.stack(seven_elements(nothing)), torch.zeros(7, dtype=torch.float64))
+    assert torch.equal(elements_jacobian(nothing), torch.zeros(3, 3, dtype=torch.float64))
+
+
+def test_paper_example_has_a_negative_inclination():
+    """2 S, 162 E in the paper: D 8.019, I -16.150, B_H 35467.990."""
+    found = measured_elements(field_vector(f64(8.019, -16.150, 35467.990)))
+    torch.testing.assert_close(found, f64(8.019, -16.150, 35467.990), rtol=1e-13, atol=0)
+
+
+def test_field_vector_worked_by_hand():
+    found = field_vector(f64(30.0, -45.0, 20000.0))
+    torch.testing.assert_close(found, f64(10000 * math.sqrt(3), 10000.0, -20000.0), rtol=1e-14, atol=0)
+
+
+def test_round_trip():
+    b_ned = random_fields(1000, seed=1)
+    torch.testing.assert_close(field_vector(measured_elements(b_ned)), b_ned, rtol=1e-10, atol=1e-7)
+
+
+@pytest.mark.parametrize("differentiate", [torch.func.jacrev, torch.func.jacfwd])
+def test_jacobian_matches_autograd(differentiate):
+    b_ned = random_fields(200, seed=2)
+    expected = torch.func.vmap(differentiate(measured_elements))(b_ned)
+    row = expected.abs().amax(-1, keepdim=True)
+    assert ((elements_jacobian(b_ned) - expected).abs() / row).max() < 1e-12
+
+
+def test_jacobian_at_a_magnetic_pole_is_zero_where_it_is_undefined():
+    """The rows of D and B_H have no direction there; a change of B_z alone changes no element."""
+    jacobian = elements_jacobian(f64(0.0, 0.0, 5e4))
+    assert torch.isfinite(jacobian).all()
+    assert torch.equal(jacobian[[0, 2]], torch.zeros(2, 3, dtype=torch.float64))
+    assert torch.equal(jacobian[:, 2], torch.zeros(3, dtype=torch.float64))
+
+
+def test_gradient_is_the_chain_rule():
+    """The elements of B + G d, differentiated in d."""
+    b_ned, gradient = random_fields(50, seed=3), random_fields(50, 2, seed=4).mT / 1e3
+
+    def along(d, b, g):
+        return measured_elements(b + g @ d)
+
+    origin = torch.zeros(50, 2, dtype=torch.float64)
+    expected = torch.func.vmap(torch.func.jacrev(along))(origin, b_ned, gradient)
+    found = elements_gradient(b_ned, gradient)
+    assert ((found - expected).abs() / expected.abs().amax(-1, keepdim=True)).max() < 1e-12
+
+
+def test_gradient_worked_by_hand():
+    """B = (100, 0, 100) nT; eastward B_y grows by 1 nT/km, northward B_z by 2 nT/km."""
+    gradient = torch.zeros(3, 2, dtype=torch.float64)
+    gradient[1, 1], gradient[2, 0] = 1.0, 2.0
+    found = elements_gradient(f64(100.0, 0.0, 100.0), gradient)
+    expected = torch.zeros(3, 2, dtype=torch.float64)
+    expected[0, 1] = math.degrees(1 / 100)  # D turns by dB_y / B_H
+    expected[1, 0] = math.degrees(2 * 100 / (100**2 + 100**2))  # I by B_H dB_z / B_F^2
+    torch.testing.assert_close(found, expected, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_shapes_and_dtypes(shape, dtype):
+    b_ned = random_fields(*shape, seed=5).to(dtype)
+    gradient = torch.ones(*shape, 3, 2, dtype=dtype)
+    outputs = {
+        (*shape, 3): (measured_elements(b_ned), field_vector(measured_elements(b_ned))),
+        (*shape, 3, 3): (elements_jacobian(b_ned),),
+        (*shape, 3, 2): (elements_gradient(b_ned, gradient),),
+        shape: seven_elements(b_ned),
+    }
+    for expected, found in outputs.items():
+        assert {x.shape for x in found} == {torch.Size(expected)}
+        assert {x.dtype for x in found} == {dtype}
+
+
+def test_measured_elements_are_the_first_three():
+    b_ned = random_fields(7, seed=6)
+    assert Elements._fields[:3] == NAMES
+    assert len(UNITS) == len(NAMES)
+    for index, name in enumerate(NAMES):
+        assert element_index(name) == index
+        assert torch.equal(measured_elements(b_ned)[:, index], getattr(seven_elements(b_ned), name))
+
+
+@pytest.mark.parametrize("name", ["B_F", "d", "", "H"])
+def test_an_unknown_element_is_refused(name):
+    with pytest.raises(ValueError, match=rf"unknown magnetic element '{name}'.*D, I, B_H"):
+        element_index(name)

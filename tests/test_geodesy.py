@@ -1,0 +1,359 @@
+"""Positions, moves, distances and bearings, against closed forms and against GeographicLib."""
+
+import math
+
+import pytest
+import torch
+from geographiclib.geodesic import Geodesic
+
+from magrl.geodesy import (
+    WGS84_A_KM,
+    WGS84_B_KM,
+    curvature_radii,
+    from_ecef_surface,
+    geodesic,
+    local_frame,
+    move,
+    to_ecef,
+    wrap_angle,
+    wrap_longitude,
+)
+
+KARNEY = Geodesic.WGS84
+DTYPES = (torch.float32, torch.float64)
+SHAPES = ((), (3,), (2, 3), (0,))
+
+
+def f64(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def globe(count, seed):
+    """Points uniform over the globe; the first ones sit at the poles, on the antimeridian and on the equator."""
+    generator = torch.Generator().manual_seed(seed)
+    latitude = torch.rad2deg(torch.asin(2 * torch.rand(count, generator=generator, dtype=torch.float64) - 1))
+    longitude = 360 * torch.rand(count, generator=generator, dtype=torch.float64) - 180
+    latitude[:10], latitude[10:20], latitude[20:30], latitude[30:40] = 90, -90, 89.999, 0
+    longitude[40:50], longitude[50:60], longitude[60:70] = 180, -180, 179.999
+    return latitude, longitude
+
+
+def headings(count, seed):
+    generator = torch.Generator().manual_seed(seed)
+    return (2 * torch.rand(count, generator=generator, dtype=torch.float64) - 1) * math.pi
+
+
+def karney_inverse(latitude1, longitude1, latitude2, longitude2):
+    """Distance [km], bearing [rad] and arc [deg] of each pair."""
+    columns = (x.tolist() for x in (latitude1, longitude1, latitude2, longitude2))
+    found = [KARNEY.Inverse(*pair, Geodesic.DISTANCE | Geodesic.AZIMUTH) for pair in zip(*columns, strict=True)]
+    return (
+        f64(*(x["s12"] / 1e3 for x in found)),
+        torch.deg2rad(f64(*(x["azi1"] for x in found))),
+        f64(*(x["a12"] for x in found)),
+    )
+
+
+def apart_km(latitude1, longitude1, latitude2, longitude2):
+    """Distance of points so close that their chord is their distance."""
+    return (to_ecef(latitude1, longitude1) - to_ecef(latitude2, longitude2)).norm(dim=-1)
+
+
+# --- angles -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    ("turns", "wrapped"),
+    [(0.0, 0.0), (0.25, 0.25), (0.5, 0.5), (-0.5, 0.5), (1.5, 0.5), (-1.5, 0.5), (0.75, -0.25), (-0.75, 0.25), (7, 0)],
+)
+def test_wrap_of_known_angles(turns, wrapped, dtype):
+    degrees = wrap_longitude(torch.tensor(360 * turns, dtype=dtype))
+    assert float(degrees) == 360 * wrapped
+    angle = wrap_angle(torch.tensor(2 * math.pi * turns, dtype=dtype))
+    off_by = math.remainder(float(angle) - 2 * math.pi * wrapped, 2 * math.pi)
+    assert abs(off_by) < 8 * torch.finfo(dtype).eps * (1 + abs(turns))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("half_turn", [math.pi, -math.pi])
+def test_half_a_turn_is_plus_pi(half_turn, dtype):
+    assert wrap_angle(torch.tensor(half_turn, dtype=dtype)) == torch.tensor(math.pi, dtype=dtype)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("wrap", "half"), [(wrap_angle, math.pi), (wrap_longitude, 180.0)])
+def test_wrap_stays_in_the_half_open_turn(wrap, half, dtype):
+    """Over 25 decades, at every multiple of half a turn, and one rounding step to either side of all of them."""
+    generator = torch.Generator().manual_seed(1)
+    scales = 10.0 ** torch.arange(-20, 6, dtype=torch.float64).unsqueeze(-1)
+    spread = ((2 * torch.rand(1000, generator=generator, dtype=torch.float64) - 1) * scales).flatten()
+    multiples = half * torch.arange(-200, 201, dtype=torch.float64)
+    values = torch.cat((spread, multiples, f64(0.0, -0.0, 1e-40, -1e-40, -1e-300))).to(dtype)
+    up, down = (torch.nextafter(values, torch.full_like(values, way)) for way in (math.inf, -math.inf))
+    values = torch.cat((values, up, down))
+    wrapped, edge = wrap(values), torch.tensor(half, dtype=dtype)
+    assert wrapped.dtype == dtype
+    assert (wrapped <= edge).all()
+    assert (wrapped > -edge).all()
+    turns = (values.double() - wrapped.double()) / (2 * half)
+    small = values.abs() < 100 * half
+    assert ((turns - turns.round())[small].abs() < 200 * torch.finfo(dtype).eps).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_wrap_keeps_an_angle_that_is_in_range(dtype):
+    angles = torch.linspace(-3.1, 3.1, 101, dtype=dtype)
+    assert (wrap_angle(angles) - angles).abs().max() <= 4 * torch.finfo(dtype).eps
+    assert (wrap_angle(angles + 2 * math.pi) - angles).abs().max() <= 8 * torch.finfo(dtype).eps
+
+
+# --- frames and coordinates -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("latitude", "meridian", "prime_vertical"),
+    [
+        (0.0, WGS84_B_KM**2 / WGS84_A_KM, WGS84_A_KM),
+        (90.0, WGS84_A_KM**2 / WGS84_B_KM, WGS84_A_KM**2 / WGS84_B_KM),
+        (-90.0, WGS84_A_KM**2 / WGS84_B_KM, WGS84_A_KM**2 / WGS84_B_KM),
+        (45.0, 6367.381815619549, 6388.838290121148),
+    ],
+)
+def test_curvature_radii(latitude, meridian, prime_vertical):
+    found = torch.stack(curvature_radii(torch.tensor(latitude, dtype=torch.float64)))
+    torch.testing.assert_close(found, f64(meridian, prime_vertical), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "altitude_km", "ecef"),
+    [
+        (0.0, 0.0, 0.0, (WGS84_A_KM, 0.0, 0.0)),
+        (0.0, 90.0, 2.0, (0.0, WGS84_A_KM + 2, 0.0)),
+        (0.0, 180.0, 0.0, (-WGS84_A_KM, 0.0, 0.0)),
+        (90.0, 33.0, 1.0, (0.0, 0.0, WGS84_B_KM + 1)),
+        (-90.0, -70.0, 0.0, (0.0, 0.0, -WGS84_B_KM)),
+    ],
+)
+def test_to_ecef_on_the_axes(latitude, longitude, altitude_km, ecef):
+    found = to_ecef(*f64(latitude, longitude, altitude_km))
+    torch.testing.assert_close(found, f64(*ecef), rtol=0, atol=1e-11)
+
+
+def test_ecef_points_lie_on_the_ellipsoid_and_altitude_follows_its_normal():
+    latitude, longitude = globe(500, 2)
+    x, y, z = to_ecef(latitude, longitude).unbind(-1)
+    on = (x**2 + y**2) / WGS84_A_KM**2 + z**2 / WGS84_B_KM**2
+    torch.testing.assert_close(on, torch.ones_like(on), rtol=0, atol=1e-14)
+    lifted = to_ecef(latitude, longitude, 3.0) - to_ecef(latitude, longitude)
+    torch.testing.assert_close(lifted, -3 * local_frame(latitude, longitude)[:, 2], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("altitude_km", [0.0, -10.0, 10.0])
+def test_from_ecef_is_the_inverse_near_the_surface(altitude_km):
+    latitude, longitude = globe(500, 3)
+    latitude2, longitude2 = from_ecef_surface(to_ecef(latitude, longitude, altitude_km))
+    assert (latitude2 - latitude).abs().max() < 1e-9
+    turned = wrap_longitude(longitude2 - longitude)
+    assert turned[latitude.abs() < 89.9].abs().max() < 1e-9
+    assert (longitude2.abs() <= 180).all()
+
+
+def test_local_frame_is_a_rotation():
+    frame = local_frame(*globe(500, 4))
+    identity = torch.eye(3, dtype=torch.float64).expand_as(frame)
+    torch.testing.assert_close(frame @ frame.mT, identity, rtol=0, atol=1e-15)
+    north, east, down = frame.unbind(-2)
+    torch.testing.assert_close(torch.linalg.cross(north, east), down, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_local_frame_points_where_the_position_moves(column):
+    """North and east are the derivatives of the position by latitude and longitude."""
+    latitude, longitude = globe(500, 5)
+    latitude = latitude.clamp(-85, 85)
+    step = f64(1e-3, 0.0) if column == 0 else f64(0.0, 1e-3)
+    ahead, behind = (to_ecef(latitude + way * step[0], longitude + way * step[1]) for way in (1, -1))
+    direction = torch.nn.functional.normalize(ahead - behind, dim=-1)
+    torch.testing.assert_close(local_frame(latitude, longitude)[:, column], direction, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_shapes_and_dtypes(shape, dtype):
+    latitude, longitude = torch.full(shape, -8.0, dtype=dtype), torch.full(shape, 164.0, dtype=dtype)
+    assert local_frame(latitude, longitude).shape == (*shape, 3, 3)
+    assert to_ecef(latitude, longitude).shape == (*shape, 3)
+    heading, distance = torch.zeros(shape, dtype=dtype), torch.full(shape, 50.0, dtype=dtype)
+    end = move(latitude, longitude, heading, distance)
+    for out in (*end, *geodesic(latitude, longitude, *end), wrap_angle(heading), wrap_longitude(longitude)):
+        assert out.shape == shape
+        assert out.dtype == dtype
+
+
+def test_functions_broadcast():
+    latitude, longitude = f64(-8.0, 0.0, 8.0).unsqueeze(-1), f64(0.0, 90.0)
+    end = move(latitude, longitude, f64(0.3), f64(50.0))
+    distance, bearing = geodesic(latitude, longitude, *end)
+    assert distance.shape == bearing.shape == (3, 2)
+    torch.testing.assert_close(distance, torch.full_like(distance, 50), rtol=0, atol=5e-6)
+    for row in range(3):
+        for column in range(2):
+            one = move(latitude[row, 0], longitude[column], f64(0.3)[0], f64(50.0)[0])
+            assert one == (end[0][row, column], end[1][row, column])
+
+
+# --- moves ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("distance_km", "within_km"), [(0.0, 1e-8), (1.0, 1e-7), (50.0, 2e-6), (500.0, 2e-3)], ids="{}km".format
+)
+def test_move_follows_the_geodesic(distance_km, within_km):
+    """The promise is 5 mm at 50 km and 5 m at 500 km; a third of it is needed."""
+    latitude, longitude = globe(1000, 6)
+    heading = headings(1000, 7)
+    found = move(latitude, longitude, heading, torch.full_like(latitude, distance_km))
+    legs = zip(latitude.tolist(), longitude.tolist(), torch.rad2deg(heading).tolist(), strict=True)
+    ends = [KARNEY.Direct(*leg, distance_km * 1e3) for leg in legs]
+    apart = apart_km(*found, f64(*(x["lat2"] for x in ends)), f64(*(x["lon2"] for x in ends)))
+    assert apart.max() < within_km
+    assert (found[1].abs() <= 180).all()
+
+
+@pytest.mark.parametrize(
+    ("start", "heading_deg", "end"),
+    [
+        ((0.0, 0.0), 90.0, (0.0, 0.1)),
+        ((0.0, 0.0), -90.0, (0.0, -0.1)),
+        ((0.0, 179.95), 90.0, (0.0, -179.95)),
+        ((0.0, -179.95), -90.0, (0.0, 179.95)),
+    ],
+)
+def test_move_along_the_equator(start, heading_deg, end):
+    tenth_of_a_degree = f64(math.radians(0.1) * WGS84_A_KM)[0]
+    found = torch.stack(move(*f64(*start), torch.deg2rad(f64(heading_deg))[0], tenth_of_a_degree))
+    torch.testing.assert_close(found, f64(*end), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("pole", "heading"), [(90.0, 0.0), (-90.0, math.pi)])
+def test_move_across_a_pole_comes_down_the_other_side(pole, heading):
+    before = pole - math.copysign(0.2, pole)
+    to_pole = geodesic(*f64(before, 30.0, pole, 30.0))[0]
+    latitude, longitude = move(*f64(before, 30.0, heading), 2 * to_pole)
+    assert float(latitude) == pytest.approx(before, abs=1e-9)
+    assert float(longitude) == pytest.approx(-150.0, abs=1e-7)
+
+
+def test_there_and_back():
+    latitude, longitude = globe(1000, 8)
+    away = move(latitude, longitude, headings(1000, 9), torch.full_like(latitude, 50.0))
+    distance, bearing = geodesic(*away, latitude, longitude)
+    torch.testing.assert_close(distance, torch.full_like(distance, 50), rtol=0, atol=5e-6)
+    assert apart_km(*move(*away, bearing, distance), latitude, longitude).max() < 5e-6
+
+
+# --- geodesics --------------------------------------------------------------------------------------------------------
+
+
+def test_geodesic_matches_geographiclib():
+    start, end = globe(2000, 10), tuple(x.flip(0) for x in globe(2000, 11))
+    distance, bearing = geodesic(*start, *end)
+    expected, azimuth, arc = karney_inverse(*start, *end)
+    sound = arc < 170
+    assert sound.sum() > 1900
+    assert (distance - expected)[sound].abs().max() < 1e-6
+    assert wrap_angle(bearing - azimuth)[sound].abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("distance_km", [1e-3, 1.0, 50.0, 5000.0])
+def test_geodesic_of_a_leg_gives_its_length_and_heading(distance_km):
+    latitude, longitude = globe(500, 12)
+    heading = headings(500, 13)
+    legs = zip(latitude.tolist(), longitude.tolist(), torch.rad2deg(heading).tolist(), strict=True)
+    ends = [KARNEY.Direct(*leg, distance_km * 1e3) for leg in legs]
+    found, bearing = geodesic(latitude, longitude, f64(*(x["lat2"] for x in ends)), f64(*(x["lon2"] for x in ends)))
+    assert (found - distance_km).abs().max() < 1e-6
+    resolution = 1e-8 / distance_km  # ten nanometres, to which a position in degrees is rounded
+    pole = latitude.abs() > 89.99  # there the longitude, and so the heading, resolves less
+    assert wrap_angle(bearing - heading)[~pole].abs().max() < 1e-9 + resolution
+
+
+@pytest.mark.parametrize("point", [(0.0, 0.0), (12.3, 45.6), (-89.0, 180.0), (90.0, 0.0), (-90.0, 10.0)])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_coincident_points(point, dtype):
+    latitude, longitude = torch.tensor(point, dtype=dtype)
+    distance, bearing = geodesic(latitude, longitude, latitude, longitude)
+    assert distance == 0
+    assert bearing == 0
+
+
+def test_the_same_place_written_as_another_turn():
+    distance, _ = geodesic(f64(10.0), f64(180.0, -180.0, 540.0, 20.0), f64(10.0), f64(-180.0, 180.0, 180.0, 380.0))
+    assert distance.max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("longitude1", "longitude2", "bearing_deg"),
+    [(0.0, 1.0, 90.0), (1.0, 0.0, -90.0), (0.0, 120.0, 90.0), (179.5, -179.5, 90.0), (-100.0, 79.0, 90.0)],
+)
+def test_geodesic_along_the_equator(longitude1, longitude2, bearing_deg):
+    distance, bearing = geodesic(*f64(0.0, longitude1, 0.0, longitude2))
+    arc = abs(math.remainder(longitude2 - longitude1, 360))
+    assert float(distance) == pytest.approx(math.radians(arc) * WGS84_A_KM, abs=1e-6)
+    assert math.degrees(float(bearing)) == pytest.approx(bearing_deg, abs=1e-9)
+
+
+@pytest.mark.parametrize(("latitude1", "latitude2", "bearing"), [(-90.0, 90.0, 0.0), (0.0, 90.0, 0.0)])
+def test_geodesic_along_a_meridian(latitude1, latitude2, bearing):
+    quarter_km = 10001.965729
+    distance, found = geodesic(*f64(latitude1, 20.0, latitude2, 20.0))
+    assert float(distance) == pytest.approx(quarter_km * (latitude2 - latitude1) / 90, abs=1e-6)
+    assert float(found) == pytest.approx(bearing, abs=1e-9)
+
+
+def test_bearing_due_south_is_plus_pi():
+    """Also towards a pole that is written with another longitude, to either side."""
+    latitude, longitude = f64(-10.0, 5.0, -90.0, -90.0), f64(20.0, 380.0, 0.0, 40.0)
+    bearing = geodesic(f64(10.0), f64(20.0), latitude, longitude)[1]
+    assert (bearing - math.pi).abs().max() < 1e-13
+
+
+def near_antipodal(count, seed, nearest_deg, farthest_deg):
+    """Pairs whose second point lies in a ring about the antipode of the first."""
+    latitude, longitude = globe(count, seed)
+    generator = torch.Generator().manual_seed(seed + 1)
+    ring = nearest_deg + (farthest_deg - nearest_deg) * torch.rand(count, generator=generator, dtype=torch.float64)
+    arcs = zip((-latitude).tolist(), (longitude + 180).tolist(), torch.rad2deg(headings(count, seed + 2)), strict=True)
+    ends = [KARNEY.ArcDirect(*map(float, arc), off) for arc, off in zip(arcs, ring.tolist(), strict=True)]
+    return latitude, longitude, f64(*(x["lat2"] for x in ends)), f64(*(x["lon2"] for x in ends))
+
+
+def test_a_nearly_antipodal_pair_gives_the_truth_or_nan():
+    pairs = near_antipodal(1000, 14, 0.0, 2.0)
+    distance, bearing = geodesic(*pairs)
+    expected, azimuth, _ = karney_inverse(*pairs)
+    known = ~distance.isnan()
+    assert torch.equal(known, ~bearing.isnan())
+    assert 0 < known.sum() < len(known)
+    assert (distance - expected)[known].abs().max() < 1e-6
+    assert wrap_angle(bearing - azimuth)[known].abs().max() < 1e-7
+
+
+def test_pairs_two_degrees_from_antipodal_converge():
+    pairs = near_antipodal(1000, 17, 2.0, 10.0)
+    distance, _ = geodesic(*pairs)
+    assert int(distance.isnan().sum()) == 0
+    assert (distance - karney_inverse(*pairs)[0]).abs().max() < 1e-6
+
+
+def test_geodesic_of_whole_degrees_is_not_cut_to_whole_kilometres():
+    distance, bearing = geodesic(*torch.tensor([0, 0, 0, 1]))
+    assert float(distance) == pytest.approx(111.319491, abs=1e-4)
+    assert float(bearing) == pytest.approx(math.pi / 2, abs=1e-6)
+
+
+@pytest.mark.parametrize("double", range(4))
+def test_geodesic_answers_in_the_widest_dtype_given(double):
+    inputs = [torch.ones(3, dtype=torch.float64 if k == double else torch.float32) for k in range(4)]
+    assert [x.dtype for x in geodesic(*inputs)] == [torch.float64, torch.float64]

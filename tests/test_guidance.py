@@ -1,0 +1,333 @@
+"""The paper's equations, each against a case worked by hand and in its limits."""
+
+import math
+
+import pytest
+import torch
+
+from magrl.geodesy import wrap_angle
+from magrl.guidance import (
+    OBJECTIVE_FLOORS,
+    alignment_reward,
+    destination_reward,
+    late_decay,
+    objective,
+    objective_weights,
+    parallel_approach,
+    proximity_reward,
+)
+
+SHAPES = ((), (3,), (2, 3), (0,))
+DTYPES = (torch.float32, torch.float64)
+FLOORS = torch.tensor(OBJECTIVE_FLOORS, dtype=torch.float64)
+
+
+def f64(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def randn(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+# --- objective, Eq. 2-6 -----------------------------------------------------------------------------------------------
+
+
+def test_weights_and_objective_worked_by_hand():
+    """Of the differences 2 deg, -10 deg, 200 nT a half, a fifth and a tenth are left: F = 1/4 + 1/25 + 1/100."""
+    start, target = f64(8.0, -16.0, 35000.0), f64(10.0, -26.0, 35200.0)
+    weights = objective_weights(start, target, FLOORS)
+    torch.testing.assert_close(weights, f64(1 / 4, 1 / 100, 1 / 40000), rtol=1e-14, atol=0)
+    found = objective(f64(9.0, -24.0, 35180.0), target, weights)
+    torch.testing.assert_close(found, f64(0.25 + 0.04 + 0.01), rtol=1e-12, atol=0)
+
+
+def test_objective_at_both_ends():
+    start, target = f64(8.0, -16.0, 35000.0), f64(10.0, -26.0, 35200.0)
+    weights = objective_weights(start, target, FLOORS)
+    assert float(objective(start, target, weights)) == pytest.approx(3.0, abs=1e-12)
+    assert float(objective(target, target, weights)) == 0.0
+
+
+@pytest.mark.parametrize(("element", "floor"), tuple(enumerate(OBJECTIVE_FLOORS)))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_small_differences_are_floored(element, floor, sign):
+    """A difference of half the floor counts as the floor, one of twice the floor as itself; none is infinite."""
+    start = f64(8.0, -16.0, 35000.0)
+    for difference, counted in ((0.0, floor), (floor / 2, floor), (2 * floor, 2 * floor)):
+        target = start + 1000.0
+        target[element] = start[element] + sign * difference
+        weight = objective_weights(start, target, FLOORS)[element]
+        assert float(weight) == pytest.approx(1 / counted**2, rel=1e-9)
+
+
+def test_floored_objective_of_a_journey_without_a_difference():
+    """With both ends alike, being off by one floor in each element is F = 3."""
+    here = f64(8.0, -16.0, 35000.0)
+    weights = objective_weights(here, here, FLOORS)
+    assert float(objective(here, here, weights)) == 0.0
+    assert float(objective(here + FLOORS, here, weights)) == pytest.approx(3.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_objective_shapes_and_dtypes(shape, dtype):
+    field, target = randn(*shape, 3).to(dtype), randn(*shape, 3, seed=1).to(dtype)
+    weights = objective_weights(field, target, FLOORS.to(dtype))
+    value = objective(field, target, weights)
+    assert (weights.shape, weights.dtype) == ((*shape, 3), dtype)
+    assert (value.shape, value.dtype) == ((*shape, 1), dtype)
+
+
+# --- rewards, Eqs. 3-3 to 3-6 -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
+def test_destination_pays_only_at_arrival(shape):
+    assert torch.equal(destination_reward(torch.ones(shape, dtype=torch.bool), 200.0), torch.full(shape, 200.0))
+    assert torch.equal(destination_reward(torch.zeros(shape, dtype=torch.bool), 200.0), torch.zeros(shape))
+
+
+@pytest.mark.parametrize(("before", "after", "reward"), [(3.0, 2.5, 5.0), (2.5, 3.0, -5.0), (1.0, 1.0, 0.0)])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_proximity_pays_what_the_objective_loses(before, after, reward, dtype):
+    found = proximity_reward(torch.tensor(before, dtype=dtype), torch.tensor(after, dtype=dtype), 10.0)
+    assert found.dtype == dtype
+    assert float(found) == reward
+
+
+def test_proximity_adds_up_along_a_path():
+    values = f64(3.0, 1.7, 2.2, 0.4, 0.0)
+    assert float(proximity_reward(values[:-1], values[1:], 10.0).sum()) == pytest.approx(30.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("step", "gain", "loss"),
+    [
+        (1, 4.0, -4.0),
+        (25, 4.0, -4.0),  # half way: not yet
+        (26, 4.0 * (1 - 0.52), -4.0 * (1 + 0.52)),
+        (40, 0.8, -7.2),
+        (50, 0.0, -8.0),
+    ],
+)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_late_gains_shrink_and_late_losses_grow(step, gain, loss, dtype):
+    found = late_decay(torch.tensor([4.0, -4.0, 0.0], dtype=dtype), torch.tensor(step), 50)
+    assert found.dtype == dtype
+    torch.testing.assert_close(
+        found, torch.tensor([gain, loss, 0.0], dtype=dtype), rtol=0, atol=8 * torch.finfo(dtype).eps
+    )
+
+
+def test_late_decay_of_an_odd_limit_starts_past_its_half():
+    found = late_decay(torch.ones(2, dtype=torch.float64), torch.tensor([3, 4]), 7)
+    torch.testing.assert_close(found, f64(1.0, 3 / 7), rtol=0, atol=1e-7)
+
+
+def test_late_decay_broadcasts_over_vehicles():
+    found = late_decay(torch.ones(4, 1), torch.tensor([[10], [30], [40], [50]]), 50)
+    torch.testing.assert_close(found, torch.tensor([[1.0], [0.4], [0.2], [0.0]]), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "reference_deg", "deviation_deg"),
+    [
+        (30.0, 30.0, 0.0),
+        (75.0, 30.0, 45.0),
+        (30.0, 75.0, 45.0),
+        (170.0, -170.0, 20.0),  # across south
+        (-170.0, 170.0, 20.0),
+        (180.0, -180.0, 0.0),
+        (-90.0, 90.0, 180.0),
+        (350.0, 10.0, 20.0),
+        (720.0 + 40.0, 10.0, 30.0),
+    ],
+)
+@pytest.mark.parametrize("offset_deg", [45.0, 0.0])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_alignment(angle_deg, reference_deg, deviation_deg, offset_deg, dtype):
+    angle, reference = (torch.tensor(math.radians(x), dtype=dtype) for x in (angle_deg, reference_deg))
+    found = alignment_reward(angle, reference, 3.0, math.radians(offset_deg))
+    assert found.dtype == dtype
+    assert float(found) == pytest.approx(3 * math.radians(offset_deg - deviation_deg), abs=60 * torch.finfo(dtype).eps)
+
+
+def test_alignment_by_default_pays_up_to_three_quarters_of_pi():
+    found = alignment_reward(f64(0.0, math.pi / 4, math.pi), f64(0.0), 3.0)
+    torch.testing.assert_close(found, 3 * f64(math.pi / 4, 0.0, -3 * math.pi / 4), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_reward_shapes(shape):
+    values = torch.zeros(shape)
+    rewards = (
+        proximity_reward(values, values, 10.0),
+        late_decay(values, torch.ones(shape, dtype=torch.int64), 50),
+        alignment_reward(values, values, 3.0),
+        destination_reward(values.bool(), 200.0),
+    )
+    assert {x.shape for x in rewards} == {torch.Size(shape)}
+
+
+# --- parallel approach, Eq. 3-15 --------------------------------------------------------------------------------------
+
+# Rows: the two elements' slopes northward and eastward. The paper's box has about the first; the others have a
+# determinant of the other sign, large and tiny slopes, and slopes that are all negative.
+GRADIENTS = {
+    "paper": ((0.0005, 0.002), (0.017, 0.001)),
+    "positive": ((0.017, 0.001), (0.0005, 0.002)),
+    "mixed units": ((3.0, -40.0), (2e-4, 1e-4)),
+    "negative": ((-2.0, -1.0), (-1.0, -3.0)),
+    "diagonal": ((1.0, 0.0), (0.0, -1.0)),
+}
+
+
+def approach_along(gradient, heading, distance=1.0):
+    """The approach over errors that a displacement in direction ``heading`` would exactly remove."""
+    displacement = distance * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
+    error = (gradient @ displacement.unsqueeze(-1)).squeeze(-1)
+    here = torch.zeros_like(error)
+    return parallel_approach(here, here + error, gradient)
+
+
+def test_approach_worked_by_hand():
+    """The first element grows by 2 eastward, the second by 1 northward: errors (2, -1) are 1 east and 1 south."""
+    gradient = f64(0.0, 2.0, 1.0, 0.0).reshape(2, 2)
+    heading, valid = parallel_approach(f64(5.0, 7.0), f64(7.0, 6.0), gradient)
+    assert float(heading) == pytest.approx(math.radians(135), abs=1e-14)
+    assert bool(valid)
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+@pytest.mark.parametrize("heading_deg", [0, 30, 90, 135, 180, -150, -90, -45])
+@pytest.mark.parametrize("distance", [1.0, 1e-6, 1e4])
+def test_approach_points_at_the_destination_in_every_quadrant(name, heading_deg, distance):
+    gradient, expected = torch.tensor(GRADIENTS[name], dtype=torch.float64), torch.deg2rad(f64(heading_deg))[0]
+    heading, valid = approach_along(gradient, expected, distance)
+    assert bool(valid)
+    assert -math.pi < float(heading) <= math.pi
+    assert abs(float(wrap_angle(heading - expected))) < 1e-12
+
+
+def test_both_signs_of_the_determinant_are_tried():
+    determinants = [torch.linalg.det(torch.tensor(rows)) for rows in GRADIENTS.values()]
+    assert min(determinants) < 0 < max(determinants)
+
+
+def random_approaches(count, seed):
+    """Gradients that cross at 10 degrees or more, and errors."""
+    gradient = randn(4 * count, 2, 2, seed=seed)
+    sine = torch.linalg.det(gradient).abs() / gradient.norm(dim=-1).prod(-1)
+    return gradient[sine > math.sin(math.radians(10))][:count], randn(count, 2, seed=seed + 1)
+
+
+def test_approach_is_the_direction_of_the_inverse():
+    gradient, error = random_approaches(500, 2)
+    solved = torch.linalg.solve(gradient, error)
+    heading, valid = parallel_approach(torch.zeros_like(error), error, gradient)
+    assert valid.all()
+    assert wrap_angle(heading[:, 0] - torch.atan2(solved[:, 1], solved[:, 0])).abs().max() < 1e-12
+
+
+def test_opposite_errors_have_opposite_headings():
+    gradient, error = random_approaches(200, 4)
+    zero = torch.zeros_like(error)
+    there, back = (parallel_approach(zero, way * error, gradient)[0] for way in (1, -1))
+    assert (wrap_angle(there - back).abs() - math.pi).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("turn_deg", [17.0, 90.0, -120.0, 180.0])
+def test_turning_the_axes_turns_the_heading(turn_deg):
+    gradient, error = random_approaches(200, 6)
+    turn = math.radians(turn_deg)
+    rotation = f64(math.cos(turn), math.sin(turn), -math.sin(turn), math.cos(turn)).reshape(2, 2)
+    zero = torch.zeros_like(error)
+    plain, turned = (parallel_approach(zero, error, g)[0] for g in (gradient, gradient @ rotation.T))
+    assert wrap_angle(plain - turn - turned).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("scale", [(1000.0, 1.0), (1.0, 1e-6), (-2.0, 1.0), (-3.0, -5.0)])
+def test_the_units_of_an_element_do_not_matter(scale):
+    gradient, error = random_approaches(200, 8)
+    zero, factor = torch.zeros_like(error), f64(*scale)
+    heading, _ = parallel_approach(zero, error, gradient)
+    scaled, valid = parallel_approach(zero, error * factor, gradient * factor.unsqueeze(-1))
+    assert valid.all()
+    assert wrap_angle(heading - scaled).abs().max() < 1e-12
+
+
+def test_the_order_of_the_elements_does_not_matter():
+    gradient, error = random_approaches(200, 10)
+    zero = torch.zeros_like(error)
+    heading, swapped = (
+        parallel_approach(zero, error, gradient)[0],
+        parallel_approach(zero, error.flip(-1), gradient.flip(-2))[0],
+    )
+    assert wrap_angle(heading - swapped).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("crossing_deg", [0.0, 1.9, 2.1, 90.0, 177.9, 178.1, 180.0, -1.9, -2.1])
+@pytest.mark.parametrize("scale", [1.0, 1e-4, 1e4])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nearly_parallel_gradients_are_flagged(crossing_deg, scale, dtype):
+    crossing = math.radians(crossing_deg)
+    gradient = torch.tensor([[1.0, 0.0], [scale * math.cos(crossing), scale * math.sin(crossing)]], dtype=dtype)
+    heading, valid = parallel_approach(torch.zeros(2, dtype=dtype), torch.ones(2, dtype=dtype), gradient)
+    expected = abs(math.sin(crossing)) > math.sin(math.radians(2))
+    assert bool(valid) == expected
+    assert torch.isfinite(heading).all()
+    assert (float(heading) == 0) == (not expected)
+
+
+def test_the_least_crossing_can_be_chosen():
+    gradient, here = f64(1.0, 0.0, 1.0, 1.0).reshape(2, 2), torch.zeros(2, dtype=torch.float64)
+    for least_deg, expected in ((44.0, True), (46.0, False)):
+        _, valid = parallel_approach(here, here + 1, gradient, min_crossing=math.radians(least_deg))
+        assert bool(valid) == expected
+
+
+@pytest.mark.parametrize(
+    ("gradient", "error"),
+    [
+        (((0.0, 0.0), (0.0, 0.0)), (1.0, 1.0)),
+        (((0.0, 0.0), (1.0, 2.0)), (1.0, 1.0)),
+        (((1.0, 2.0), (0.0, 0.0)), (1.0, 1.0)),
+        (((1.0, 2.0), (2.0, 4.0)), (1.0, 3.0)),
+        (((1.0, 0.0), (0.0, 1.0)), (0.0, 0.0)),
+        (((-1.0, 0.0), (0.0, 1.0)), (0.0, 0.0)),
+    ],
+    ids=["none", "first none", "second none", "parallel", "on target", "on target, mirrored"],
+)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_an_approach_without_direction_is_heading_zero_and_flagged(gradient, error, dtype):
+    here = torch.zeros(2, dtype=dtype)
+    heading, valid = parallel_approach(here, torch.tensor(error, dtype=dtype), torch.tensor(gradient, dtype=dtype))
+    assert not bool(valid)
+    assert float(heading) == 0
+
+
+def test_one_element_on_target_still_has_a_heading():
+    """Along the line on which that element stays: here due east and due west."""
+    gradient, here = torch.eye(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    for error, expected in (((0.0, 1.0), math.pi / 2), ((0.0, -1.0), -math.pi / 2), ((-1.0, 0.0), math.pi)):
+        heading, valid = parallel_approach(here, f64(*error), gradient)
+        assert bool(valid)
+        assert float(heading) == pytest.approx(expected, abs=1e-15)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_approach_shapes_and_dtypes(shape, dtype):
+    gradient = torch.tensor(GRADIENTS["paper"], dtype=dtype).expand(*shape, 2, 2)
+    heading, valid = approach_along(gradient, torch.full(shape, 2.0, dtype=dtype))
+    assert (heading.shape, heading.dtype) == ((*shape, 1), dtype)
+    assert (valid.shape, valid.dtype) == ((*shape, 1), torch.bool)
+    assert (heading - 2).abs().sum() < 100 * torch.finfo(dtype).eps
+
+
+def test_a_flag_belongs_to_its_own_vehicle():
+    gradient = torch.stack((torch.eye(2), torch.ones(2, 2), -torch.eye(2))).double()
+    heading, valid = parallel_approach(torch.zeros(3, 2).double(), f64(1.0, 0.0).expand(3, 2), gradient)
+    assert valid.squeeze(-1).tolist() == [True, False, True]
+    torch.testing.assert_close(heading.squeeze(-1), f64(0.0, 0.0, math.pi), rtol=0, atol=1e-15)

@@ -1,0 +1,185 @@
+"""Solid harmonics and the linear maps between their tables, against closed forms, SciPy and autograd."""
+
+import math
+
+import pytest
+import scipy.special
+import torch
+
+from magrl.harmonics import REFERENCE_RADIUS_KM, basis, differentiate, field_table, gradient_table
+
+ROOT3 = math.sqrt(3)
+
+
+def random_table(degree, seed):
+    """A table ``g - i h`` with nothing above its diagonal and no sine of order 0."""
+    generator = torch.Generator().manual_seed(seed)
+    table = torch.randn(degree + 1, degree + 1, generator=generator, dtype=torch.complex128).tril()
+    table[:, 0] = table[:, 0].real.to(torch.complex128)
+    return table
+
+
+def random_points(count, seed, radius=(0.9, 1.3)):
+    """``(count, 3)`` km in random directions, at radii in units of the reference radius."""
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+    low, high = radius
+    length = low + (high - low) * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    return direction * length * REFERENCE_RADIUS_KM
+
+
+def potential(table, ecef_km):
+    """V / a [nT], term by term, with none of the library's layout but the order of the basis."""
+    rows = iter(basis(ecef_km, len(table) - 1))
+    total = 0
+    for n in range(len(table)):
+        for m in range(n + 1):
+            total = total + table[n, m].real * next(rows) - table[n, m].imag * next(rows)
+    return total
+
+
+def column(degree, entries):
+    table = torch.zeros(degree + 1, degree + 1, dtype=torch.complex128)
+    for (n, m), value in entries.items():
+        table[n, m] = value
+    return table
+
+
+def meaningful(tables):
+    """Tables without what a basis never sees: the sine of order 0."""
+    tables = tables.clone()
+    tables[..., 0] = tables[..., 0].real.to(tables.dtype)
+    return tables
+
+
+# --- differentiate ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("degree", "potential_entries", "along_x", "along_y", "along_z"),
+    [
+        # 1/r: the gradient is -(x, y, z)/r^3, and x/r^3, y/r^3, z/r^3 are g11, h11, g10
+        (0, {(0, 0): 1}, {(1, 1): -1}, {(1, 1): 1j}, {(1, 0): -1}),
+        # z/r^3: -3xz/r^5 = -sqrt(3) g21, -3yz/r^5 = -sqrt(3) h21, (r^2 - 3z^2)/r^5 = -2 g20
+        (1, {(1, 0): 1}, {(2, 1): -ROOT3}, {(2, 1): 1j * ROOT3}, {(2, 0): -2}),
+        # x/r^3: (r^2 - 3x^2)/r^5 = g20 - sqrt(3) g22, -3xy/r^5 = -sqrt(3) h22, -3xz/r^5 = -sqrt(3) g21
+        (1, {(1, 1): 1}, {(2, 0): 1, (2, 2): -ROOT3}, {(2, 2): 1j * ROOT3}, {(2, 1): -ROOT3}),
+        # y/r^3: -3xy/r^5 = -sqrt(3) h22, (r^2 - 3y^2)/r^5 = g20 + sqrt(3) g22, -3yz/r^5 = -sqrt(3) h21
+        (1, {(1, 1): -1j}, {(2, 2): 1j * ROOT3}, {(2, 0): 1, (2, 2): ROOT3}, {(2, 1): 1j * ROOT3}),
+    ],
+    ids=["monopole", "axial dipole", "dipole along x", "dipole along y"],
+)
+def test_derivative_tables_worked_by_hand(degree, potential_entries, along_x, along_y, along_z):
+    found = differentiate(column(degree, potential_entries))
+    expected = torch.stack([column(degree + 1, entries) for entries in (along_x, along_y, along_z)])
+    torch.testing.assert_close(meaningful(found), expected, rtol=0, atol=1e-14)
+
+
+def test_differentiate_is_batched_and_linear():
+    tables = torch.stack([random_table(4, seed) for seed in range(6)]).reshape(2, 3, 5, 5)
+    found = differentiate(tables)
+    assert found.shape == (2, 3, 3, 6, 6)
+    torch.testing.assert_close(found[1, 2], differentiate(tables[1, 2]), rtol=0, atol=0)
+    combined = differentiate(2 * tables[0, 0] - 3 * tables[1, 1])
+    torch.testing.assert_close(combined, 2 * found[0, 0] - 3 * found[1, 1], rtol=1e-14, atol=1e-13)
+
+
+def test_entries_that_mean_nothing_are_ignored():
+    clean = random_table(4, 1)
+    soiled = clean + torch.triu(torch.full_like(clean, 7 - 5j), diagonal=1)
+    soiled[:, 0] += 3j  # there is no sine of order 0
+    torch.testing.assert_close(differentiate(soiled), differentiate(clean), rtol=0, atol=0)
+
+
+def test_derivatives_commute():
+    twice = meaningful(differentiate(differentiate(random_table(5, 2))))
+    torch.testing.assert_close(twice, twice.transpose(0, 1), rtol=1e-13, atol=1e-13)
+
+
+# --- basis ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 8, 15])
+def test_basis_is_the_schmidt_normalised_legendre_functions(degree):
+    ecef = random_points(50, 3)
+    x, y, z = ecef.T.numpy() / REFERENCE_RADIUS_KM
+    radius, longitude = (x**2 + y**2 + z**2) ** 0.5, torch.atan2(*ecef[:, [1, 0]].T).numpy()
+    rows = []
+    for n in range(degree + 1):
+        for m in range(n + 1):
+            norm = math.sqrt((2 if m else 1) * math.factorial(n - m) / math.factorial(n + m))
+            legendre = (-1) ** m * scipy.special.lpmv(m, n, z / radius)  # SciPy has the Condon-Shortley phase
+            term = torch.from_numpy(norm * legendre / radius ** (n + 1))
+            rows += [term * torch.from_numpy(m * longitude).cos(), term * torch.from_numpy(m * longitude).sin()]
+    found = basis(ecef, degree)
+    assert found.shape == ((degree + 1) * (degree + 2), 50)
+    torch.testing.assert_close(found, torch.stack(rows), rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("pole", [1.0, -1.0])
+def test_basis_on_the_axis(pole):
+    """There every S_n0 is (+-1)^n and every other order vanishes."""
+    ecef = torch.tensor([[0.0, 0.0, pole * REFERENCE_RADIUS_KM]], dtype=torch.float64)
+    expected = [float(kind == m == 0) * pole**n for n in range(6) for m in range(n + 1) for kind in (0, 1)]
+    torch.testing.assert_close(
+        basis(ecef, 5).squeeze(-1), torch.tensor(expected, dtype=torch.float64), atol=1e-15, rtol=0
+    )
+
+
+def test_basis_keeps_float32_and_takes_no_points():
+    ecef = random_points(5, 4)
+    single = basis(ecef.float(), 8)
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), basis(ecef, 8), rtol=1e-4, atol=1e-5)
+    assert basis(ecef[:0], 3).shape == (20, 0)
+
+
+# --- field and gradient -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2, 6, 13])
+def test_field_is_minus_the_gradient_of_the_potential(degree):
+    table, ecef = random_table(degree, 5), random_points(20, 6).requires_grad_()
+    (slope,) = torch.autograd.grad((REFERENCE_RADIUS_KM * potential(table, ecef)).sum(), ecef)
+    found = (field_table(table) @ basis(ecef.detach(), degree + 1)).T
+    torch.testing.assert_close(found, -slope, rtol=1e-10, atol=1e-10 * float(slope.abs().max()))
+
+
+@pytest.mark.parametrize("degree", [1, 2, 6])
+def test_gradient_is_the_derivative_of_the_field(degree):
+    table, ecef = random_table(degree, 7), random_points(10, 8)
+    weights = field_table(table)
+    jacobian = torch.stack(
+        [torch.autograd.functional.jacobian(lambda p: (weights @ basis(p[None], degree + 1))[:, 0], p) for p in ecef]
+    )
+    found = (gradient_table(table) @ basis(ecef, degree + 2)).T.unflatten(-1, (3, 3))
+    torch.testing.assert_close(found, jacobian, rtol=1e-10, atol=1e-10 * float(jacobian.abs().max()))
+
+
+def test_field_of_an_axial_dipole():
+    """B = -g a^3 (r^2 z_hat - 3 z r_vec) / r^5: -g along z on the equator, +2 g along z at the north pole."""
+    a = REFERENCE_RADIUS_KM
+    table = column(1, {(1, 0): -30000.0})
+    points = torch.tensor([[a, 0, 0], [0, a, 0], [0, 0, a], [0, 0, -a], [2 * a, 0, 0]], dtype=torch.float64)
+    found = (field_table(table) @ basis(points, 2)).T
+    along_z = torch.tensor([30000.0, 30000.0, -60000.0, -60000.0, 3750.0], dtype=torch.float64)
+    expected = torch.stack((torch.zeros(5), torch.zeros(5), along_z), -1).double()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("degree", [1, 6, 13])
+def test_the_field_has_no_sources_and_no_curl(degree):
+    tensor = (gradient_table(random_table(degree, 9)) @ basis(random_points(200, 10), degree + 2)).T.unflatten(
+        -1, (3, 3)
+    )
+    largest = tensor.abs().amax((-2, -1))
+    divergence = tensor.diagonal(dim1=-2, dim2=-1).sum(-1)
+    assert (divergence.abs() / largest).max() < 1e-12
+    assert ((tensor - tensor.mT).abs().amax((-2, -1)) / largest).max() < 1e-12
+
+
+def test_shapes_of_the_weight_tables():
+    table = random_table(3, 11)
+    assert field_table(table).shape == (3, 5 * 6)
+    assert gradient_table(table).shape == (9, 6 * 7)
+    assert field_table(table).dtype == gradient_table(table).dtype == torch.float64
