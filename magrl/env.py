@@ -24,7 +24,6 @@ from magrl.fields import IGRF, Date, FieldModel, elements_at, elements_range
 from magrl.geodesy import move, wrap_angle
 from magrl.regional import RegionalField
 from magrl.tasks import (
-    KM_PER_DEGREE,
     PAPER_DISTANCE_KM,
     PAPER_REGION,
     Region,
@@ -47,6 +46,8 @@ PRIVILEGED_KEYS = (
 )
 """What no policy that claims to navigate by the field may read."""
 
+SHORTEST_DEGREE_KM = 110.5
+"""A degree of arc is nowhere shorter on the ellipsoid."""
 _HEADING_STREAM = -1  # the counter that sets a start heading apart from the attempts at placing a task
 
 
@@ -78,13 +79,19 @@ def paper_field(
 
 
 def flown_box(region: Region, margin_deg: float, max_move_km: float) -> Region:
-    """Every place that a vehicle can reach: the region, its margin, and one move beyond, to the next half degree."""
+    """Every place that a vehicle can reach: the region, its margin, and one move beyond, to the next half degree.
+
+    Example:
+        >>> flown_box(PAPER_REGION, margin_deg=5, max_move_km=50)
+        Region(latitude=(-15.5, 5.5), longitude=(154.5, 175.5))
+    """
     edge = region.expanded(margin_deg)
-    widest = math.cos(math.radians(min(max(abs(x) for x in edge.latitude) + max_move_km / KM_PER_DEGREE, 89.0)))
-    south_north = math.ceil(max_move_km / KM_PER_DEGREE * 2) / 2
-    west_east = math.ceil(max_move_km / KM_PER_DEGREE / widest * 2) / 2
-    (south, north), (west, east) = edge.latitude, edge.expanded(west_east).longitude
-    return Region((max(south - south_north, -90), min(north + south_north, 90)), (west, east))
+    reach = math.radians(max_move_km / SHORTEST_DEGREE_KM)
+    nearest_pole = math.radians(90 - max(abs(x) for x in edge.latitude))
+    # The farthest that a great circle of this length leads from its meridian; past a pole it leads anywhere.
+    aside = math.degrees(math.asin(math.sin(reach) / math.sin(nearest_pole))) if reach < nearest_pole else 180.0
+    south_north, west_east = (math.ceil(2 * x) / 2 for x in (math.degrees(reach), aside))
+    return Region(edge.expanded(south_north).latitude, edge.expanded(west_east).longitude)
 
 
 class GeomagneticNavEnv(EnvBase):
@@ -246,23 +253,25 @@ class GeomagneticNavEnv(EnvBase):
         """Starts the next journey of every vehicle that is named by ``_reset``, or of all."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            start = self._started(self.vehicle)
+            chosen, start = self.vehicle, self._start_of(self.vehicle)
         else:
             mask = mask.reshape(self.num_envs)
+            chosen = mask.nonzero().squeeze(-1)
             # The rows of the others are placeholders: the base class puts their running state back.
-            start = self._started(mask.nonzero().squeeze(-1))[(mask.cumsum(0) - 1).clamp_min(0)]
+            rows = self._start_of(chosen if len(chosen) else self.vehicle[:1])
+            start = rows[(mask.cumsum(0) - 1).clamp_min(0)]
+        # Counted out of place: a rollout or a checkpoint may hold the old tensor.
+        self.episode = self.episode.index_add(0, chosen, torch.ones_like(chosen))
         self._remember(start, mask)
         return start
 
-    def _started(self, vehicle: Tensor) -> TensorDict:
+    def _start_of(self, vehicle: Tensor) -> TensorDict:
         """The first observation of the next journey of some vehicles, ``(P,)``."""
         episode = self.episode[vehicle]
         tasks = self._tasks(vehicle, episode)
         field, target_field = elements_at(self.field, torch.stack(tasks))
         weights = guidance.objective_weights(field, target_field, self.objective_floors)
         zeros = field.new_zeros(len(vehicle), 2)
-        # Counted out of place: a rollout or a checkpoint may hold the old tensor.
-        self.episode = self.episode.index_add(0, vehicle, torch.ones_like(vehicle))
         flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         return TensorDict(
             {

@@ -19,7 +19,6 @@ from magrl.fields import check_box, check_positions
 from magrl.geodesy import geodesic, move, wrap_longitude
 
 MEAN_RADIUS_KM = 6371.0
-KM_PER_DEGREE = MEAN_RADIUS_KM * math.pi / 180
 TRIES_PER_ROUND = 8
 MAX_ROUNDS = 1000
 """Rounds of rejection sampling before a region is held to be too small for its distances."""
@@ -247,7 +246,7 @@ def task_set(
 
 
 def check_tasks(tasks: Tasks, within: Region) -> Tasks:
-    """Tasks as float64, once they are found to be sound.
+    """A copy of tasks in float64, longitudes wrapped, once they are found to be sound.
 
     Args:
         tasks: start and target, each ``(M, 2)`` latitude, longitude [deg].
@@ -267,4 +266,4 @@ def check_tasks(tasks: Tasks, within: Region) -> Tasks:
         if outside.any():
             index = int(outside.nonzero()[0])
             raise ValueError(f"the {name} of task {index}, {position[index].tolist()}, lies outside {within}")
-    return Tasks(start, target)
+    return Tasks(*(torch.stack((x[:, 0], wrap_longitude(x[:, 1])), -1) for x in (start, target)))

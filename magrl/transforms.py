@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
+from torchrl.envs import EnvBase, Transform
 
 from magrl import guidance
 from magrl.elements import element_index
@@ -44,6 +44,21 @@ class _ObservationTransform(Transform):
         if self.missing_tolerance:
             return None
         raise KeyError(f"{type(self).__name__} reads {missing}, which are not among {sorted_keys(tensordict)}")
+
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Refuses to write over what the environment reads back: its next step would start from the written value.
+
+        Raises:
+            ValueError: naming the key.
+        """
+        state = input_spec["full_state_spec"]
+        for key in self.out_keys:
+            if state is not None and key in state.keys(True, True) and key not in self.in_keys_inv:
+                raise ValueError(
+                    f"{type(self).__name__} would overwrite {key!r}, which the environment reads back as its state: "
+                    "write to another out_key"
+                )
+        return input_spec
 
     def _leaf(self, spec: Composite, key: NestedKey) -> TensorSpec:
         if key not in spec.keys(True, True):
@@ -126,12 +141,12 @@ class MinMaxNorm(_ObservationTransform):
             if unravel_key(key) not in self._bounded_keys:
                 raise ValueError(f"bounds are given for {key!r}, which is none of the keys {self._bounded_keys}")
             self._given.add(unravel_key(key))
-            self._set_bounds(unravel_key(key), torch.as_tensor(low), torch.as_tensor(high))
+            self._set_bounds(unravel_key(key), *(_as_float(bound) for bound in (low, high)))
 
     # Bounds
 
     def _set_bounds(self, key: NestedKey, low: Tensor, high: Tensor) -> None:
-        dtype = torch.promote_types(torch.promote_types(low.dtype, high.dtype), torch.float32)
+        dtype = torch.promote_types(low.dtype, high.dtype)
         low, high = torch.broadcast_tensors(low.to(dtype), high.to(dtype))
         extreme = torch.finfo(dtype).max  # how a spec writes that a side is open
         finite = torch.isfinite(low) & torch.isfinite(high) & (low > -extreme) & (high < extreme)
@@ -148,6 +163,16 @@ class MinMaxNorm(_ObservationTransform):
         if getattr(self, f"low_{index}") is None:
             self._bounds_from_parent(key)
         return getattr(self, f"low_{index}"), getattr(self, f"high_{index}")
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Reads the bounds of the environment that the transform is attached to, where its specs have any."""
+        super().set_container(container)
+        parent = self.parent
+        if parent is not None:
+            for key in self._bounded_keys:
+                for spec in (parent.full_observation_spec, parent.full_action_spec, parent.full_state_spec):
+                    if key in spec.keys(True, True) and isinstance(spec[key], Bounded):
+                        self._bounds_from_spec(key, spec[key], len(parent.batch_size))
 
     def _bounds_from_parent(self, key: NestedKey) -> None:
         parent = self.parent
@@ -183,7 +208,8 @@ class MinMaxNorm(_ObservationTransform):
     # Data
 
     def normalize(self, key: NestedKey, value: Tensor) -> Tensor:
-        """Scales a value of ``key`` from its bounds to the interval: ``(...)`` to ``(...)``."""
+        """Scales a value of ``key`` from its bounds to the interval: ``(...)`` to ``(...)``, in floats."""
+        value = _as_float(value)
         low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key))
         start, end = self.interval
         return start + (end - start) * ((value - low) / (high - low))
@@ -216,20 +242,13 @@ class MinMaxNorm(_ObservationTransform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            if in_key in observation_spec.keys(True, True):
-                observation_spec[out_key] = self._scaled_spec(in_key, observation_spec[in_key], observation_spec)
+            if in_key in observation_spec.keys(True, True) or in_key not in self.in_keys_inv:
+                leaf = self._leaf(observation_spec, in_key)
+                observation_spec[out_key] = self._scaled_spec(in_key, leaf, observation_spec)
         return observation_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        input_spec = input_spec.clone()
-        state_spec = input_spec["full_state_spec"]
-        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            in_place = in_key == out_key and in_key not in self.in_keys_inv
-            if in_place and state_spec is not None and in_key in state_spec.keys(True, True):
-                raise ValueError(
-                    f"MinMaxNorm would overwrite {in_key!r}, which the environment reads back as its state: "
-                    "write it to another out_key"
-                )
+        input_spec = super().transform_input_spec(input_spec).clone()
         for in_key, out_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
             for name in ("full_action_spec", "full_state_spec"):
                 spec = input_spec[name]
@@ -242,9 +261,10 @@ class MinMaxNorm(_ObservationTransform):
     def _scaled_spec(self, key: NestedKey, spec: TensorSpec, root: Composite) -> TensorSpec:
         self._bounds_from_spec(key, spec, len(root.shape))
         if not isinstance(spec, Bounded):
-            return Unbounded(spec.shape, device=spec.device, dtype=spec.dtype)
+            dtype = spec.dtype if spec.dtype.is_floating_point else torch.get_default_dtype()
+            return Unbounded(spec.shape, device=spec.device, dtype=dtype)
         low, high = self.normalize(key, spec.space.low), self.normalize(key, spec.space.high)
-        return Bounded(low, high, spec.shape, device=spec.device, dtype=spec.dtype)
+        return Bounded(low, high, spec.shape, device=spec.device, dtype=low.dtype)
 
 
 class AngleVector(_ObservationTransform):
@@ -402,11 +422,11 @@ class GradientHeading(_ObservationTransform):
         # A plain sequence of strings is several keys here, never one nested key.
         super().__init__(in_keys=[unravel_key(k) for k in in_keys], out_keys=[unravel_key(k) for k in out_keys])
         _expect_keys(self, 3, 2)
-        if len(pair) != 2 or pair[0] == pair[1]:
-            raise ValueError(f"pair must be two different elements, got {pair}")
         if not 0 <= min_crossing_deg < 90:
             raise ValueError(f"min_crossing_deg must be in [0, 90), got {min_crossing_deg}")
         self.pair = [element_index(name) if isinstance(name, str) else int(name) for name in pair]
+        if len(set(self.pair)) != 2 or len(pair) != 2:
+            raise ValueError(f"pair must be two different elements, got {pair}")
         self.wraps = [name == "D" for name in pair]
         self.min_crossing = math.radians(min_crossing_deg)
 
@@ -531,6 +551,13 @@ class AlignmentReward(Transform):
         if key not in spec.keys(True, True):
             raise KeyError(f"AlignmentReward reads {key!r}, which is not among the observations {sorted_keys(spec)}")
         return spec[key]
+
+
+def _as_float(value: Tensor | float) -> Tensor:
+    """A tensor of floats: numbers in float64, whole-number tensors in the default dtype."""
+    if not isinstance(value, Tensor):
+        return torch.as_tensor(value, dtype=torch.float64)
+    return value if value.is_floating_point() else value.to(torch.get_default_dtype())
 
 
 def _expect_keys(transform: Transform, num_in: int, num_out: int) -> None:

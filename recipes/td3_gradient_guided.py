@@ -66,7 +66,7 @@ class Config:
     # Environment
     num_envs: int = 512
     """Vehicles that fly at the same time."""
-    total_frames: int = 409_600
+    total_frames: int = 256_000
     """Vehicle-steps to train for."""
     zeta: float = 0.01
     """Arrival threshold on the objective (Eq. 2-7)."""
@@ -96,7 +96,7 @@ class Config:
     """Transitions that the replay buffer holds."""
     init_random_frames: int = 1024
     """Vehicle-steps flown at random before the policy acts."""
-    gamma: float = 0.97
+    gamma: float = 0.9
     """Discount factor."""
     tau: float = 0.01
     """Share of the networks that enters the targets at each soft update."""
@@ -117,7 +117,7 @@ class Config:
     reward_scale: float = 0.05
     """Factor on rewards, for the critics only; what is reported is unscaled."""
     saturation_weight: float = 0.05
-    """Weight of the penalty that keeps the actor out of the flat ends of its tanh."""
+    """Weight of the penalty that keeps the actor out of the flat ends of its tanh; falls linearly to 0."""
 
     # Evaluation
     eval_every: int = 20
@@ -255,8 +255,9 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
             buffer.extend(batch.select(*TRANSITION))
             noise.step(batch.numel())
             tally.add(batch, guidance[-1].term(batch, batch["next"]) if guided else None)
+            left = 1 - tally.frames / config.total_frames
             for optimiser in (critic_optimiser, actor_optimiser):
-                anneal(optimiser, config.learning_rate, config.final_learning_rate, tally.frames / config.total_frames)
+                anneal(optimiser, config.learning_rate, config.final_learning_rate, left)
 
             for _ in range(config.updates_per_batch if len(buffer) >= config.batch_size else 0):
                 transitions = buffer.sample()
@@ -265,8 +266,9 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
                 updates += 1
                 if updates % config.policy_delay == 0:
                     loss_actor, _ = loss.actor_loss(transitions)
-                    penalty = td3.saturation_penalty(loss, transitions) if config.saturation_weight else 0.0
-                    step(actor_optimiser, loss_actor + config.saturation_weight * penalty)
+                    weight = left * config.saturation_weight
+                    penalty = td3.saturation_penalty(loss, transitions) if weight else 0.0
+                    step(actor_optimiser, loss_actor + weight * penalty)
                     soft_update.step()
 
             if iteration % config.eval_every == 0 or tally.frames >= config.total_frames:
@@ -309,10 +311,10 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
     return result
 
 
-def anneal(optimiser: torch.optim.Optimizer, start: float, end: float, share: float) -> None:
-    """Sets the learning rate on the line from ``start`` to ``end``."""
+def anneal(optimiser: torch.optim.Optimizer, start: float, end: float, left: float) -> None:
+    """Sets the learning rate on the line from ``start`` to ``end``, of which the share ``left`` is still to go."""
     for group in optimiser.param_groups:
-        group["lr"] = start + share * (end - start)
+        group["lr"] = end + left * (start - end)
 
 
 def step(optimiser: torch.optim.Optimizer, loss: torch.Tensor) -> None:
