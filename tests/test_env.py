@@ -218,14 +218,20 @@ def test_one_move_by_hand(turn: float, end: tuple[float, float]) -> None:
     assert after["objective"].item() == pytest.approx(objective, rel=1e-5)
     assert after["reward"].item() == pytest.approx(10 * (3 - objective), rel=1e-3)  # Eq. 3-5
     assert not after["done"]
-    for key in ("target_field", "target_position", "start_position", "objective_weights"):
-        assert torch.equal(after[key], step[0][key]), key
 
 
 def test_turns_add_up_and_wrap() -> None:
     env = make(tasks=task(START, TARGET))
     headings = [step["next", "heading"].item() for step in fly(env, *[(1.0, 1.5)] * 5)]
     assert headings == pytest.approx([1.5, 3.0, 4.5 - 2 * math.pi, 6 - 2 * math.pi, 7.5 - 2 * math.pi], abs=1e-5)
+
+
+def test_what_holds_for_the_episode_is_handed_on() -> None:
+    env = make(3)
+    steps = fly(env, *random_actions(4, 3))
+    for key in ("target_field", "target_position", "start_position", "objective_weights"):
+        assert all(torch.equal(step["next", key], steps[0][key]) for step in steps), key
+    assert torch.equal(steps[0]["start_position"], steps[0]["position"])
 
 
 def test_no_distance_is_no_move() -> None:
@@ -581,6 +587,8 @@ class TestFrozenTasks:
         for expected in ([0, 3], [0, 0], [0, 2]):
             td = env.reset(td.set("_reset", torch.tensor([[False], [True]])))
             assert self.started(td) == expected
+        env.reset(td.set("_reset", torch.tensor([[False], [False]])))
+        assert self.started(env.reset()) == [2, 4]
 
     def test_they_do_not_depend_on_the_seed_and_set_seed_goes_back_to_the_first(self, tasks: Tasks) -> None:
         env = make(2, tasks=tasks, seed=1)

@@ -456,7 +456,7 @@ class TestConformanceOnData:
         self, case: DataCase, batch: tuple[int, ...], dtype: torch.dtype, key: KeyNamer, request: pytest.FixtureRequest
     ) -> None:
         td, expected = data_of(case, key, batch, dtype)
-        given = td.clone()
+        given, tensors = td.clone(), dict(td.items(True, True))
         out = case.transform(key)(td)
         check_outputs(out, expected)
         for name, value in expected.items():
@@ -464,6 +464,7 @@ class TestConformanceOnData:
             assert gradient or out[name].dtype == (value.dtype if value.dtype == torch.bool else dtype), name
         for name in given.keys(True, True):
             assert name in expected or torch.equal(out[name], given[name]), name
+            assert torch.equal(tensors[name], given[name]), f"{name} was written in place"
 
     @key_namers
     @data_cases
@@ -773,8 +774,12 @@ class TestMinMaxNorm:
         assert all(torch.equal(a[name], b[name]) for name in a)
 
     def test_state_dict_is_whole_as_soon_as_the_transform_is_attached(self) -> None:
-        env = TransformedEnv(nav(2), minmax_nav())
-        assert len(env.transform.state_dict()) == 6
+        for env in (
+            TransformedEnv(nav(2), minmax_nav()),
+            TransformedEnv(nav(2), Compose(AngleVector(["heading"], ["course"]), minmax_nav())),
+            TransformedEnv(nav(2)).append_transform(minmax_nav()),
+        ):
+            assert len(env.transform.state_dict()) == 6
 
     @pytest.mark.parametrize("through", [lambda state: state, lambda state: pickle.loads(pickle.dumps(state))])
     def test_state_dict_loads_where_there_is_no_env(self, through: Callable[[dict], dict]) -> None:
