@@ -270,7 +270,9 @@ class GeomagneticNavEnv(EnvBase):
         episode = self.episode[vehicle]
         tasks = self._tasks(vehicle, episode)
         field, target_field = elements_at(self.field, torch.stack(tasks))
-        weights = guidance.objective_weights(field, target_field, self.objective_floors)
+        # As the vehicle reads it: a move of no length must not change the objective by a rounding.
+        field, target_field = field.float().double(), target_field.float().double()
+        weights = guidance.objective_weights(field, target_field, self.objective_floors).float().double()
         zeros = field.new_zeros(len(vehicle), 2)
         flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         return TensorDict(
@@ -318,6 +320,7 @@ class GeomagneticNavEnv(EnvBase):
         lost = ~self.edge.contains(position)
 
         field = elements_at(self.field, position)
+        field = field.float().double()
         weights = tensordict["objective_weights"].double()
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
         arrived = (objective < self.zeta) & ~lost

@@ -149,7 +149,7 @@ class MinMaxNorm(_ObservationTransform):
         dtype = torch.promote_types(low.dtype, high.dtype)
         low, high = torch.broadcast_tensors(low.to(dtype), high.to(dtype))
         extreme = torch.finfo(dtype).max  # how a spec writes that a side is open
-        finite = torch.isfinite(low) & torch.isfinite(high) & (low > -extreme) & (high < extreme)
+        finite = torch.isfinite(high - low) & (low > -extreme) & (high < extreme)
         if not (finite & (low < high)).all():
             raise ValueError(
                 f"MinMaxNorm needs finite bounds that rise for {key!r}, got low {low.tolist()}, high {high.tolist()}"
@@ -424,9 +424,9 @@ class GradientHeading(_ObservationTransform):
         _expect_keys(self, 3, 2)
         if not 0 <= min_crossing_deg < 90:
             raise ValueError(f"min_crossing_deg must be in [0, 90), got {min_crossing_deg}")
-        self.pair = [element_index(name) if isinstance(name, str) else int(name) for name in pair]
-        if len(set(self.pair)) != 2 or len(pair) != 2:
-            raise ValueError(f"pair must be two different elements, got {pair}")
+        self.pair = [element_index(name) if isinstance(name, str) else name for name in pair]
+        if len(set(self.pair)) != 2 or not all(isinstance(i, int) and i >= 0 for i in self.pair):
+            raise ValueError(f"pair must be two different elements, by name or by index from 0, got {pair}")
         self.wraps = [name == "D" for name in pair]
         self.min_crossing = math.radians(min_crossing_deg)
 

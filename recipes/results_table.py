@@ -1,6 +1,6 @@
 """A Markdown table of finished runs, a row each, then their mean and spread.
 
-    python recipes/results_table.py runs/td3_gradient_guided-fast-seed*
+python recipes/results_table.py runs/td3_gradient_guided-fast-seed*
 """
 
 import json
@@ -37,7 +37,7 @@ class Runs:
 def row(name: str, results: dict[str, float | None]) -> str:
     """One line of the table; what is missing is a dash."""
     values = (results.get(key) for key, _ in COLUMNS.values())
-    cells = ("–" if v is None else form.format(v) for v, (_, form) in zip(values, COLUMNS.values(), strict=True))
+    cells = ("—" if v is None else form.format(v) for v, (_, form) in zip(values, COLUMNS.values(), strict=True))
     return f"| {name} | " + " | ".join(cells) + " |"
 
 
