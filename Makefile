@@ -6,7 +6,7 @@ export GOMP_SPINCOUNT ?= 3000
 
 .PHONY: train test test-slow check format clean
 
-train: $(VENV)/.installed  ## train Gradient-Guided TD3: about two minutes on two cores
+train: $(VENV)/.installed  ## train Gradient-Guided TD3: about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
 
 test: $(VENV)/.installed-dev  ## the fast tests

@@ -13,6 +13,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -20,10 +21,22 @@ from magrl.elements import NAMES, UNITS
 from magrl.fields import FieldModel, elements_at
 from magrl.geodesy import wrap_longitude
 from magrl.metrics import flown
-from magrl.tasks import Region
+from magrl.tasks import Region, Tasks
 
 ELEMENT_COLOURS = {"D": "#E69F00", "I": "#0072B2", "B_H": "#009E73"}
 PATH, START, TARGET = "#404040", "#D55E00", "#CC79A7"
+NAVIGATOR_NAMES = {
+    "gg_td3": "Gradient-Guided TD3",
+    "td3": "TD3",
+    "ga": "GA",
+    "pso": "PSO",
+    "afsa": "AFSA",
+    "secant": "secant",
+    "parallel": "parallel",
+}
+NAVIGATOR_COLOURS = dict(
+    zip(NAVIGATOR_NAMES, ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"), strict=True)
+)
 LINES = ("#0072B2", "#D55E00", "#009E73")
 TRAINING_PANELS = {
     "return of the last 200 episodes": {"return": "return"},
@@ -48,7 +61,7 @@ def rgb_array(draw: Callable[..., None], size_px: int, *args: Any) -> np.ndarray
     Returns:
         ``(size_px, size_px, 3)`` uint8.
     """
-    figure = Figure(figsize=(size_px / 100, size_px / 100), dpi=100, layout="constrained")
+    figure = Figure(figsize=(7, 7), dpi=(size_px + 0.01) / 7, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     draw(figure.subplots(), *args)
     canvas.draw()
@@ -136,6 +149,7 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
             axes.legend(fontsize=8)
     for axes in figure.axes[2:]:
         axes.set_xlabel("frames (vehicle-steps)")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     return figure
 
 
@@ -162,3 +176,107 @@ def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Regi
 def _device(field: FieldModel) -> torch.device:
     buffers = field.buffers() if isinstance(field, torch.nn.Module) else iter(())
     return next((b.device for b in buffers), torch.device("cpu"))
+
+
+def learning_curves(
+    curves: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]], label: str, points: int = 200
+) -> Figure:
+    """Curves of several trainings of each navigator: every run faintly, their mean, and the span between extremes.
+
+    Args:
+        curves: by navigator, for each run its frames and its values; NaN is left out.
+        label: of the vertical axis.
+        points: at which the mean is drawn.
+    """
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for name, runs in curves.items():
+        known = [np.array(run)[:, np.isfinite(run[1])] for run in runs]
+        known = [run for run in known if run.shape[1]]
+        if not known:
+            continue
+        grid = np.linspace(max(run[0, 0] for run in known), min(run[0, -1] for run in known), points)
+        values = np.array([np.interp(grid, *run) for run in known])
+        axes.plot(grid, values.T, color=NAVIGATOR_COLOURS[name], lw=0.5, alpha=0.5)
+        axes.fill_between(grid, values.min(0), values.max(0), color=NAVIGATOR_COLOURS[name], alpha=0.15, lw=0)
+        label_text = f"{NAVIGATOR_NAMES[name]}, {len(known)} seed{'s' if len(known) > 1 else ''}"
+        axes.plot(grid, values.mean(0), color=NAVIGATOR_COLOURS[name], lw=2, label=label_text)
+    axes.set(xlabel="frames (vehicle-steps)", ylabel=label)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure
+
+
+def compared_trajectories(
+    tracks: Mapping[str, tuple[Sequence[float], Sequence[float]]], field: FieldModel, task: Tasks
+) -> Figure:
+    """One task flown by several navigators, over the field's contours (Fig. 4-4).
+
+    Args:
+        tracks: by navigator, latitudes and longitudes of its way-points [deg].
+        field: any model of :mod:`magrl.fields`.
+        task: one task.
+    """
+    figure = Figure(figsize=(8, 8.4), layout="constrained")
+    axes = figure.subplots()
+    points = torch.tensor([[lat, lon] for track in tracks.values() for lat, lon in zip(*track, strict=True)])
+    points = torch.cat((points, task.start, task.target))
+    low, high = (points.amin(0) - 0.5).tolist(), (points.amax(0) + 0.5).tolist()
+    draw_contours(axes, field, Region((low[0], high[0]), (low[1], high[1])))
+    for name, (latitude, longitude) in tracks.items():
+        axes.plot(longitude, latitude, "o-", color=NAVIGATOR_COLOURS[name], ms=3, lw=1.5, label=NAVIGATOR_NAMES[name])
+    axes.plot(*task.start.flip(-1).T, "s", color=START, ms=8, label="start")
+    axes.plot(*task.target.flip(-1).T, "^", color=TARGET, ms=9, label="destination")
+    axes.legend(fontsize=8, loc="best")
+    return figure
+
+
+def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: FieldModel, task: Tasks) -> Figure:
+    """D, I, B_H and the length of moves against the step (Fig. 4-5 a to d).
+
+    Args:
+        series: by navigator, values of ``D``, ``I``, ``B_H`` and ``L`` at each step, the start first.
+        field: any model of :mod:`magrl.fields`, for the target's values.
+        task: the task that was flown.
+    """
+    targets = dict(zip(NAMES, elements_at(field, task.target[0]).tolist(), strict=True))
+    labels = {name: f"{SYMBOLS[name]} [{unit}]" for name, unit in zip(NAMES, UNITS, strict=True)}
+    labels["L"] = "length of the move [km]"
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    for letter, axes, (key, label) in zip("abcd", figure.subplots(2, 2).flat, labels.items(), strict=True):
+        for name, values in series.items():
+            shown = list(enumerate(values[key]))[key == "L" :]
+            axes.plot(*zip(*shown, strict=True), color=NAVIGATOR_COLOURS[name], lw=1.5, label=NAVIGATOR_NAMES[name])
+        if key in targets:
+            axes.axhline(targets[key], color="#404040", ls="--", lw=1, label="at the destination")
+        axes.set(xlabel="step", ylabel=label, title=f"({letter})")
+        axes.grid(alpha=0.3)
+    figure.axes[0].legend(fontsize=8)
+    return figure
+
+
+def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
+    """Heading deviation, smoothness and navigation error of successful journeys (Fig. 4-6 a to d).
+
+    Args:
+        measures: by navigator, one value for each journey of ``heading_mae_deg``, ``heading_rmse_deg``,
+            ``smoothness_deg`` and ``navigation_error_km``; NaN is left out.
+    """
+    labels = {
+        "heading_mae_deg": "MAE of heading deviation [°]",
+        "heading_rmse_deg": "RMSE of heading deviation [°]",
+        "smoothness_deg": "path smoothness [°]",
+        "navigation_error_km": "navigation error [km]",
+    }
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    for letter, axes, (key, label) in zip("abcd", figure.subplots(2, 2).flat, labels.items(), strict=True):
+        values = [np.array(m[key])[np.isfinite(m[key])] for m in measures.values()]
+        boxes = axes.boxplot(values, patch_artist=True, showmeans=True, flierprops={"ms": 2, "alpha": 0.4})
+        for box, name in zip(boxes["boxes"], measures, strict=True):
+            box.set(facecolor=NAVIGATOR_COLOURS[name], alpha=0.6)
+        names = [NAVIGATOR_NAMES[name].replace("Gradient-Guided", "GG") for name in measures]
+        axes.set_xticks(range(1, len(names) + 1), names)
+        axes.set(ylabel=label, title=f"({letter})")
+        axes.grid(alpha=0.3, axis="y")
+    return figure

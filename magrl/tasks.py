@@ -97,6 +97,11 @@ PAPER_REGION = Region((-10.0, 0.0), (160.0, 170.0))
 PAPER_DISTANCE_KM = (300.0, 500.0)
 
 
+VALIDATION_SEED, TEST_SEED, PAPER_SEED = 2_000_000_011, 2_000_000_012, 2_000_000_014
+"""Seeds of frozen task sets, which training refuses: to choose a policy by, to test it, and the paper's 100."""
+FIRST_RESERVED_SEED = 2_000_000_000
+
+
 class Tasks(NamedTuple):
     """Journeys: where they start and end, each ``(..., 2)`` latitude, longitude [deg], float64."""
 
@@ -243,6 +248,32 @@ def task_set(
         raise ValueError(f"num_tasks must be at least 1, got {num_tasks}")
     vehicle = torch.arange(num_tasks)
     return sample_tasks(region, distance_range_km, seed, vehicle, torch.zeros_like(vehicle))
+
+
+TASK_SETS = ("test-1000", "paper-100", "figure-4-1")
+"""Frozen task sets: 1000 unseen tasks, the paper's 100, and its one task of Fig. 4-1."""
+
+
+def named_tasks(name: str) -> Tasks:
+    """A frozen task set in the paper's region.
+
+    Args:
+        name: one of :data:`TASK_SETS`.
+
+    Raises:
+        ValueError: for another name.
+
+    Example:
+        >>> named_tasks("figure-4-1").start
+        tensor([[ -2., 162.]], dtype=torch.float64)
+    """
+    if name == "test-1000":
+        return task_set(1000, TEST_SEED)
+    if name == "paper-100":
+        return task_set(100, PAPER_SEED)
+    if name == "figure-4-1":
+        return Tasks(*(torch.tensor([end], dtype=torch.float64) for end in ((-2.0, 162.0), (-8.0, 164.0))))
+    raise ValueError(f"unknown task set {name!r}: choose from {', '.join(TASK_SETS)}")
 
 
 def check_tasks(tasks: Tasks, within: Region) -> Tasks:

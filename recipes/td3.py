@@ -5,7 +5,7 @@
 The same training as td3_gradient_guided.py, flags included, without the theoretical heading and its reward.
 """
 
-from td3_gradient_guided import parse, train
+from td3_gradient_guided import main
 
 if __name__ == "__main__":
-    train(parse("td3.py"), guided=False)
+    main("td3.py", guided=False)

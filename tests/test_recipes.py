@@ -151,8 +151,7 @@ def test_paper_preset_is_table_1(recipe) -> None:
 
 
 def test_evaluation_seeds_are_out_of_reach(recipe) -> None:
-    assert recipe.FINAL_TASKS_SEED != recipe.SMALL_TASKS_SEED
-    for seed in (recipe.FINAL_TASKS_SEED, recipe.SMALL_TASKS_SEED):
+    for seed in (recipe.TEST_SEED, recipe.VALIDATION_SEED):
         with pytest.raises(ValueError, match="seed"):
             dataclasses.replace(recipe.Config(), seed=seed)
 
@@ -165,3 +164,11 @@ def test_help_lists_the_flags(name: str, tmp_path: Path) -> None:
     )
     for flag in ("--preset", "--seed", "--out", "--device", "--num-envs", "--total-frames", "--wandb-mode"):
         assert flag in run.stdout
+
+
+def test_what_cannot_run_is_said_in_a_line(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").touch()
+    command = [sys.executable, RECIPES / "td3.py", "--out", tmp_path]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert run.stderr.strip() == f"td3.py: the run folder {tmp_path} is in use: choose another --out, or move it away"

@@ -10,12 +10,17 @@ from geographiclib.geodesic import Geodesic
 from magrl import tasks as tasks_module
 from magrl.geodesy import geodesic, wrap_longitude
 from magrl.tasks import (
+    FIRST_RESERVED_SEED,
     PAPER_DISTANCE_KM,
     PAPER_REGION,
+    PAPER_SEED,
+    TEST_SEED,
+    VALIDATION_SEED,
     Region,
     Tasks,
     check_tasks,
     counter_uniform,
+    named_tasks,
     sample_tasks,
     task_set,
 )
@@ -442,3 +447,29 @@ def test_sound_tasks_are_accepted_as_float64(convert):
 def test_unsound_tasks_are_refused(start, target, message):
     with pytest.raises(ValueError, match=message):
         check_tasks(Tasks(start, target), PAPER_REGION)
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "digest"),
+    [
+        ("test-1000", 1000, "10423570ca1ee8a2"),
+        ("paper-100", 100, "ba5ab14cd5080e8c"),
+        ("figure-4-1", 1, "f43a0a947f5097e1"),
+    ],
+)
+def test_named_task_sets_are_frozen(name: str, count: int, digest: str) -> None:
+    """Rounded to a centimetre, so that the last bits of a platform's sine do not matter."""
+    tasks = named_tasks(name)
+    assert tasks.start.shape == tasks.target.shape == (count, 2)
+    rounded = (torch.cat(tasks) * 1e7).round().long().numpy()
+    assert hashlib.sha256(rounded.tobytes()).hexdigest()[:16] == digest
+
+
+def test_an_unknown_task_set_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"'test-10'.*test-1000"):
+        named_tasks("test-10")
+
+
+def test_frozen_seeds_are_reserved() -> None:
+    assert len({VALIDATION_SEED, TEST_SEED, PAPER_SEED}) == 3
+    assert min(VALIDATION_SEED, TEST_SEED, PAPER_SEED) > FIRST_RESERVED_SEED
