@@ -1,0 +1,73 @@
+"""What the transforms share: keys, clear errors, and how an observation is added."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs import Transform
+
+Keys = Sequence[NestedKey]
+
+
+class ObservationTransform(Transform):
+    """What the transforms that add an observation share: they also run at reset, and on plain TensorDicts."""
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        return self._call(tensordict_reset)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict)
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor] | None:
+        """The values at ``in_keys``, or None where keys may be missing and one is."""
+        values = [tensordict.get(key, None) for key in self.in_keys]
+        missing = [key for key, value in zip(self.in_keys, values, strict=True) if value is None]
+        if not missing:
+            return values
+        if self.missing_tolerance:
+            return None
+        raise KeyError(f"{type(self).__name__} reads {missing}, which are not among {sorted_keys(tensordict)}")
+
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Refuses to write over what the environment reads back: its next step would start from the written value.
+
+        Raises:
+            ValueError: naming the key.
+        """
+        state = input_spec["full_state_spec"]
+        for key in self.out_keys:
+            if state is not None and key in state.keys(True, True) and key not in self.in_keys_inv:
+                raise ValueError(
+                    f"{type(self).__name__} would overwrite {key!r}, which the environment reads back as its state: "
+                    "write to another out_key"
+                )
+        return input_spec
+
+    def _leaf(self, spec: Composite, key: NestedKey) -> TensorSpec:
+        if key not in spec.keys(True, True):
+            raise KeyError(f"{type(self).__name__} reads {key!r}, which is not among {sorted_keys(spec)}")
+        return spec[key]
+
+
+def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
+    """The leaves of a TensorDict or a spec, for messages."""
+    return sorted(str(key) for key in container.keys(True, True))
+
+
+def key_list(keys: NestedKey | Keys) -> list[NestedKey]:
+    """One key or several, as a list; a tuple of strings is one nested key."""
+    if isinstance(keys, str) or (isinstance(keys, tuple) and keys and all(isinstance(k, str) for k in keys)):
+        return [unravel_key(keys)]
+    return [unravel_key(key) for key in keys]
+
+
+def expect_keys(transform: Transform, num_in: int, num_out: int) -> None:
+    if len(transform.in_keys) != num_in or len(transform.out_keys) != num_out:
+        raise ValueError(
+            f"{type(transform).__name__} takes {num_in} in_keys and {num_out} out_keys, "
+            f"got {transform.in_keys} and {transform.out_keys}"
+        )
