@@ -111,7 +111,7 @@ def summarise(episodes: dict[str, Tensor]) -> dict[str, float]:
     Returns:
         ``success_rate`` [%] with its Wilson 95 % interval ``success_rate_low`` and ``_high``;
         ``success_rate_within_10km`` and ``_25km`` [%], the share that ends so near whatever the field says;
-        ``spl`` [%] with the half width ``spl_ci`` of its 95 % interval;
+        ``spl`` [%] with its bootstrap 95 % interval ``spl_low`` and ``spl_high``;
         ``trajectory_length_m`` and ``steps`` over successes, as the paper seems to, and ``_all`` over all;
         ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg``, ``heading_rmse_deg`` over successes;
         ``num_tasks``. Means over no success at all are NaN.
@@ -123,7 +123,8 @@ def summarise(episodes: dict[str, Tensor]) -> dict[str, float]:
     error, spl = episodes["navigation_error_km"], episodes["spl"]
     summary = {"success_rate": 100 * rate, "success_rate_low": 100 * low, "success_rate_high": 100 * high}
     summary |= {f"success_rate_within_{d}km": 100 * (error <= d).double().mean().item() for d in WITHIN_KM}
-    summary |= {"spl": 100 * spl.mean().item(), "spl_ci": 196 * spl.std(correction=0).item() / math.sqrt(count)}
+    low, high = bootstrap_interval(spl)
+    summary |= {"spl": 100 * spl.mean().item(), "spl_low": 100 * low, "spl_high": 100 * high}
     summary["trajectory_length_m"] = 1000 * episodes["length_km"][success].mean().item()
     summary["trajectory_length_m_all"] = 1000 * episodes["length_km"].mean().item()
     summary["steps"] = episodes["steps"][success].double().mean().item()
@@ -131,6 +132,29 @@ def summarise(episodes: dict[str, Tensor]) -> dict[str, float]:
     for name in ("navigation_error_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"):
         summary[name] = episodes[name][success].nanmean().item()
     return summary | {"num_tasks": count}
+
+
+def bootstrap_interval(values: Tensor, resamples: int = 1000, seed: int = 0) -> tuple[float, float]:
+    """Percentile bootstrap 95 % interval of a mean.
+
+    Args:
+        values: ``(M,)``.
+        resamples: how often the values are drawn anew.
+        seed: of the draws.
+
+    Source:
+        B. Efron, Bootstrap methods: another look at the jackknife, Annals of Statistics 7 (1979).
+
+    Example:
+        >>> bootstrap_interval(torch.ones(10))
+        (1.0, 1.0)
+    """
+    generator = torch.Generator().manual_seed(seed)
+    draws = torch.randint(len(values), (resamples, len(values)), generator=generator)
+    low, high = (
+        values.cpu().double()[draws].mean(1).quantile(torch.tensor((0.025, 0.975), dtype=torch.float64)).tolist()
+    )
+    return low, high
 
 
 def wilson_interval(rate: float, count: int, z: float = 1.96) -> tuple[float, float]:

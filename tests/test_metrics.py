@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from magrl.geodesy import geodesic, move
-from magrl.metrics import TrainingTally, episode_measures, flown, summarise, wilson_interval
+from magrl.metrics import TrainingTally, bootstrap_interval, episode_measures, flown, summarise, wilson_interval
 
 
 def journey(legs: list[tuple[float, float]], target: tuple[float, float], success: bool, steps: int) -> TensorDict:
@@ -119,7 +119,7 @@ def test_summary_of_one_success_and_one_failure() -> None:
     assert summary["success_rate_within_10km"] == 50
     assert summary["success_rate_within_25km"] == 100
     assert summary["spl"] == pytest.approx(40)
-    assert summary["spl_ci"] == pytest.approx(196 * 0.4 / math.sqrt(2))
+    assert (summary["spl_low"], summary["spl_high"]) == pytest.approx((0, 80))  # of two values, both or neither
     assert summary["trajectory_length_m"] == 500_000
     assert summary["trajectory_length_m_all"] == 750_000
     assert (summary["steps"], summary["steps_all"]) == (10, 30)
@@ -141,6 +141,16 @@ def test_summary_without_success_is_nan_and_not_zero() -> None:
 )
 def test_wilson_interval(rate: float, count: int, expected: tuple[float, float]) -> None:
     assert wilson_interval(rate, count) == pytest.approx(expected, abs=1e-4)
+
+
+def test_bootstrap_interval_of_a_known_spread() -> None:
+    torch.manual_seed(0)
+    values = torch.randn(2000, dtype=torch.float64)
+    low, high = bootstrap_interval(values)
+    half = 1.96 * values.std().item() / math.sqrt(2000)
+    assert low == pytest.approx(values.mean().item() - half, abs=0.005)
+    assert high == pytest.approx(values.mean().item() + half, abs=0.005)
+    assert bootstrap_interval(values) == (low, high)
 
 
 def test_shortest_is_the_geodesic() -> None:
