@@ -128,11 +128,12 @@ class Config:
     def __post_init__(self) -> None:
         counts = ("num_envs", "total_frames", "updates_per_batch", "batch_size", "buffer_size", "policy_delay")
         counts += ("eval_every", "eval_tasks_small", "eval_tasks")
-        positive = ("learning_rate", "final_learning_rate", "tau", "reward_scale")
+        positive = ("learning_rate", "final_learning_rate", "reward_scale", "zeta")
         ranges = dict.fromkeys(counts, (1, math.inf)) | dict.fromkeys(positive, (1e-12, math.inf))
         ranges |= {"tau": (1e-12, 1), "gamma": (0, 1 - 1e-12), "seed": (0, FIRST_RESERVED_SEED - 1)}
         ranges |= dict.fromkeys(("exploration_noise", "final_exploration_noise", "policy_noise"), (0, 10))
         ranges |= dict.fromkeys(("noise_clip", "saturation_weight", "init_random_frames"), (0, math.inf))
+        ranges |= dict.fromkeys(("alignment_weight", "alignment_offset"), (-1e6, 1e6))
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name} must be between {low} and {high}, got {getattr(self, name)}")
@@ -177,15 +178,6 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
     """Trains, evaluates and writes the run folder; returns what is in its ``eval.json``."""
     name = "td3_gradient_guided" if guided else "td3"
     folder = create_run_folder(config.out or Path("runs") / f"{name}-{config.preset}-seed{config.seed}")
-    settings = {**asdict(config), "out": folder.name, "guided": guided}
-    run = RunLog(
-        folder,
-        COLUMNS,
-        settings,
-        wandb_mode=config.wandb_mode,
-        group=f"{name}-{config.preset}",
-        tags=[name, config.preset],
-    )
     torchrl_logger.setLevel("WARNING")
     torch.manual_seed(config.seed)
 
@@ -242,8 +234,11 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
     storage = LazyTensorStorage(config.buffer_size, device=env.device)
     buffer = TensorDictReplayBuffer(storage=storage, batch_size=config.batch_size)
 
+    settings = {**asdict(config), "out": folder.name, "guided": guided}
+    labels = {"group": f"{name}-{config.preset}", "tags": [name, config.preset]}
+    run = RunLog(folder, COLUMNS, settings, wandb_mode=config.wandb_mode, **labels)
     tally = TrainingTally(base.destination_weight, config.reward_scale)
-    kept, kept_weights = -1.0, copy.deepcopy(actor.state_dict())
+    kept, kept_weights = -1.0, None
     updates, loss_critic, loss_actor = 0, torch.zeros(()), torch.zeros(())
     began, interrupted = time.perf_counter(), False
     progress = tqdm(total=config.total_frames, unit="frame", unit_scale=True, desc=name, mininterval=0.5)
@@ -253,7 +248,7 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
             buffer.extend(batch.select(*TRANSITION))
             noise.step(batch.numel())
             tally.add(batch, guidance[-1].term(batch, batch["next"]) if guided else None)
-            left = 1 - tally.frames / config.total_frames
+            left = max(0.0, 1 - tally.frames / config.total_frames)
             for optimiser in (critic_optimiser, actor_optimiser):
                 anneal(optimiser, config.learning_rate, config.final_learning_rate, left)
 
@@ -288,15 +283,13 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
     collector.shutdown()
 
     # What is left behind: the policy that was best on the small set, its numbers on tasks that it never saw, pictures
-    actor.load_state_dict(kept_weights)
+    actor.load_state_dict(kept_weights or actor.state_dict())
     td3.save_policy(folder / "policy.pt", policy)
     if run.rows:
         run.figure("training", plots.training_figure(run.rows))
     if interrupted:
         run.close()
-        print(
-            f"\nStopped after {tally.frames} frames; the best policy so far is {folder / 'policy.pt'}", file=sys.stderr
-        )
+        print(f"\nStopped after {tally.frames} frames; the policy so far is {folder / 'policy.pt'}", file=sys.stderr)
         raise SystemExit(130)
     rollout = td3.evaluation_rollout(final_env, policy)
     result = summarise(episode_measures(rollout)) | {"seed": config.seed, "tasks_seed": TEST_SEED}
@@ -340,8 +333,12 @@ def report(folder: Path, result: dict[str, float]) -> None:
 def main(recipe: str, *, guided: bool) -> None:
     """The command: what cannot be run as asked is said in a line, without a traceback."""
     try:
-        train(parse(recipe), guided=guided)
-    except (ValueError, FileExistsError) as error:
+        config = parse(recipe)
+    except ValueError as error:
+        sys.exit(f"{recipe}: {error}")
+    try:
+        train(config, guided=guided)
+    except FileExistsError as error:
         sys.exit(f"{recipe}: {error}")
 
 

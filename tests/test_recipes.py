@@ -78,12 +78,13 @@ def test_same_seed_same_numbers(recipe, tmp_path: Path) -> None:
     assert all(torch.equal(one[key], again[key]) for key in one)
 
 
-def test_interrupt_keeps_what_was_learned(recipe, tmp_path: Path, monkeypatch, capsys) -> None:
+@pytest.mark.parametrize("frames", [240, 96], ids=["after an evaluation", "before any"])
+def test_interrupt_keeps_what_was_learned(recipe, tmp_path: Path, monkeypatch, capsys, frames: int) -> None:
     calls = []
 
     def interrupted(*args):
         calls.append(args)
-        if len(calls) == 30:
+        if len(calls) == 2 * frames // 16:
             raise KeyboardInterrupt
         return anneal(*args)
 
@@ -92,9 +93,9 @@ def test_interrupt_keeps_what_was_learned(recipe, tmp_path: Path, monkeypatch, c
     with pytest.raises(SystemExit) as stop:
         recipe.train(settings(recipe, tmp_path / "run"))
     assert stop.value.code == 130
-    assert "Stopped after 240 frames" in capsys.readouterr().err
+    assert f"Stopped after {frames} frames" in capsys.readouterr().err
     assert td3.load_policy(tmp_path / "run" / "policy.pt").config.num_cells == (16, 16)
-    assert (tmp_path / "run" / "training.png").exists()
+    assert (tmp_path / "run" / "training.png").exists() == (frames >= 160)
     assert not (tmp_path / "run" / "eval.json").exists()
 
 
@@ -118,6 +119,8 @@ def test_folder_in_use_is_refused(recipe, tmp_path: Path) -> None:
         {"init_random_frames": -1},
         {"learning_rate": 0.0},
         {"tau": 2.0},
+        {"zeta": 0.0},
+        {"alignment_weight": math.inf},
         {"exploration_noise": -0.1},
     ],
     ids=str,
