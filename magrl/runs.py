@@ -66,42 +66,80 @@ class RunLog:
         self._file = (folder / "train.csv").open("w", newline="")
         self._writer = csv.DictWriter(self._file, columns)
         self._writer.writeheader()
-        self._wandb = None if wandb_mode == "disabled" else _wandb_logger(folder, wandb_mode, config, group, tags)
+        self._wandb = WandbRun(folder, wandb_mode, config, group, tags)
 
     def row(self, row: Mapping[str, float]) -> None:
         """Adds a row of curves; it is in the file when this returns. ``frames`` is the step."""
         self.rows.append(dict(row))
         self._writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
         self._file.flush()
-        if self._wandb:
-            for key, value in row.items():
-                if key != "frames" and math.isfinite(value):
-                    self._wandb.log_scalar(_panel(key), value, step=int(row["frames"]))
+        self._wandb.row(row)
 
     def figure(self, name: str, figure: Figure) -> None:
         """Saves a picture as ``<name>.png``."""
-        figure.savefig(self.folder / f"{name}.png", dpi=120)
-        if self._wandb:
-            import wandb
-
-            self._wandb.experiment.log({f"figures/{name}": wandb.Image(str(self.folder / f"{name}.png"))})
+        path = self.folder / f"{name}.png"
+        figure.savefig(path, dpi=120)
+        self._wandb.picture(name, path)
 
     def result(self, result: Mapping[str, float]) -> None:
         """Writes ``eval.json``; wandb gets a table and its summary."""
         write_json(self.folder / "eval.json", result)
-        if self._wandb:
-            import wandb
-
-            # A wandb.Table would be staged as an artifact, with the absolute path of its staging folder in the run.
-            rows = "".join(f"<tr><td>{key}</td><td>{value:.6g}</td></tr>" for key, value in result.items())
-            self._wandb.experiment.log({"final/table": wandb.Html(f"<table>{rows}</table>", inject=False)})
-            self._wandb.experiment.summary.update({f"final/{key}": value for key, value in result.items()})
+        self._wandb.table("final/table", [["measure", "value"], *([key, f"{x:.6g}"] for key, x in result.items())])
+        self._wandb.summary({f"final/{key}": value for key, value in result.items()})
 
     def close(self) -> None:
-        """Closes the files and the wandb run, whose own debug logs, full of this machine's paths, are removed."""
+        """Closes the files and the wandb run."""
         self._file.close()
-        if self._wandb:
-            self._wandb.experiment.finish()
+        self._wandb.close()
+
+
+class WandbRun:
+    """A run of wandb, or nothing at all where that is disabled: every method may be called either way.
+
+    Args:
+        folder: of the run; wandb gets the folder ``wandb`` in it.
+        mode: ``offline`` (no network, no login), ``online`` or ``disabled``.
+        config: shown with the run.
+        group: runs that belong together.
+        tags: to filter runs by.
+    """
+
+    def __init__(
+        self, folder: Path, mode: str, config: Mapping[str, Any], group: str = "", tags: Sequence[str] = ()
+    ) -> None:
+        self.folder = folder
+        self._logger = None if mode == "disabled" else _wandb_logger(folder, mode, config, group, tags)
+
+    def row(self, row: Mapping[str, float]) -> None:
+        """Points of curves; ``frames`` is the step."""
+        for key, value in row.items():
+            if self._logger and key != "frames" and math.isfinite(value):
+                self._logger.log_scalar(_panel(key), value, step=int(row["frames"]))
+
+    def picture(self, name: str, path: Path) -> None:
+        """A picture that lies in a file."""
+        if self._logger:
+            import wandb
+
+            self._logger.experiment.log({f"figures/{name}": wandb.Image(str(path))})
+
+    def table(self, name: str, rows: Sequence[Sequence[str]]) -> None:
+        """A table of texts, as HTML: a wandb.Table would put the absolute path of its staging folder into the run."""
+        if self._logger:
+            import wandb
+
+            lines = ("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+            self._logger.experiment.log({name: wandb.Html(f"<table>{''.join(lines)}</table>", inject=False)})
+
+    def summary(self, values: Mapping[str, float]) -> None:
+        """Final values."""
+        if self._logger:
+            self._logger.experiment.summary.update(dict(values))
+
+    def close(self) -> None:
+        """Ends the run, and removes wandb's own debug logs, which are full of this machine's paths."""
+        if self._logger:
+            self._logger.experiment.finish()
             for link in (self.folder / "wandb").glob("debug*.log"):
                 link.unlink()
             for logs in (self.folder / "wandb").glob("*run-*/logs"):

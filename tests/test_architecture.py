@@ -12,7 +12,8 @@ LEVELS = (
     {"geodesy", "harmonics", "elements", "guidance"},
     {"fields", "regional", "tasks", "metrics", "plots"},
     {"env", "transforms"},
-    {"td3", "runs"},
+    {"td3", "runs", "navigators"},
+    {"metaheuristics"},
 )
 LEVEL = {module: level for level, modules in enumerate(LEVELS) for module in modules}
 

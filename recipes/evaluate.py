@@ -1,0 +1,210 @@
+"""Flies navigators over the same tasks and measures them: the paper's Section 4.4, as a command.
+
+    python recipes/evaluate.py secant parallel                          # no training needed
+    python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso:flown --out runs/comparison
+
+A trained agent is named with its run folder; several runs of one name are averaged, and their spread is shown.
+Metaheuristics take `--mode look-ahead` (the field at every candidate's end is read for free: an oracle) or
+`--mode flown` (every candidate is a move), or have it behind their name. Writes episodes.csv, runs.csv, summary.json,
+table.md, and paths.csv of the paper's example task.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+
+import csv
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl import torchrl_logger
+from tqdm import tqdm
+
+from magrl import td3
+from magrl.env import GeomagneticNavEnv
+from magrl.metaheuristics import METAHEURISTICS
+from magrl.metrics import episode_measures, flown, summarise
+from magrl.navigators import NAVIGATORS
+from magrl.runs import WandbRun, create_run_folder
+from magrl.tasks import named_tasks
+
+LABELS = {
+    "gg_td3": "Gradient-Guided TD3",
+    "td3": "TD3",
+    "ga": "GA",
+    "pso": "PSO",
+    "afsa": "AFSA",
+    "secant": "secant (no training, fair)",
+    "parallel": "parallel (true gradient, an oracle)",
+}
+PAPER = {  # Table 2: SR %, TL m, SPL %, TNT steps
+    "gg_td3": (97, 445564.313, 88.4119, 21.757),
+    "td3": (89, 511983.904, 73.6277, 22.093),
+    "ga": (51, 443360.591, 47.0986, 22.534),
+    "pso": (29, 442495.161, 27.0941, 21.031),
+    "afsa": (77, 515649.380, 63.6267, 35.560),
+}
+MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
+MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg")
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is flown, over what, and where the results go."""
+
+    navigators: tyro.conf.Positional[tuple[str, ...]]
+    """gg_td3=RUN, td3=RUN, ga, pso, afsa, parallel, secant; as many as wanted."""
+    tasks: Literal["test-1000", "paper-100", "figure-4-1"] = "test-1000"
+    """A frozen task set."""
+    mode: Literal["look-ahead", "flown"] = "look-ahead"
+    """How metaheuristics evaluate a candidate."""
+    zeta: float = 0.01
+    """Arrival threshold on the objective."""
+    seed: int = 0
+    """Of navigators that draw random numbers."""
+    out: Path = Path("runs/evaluation")
+    """Folder of the results; refused if it holds anything."""
+    wandb_mode: Literal["offline", "online", "disabled"] = "offline"
+    """offline needs neither network nor login."""
+
+
+def navigator(text: str, env: GeomagneticNavEnv, mode: str, seed: int) -> TensorDictModuleBase:
+    """A navigator from its name on the command line.
+
+    Raises:
+        ValueError: for an unknown name, a trained agent without a run, or a run where none belongs.
+    """
+    name, _, run = text.partition("=")
+    name, _, own_mode = name.partition(":")
+    makers: dict[str, Callable[..., TensorDictModuleBase]] = {**NAVIGATORS, **METAHEURISTICS}
+    if name in ("gg_td3", "td3"):
+        if not run:
+            raise ValueError(f"{name} needs the folder of a finished run: {name}=RUN")
+        return td3.load_policy(Path(run) / "policy.pt")
+    if name not in makers or run or (own_mode and name not in METAHEURISTICS):
+        raise ValueError(f"unknown navigator {text!r}: choose from gg_td3=RUN, td3=RUN, {', '.join(makers)}")
+    return makers[name](env, own_mode or mode, seed)
+
+
+def make_env(config: Config, tasks: str) -> GeomagneticNavEnv:
+    """The environment of a task set: one vehicle for each task."""
+    chosen = named_tasks(tasks)
+    return GeomagneticNavEnv(num_envs=len(chosen.start), tasks=chosen, zeta=config.zeta, seed=config.seed)
+
+
+def path_rows(label: str, rollout: TensorDictBase) -> list[dict[str, float | str]]:
+    """The first journey of a rollout, a row a step, for Figs. 4-4 and 4-5."""
+    count = int(flown(rollout["next", "done"]).sum(1)[0])
+    states = [rollout[0, 0], *(rollout["next"][0, step] for step in range(count))]
+    return [
+        {
+            "navigator": label,
+            "step": step,
+            "latitude": state["position"][0].item(),
+            "longitude": state["position"][1].item(),
+            "D": state["field"][0].item(),
+            "I": state["field"][1].item(),
+            "B_H": state["field"][2].item(),
+            "L": state["move"][0].item(),
+        }
+        for step, state in enumerate(states)
+    ]
+
+
+def write_csv(path: Path, rows: list[dict]) -> None:
+    """Rows with the columns of the first."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def spread(values: list[float], form: str) -> str:
+    """A mean, with the standard deviation over runs where there are several."""
+    text = format(statistics.fmean(values), form)
+    return text if len(values) == 1 else f"{text} ± {format(statistics.stdev(values), form)}"
+
+
+def table(summaries: dict[str, list[dict[str, float]]]) -> str:
+    """The paper's Table 2, its row beside ours, and the measures of Fig. 4-6."""
+    lines = [
+        "| navigator | runs | SR % | TL m | SPL % | TNT steps | NE km | smoothness ° | MAE ° | RMSE ° "
+        "| within 10 km % | within 25 km % | readings |",
+        "|---" * 13 + "|",
+    ]
+    for name, results in summaries.items():
+        base, _, mode = name.partition(":")
+        if base in PAPER and not any(f"{LABELS[base]}, paper" in line for line in lines):
+            sr, tl, spl, tnt = PAPER[base]
+            lines.append(f"| {LABELS[base]}, paper | 1 | {sr} | {tl:.0f} | {spl:.1f} | {tnt:.1f} |" + " — |" * 7)
+        columns = {"success_rate": ".1f", "trajectory_length_m": ".0f", "spl": ".2f", "steps": ".2f"}
+        columns |= {"navigation_error_km": ".1f", "smoothness_deg": ".1f", "heading_mae_deg": ".1f"}
+        columns |= {"heading_rmse_deg": ".1f", "success_rate_within_10km": ".1f", "success_rate_within_25km": ".1f"}
+        columns["field_readings"] = ".0f"
+        cells = (spread([result[key] for result in results], form) for key, form in columns.items())
+        label = f"{LABELS[base]}, {mode}" if mode else LABELS[base]
+        lines.append(f"| {label} | {len(results)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
+    """Flies every navigator and writes the results.
+
+    Raises:
+        ValueError: for an unknown navigator, or none.
+    """
+    torchrl_logger.setLevel("WARNING")
+    if not config.navigators:
+        raise ValueError("name at least one navigator, for example: secant")
+    env, example = make_env(config, config.tasks), make_env(config, "figure-4-1")
+    makers = [(text.partition("=")[0], text) for text in config.navigators]
+    pairs = [[navigator(text, e, config.mode, config.seed) for e in (env, example)] for _, text in makers]
+    folder = create_run_folder(config.out)
+    summaries: dict[str, list[dict[str, float]]] = {}
+    episodes, runs, paths = [], [], []
+    for (name, text), (pilot, example_pilot) in zip(tqdm(makers, unit="navigator"), pairs, strict=True):
+        began = time.perf_counter()
+        measured = episode_measures(td3.evaluation_rollout(env, pilot))
+        readings = getattr(pilot, "field_readings", torch.zeros(1)).double().mean().item()
+        summary = summarise(measured) | {"field_readings": readings, "seconds": time.perf_counter() - began}
+        number = len(summaries.setdefault(name, []))
+        summaries[name].append(summary)
+        runs.append({"navigator": name, "run": number, "source": Path(text.partition("=")[2]).name, **summary})
+        columns = {key: measured[key].tolist() for key in MEASURES}
+        episodes += [
+            {"navigator": name, "run": number, "task": task, **{key: columns[key][task] for key in MEASURES}}
+            for task in range(env.num_envs)
+        ]
+        if number == 0:
+            paths += path_rows(name, td3.evaluation_rollout(example, example_pilot))
+    for file, rows in (("episodes", episodes), ("runs", runs), ("paths", paths)):
+        write_csv(folder / f"{file}.csv", rows)
+    (folder / "summary.json").write_text(json.dumps(summaries, indent=2) + "\n")
+    text = table(summaries)
+    (folder / "table.md").write_text(text)
+    run = WandbRun(folder, config.wandb_mode, {"tasks": config.tasks, "zeta": config.zeta}, "evaluation")
+    lines = [line for line in text.splitlines() if not line.startswith("|---")]
+    run.table("eval/navigators", [[cell.strip() for cell in line.strip("|").split("|")] for line in lines])
+    run.close()
+    return summaries
+
+
+if __name__ == "__main__":
+    settings = tyro.cli(Config, description=__doc__)
+    try:
+        print(table(evaluate(settings)))
+    except (ValueError, FileNotFoundError, FileExistsError) as error:
+        sys.exit(f"evaluate.py: {error}")
+    print(f"the results are in {settings.out}")
