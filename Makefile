@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 export GOMP_SPINCOUNT ?= 3000
 
-.PHONY: train test test-slow check format clean
+.PHONY: train test test-slow check format clean paper trade
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3: about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -23,6 +23,51 @@ check: $(VENV)/.installed-dev  ## lint, format and types
 format: $(VENV)/.installed-dev
 	$(RUN)/ruff format .
 	$(RUN)/ruff check --fix .
+
+# What the discount and the offset of the alignment term trade, and what the paper's state costs: eight trainings.
+trade: $(VENV)/.installed
+	for gamma in 0.9 0.97 0.995; do for offset in 0.785398 0; do \
+	  test -e runs/trade-gamma$$gamma-offset$$offset || $(RECIPE)/td3_gradient_guided.py --wandb-mode disabled \
+	    --gamma $$gamma --alignment-offset $$offset --out runs/trade-gamma$$gamma-offset$$offset || exit; done; done
+	test -e runs/no-difference || $(RECIPE)/td3_gradient_guided.py --no-observe-difference --out runs/no-difference
+	test -e runs/literal-state || $(RECIPE)/td3_gradient_guided.py --no-observe-difference --no-observe-heading \
+	  --out runs/literal-state
+	mkdir -p docs/results
+	$(RECIPE)/results_table.py $(foreach g,0.9 0.97 0.995,"γ $(g), offset π/4=runs/trade-gamma$(g)-offset0.785398" \
+	  "γ $(g), offset 0=runs/trade-gamma$(g)-offset0") > docs/results/trade.md
+	$(RECIPE)/results_table.py "as published=runs/td3_gradient_guided-fast-seed0" \
+	  "without the difference=runs/no-difference" "the paper's eight numbers=runs/literal-state" > docs/results/state.md
+
+# The paper's Section 4. Runs that are there are used as they are; ten trainings take about a quarter of an hour on two
+# cores, everything else about a minute.
+SEEDS := 0 1 2 3 4
+GUIDED := $(SEEDS:%=runs/td3_gradient_guided-fast-seed%)
+PLAIN := $(SEEDS:%=runs/td3-fast-seed%)
+STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
+PILOTS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
+RECIPE := $(RUN)/python recipes
+
+paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json)  ## every table and figure of Section 4
+	rm -rf runs/comparison runs/comparison-paper-100 runs/comparison-zeta0.001
+	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(PILOTS) --out runs/comparison
+	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(PILOTS) --tasks paper-100 --out runs/comparison-paper-100
+	$(RECIPE)/evaluate.py $(STRICT:%=gg_td3=%) secant parallel --zeta 0.001 --out runs/comparison-zeta0.001
+	$(RECIPE)/figures.py --results runs/comparison --gg-td3 $(GUIDED) --td3 $(PLAIN) --out docs/figures
+	cp runs/td3_gradient_guided-fast-seed0/trajectories.png docs/figures/
+	mkdir -p docs/results
+	for name in comparison comparison-paper-100 comparison-zeta0.001; do cp runs/$$name/table.md docs/results/$$name.md; done
+	$(RECIPE)/learning_table.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) > docs/results/learning.md
+	$(RECIPE)/results_table.py $(GUIDED) > docs/results/seeds.md
+	$(RECIPE)/publish.py README.md docs/reproduction.md
+
+runs/td3_gradient_guided-fast-seed%/eval.json: | $(VENV)/.installed
+	$(RECIPE)/td3_gradient_guided.py --seed $*
+
+runs/td3-fast-seed%/eval.json: | $(VENV)/.installed
+	$(RECIPE)/td3.py --seed $*
+
+runs/td3_gradient_guided-zeta0.001-seed%/eval.json: | $(VENV)/.installed
+	$(RECIPE)/td3_gradient_guided.py --zeta 0.001 --seed $* --out $(@D)
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache

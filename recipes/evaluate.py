@@ -17,6 +17,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 import csv
 import json
+import math
 import statistics
 import sys
 import time
@@ -132,9 +133,12 @@ def write_csv(path: Path, rows: list[dict]) -> None:
 
 
 def spread(values: list[float], form: str) -> str:
-    """A mean, with the standard deviation over runs where there are several."""
-    text = format(statistics.fmean(values), form)
-    return text if len(values) == 1 else f"{text} ± {format(statistics.stdev(values), form)}"
+    """A mean, with the standard deviation over runs where there are several; a dash where no run has a value."""
+    known = [value for value in values if math.isfinite(value)]
+    if not known:
+        return "—"
+    text = format(statistics.fmean(known), form)
+    return text if len(known) == 1 else f"{text} ± {format(statistics.stdev(known), form)}"
 
 
 def table(summaries: dict[str, list[dict[str, float]]]) -> str:

@@ -1,6 +1,8 @@
-"""How fast trainings learn: a Markdown table, mean and spread over the runs of each name.
+"""How fast trainings learn: a Markdown table.
 
-python recipes/learning_table.py gg_td3=runs/A gg_td3=runs/B td3=runs/C td3=runs/D
+    python recipes/learning_table.py gg_td3=runs/A gg_td3=runs/B td3=runs/C td3=runs/D
+
+Mean and spread over the runs of each name, on the validation tasks.
 """
 
 import csv

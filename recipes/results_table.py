@@ -1,6 +1,9 @@
-"""A Markdown table of finished runs, a row each, then their mean and spread.
+"""A Markdown table of finished runs, a row each, then their mean and spread; or runs by names of your own.
 
-python recipes/results_table.py runs/td3_gradient_guided-fast-seed*
+    python recipes/results_table.py runs/td3_gradient_guided-fast-seed*
+    python recipes/results_table.py "low gamma=runs/A" "high gamma=runs/B"
+
+With names, nothing is averaged.
 """
 
 import json
@@ -30,8 +33,8 @@ PAPER = {"success_rate": 97.0, "spl": 88.4119, "trajectory_length_m": 445564.313
 class Runs:
     """Which runs to show."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders, each with an eval.json."""
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Run folders, each with an eval.json; as NAME=RUN they are named, and not averaged."""
 
 
 def row(name: str, results: dict[str, float | None]) -> str:
@@ -41,19 +44,21 @@ def row(name: str, results: dict[str, float | None]) -> str:
     return f"| {name} | " + " | ".join(cells) + " |"
 
 
-def table(runs: tuple[Path, ...]) -> str:
+def table(runs: tuple[str, ...]) -> str:
     """The whole table.
 
     Raises:
         SystemExit: for a run without an ``eval.json``, by name.
     """
-    missing = [str(run) for run in runs if not (run / "eval.json").is_file()]
+    named = [text.rpartition("=")[::2] for text in runs]
+    missing = [folder for _, folder in named if not (Path(folder) / "eval.json").is_file()]
     if missing or not runs:
         sys.exit(f"no eval.json in {', '.join(missing) or 'no run at all'}: is the training finished?")
-    results = [json.loads((run / "eval.json").read_text()) for run in runs]
+    results = [json.loads((Path(folder) / "eval.json").read_text()) for _, folder in named]
     lines = ["| | " + " | ".join(COLUMNS) + " |", "|---|" + "---|" * len(COLUMNS), row("paper", PAPER)]
-    lines += [row(f"seed {result['seed']}", result) for result in results]
-    for name, statistic in (("mean", statistics.fmean), ("min", min), ("max", max)):
+    lines += [row(name or f"seed {r['seed']}", r) for (name, _), r in zip(named, results, strict=True)]
+    averages = (("mean", statistics.fmean), ("min", min), ("max", max)) if not named[0][0] else ()
+    for name, statistic in averages:
         numbers = {key: [r[key] for r in results] for key, _ in COLUMNS.values()}
         lines.append(row(name, {key: statistic(v) if None not in v else None for key, v in numbers.items()}))
     return "\n".join(lines)

@@ -1,7 +1,9 @@
 """What the documents say exists."""
 
 import importlib
+import importlib.util
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -51,3 +53,13 @@ def test_every_option_of_the_environment_is_documented() -> None:
     text = (ROOT / "docs" / "environment.md").read_text()
     for option in set(inspect.signature(GeomagneticNavEnv.__init__).parameters) - {"self"}:
         assert f"`{option}`" in text, option
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tables_are_those_that_were_measured(page: Path) -> None:
+    spec = importlib.util.spec_from_file_location("publish", ROOT / "recipes" / "publish.py")
+    publish = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = publish
+    spec.loader.exec_module(publish)
+    text = page.read_text()
+    assert publish.filled(text, ROOT) == text
