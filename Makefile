@@ -24,17 +24,19 @@ format: $(VENV)/.installed-dev
 	$(RUN)/ruff format .
 	$(RUN)/ruff check --fix .
 
-# What the discount and the offset of the alignment term trade, and what the paper's state costs: eight trainings.
-trade: $(VENV)/.installed
-	for gamma in 0.9 0.97 0.995; do for offset in 0.785398 0; do \
-	  test -e runs/trade-gamma$$gamma-offset$$offset || $(RECIPE)/td3_gradient_guided.py --wandb-mode disabled \
-	    --gamma $$gamma --alignment-offset $$offset --out runs/trade-gamma$$gamma-offset$$offset || exit; done; done
+# What the discount and the offset of the alignment term trade, and what the paper's state costs: seven trainings.
+trade: runs/td3_gradient_guided-fast-seed0/eval.json
+	for gamma in 0.97 0.995; do test -e runs/trade-gamma$$gamma || \
+	  $(RECIPE)/td3_gradient_guided.py --gamma $$gamma --out runs/trade-gamma$$gamma || exit; done
+	for gamma in 0.9 0.97 0.995; do test -e runs/trade-gamma$$gamma-offset0 || $(RECIPE)/td3_gradient_guided.py \
+	  --gamma $$gamma --alignment-offset 0 --out runs/trade-gamma$$gamma-offset0 || exit; done
 	test -e runs/no-difference || $(RECIPE)/td3_gradient_guided.py --no-observe-difference --out runs/no-difference
 	test -e runs/literal-state || $(RECIPE)/td3_gradient_guided.py --no-observe-difference --no-observe-heading \
 	  --out runs/literal-state
 	mkdir -p docs/results
-	$(RECIPE)/results_table.py $(foreach g,0.9 0.97 0.995,"γ $(g), offset π/4=runs/trade-gamma$(g)-offset0.785398" \
-	  "γ $(g), offset 0=runs/trade-gamma$(g)-offset0") > docs/results/trade.md
+	$(RECIPE)/results_table.py "γ 0.9, offset π/4=runs/td3_gradient_guided-fast-seed0" \
+	  $(foreach g,0.97 0.995,"γ $(g), offset π/4=runs/trade-gamma$(g)") \
+	  $(foreach g,0.9 0.97 0.995,"γ $(g), offset 0=runs/trade-gamma$(g)-offset0") > docs/results/trade.md
 	$(RECIPE)/results_table.py "as published=runs/td3_gradient_guided-fast-seed0" \
 	  "without the difference=runs/no-difference" "the paper's eight numbers=runs/literal-state" > docs/results/state.md
 
@@ -58,6 +60,7 @@ paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json)  #
 	for name in comparison comparison-paper-100 comparison-zeta0.001; do cp runs/$$name/table.md docs/results/$$name.md; done
 	$(RECIPE)/learning_table.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) > docs/results/learning.md
 	$(RECIPE)/results_table.py $(GUIDED) > docs/results/seeds.md
+	$(RECIPE)/path_loss.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) secant parallel > docs/results/path_loss.md
 	$(RECIPE)/publish.py README.md docs/reproduction.md
 
 runs/td3_gradient_guided-fast-seed%/eval.json: | $(VENV)/.installed
@@ -67,7 +70,7 @@ runs/td3-fast-seed%/eval.json: | $(VENV)/.installed
 	$(RECIPE)/td3.py --seed $*
 
 runs/td3_gradient_guided-zeta0.001-seed%/eval.json: | $(VENV)/.installed
-	$(RECIPE)/td3_gradient_guided.py --zeta 0.001 --seed $* --out $(@D)
+	$(RECIPE)/td3_gradient_guided.py --zeta 0.001 --total-frames 409600 --seed $* --out $(@D)
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache

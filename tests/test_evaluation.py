@@ -3,12 +3,14 @@
 import csv
 import importlib.util
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from test_metrics import journey, point
 
 from magrl import td3
 from magrl.env import GeomagneticNavEnv
@@ -126,6 +128,18 @@ def test_figures_are_drawn_from_the_files(results: Path, run: Path, tmp_path: Pa
     assert {name[:7] for name in names} == {"fig-4-1", "fig-4-2", "fig-4-3", "fig-4-4", "fig-4-5", "fig-4-6", "learnin"}
     with pytest.raises(SystemExit, match=r"no .*paths\.csv"):
         figures.main(figures.Config(results=tmp_path, out=tmp_path))
+
+
+def test_path_loss_is_what_a_detour_costs(monkeypatch) -> None:
+    """A square corner of 30 and 40 km for 50 km of way, then straight on: 20 km lost, all of it at the start."""
+    monkeypatch.syspath_prepend(str(RECIPES))
+    loss = load("path_loss")
+    heading = math.degrees(math.atan2(40, 30))
+    legs = [(30.0, 0.0), (40.0, 90.0), *[(50.0, heading)] * 3]
+    got = loss.losses(journey(legs, point(200.0, heading), True, 6))
+    assert got["first two moves"] == pytest.approx(20, abs=0.5)  # the course holds while the bearing turns a little
+    assert got["between"] == pytest.approx(0, abs=0.5)
+    assert got["last two moves"] == pytest.approx(0, abs=0.5)
 
 
 def test_learning_table(run: Path) -> None:
