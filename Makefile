@@ -58,6 +58,7 @@ paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json)  #
 	cp runs/td3_gradient_guided-fast-seed0/trajectories.png docs/figures/
 	mkdir -p docs/results
 	for name in comparison comparison-paper-100 comparison-zeta0.001; do cp runs/$$name/table.md docs/results/$$name.md; done
+	cp runs/comparison/short.md docs/results/summary.md
 	$(RECIPE)/learning_table.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) > docs/results/learning.md
 	$(RECIPE)/results_table.py $(GUIDED) > docs/results/seeds.md
 	$(RECIPE)/path_loss.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) secant parallel > docs/results/path_loss.md

@@ -6,7 +6,7 @@
 A trained agent is named with its run folder; several runs of one name are averaged, and their spread is shown.
 Metaheuristics take `--mode look-ahead` (the field at every candidate's end is read for free: an oracle) or
 `--mode flown` (every candidate is a move), or have it behind their name. Writes episodes.csv, runs.csv, summary.json,
-table.md, and paths.csv of the paper's example task.
+table.md and short.md, and paths.csv of the paper's example task.
 """
 
 from __future__ import annotations
@@ -163,6 +163,18 @@ def table(summaries: dict[str, list[dict[str, float]]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def short_table(summaries: dict[str, list[dict[str, float]]]) -> str:
+    """What a reader wants first, without the paper's rows."""
+    columns = {"SR %": ("success_rate", ".1f"), "SPL %": ("spl", ".1f"), "TNT steps": ("steps", ".1f")}
+    columns |= {"NE km": ("navigation_error_km", ".1f")}
+    lines = ["| navigator | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
+    for name, results in summaries.items():
+        base, _, mode = name.partition(":")
+        cells = (spread([result[key] for result in results], form) for key, form in columns.values())
+        lines.append(f"| {LABELS[base]}{', ' * bool(mode)}{mode} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
     """Flies every navigator and writes the results.
 
@@ -198,6 +210,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
     (folder / "summary.json").write_text(json.dumps(summaries, indent=2) + "\n")
     text = table(summaries)
     (folder / "table.md").write_text(text)
+    (folder / "short.md").write_text(short_table(summaries))
     run = WandbRun(folder, config.wandb_mode, {"tasks": config.tasks, "zeta": config.zeta}, "evaluation")
     lines = [line for line in text.splitlines() if not line.startswith("|---")]
     run.table("eval/navigators", [[cell.strip() for cell in line.strip("|").split("|")] for line in lines])

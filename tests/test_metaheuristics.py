@@ -19,10 +19,8 @@ from magrl.metaheuristics import (
     GeneticAlgorithm,
     ParticleSwarm,
     build,
-    in_disc,
-    reachable,
-    take,
 )
+from magrl.metaheuristics.base import in_disc, reachable, take
 from magrl.metrics import episode_measures, summarise
 from magrl.tasks import task_set
 from magrl.td3 import evaluation_rollout

@@ -1,0 +1,73 @@
+"""An artificial fish swarm as a navigator."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from magrl.metaheuristics.base import Evaluate, Metaheuristic, checked, in_disc, take
+
+
+class ArtificialFishSwarm(Metaheuristic):
+    """The artificial fish swarm: each fish follows a better neighbour, swarms to the centre, or preys.
+
+    Where only flying tells what a place is worth, the centre counts as the mean of those around it, and prey is a
+    random step.
+
+    Args:
+        visual: how far a fish sees, in longest moves.
+        step: its longest step, in longest moves.
+        crowding: share of the population about a place above which it is crowded.
+        tries: places that a preying fish looks at before it steps at random.
+        options: of :class:`Metaheuristic`.
+
+    Source:
+        X. Li, Z. Shao and J. Qian, An optimizing method based on autonomous animats: fish-swarm algorithm, Systems
+        Engineering: Theory and Practice 22 (2002); as in D. Yazdani et al., Fuzzy adaptive artificial fish swarm
+        algorithm, AI (2010).
+    """
+
+    def __init__(
+        self, *, visual: float = 0.5, step: float = 0.3, crowding: float = 0.6, tries: int = 3, **options: Any
+    ) -> None:
+        super().__init__(**options)
+        self.visual, self.step = checked("visual", visual, 1e-6, 10), checked("step", step, 1e-6, 10)
+        self.crowding = checked("crowding", crowding, 0, 1)
+        self.tries = checked("tries", tries, 1, 1000, whole=True)
+
+    def begin(self, population: Tensor) -> dict[str, Tensor]:  # noqa: ARG002 - a population is all it has
+        return {}
+
+    def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate | None) -> dict[str, Tensor]:
+        fish = state["population"]
+        near = (fish.unsqueeze(1) - fish.unsqueeze(2)).norm(dim=-1) < self.visual
+        near = near & ~torch.eye(fish.shape[1], dtype=torch.bool, device=fish.device)
+        count = near.sum(-1)
+        leader_fitness, leader = torch.where(near, fitness.unsqueeze(1), math.inf).min(-1)
+        weight = near.double() / count.clamp_min(1).unsqueeze(-1)
+        centre = weight @ fish
+        mean = torch.where(near, fitness.unsqueeze(1), 0.0).sum(-1) / count.clamp_min(1)
+        centre_fitness = mean if evaluate is None else evaluate(centre)
+        # Alone, a fish has neither leader nor centre; where it is crowded, it goes its own way.
+        free = (count > 0) & (count <= self.crowding * fish.shape[1])
+        follow = free & (leader_fitness < fitness) & (leader_fitness <= centre_fitness)
+        swarm = free & (centre_fitness < fitness) & ~follow
+        goal = torch.where(follow.unsqueeze(-1), take(fish, leader), centre)
+        goal = torch.where((follow | swarm).unsqueeze(-1), goal, self._prey(fish, fitness, evaluate))
+        way = goal - fish
+        length = self.step * self.uniform(fish, *fish.shape[:2], 1)
+        return {"population": in_disc(fish + way * (length / way.norm(dim=-1, keepdim=True).clamp_min(1e-9)))}
+
+    def _prey(self, fish: Tensor, fitness: Tensor, evaluate: Evaluate | None) -> Tensor:
+        """The first better place in sight, or else the last one looked at: ``(N, P, 2)``."""
+        places = fish.unsqueeze(2) + self.visual * (2 * self.uniform(fish, *fish.shape[:2], self.tries, 2) - 1)
+        if evaluate is None:
+            return places[:, :, -1]
+        better = evaluate(places.flatten(1, 2)).unflatten(1, (-1, self.tries)) < fitness.unsqueeze(-1)
+        better[..., -1] = True
+        first = better.long().argmax(-1)
+        return places.gather(2, first[..., None, None].expand(*first.shape, 1, 2)).squeeze(2)

@@ -1,0 +1,69 @@
+"""A genetic algorithm as a navigator."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from magrl.metaheuristics.base import Evaluate, Metaheuristic, checked, in_disc, take
+
+
+class GeneticAlgorithm(Metaheuristic):
+    """A real-coded genetic algorithm: tournaments, blend crossover, Gaussian mutation, elitism.
+
+    Args:
+        tournament_size: individuals that compete to be a parent.
+        crossover_rate: share of children with two parents.
+        blend: how far a child may lie beyond its parents, in their distance (BLX-alpha).
+        mutation_rate: share of coordinates that mutate.
+        mutation_scale: standard deviation of a mutation, in longest moves.
+        elites: best individuals that live on.
+        options: of :class:`Metaheuristic`.
+
+    Source:
+        J. H. Holland, Adaptation in Natural and Artificial Systems (1975); blend crossover: L. J. Eshelman and
+        J. D. Schaffer, Real-coded genetic algorithms and interval-schemata, FOGA 2 (1993).
+    """
+
+    def __init__(
+        self,
+        *,
+        tournament_size: int = 2,
+        crossover_rate: float = 0.9,
+        blend: float = 0.5,
+        mutation_rate: float = 0.3,
+        mutation_scale: float = 0.2,
+        elites: int = 1,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self.tournament_size = checked("tournament_size", tournament_size, 1, 10_000, whole=True)
+        self.crossover_rate = checked("crossover_rate", crossover_rate, 0, 1)
+        self.blend = checked("blend", blend, 0, 10)
+        self.mutation_rate = checked("mutation_rate", mutation_rate, 0, 1)
+        self.mutation_scale = checked("mutation_scale", mutation_scale, 0, 10)
+        self.elites = checked("elites", elites, 0, self.population_size - 1, whole=True)
+
+    def begin(self, population: Tensor) -> dict[str, Tensor]:  # noqa: ARG002 - a population is all it has
+        return {}
+
+    def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate | None) -> dict[str, Tensor]:  # noqa: ARG002
+        population = state["population"]
+        elite = take(population, fitness.topk(self.elites, dim=1, largest=False).indices)
+        first, second = (take(population, self._tournament(fitness)) for _ in range(2))
+        weight = (1 + 2 * self.blend) * self.uniform(population, *population.shape) - self.blend
+        crossed = self.uniform(population, *population.shape[:2], 1) < self.crossover_rate
+        children = torch.where(crossed, first + weight * (second - first), first)
+        mutated = self.uniform(population, *population.shape) < self.mutation_rate
+        children = children + mutated * self.mutation_scale * self.normal(children)
+        return {"population": torch.cat((elite, in_disc(children)[:, self.elites :]), 1)}
+
+    def _tournament(self, fitness: Tensor) -> Tensor:
+        """Numbers of the winners, one for each place in the next generation, ``(N, P)``."""
+        size = fitness.shape[1]
+        draws = (size * self.uniform(fitness, len(fitness), size * self.tournament_size)).long()
+        winner = take(fitness, draws).unflatten(1, (size, -1)).argmin(-1, keepdim=True)
+        return draws.unflatten(1, (size, -1)).gather(-1, winner).squeeze(-1)
