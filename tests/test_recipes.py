@@ -175,3 +175,15 @@ def test_what_cannot_run_is_said_in_a_line(tmp_path: Path) -> None:
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 1
     assert run.stderr.strip() == f"td3.py: the run folder {tmp_path} is in use: choose another --out, or move it away"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [5, 6])
+def test_the_agent_learns_to_navigate(recipe, tmp_path: Path, seed: int) -> None:
+    """Half of the preset's frames, on seeds that it was not tuned on: the paper's figures, on 1000 unseen tasks."""
+    config = dataclasses.replace(
+        recipe.Config(), seed=seed, total_frames=102_400, out=tmp_path / "run", wandb_mode="disabled"
+    )
+    result = recipe.train(config)
+    assert result["success_rate"] >= 97
+    assert result["spl"] >= 88.4
