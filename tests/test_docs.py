@@ -10,6 +10,11 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+EXAMPLES = [
+    (page, block)
+    for page in PAGES
+    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+]
 THEORY = (ROOT / "docs" / "theory.md").read_text()
 
 
@@ -39,10 +44,11 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_python_examples_run(page: Path) -> None:
-    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
-        exec(compile(block, str(page), "exec"), {})
+@pytest.mark.parametrize(("page", "block"), EXAMPLES, ids=lambda value: getattr(value, "name", None))
+def test_python_examples_run(page: Path, block: str) -> None:
+    names: dict[str, object] = {}
+    exec(compile(block, str(page), "exec"), names)
+    assert len(names) > 1, "an example should leave something behind"
 
 
 def test_every_option_of_the_environment_is_documented() -> None:
