@@ -669,8 +669,10 @@ def test_flown_box_holds_every_place_that_a_move_can_reach(row: tuple[Region, fl
 
 @pytest.mark.parametrize("margin_deg", [0.0, 0.1, 0.2, 0.7, 1.3, 4.9])
 def test_the_default_field_covers_what_is_flown(margin_deg: float) -> None:
-    make(margin_deg=margin_deg)
-    make(region=Region((-9.9, 0.1), (160.3, 170.7)), margin_deg=margin_deg)
+    for region in (PAPER_REGION, Region((-9.9, 0.1), (160.3, 170.7))):
+        field = make(region=region, margin_deg=margin_deg).field
+        assert field.latitude[0] < region.latitude[0] - margin_deg
+        assert field.longitude[1] > region.longitude[1] + margin_deg
 
 
 # ---------------------------------------------------------------------------------------------------------------------
