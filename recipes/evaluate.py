@@ -141,7 +141,15 @@ def spread(values: list[float], form: str) -> str:
     return text if len(known) == 1 else f"{text} ± {format(statistics.stdev(known), form)}"
 
 
-def table(summaries: dict[str, list[dict[str, float]]]) -> str:
+def label(name: str, default_mode: str) -> str:
+    """A navigator as a reader should know it: a metaheuristic with its mode, an oracle called one."""
+    base, _, mode = name.partition(":")
+    if base not in METAHEURISTICS:
+        return LABELS[base]
+    return LABELS[base] + (", look-ahead (an oracle)" if (mode or default_mode) == "look-ahead" else ", flown")
+
+
+def table(summaries: dict[str, list[dict[str, float]]], mode: str) -> str:
     """The paper's Table 2, its row beside ours, and the measures of Fig. 4-6."""
     lines = [
         "| navigator | runs | SR % | TL m | SPL % | TNT steps | NE km | smoothness ° | MAE ° | RMSE ° "
@@ -149,7 +157,7 @@ def table(summaries: dict[str, list[dict[str, float]]]) -> str:
         "|---" * 13 + "|",
     ]
     for name, results in summaries.items():
-        base, _, mode = name.partition(":")
+        base = name.partition(":")[0]
         if base in PAPER and not any(f"{LABELS[base]}, paper" in line for line in lines):
             sr, tl, spl, tnt = PAPER[base]
             lines.append(f"| {LABELS[base]}, paper | 1 | {sr} | {tl:.0f} | {spl:.1f} | {tnt:.1f} |" + " — |" * 7)
@@ -158,20 +166,18 @@ def table(summaries: dict[str, list[dict[str, float]]]) -> str:
         columns |= {"heading_rmse_deg": ".1f", "success_rate_within_10km": ".1f", "success_rate_within_25km": ".1f"}
         columns["field_readings"] = ".0f"
         cells = (spread([result[key] for result in results], form) for key, form in columns.items())
-        label = f"{LABELS[base]}, {mode}" if mode else LABELS[base]
-        lines.append(f"| {label} | {len(results)} | " + " | ".join(cells) + " |")
+        lines.append(f"| {label(name, mode)} | {len(results)} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def short_table(summaries: dict[str, list[dict[str, float]]]) -> str:
+def short_table(summaries: dict[str, list[dict[str, float]]], mode: str) -> str:
     """What a reader wants first, without the paper's rows."""
     columns = {"SR %": ("success_rate", ".1f"), "SPL %": ("spl", ".1f"), "TNT steps": ("steps", ".1f")}
     columns |= {"NE km": ("navigation_error_km", ".1f")}
     lines = ["| navigator | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
     for name, results in summaries.items():
-        base, _, mode = name.partition(":")
         cells = (spread([result[key] for result in results], form) for key, form in columns.values())
-        lines.append(f"| {LABELS[base]}{', ' * bool(mode)}{mode} | " + " | ".join(cells) + " |")
+        lines.append(f"| {label(name, mode)} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
@@ -208,9 +214,9 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
     for file, rows in (("episodes", episodes), ("runs", runs), ("paths", paths)):
         write_csv(folder / f"{file}.csv", rows)
     (folder / "summary.json").write_text(json.dumps(summaries, indent=2) + "\n")
-    text = table(summaries)
+    text = table(summaries, config.mode)
     (folder / "table.md").write_text(text)
-    (folder / "short.md").write_text(short_table(summaries))
+    (folder / "short.md").write_text(short_table(summaries, config.mode))
     run = WandbRun(folder, config.wandb_mode, {"tasks": config.tasks, "zeta": config.zeta}, "evaluation")
     lines = [line for line in text.splitlines() if not line.startswith("|---")]
     run.table("eval/navigators", [[cell.strip() for cell in line.strip("|").split("|")] for line in lines])
@@ -221,7 +227,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
 if __name__ == "__main__":
     settings = tyro.cli(Config, description=__doc__)
     try:
-        print(table(evaluate(settings)))
+        print(table(evaluate(settings), settings.mode))
     except (ValueError, FileNotFoundError, FileExistsError) as error:
         sys.exit(f"evaluate.py: {error}")
     print(f"the results are in {settings.out}")

@@ -82,6 +82,7 @@ def test_table_has_the_papers_row_beside_ours(results: Path) -> None:
     labels = [line.split("|")[1].strip() for line in lines[2:]]
     assert labels[:2] == ["Gradient-Guided TD3, paper", "Gradient-Guided TD3"]
     assert "AFSA, flown" in labels
+    assert "PSO, look-ahead (an oracle)" in labels
     assert lines[2].split("|")[3:6] == [" 97 ", " 445564 ", " 88.4 "]
     assert lines[3].split("|")[2] == " 2 "
     assert "0.0 ± 0.0" in lines[3]  # twice the same run
