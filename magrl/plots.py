@@ -95,9 +95,7 @@ def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
     axes.set_aspect(1 / np.cos(np.radians(latitude.mean())))
 
 
-def draw_journeys(
-    axes: Axes, field: FieldModel, region: Region, paths: Sequence[Tensor], targets: Tensor, zoom: bool = False
-) -> None:
+def draw_journeys(axes: Axes, field: FieldModel, region: Region, paths: Sequence[Tensor], targets: Tensor) -> None:
     """Journeys over the field's contours, each from its start (square) to its target (triangle).
 
     Args:
@@ -106,14 +104,12 @@ def draw_journeys(
         region: where tasks lie; what strays beyond it is shown too.
         paths: one ``(T, 2)`` latitude, longitude [deg] for each journey.
         targets: ``(len(paths), 2)`` [deg].
-        zoom: keep to the region even where a journey leaves it.
     """
     centre = sum(region.longitude) / 2
     unwrapped = [torch.stack((p[:, 0], centre + wrap_longitude(p[:, 1] - centre)), -1) for p in paths]
     ends = torch.stack((targets[:, 0], centre + wrap_longitude(targets[:, 1] - centre)), -1)
     points = torch.cat([*unwrapped, ends])
-    shown = region if zoom else _around(region, points)
-    draw_contours(axes, field, shown)
+    draw_contours(axes, field, _around(region, points))
     for path, end in zip(unwrapped, ends, strict=True):
         axes.plot(*torch.stack((path[0], end)).flip(-1).T, ":", color=TARGET, lw=0.8)
         axes.plot(path[:, 1], path[:, 0], "-", color=PATH, lw=1, marker=".", ms=3, alpha=0.8)

@@ -38,15 +38,11 @@ from magrl.env import GeomagneticNavEnv
 from magrl.metaheuristics import METAHEURISTICS
 from magrl.metrics import episode_measures, flown, summarise
 from magrl.navigators import NAVIGATORS
+from magrl.plots import NAVIGATOR_NAMES
 from magrl.runs import WandbRun, create_run_folder
 from magrl.tasks import named_tasks
 
-LABELS = {
-    "gg_td3": "Gradient-Guided TD3",
-    "td3": "TD3",
-    "ga": "GA",
-    "pso": "PSO",
-    "afsa": "AFSA",
+LABELS = NAVIGATOR_NAMES | {
     "secant": "secant (no training, fair)",
     "parallel": "parallel (true gradient, an oracle)",
 }

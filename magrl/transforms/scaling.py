@@ -74,11 +74,9 @@ class MinMaxNorm(ObservationTransform):
         for index in range(len(self._bounded_keys)):
             self.register_buffer(f"low_{index}", None)
             self.register_buffer(f"high_{index}", None)
-        self._given = set()
         for key, (low, high) in (bounds or {}).items():
             if unravel_key(key) not in self._bounded_keys:
                 raise ValueError(f"bounds are given for {key!r}, which is none of the keys {self._bounded_keys}")
-            self._given.add(unravel_key(key))
             self._set_bounds(unravel_key(key), *(_as_float(bound) for bound in (low, high)))
 
     # Bounds
@@ -127,7 +125,7 @@ class MinMaxNorm(ObservationTransform):
 
     def _bounds_from_spec(self, key: NestedKey, spec: TensorSpec, batch_dims: int) -> None:
         index = self._bounded_keys.index(key)
-        if key in self._given or getattr(self, f"low_{index}") is not None:
+        if getattr(self, f"low_{index}") is not None:
             return
         if not isinstance(spec, Bounded):
             raise ValueError(
