@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -222,3 +223,15 @@ class TrainingTally:
             "success_rate": 100 * sum(self._successes) / count if count else math.nan,
             **dict(zip(names, terms, strict=True)),
         }
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counts, the window and the terms so far."""
+        window = {"returns": list(self._returns), "successes": list(self._successes), "terms": list(self._terms)}
+        return {"frames": self.frames, "episodes": self.episodes, **window}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Goes on counting from there."""
+        self.frames, self.episodes = state_dict["frames"], state_dict["episodes"]
+        self._returns.extend(state_dict["returns"])
+        self._successes.extend(state_dict["successes"])
+        self._terms = [tuple(term) for term in state_dict["terms"]]

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+import signal
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Any
 
+from filelock import FileLock, Timeout
 from matplotlib.figure import Figure
 
 WANDB_PROJECT = "magrl"
@@ -33,6 +41,52 @@ def create_run_folder(path: Path | str) -> Path:
     return path
 
 
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Claims a run folder for this process while the block runs; a kill releases it too.
+
+    Raises:
+        FileExistsError: if another process writes it.
+    """
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise FileExistsError(f"another process is writing the run folder {folder}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+class StopRequest:
+    """Ctrl-C and SIGTERM, kept until the loop asks, so that it ends where nothing is lost; a second one ends at once.
+
+    Example:
+        >>> with StopRequest() as stop:
+        ...     stop.exit_code is None
+        True
+    """
+
+    def __init__(self) -> None:
+        self.exit_code: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():  # elsewhere signals cannot be handled
+            self._before = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, _: FrameType | None) -> None:
+        if self.exit_code is not None:
+            raise KeyboardInterrupt
+        self.exit_code = 128 + number  # what a shell reports for a process that a signal ended
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes numbers and texts in their order; NaN, which JSON lacks, becomes null."""
     clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in content.items()}
@@ -49,6 +103,7 @@ class RunLog:
         wandb_mode: ``offline`` (no network, no login), ``online``, or ``disabled`` (nothing of wandb is written).
         group: runs that belong together.
         tags: to filter runs by.
+        resumed: whether the run goes on; its files stay as they are until :meth:`load_state_dict`.
     """
 
     def __init__(
@@ -60,19 +115,39 @@ class RunLog:
         wandb_mode: str = "disabled",
         group: str = "",
         tags: Sequence[str] = (),
+        resumed: bool = False,
     ) -> None:
-        self.folder, self.rows = folder, list[dict[str, float]]()
-        write_json(folder / "config.json", config)
-        self._file = (folder / "train.csv").open("w", newline="")
-        self._writer = csv.DictWriter(self._file, columns)
-        self._writer.writeheader()
-        self._wandb = WandbRun(folder, wandb_mode, config, group, tags)
+        self.folder, self.columns, self.rows = folder, tuple(columns), list[dict[str, float]]()
+        self._wandb_options = (folder, wandb_mode, config, group, tags)
+        self._began = time.perf_counter()
+        if not resumed:
+            write_json(folder / "config.json", config)
+            self._open([], uuid.uuid4().hex[:8])
 
-    def row(self, row: Mapping[str, float]) -> None:
-        """Adds a row of curves; it is in the file when this returns. ``frames`` is the step."""
+    def _open(self, rows: Sequence[Mapping[str, float]], wandb_id: str) -> None:
+        """Starts ``train.csv`` with some rows, and the wandb run."""
+        aside = self.folder / "train.csv.aside"
+        self._file = aside.open("w", newline="")
+        self._writer = csv.DictWriter(self._file, self.columns)
+        self._writer.writeheader()
+        for row in rows:
+            self._write(row)
+        aside.replace(self.folder / "train.csv")
+        self._wandb = WandbRun(*self._wandb_options, run_id=wandb_id)
+
+    def _write(self, row: Mapping[str, float]) -> None:
         self.rows.append(dict(row))
         self._writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
         self._file.flush()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the run began; where it was resumed, the time between is left out."""
+        return time.perf_counter() - self._began
+
+    def row(self, row: Mapping[str, float]) -> None:
+        """Adds a row of curves; it is in the file when this returns. ``frames`` is the step."""
+        self._write(row)
         self._wandb.row(row)
 
     def figure(self, name: str, figure: Figure) -> None:
@@ -87,6 +162,15 @@ class RunLog:
         self._wandb.table("final/table", [["measure", "value"], *([key, f"{x:.6g}"] for key, x in result.items())])
         self._wandb.summary({f"final/{key}": value for key, value in result.items()})
 
+    def state_dict(self) -> dict[str, Any]:
+        """The rows so far, the time that they took, and the wandb run that they went to."""
+        return {"rows": list(self.rows), "seconds": self.seconds, "wandb_id": self._wandb.run_id}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Goes on from those rows; later ones that are in the file are dropped."""
+        self._began = time.perf_counter() - float(state_dict["seconds"])
+        self._open(state_dict["rows"], str(state_dict["wandb_id"]))
+
     def close(self) -> None:
         """Closes the files and the wandb run."""
         self._file.close()
@@ -96,32 +180,52 @@ class RunLog:
 class WandbRun:
     """A run of wandb, or nothing at all where that is disabled: every method may be called either way.
 
+    What goes wrong in wandb (a folder that cannot be written, a full disk) is said once and never stops the caller.
+
     Args:
         folder: of the run; wandb gets the folder ``wandb`` in it.
         mode: ``offline`` (no network, no login), ``online`` or ``disabled``.
         config: shown with the run.
         group: runs that belong together.
         tags: to filter runs by.
+        run_id: of the run; one that exists is gone on with.
     """
 
     def __init__(
-        self, folder: Path, mode: str, config: Mapping[str, Any], group: str = "", tags: Sequence[str] = ()
+        self,
+        folder: Path,
+        mode: str,
+        config: Mapping[str, Any],
+        group: str = "",
+        tags: Sequence[str] = (),
+        *,
+        run_id: str = "",
     ) -> None:
-        self.folder = folder
-        self._logger = None if mode == "disabled" else _wandb_logger(folder, mode, config, group, tags)
+        self.folder, self.run_id = folder, run_id or uuid.uuid4().hex[:8]
+        self._logger: Any = None
+        if mode != "disabled":
+            options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags)}
+            self._try(lambda: setattr(self, "_logger", _wandb_logger(folder, mode, config, options)))
+
+    def _try(self, action: Callable[[], Any]) -> None:
+        try:
+            action()
+        except Exception as error:
+            self._logger = None
+            print(f"wandb failed and is left out from here on: {error}", file=sys.stderr)
 
     def row(self, row: Mapping[str, float]) -> None:
         """Points of curves; ``frames`` is the step."""
         for key, value in row.items():
             if self._logger and key != "frames" and math.isfinite(value):
-                self._logger.log_scalar(_panel(key), value, step=int(row["frames"]))
+                self._try(lambda: self._logger.log_scalar(_panel(key), value, step=int(row["frames"])))  # noqa: B023
 
     def picture(self, name: str, path: Path) -> None:
         """A picture that lies in a file."""
         if self._logger:
             import wandb
 
-            self._logger.experiment.log({f"figures/{name}": wandb.Image(str(path))})
+            self._try(lambda: self._logger.experiment.log({f"figures/{name}": wandb.Image(str(path))}))
 
     def table(self, name: str, rows: Sequence[Sequence[str]]) -> None:
         """A table of texts, as HTML: a wandb.Table would put the absolute path of its staging folder into the run."""
@@ -129,17 +233,18 @@ class WandbRun:
             import wandb
 
             lines = ("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-            self._logger.experiment.log({name: wandb.Html(f"<table>{''.join(lines)}</table>", inject=False)})
+            html = f"<table>{''.join(lines)}</table>"
+            self._try(lambda: self._logger.experiment.log({name: wandb.Html(html, inject=False)}))
 
     def summary(self, values: Mapping[str, float]) -> None:
         """Final values."""
         if self._logger:
-            self._logger.experiment.summary.update(dict(values))
+            self._try(lambda: self._logger.experiment.summary.update(dict(values)))
 
     def close(self) -> None:
         """Ends the run, and removes wandb's own debug logs, which are full of this machine's paths."""
         if self._logger:
-            self._logger.experiment.finish()
+            self._try(lambda: self._logger.experiment.finish())
             for link in (self.folder / "wandb").glob("debug*.log"):
                 link.unlink()
             for logs in (self.folder / "wandb").glob("*run-*/logs"):
@@ -154,7 +259,7 @@ def _panel(key: str) -> str:
     return f"train/{key}"
 
 
-def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], group: str, tags: Sequence[str]) -> Any:
+def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], options: Mapping[str, Any]) -> Any:
     """TorchRL's wandb logger, writing under the run folder and telling nothing of the machine."""
     import wandb
     from torchrl.record.loggers import get_logger
@@ -170,6 +275,6 @@ def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], group: str
         x_disable_stats=True,
         x_disable_machine_info=True,
     )
-    options: dict[str, Any] = {"project": WANDB_PROJECT, "mode": mode, "config": dict(config), "group": group}
-    options |= {"tags": list(tags), "settings": private, "log_env_packages": False}
-    return get_logger("wandb", logger_name=str(folder), experiment_name=folder.name, wandb_kwargs=options)
+    wandb_kwargs = {"project": WANDB_PROJECT, "mode": mode, "config": dict(config), "settings": private}
+    wandb_kwargs |= {"log_env_packages": False, **options}
+    return get_logger("wandb", logger_name=str(folder), experiment_name=folder.name, wandb_kwargs=wandb_kwargs)

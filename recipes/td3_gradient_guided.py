@@ -2,6 +2,7 @@
 
     python recipes/td3_gradient_guided.py                  # preset fast, about a minute on two cores
     python recipes/td3_gradient_guided.py --preset paper   # Table 1 as printed; many hours on a CPU
+    python recipes/td3_gradient_guided.py --resume RUN     # go on after a kill, exactly
 
 Preset `fast` is expected to fly more than 99.5 % of 1000 tasks that it never saw to their destination, on paths
 within 3 % of the shortest. The run folder holds the policy, the curves, the numbers and the pictures.
@@ -15,18 +16,20 @@ import os
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 import argparse
-import copy
+import json
 import math
 import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import tyro
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl import torchrl_logger
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
@@ -35,9 +38,10 @@ from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from magrl import plots, td3
+from magrl.checkpoints import BestPolicy, Checkpoints, RunningEpisodes, check_finite
 from magrl.env import GeomagneticNavEnv
 from magrl.metrics import TrainingTally, episode_measures, summarise
-from magrl.runs import RunLog, create_run_folder
+from magrl.runs import RunLog, StopRequest, create_run_folder, locked
 from magrl.tasks import FIRST_RESERVED_SEED, TEST_SEED, VALIDATION_SEED, task_set
 
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
@@ -56,16 +60,22 @@ class Config:
     """Of networks, exploration and training tasks."""
     out: Path | None = None
     """Run folder; by default runs/<recipe>-<preset>-seed<seed>."""
+    resume: Path | None = None
+    """Run folder of a training that was cut off, to go on with: its settings are used, and no others."""
     device: str = "cpu"
     """Where everything runs: cpu, cuda, cuda:0 …"""
     wandb_mode: Literal["offline", "online", "disabled"] = "offline"
     """offline needs neither network nor login."""
+    checkpoint_every: float = 30.0
+    """Seconds between checkpoints, from which --resume RUN goes on."""
 
     # Environment
     num_envs: int = 512
     """Vehicles that fly at the same time."""
     total_frames: int = 204_800
     """Vehicle-steps to train for."""
+    total_episodes: int | None = None
+    """Episodes to train for, if they end before the vehicle-steps."""
     zeta: float = 0.01
     """Arrival threshold on the objective (Eq. 2-7)."""
     start_heading: Literal["north", "random"] = "north"
@@ -126,10 +136,16 @@ class Config:
     """Tasks of the final evaluation."""
 
     def __post_init__(self) -> None:
+        for name, kind in (("preset", ("fast", "paper")), ("wandb_mode", ("offline", "online", "disabled"))):
+            if getattr(self, name) not in kind:
+                raise ValueError(f"{name} must be one of {kind}, got {getattr(self, name)!r}")
         counts = ("num_envs", "total_frames", "updates_per_batch", "batch_size", "buffer_size", "policy_delay")
         counts += ("eval_every", "eval_tasks_small", "eval_tasks")
         positive = ("learning_rate", "final_learning_rate", "reward_scale", "zeta")
         ranges = dict.fromkeys(counts, (1, math.inf)) | dict.fromkeys(positive, (1e-12, math.inf))
+        if self.total_episodes is not None:
+            ranges["total_episodes"] = (1, math.inf)
+        ranges |= {"checkpoint_every": (0, math.inf)}
         ranges |= {"tau": (1e-12, 1), "gamma": (0, 1 - 1e-12), "seed": (0, FIRST_RESERVED_SEED - 1)}
         ranges |= dict.fromkeys(("exploration_noise", "final_exploration_noise", "policy_noise"), (0, 10))
         ranges |= dict.fromkeys(("noise_clip", "saturation_weight", "init_random_frames"), (0, math.inf))
@@ -147,6 +163,7 @@ PRESETS = {
         preset="paper",
         num_envs=1,
         total_frames=1_000_000,
+        total_episodes=20_000,
         num_cells=(512, 512, 512),
         layer_norm=False,
         observe_difference=False,
@@ -161,23 +178,104 @@ PRESETS = {
         final_exploration_noise=0.2,
         reward_scale=1.0,
         saturation_weight=0.0,
-        eval_every=10_000,
+        eval_every=2000,
     ),
 }
 
 
 def parse(recipe: str, args: list[str] | None = None) -> Config:
-    """Reads the command line: the preset first, then what overrides it."""
+    """Reads the command line: the preset first, then what overrides it; or the settings of the run to go on with."""
     first = argparse.ArgumentParser(add_help=False)
     first.add_argument("--preset", choices=sorted(PRESETS), default="fast")
-    preset = first.parse_known_args(args)[0].preset
-    return tyro.cli(Config, default=PRESETS[preset], args=args, prog=recipe, description=__doc__)
+    first.add_argument("--resume", type=Path)
+    known, others = first.parse_known_args(args)
+    if known.resume is None or {"-h", "--help"} & set(others):
+        return tyro.cli(Config, default=PRESETS[known.preset], args=args, prog=recipe, description=__doc__)
+    if others:
+        raise ValueError(f"--resume takes its settings from the run: leave out {' '.join(others)}")
+    return read_config(known.resume, guided=recipe != "td3.py")
+
+
+def read_config(folder: Path, *, guided: bool) -> Config:
+    """The settings of a run that was begun and is not complete."""
+    if not (folder / "config.json").is_file():
+        raise ValueError(f"there is no run to resume in {folder}: it holds no config.json")
+    if (folder / "eval.json").is_file():
+        raise ValueError(f"the run in {folder} is complete: its numbers are in {folder / 'eval.json'}")
+    try:
+        settings = json.loads((folder / "config.json").read_text())
+        if settings.pop("guided") is not guided:
+            raise ValueError(f"it was begun by {'td3.py' if guided else 'td3_gradient_guided.py'}")
+        settings = {key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()}
+        return Config(**settings | {"out": folder, "resume": folder})
+    except (TypeError, ValueError, AttributeError, LookupError) as error:
+        raise ValueError(f"cannot resume from {folder / 'config.json'}: {error}") from error
+
+
+class Learner:
+    """TD3: the networks, TorchRL's loss over them, and their optimisers."""
+
+    def __init__(self, config: Config, view: td3.PolicyConfig, device: torch.device) -> None:
+        self.config, self.updates = config, 0
+        self.actor, critic = td3.make_actor(view, device), td3.make_critic(view, device)
+        noise = {"policy_noise": config.policy_noise, "noise_clip": config.noise_clip}
+        self.loss = td3.make_loss(self.actor, critic, gamma=config.gamma, **noise)
+        self.soft_update = SoftUpdate(self.loss, tau=config.tau)
+        self.critic_optimiser, self.actor_optimiser = (
+            torch.optim.Adam(params.flatten_keys().values(), lr=config.learning_rate, fused=True)
+            for params in (self.loss.qvalue_network_params, self.loss.actor_network_params)
+        )
+        self.loss_critic, self.loss_actor = torch.zeros(()), torch.zeros(())
+
+    def anneal(self, left: float) -> None:
+        """Sets the learning rate on its line, of which the share ``left`` is still to go."""
+        start, end = self.config.learning_rate, self.config.final_learning_rate
+        for optimiser in (self.critic_optimiser, self.actor_optimiser):
+            for group in optimiser.param_groups:
+                group["lr"] = end + left * (start - end)
+
+    def update(self, transitions: TensorDictBase, saturation_weight: float) -> None:
+        """One gradient step of the critics and, every ``policy_delay`` of them, of the actor and the targets."""
+        self.loss_critic, _ = self.loss.value_loss(transitions)
+        step(self.critic_optimiser, self.loss_critic)
+        self.updates += 1
+        if self.updates % self.config.policy_delay == 0:
+            self.loss_actor, _ = self.loss.actor_loss(transitions)
+            penalty = td3.saturation_penalty(self.loss, transitions) if saturation_weight else 0.0
+            step(self.actor_optimiser, self.loss_actor + saturation_weight * penalty)
+            self.soft_update.step()
+
+    def check(self) -> None:
+        """Stops at a loss or a weight that is not a number."""
+        what = f"after update {self.updates}"
+        check_finite((("loss_critic", self.loss_critic), ("loss_actor", self.loss_actor)), what)
+        check_finite(self.loss.named_parameters(), what)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, targets, moments of Adam, counts."""
+        parts = {"loss": self.loss, "critic": self.critic_optimiser, "actor": self.actor_optimiser}
+        state = {name: part.state_dict() for name, part in parts.items()}
+        return state | {"updates": self.updates, "losses": (self.loss_critic.item(), self.loss_actor.item())}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Goes on from there."""
+        self.loss.load_state_dict(state_dict["loss"])
+        self.critic_optimiser.load_state_dict(state_dict["critic"])
+        self.actor_optimiser.load_state_dict(state_dict["actor"])
+        self.updates = state_dict["updates"]
+        self.loss_critic, self.loss_actor = (torch.tensor(loss) for loss in state_dict["losses"])
 
 
 def train(config: Config, *, guided: bool = True) -> dict[str, float]:
     """Trains, evaluates and writes the run folder; returns what is in its ``eval.json``."""
     name = "td3_gradient_guided" if guided else "td3"
-    folder = create_run_folder(config.out or Path("runs") / f"{name}-{config.preset}-seed{config.seed}")
+    folder = config.out or Path("runs") / f"{name}-{config.preset}-seed{config.seed}"
+    with locked(config.resume or create_run_folder(folder)):
+        return train_in(folder, config, name=name, guided=guided)
+
+
+def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[str, float]:
+    """The training itself, in a folder that is this process's own."""
     torchrl_logger.setLevel("WARNING")
     torch.manual_seed(config.seed)
 
@@ -201,19 +299,9 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
         base, Compose(*guidance, *td3.observation_transforms(view), td3.action_transform(view), *rewards)
     )
 
-    # Networks, loss, optimisers
-    actor, critic = td3.make_actor(view, env.device), td3.make_critic(view, env.device)
-    loss = td3.make_loss(
-        actor, critic, gamma=config.gamma, policy_noise=config.policy_noise, noise_clip=config.noise_clip
-    )
-    soft_update = SoftUpdate(loss, tau=config.tau)
-    critic_optimiser, actor_optimiser = (
-        torch.optim.Adam(params.flatten_keys().values(), lr=config.learning_rate, fused=True)
-        for params in (loss.qvalue_network_params, loss.actor_network_params)
-    )
-    policy = td3.FieldPolicy(view, actor).to(env.device)
-
-    # Collection and replay
+    # Learning, collection and replay
+    learner = Learner(config, view, env.device)
+    policy = td3.FieldPolicy(view, learner.actor).to(env.device)
     noise = AdditiveGaussianModule(
         spec=env.action_spec_unbatched,
         sigma_init=config.exploration_noise,
@@ -223,7 +311,7 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
     )
     collector = Collector(
         env,
-        TensorDictSequential(actor, noise),
+        TensorDictSequential(learner.actor, noise),
         frames_per_batch=config.num_envs,
         total_frames=config.total_frames,
         init_random_frames=config.init_random_frames,
@@ -234,78 +322,83 @@ def train(config: Config, *, guided: bool = True) -> dict[str, float]:
     storage = LazyTensorStorage(config.buffer_size, device=env.device)
     buffer = TensorDictReplayBuffer(storage=storage, batch_size=config.batch_size)
 
-    settings = {**asdict(config), "out": folder.name, "guided": guided}
+    # Everything that a training is made of, so that it can be put aside and taken up again
+    settings = {**asdict(config), "out": folder.name, "resume": None, "guided": guided}
     labels = {"group": f"{name}-{config.preset}", "tags": [name, config.preset]}
-    run = RunLog(folder, COLUMNS, settings, wandb_mode=config.wandb_mode, **labels)
-    tally = TrainingTally(base.destination_weight, config.reward_scale)
-    kept, kept_weights = -1.0, None
-    updates, loss_critic, loss_actor = 0, torch.zeros(()), torch.zeros(())
-    began, interrupted = time.perf_counter(), False
-    progress = tqdm(total=config.total_frames, unit="frame", unit_scale=True, desc=name, mininterval=0.5)
-    try:
-        for iteration, batch in enumerate(collector, start=1):
+    tally, best = TrainingTally(base.destination_weight, config.reward_scale), BestPolicy()
+    parts = {"learner": learner, "noise": noise, "buffer": buffer, "tally": tally, "best": best}
+    parts |= {"episodes": RunningEpisodes(collector, base), "random": GlobalRNGState()}
+    checkpoints = Checkpoints(folder / "checkpoints", parts)
+    resumed = config.resume is not None and bool(checkpoints.files())  # before the first one, the seed leads there
+    run = RunLog(folder, COLUMNS, settings, wandb_mode=config.wandb_mode, resumed=resumed, **labels)
+    checkpoints.parts["run"] = run
+    if resumed:
+        checkpoints.load()
+    saved = time.perf_counter()
+
+    progress = tqdm(
+        total=config.total_frames, initial=tally.frames, unit="frame", unit_scale=True, desc=name, mininterval=0.5
+    )
+    with StopRequest() as stop:
+        for batch in collector:
             batch = batch.reshape(-1)
+            check_finite(batch, f"after {tally.frames} frames")
             buffer.extend(batch.select(*TRANSITION))
             noise.step(batch.numel())
             tally.add(batch, guidance[-1].term(batch, batch["next"]) if guided else None)
             left = max(0.0, 1 - tally.frames / config.total_frames)
-            for optimiser in (critic_optimiser, actor_optimiser):
-                anneal(optimiser, config.learning_rate, config.final_learning_rate, left)
-
+            learner.anneal(left)
             for _ in range(config.updates_per_batch if len(buffer) >= config.batch_size else 0):
-                transitions = buffer.sample()
-                loss_critic, _ = loss.value_loss(transitions)
-                step(critic_optimiser, loss_critic)
-                updates += 1
-                if updates % config.policy_delay == 0:
-                    loss_actor, _ = loss.actor_loss(transitions)
-                    weight = left * config.saturation_weight
-                    penalty = td3.saturation_penalty(loss, transitions) if weight else 0.0
-                    step(actor_optimiser, loss_actor + weight * penalty)
-                    soft_update.step()
+                learner.update(buffer.sample(), left * config.saturation_weight)
+            learner.check()
 
-            if iteration % config.eval_every == 0 or tally.frames >= config.total_frames:
+            done = tally.frames >= config.total_frames or tally.episodes >= (config.total_episodes or math.inf)
+            if done or tally.frames // config.num_envs % config.eval_every == 0:
                 small = summarise(episode_measures(td3.evaluation_rollout(small_env, policy)))
-                if small["spl"] > kept:
-                    kept, kept_weights = small["spl"], copy.deepcopy(actor.state_dict())
-                row = {"frames": tally.frames, "episodes": tally.episodes, "updates": updates}
-                row |= {"seconds": time.perf_counter() - began, **tally.row()}
-                row |= {"loss_critic": loss_critic.item(), "loss_actor": loss_actor.item()}
+                best.offer(small["spl"], learner.actor)
+                row = {"frames": tally.frames, "episodes": tally.episodes, "updates": learner.updates}
+                row |= {"seconds": run.seconds, **tally.row()}
+                row |= {"loss_critic": learner.loss_critic.item(), "loss_actor": learner.loss_actor.item()}
                 run.row(row | {f"eval_{key}": small[key] for key in EVALUATED})
                 progress.set_postfix_str(
                     f"SR {small['success_rate']:.1f} %, SPL {small['spl']:.1f} %, return {row['return']:.0f}"
                 )
             progress.update(batch.numel())
-    except KeyboardInterrupt:
-        interrupted = True
-    seconds = time.perf_counter() - began
+            if done:
+                break
+            if stop.exit_code or time.perf_counter() - saved >= config.checkpoint_every:
+                checkpoints.save(tally.frames)
+                saved = time.perf_counter()
+            if stop.exit_code:
+                break
+    seconds = run.seconds
     progress.close()
     collector.shutdown()
 
     # What is left behind: the policy that was best on the small set, its numbers on tasks that it never saw, pictures
-    actor.load_state_dict(kept_weights or actor.state_dict())
+    learner.actor.load_state_dict(best.weights or learner.actor.state_dict())
     td3.save_policy(folder / "policy.pt", policy)
     if run.rows:
         run.figure("training", plots.training_figure(run.rows))
-    if interrupted:
+    if stop.exit_code:
         run.close()
-        print(f"\nStopped after {tally.frames} frames; the policy so far is {folder / 'policy.pt'}", file=sys.stderr)
-        raise SystemExit(130)
+        print(
+            f"\nStopped after {tally.frames} frames; the policy so far is {folder / 'policy.pt'}\n"
+            f"To go on: --resume {folder}",
+            file=sys.stderr,
+        )
+        raise SystemExit(stop.exit_code)
     rollout = td3.evaluation_rollout(final_env, policy)
     result = summarise(episode_measures(rollout)) | {"seed": config.seed, "tasks_seed": TEST_SEED}
-    result |= {"frames": tally.frames, "updates": updates, "training_seconds": seconds}
+    result |= {"frames": tally.frames, "episodes": tally.episodes, "updates": learner.updates}
+    result |= {"training_seconds": seconds}
     result |= {"seconds_to_97_sr_88_spl": next((r["seconds"] for r in run.rows if passes_paper(r)), math.nan)}
     run.figure("trajectories", plots.trajectories_figure(rollout, base.field, base.region))
     run.result(result)
     run.close()
+    checkpoints.clear()
     report(folder, result)
     return result
-
-
-def anneal(optimiser: torch.optim.Optimizer, start: float, end: float, left: float) -> None:
-    """Sets the learning rate on the line from ``start`` to ``end``, of which the share ``left`` is still to go."""
-    for group in optimiser.param_groups:
-        group["lr"] = end + left * (start - end)
 
 
 def step(optimiser: torch.optim.Optimizer, loss: torch.Tensor) -> None:
@@ -333,12 +426,8 @@ def report(folder: Path, result: dict[str, float]) -> None:
 def main(recipe: str, *, guided: bool) -> None:
     """The command: what cannot be run as asked is said in a line, without a traceback."""
     try:
-        config = parse(recipe)
-    except ValueError as error:
-        sys.exit(f"{recipe}: {error}")
-    try:
-        train(config, guided=guided)
-    except FileExistsError as error:
+        train(parse(recipe), guided=guided)
+    except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"{recipe}: {error}")
 
 

@@ -5,6 +5,8 @@ import dataclasses
 import importlib.util
 import json
 import math
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -44,11 +46,17 @@ def settings(recipe, out: Path, **options):
     return dataclasses.replace(recipe.Config(), out=out, **SMALL | options)
 
 
+def rows(folder: Path) -> list[dict[str, str]]:
+    """The curves of a run, without their timing."""
+    with (folder / "train.csv").open() as file:
+        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+
+
 @pytest.mark.parametrize("guided", [True, False])
 def test_run_folder(recipe, tmp_path: Path, guided: bool) -> None:
     out = tmp_path / "run"
     result = recipe.train(settings(recipe, out), guided=guided)
-    names = {"config.json", "train.csv", "policy.pt", "eval.json", "training.png", "trajectories.png"}
+    names = {".lock", "config.json", "train.csv", "policy.pt", "eval.json", "training.png", "trajectories.png"}
     assert {path.name for path in out.iterdir()} == names
     written = json.loads((out / "eval.json").read_text())
     needed = {"success_rate", "spl", "trajectory_length_m", "steps", "navigation_error_km", "num_tasks", "seed"}
@@ -56,11 +64,9 @@ def test_run_folder(recipe, tmp_path: Path, guided: bool) -> None:
     assert (written["num_tasks"], written["seed"], written["frames"]) == (6, 0, 320)
     assert written["spl"] == result["spl"]
     assert json.loads((out / "config.json").read_text())["guided"] is guided
-    with (out / "train.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [int(row["frames"]) for row in rows] == [160, 320]
-    assert [int(row["updates"]) for row in rows] == [9, 19]
-    aligned = [float(row["reward_alignment"]) != 0 for row in rows]
+    assert [int(row["frames"]) for row in rows(out)] == [160, 320]
+    assert [int(row["updates"]) for row in rows(out)] == [9, 19]
+    aligned = [float(row["reward_alignment"]) != 0 for row in rows(out)]
     assert aligned == [guided, guided]
     env = GeomagneticNavEnv(num_envs=3, seed=0)
     assert env.rollout(2, td3.load_policy(out / "policy.pt"))["action"].isfinite().all()
@@ -69,34 +75,42 @@ def test_run_folder(recipe, tmp_path: Path, guided: bool) -> None:
 def test_same_seed_same_numbers(recipe, tmp_path: Path) -> None:
     def trained(name: str, seed: int) -> tuple[dict, list]:
         recipe.train(settings(recipe, tmp_path / name, seed=seed))
-        with (tmp_path / name / "train.csv").open() as file:
-            rows = [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
-        return td3.load_policy(tmp_path / name / "policy.pt").state_dict(), rows
+        return td3.load_policy(tmp_path / name / "policy.pt").state_dict(), rows(tmp_path / name)
 
     (one, rows_one), (again, rows_again), (_, rows_other) = trained("a", 1), trained("b", 1), trained("c", 2)
     assert rows_one == rows_again != rows_other
     assert all(torch.equal(one[key], again[key]) for key in one)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("frames", [240, 96], ids=["after an evaluation", "before any"])
-def test_interrupt_keeps_what_was_learned(recipe, tmp_path: Path, monkeypatch, capsys, frames: int) -> None:
+def test_stopped_training_goes_on_as_if_it_had_not(recipe, tmp_path: Path, monkeypatch, capsys, frames, number) -> None:
+    """Ctrl-C and SIGTERM: the iteration is finished, the policy and a checkpoint are kept, and --resume is exact."""
     calls = []
 
-    def interrupted(*args):
+    def stopped(*args):
         calls.append(args)
-        if len(calls) == 2 * frames // 16:
-            raise KeyboardInterrupt
+        if len(calls) == frames // 16:
+            os.kill(os.getpid(), number)
         return anneal(*args)
 
-    anneal = recipe.anneal
-    monkeypatch.setattr(recipe, "anneal", interrupted)
+    anneal = recipe.Learner.anneal
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    monkeypatch.setattr(recipe.Learner, "anneal", stopped)
     with pytest.raises(SystemExit) as stop:
-        recipe.train(settings(recipe, tmp_path / "run"))
-    assert stop.value.code == 130
+        recipe.train(settings(recipe, run))
+    assert stop.value.code == 128 + number
     assert f"Stopped after {frames} frames" in capsys.readouterr().err
-    assert td3.load_policy(tmp_path / "run" / "policy.pt").config.num_cells == (16, 16)
-    assert (tmp_path / "run" / "training.png").exists() == (frames >= 160)
-    assert not (tmp_path / "run" / "eval.json").exists()
+    assert td3.load_policy(run / "policy.pt").config.num_cells == (16, 16)
+    assert (run / "training.png").exists() == (frames >= 160)
+    assert not (run / "eval.json").exists()
+    monkeypatch.setattr(recipe.Learner, "anneal", anneal)
+    recipe.train(recipe.parse("td3_gradient_guided.py", ["--resume", str(run)]))
+    recipe.train(settings(recipe, whole))
+    assert rows(run) == rows(whole)
+    weights, others = (td3.load_policy(folder / "policy.pt").state_dict() for folder in (run, whole))
+    assert all(torch.equal(weights[key], others[key]) for key in weights)
+    assert not (run / "checkpoints").exists()
 
 
 def test_folder_in_use_is_refused(recipe, tmp_path: Path) -> None:
