@@ -20,7 +20,7 @@ import json
 import math
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -136,6 +136,13 @@ class Config:
     """Tasks of the final evaluation."""
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            value, kind = getattr(self, field.name), type(field.default)
+            fits = isinstance(value, (int, float) if kind is float else kind) and (kind is bool) == isinstance(
+                value, bool
+            )
+            if not fits and field.default is not None:
+                raise ValueError(f"{field.name} must be of type {kind.__name__}, got {value!r}")
         for name, kind in (("preset", ("fast", "paper")), ("wandb_mode", ("offline", "online", "disabled"))):
             if getattr(self, name) not in kind:
                 raise ValueError(f"{name} must be one of {kind}, got {getattr(self, name)!r}")
