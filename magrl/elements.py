@@ -1,7 +1,8 @@
 """The magnetic elements: a field vector seen as angles and intensities (Eq. 2-1, with true signs).
 
 The paper's arccos loses the sign of both angles; ``atan2`` keeps it. Declination and inclination are in degrees,
-intensities in nanotesla. The three elements that the agent reads are ordered D, I, B_H everywhere.
+intensities in nanotesla. The three elements that the agent reads are ordered D, I, B_H everywhere. A component that is
+NaN makes NaN of every element and derivative that depends on it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from magrl.geodesy import check_tensor
 
 NAMES = ("D", "I", "B_H")
 """The elements that a vehicle measures, in the order of every ``field`` tensor."""
@@ -57,6 +60,7 @@ def seven_elements(b_ned: Tensor) -> Elements:
         >>> float(e.B_F), round(float(e.I), 2)
         (50000.0, -53.13)
     """
+    check_tensor(3, b_ned=b_ned)
     north, east, down = b_ned.unbind(-1)
     horizontal = torch.hypot(north, east)
     declination = torch.rad2deg(torch.atan2(east + 0.0, north + 0.0))  # adding zero takes the sign off a zero
@@ -93,6 +97,7 @@ def field_vector(elements: Tensor) -> Tensor:
         >>> field_vector(torch.tensor([90.0, 0.0, 30000.0])).round()
         tensor([   -0., 30000.,     0.])
     """
+    check_tensor(3, elements=elements)
     declination, inclination = torch.deg2rad(elements[..., :2]).unbind(-1)
     horizontal = elements[..., 2]
     return torch.stack(
@@ -115,13 +120,14 @@ def elements_jacobian(b_ned: Tensor) -> Tensor:
         >>> elements_jacobian(torch.tensor([100.0, 0.0, 0.0]))[0, 1].deg2rad()  # D turns by 1/B_H per nT eastward
         tensor(0.0100)
     """
+    check_tensor(3, b_ned=b_ned)
     north, east, down = b_ned.unbind(-1)
     horizontal2 = north * north + east * east
     horizontal = torch.sqrt(horizontal2)
     total2 = horizontal2 + down * down
-    defined = horizontal2 > 0
+    defined = horizontal2 != 0  # NaN is left to become NaN
     inverse = torch.where(defined, 1 / torch.where(defined, horizontal, 1.0), 0.0)
-    inverse_total2 = torch.where(total2 > 0, 1 / torch.where(total2 > 0, total2, 1.0), 0.0)
+    inverse_total2 = torch.where(total2 != 0, 1 / torch.where(total2 != 0, total2, 1.0), 0.0)
     unit_north, unit_east = north * inverse, east * inverse
     zero = torch.zeros_like(north)
     d_row = torch.rad2deg(torch.stack((-unit_east * inverse, unit_north * inverse, zero), -1))
@@ -144,4 +150,5 @@ def elements_gradient(b_ned: Tensor, b_gradient: Tensor) -> Tensor:
         >>> elements_gradient(torch.ones(3), torch.zeros(3, 2)).shape
         torch.Size([3, 2])
     """
+    check_tensor(3, 2, b_gradient=b_gradient)
     return elements_jacobian(b_ned) @ b_gradient

@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 
 from magrl import guidance
 from magrl.fields import IGRF, Date, FieldModel, elements_at, elements_range
-from magrl.geodesy import move, wrap_angle
+from magrl.geodesy import check_number, check_numbers, check_type, move, wrap_angle
 from magrl.regional import RegionalField
 from magrl.tasks import (
     PAPER_DISTANCE_KM,
@@ -81,10 +81,15 @@ def paper_field(
 def flown_box(region: Region, margin_deg: float, max_move_km: float) -> Region:
     """Every place that a vehicle can reach: the region, its margin, and one move beyond, to the next half degree.
 
+    Raises:
+        ValueError: for a margin or a move that is negative or not finite.
+
     Example:
         >>> flown_box(PAPER_REGION, margin_deg=5, max_move_km=50)
         Region(latitude=(-15.5, 5.5), longitude=(154.5, 175.5))
     """
+    check_type(Region, region=region)
+    check_number(0, margin_deg=margin_deg, max_move_km=max_move_km)
     edge = region.expanded(margin_deg)
     reach = math.radians(max_move_km / SHORTEST_DEGREE_KM)
     nearest_pole = math.radians(90 - max(abs(x) for x in edge.latitude))
@@ -157,19 +162,21 @@ class GeomagneticNavEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        _check_positive_int(num_envs=num_envs, max_steps=max_steps)
-        _check_positive(max_move_km=max_move_km, max_turn_rad=max_turn_rad, zeta=zeta)
-        _check_non_negative(
-            destination_weight=destination_weight, proximity_weight=proximity_weight, margin_deg=margin_deg
-        )
-        if max_move_km > 1000:
-            raise ValueError(f"max_move_km must be at most 1000, got {max_move_km}: a move is one short leg")
-        if max_turn_rad > math.pi:
-            raise ValueError(f"max_turn_rad must be at most pi, got {max_turn_rad}")
+        check_number(1, whole=True, num_envs=num_envs, max_steps=max_steps)
+        check_number(0, 2**64 - 1, whole=True, seed=0 if seed is None else seed)
+        check_number(0, 1000, above=True, max_move_km=max_move_km)  # a move is one short leg
+        check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
+        check_number(0, above=True, zeta=zeta)
+        check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, margin_deg=margin_deg)
         if start_heading not in ("north", "random"):
             raise ValueError(f"start_heading must be 'north' or 'random', got {start_heading!r}")
-        if len(objective_floors) != 3 or not all(math.isfinite(x) and x > 0 for x in objective_floors):
+        check_numbers(2, distance_range_km=distance_range_km)
+        check_numbers(3, objective_floors=objective_floors)
+        if min(objective_floors) <= 0:
             raise ValueError(f"objective_floors must be three positive numbers (deg, deg, nT), got {objective_floors}")
+        check_type(Region, region=region)
+        if not (field is None or callable(field)):
+            raise TypeError(f"field must be called as field(latitude, longitude), got {field!r}")
         if tasks is None:
             check_distance_range(region, distance_range_km)
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
@@ -244,8 +251,8 @@ class GeomagneticNavEnv(EnvBase):
     # Reset
 
     def _set_seed(self, seed: int | None) -> None:
-        if seed is None:
-            raise ValueError("seed must be an integer, got None")
+        check_number(0, 2**64 - 1, whole=True, seed=seed)
+        assert seed is not None  # it was refused above
         self.seed = int(seed)
         self.episode = torch.zeros_like(self.episode)
 
@@ -397,6 +404,7 @@ class GeomagneticNavEnv(EnvBase):
         """
         if not self._track:
             raise RuntimeError("there is no episode to show yet: call reset() first")
+        check_number(whole=True, vehicle=vehicle)
         if not 0 <= vehicle < self.num_envs:
             raise IndexError(f"vehicle {vehicle} is not one of the {self.num_envs} in the batch")
         since = int(self._track[-1][1][vehicle])
@@ -422,21 +430,3 @@ class GeomagneticNavEnv(EnvBase):
         paths = [self.track(vehicle).cpu() for vehicle in chosen]
         targets = self._track[-1][2][list(chosen)].cpu()
         return plots.rgb_array(plots.draw_journeys, size_px, self.field, self.region, paths, targets)
-
-
-def _check_positive_int(**options: int) -> None:
-    for name, value in options.items():
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-            raise ValueError(f"{name} must be a whole number from 1 on, got {value!r}")
-
-
-def _check_positive(**options: float) -> None:
-    for name, value in options.items():
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be positive and finite, got {value}")
-
-
-def _check_non_negative(**options: float) -> None:
-    for name, value in options.items():
-        if not (math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must be finite and not negative, got {value}")

@@ -3,12 +3,18 @@
 Latitudes and longitudes are geodetic and in degrees, distances in kilometres, headings and bearings in
 radians clockwise from true north. Every function is pure, batched by broadcasting, and smooth across the
 antimeridian; nothing here divides by the cosine of the latitude, so the poles are ordinary points.
+
+Types, dtypes and shapes are checked, and refused by name. Values are not, because looking at them would make an
+accelerator wait at every step: NaN or infinity in gives NaN out, and a latitude beyond 90 degrees goes on over the
+pole. Only :func:`geodesic` refuses such a latitude. The modules above use the checks at the end of this one.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from functools import reduce
+from numbers import Integral, Real
 
 import torch
 from torch import Tensor
@@ -36,6 +42,7 @@ def wrap_angle(angle: Tensor) -> Tensor:
         >>> wrap_angle(torch.tensor([3.5 * math.pi, -math.pi])) / math.pi
         tensor([-0.5000,  1.0000])
     """
+    check_tensor(angle=angle)
     wrapped = math.pi - torch.remainder(math.pi - angle, 2 * math.pi)
     # In float32 the remainder of a tiny negative number rounds up to the full turn.
     return torch.where(wrapped <= -math.pi, wrapped + 2 * math.pi, wrapped)
@@ -54,6 +61,7 @@ def wrap_longitude(longitude: Tensor) -> Tensor:
         >>> wrap_longitude(torch.tensor([181.0, -180.0, 540.0]))
         tensor([-179.,  180.,  180.])
     """
+    check_tensor(longitude=longitude)
     wrapped = 180 - torch.remainder(180 - longitude, 360)
     return torch.where(wrapped <= -180, wrapped + 360, wrapped)
 
@@ -71,6 +79,7 @@ def curvature_radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
         >>> [round(float(r), 3) for r in curvature_radii(torch.zeros((), dtype=torch.float64))]
         [6335.439, 6378.137]
     """
+    check_tensor(latitude=latitude)
     w2 = 1 - WGS84_E2 * torch.sin(torch.deg2rad(latitude)) ** 2
     prime_vertical = WGS84_A_KM / torch.sqrt(w2)
     return prime_vertical * (1 - WGS84_E2) / w2, prime_vertical
@@ -92,6 +101,7 @@ def local_frame(latitude: Tensor, longitude: Tensor) -> Tensor:
                 [-0.,  1.,  0.],
                 [-1., -0., -0.]])
     """
+    check_tensor(latitude=latitude, longitude=longitude)
     phi, lam = torch.deg2rad(latitude), torch.deg2rad(longitude)
     sp, cp, sl, cl = torch.sin(phi), torch.cos(phi), torch.sin(lam), torch.cos(lam)
     sp, cp, sl, cl = torch.broadcast_tensors(sp, cp, sl, cl)
@@ -114,6 +124,9 @@ def to_ecef(latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float = 0
         >>> to_ecef(torch.tensor(0.0), torch.tensor(90.0)).round()
         tensor([  -0., 6378.,    0.])
     """
+    check_tensor(latitude=latitude, longitude=longitude)
+    if isinstance(altitude_km, Tensor):
+        check_tensor(altitude_km=altitude_km)
     phi, lam = torch.deg2rad(latitude), torch.deg2rad(longitude)
     _, prime_vertical = curvature_radii(latitude)
     horizontal = (prime_vertical + altitude_km) * torch.cos(phi)
@@ -138,6 +151,7 @@ def from_ecef_surface(ecef: Tensor) -> tuple[Tensor, Tensor]:
         >>> round(float(lat), 3), round(float(lon), 3)
         (-8.0, 164.0)
     """
+    check_tensor(3, ecef=ecef)
     x, y, z = ecef.unbind(-1)
     horizontal = torch.hypot(x, y)
     reduced = torch.atan2(z * WGS84_A_KM, horizontal * WGS84_B_KM)
@@ -167,6 +181,7 @@ def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tens
         >>> round(float(lat), 4), round(float(lon), 4)
         (0.0, -179.6508)
     """
+    check_tensor(latitude=latitude, longitude=longitude, heading=heading, distance_km=distance_km)
     sin, cos = torch.sin(heading), torch.cos(heading)
     meridian, prime_vertical = curvature_radii(latitude)
     radius = 1 / (cos**2 / meridian + sin**2 / prime_vertical)
@@ -192,7 +207,10 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
 
     Returns:
         The distance [km] and the bearing at the start [rad, clockwise from true north, (-pi, pi]], each ``(...)``;
-        zero and zero for coincident points.
+        zero and zero for coincident points, NaN where an input is NaN or a longitude infinite.
+
+    Raises:
+        ValueError: naming a latitude that is beyond 90 degrees.
 
     Source:
         T. Vincenty, Direct and inverse solutions of geodesics on the ellipsoid, Survey Review 23 (1975).
@@ -203,6 +221,11 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
         (699.56, 161.594)
     """
     inputs = (latitude1, longitude1, latitude2, longitude2)
+    check_tensor(latitude1=latitude1, longitude1=longitude1, latitude2=latitude2, longitude2=longitude2)
+    for latitude in (latitude1, latitude2):
+        beyond = latitude.abs() > 90
+        if beyond.any():
+            raise ValueError(f"latitude {latitude[beyond][0].item()} is not between -90 and 90 degrees")
     lat1, lon1, lat2, lon2 = (torch.deg2rad(x.double()) for x in torch.broadcast_tensors(*inputs))
     u1, u2 = (torch.atan2((1 - WGS84_F) * torch.sin(lat), torch.cos(lat)) for lat in (lat1, lat2))
     su1, cu1, su2, cu2 = torch.sin(u1), torch.cos(u1), torch.sin(u2), torch.cos(u2)
@@ -234,3 +257,93 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
     bearing = wrap_angle(torch.atan2(x, y))
     dtype = reduce(torch.promote_types, (x.dtype for x in inputs), torch.float32)
     return torch.where(converged, distance, nan).to(dtype), torch.where(converged, bearing, nan).to(dtype)
+
+
+def check_tensor(*last: int, **tensors: object) -> None:
+    """Refuses what is no tensor of real numbers, or does not end in the dimensions ``last``.
+
+    Args:
+        last: sizes of the last dimensions; any shape will do without them.
+        tensors: by the name that the message shall give them.
+
+    Raises:
+        TypeError: for what is no tensor, or one of bools or of complex numbers.
+        ValueError: for another shape.
+
+    Example:
+        >>> check_tensor(3, b_ned=torch.zeros(5, 2))
+        Traceback (most recent call last):
+        ValueError: b_ned must have the shape (..., 3), got (5, 2)
+    """
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, Tensor):
+            raise TypeError(f"{name} must be a tensor, got the {type(tensor).__name__} {tensor!r}")
+        if tensor.is_complex() or tensor.dtype == torch.bool:
+            raise TypeError(f"{name} must hold real numbers, got {tensor.dtype}")
+        if last and tensor.shape[-len(last) :] != last:
+            wanted = ", ".join(map(str, last))
+            raise ValueError(f"{name} must have the shape (..., {wanted}), got {tuple(tensor.shape)}")
+
+
+def check_number(
+    low: float = -math.inf, high: float = math.inf, *, above: bool = False, whole: bool = False, **numbers: object
+) -> None:
+    """Refuses what is no finite number from ``low`` to ``high``.
+
+    Args:
+        low: least that is allowed.
+        high: most that is allowed.
+        above: whether ``low`` itself is refused.
+        whole: whether fractions are refused.
+        numbers: by the name that the message shall give them.
+
+    Raises:
+        ValueError: with the name and the value.
+
+    Example:
+        >>> check_number(1, whole=True, num_envs=1.5)
+        Traceback (most recent call last):
+        ValueError: num_envs must be a whole number from 1 on, got 1.5
+    """
+    for name, value in numbers.items():
+        sound = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
+        if not (sound and math.isfinite(value) and low <= value <= high and not (above and value == low)):  # type: ignore
+            kind = "a whole number" if whole else "a finite number"
+            start = "" if low == -math.inf else f" {'above' if above else 'from'} {low:g}"
+            end = f" up to {high:g}" if high < math.inf else " on" if start and not above else ""
+            raise ValueError(f"{name} must be {kind}{start}{end}, got {value!r}")
+
+
+def check_numbers(count: int, **values: object) -> None:
+    """Refuses what is not ``count`` finite numbers.
+
+    Raises:
+        ValueError: with the name and the values.
+
+    Example:
+        >>> check_numbers(2, interval=(0.0, "a"))
+        Traceback (most recent call last):
+        ValueError: interval must be 2 finite numbers, got (0.0, 'a')
+    """
+    for name, value in values.items():
+        given = list(value) if isinstance(value, Iterable) else []
+        sound = all(isinstance(x, Real) and not isinstance(x, bool) and math.isfinite(x) for x in given)
+        if len(given) != count or not sound:
+            raise ValueError(f"{name} must be {count} finite numbers, got {value!r}")
+
+
+def check_type(kind: type | tuple[type, ...], **values: object) -> None:
+    """Refuses what is no instance of a class.
+
+    Raises:
+        TypeError: with the name and the value.
+
+    Example:
+        >>> check_type(str, name=5)
+        Traceback (most recent call last):
+        TypeError: name must be a str, got 5
+    """
+    for name, value in values.items():
+        if not isinstance(value, kind):
+            kinds = kind if isinstance(kind, tuple) else (kind,)
+            raise TypeError(f"{name} must be a {' or '.join(k.__name__ for k in kinds)}, got {value!r}")

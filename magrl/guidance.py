@@ -3,6 +3,9 @@
 Nothing here knows of environments or keys. Shapes broadcast over leading dimensions; angles are in radians
 clockwise from true north unless a name says otherwise; the last dimension of a ``field`` is the element
 (D [deg], I [deg], B_H [nT]).
+
+These run in every step, so types and shapes are checked and values are not: NaN in gives NaN out, but for
+:func:`parallel_approach`, whose mask is False there.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from magrl.geodesy import wrap_angle
+from magrl.geodesy import check_tensor, wrap_angle
 
 OBJECTIVE_FLOORS = (0.05, 0.4, 15.0)
 """Least |B_T - B_0| of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 25 km of travel each."""
@@ -29,10 +32,14 @@ def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Te
     Returns:
         ``(..., E)`` weights, per squared unit.
 
+    Raises:
+        ValueError: where E is not one number of elements.
+
     Example:
         >>> objective_weights(torch.tensor([8.0, -16.0]), torch.tensor([10.0, -16.0]), torch.tensor([0.05, 0.5]))
         tensor([0.2500, 4.0000])
     """
+    _check_elements(field=field, target_field=target_field, floors=floors)
     return (target_field - field).abs().maximum(floors).square().reciprocal()
 
 
@@ -47,10 +54,14 @@ def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
     Returns:
         ``(..., 1)``, dimensionless: at most E at the start, 0 at the destination.
 
+    Raises:
+        ValueError: where E is not one number of elements.
+
     Example:
         >>> objective(torch.tensor([9.0, -16.0]), torch.tensor([10.0, -16.0]), torch.tensor([0.25, 4.0]))
         tensor([0.2500])
     """
+    _check_elements(field=field, target_field=target_field, weights=weights)
     return (weights * (target_field - field).square()).sum(-1, keepdim=True)
 
 
@@ -61,7 +72,18 @@ def destination_reward(arrived: Tensor, weight: float) -> Tensor:
         >>> destination_reward(torch.tensor([True, False]), 200.0)
         tensor([200.,   0.])
     """
+    if not isinstance(arrived, Tensor) or arrived.dtype != torch.bool:
+        raise TypeError(f"arrived must be a tensor of bools, got {getattr(arrived, 'dtype', arrived)!r}")
     return weight * arrived
+
+
+def _check_elements(**fields: Tensor) -> None:
+    """Refuses tensors whose last dimensions, the elements, differ: one of size 1 would be spread over all of them."""
+    check_tensor(**fields)
+    sizes = {tensor.shape[-1:] for tensor in fields.values()}
+    if len(sizes) != 1 or torch.Size() in sizes:
+        shapes = ", ".join(f"{name} {tuple(tensor.shape)}" for name, tensor in fields.items())
+        raise ValueError(f"the last dimensions must be the same elements, got {shapes}")
 
 
 def proximity_reward(objective_before: Tensor, objective_after: Tensor, weight: float) -> Tensor:
@@ -79,6 +101,7 @@ def proximity_reward(objective_before: Tensor, objective_after: Tensor, weight: 
         >>> proximity_reward(torch.tensor(2.0), torch.tensor(1.5), 10.0)
         tensor(5.)
     """
+    check_tensor(objective_before=objective_before, objective_after=objective_after)
     return -weight * (objective_after - objective_before)
 
 
@@ -99,6 +122,9 @@ def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
         >>> late_decay(torch.tensor([4.0, 4.0, -4.0]), torch.tensor([25, 40, 40]), 50)
         tensor([ 4.0000,  0.8000, -7.2000])
     """
+    check_tensor(proximity=proximity, step=step)
+    if not max_steps >= 1:
+        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     late = step > max_steps / 2
     return proximity - late * (step.to(proximity.dtype) / max_steps) * proximity.abs()
 
@@ -120,6 +146,7 @@ def alignment_reward(angle: Tensor, reference: Tensor, weight: float, offset: fl
         >>> alignment_reward(torch.tensor(math.pi), torch.tensor(-math.pi), 3.0) / 3.0 / math.pi  # the same heading
         tensor(0.2500)
     """
+    check_tensor(angle=angle, reference=reference)
     return weight * (offset - wrap_angle(angle - reference).abs())
 
 
@@ -139,7 +166,11 @@ def parallel_approach(
 
     Returns:
         The heading ``(..., 1)`` [rad, (-pi, pi]] and a mask ``(..., 1)``: False, with heading 0, where the gradients
-        are nearer to parallel than ``min_crossing``, where one vanishes, or where both elements are on target.
+        are nearer to parallel than ``min_crossing``, where one vanishes, where both elements are on target, or where an
+        input is NaN.
+
+    Raises:
+        ValueError: for other shapes, or a crossing angle outside [0, pi/2).
 
     Source:
         Eqs. 3-12 to 3-15, after the bionic navigation of Wang et al. (2018).
@@ -150,13 +181,17 @@ def parallel_approach(
         >>> round(float(torch.rad2deg(heading)), 3), bool(valid)
         (45.0, True)
     """
+    check_tensor(2, field=field, target_field=target_field)
+    check_tensor(2, 2, gradient=gradient)
+    if not 0 <= min_crossing < math.pi / 2:
+        raise ValueError(f"min_crossing must be in [0, pi/2), got {min_crossing}")
     (g1n, g1e), (g2n, g2e) = (row.unbind(-1) for row in gradient.unbind(-2))
     e1, e2 = (target_field - field).unbind(-1)
     determinant = g1n * g2e - g1e * g2n
     north, east = g2e * e1 - g1e * e2, g1n * e2 - g2n * e1
     lengths = torch.hypot(g1n, g1e) * torch.hypot(g2n, g2e)
     crosses = determinant.abs() > lengths * math.sin(min_crossing)
-    valid = crosses & ((north != 0) | (east != 0))
+    valid = crosses & (north.abs() + east.abs() > 0)
     sign = torch.sign(determinant)
     heading = torch.atan2(torch.where(valid, sign * east, 0.0), torch.where(valid, sign * north, 1.0))
     return wrap_angle(heading).unsqueeze(-1), valid.unsqueeze(-1)

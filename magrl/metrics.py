@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.geodesy import geodesic, wrap_angle
+from magrl.geodesy import check_number, check_tensor, check_type, geodesic, wrap_angle
 
 WITHIN_KM = (10, 25)
 """Distances at which a second, field-free success rate is reported [km]."""
@@ -29,10 +29,16 @@ def flown(done: Tensor) -> Tensor:
     Returns:
         ``(M, T)`` bool: True up to and including the first done.
 
+    Raises:
+        ValueError: for another shape or dtype.
+
     Example:
         >>> flown(torch.tensor([[False, True, True]]))
         tensor([[ True,  True, False]])
     """
+    check_type(Tensor, done=done)
+    if done.dtype != torch.bool or done.ndim not in (2, 3) or done.shape[2:].numel() != 1:
+        raise ValueError(f"done must be bool of shape (M, T) or (M, T, 1), got {done.dtype} of {tuple(done.shape)}")
     done = done.reshape(done.shape[:2])
     return done.long().cumsum(1) - done.long() == 0
 
@@ -50,9 +56,16 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
         ``heading_mae_deg`` and ``heading_rmse_deg``, from the bearing to the destination at each move of some
         length (NaN without any).
 
+    Raises:
+        ValueError: for a rollout of other dimensions, or of no vehicle or no step.
+        KeyError: for an entry that it lacks.
+
     Source:
         SPL: Anderson et al., On evaluation of embodied navigation agents (2018).
     """
+    check_type(TensorDictBase, rollout=rollout)
+    if rollout.ndim != 2 or 0 in rollout.shape:
+        raise ValueError(f"a rollout must be of shape (M, T), each at least 1, got {tuple(rollout.shape)}")
     valid = flown(rollout["next", "done"])
     steps = valid.sum(1)
     last = (steps - 1).unsqueeze(-1)
@@ -116,8 +129,14 @@ def summarise(episodes: dict[str, Tensor]) -> dict[str, float]:
         ``trajectory_length_m`` and ``steps`` over successes, as the paper seems to, and ``_all`` over all;
         ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg``, ``heading_rmse_deg`` over successes;
         ``num_tasks``. Means over no success at all are NaN.
+
+    Raises:
+        ValueError: for no episode, or successes that are not bool.
+        KeyError: for a measure that is missing.
     """
     success = episodes["success"]
+    if success.dtype != torch.bool or success.ndim != 1 or not len(success):
+        raise ValueError(f"success must be bool of shape (M,) with M >= 1, got {success!r}")
     count = len(success)
     rate = success.double().mean().item()
     low, high = wilson_interval(rate, count)
@@ -143,6 +162,12 @@ def bootstrap_interval(values: Tensor, resamples: int = 1000, seed: int = 0) -> 
         resamples: how often the values are drawn anew.
         seed: of the draws.
 
+    Returns:
+        Low and high end; NaN where a value is.
+
+    Raises:
+        ValueError: for no values, another shape, or no resamples.
+
     Source:
         B. Efron, Bootstrap methods: another look at the jackknife, Annals of Statistics 7 (1979).
 
@@ -150,6 +175,11 @@ def bootstrap_interval(values: Tensor, resamples: int = 1000, seed: int = 0) -> 
         >>> bootstrap_interval(torch.ones(10))
         (1.0, 1.0)
     """
+    check_tensor(values=values)
+    check_number(1, whole=True, resamples=resamples)
+    check_number(whole=True, seed=seed)
+    if values.ndim != 1 or not len(values):
+        raise ValueError(f"values must be of shape (M,) with M >= 1, got {tuple(values.shape)}")
     generator = torch.Generator().manual_seed(seed)
     draws = torch.randint(len(values), (resamples, len(values)), generator=generator)
     low, high = (
@@ -166,6 +196,9 @@ def wilson_interval(rate: float, count: int, z: float = 1.96) -> tuple[float, fl
         count: number of trials.
         z: normal quantile; 1.96 for 95 %.
 
+    Raises:
+        ValueError: for a rate outside [0, 1], or no trial.
+
     Source:
         E. B. Wilson, Probable inference, the law of succession, and statistical inference, JASA 22 (1927).
 
@@ -173,6 +206,9 @@ def wilson_interval(rate: float, count: int, z: float = 1.96) -> tuple[float, fl
         >>> [round(x, 4) for x in wilson_interval(1.0, 100)]
         [0.963, 1.0]
     """
+    check_number(0, 1, rate=rate)
+    check_number(1, whole=True, count=count)
+    check_number(0, above=True, z=z)
     centre = rate + z**2 / (2 * count)
     half = z * math.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
     scale = 1 + z**2 / count
@@ -189,6 +225,9 @@ class TrainingTally:
     """
 
     def __init__(self, destination_weight: float, reward_scale: float, window: int = 200) -> None:
+        check_number(0, destination_weight=destination_weight)
+        check_number(0, above=True, reward_scale=reward_scale)
+        check_number(1, whole=True, window=window)
         self.destination_weight, self.reward_scale = destination_weight, reward_scale
         self.frames = self.episodes = 0
         self._returns: deque[float] = deque(maxlen=window)

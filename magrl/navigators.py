@@ -17,7 +17,7 @@ from torch import Tensor
 from magrl.elements import element_index
 from magrl.env import GeomagneticNavEnv
 from magrl.fields import FieldModel, elements_gradient_at
-from magrl.geodesy import wrap_angle
+from magrl.geodesy import check_number, check_tensor, wrap_angle
 from magrl.guidance import parallel_approach
 
 ELEMENT_SCALE = (1.0, 1.0, 0.01)
@@ -39,12 +39,17 @@ def steer(
         max_turn_rad: largest turn [rad].
 
     Returns:
-        Distance [km] and turn [rad], each ``(...)``, within their bounds.
+        Distance [km] and turn [rad], each ``(...)``, within their bounds; a heading that is NaN gives a turn of NaN.
+
+    Raises:
+        ValueError: for a bound that is not positive and finite.
 
     Example:
         >>> steer(torch.zeros(2), torch.tensor([-1.0, 2.0]), torch.tensor([70.0, 70.0]), 50.0, 1.5)
         (tensor([50.,  0.]), tensor([-1.0000,  1.5000]))
     """
+    check_tensor(heading=heading, wanted=wanted, distance_km=distance_km)
+    check_number(0, above=True, max_move_km=max_move_km, max_turn_rad=max_turn_rad)
     turn = wrap_angle(wanted - heading)
     within = turn.abs() <= max_turn_rad + 1e-6  # a right angle in float32 is still a right angle
     distance = torch.where(within, distance_km.clamp(0, max_move_km), 0.0)
@@ -59,12 +64,17 @@ def displacement_to(error: Tensor, jacobian: Tensor) -> Tensor:
         jacobian: ``(..., E, 2)`` the same units per km, north and east.
 
     Returns:
-        ``(..., 2)`` north, east [km]; of singular equations, one that is finite.
+        ``(..., 2)`` north, east [km]; of singular equations, one that is finite. NaN in gives NaN out.
+
+    Raises:
+        ValueError: for shapes that do not match.
 
     Example:
         >>> displacement_to(torch.tensor([2.0, 1.0]), torch.tensor([[0.0, 0.1], [0.5, 0.0]]))
         tensor([ 2., 20.])
     """
+    check_tensor(error=error)
+    check_tensor(*error.shape[-1:], 2, jacobian=jacobian)
     wide, sides = jacobian.double(), error.double().unsqueeze(-1)  # squaring costs half of the digits
     normal, right = wide.mT @ wide, (wide.mT @ sides).squeeze(-1)
     ridge = 1e-12 * normal.diagonal(dim1=-2, dim2=-1).sum(-1) + 1e-30
@@ -85,6 +95,10 @@ def broyden_update(jacobian: Tensor, displacement: Tensor, change: Tensor, direc
 
     Returns:
         ``(..., E, 2)`` with ``J_new displacement = change``; the old one where there was no move along ``direction``.
+        NaN in gives NaN out.
+
+    Raises:
+        ValueError: for shapes that do not match.
 
     Source:
         C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, Math. Comp. 19 (1965).
@@ -94,11 +108,14 @@ def broyden_update(jacobian: Tensor, displacement: Tensor, change: Tensor, direc
         tensor([[0.0200, 0.0000]])
     """
     direction = displacement if direction is None else direction
+    check_tensor(2, displacement=displacement, direction=direction)
+    check_tensor(change=change)
+    check_tensor(*change.shape[-1:], 2, jacobian=jacobian)
     surprise = change - (jacobian @ displacement.unsqueeze(-1)).squeeze(-1)
     along = (direction * displacement).sum(-1)[..., None, None]
     rank_one = surprise.unsqueeze(-1) * direction.unsqueeze(-2)
-    moved = along > 1e-9
-    return torch.where(moved, jacobian + rank_one / torch.where(moved, along, 1.0), jacobian)
+    still = along <= 1e-9  # which NaN is not
+    return torch.where(still, jacobian, jacobian + rank_one / torch.where(still, 1.0, along))
 
 
 def element_indices(elements: Sequence[str], least: int) -> list[int]:
@@ -107,6 +124,8 @@ def element_indices(elements: Sequence[str], least: int) -> list[int]:
     Raises:
         ValueError: for an unknown name, one that is repeated, or fewer than ``least``.
     """
+    if isinstance(elements, str) or not isinstance(elements, Sequence):
+        raise ValueError(f"elements must be a sequence of D, I, B_H, got {elements!r}")
     if len(set(elements)) != len(elements) or len(elements) < least:
         raise ValueError(f"elements must be at least {least} different ones of D, I, B_H, got {tuple(elements)}")
     return [element_index(name) for name in elements]
@@ -132,10 +151,8 @@ class Navigator(TensorDictModuleBase):
 
     def __init__(self, max_move_km: float, max_turn_rad: float) -> None:
         super().__init__()
-        if not (math.isfinite(max_move_km) and max_move_km > 0):
-            raise ValueError(f"max_move_km must be positive and finite, got {max_move_km}")
-        if not 0 < max_turn_rad <= math.pi:
-            raise ValueError(f"max_turn_rad must be above 0 and at most pi, got {max_turn_rad}")
+        check_number(0, above=True, max_move_km=max_move_km)
+        check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
         self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
         self.out_keys = ["action"]
         self.memory: TensorDictBase | None = None
@@ -207,6 +224,8 @@ class ParallelApproach(Navigator):
         pair: Sequence[str] = ("D", "I"),
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
+        if not hasattr(field, "value_and_gradient"):
+            raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         self.in_keys = ["field", "target_field", "heading", "position", "step_count"]
         self.field, self.pair = field, element_indices(pair, 2)
         if len(self.pair) != 2:
@@ -259,8 +278,7 @@ class Secant(Navigator):
         elements: Sequence[str] = ("D", "I"),
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
-        if not 0 < probe_km <= max_move_km:
-            raise ValueError(f"probe_km must be above 0 and at most max_move_km {max_move_km}, got {probe_km}")
+        check_number(0, max_move_km, above=True, probe_km=probe_km)
         self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
         self.probe_km, self.elements = float(probe_km), element_indices(elements, 2)
         self.probe_turn = min(math.pi / 2, self.max_turn_rad)
@@ -293,12 +311,13 @@ class Secant(Navigator):
 
 
 def project(vector: Tensor, onto: Tensor) -> Tensor:
-    """The part of a vector along another, ``(..., 2)``; zero along a zero vector.
+    """The part of a vector along another, ``(..., 2)``; zero along a zero vector, NaN where either is NaN.
 
     Example:
         >>> project(torch.tensor([3.0, 4.0]), torch.tensor([0.0, 2.0]))
         tensor([0., 4.])
     """
+    check_tensor(2, vector=vector, onto=onto)
     square = onto.square().sum(-1, keepdim=True)
     return (vector * onto).sum(-1, keepdim=True) / torch.where(square > 0, square, 1.0) * onto
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from magrl.elements import NAMES, UNITS
 from magrl.fields import FieldModel, elements_at
-from magrl.geodesy import wrap_longitude
+from magrl.geodesy import check_number, check_tensor, check_type, wrap_longitude
 from magrl.metrics import flown
 from magrl.tasks import Region, Tasks
 
@@ -60,7 +60,11 @@ def rgb_array(draw: Callable[..., None], size_px: int, *args: Any) -> np.ndarray
 
     Returns:
         ``(size_px, size_px, 3)`` uint8.
+
+    Raises:
+        ValueError: for a size that is no positive whole number.
     """
+    check_number(1, whole=True, size_px=size_px)
     figure = Figure(figsize=(7, 7), dpi=(size_px + 0.01) / 7, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     draw(figure.subplots(), *args)
@@ -76,6 +80,8 @@ def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
         field: any model of :mod:`magrl.fields`.
         region: what to show.
     """
+    check_type(Axes, axes=axes)
+    check_type(Region, region=region)
     grid = region.grid(61)
     values = elements_at(field, grid.to(_device(field))).cpu().numpy()
     latitude, longitude = grid[:, 0, 0].numpy(), grid[0, :, 1].numpy()
@@ -104,7 +110,14 @@ def draw_journeys(axes: Axes, field: FieldModel, region: Region, paths: Sequence
         region: where tasks lie; what strays beyond it is shown too.
         paths: one ``(T, 2)`` latitude, longitude [deg] for each journey.
         targets: ``(len(paths), 2)`` [deg].
+
+    Raises:
+        ValueError: for no path, or another number of targets.
     """
+    check_type(Region, region=region)
+    check_tensor(2, targets=targets)
+    if not len(paths) or targets.shape != (len(paths), 2):
+        raise ValueError(f"there must be one target for each path, got {len(paths)} and {tuple(targets.shape)}")
     centre = sum(region.longitude) / 2
     unwrapped = [torch.stack((p[:, 0], centre + wrap_longitude(p[:, 1] - centre)), -1) for p in paths]
     ends = torch.stack((targets[:, 0], centre + wrap_longitude(targets[:, 1] - centre)), -1)
@@ -131,7 +144,12 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
 
     Args:
         rows: of a ``train.csv``; values that are missing or NaN are left out.
+
+    Raises:
+        ValueError: for no row, or one without ``frames``.
     """
+    if not rows or not all("frames" in row for row in rows):
+        raise ValueError(f"each row of a training must have its frames, got {list(rows)[:1]}")
     figure = Figure(figsize=(10, 7), layout="constrained")
     frames = np.array([row["frames"] for row in rows])
     for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, TRAINING_PANELS.items(), strict=True):
@@ -158,6 +176,8 @@ def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Regi
         region: where tasks lie.
         journeys: how many to show.
     """
+    check_type(TensorDictBase, rollout=rollout)
+    check_number(1, whole=True, journeys=journeys)
     shown = rollout[:journeys].cpu()
     steps = flown(shown["next", "done"]).sum(1)
     paths = [
@@ -167,6 +187,12 @@ def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Regi
     figure = Figure(figsize=(8, 8.4), layout="constrained")
     draw_journeys(figure.subplots(), field, region, paths, shown["target_position"][:, 0])
     return figure
+
+
+def _check_navigators(named: Mapping[str, Any]) -> None:
+    unknown = [name for name in named if name not in NAVIGATOR_NAMES]
+    if unknown or not named:
+        raise ValueError(f"navigators must be among {', '.join(NAVIGATOR_NAMES)}, got {unknown or dict(named)}")
 
 
 def _device(field: FieldModel) -> torch.device:
@@ -183,7 +209,12 @@ def learning_curves(
         curves: by navigator, for each run its frames and its values; NaN is left out.
         label: of the vertical axis.
         points: at which the mean is drawn.
+
+    Raises:
+        ValueError: for a navigator that has no name and colour here.
     """
+    _check_navigators(curves)
+    check_number(2, whole=True, points=points)
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     for name, runs in curves.items():
@@ -213,7 +244,12 @@ def compared_trajectories(
         tracks: by navigator, latitudes and longitudes of its way-points [deg].
         field: any model of :mod:`magrl.fields`.
         task: one task.
+
+    Raises:
+        ValueError: for a navigator that has no name and colour here.
     """
+    _check_navigators(tracks)
+    check_type(Tasks, task=task)
     figure = Figure(figsize=(8, 8.4), layout="constrained")
     axes = figure.subplots()
     points = torch.tensor([[lat, lon] for track in tracks.values() for lat, lon in zip(*track, strict=True)])
@@ -235,7 +271,12 @@ def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: Fiel
         series: by navigator, values of ``D``, ``I``, ``B_H`` and ``L`` at each step, the start first.
         field: any model of :mod:`magrl.fields`, for the target's values.
         task: the task that was flown.
+
+    Raises:
+        ValueError: for a navigator that has no name and colour here.
     """
+    _check_navigators(series)
+    check_type(Tasks, task=task)
     targets = dict(zip(NAMES, elements_at(field, task.target[0]).tolist(), strict=True))
     labels = {name: f"{SYMBOLS[name]} [{unit}]" for name, unit in zip(NAMES, UNITS, strict=True)}
     labels["L"] = "length of the move [km]"
@@ -258,7 +299,11 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
     Args:
         measures: by navigator, one value for each journey of ``heading_mae_deg``, ``heading_rmse_deg``,
             ``smoothness_deg`` and ``navigation_error_km``; NaN is left out.
+
+    Raises:
+        ValueError: for a navigator that has no name and colour here, or none at all.
     """
+    _check_navigators(measures)
     labels = {
         "heading_mae_deg": "MAE of heading deviation [°]",
         "heading_rmse_deg": "RMSE of heading deviation [°]",

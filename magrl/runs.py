@@ -20,7 +20,10 @@ from typing import Any
 from filelock import FileLock, Timeout
 from matplotlib.figure import Figure
 
+from magrl.geodesy import check_type
+
 WANDB_PROJECT = "magrl"
+WANDB_MODES = ("offline", "online", "disabled")
 
 
 def create_run_folder(path: Path | str) -> Path:
@@ -48,6 +51,7 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         FileExistsError: if another process writes it.
     """
+    check_type(Path, folder=folder)
     lock = FileLock(folder / ".lock")
     try:
         lock.acquire(timeout=0)
@@ -89,6 +93,7 @@ class StopRequest:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes numbers and texts in their order; NaN, which JSON lacks, becomes null."""
+    check_type(Path, path=path)
     clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in content.items()}
     path.write_text(json.dumps(clean, indent=2, allow_nan=False) + "\n")
 
@@ -104,6 +109,9 @@ class RunLog:
         group: runs that belong together.
         tags: to filter runs by.
         resumed: whether the run goes on; its files stay as they are until :meth:`load_state_dict`.
+
+    Raises:
+        ValueError: for another mode.
     """
 
     def __init__(
@@ -117,6 +125,8 @@ class RunLog:
         tags: Sequence[str] = (),
         resumed: bool = False,
     ) -> None:
+        check_type(Path, folder=folder)
+        _check_mode(wandb_mode)
         self.folder, self.columns, self.rows = folder, tuple(columns), list[dict[str, float]]()
         self._wandb_options = (folder, wandb_mode, config, group, tags)
         self._began = time.perf_counter()
@@ -189,6 +199,9 @@ class WandbRun:
         group: runs that belong together.
         tags: to filter runs by.
         run_id: of the run; one that exists is gone on with.
+
+    Raises:
+        ValueError: for another mode.
     """
 
     def __init__(
@@ -201,6 +214,8 @@ class WandbRun:
         *,
         run_id: str = "",
     ) -> None:
+        check_type(Path, folder=folder)
+        _check_mode(mode)
         self.folder, self.run_id = folder, run_id or uuid.uuid4().hex[:8]
         self._logger: Any = None
         if mode != "disabled":
@@ -249,6 +264,11 @@ class WandbRun:
                 link.unlink()
             for logs in (self.folder / "wandb").glob("*run-*/logs"):
                 shutil.rmtree(logs)
+
+
+def _check_mode(mode: str) -> None:
+    if mode not in WANDB_MODES:
+        raise ValueError(f"the mode of wandb must be one of {', '.join(WANDB_MODES)}, got {mode!r}")
 
 
 def _panel(key: str) -> str:

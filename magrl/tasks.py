@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from magrl.fields import check_box, check_positions
-from magrl.geodesy import geodesic, move, wrap_longitude
+from magrl.geodesy import check_number, check_numbers, check_tensor, check_type, geodesic, move, wrap_longitude
 
 MEAN_RADIUS_KM = 6371.0
 TRIES_PER_ROUND = 8
@@ -44,6 +44,7 @@ class Region:
     longitude: tuple[float, float]
 
     def __post_init__(self) -> None:
+        check_numbers(2, latitudes=self.latitude, longitudes=self.longitude)
         check_box(self.latitude, self.longitude)
         object.__setattr__(self, "latitude", tuple(float(x) for x in self.latitude))
         object.__setattr__(self, "longitude", tuple(float(x) for x in self.longitude))
@@ -55,8 +56,9 @@ class Region:
             position: ``(..., 2)`` latitude, longitude [deg].
 
         Returns:
-            ``(..., 1)`` bool, edges included.
+            ``(..., 1)`` bool, edges included; False for NaN.
         """
+        check_tensor(2, position=position)
         latitude, longitude = position.unbind(-1)
         south, north = self.latitude
         half = (self.longitude[1] - self.longitude[0]) / 2
@@ -66,6 +68,7 @@ class Region:
 
     def expanded(self, margin_deg: float) -> Region:
         """The box with a margin on each side, cut at the poles and at a full turn [deg]."""
+        check_number(0, margin_deg=margin_deg)
         (south, north), (west, east) = self.latitude, self.longitude
         west -= min(margin_deg, (360 - (east - west)) / 2)
         east = min(east + margin_deg, west + 360)
@@ -73,6 +76,7 @@ class Region:
 
     def grid(self, points: int) -> Tensor:
         """An even grid of positions, edges included: ``(points, points, 2)`` latitude, longitude [deg]."""
+        check_number(1, whole=True, points=points)
         latitude = torch.linspace(*self.latitude, points, dtype=torch.float64)
         longitude = torch.linspace(*self.longitude, points, dtype=torch.float64)
         return torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
@@ -120,6 +124,9 @@ def counter_uniform(seed: int, counters: Tensor, draws: int) -> Tensor:
     Returns:
         ``(..., draws)`` float64 in [0, 1).
 
+    Raises:
+        ValueError: for a seed or a number of draws that is no whole number, or counters that are no rows of int64.
+
     Source:
         The finaliser of SplitMix64 (Steele, Lea and Flood, Fast splittable pseudorandom number generators, 2014).
 
@@ -128,6 +135,10 @@ def counter_uniform(seed: int, counters: Tensor, draws: int) -> Tensor:
         >>> bool((counter_uniform(7, rows, 2)[1] == counter_uniform(7, rows[1:], 2)[0]).all())
         True
     """
+    check_number(whole=True, seed=seed)
+    check_number(1, whole=True, draws=draws)
+    if not isinstance(counters, Tensor) or counters.dtype != torch.int64 or not counters.ndim:
+        raise ValueError(f"counters must be int64 of shape (..., C), got {counters!r}")
     key = _mix(torch.full(counters.shape[:-1], _signed(seed), dtype=torch.int64, device=counters.device))
     for counter in counters.unbind(-1):
         key = _mix(key ^ _mix(counter + _signed(0x9E3779B97F4A7C15)))
@@ -158,9 +169,11 @@ def check_distance_range(region: Region, distance_range_km: tuple[float, float])
     Raises:
         ValueError: with the values.
     """
+    check_type(Region, region=region)
+    check_numbers(2, distance_range_km=distance_range_km)
     shortest, longest = distance_range_km
-    if not (0 <= shortest < longest < math.inf):
-        raise ValueError(f"distance_range_km {distance_range_km} must be two rising finite numbers from 0 on")
+    if not 0 <= shortest < longest:
+        raise ValueError(f"distance_range_km {distance_range_km} must be two rising numbers from 0 on")
     held = region.longest_km()
     if shortest >= held:
         raise ValueError(
@@ -184,7 +197,8 @@ def sample_tasks(
         ``P`` tasks, each a function of (seed, vehicle, episode) alone.
 
     Raises:
-        ValueError: for a range that is none, or that the region cannot hold.
+        ValueError: for a range that is none, or that the region cannot hold, a seed that is no whole number, or
+            vehicles and episodes that are not as many.
         RuntimeError: if a range at the edge of what the region holds leaves a task without a place.
 
     Example:
@@ -194,6 +208,9 @@ def sample_tasks(
         True
     """
     check_distance_range(region, distance_range_km)
+    check_tensor(vehicle=vehicle, episode=episode)
+    if vehicle.ndim != 1 or vehicle.shape != episode.shape or {vehicle.dtype, episode.dtype} != {torch.int64}:
+        raise ValueError(f"vehicle and episode must be int64 of one shape (P,), got {vehicle!r} and {episode!r}")
     start = torch.empty(len(vehicle), 2, dtype=torch.float64, device=vehicle.device)
     target = torch.empty_like(start)
     waiting = torch.arange(len(vehicle), device=vehicle.device)
@@ -244,8 +261,7 @@ def task_set(
         >>> task_set(100, seed=1).start.shape
         torch.Size([100, 2])
     """
-    if num_tasks < 1:
-        raise ValueError(f"num_tasks must be at least 1, got {num_tasks}")
+    check_number(1, whole=True, num_tasks=num_tasks)
     vehicle = torch.arange(num_tasks)
     return sample_tasks(region, distance_range_km, seed, vehicle, torch.zeros_like(vehicle))
 
@@ -286,6 +302,9 @@ def check_tasks(tasks: Tasks, within: Region) -> Tasks:
     Raises:
         ValueError: for other shapes, an empty set, positions that are not on Earth, or outside ``within``.
     """
+    check_type(Region, within=within)
+    if not isinstance(tasks, (tuple, list)) or len(tasks) != 2:
+        raise ValueError(f"tasks must be two (M, 2) tensors, got {tasks!r}")
     start, target = (torch.as_tensor(x, dtype=torch.float64) for x in tasks)
     if start.shape != target.shape or start.ndim != 2 or start.shape[-1] != 2 or not len(start):
         raise ValueError(

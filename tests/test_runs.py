@@ -59,7 +59,7 @@ def test_wandb_offline_holds_the_run_and_nothing_of_the_machine(tmp_path: Path, 
         assert name.encode() in content, name
     assert list((run / "files" / "media" / "images" / "figures").glob("picture*.png"))
     private = [os.fsencode(tmp_path), os.fsencode(Path.home()) + b"/", os.fsencode(os.getcwd())]
-    private += [b"do-not-tell-anyone", socket.gethostname().encode()]
+    private += [b"do-not-tell-anyone", *([host] if len(host := socket.gethostname().encode()) > 4 else [])]
     for path in (p for p in (folder / "wandb").rglob("*") if p.is_file()):
         for secret in private:
             assert secret not in path.read_bytes(), f"{secret!r} is in {path.name}"

@@ -17,6 +17,7 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 
 from magrl.env import GeomagneticNavEnv
+from magrl.geodesy import check_type
 from magrl.metaheuristics.base import MODES, Metaheuristic
 from magrl.metaheuristics.fish_swarm import ArtificialFishSwarm
 from magrl.metaheuristics.genetic import GeneticAlgorithm
@@ -73,7 +74,9 @@ def build(name: str, env: GeomagneticNavEnv, mode: str, seed: int, **options: An
 
     Raises:
         ValueError: for an unknown algorithm or mode, or an option out of its range.
+        TypeError: for another environment, or an option that the algorithm does not have.
     """
+    check_type(GeomagneticNavEnv, env=env)
     if name not in ALGORITHMS:
         raise ValueError(f"unknown metaheuristic {name!r}: choose from {', '.join(ALGORITHMS)}")
     if mode not in MODES:

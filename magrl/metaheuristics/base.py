@@ -12,7 +12,7 @@ from torch import Tensor
 
 from magrl import guidance
 from magrl.fields import FieldModel, elements_at
-from magrl.geodesy import move, wrap_angle
+from magrl.geodesy import check_number, check_numbers, check_tensor, move, wrap_angle
 from magrl.navigators import Navigator
 
 MODES = ("look-ahead", "flown")
@@ -35,29 +35,41 @@ def reachable(candidate: Tensor, heading: Tensor, max_turn_rad: float) -> tuple[
         >>> reachable(torch.tensor([[0.0, 2.0], [-0.3, 0.0]]), torch.zeros(2), 1.0)
         (tensor([1.0000, 0.3000]), tensor([1., 1.]))
     """
+    check_tensor(2, candidate=candidate)
+    check_tensor(heading=heading)
+    check_number(0, above=True, max_turn_rad=max_turn_rad)
     turn = wrap_angle(torch.atan2(candidate[..., 1], candidate[..., 0]) - heading)
     return candidate.norm(dim=-1).clamp_max(1), turn.clamp(-max_turn_rad, max_turn_rad)
 
 
 def displacement(distance: Tensor, heading: Tensor) -> Tensor:
     """North and east of a move, ``(..., 2)``."""
+    check_tensor(distance=distance, heading=heading)
     return torch.stack((distance * torch.cos(heading), distance * torch.sin(heading)), -1)
 
 
 def take(values: Tensor, index: Tensor) -> Tensor:
     """Individuals by their number: ``(N, P, ...)`` at ``(N, K)`` is ``(N, K, ...)``."""
+    check_tensor(index=index)
+    if index.ndim != 2 or len(index) != len(values):
+        raise ValueError(f"index must be of shape ({len(values)}, K), got {tuple(index.shape)}")
     return values[torch.arange(len(values), device=values.device).unsqueeze(-1), index]
 
 
 def in_disc(candidate: Tensor) -> Tensor:
-    """Candidates ``(..., 2)`` with none longer than 1."""
+    """Candidates ``(..., 2)`` with none longer than 1; NaN stays NaN."""
+    check_tensor(2, candidate=candidate)
     return candidate / candidate.norm(dim=-1, keepdim=True).clamp_min(1)
 
 
 def checked(name: str, value: float, low: float, high: float, whole: bool = False) -> Any:
-    if isinstance(value, bool) or not (low <= value <= high) or (whole and int(value) != value):
-        kind = "a whole number" if whole else "a number"
-        raise ValueError(f"{name} must be {kind} from {low} to {high}, got {value}")
+    """An option as an int or a float, once it is found to be in its range.
+
+    Raises:
+        ValueError: with the name and the value.
+    """
+    option: dict[str, Any] = {name: value}
+    check_number(low, high, whole=whole, **option)
     return int(value) if whole else float(value)
 
 
@@ -99,13 +111,17 @@ class Metaheuristic(Navigator):
             raise ValueError(f"mode must be one of {MODES}, got {mode!r}")
         if (field is not None) != (mode == "look-ahead"):
             raise ValueError(f"field must be given in look-ahead mode and in no other, got {field} in mode {mode!r}")
-        if len(objective_floors) != 3 or not all(math.isfinite(x) and x > 0 for x in objective_floors):
+        if field is not None and not callable(field):
+            raise TypeError(f"field must be called as field(latitude, longitude), got {field!r}")
+        check_numbers(3, objective_floors=objective_floors)
+        if min(objective_floors) <= 0:
             raise ValueError(f"objective_floors must be three positive numbers (deg, deg, nT), got {objective_floors}")
         self.mode, self.field, self.oracle = mode, field, mode == "look-ahead"
         self.population_size = checked("population_size", population_size, 2, 10_000, whole=True)
         self.generations = checked("generations", generations, 1, 10_000, whole=True)
         self.spread = checked("spread", spread, 1e-3, 1)
         self.objective_floors = tuple(objective_floors)
+        check_number(whole=True, seed=seed)
         self.generator = torch.Generator().manual_seed(seed)
         private = ["position", "objective_weights", "done"] if self.oracle else ["field"]
         self.in_keys = ["target_field", "heading", "step_count", *private]

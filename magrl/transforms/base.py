@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
+
+from magrl.geodesy import check_type
 
 Keys = Sequence[NestedKey]
 
@@ -55,17 +57,39 @@ class ObservationTransform(Transform):
 
 def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
     """The leaves of a TensorDict or a spec, for messages."""
+    check_type((TensorDictBase, Composite), container=container)
     return sorted(str(key) for key in container.keys(True, True))
 
 
 def key_list(keys: NestedKey | Keys) -> list[NestedKey]:
-    """One key or several, as a list; a tuple of strings is one nested key."""
+    """One key or several, as a list; a tuple of strings is one nested key.
+
+    Raises:
+        TypeError: for what is neither.
+    """
     if isinstance(keys, str) or (isinstance(keys, tuple) and keys and all(isinstance(k, str) for k in keys)):
         return [unravel_key(keys)]
+    return several_keys(keys)
+
+
+def several_keys(keys: Keys) -> list[NestedKey]:
+    """Keys as a list, where a sequence of strings is always several of them.
+
+    Raises:
+        TypeError: for a lone string, or what is no sequence of keys.
+    """
+    if isinstance(keys, str) or not isinstance(keys, Iterable) or not all(isinstance(k, (str, tuple)) for k in keys):
+        raise TypeError(f"keys must be a sequence of names or of nested names, got {keys!r}")
     return [unravel_key(key) for key in keys]
 
 
 def expect_keys(transform: Transform, num_in: int, num_out: int) -> None:
+    """Refuses a transform with another number of keys.
+
+    Raises:
+        ValueError: with its keys.
+    """
+    check_type(Transform, transform=transform)
     if len(transform.in_keys) != num_in or len(transform.out_keys) != num_out:
         raise ValueError(
             f"{type(transform).__name__} takes {num_in} in_keys and {num_out} out_keys, "

@@ -6,15 +6,15 @@ import math
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
 
 from magrl import guidance
 from magrl.elements import element_index
 from magrl.fields import FieldModel, elements_gradient_at
-from magrl.geodesy import wrap_angle
-from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list
+from magrl.geodesy import check_number, wrap_angle
+from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list, several_keys
 
 
 class AngleVector(ObservationTransform):
@@ -71,7 +71,7 @@ class TargetDifference(ObservationTransform):
     def __init__(
         self, in_keys: Keys = ("field", "target_field"), out_keys: NestedKey | Keys = ("field_difference",)
     ) -> None:
-        super().__init__(in_keys=[unravel_key(k) for k in in_keys], out_keys=key_list(out_keys))
+        super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
         expect_keys(self, 2, 1)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -170,10 +170,13 @@ class GradientHeading(ObservationTransform):
         min_crossing_deg: float = 2.0,
     ) -> None:
         # A plain sequence of strings is several keys here, never one nested key.
-        super().__init__(in_keys=[unravel_key(k) for k in in_keys], out_keys=[unravel_key(k) for k in out_keys])
+        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
         expect_keys(self, 3, 2)
-        if not 0 <= min_crossing_deg < 90:
+        check_number(0, 90, min_crossing_deg=min_crossing_deg)
+        if min_crossing_deg == 90:
             raise ValueError(f"min_crossing_deg must be in [0, 90), got {min_crossing_deg}")
+        if not isinstance(pair, (tuple, list)):
+            raise ValueError(f"pair must be two different elements, by name or by index from 0, got {pair!r}")
         self.pair = [element_index(name) if isinstance(name, str) else name for name in pair]
         if len(set(self.pair)) != 2 or not all(isinstance(i, int) and i >= 0 for i in self.pair):
             raise ValueError(f"pair must be two different elements, by name or by index from 0, got {pair}")

@@ -6,13 +6,14 @@ import math
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from magrl import guidance
-from magrl.transforms.base import Keys, key_list, sorted_keys
+from magrl.geodesy import check_number
+from magrl.transforms.base import Keys, key_list, several_keys, sorted_keys
 
 
 class AlignmentReward(Transform):
@@ -47,14 +48,13 @@ class AlignmentReward(Transform):
         weight: float = 3.0,
         offset: float = math.pi / 4,
     ) -> None:
-        super().__init__(in_keys=[unravel_key(k) for k in in_keys], out_keys=key_list(out_keys))
+        super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
         if len(self.in_keys) not in (2, 3) or len(self.out_keys) != 1:
             raise ValueError(
                 f"AlignmentReward reads an angle, a reference and perhaps a mask, and writes one reward; "
                 f"got in_keys {self.in_keys}, out_keys {self.out_keys}"
             )
-        if not (math.isfinite(weight) and math.isfinite(offset)):
-            raise ValueError(f"weight and offset must be finite, got {weight} and {offset}")
+        check_number(weight=weight, offset=offset)
         self.weight, self.offset = float(weight), float(offset)
 
     def term(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:

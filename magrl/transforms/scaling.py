@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
+from magrl.geodesy import check_numbers
 from magrl.transforms.base import Keys, ObservationTransform, key_list, sorted_keys
 
 
@@ -67,17 +67,22 @@ class MinMaxNorm(ObservationTransform):
         for ins, outs in ((self.in_keys, self.out_keys), (self.in_keys_inv, self.out_keys_inv)):
             if len(ins) != len(outs):
                 raise ValueError(f"{len(ins)} input keys {ins} do not pair with {len(outs)} output keys {outs}")
-        if not (math.isfinite(interval[0]) and math.isfinite(interval[1]) and interval[0] < interval[1]):
-            raise ValueError(f"interval must be two rising finite numbers, got {interval}")
+        check_numbers(2, interval=interval)
+        if not interval[0] < interval[1]:
+            raise ValueError(f"interval must be two rising numbers, got {interval}")
         self.interval = (float(interval[0]), float(interval[1]))
         self._bounded_keys = list(dict.fromkeys([*self.in_keys, *self.in_keys_inv]))
         for index in range(len(self._bounded_keys)):
             self.register_buffer(f"low_{index}", None)
             self.register_buffer(f"high_{index}", None)
-        for key, (low, high) in (bounds or {}).items():
+        if not isinstance(bounds or {}, Mapping):
+            raise ValueError(f"bounds must be a mapping from keys to (low, high), got {bounds!r}")
+        for key, pair in (bounds or {}).items():
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                raise ValueError(f"the bounds of {key!r} must be (low, high), got {pair!r}")
             if unravel_key(key) not in self._bounded_keys:
                 raise ValueError(f"bounds are given for {key!r}, which is none of the keys {self._bounded_keys}")
-            self._set_bounds(unravel_key(key), *(_as_float(bound) for bound in (low, high)))
+            self._set_bounds(unravel_key(key), *(_as_float(bound) for bound in pair))
 
     # Bounds
 
@@ -95,6 +100,8 @@ class MinMaxNorm(ObservationTransform):
         setattr(self, f"high_{index}", high.clone())
 
     def _bounds(self, key: NestedKey) -> tuple[Tensor, Tensor]:
+        if key not in self._bounded_keys:
+            raise KeyError(f"MinMaxNorm does not scale {key!r}: its keys are {self._bounded_keys}")
         index = self._bounded_keys.index(key)
         if getattr(self, f"low_{index}") is None:
             self._bounds_from_parent(key)

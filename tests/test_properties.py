@@ -1,0 +1,375 @@
+"""What must hold for every input: symmetries, round trips and limits, on examples that hypothesis chooses.
+
+Hand-worked numbers are in the tests of each module; here the inputs are any that the docstrings allow, poles,
+antimeridian and zeros first.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import pytest
+import torch
+from geographiclib.geodesic import Geodesic
+from hypothesis import Phase, assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.strategies import SearchStrategy
+from torch import Tensor
+
+from magrl import geodesy
+from magrl.elements import field_vector, measured_elements, seven_elements
+from magrl.env import GeomagneticNavEnv
+from magrl.fields import IGRF, SphericalHarmonicField
+from magrl.guidance import objective, objective_weights, parallel_approach
+from magrl.tasks import PAPER_REGION, Region
+from magrl.transforms import MinMaxNorm
+
+MILLIMETRE = 1e-6
+ROUNDING_NT = 1e-6
+
+
+def f64(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def scalars(*values: float) -> tuple[Tensor, ...]:
+    return f64(*values).unbind()
+
+
+def between(low: float, high: float, *special: float) -> SearchStrategy[float]:
+    """Numbers in an interval, the special ones often."""
+    return st.sampled_from(special) | st.floats(low, high) if special else st.floats(low, high)
+
+
+LATITUDES = between(-90, 90, -90.0, 90.0, 0.0, 89.9999999, -89.9999999)
+LONGITUDES = between(-180, 180, -180.0, 180.0, 0.0, 179.9999999, -179.9999999)
+ANGLES = between(-math.pi, math.pi, 0.0, math.pi, -math.pi, math.pi / 2, -math.pi / 2)
+PLACES = st.tuples(LATITUDES, LONGITUDES)
+LEGS = between(0, 50, 0.0, 50.0, 1e-6)
+
+
+def apart_km(place: tuple[Any, Any], other: tuple[Any, Any]) -> float:
+    """The straight line between two places, which knows neither poles nor antimeridian [km]."""
+    ends = (geodesy.to_ecef(*(torch.as_tensor(x, dtype=torch.float64) for x in end)) for end in (place, other))
+    return float(torch.dist(*ends))
+
+
+def moved(place: tuple[float, float], heading: float, distance_km: float) -> tuple[float, float]:
+    latitude, longitude = geodesy.move(*scalars(*place, heading, distance_km))
+    return float(latitude), float(longitude)
+
+
+def geodesic(place: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+    distance, bearing = geodesy.geodesic(*scalars(*place, *other))
+    return float(distance), float(bearing)
+
+
+# --- Geodesy ----------------------------------------------------------------------------------------------------------
+
+
+@given(PLACES, ANGLES, LEGS)
+def test_a_leg_leads_where_geographiclib_says(place: tuple[float, float], heading: float, distance_km: float) -> None:
+    end = Geodesic.WGS84.Direct(*place, math.degrees(heading), 1000 * distance_km)
+    assert apart_km(moved(place, heading, distance_km), (end["lat2"], end["lon2"])) < 5 * MILLIMETRE
+
+
+@given(PLACES, ANGLES, LEGS)
+def test_there_and_back(place: tuple[float, float], heading: float, distance_km: float) -> None:
+    end = moved(place, heading, distance_km)
+    distance, bearing = geodesic(end, place)
+    assert distance == pytest.approx(distance_km, abs=5 * MILLIMETRE)
+    assert apart_km(moved(end, bearing, distance), place) < 10 * MILLIMETRE
+
+
+@given(PLACES, ANGLES, LEGS, between(-1000, 1000, 180.0, -180.0, 360.0))
+def test_turning_the_globe_turns_the_leg(
+    place: tuple[float, float], heading: float, distance_km: float, turn_deg: float
+) -> None:
+    """Nothing on the ellipsoid depends on the longitude: the antimeridian is a meridian as any other."""
+    latitude, longitude = moved(place, heading, distance_km)
+    turned = moved((place[0], place[1] + turn_deg), heading, distance_km)
+    assert apart_km(turned, (latitude, longitude + turn_deg)) < MILLIMETRE
+    assert -180 <= turned[1] <= 180
+
+
+@given(PLACES, PLACES)
+def test_geodesics_are_those_of_geographiclib(place: tuple[float, float], other: tuple[float, float]) -> None:
+    line = Geodesic.WGS84.Inverse(*place, *other)
+    assume(line["a12"] < 178)  # nearly antipodal pairs may be NaN
+    distance, bearing = geodesic(place, other)
+    assert distance == pytest.approx(line["s12"] / 1000, abs=MILLIMETRE)
+    # A bearing is worth as much as what it does at the far end, which is nothing at a pole or at no distance.
+    across = 6400 * math.sin(math.radians(line["a12"]))
+    deviation = math.remainder(bearing - math.radians(line["azi1"]), 2 * math.pi)
+    if abs(place[0]) < 89.9 and abs(other[0]) < 89.9:
+        assert abs(deviation) * across < 100 * MILLIMETRE
+
+
+@given(PLACES, PLACES, PLACES)
+def test_distances_are_a_metric(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> None:
+    sides = [geodesic(a, b)[0] for a, b in ((one, two), (two, three), (one, three), (two, one))]
+    assume(all(math.isfinite(side) for side in sides))
+    assert sides[0] == pytest.approx(sides[3], abs=MILLIMETRE)
+    assert sides[2] <= sides[0] + sides[1] + MILLIMETRE
+    assert sides[0] >= apart_km(one, two) - MILLIMETRE  # no arc is shorter than its chord
+
+
+@given(PLACES)
+def test_earth_centred_coordinates_come_back(place: tuple[float, float]) -> None:
+    latitude, longitude = geodesy.from_ecef_surface(geodesy.to_ecef(*scalars(*place)))
+    assert apart_km((latitude, longitude), place) < MILLIMETRE
+    assert abs(float(latitude) - place[0]) < 1e-7  # a metre across the pole turns it by no more
+
+
+# --- Elements ---------------------------------------------------------------------------------------------------------
+
+COMPONENTS = between(-70_000, 70_000, 0.0, -0.0, 1.0, -1.0)
+VECTORS = st.tuples(COMPONENTS, COMPONENTS, COMPONENTS)
+TILTED = VECTORS.filter(lambda b: math.hypot(*b[:2]) > 1)
+
+
+@given(TILTED)
+def test_elements_come_back_as_the_vector(b_ned: tuple[float, float, float]) -> None:
+    found = field_vector(measured_elements(f64(*b_ned)))
+    torch.testing.assert_close(found, f64(*b_ned), rtol=0, atol=1e-9 * math.hypot(*b_ned))
+
+
+@given(VECTORS)
+def test_elements_have_the_signs_of_the_components(b_ned: tuple[float, float, float]) -> None:
+    north, east, down = b_ned
+    found = seven_elements(f64(*b_ned))
+    declination, inclination = float(found.D), float(found.I)
+    assert -180 <= declination <= 180
+    assert -90 <= inclination <= 90
+    assert declination * east >= 0
+    assert inclination * down >= 0
+    assert abs(declination) <= 90 if north > 0 else abs(declination) >= 90 or north == 0
+    assert float(found.B_H) == pytest.approx(math.hypot(north, east))
+    assert float(found.B_F) == pytest.approx(math.hypot(*b_ned))
+
+
+@given(TILTED, ANGLES, between(0.01, 100))
+def test_turning_and_scaling_the_field(b_ned: tuple[float, float, float], turn: float, scale: float) -> None:
+    """A turn about the vertical is a change of D alone, a factor one of B_H alone; a mirror changes the sign of D."""
+    north, east, down = b_ned
+    sin, cos = math.sin(turn), math.cos(turn)
+    before, turned, scaled, mirrored = measured_elements(
+        f64(
+            *b_ned,
+            *(north * cos - east * sin, north * sin + east * cos, down),
+            *(scale * x for x in b_ned),
+            *(north, -east, down),
+        ).unflatten(0, (4, 3))
+    )
+    assert abs(math.remainder(float(turned[0] - before[0]) - math.degrees(turn), 360)) < 1e-9
+    torch.testing.assert_close(turned[1:], before[1:], rtol=1e-12, atol=1e-9)
+    torch.testing.assert_close(scaled, before * f64(1, 1, scale), rtol=1e-12, atol=1e-9)
+    assert abs(math.remainder(float(mirrored[0] + before[0]), 360)) < 1e-9
+    torch.testing.assert_close(mirrored[1:], before[1:])
+
+
+# --- Fields -----------------------------------------------------------------------------------------------------------
+
+
+@cache
+def igrf() -> IGRF:
+    return IGRF("2022-01-01", 13)
+
+
+@cache
+def random_field(degree: int, seed: int) -> SphericalHarmonicField:
+    """An expansion of some degree, its coefficients falling off as the Earth's do."""
+    generator = torch.Generator().manual_seed(seed)
+    parts = torch.randn(2, degree + 1, degree + 1, generator=generator, dtype=torch.float64)
+    gauss = torch.complex(*parts).tril() * 30_000 * 0.5 ** torch.arange(degree + 1).unsqueeze(-1)
+    gauss[0] = 0
+    return SphericalHarmonicField(gauss)
+
+
+MODELS = st.builds(igrf) | st.builds(random_field, st.integers(1, 8), st.integers(0, 3))
+
+
+def ecef_field(model: SphericalHarmonicField, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> Tensor:
+    """The field in axes that are the same everywhere, ``(..., 3)`` [nT]."""
+    b_ned = model(latitude, longitude, altitude_km)
+    return (geodesy.local_frame(latitude, longitude).mT @ b_ned.unsqueeze(-1)).squeeze(-1)
+
+
+@given(MODELS, between(-88, 88, 0.0), LONGITUDES, between(-5, 1000, 0.0))
+def test_the_field_has_no_sources_and_no_curl(
+    model: SphericalHarmonicField, latitude: float, longitude: float, altitude_km: float
+) -> None:
+    """Its tensor of derivatives in fixed axes, by fourth-order differences, has no trace and is symmetric."""
+    steps = f64(0.02, 0.02 / math.cos(math.radians(latitude)), 2.0)  # deg, deg, km: about 2 km each
+    offsets = torch.stack([k * torch.diag(steps) for k in (-2, -1, 1, 2)])  # (4, 3 coordinates, 3)
+    weights = (f64(1, -8, 8, -1) / 12)[:, None, None] / steps[:, None]
+    points = (f64(latitude, longitude, altitude_km) + offsets).unbind(-1)
+    b_by_coordinate = (weights * ecef_field(model, *points)).sum(0)
+    x_by_coordinate = (weights * geodesy.to_ecef(*points)).sum(0)
+    tensor = torch.linalg.solve(x_by_coordinate, b_by_coordinate)  # [j, i] is dB_i / dx_j, in nT/km
+    # Differences of 1e5 nT, good to 1e-11, over kilometres.
+    tolerance = 1e-7 * float(tensor.norm()) + 1e-9 * float(model(*scalars(latitude, longitude, altitude_km)).norm())
+    assert abs(float(tensor.trace())) < tolerance
+    assert float((tensor - tensor.T).abs().max()) < tolerance
+
+
+@given(MODELS, LATITUDES, LONGITUDES, st.integers(-3, 3))
+def test_the_field_is_periodic_in_longitude(
+    model: SphericalHarmonicField, latitude: float, longitude: float, turns: int
+) -> None:
+    assume(abs(latitude) < 89.99)  # the gradient grows without bound where the axes turn
+    value, gradient = model.value_and_gradient(f64(latitude, latitude), f64(longitude, longitude + 360 * turns))
+    torch.testing.assert_close(value[1], value[0], rtol=0, atol=ROUNDING_NT)
+    torch.testing.assert_close(gradient[1], gradient[0], rtol=1e-6, atol=ROUNDING_NT)
+
+
+@given(MODELS, st.sampled_from((-1, 1)), st.lists(LONGITUDES, min_size=2, max_size=20))
+def test_a_pole_has_one_field_from_every_side(
+    model: SphericalHarmonicField, pole: int, longitudes: list[float]
+) -> None:
+    longitude = f64(*longitudes, *longitudes)
+    beside = torch.full((len(longitudes),), 90 - 1e-9, dtype=torch.float64)  # a tenth of a millimetre away
+    latitude = pole * torch.cat((torch.full_like(beside, 90.0), beside))
+    found = ecef_field(model, latitude, longitude, torch.zeros_like(latitude))
+    torch.testing.assert_close(found, found[:1].expand_as(found), rtol=0, atol=1e-4)
+
+
+# --- Guidance ---------------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def approaches(draw: st.DrawFn, crossing: SearchStrategy[float]) -> tuple[Tensor, Tensor]:
+    """Errors ``(2,)`` and gradients ``(2, 2)`` of two elements, the gradients crossing at some angle [rad]."""
+    first, sizes = draw(ANGLES), [draw(between(1e-3, 1e3)) for _ in range(2)]
+    second = first + draw(crossing)
+    gradient = f64(math.cos(first), math.sin(first), math.cos(second), math.sin(second)).reshape(2, 2)
+    errors = [draw(between(0.01, 100)) * draw(st.sampled_from((-1, 1))) * size for size in sizes]
+    return f64(*errors), gradient * f64(*sizes).unsqueeze(-1)
+
+
+def signed(low_deg: float, high_deg: float) -> SearchStrategy[float]:
+    """Angles between limits to either side [rad]."""
+    return st.floats(low_deg, high_deg).flatmap(lambda x: st.sampled_from((math.radians(x), -math.radians(x))))
+
+
+CROSSING = approaches(signed(3, 177))
+
+
+def heading_of(error: Tensor, gradient: Tensor) -> float:
+    heading, valid = parallel_approach(torch.zeros(2, dtype=torch.float64), error, gradient)
+    assert valid
+    return float(heading)
+
+
+@given(CROSSING)
+def test_the_heading_closes_both_elements_in_proportion(approach: tuple[Tensor, Tensor]) -> None:
+    error, gradient = approach
+    heading = heading_of(error, gradient)
+    change = gradient @ f64(math.cos(heading), math.sin(heading))  # per km
+    share = change / error
+    assert (share > 0).all()
+    torch.testing.assert_close(share[0], share[1], rtol=1e-9, atol=0)
+
+
+@given(CROSSING, ANGLES)
+def test_turning_the_axes_turns_the_heading(approach: tuple[Tensor, Tensor], turn: float) -> None:
+    error, gradient = approach
+    sin, cos = math.sin(turn), math.cos(turn)
+    turned = gradient @ f64(cos, -sin, sin, cos).reshape(2, 2)  # components along axes turned clockwise
+    difference = heading_of(error, gradient) - turn - heading_of(error, turned)
+    assert abs(math.remainder(difference, 2 * math.pi)) < 1e-9
+
+
+@given(CROSSING, between(1e-3, 1e3), between(1e-3, 1e3))
+def test_the_units_of_an_element_do_not_matter(approach: tuple[Tensor, Tensor], one: float, two: float) -> None:
+    error, gradient = approach
+    units = f64(one, two)
+    difference = heading_of(error, gradient) - heading_of(error * units, gradient * units.unsqueeze(-1))
+    assert abs(math.remainder(difference, 2 * math.pi)) < 1e-9
+    here, there, floors = torch.zeros(2, dtype=torch.float64), error, f64(0.01, 0.01)
+    plain, scaled = (
+        objective(0.3 * there * unit, there * unit, objective_weights(here, there * unit, floors * unit))
+        for unit in (f64(1, 1), units)
+    )
+    torch.testing.assert_close(scaled, plain)
+
+
+@given(approaches(signed(0, 1.99) | signed(178.01, 180)))
+def test_nearly_parallel_gradients_are_flagged(approach: tuple[Tensor, Tensor]) -> None:
+    heading, valid = parallel_approach(torch.zeros(2, dtype=torch.float64), *approach)
+    assert not valid
+    assert heading == 0
+
+
+@given(approaches(signed(2.01, 177.99)))
+def test_gradients_that_cross_are_not_flagged(approach: tuple[Tensor, Tensor]) -> None:
+    heading_of(*approach)
+
+
+# --- Scaling ----------------------------------------------------------------------------------------------------------
+
+
+@given(between(-1e4, 1e4, 0.0), between(1e-3, 1e4), between(-3, 4, 0.0, 1.0), between(-5, 5, -1.0), between(0.1, 10))
+def test_scaling_comes_back(low: float, span: float, share: float, start: float, length: float) -> None:
+    """Within the bounds and beyond them; what is inside them lands inside the interval."""
+    norm = MinMaxNorm(["x"], bounds={"x": (low, low + span)}, interval=(start, start + length))
+    value = f64(low + share * span)
+    scaled = norm.normalize("x", value)
+    torch.testing.assert_close(norm.denormalize("x", scaled), value, rtol=0, atol=1e-11 * (abs(low) + 10 * span))
+    torch.testing.assert_close(scaled, f64(start + share * length), rtol=0, atol=1e-9 * (1 + abs(low) / span))
+    ends = norm.normalize("x", f64(low, low + span))
+    torch.testing.assert_close(ends, f64(start, start + length), rtol=1e-12, atol=1e-12)
+
+
+@given(st.floats(), st.floats())
+def test_bounds_that_do_not_rise_are_refused(low: float, high: float) -> None:
+    if low < high and math.isfinite(high - low) and max(-low, high) < torch.finfo(torch.float64).max:
+        MinMaxNorm(["x"], bounds={"x": (low, high)})
+        return
+    with pytest.raises(ValueError, match="'x'") as error:
+        MinMaxNorm(["x"], bounds={"x": (low, high)})
+    assert str(low) in str(error.value)
+    assert str(high) in str(error.value)
+
+
+# --- Environment ------------------------------------------------------------------------------------------------------
+
+OPTIONS = st.fixed_dictionaries(
+    {
+        "num_envs": st.integers(1, 40),
+        "region": st.sampled_from((PAPER_REGION, Region((-5, 5), (175, 185)), Region((60, 70), (10, 30)))),
+        "distance_range_km": st.sampled_from(((300.0, 500.0), (0.0, 1.0), (100.0, 900.0))),
+        "max_steps": st.sampled_from((50, 7, 3)),
+        "max_move_km": between(0.1, 300),
+        "max_turn_rad": between(0.01, math.pi, math.pi),
+        "zeta": between(1e-4, 1),
+        "start_heading": st.sampled_from(("north", "random")),
+        "objective_floors": st.tuples(between(0.01, 1), between(0.01, 1), between(1, 100)),
+        "destination_weight": between(0, 1000),
+        "proximity_weight": between(0, 100),
+        "margin_deg": between(0, 3, 0.0),
+        "seed": st.integers(0, 2**32),
+    }
+)
+
+
+@settings(max_examples=4, phases=(Phase.generate,))  # to shrink a failure would take minutes
+@given(OPTIONS)
+def test_a_thousand_random_steps_stay_in_the_specs(options: dict[str, Any]) -> None:
+    """A thousand over all examples, through several episodes each."""
+    torch.manual_seed(0)
+    env = GeomagneticNavEnv(**options)
+    rollout = env.rollout(250, break_when_any_done=False)
+    after, shape = rollout["next"], rollout.batch_size
+    assert shape == (options["num_envs"], 250)
+    for spec, data in ((env.full_observation_spec, rollout), (env.full_observation_spec, after)):
+        many = spec.unsqueeze(1).expand(shape)
+        assert many.is_in(data.select(*spec.keys(True, True)))
+    assert after["reward"].isfinite().all()
+    assert (after["step_count"] <= options["max_steps"]).all()
+    assert (after["done"] == after["terminated"] ^ after["truncated"]).all()
+    assert (after["terminated"] | ~after["success"]).all()
+    assert (after["objective"][after["success"]] <= options["zeta"]).all()
+    assert (rollout["step_count"][:, 1:][after["done"][:, :-1]] == 0).all()
