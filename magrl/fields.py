@@ -8,10 +8,10 @@ nanotesla, ``(..., 3)``; ``model.value_and_gradient`` adds the exact derivative 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta, timezone
-from functools import cache
-from typing import Protocol
+from functools import cache, partial
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from typing_extensions import Self
 
 from magrl import harmonics
 from magrl.elements import elements_gradient, measured_elements
-from magrl.geodesy import curvature_radii, local_frame, to_ecef
+from magrl.geodesy import WGS84_A_KM, WGS84_E2
 
 Date = datetime | str | float
 """A ``datetime``, ISO text such as ``"2022-01-01"``, or a decimal year such as ``2022.0``."""
@@ -124,16 +124,19 @@ class SphericalHarmonicField(Float64Module):
     Args:
         gauss: complex ``(N + 1, N + 1)`` table ``g - i h`` [nT].
         altitude_km: default height over the ellipsoid [km].
-        chunk: points evaluated at a time: bounds the memory at about 7 kB a point for degree 13.
+        chunk: points evaluated at a time: bounds the memory, beyond that of the answer, at about 1 kB a point on a CPU
+            and 6 kB on an accelerator.
 
     Raises:
         ValueError: for a table of another shape, or that is not finite.
     """
 
-    value_table: Tensor
-    gradient_table: Tensor
+    value_weights: Tensor
+    gradient_weights: Tensor
+    level_value_weights: Tensor
+    level_gradient_weights: Tensor
 
-    def __init__(self, gauss: Tensor, *, altitude_km: float = 0.0, chunk: int = 4096) -> None:
+    def __init__(self, gauss: Tensor, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
         super().__init__()
         if gauss.ndim != 2 or gauss.shape[0] != gauss.shape[1] or gauss.shape[0] < 2:
             raise ValueError(f"gauss must be a square (N + 1, N + 1) table with N >= 1, got shape {tuple(gauss.shape)}")
@@ -145,8 +148,13 @@ class SphericalHarmonicField(Float64Module):
         self.altitude_km = _checked_altitude(altitude_km)
         self.chunk = int(chunk)
         gauss = gauss.to(torch.complex128)
-        self.register_buffer("value_table", harmonics.field_table(gauss))
-        self.register_buffer("gradient_table", harmonics.gradient_table(gauss))
+        value, gradient = harmonics.field_table(gauss), harmonics.gradient_table(gauss)
+        padding = (0, gradient.shape[1] - value.shape[1])
+        both = torch.cat((nn.functional.pad(value, padding), gradient[list(_INDEPENDENT)]))
+        for name, table, degree in (("value", value, self.degree + 1), ("gradient", both, self.degree + 2)):
+            weights = harmonics.separate(table, degree)
+            self.register_buffer(f"{name}_weights", weights)
+            self.register_buffer(f"level_{name}_weights", _at_altitude(weights, self.altitude_km))
 
     def forward(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None) -> Tensor:
         """The field vector.
@@ -163,8 +171,11 @@ class SphericalHarmonicField(Float64Module):
             ValueError: for a latitude beyond 90 degrees, or a position that is not finite.
         """
         shape, points = self._points(latitude, longitude, altitude_km)
-        parts = [self._value(*chunk) for chunk in zip(*(p.split(self.chunk) for p in points), strict=True)]
-        return torch.cat(parts).reshape(*shape, 3)
+        return (
+            in_chunks(partial(self._value, altitude_km is None), points, 3, self.chunk)
+            .reshape(3, *shape)
+            .movedim(0, -1)
+        )
 
     def value_and_gradient(
         self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None
@@ -187,45 +198,137 @@ class SphericalHarmonicField(Float64Module):
             ValueError: for a latitude beyond 90 degrees, or a position that is not finite.
         """
         shape, points = self._points(latitude, longitude, altitude_km)
-        parts = [self._value_and_gradient(*c) for c in zip(*(p.split(self.chunk) for p in points), strict=True)]
-        value, gradient = (torch.cat(column) for column in zip(*parts, strict=True))
-        return value.reshape(*shape, 3), gradient.reshape(*shape, 3, 2)
+        rows = in_chunks(partial(self._value_and_gradient, altitude_km is None), points, 9, self.chunk)
+        return rows[:3].reshape(3, *shape).movedim(0, -1), rows[3:].reshape(3, 2, *shape).movedim((0, 1), (-2, -1))
 
     def _points(
         self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None
     ) -> tuple[torch.Size, list[Tensor]]:
         inputs = (latitude, longitude, self.altitude_km if altitude_km is None else altitude_km)
-        tensors = [torch.as_tensor(x, dtype=torch.float64, device=self.value_table.device) for x in inputs]
-        tensors = list(torch.broadcast_tensors(*tensors))
+        tensors = [torch.as_tensor(x, dtype=torch.float64, device=self.value_weights.device) for x in inputs]
         check_positions(tensors[0], tensors[1])
-        if not torch.isfinite(tensors[2]).all():
-            raise ValueError("altitude_km holds values that are not finite")
+        _require(tensors[2].abs() < math.inf, tensors[2], "altitude_km {} is not a finite number")
+        tensors = list(torch.broadcast_tensors(*tensors))
         return tensors[0].shape, [x.reshape(-1) for x in tensors]
 
-    def _value(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> Tensor:
-        terms = harmonics.basis(to_ecef(latitude, longitude, altitude_km), self.degree + 1)
-        b_ecef = (self.value_table @ terms).T
-        return (local_frame(latitude, longitude) * b_ecef.unsqueeze(-2)).sum(-1)
+    def _value(self, level: bool, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> Tensor:
+        """North, east, down: ``(3, P)`` [nT]; ``level`` if the altitude is the model's."""
+        place = _place(latitude, longitude, altitude_km)
+        sums = _level_sums(self.level_value_weights, place) if level else _sums(self.value_weights, place)
+        return (place.frame * sums).sum(1)
 
-    def _value_and_gradient(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> tuple[Tensor, Tensor]:
-        terms = harmonics.basis(to_ecef(latitude, longitude, altitude_km), self.degree + 2)
-        frame = local_frame(latitude, longitude)
-        b_ecef = (self.value_table @ terms[: self.value_table.shape[1]]).T
-        b_ned = (frame * b_ecef.unsqueeze(-2)).sum(-1)
-        tensor_ecef = (self.gradient_table @ terms).T.unflatten(-1, (3, 3))
-        gradient = frame @ tensor_ecef @ frame[:, :2].mT
-        return b_ned, gradient + _frame_turning(b_ned, latitude, altitude_km)
+    def _value_and_gradient(self, level: bool, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> Tensor:
+        """The vector [nT], then the derivative of each component northward and eastward [nT/km]: ``(9, P)``."""
+        place = _place(latitude, longitude, altitude_km)
+        sums = _level_sums(self.level_gradient_weights, place) if level else _sums(self.gradient_weights, place)
+        value = (place.frame * sums[:3]).sum(1)
+        xx, xy, xz, yy, yz = sums[3:]
+        tensor = torch.stack((xx, xy, xz, xy, yy, yz, xz, yz, -xx - yy)).unflatten(0, (3, 3))
+        half = (place.frame.unsqueeze(2) * tensor).sum(1)
+        gradient = (half.unsqueeze(1) * place.frame[:2]).sum(2).flatten(0, 1)
+        return torch.cat((value, gradient + _frame_turning(value, place)))
 
 
-def _frame_turning(b_ned: Tensor, latitude: Tensor, altitude_km: Tensor) -> Tensor:
-    """What the turning of north, east, down adds to the gradient of the components: ``(P, 3, 2)`` [nT/km]."""
-    meridian, prime_vertical = curvature_radii(latitude)
-    north, east, down = b_ned.unbind(-1)
-    per_north, per_east = 1 / (meridian + altitude_km), 1 / (prime_vertical + altitude_km)
-    tan = torch.tan(torch.deg2rad(latitude))
-    along = torch.stack((down * per_north, torch.zeros_like(down), -north * per_north), -1)
-    across = torch.stack((-tan * east, down + tan * north, -east), -1) * per_east.unsqueeze(-1)
-    return torch.stack((along, across), -1)
+def in_chunks(function: Callable[..., Tensor], points: Sequence[Tensor], rows: int, chunk: int) -> Tensor:
+    """Evaluates a function of many points some at a time, so that its arrays stay small and in the cache.
+
+    Args:
+        function: from tensors ``(..., P)`` to ``(rows, P)``.
+        points: its arguments, each ``(..., P)``.
+        rows: of the answer.
+        chunk: largest P to hand it.
+
+    Returns:
+        ``(rows, P)``.
+    """
+    count = points[0].shape[-1]
+    if count <= chunk:
+        return function(*points)
+    out = points[0].new_empty(rows, count)
+    for start in range(0, count, chunk):
+        out[:, start : start + chunk] = function(*(x[..., start : start + chunk] for x in points))
+    return out
+
+
+_INDEPENDENT = (0, 1, 2, 4, 5)
+"""Rows xx, xy, xz, yy, yz of the gradient: it is symmetric, the field having no curl, and without trace."""
+
+
+class _Place(NamedTuple):
+    """What the synthesis needs to know of P points, each sine and cosine taken once."""
+
+    sines: tuple[Tensor, Tensor]  # of latitude and longitude
+    cosines: tuple[Tensor, Tensor]
+    frame: Tensor  # (3, 3, P), rows north, east, down, as geodesy.local_frame
+    meridian_km: Tensor  # radius of curvature at the altitude, along the meridian
+    across_km: Tensor  # and across it
+    z_km: Tensor  # height over the plane of the equator
+
+
+def _place(latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> _Place:
+    angles = torch.deg2rad(torch.stack((latitude, longitude)))
+    (sp, sl), (cp, cl) = torch.sin(angles), torch.cos(angles)
+    root = torch.rsqrt(1 - WGS84_E2 * sp * sp)
+    prime_vertical = WGS84_A_KM * root
+    meridian = (1 - WGS84_E2) * prime_vertical * root * root + altitude_km
+    z = ((1 - WGS84_E2) * prime_vertical + altitude_km) * sp
+    frame = torch.stack((-sp * cl, -sp * sl, cp, -sl, cl, torch.zeros_like(sl), -cp * cl, -cp * sl, -sp))
+    return _Place((sp, sl), (cp, cl), frame.unflatten(0, (3, 3)), meridian, prime_vertical + altitude_km, z)
+
+
+def _sums(weights: Tensor, place: _Place) -> Tensor:
+    """Rows of an expansion at points of any altitude: ``(R, P)``."""
+
+    def some(axis_km: Tensor, z_km: Tensor, cos_lon: Tensor, sin_lon: Tensor) -> Tensor:
+        features, lift = harmonics.products(axis_km, z_km, weights.shape[1] // 2)
+        return harmonics.contract(weights, features, harmonics.waves(cos_lon, sin_lon, lift, weights.shape[1] // 2))
+
+    points = (place.across_km * place.cosines[0], place.z_km, place.cosines[1], place.sines[1])
+    return in_chunks(some, points, len(weights), _points_in_cache(weights))
+
+
+def _level_sums(weights: Tensor, place: _Place) -> Tensor:
+    """The same at the altitude that the weights were made for."""
+
+    def some(sin_lat: Tensor, cos_lat: Tensor, cos_lon: Tensor, sin_lon: Tensor) -> Tensor:
+        features = harmonics.chebyshev(sin_lat, weights.shape[2])
+        return harmonics.contract(weights, features, harmonics.waves(cos_lon, sin_lon, cos_lat, weights.shape[1] // 2))
+
+    points = (place.sines[0], place.cosines[0], place.cosines[1], place.sines[1])
+    return in_chunks(some, points, len(weights), _points_in_cache(weights))
+
+
+def _points_in_cache(weights: Tensor) -> int:
+    """For how many points the largest array of a synthesis stays in the cache of a CPU; others have no use for it."""
+    return max(1, 180_000 // weights[..., 0].numel()) if weights.device.type == "cpu" else 2**62
+
+
+def _at_altitude(weights: Tensor, altitude_km: float) -> Tensor:
+    """Weights over Chebyshev polynomials of the sine of the latitude, for points of one altitude.
+
+    The ellipsoid is so nearly a sphere that few more than the degree suffice: on IGRF 12 more leave 1e-9 nT.
+    """
+    angles, _ = harmonics.chebyshev_nodes(weights.shape[1] // 2 + 12, weights.device)
+    latitude = 90 - torch.rad2deg(angles)
+    place = _place(latitude, torch.zeros_like(latitude), torch.full_like(latitude, altitude_km))
+    return harmonics.on_surface(weights, place.across_km * place.cosines[0], place.z_km)
+
+
+def _frame_turning(b_ned: Tensor, place: _Place) -> Tensor:
+    """What the turning of north, east, down adds to the gradient of the components: ``(6, P)`` [nT/km]."""
+    north, east, down = b_ned
+    along, across = place.meridian_km, place.across_km
+    turned = place.sines[0] / place.cosines[0] * b_ned[:2]
+    return torch.stack(
+        (
+            down / along,
+            -turned[1] / across,
+            torch.zeros_like(down),
+            (down + turned[0]) / across,
+            -north / along,
+            -east / across,
+        )
+    )
 
 
 class IGRF(SphericalHarmonicField):
@@ -250,7 +353,7 @@ class IGRF(SphericalHarmonicField):
         tensor([ 35120.,   4947., -10270.], dtype=torch.float64)
     """
 
-    def __init__(self, date: Date, generation: int = 14, *, altitude_km: float = 0.0, chunk: int = 4096) -> None:
+    def __init__(self, date: Date, generation: int = 14, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
         super().__init__(igrf_coefficients(date, generation), altitude_km=altitude_km, chunk=chunk)
         self.date = parse_date(date)
         self.generation = generation
@@ -305,12 +408,16 @@ def check_positions(latitude: Tensor, longitude: Tensor) -> None:
     Raises:
         ValueError: naming the first latitude beyond 90 degrees or value that is not finite.
     """
-    bad = ~(latitude.abs() <= 90)
-    if bad.any():
-        raise ValueError(f"latitude {latitude[bad].flatten()[0].item()} is not between -90 and 90 degrees")
-    bad = ~torch.isfinite(longitude)
-    if bad.any():
-        raise ValueError(f"longitude {longitude[bad].flatten()[0].item()} is not a finite number of degrees")
+    _require(latitude.abs() <= 90, latitude, "latitude {} is not between -90 and 90 degrees")
+    _require(longitude.abs() < math.inf, longitude, "longitude {} is not a finite number of degrees")
+
+
+def _require(good: Tensor, values: Tensor, message: str) -> None:
+    """Raises a ValueError that names the first value that is not good; compiled code cannot name it."""
+    if torch.compiler.is_compiling():
+        torch._assert_async(good.all(), message)
+    elif not good.all():
+        raise ValueError(message.format(values[~good].flatten()[0].item()))
 
 
 def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> None:

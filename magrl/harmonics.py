@@ -3,13 +3,19 @@
 A potential ``V = a * sum (a/r)^(n+1) (g cos m.lon + h sin m.lon) S_nm`` is kept as one complex table
 ``c = g - i h``. The derivative of a solid harmonic along a Cartesian axis is a solid harmonic of the next degree,
 so that *differentiating is a linear map of the table*: the field is the same basis times another table, and its
-gradient the same basis times a third. One basis and one matrix product therefore give the field and its exact
-gradient, with no singularity at the poles, and no loop over coefficients (the recursion runs over degrees,
-vectorised over orders and points).
+gradient the same basis times a third, exactly, with no singularity at the poles.
+
+:func:`basis` evaluates it by Cunningham's recursion, and defines what a table means. At many points it is faster to
+keep longitude apart, because S_nm is a polynomial in the cosine of the colatitude, times its sine where m is odd.
+:func:`separate` turns weights over the basis into weights over the products ``(a/r)^(d+1) T_i(cos theta)``, once;
+:func:`contract` then needs one matrix product, and one sum over the orders. The Chebyshev polynomials T_i stay
+within [-1, 1], and so do the S_nm: that keeps the change of basis exact to rounding.
 
 Source: L. E. Cunningham, On the computation of the spherical harmonic terms needed during the numerical
 integration of the orbital motion of an artificial satellite, Celestial Mechanics 2 (1970); Schmidt
-normalisation as in Winch et al., Geomagnetism and Schmidt quasi-normalization, GJI 160 (2005).
+normalisation as in Winch et al., Geomagnetism and Schmidt quasi-normalization, GJI 160 (2005). Legendre functions as
+trigonometric polynomials in the colatitude: Sneeuw and Bun, Global spherical harmonic computation by two-dimensional
+Fourier methods, Journal of Geodesy 70 (1996).
 """
 
 from __future__ import annotations
@@ -130,3 +136,169 @@ def _weights(table: Tensor) -> Tensor:
     """Lays the lower triangle of complex tables out as :func:`basis` is: ``(R, N, N)`` to ``(R, N (N + 1))``."""
     n, m = torch.tril_indices(table.shape[-1], table.shape[-1], device=table.device)
     return torch.view_as_real(table[:, n, m].conj().resolve_conj()).flatten(1)
+
+
+def chebyshev_nodes(count: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    """Where to sample a function, and how to turn the samples into its Chebyshev coefficients.
+
+    Args:
+        count: of nodes, and of coefficients.
+        device: where to put them.
+
+    Returns:
+        ``(count,)`` angles in (0, pi), the nodes being their cosines, and the ``(count, count)`` matrix.
+
+    Example:
+        >>> angles, to_coefficients = chebyshev_nodes(3)
+        >>> (to_coefficients @ torch.cos(2 * angles)).round().abs()
+        tensor([0., 0., 1.], dtype=torch.float64)
+    """
+    k = torch.arange(count, dtype=torch.float64, device=device)
+    angles = (k + 0.5) * (math.pi / count)
+    matrix = torch.cos(k.unsqueeze(-1) * angles) * (2 / count)
+    matrix[0] /= 2
+    return angles, matrix
+
+
+def separate(weights: Tensor, degree: int) -> Tensor:
+    """Turns weights over :func:`basis` into weights for :func:`contract`.
+
+    Args:
+        weights: ``(R, (degree + 1) * (degree + 2))`` float64, for example a :func:`field_table`.
+        degree: of the basis.
+
+    Returns:
+        ``(R, 2 * degree + 1, F)``: for each row the sines of orders 1 to degree and the cosines of orders 0 to
+        degree; for each of these the products ``(a/r)^(d+1) T_i(cos theta)`` with d - i = 0, 2, 4 ..., by i in each.
+
+    Example:
+        >>> separate(torch.ones(3, 12, dtype=torch.float64), 2).shape
+        torch.Size([3, 5, 4])
+    """
+    n, m = torch.tril_indices(degree + 1, degree + 1, device=weights.device)
+    odd = m % 2
+    angles, to_coefficients = chebyshev_nodes(degree + 1, weights.device)
+    meridian = torch.stack((angles.sin(), torch.zeros_like(angles), angles.cos()), -1)
+    legendre = basis(meridian * REFERENCE_RADIUS_KM, degree)[::2]
+    polynomial = legendre / angles.sin() ** odd.unsqueeze(-1)
+    cosine, sine = (weights[:, k::2, None] * (polynomial @ to_coefficients.T) for k in (0, 1))
+    full = weights.new_zeros(len(weights), 2, *[degree + 1] * 3)  # row, sine or cosine, m, d, i
+    # An odd order lends one (a/r) to the sine of the colatitude: then d - i is even for every order.
+    full[:, :, m, n - odd] = torch.stack((sine, cosine), 1)
+    parts = [full[..., range(2 * k, degree + 1), range(degree + 1 - 2 * k)] for k in range(degree // 2 + 1)]
+    return torch.cat(parts, -1).flatten(1, 2)[:, 1:]
+
+
+def on_surface(weights: Tensor, axis_km: Tensor, z_km: Tensor) -> Tensor:
+    """Restricts separated weights to a surface of revolution, where radius and colatitude follow from a latitude.
+
+    There an order is a function of the latitude alone, and its expansion is shorter.
+
+    Args:
+        weights: ``(R, 2 * degree + 1, F)`` from :func:`separate`.
+        axis_km: ``(K,)`` distance from the axis where the sine of the latitude is a Chebyshev node [km].
+        z_km: ``(K,)`` height over the plane of the equator there [km].
+
+    Returns:
+        ``(R, 2 * degree + 1, K)`` weights over T_k(sin latitude), for :func:`waves` lifted by the cosine of it.
+
+    Example:
+        >>> angles, _ = chebyshev_nodes(6)  # a sphere
+        >>> sphere = REFERENCE_RADIUS_KM * torch.stack((angles.sin(), angles.cos()))
+        >>> on_surface(separate(torch.ones(3, 12, dtype=torch.float64), 2), *sphere).shape
+        torch.Size([3, 5, 6])
+    """
+    degree = weights.shape[1] // 2
+    angles, to_coefficients = chebyshev_nodes(len(z_km), weights.device)
+    features, lift = products(axis_km, z_km, degree)
+    sums = weights @ features
+    order = torch.cat((torch.arange(1, degree + 1), torch.arange(degree + 1))).to(weights.device)
+    return (sums * (lift / angles.sin()) ** (order % 2).unsqueeze(-1)) @ to_coefficients.T
+
+
+def chebyshev(x: Tensor, count: int) -> Tensor:
+    """Chebyshev polynomials, by 2 T_a T_b = T_a+b + T_|a-b|: one operation for each.
+
+    Args:
+        x: any shape, in [-1, 1].
+        count: how many, at least two.
+
+    Returns:
+        ``(count, ...)``: T_0 to T_count-1.
+
+    Example:
+        >>> chebyshev(torch.tensor(0.5), 4)
+        tensor([ 1.0000,  0.5000, -0.5000, -1.0000])
+    """
+    rows = [torch.ones_like(x), x]
+    minus = -rows[0], -x
+    for k in range(2, count):
+        rows.append(torch.addcmul(minus[k % 2], rows[k // 2], rows[k - k // 2], value=2))
+    return torch.stack(rows)
+
+
+def products(axis_km: Tensor, z_km: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """What :func:`separate` gives weights for, at points.
+
+    Args:
+        axis_km: ``(P,)`` distance from the Earth's axis [km].
+        z_km: ``(P,)`` height over the plane of the equator [km].
+        degree: 1 or more.
+
+    Returns:
+        ``(F, P)`` products ``(a/r)^(d+1) T_i(cos theta)``, and ``(P,)`` what lifts odd orders, ``(a/r) sin theta``.
+    """
+    inverse = REFERENCE_RADIUS_KM / (axis_km * axis_km + z_km * z_km)
+    ratio2, z = REFERENCE_RADIUS_KM * inverse, z_km * inverse
+    ratio, twice = torch.sqrt(ratio2), z + z
+    rows = [ratio, z * ratio]
+    for _ in range(degree - 1):
+        rows.append(torch.addcmul(twice * rows[-1], ratio2, rows[-2], value=-1))
+    blocks = [torch.stack(rows)]
+    while len(blocks[-1]) > 2:
+        blocks.append(blocks[-1][:-2] * ratio2)
+    return torch.cat(blocks), axis_km * inverse
+
+
+def waves(cos_lon: Tensor, sin_lon: Tensor, lift: Tensor, degree: int) -> Tensor:
+    """Sines of orders 1 to degree and cosines of orders 0 to degree, odd orders times a factor.
+
+    Args:
+        cos_lon: ``(P,)`` cosine of the longitude.
+        sin_lon: ``(P,)`` sine of the longitude.
+        lift: ``(P,)`` the factor.
+        degree: 1 or more.
+
+    Returns:
+        ``(2 * degree + 1, P)``.
+    """
+    rows = [torch.stack((torch.zeros_like(cos_lon), torch.ones_like(cos_lon))), torch.stack((sin_lon, cos_lon))]
+    minus = -rows[0], -rows[1]
+    for k in range(2, degree + 1):  # 2 cos a sin b = sin(a + b) + sin(b - a), and so for the cosine
+        rows.append(torch.addcmul(minus[k % 2], rows[k // 2][1:], rows[k - k // 2], value=2))
+    table = torch.stack(rows, 1)
+    table[:, 1::2] *= lift
+    return table.flatten(0, 1)[1:]
+
+
+def contract(weights: Tensor, features: Tensor, orders: Tensor) -> Tensor:
+    """Sums an expansion at many points.
+
+    Args:
+        weights: ``(R, 2 * degree + 1, F)`` from :func:`separate` or :func:`on_surface`.
+        features: ``(F, P)`` from :func:`products` or :func:`chebyshev`.
+        orders: ``(2 * degree + 1, P)`` from :func:`waves`.
+
+    Returns:
+        ``(R, P)``: what the weights times :func:`basis` would be.
+
+    Example:
+        >>> g10 = torch.zeros(2, 2, dtype=torch.complex128)
+        >>> g10[1, 0] = -30000.0
+        >>> axis, z, cos, sin = (torch.tensor([x], dtype=torch.float64) for x in (REFERENCE_RADIUS_KM, 0.0, 1.0, 0.0))
+        >>> features, lift = products(axis, z, 2)
+        >>> contract(separate(field_table(g10), 2), features, waves(cos, sin, lift, 2)).T.round()
+        tensor([[    0.,     0., 30000.]], dtype=torch.float64)
+    """
+    terms = (weights.flatten(0, 1) @ features).unflatten(0, weights.shape[:2])
+    return terms.mul_(orders).sum(1)

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import math
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from magrl.fields import FieldModel, Float64Module, check_box
-from magrl.geodesy import curvature_radii, wrap_longitude
+from magrl.fields import FieldModel, Float64Module, check_box, in_chunks
+from magrl.geodesy import curvature_radii
+from magrl.harmonics import chebyshev, chebyshev_nodes
 
 
 class RegionalField(Float64Module):
     """A field model on a latitude-longitude box, as a two-dimensional Chebyshev expansion.
 
-    Value and gradient are two small contractions, which is what makes a simulation step cheap. The expansion is
-    compared with the model on points between its nodes when it is built, and refused if it misses the tolerance.
+    Value and gradient are one small matrix product over the polynomials of the latitude and one sum over those of the
+    longitude, which is what makes a simulation step cheap. The expansion is compared with the model on points between
+    its nodes when it is built, and refused if it misses the tolerance.
 
     Args:
         model: the field to expand.
@@ -36,7 +38,10 @@ class RegionalField(Float64Module):
         True
     """
 
+    CHUNK = 2560
+    """Points evaluated at a time: bounds the memory, beyond that of the answer, at about 2 kB a point."""
     coefficients: Tensor
+    scaling: Tensor
 
     def __init__(
         self,
@@ -55,10 +60,11 @@ class RegionalField(Float64Module):
             raise ValueError(f"tolerance_nt must be positive, got {tolerance_nt}")
         self.latitude, self.longitude, self.degree = tuple(latitude), tuple(longitude), int(degree)
         self.tolerance_nt = float(tolerance_nt)
-        nodes, from_nodes = _chebyshev_nodes(degree)
-        samples = model(*self._grid(nodes)).to("cpu", torch.float64)
+        angles, from_nodes = chebyshev_nodes(degree + 1)
+        samples = model(*self._grid(angles.cos())).to("cpu", torch.float64)
         expansion = torch.einsum("ia,jb,abc->cij", from_nodes, from_nodes, samples)
         self.register_buffer("coefficients", _with_derivatives(expansion, self._half_spans()))
+        self.register_buffer("scaling", self._scaling(), persistent=False)
         self.error_nt = self._worst_error(model)
         """The largest difference from the model that was found on the check points [nT]."""
         if not self.error_nt <= tolerance_nt:
@@ -77,8 +83,7 @@ class RegionalField(Float64Module):
         Returns:
             ``(..., 3)`` float64: north, east, down [nT]; NaN outside the box, never an extrapolation.
         """
-        across, along = self._chebyshev(latitude, longitude)
-        return (self._contract(along, 3) @ across.unsqueeze(-1)).squeeze(-1)
+        return self._evaluate(latitude, longitude, 3).movedim(0, -1)
 
     def value_and_gradient(self, latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
         """The field vector and its exact horizontal gradient.
@@ -90,32 +95,37 @@ class RegionalField(Float64Module):
         Returns:
             ``(..., 3)`` [nT] and ``(..., 3, 2)`` [nT/km] northward and eastward at sea level; NaN outside the box.
         """
-        across, along = self._chebyshev(latitude, longitude)
-        parts = (self._contract(along, 9) @ across.unsqueeze(-1)).squeeze(-1)
-        value, gradient = parts[..., :3], parts[..., 3:].unflatten(-1, (3, 2))
-        latitude = latitude.to(parts.dtype)
-        meridian, prime_vertical = curvature_radii(latitude)
-        parallel = prime_vertical * torch.cos(torch.deg2rad(latitude))
-        degrees_per_km = torch.rad2deg(torch.stack((1 / meridian, 1 / parallel), -1))
-        return value, gradient * degrees_per_km.unsqueeze(-2)
+        rows = self._evaluate(latitude, longitude, 9)
+        meridian, prime_vertical = curvature_radii(latitude.double())
+        parallel = prime_vertical * torch.cos(torch.deg2rad(latitude.double()))
+        degrees_per_km = torch.rad2deg(torch.stack(torch.broadcast_tensors(1 / meridian, 1 / parallel)))
+        gradient = rows[3:].unflatten(0, (2, 3)) * degrees_per_km.unsqueeze(1)
+        return rows[:3].movedim(0, -1), gradient.movedim((1, 0), (-2, -1))
 
-    def _chebyshev(self, latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
-        """T_k at the scaled longitude and latitude, each ``(..., degree + 1)``; NaN beyond [-1, 1]."""
-        half_lat, half_lon = self._half_spans()
-        y = (latitude.double() - sum(self.latitude) / 2) / half_lat
-        x = wrap_longitude(longitude.double() - sum(self.longitude) / 2) / half_lon
-        unit = torch.stack(torch.broadcast_tensors(x, y))
+    def _evaluate(self, latitude: Tensor, longitude: Tensor, rows: int) -> Tensor:
+        """The first 3 rows or all 9 of what the coefficients stand for: ``(rows, ...)``."""
+        position = torch.stack(torch.broadcast_tensors(latitude.double(), longitude.double()))
+        sums = partial(self._sums, self.coefficients[: rows * (self.degree + 1)])
+        return in_chunks(sums, [position.reshape(2, -1)], rows, self.CHUNK).reshape(rows, *position.shape[1:])
+
+    def _sums(self, coefficients: Tensor, position: Tensor) -> Tensor:
+        polynomials = chebyshev(self._unit(position), self.degree + 1)
+        terms = (coefficients @ polynomials[:, 0]).unflatten(0, (-1, self.degree + 1, 3))
+        return terms.mul_(polynomials[:, 1:]).sum(1).flatten(0, 1)
+
+    def _unit(self, position: Tensor) -> Tensor:
+        """Latitude and longitude ``(2, P)`` in half spans from the centre of the box; NaN beyond [-1, 1]."""
+        centre, turns, per_degree = self.scaling
+        offset = position - centre
+        unit = torch.sub(offset, torch.round(offset * turns), alpha=360) * per_degree
         # The edges belong to the box, though scaling may round them out of it.
-        unit = torch.where(unit.abs() <= 1 + 1e-12, unit.clamp(-1, 1), float("nan"))
-        polynomials = [torch.ones_like(unit), unit]
-        for _ in range(self.degree - 1):
-            polynomials.append(2 * unit * polynomials[-1] - polynomials[-2])
-        across, along = torch.stack(polynomials, -1)
-        return across, along
+        return unit.masked_fill_(unit.abs() > 1 + 1e-12, float("nan"))
 
-    def _contract(self, along: Tensor, channels: int) -> Tensor:
-        table = self.coefficients[:, :channels].flatten(1)
-        return (along @ table).unflatten(-1, (channels, -1))
+    def _scaling(self) -> Tensor:
+        """Centre [deg], turns per degree and half spans per degree, of latitude and of longitude: ``(3, 2, 1)``."""
+        centres = sum(self.latitude) / 2, sum(self.longitude) / 2
+        rows = (centres, (0.0, 1 / 360), tuple(1 / half for half in self._half_spans()))
+        return torch.tensor(rows, dtype=torch.float64).unsqueeze(-1)
 
     def _half_spans(self) -> tuple[float, float]:
         return (self.latitude[1] - self.latitude[0]) / 2, (self.longitude[1] - self.longitude[0]) / 2
@@ -137,15 +147,6 @@ class RegionalField(Float64Module):
         )
 
 
-def _chebyshev_nodes(degree: int) -> tuple[Tensor, Tensor]:
-    """The K = degree + 1 Chebyshev nodes and the matrix from values there to coefficients, ``(K, K)``."""
-    k = torch.arange(degree + 1, dtype=torch.float64)
-    angles = (k + 0.5) * math.pi / (degree + 1)
-    matrix = torch.cos(k.unsqueeze(-1) * angles) * (2 / (degree + 1))
-    matrix[0] /= 2
-    return torch.cos(angles), matrix
-
-
 def _with_derivatives(expansion: Tensor, half_spans: tuple[float, float]) -> Tensor:
     """Value and derivative coefficients laid out for one matrix product.
 
@@ -154,12 +155,11 @@ def _with_derivatives(expansion: Tensor, half_spans: tuple[float, float]) -> Ten
         half_spans: half the box's height and width [deg].
 
     Returns:
-        ``(K, 9, K)``: per latitude order the three components, then (component, north or east) per degree of arc.
+        ``(9 K, K)``: the components, their derivatives northward, those eastward, each per degree of arc; in each the
+        longitude order, then the component. The second dimension is the latitude order.
     """
     table = expansion.numpy()
-    cheb = np.polynomial.chebyshev.chebder
-    pad = [np.zeros_like(table), np.zeros_like(table)]
-    pad[0][:, :-1] = cheb(table, axis=1) / half_spans[0]
-    pad[1][:, :, :-1] = cheb(table, axis=2) / half_spans[1]
-    derivative = np.stack(pad, 1).reshape(6, *table.shape[1:])
-    return torch.from_numpy(np.concatenate((table, derivative))).transpose(0, 1).contiguous()
+    north, east = np.zeros_like(table), np.zeros_like(table)
+    north[:, :-1] = np.polynomial.chebyshev.chebder(table, axis=1) / half_spans[0]
+    east[:, :, :-1] = np.polynomial.chebyshev.chebder(table, axis=2) / half_spans[1]
+    return torch.from_numpy(np.stack((table, north, east))).permute(0, 3, 1, 2).flatten(0, 2)

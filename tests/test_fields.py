@@ -193,12 +193,25 @@ def test_altitude_is_that_of_the_model_unless_given():
     latitude, longitude = globe(20, 1)
     high = IGRF(PAPER_DATE, 13, altitude_km=400.0)
     low = IGRF(PAPER_DATE, 13)
-    assert torch.equal(high(latitude, longitude), low(latitude, longitude, 400.0))
-    assert torch.equal(high(latitude, longitude, 0.0), low(latitude, longitude))
-    assert torch.equal(
-        high.value_and_gradient(latitude, longitude)[1], low.value_and_gradient(latitude, longitude, 400.0)[1]
-    )
+    for found, expected in (
+        (high(latitude, longitude), low(latitude, longitude, 400.0)),
+        (high(latitude, longitude, 0.0), low(latitude, longitude)),
+        (high.value_and_gradient(latitude, longitude)[1], low.value_and_gradient(latitude, longitude, 400.0)[1]),
+    ):
+        torch.testing.assert_close(found, expected, rtol=0, atol=ROUNDING_NT)
     assert (high(latitude, longitude).norm(dim=-1) < low(latitude, longitude).norm(dim=-1)).all()
+
+
+@pytest.mark.parametrize("altitude_km", [-5.0, 0.0, 600.0, 36000.0])
+def test_the_model_s_altitude_and_the_same_given_agree(altitude_km):
+    """One is a short series made for that altitude, the other the whole expansion: over the globe and at its poles."""
+    latitude, longitude = globe(500, 6)
+    latitude[:2] = f64(90.0, -90.0)
+    model = IGRF(PAPER_DATE, 13, altitude_km=altitude_km)
+    given = model.value_and_gradient(latitude, longitude, altitude_km)
+    torch.testing.assert_close(model(latitude, longitude), given[0], rtol=0, atol=ROUNDING_NT)
+    found = model.value_and_gradient(latitude[2:], longitude[2:])
+    torch.testing.assert_close(found[1], given[1][2:], rtol=1e-9, atol=1e-9)
 
 
 def central_differences(model, latitude, longitude, altitude_km, step_deg=0.02):
@@ -328,6 +341,37 @@ def test_a_cast_to_lower_precision_is_not_obeyed(model, cast, request):
     assert cast(field) is field
     assert {x.dtype for x in field.buffers()} == {torch.float64}
     assert torch.equal(field(*position), before)
+
+
+@pytest.mark.parametrize("count", [20_000, 40_000])
+def test_many_points_are_those_points_one_by_one(igrf, region, count):
+    """More than any chunk holds."""
+    position = inside((-15.5, 5.5), (154.5, 175.5), count)
+    chosen = torch.tensor([0, 1, 2067, 2068, 16383, 16384, count - 1])
+    few = tuple(x[chosen] for x in position)
+    for model in (igrf, region):
+        torch.testing.assert_close(model(*position)[chosen], model(*few), rtol=0, atol=ROUNDING_NT)
+        for found, expected in zip(model.value_and_gradient(*position), model.value_and_gradient(*few), strict=True):
+            torch.testing.assert_close(found[chosen], expected, rtol=0, atol=ROUNDING_NT)
+
+
+@pytest.mark.parametrize("model", ["igrf", "region"])
+def test_models_are_traced_whole(model, request):
+    """Nothing in them breaks the graph that torch.compile makes."""
+    field, position = request.getfixturevalue(model), (f64(-8.0, -2.0), f64(164.0, 162.0))
+    whole = torch.compile(field.forward, fullgraph=True, backend="eager")
+    torch.testing.assert_close(whole(*position), field(*position), rtol=0, atol=ROUNDING_NT)
+
+
+@pytest.mark.parametrize("model", ["igrf", "region"])
+def test_models_can_be_differentiated(model, request):
+    """Their own gradient, northward per km, is what autograd finds per degree."""
+    field = request.getfixturevalue(model)
+    latitude, longitude = f64(-8.0, -2.0).requires_grad_(), f64(164.0, 162.0)
+    (slope,) = torch.autograd.grad(field(latitude, longitude).sum(), latitude)
+    meridian, _ = curvature_radii(latitude.detach())
+    expected = field.value_and_gradient(latitude.detach(), longitude)[1][..., 0].sum(-1) * torch.deg2rad(meridian)
+    torch.testing.assert_close(slope, expected, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("count", [1, 7, 20])

@@ -6,7 +6,20 @@ import pytest
 import scipy.special
 import torch
 
-from magrl.harmonics import REFERENCE_RADIUS_KM, basis, differentiate, field_table, gradient_table
+from magrl.harmonics import (
+    REFERENCE_RADIUS_KM,
+    basis,
+    chebyshev,
+    chebyshev_nodes,
+    contract,
+    differentiate,
+    field_table,
+    gradient_table,
+    on_surface,
+    products,
+    separate,
+    waves,
+)
 
 ROOT3 = math.sqrt(3)
 
@@ -183,3 +196,100 @@ def test_shapes_of_the_weight_tables():
     assert field_table(table).shape == (3, 5 * 6)
     assert gradient_table(table).shape == (9, 6 * 7)
     assert field_table(table).dtype == gradient_table(table).dtype == torch.float64
+
+
+# --- separated synthesis ----------------------------------------------------------------------------------------------
+
+
+def cylindrical(ecef_km):
+    """Distance from the axis, height over the equator [km], cosine and sine of the longitude."""
+    x, y, z = ecef_km.unbind(-1)
+    axis = torch.hypot(x, y)
+    return axis, z, x / axis, y / axis
+
+
+def separated(weights, degree, ecef_km):
+    axis, z, cosine, sine = cylindrical(ecef_km)
+    features, lift = products(axis, z, degree)
+    return contract(separate(weights, degree), features, waves(cosine, sine, lift, degree))
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 8, 15, 40])
+def test_separated_weights_give_what_the_basis_gives(degree):
+    generator = torch.Generator().manual_seed(12)
+    weights = torch.randn(4, (degree + 1) * (degree + 2), generator=generator, dtype=torch.float64)
+    ecef = random_points(50, 13, radius=(0.98, 1.5))
+    torch.testing.assert_close(
+        separated(weights, degree, ecef), weights @ basis(ecef, degree), rtol=0, atol=1e-12 * degree**2
+    )
+
+
+def test_products_and_waves_worked_by_hand():
+    """At twice the reference radius, 60 degrees from the pole, 30 degrees east; degree 3."""
+    a, root = REFERENCE_RADIUS_KM, math.sqrt(3)
+    at = torch.tensor([[root * a], [a], [root / 2], [0.5]], dtype=torch.float64)
+    features, lift = products(at[0], at[1], 3)
+    # (a/r)^(i+1) cos(60 i), i = 0 to 3; then two more powers of a/r for i = 0 and 1
+    expected = [0.5, 0.25 / 2, -0.125 / 2, -0.0625, 0.125, 0.0625 / 2]
+    torch.testing.assert_close(features.squeeze(-1), torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-15)
+    assert lift.item() == pytest.approx(root / 4, abs=1e-15)  # (a/r) sin 60
+    sines_then_cosines = [0.5 * 10, root / 2, 10.0, 1.0, root / 2 * 10, 0.5, 0.0]
+    found = waves(at[2], at[3], torch.full_like(lift, 10.0), 3).squeeze(-1)
+    torch.testing.assert_close(found, torch.tensor(sines_then_cosines, dtype=torch.float64), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("pole", [1.0, -1.0])
+def test_separated_field_at_a_pole(pole):
+    """On the axis every meridian gives the same vector, and its neighbourhood joins on."""
+    table = random_table(5, 14)
+    weights = separate(field_table(table), 6)
+    longitude = torch.linspace(0, 6, 7, dtype=torch.float64)
+    on_axis = torch.zeros_like(longitude)
+    features, lift = products(on_axis, torch.full_like(longitude, pole * REFERENCE_RADIUS_KM), 6)
+    found = contract(weights, features, waves(longitude.cos(), longitude.sin(), lift, 6))
+    ecef = torch.tensor([[0.0, 0.0, pole * REFERENCE_RADIUS_KM]], dtype=torch.float64)
+    expected = (field_table(table) @ basis(ecef, 6)).expand(3, 7)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("flattening", [0.0, 1 / 298.257])
+def test_weights_on_a_surface(flattening):
+    """A spheroid about as flat as the Earth needs 12 polynomials beyond the degree, a sphere none."""
+    degree, count = 8, 9 if flattening == 0 else 21
+    weights = separate(field_table(random_table(degree - 1, 15)), degree)
+
+    def spheroid(parametric):
+        shape = torch.stack((parametric.cos(), (1 - flattening) * parametric.sin()))
+        return REFERENCE_RADIUS_KM * shape
+
+    angles, _ = chebyshev_nodes(count)
+    short = on_surface(weights, *spheroid(math.pi / 2 - angles))
+    assert short.shape == (3, 2 * degree + 1, count)
+    generator = torch.Generator().manual_seed(16)
+    latitude, longitude = torch.rand(2, 100, generator=generator, dtype=torch.float64) * 3 - 1.5
+    features, lift = products(*spheroid(latitude), degree)
+    expected = contract(weights, features, waves(longitude.cos(), longitude.sin(), lift, degree))
+    orders = waves(longitude.cos(), longitude.sin(), latitude.cos(), degree)
+    found = contract(short, chebyshev(latitude.sin(), count), orders)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("count", [2, 3, 8, 27])
+def test_chebyshev_polynomials_and_their_coefficients(count):
+    x = torch.linspace(-1, 1, 11, dtype=torch.float64)
+    expected = torch.stack([torch.cos(k * torch.acos(x)) for k in range(count)])
+    torch.testing.assert_close(chebyshev(x, count), expected, rtol=0, atol=1e-13)
+    angles, to_coefficients = chebyshev_nodes(count)
+    identity = to_coefficients @ chebyshev(angles.cos(), count).T
+    torch.testing.assert_close(identity, torch.eye(count, dtype=torch.float64), rtol=0, atol=1e-14)
+
+
+def test_the_synthesis_can_be_differentiated():
+    weights, ecef = separate(field_table(random_table(4, 17)), 5), random_points(6, 18)
+    inputs = [x.detach().requires_grad_() for x in cylindrical(ecef)]
+
+    def field(axis, z, cosine, sine):
+        features, lift = products(axis, z, 5)
+        return contract(weights, features, waves(cosine, sine, lift, 5))
+
+    assert torch.autograd.gradcheck(field, inputs, eps=1e-5, atol=1e-5)
