@@ -7,9 +7,12 @@ that it flies in the plain environment beside every other navigator.
 
 from __future__ import annotations
 
+import copy
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,12 +21,14 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Bounded
-from torchrl.envs import CatTensors, Compose, Transform
+from torchrl.envs import CatTensors, Compose, EnvBase, Transform
 from torchrl.modules import MLP, TanhModule, ValueOperator
-from torchrl.objectives import TD3Loss
+from torchrl.objectives import SoftUpdate, TD3Loss
 
+from magrl.checkpoints import DamagedCheckpointError, check_finite, load_tensors, save_tensors
 from magrl.env import GeomagneticNavEnv
 from magrl.fields import elements_range
+from magrl.geodesy import check_number, check_numbers, check_tensor, check_type
 from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")
@@ -45,6 +50,10 @@ class PolicyConfig:
         field_high: D [deg], I [deg], B_H [nT] that are scaled to 1.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
+
+    Raises:
+        ValueError: for bounds that are not finite or do not rise, a move or a turn that is not positive, widths that
+            are no positive whole numbers, or switches that are not bool.
     """
 
     num_cells: tuple[int, ...]
@@ -57,9 +66,14 @@ class PolicyConfig:
     max_turn_rad: float
 
     def __post_init__(self) -> None:
-        numbers = (*self.field_low, *self.field_high, self.max_move_km, self.max_turn_rad)
-        if len(self.field_low) != 3 or len(self.field_high) != 3 or not all(math.isfinite(x) for x in numbers):
-            raise ValueError(f"the bounds of a policy must be finite, three to an end: {self}")
+        check_numbers(3, field_low=self.field_low, field_high=self.field_high)
+        if not all(low < high for low, high in zip(self.field_low, self.field_high, strict=True)):
+            raise ValueError(f"field_low {self.field_low} must lie below field_high {self.field_high}")
+        check_number(0, above=True, max_move_km=self.max_move_km)
+        check_number(0, math.pi, above=True, max_turn_rad=self.max_turn_rad)
+        for name in ("layer_norm", "observe_heading", "observe_difference"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
         if not self.num_cells or not all(isinstance(n, int) and 1 <= n <= 65536 for n in self.num_cells):
             raise ValueError(f"num_cells must be positive whole numbers, got {self.num_cells}")
 
@@ -73,6 +87,7 @@ def policy_config(
     observe_difference: bool = True,
 ) -> PolicyConfig:
     """The configuration of a policy for an environment, scaled to the range of the field over its region."""
+    check_type(GeomagneticNavEnv, env=env)
     low, high = (tuple(x.tolist()) for x in elements_range(env.field, env.region.grid(81).to(env.device)))
     return PolicyConfig(
         tuple(num_cells),
@@ -88,6 +103,7 @@ def policy_config(
 
 def observation_transforms(config: PolicyConfig) -> list[Transform]:
     """From the public keys to ``observation``, the input of the networks."""
+    check_type(PolicyConfig, config=config)
     low, high = torch.tensor(config.field_low), torch.tensor(config.field_high)
     keys = ["field", "target_field", "move"]
     move_high = torch.tensor((config.max_move_km, config.max_turn_rad))
@@ -108,17 +124,20 @@ def observation_transforms(config: PolicyConfig) -> list[Transform]:
 
 def action_transform(config: PolicyConfig) -> MinMaxNorm:
     """From the networks' action in [-1, 1] to kilometres and radians."""
+    check_type(PolicyConfig, config=config)
     high = torch.tensor((config.max_move_km, config.max_turn_rad))
     return MinMaxNorm(in_keys_inv=["action"], bounds={"action": (high * torch.tensor((0, -1)), high)})
 
 
 def guidance_transforms(env: GeomagneticNavEnv, weight: float, offset: float) -> list[Transform]:
     """What makes TD3 gradient-guided: the theoretical heading, and the reward for holding it."""
+    check_type(GeomagneticNavEnv, env=env)
     return [FieldGradient(env.field), GradientHeading(), AlignmentReward(weight=weight, offset=offset)]
 
 
 def observation_size(config: PolicyConfig) -> int:
     """Number of entries in ``observation``."""
+    check_type(PolicyConfig, config=config)
     return 8 + 3 * config.observe_difference + 2 * config.observe_heading
 
 
@@ -153,11 +172,83 @@ def make_critic(config: PolicyConfig, device: torch.device | None = None) -> Val
     return ValueOperator(_mlp(observation_size(config) + 2, 1, config, device), in_keys=["observation", "action"])
 
 
+class LeanTD3Loss(TD3Loss):
+    """TorchRL's TD3 loss with less around it: the same values and gradients at a lower cost.
+
+    The actor asks only the critic that its gradient comes from (Eq. 3-13), where the parent evaluates both and drops
+    one; and networks whose parameters stay in place are not filled with them anew at every call.
+    """
+
+    def _make_vmap(self) -> None:
+        super()._make_vmap()
+        self._vmap_qvalue_network00 = self._each_critic
+
+    @cached_property
+    def _standing(self) -> dict[str, Any]:
+        """Networks that hold their parameters, shared with those of the loss; none but the actor's has a gradient."""
+        filled = {
+            "actor": (self.actor_network, [self.actor_network_params]),
+            "first critic": (self.qvalue_network, [self.qvalue_network_params.data[0]]),
+            "target critics": (self.qvalue_network, self.target_qvalue_network_params.data.unbind(0)),
+        }
+        networks: dict[str, Any] = {}
+        for name, (network, all_params) in filled.items():
+            networks[name] = [copy.deepcopy(network) for _ in all_params]
+            for holder, params in zip(networks[name], all_params, strict=True):
+                params.to_module(holder)
+        return networks
+
+    def _each_critic(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDict:
+        """Values of both critics: ``(2, B)`` in, the same in each row, ``state_action_value`` ``(2, B, 1)`` out."""
+        key, seen = self.tensor_keys.state_action_value, tensordict[0]
+        if params is self.target_qvalue_network_params:
+            values = [critic(seen)[key] for critic in self._standing["target critics"]]
+        else:
+            values = []
+            for critic in params.unbind(0):
+                with critic.to_module(self.qvalue_network, preserve_module_state=False):
+                    values.append(self.qvalue_network(seen)[key])
+        return TensorDict({key: torch.stack(values)}, tensordict.batch_size)
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The actor's loss.
+
+        Args:
+            tensordict: ``(B,)`` with ``observation``.
+
+        Returns:
+            A scalar, and ``logits`` ``(B, 2)``, the actor's outputs before the tanh, with their gradient.
+        """
+        (actor,), (critic,) = self._standing["actor"], self._standing["first critic"]
+        seen = critic(actor(tensordict.select(*self.actor_network.in_keys)))
+        return -seen[self.tensor_keys.state_action_value].mean(), {"logits": seen["logits"]}
+
+
+class LeanSoftUpdate(SoftUpdate):
+    """TorchRL's soft update of all targets in one call."""
+
+    def step(self) -> None:
+        """Moves each target by its share towards its source."""
+        if not hasattr(self, "_pairs"):
+            sources = {f"target_{key}": value for key, value in self._sources.flatten_keys(".").data.items()}
+            targets = dict(self._targets.flatten_keys(".").data.items())
+            self._pairs = list(targets.values()), [sources[key] for key in targets]
+        torch._foreach_lerp_(*self._pairs, 1 - self.eps)
+
+
 def make_loss(
     actor: TensorDictSequential, critic: ValueOperator, *, gamma: float, policy_noise: float, noise_clip: float
-) -> TD3Loss:
-    """TorchRL's TD3 loss with twin critics, squared errors (Eq. 3-10) and one-step targets (Eqs. 3-9, 3-11)."""
-    loss = TD3Loss(
+) -> LeanTD3Loss:
+    """TorchRL's TD3 loss with twin critics, squared errors (Eq. 3-10) and one-step targets (Eqs. 3-9, 3-11).
+
+    Raises:
+        ValueError: for a discount outside [0, 1], or a noise that is negative.
+    """
+    check_type(TensorDictSequential, actor=actor)
+    check_type(ValueOperator, critic=critic)
+    check_number(0, 1, gamma=gamma)
+    check_number(0, policy_noise=policy_noise, noise_clip=noise_clip)
+    loss = LeanTD3Loss(
         actor,
         critic,
         action_spec=Bounded(-1.0, 1.0, (2,), device=next(actor.parameters()).device),
@@ -170,7 +261,7 @@ def make_loss(
     return loss
 
 
-def saturation_penalty(loss: TD3Loss, batch: TensorDictBase) -> Tensor:
+def saturation_penalty(logits: Tensor) -> Tensor:
     """Mean square of the actor's outputs before the tanh.
 
     Early in training every move is a loss on average, whatever its direction; an actor that follows that into the
@@ -178,14 +269,13 @@ def saturation_penalty(loss: TD3Loss, batch: TensorDictBase) -> Tensor:
     the outputs where the tanh still bends.
 
     Args:
-        loss: the TD3 loss that holds the actor's parameters.
-        batch: ``(B,)`` with ``observation``.
+        logits: ``(B, 2)``, of :meth:`LeanTD3Loss.actor_loss`.
 
     Returns:
         A scalar with a gradient for the actor.
     """
-    with loss.actor_network_params.to_module(loss.actor_network):
-        return loss.actor_network[0](batch.select("observation"))["logits"].square().mean()
+    check_tensor(logits=logits)
+    return logits.square().mean()
 
 
 class FieldPolicy(TensorDictModuleBase):
@@ -207,6 +297,7 @@ class FieldPolicy(TensorDictModuleBase):
 
     def __init__(self, config: PolicyConfig, actor: TensorDictSequential | None = None) -> None:
         super().__init__()
+        check_type(PolicyConfig, config=config)
         self.config = config
         self.observe = Compose(*observation_transforms(config))
         self.act = action_transform(config)
@@ -219,8 +310,9 @@ class FieldPolicy(TensorDictModuleBase):
 
 def save_policy(path: Path | str, policy: FieldPolicy) -> None:
     """Writes a policy: its configuration and its weights, as plain tensors and numbers."""
+    check_type(FieldPolicy, policy=policy)
     weights = {key: value.cpu() for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
-    torch.save({"format": POLICY_FORMAT, "config": asdict(policy.config), "weights": weights}, path)
+    save_tensors({"format": POLICY_FORMAT, "config": asdict(policy.config), "weights": weights}, Path(path))
 
 
 def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy:
@@ -237,8 +329,8 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no policy file at {path}")
     try:
-        content: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever a damaged archive raises
+        content = load_tensors(path)
+    except DamagedCheckpointError as error:
         raise ValueError(f"{path} is not a policy file: {error}") from error
     if not isinstance(content, dict) or set(content) != {"format", "config", "weights"}:
         raise ValueError(f"{path} is not a policy file: it must hold format, config and weights")
@@ -248,11 +340,24 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
     if not isinstance(content["config"], dict) or set(content["config"]) != names:
         raise ValueError(f"{path}: the configuration of a policy must hold exactly {sorted(names)}")
     try:
-        policy = FieldPolicy(PolicyConfig(**content["config"]))
-        policy.actor.load_state_dict(content["weights"])
-    except (TypeError, RuntimeError, ValueError) as error:
+        config, weights = PolicyConfig(**content["config"]), dict(content["weights"])
+        check_finite(weights.items(), str(path))
+        # Before anything is allocated: a few bytes may ask for any number of cells.
+        held = sum(value.numel() for key, value in weights.items() if key.endswith(("weight", "bias")))
+        if held != _number_of_weights(config):
+            raise ValueError(f"its weights are not those of layers of {config.num_cells} cells")
+        policy = FieldPolicy(config)
+        policy.actor.load_state_dict(weights)
+    except (TypeError, RuntimeError, ValueError, AttributeError, FloatingPointError) as error:
         raise ValueError(f"{path} holds a policy of another shape: {error}") from error
     return policy.to(device).eval()
+
+
+def _number_of_weights(config: PolicyConfig) -> int:
+    """Of the actor: a matrix and a bias for each layer, and two numbers a cell to normalise it."""
+    sizes = (observation_size(config), *config.num_cells, 2)
+    linear = sum((before + 1) * after for before, after in itertools.pairwise(sizes))
+    return linear + 2 * sum(config.num_cells) * config.layer_norm
 
 
 def evaluation_rollout(env: GeomagneticNavEnv, policy: TensorDictModuleBase) -> TensorDict:
@@ -261,5 +366,8 @@ def evaluation_rollout(env: GeomagneticNavEnv, policy: TensorDictModuleBase) -> 
     Returns:
         ``(num_envs, T)`` for :func:`magrl.metrics.episode_measures`: vehicles that are done stay as they were.
     """
+    check_type(EnvBase, env=env)
+    if not callable(policy):
+        raise TypeError(f"policy must be called with a TensorDict, got {policy!r}")
     with torch.no_grad():
         return env.rollout(env.max_steps, policy, break_when_any_done=False, break_when_all_done=True)

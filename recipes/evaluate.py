@@ -137,6 +137,15 @@ def spread(values: list[float], form: str) -> str:
     return text if len(known) == 1 else f"{text} ± {format(statistics.stdev(known), form)}"
 
 
+def cell(results: list[dict[str, float]], key: str, form: str) -> str:
+    """A measure: its spread over runs, or, of one run, its 95 % interval over tasks where the measure has one."""
+    text = spread([result[key] for result in results], form)
+    if len(results) > 1 or f"{key}_low" not in results[0]:
+        return text
+    low, high = (format(results[0][f"{key}_{end}"], form) for end in ("low", "high"))
+    return f"{text} ({low}–{high})"
+
+
 def label(name: str, default_mode: str) -> str:
     """A navigator as a reader should know it: a metaheuristic with its mode, an oracle called one."""
     base, _, mode = name.partition(":")
@@ -161,7 +170,7 @@ def table(summaries: dict[str, list[dict[str, float]]], mode: str) -> str:
         columns |= {"navigation_error_km": ".1f", "smoothness_deg": ".1f", "heading_mae_deg": ".1f"}
         columns |= {"heading_rmse_deg": ".1f", "success_rate_within_10km": ".1f", "success_rate_within_25km": ".1f"}
         columns["field_readings"] = ".0f"
-        cells = (spread([result[key] for result in results], form) for key, form in columns.items())
+        cells = (cell(results, key, form) for key, form in columns.items())
         lines.append(f"| {label(name, mode)} | {len(results)} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 

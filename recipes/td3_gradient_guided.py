@@ -21,6 +21,7 @@ import math
 import sys
 import time
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,11 +31,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
-from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from magrl import plots, td3
@@ -66,6 +66,10 @@ class Config:
     """Where everything runs: cpu, cuda, cuda:0 …"""
     wandb_mode: Literal["offline", "online", "disabled"] = "offline"
     """offline needs neither network nor login."""
+    collectors: int = 1
+    """Processes that collect; with more than one, runs are not repeatable to the bit."""
+    collector_backend: Literal["process", "ray"] = "process"
+    """Where several of them run: on this machine, or on a Ray cluster."""
     checkpoint_every: float = 30.0
     """Seconds between checkpoints, from which --resume RUN goes on."""
 
@@ -143,11 +147,12 @@ class Config:
             )
             if not fits and field.default is not None:
                 raise ValueError(f"{field.name} must be of type {kind.__name__}, got {value!r}")
-        for name, kind in (("preset", ("fast", "paper")), ("wandb_mode", ("offline", "online", "disabled"))):
-            if getattr(self, name) not in kind:
-                raise ValueError(f"{name} must be one of {kind}, got {getattr(self, name)!r}")
+        choices = {"preset": ("fast", "paper"), "wandb_mode": ("offline", "online", "disabled")}
+        for name, known in (choices | {"collector_backend": ("process", "ray")}).items():
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {known}, got {getattr(self, name)!r}")
         counts = ("num_envs", "total_frames", "updates_per_batch", "batch_size", "buffer_size", "policy_delay")
-        counts += ("eval_every", "eval_tasks_small", "eval_tasks")
+        counts += ("eval_every", "eval_tasks_small", "eval_tasks", "collectors")
         positive = ("learning_rate", "final_learning_rate", "reward_scale", "zeta")
         ranges = dict.fromkeys(counts, (1, math.inf)) | dict.fromkeys(positive, (1e-12, math.inf))
         if self.total_episodes is not None:
@@ -162,6 +167,8 @@ class Config:
                 raise ValueError(f"{name} must be between {low} and {high}, got {getattr(self, name)}")
         if self.buffer_size < self.batch_size:
             raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
+        if self.num_envs % self.collectors:
+            raise ValueError(f"{self.num_envs} vehicles cannot be shared out evenly to {self.collectors} collectors")
 
 
 PRESETS = {
@@ -219,6 +226,41 @@ def read_config(folder: Path, *, guided: bool) -> Config:
         raise ValueError(f"cannot resume from {folder / 'config.json'}: {error}") from error
 
 
+def make_env(base: GeomagneticNavEnv, config: Config, view: td3.PolicyConfig, *, guided: bool) -> TransformedEnv:
+    """The guidance, the agent's view and the scaled reward on top of the environment."""
+    guidance = td3.guidance_transforms(base, config.alignment_weight, config.alignment_offset) if guided else []
+    rewards = [RewardSum(), RewardScaling(loc=0.0, scale=config.reward_scale)]
+    return TransformedEnv(
+        base, Compose(*guidance, *td3.observation_transforms(view), td3.action_transform(view), *rewards)
+    )
+
+
+def worker_env(config: Config, view: td3.PolicyConfig, index: int, *, guided: bool) -> TransformedEnv:
+    """The share of the vehicles that one of several collecting processes flies, on tasks of its own."""
+    seed = (config.seed + 1_000_003 * (index + 1)) % FIRST_RESERVED_SEED
+    options = {"zeta": config.zeta, "start_heading": config.start_heading, "device": config.device}
+    base = GeomagneticNavEnv(num_envs=config.num_envs // config.collectors, seed=seed, **options)
+    return make_env(base, config, view, guided=guided)
+
+
+def make_collector(
+    config: Config, env: TransformedEnv, view: td3.PolicyConfig, policy: TensorDictSequential, *, guided: bool
+) -> BaseCollector:
+    """TorchRL's collector: one step of all vehicles at a time, here or in several processes."""
+    options: dict[str, Any] = {"frames_per_batch": config.num_envs, "total_frames": config.total_frames}
+    options |= {"init_random_frames": config.init_random_frames, "device": env.device}
+    if config.collectors == 1:
+        return Collector(env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options)
+    makers = [partial(worker_env, config, view, index, guided=guided) for index in range(config.collectors)]
+    if config.collector_backend == "ray":
+        actor = {"num_cpus": 1, "num_gpus": int(env.device.type == "cuda")}
+        path = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
+        cluster = {"log_to_driver": False, "include_dashboard": False}
+        cluster["runtime_env"] = {"env_vars": {"PYTHONPATH": path}}  # where the workers find this file
+        options |= {"backend_options": {"remote_configs": actor, "ray_init_config": cluster}}
+    return Collector(makers, policy, backend=config.collector_backend, sync=True, **options)
+
+
 class Learner:
     """TD3: the networks, TorchRL's loss over them, and their optimisers."""
 
@@ -227,7 +269,7 @@ class Learner:
         self.actor, critic = td3.make_actor(view, device), td3.make_critic(view, device)
         noise = {"policy_noise": config.policy_noise, "noise_clip": config.noise_clip}
         self.loss = td3.make_loss(self.actor, critic, gamma=config.gamma, **noise)
-        self.soft_update = SoftUpdate(self.loss, tau=config.tau)
+        self.soft_update = td3.LeanSoftUpdate(self.loss, tau=config.tau)
         self.critic_optimiser, self.actor_optimiser = (
             torch.optim.Adam(params.flatten_keys().values(), lr=config.learning_rate, fused=True)
             for params in (self.loss.qvalue_network_params, self.loss.actor_network_params)
@@ -247,9 +289,9 @@ class Learner:
         step(self.critic_optimiser, self.loss_critic)
         self.updates += 1
         if self.updates % self.config.policy_delay == 0:
-            self.loss_actor, _ = self.loss.actor_loss(transitions)
-            penalty = td3.saturation_penalty(self.loss, transitions) if saturation_weight else 0.0
-            step(self.actor_optimiser, self.loss_actor + saturation_weight * penalty)
+            self.loss_actor, outputs = self.loss.actor_loss(transitions)
+            penalty = saturation_weight * td3.saturation_penalty(outputs["logits"])
+            step(self.actor_optimiser, self.loss_actor + penalty)
             self.soft_update.step()
 
     def check(self) -> None:
@@ -300,11 +342,8 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
         observe_heading=config.observe_heading,
         observe_difference=config.observe_difference,
     )
-    guidance = td3.guidance_transforms(base, config.alignment_weight, config.alignment_offset) if guided else []
-    rewards = [RewardSum(), RewardScaling(loc=0.0, scale=config.reward_scale)]
-    env = TransformedEnv(
-        base, Compose(*guidance, *td3.observation_transforms(view), td3.action_transform(view), *rewards)
-    )
+    env = make_env(base, config, view, guided=guided)
+    alignment = env.transform[2] if guided else None
 
     # Learning, collection and replay
     learner = Learner(config, view, env.device)
@@ -316,16 +355,7 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
         annealing_num_steps=config.total_frames,
         device=env.device,
     )
-    collector = Collector(
-        env,
-        TensorDictSequential(learner.actor, noise),
-        frames_per_batch=config.num_envs,
-        total_frames=config.total_frames,
-        init_random_frames=config.init_random_frames,
-        device=env.device,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
+    collector = make_collector(config, env, view, TensorDictSequential(learner.actor, noise), guided=guided)
     storage = LazyTensorStorage(config.buffer_size, device=env.device)
     buffer = TensorDictReplayBuffer(storage=storage, batch_size=config.batch_size)
 
@@ -334,7 +364,9 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
     labels = {"group": f"{name}-{config.preset}", "tags": [name, config.preset]}
     tally, best = TrainingTally(base.destination_weight, config.reward_scale), BestPolicy()
     parts = {"learner": learner, "noise": noise, "buffer": buffer, "tally": tally, "best": best}
-    parts |= {"episodes": RunningEpisodes(collector, base), "random": GlobalRNGState()}
+    parts["random"] = GlobalRNGState()
+    if config.collectors == 1:  # what other processes are at is theirs: they start new episodes
+        parts["episodes"] = RunningEpisodes(collector, base)
     checkpoints = Checkpoints(folder / "checkpoints", parts)
     resumed = config.resume is not None and bool(checkpoints.files())  # before the first one, the seed leads there
     run = RunLog(folder, COLUMNS, settings, wandb_mode=config.wandb_mode, resumed=resumed, **labels)
@@ -352,12 +384,14 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
             check_finite(batch, f"after {tally.frames} frames")
             buffer.extend(batch.select(*TRANSITION))
             noise.step(batch.numel())
-            tally.add(batch, guidance[-1].term(batch, batch["next"]) if guided else None)
+            tally.add(batch, alignment.term(batch, batch["next"]) if alignment else None)
             left = max(0.0, 1 - tally.frames / config.total_frames)
             learner.anneal(left)
             for _ in range(config.updates_per_batch if len(buffer) >= config.batch_size else 0):
                 learner.update(buffer.sample(), left * config.saturation_weight)
             learner.check()
+            if config.collectors > 1:
+                collector.update_policy_weights_()
 
             done = tally.frames >= config.total_frames or tally.episodes >= (config.total_episodes or math.inf)
             if done or tally.frames // config.num_envs % config.eval_every == 0:

@@ -6,9 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Bounded
 from torchrl.envs import Compose, TransformedEnv
+from torchrl.objectives import SoftUpdate, TD3Loss
 
 from magrl import td3
+from magrl.checkpoints import save_tensors
 from magrl.env import PRIVILEGED_KEYS, GeomagneticNavEnv
 from magrl.tasks import Tasks
 
@@ -94,7 +97,7 @@ def test_policy_of_another_shape_is_refused(env, tmp_path: Path) -> None:
     td3.save_policy(path, td3.FieldPolicy(config(env)))
     content = torch.load(path, weights_only=True)
     content["config"]["num_cells"] = (8, 8)
-    torch.save(content, path)
+    save_tensors(content, path)
     with pytest.raises(ValueError, match="policy of another shape"):
         td3.load_policy(path)
 
@@ -113,7 +116,7 @@ def test_policy_of_another_shape_is_refused(env, tmp_path: Path) -> None:
 def test_damaged_policy_is_refused(env, tmp_path: Path, change, message: str) -> None:
     path = tmp_path / "policy.pt"
     td3.save_policy(path, td3.FieldPolicy(config(env)))
-    torch.save(change(torch.load(path, weights_only=True)), path)
+    save_tensors(change(torch.load(path, weights_only=True)), path)
     with pytest.raises(ValueError, match=message):
         td3.load_policy(path)
 
@@ -162,12 +165,65 @@ def test_loss_bootstraps_with_the_smaller_target(env) -> None:
     torch.testing.assert_close(value, expected)
 
 
+def lean_and_torchrl(view: td3.PolicyConfig) -> tuple[td3.LeanTD3Loss, TD3Loss]:
+    """Our loss after a few updates, and TorchRL's with the same weights."""
+    torch.manual_seed(0)
+    lean = td3.make_loss(td3.make_actor(view), td3.make_critic(view), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+    update = td3.LeanSoftUpdate(lean, tau=0.1)
+    optimiser = torch.optim.Adam([p for p in lean.parameters() if p.requires_grad], lr=1e-2)
+    for _ in range(3):
+        batch = transitions(view)
+        (lean.value_loss(batch)[0] + lean.actor_loss(batch)[0]).backward()
+        optimiser.step()
+        optimiser.zero_grad()
+        update.step()
+    spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 0.1, "noise_clip": 0.5}
+    theirs = TD3Loss(td3.make_actor(view), td3.make_critic(view), deactivate_vmap=True, **spec)
+    theirs.make_value_estimator(gamma=0.9)
+    SoftUpdate(theirs, tau=0.1)
+    theirs.load_state_dict(lean.state_dict())
+    return lean, theirs
+
+
+def test_lean_loss_is_that_of_torchrl(env) -> None:
+    """Values and gradients of both losses, to the bit, after updates of weights and targets."""
+    view = config(env)
+    batch, seen = transitions(view), []
+    for loss in lean_and_torchrl(view):
+        torch.manual_seed(1)
+        value, actor = loss.value_loss(batch.clone())[0], loss.actor_loss(batch.clone())[0]
+        critics, policy = (
+            [p for p in params.values(True, True) if p.requires_grad]
+            for params in (loss.qvalue_network_params, loss.actor_network_params)
+        )
+        seen.append([value, actor, *torch.autograd.grad(value, critics), *torch.autograd.grad(actor, policy)])
+    assert len(seen[0]) == 2 + 10 + 10  # two hidden layers with their normalisation, and the last
+    assert all(torch.equal(ours, theirs) for ours, theirs in zip(*seen, strict=True))
+
+
+def test_lean_soft_update_is_that_of_torchrl(env) -> None:
+    lean, theirs = lean_and_torchrl(config(env))
+    for loss, update in ((lean, td3.LeanSoftUpdate), (theirs, SoftUpdate)):
+        made = update(loss, tau=0.25)  # both begin with targets that are the weights
+        with torch.no_grad():
+            for weight in loss.parameters():
+                weight += 1.0 * weight.requires_grad
+        made.step()
+    before, after = (
+        torch.cat([p.flatten() for p in loss.target_qvalue_network_params.values(True, True)])
+        for loss in (lean, theirs)
+    )
+    torch.testing.assert_close(before, after, rtol=0, atol=0)
+    source = torch.cat([p.flatten() for p in lean.qvalue_network_params.values(True, True)])
+    torch.testing.assert_close(before, source - 0.75)
+
+
 def test_saturation_penalty_is_the_mean_square_of_the_logits(env) -> None:
     view = config(env)
     actor = td3.make_actor(view)
     loss = td3.make_loss(actor, td3.make_critic(view), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
     batch = transitions(view)
-    penalty = td3.saturation_penalty(loss, batch)
+    penalty = td3.saturation_penalty(loss.actor_loss(batch)[1]["logits"])
     torch.testing.assert_close(penalty, actor(batch.select("observation"))["logits"].square().mean())
     penalty.backward()
     assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in loss.actor_network_params.values(True, True))
