@@ -1,0 +1,106 @@
+"""The environment's step: what the field, the framework and the number of vehicles cost."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
+
+from benchmarks.timing import Row, alternate
+from magrl import td3
+from magrl.env import GeomagneticNavEnv
+
+VEHICLES = 1024
+NUMBERS = [2**k for k in range(6, 15)]
+
+
+class FreeField(nn.Module):
+    """A field that costs nothing: the same vector everywhere, ready before it is asked for."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__()
+        self.register_buffer(
+            "vector", torch.tensor((35000.0, 5000.0, -10000.0), dtype=torch.float64).repeat(num_envs, 1)
+        )
+
+    def forward(self, latitude: Tensor, _: Tensor) -> Tensor:
+        """North, east, down [nT]."""
+        if latitude.shape == self.vector.shape[:1]:
+            return self.vector
+        return self.vector[0].expand(*latitude.shape, 3)
+
+
+class Stepper:
+    """Steps an environment with ready actions, past the end of episodes: a step costs the same anywhere."""
+
+    def __init__(self, env: GeomagneticNavEnv) -> None:
+        self.env, self.state = env, env.rand_action(env.reset())
+
+    def __call__(self) -> None:
+        self.env._step(self.state)
+
+
+class Collecting:
+    """Steps of the recipe's whole environment in a collector with a random policy, resets included."""
+
+    def __init__(self, num_envs: int) -> None:
+        base = GeomagneticNavEnv(num_envs=num_envs, seed=0)
+        view = td3.policy_config(base, (8,), layer_norm=False)
+        steps = [*td3.guidance_transforms(base, 3.0, 0.785), *td3.observation_transforms(view)]
+        steps += [td3.action_transform(view), RewardSum(), RewardScaling(loc=0.0, scale=0.05)]
+        env = TransformedEnv(base, Compose(*steps))
+        collector = Collector(env, env.rand_action, frames_per_batch=num_envs, total_frames=-1, track_traj_ids=False)
+        self.batches = iter(collector)
+
+    def __call__(self) -> None:
+        next(self.batches)
+
+
+def rows(repeats: int = 15) -> list[Row]:
+    """What the field and the framework cost."""
+    env = GeomagneticNavEnv(num_envs=VEHICLES, seed=0)
+    free = GeomagneticNavEnv(num_envs=VEHICLES, seed=0)
+    step, free_step = Stepper(env), Stepper(free)
+    free.field = FreeField(VEHICLES)
+    options = {"repeats": repeats, "inner": 50}
+    return [
+        alternate("env step: with field / field free", free_step, step, goal="≤ 2.5", **options),
+        alternate("guided env in a Collector / raw env step", step, Collecting(VEHICLES), goal="≤ 4", **options),
+    ]
+
+
+def steps_per_second(seconds: float = 2.0) -> float:
+    """Vehicle-steps a second of the raw step."""
+    return VEHICLES / time_of(Stepper(GeomagneticNavEnv(num_envs=VEHICLES, seed=0)), seconds)
+
+
+def cost_by_number(seconds: float = 0.5) -> list[dict[str, float]]:
+    """Microseconds for a vehicle-step, raw and guided in a collector, as the number of vehicles grows."""
+    rows = []
+    for number in NUMBERS:
+        raw = time_of(Stepper(GeomagneticNavEnv(num_envs=number, seed=0)), seconds)
+        guided = time_of(Collecting(number), seconds)
+        rows.append({"vehicles": number, "raw_us": 1e6 * raw / number, "guided_us": 1e6 * guided / number})
+    return rows
+
+
+def time_of(function: Stepper | Collecting, seconds: float) -> float:
+    """Median time of a call [s], from calls over some seconds."""
+    function()
+    times, began = [], time.perf_counter()
+    while time.perf_counter() - began < seconds or len(times) < 3:
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return sorted(times)[len(times) // 2]
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(row)
+    print(f"{steps_per_second() / 1e6:.2f} million vehicle-steps a second")
+    for line in cost_by_number():
+        print(line)

@@ -1,0 +1,93 @@
+"""stable-baselines3 over a batched Gymnasium environment.
+
+stable-baselines3 brings its own vectors of environments, which step copies one after the other or in processes. A fair
+comparison of training speed gives it what TorchRL has: one batched step for all vehicles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+
+class BatchedVecEnv(VecEnv):
+    """A ``VecEnv`` whose vehicles live in one Gymnasium ``VectorEnv``.
+
+    Args:
+        envs: batched environments that reset in the step in which a journey ends. Gymnasium's vector wrappers may be
+            around them, for example ``TransformReward`` to scale rewards.
+
+    Raises:
+        ValueError: for environments that reset at another time.
+
+    Example:
+        >>> import magrl.gymnasium_env
+        >>> envs = gymnasium.make_vec(magrl.gymnasium_env.ENV_ID, num_envs=4)
+        >>> BatchedVecEnv(envs).reset().shape
+        (4, 13)
+    """
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
+        mode = envs.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(f"stable-baselines3 needs environments of AutoresetMode.SAME_STEP, got {mode}")
+        self.envs = envs
+        self._actions: np.ndarray | None = None
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> VecEnvObs:
+        """Starts a journey of every vehicle; after ``seed(s)``, those of that one seed."""
+        observations, _ = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keeps the actions for :meth:`step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Moves every vehicle."""
+        observations, rewards, terminated, truncated, info = self.envs.step(self._actions)
+        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(cut)} for cut in truncated]
+        for index in np.flatnonzero(terminated | truncated):
+            infos[index]["terminal_observation"] = info["final_obs"][index]
+            final = info["final_info"]
+            infos[index].update({key: final[key][index].item() for key in final if not key.startswith("_")})
+        return observations, rewards, terminated | truncated, infos
+
+    def close(self) -> None:
+        """Closes the environments."""
+        self.envs.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture of each vehicle's journey."""
+        return self.envs.render() or ()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The same attribute for each vehicle: they share one environment."""
+        return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Sets an attribute of the one environment, for all vehicles together."""
+        self._all_or_none(indices)
+        setattr(self.envs, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Calls a method of the one environment, once for all vehicles."""
+        self._all_or_none(indices)
+        return [getattr(self.envs, method_name)(*args, **kwargs)] * self.num_envs
+
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """Whether vehicles have a wrapper of their own; none has."""
+        return [isinstance(self.envs, wrapper_class)] * len(list(self._get_indices(indices)))
+
+    def _all_or_none(self, indices: VecEnvIndices) -> None:
+        if indices is not None:
+            raise ValueError(f"vehicles share one environment: it cannot be changed for {indices} alone")
