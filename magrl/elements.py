@@ -81,7 +81,12 @@ def measured_elements(b_ned: Tensor) -> Tensor:
         >>> measured_elements(torch.tensor([30000.0, 0.0, 0.0]))
         tensor([    0.,     0., 30000.])
     """
-    return torch.stack(seven_elements(b_ned)[:3], -1)
+    check_tensor(3, b_ned=b_ned)
+    north, east, down = b_ned.unbind(-1)
+    horizontal = torch.hypot(north, east)
+    # Adding zero takes the sign off a zero.
+    angles = torch.rad2deg(torch.atan2(torch.stack((east + 0.0, down), -1), torch.stack((north + 0.0, horizontal), -1)))
+    return torch.cat((angles, horizontal.unsqueeze(-1)), -1)
 
 
 def field_vector(elements: Tensor) -> Tensor:

@@ -322,9 +322,10 @@ class GeomagneticNavEnv(EnvBase):
         before = tensordict["position"]
         heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
         latitude, longitude = before.unbind(-1)
-        position = torch.stack(move(latitude, longitude, heading, distance), -1)
-        position = torch.where(self.edge.contains(before), position, before)  # the lost stay where they were lost
-        lost = ~self.edge.contains(position)
+        moved = torch.stack(move(latitude, longitude, heading, distance), -1)
+        was_inside, is_inside = self.edge.contains(torch.stack((before, moved))).unbind(0)
+        position = torch.where(was_inside, moved, before)  # the lost stay where they were lost
+        lost = ~(was_inside & is_inside)
 
         field = elements_at(self.field, position)
         field = field.float().double()

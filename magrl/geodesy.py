@@ -153,11 +153,15 @@ def from_ecef_surface(ecef: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_tensor(3, ecef=ecef)
     x, y, z = ecef.unbind(-1)
-    horizontal = torch.hypot(x, y)
-    reduced = torch.atan2(z * WGS84_A_KM, horizontal * WGS84_B_KM)
-    top = z + WGS84_E2 / (1 - WGS84_E2) * WGS84_B_KM * torch.sin(reduced) ** 3
-    bottom = horizontal - WGS84_E2 * WGS84_A_KM * torch.cos(reduced) ** 3
-    return torch.rad2deg(torch.atan2(top, bottom)), torch.rad2deg(torch.atan2(y, x))
+    return _surface_latitude(torch.hypot(x, y), z), torch.rad2deg(torch.atan2(y, x))
+
+
+def _surface_latitude(horizontal: Tensor, z: Tensor) -> Tensor:
+    """Latitude [deg] of a point on the ellipsoid from its distances to the axis and to the equator's plane [km]."""
+    up, out = z * WGS84_A_KM, horizontal * WGS84_B_KM
+    scale = torch.hypot(up, out)
+    top = z + WGS84_E2 / (1 - WGS84_E2) * WGS84_B_KM * (up / scale) ** 3
+    return torch.rad2deg(torch.atan2(top, horizontal - WGS84_E2 * WGS84_A_KM * (out / scale) ** 3))
 
 
 def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,14 +187,22 @@ def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tens
     """
     check_tensor(latitude=latitude, longitude=longitude, heading=heading, distance_km=distance_km)
     sin, cos = torch.sin(heading), torch.cos(heading)
-    meridian, prime_vertical = curvature_radii(latitude)
-    radius = 1 / (cos**2 / meridian + sin**2 / prime_vertical)
+    phi = torch.deg2rad(latitude)
+    sin_phi, cos_phi = torch.sin(phi), torch.cos(phi)
+    w2 = 1 - WGS84_E2 * sin_phi**2
+    prime_vertical = WGS84_A_KM * torch.rsqrt(w2)
+    radius = prime_vertical / (cos**2 * w2 / (1 - WGS84_E2) + sin**2)  # Euler's, from both radii of curvature
     arc = distance_km / radius
     along, fall = radius * torch.sin(arc), 2 * radius * torch.sin(arc / 2) ** 2
-    step_ned = torch.stack(torch.broadcast_tensors(along * cos, along * sin, fall), -1)
-    frame = local_frame(latitude, longitude)
-    step = (frame * step_ned.unsqueeze(-1)).sum(-2)
-    return from_ecef_surface(to_ecef(latitude, longitude) + step)
+    north, east = along * cos, along * sin
+    # Where the leg ends: outward from the Earth's axis in the plane of its first meridian, along the axis, and across.
+    outward = (prime_vertical - fall) * cos_phi - north * sin_phi
+    axial = (prime_vertical * (1 - WGS84_E2) - fall) * sin_phi + north * cos_phi
+    turned = torch.rad2deg(torch.atan2(east, outward))
+    end = torch.broadcast_tensors(
+        _surface_latitude(torch.hypot(outward, east), axial), wrap_longitude(longitude + turned)
+    )
+    return end[0], end[1]
 
 
 def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude2: Tensor) -> tuple[Tensor, Tensor]:

@@ -175,40 +175,54 @@ def make_critic(config: PolicyConfig, device: torch.device | None = None) -> Val
 class LeanTD3Loss(TD3Loss):
     """TorchRL's TD3 loss with less around it: the same values and gradients at a lower cost.
 
-    The actor asks only the critic that its gradient comes from (Eq. 3-13), where the parent evaluates both and drops
-    one; and networks whose parameters stay in place are not filled with them anew at every call.
+    Its networks stand, each with its own parameters in it, where the parent fills one network anew with the parameters
+    of each at every call; and the actor asks only the critic that its gradient comes from (Eq. 3-13), where the parent
+    evaluates both and drops one. Parameters, targets and state are the parent's, and share its memory.
     """
 
-    def _make_vmap(self) -> None:
-        super()._make_vmap()
-        self._vmap_qvalue_network00 = self._each_critic
-
     @cached_property
-    def _standing(self) -> dict[str, Any]:
-        """Networks that hold their parameters, shared with those of the loss; none but the actor's has a gradient."""
-        filled = {
-            "actor": (self.actor_network, [self.actor_network_params]),
-            "first critic": (self.qvalue_network, [self.qvalue_network_params.data[0]]),
-            "target critics": (self.qvalue_network, self.target_qvalue_network_params.data.unbind(0)),
-        }
-        networks: dict[str, Any] = {}
-        for name, (network, all_params) in filled.items():
-            networks[name] = [copy.deepcopy(network) for _ in all_params]
-            for holder, params in zip(networks[name], all_params, strict=True):
-                params.to_module(holder)
+    def _standing(self) -> dict[str, list[Any]]:
+        """The networks by their role; those of the critics that are trained have parameters to optimise."""
+        networks: dict[str, list[Any]] = {}
+        for role, network, params in (
+            ("actor", self.actor_network, [self.actor_network_params]),
+            ("target actor", self.actor_network, [self.target_actor_network_params.data]),
+            ("critics", self.qvalue_network, self.qvalue_network_params.data.unbind(0)),
+            ("target critics", self.qvalue_network, self.target_qvalue_network_params.data.unbind(0)),
+            ("asked critic", self.qvalue_network, [self.qvalue_network_params.data[0]]),
+        ):
+            networks[role] = [copy.deepcopy(network) for _ in params]
+            for holder, held in zip(networks[role], params, strict=True):
+                held.to_module(holder)
+        for critic in networks["critics"]:
+            critic.requires_grad_()
         return networks
 
-    def _each_critic(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDict:
-        """Values of both critics: ``(2, B)`` in, the same in each row, ``state_action_value`` ``(2, B, 1)`` out."""
-        key, seen = self.tensor_keys.state_action_value, tensordict[0]
-        if params is self.target_qvalue_network_params:
-            values = [critic(seen)[key] for critic in self._standing["target critics"]]
-        else:
-            values = []
-            for critic in params.unbind(0):
-                with critic.to_module(self.qvalue_network, preserve_module_state=False):
-                    values.append(self.qvalue_network(seen)[key])
-        return TensorDict({key: torch.stack(values)}, tensordict.batch_size)
+    def critic_parameters(self) -> list[Tensor]:
+        """What the critics' optimiser trains: parts of the parent's stacked parameters, critic after critic."""
+        return [weight for critic in self._standing["critics"] for weight in critic.parameters()]
+
+    def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The critics' loss (Eqs. 3-9 to 3-11).
+
+        Args:
+            tensordict: ``(B,)`` with ``observation``, ``action``, and in ``next`` ``observation``, ``reward`` and
+                ``terminated``.
+
+        Returns:
+            A scalar, and ``target_value`` ``(B, 1)``.
+        """
+        action, after = tensordict["action"], tensordict["next"]
+        noise = (torch.randn_like(action) * self.policy_noise).clamp(-self.noise_clip, self.noise_clip)
+        with torch.no_grad():
+            (actor,) = self._standing["target actor"]
+            seen = actor(after.select(*self.actor_network.in_keys))
+            seen["action"] = (seen["action"] + noise).clamp(self.min_action, self.max_action)
+            value = torch.minimum(*(critic(seen)["state_action_value"] for critic in self._standing["target critics"]))
+            target = after["reward"] + self.value_estimator.gamma * (~after["terminated"]).to(value.dtype) * value
+        here = tensordict.select(*self.qvalue_network.in_keys)
+        first, second = (critic(here)["state_action_value"] - target for critic in self._standing["critics"])
+        return (first.square() + second.square()).mean(), {"target_value": target}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss.
@@ -219,9 +233,9 @@ class LeanTD3Loss(TD3Loss):
         Returns:
             A scalar, and ``logits`` ``(B, 2)``, the actor's outputs before the tanh, with their gradient.
         """
-        (actor,), (critic,) = self._standing["actor"], self._standing["first critic"]
+        (actor,), (critic,) = self._standing["actor"], self._standing["asked critic"]
         seen = critic(actor(tensordict.select(*self.actor_network.in_keys)))
-        return -seen[self.tensor_keys.state_action_value].mean(), {"logits": seen["logits"]}
+        return -seen["state_action_value"].mean(), {"logits": seen["logits"]}
 
 
 class LeanSoftUpdate(SoftUpdate):

@@ -271,8 +271,8 @@ class Learner:
         self.loss = td3.make_loss(self.actor, critic, gamma=config.gamma, **noise)
         self.soft_update = td3.LeanSoftUpdate(self.loss, tau=config.tau)
         self.critic_optimiser, self.actor_optimiser = (
-            torch.optim.Adam(params.flatten_keys().values(), lr=config.learning_rate, fused=True)
-            for params in (self.loss.qvalue_network_params, self.loss.actor_network_params)
+            torch.optim.Adam(weights, lr=config.learning_rate, fused=True)
+            for weights in (self.loss.critic_parameters(), self.loss.actor_network_params.parameters())
         )
         self.loss_critic, self.loss_actor = torch.zeros(()), torch.zeros(())
 
