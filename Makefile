@@ -4,6 +4,15 @@ VENV := .venv
 RUN := $(VENV)/bin
 export GOMP_SPINCOUNT ?= 3000
 
+# Runs that the documents are made of
+SEEDS := 0 1 2 3 4
+GUIDED := $(SEEDS:%=runs/td3_gradient_guided-fast-seed%)
+PLAIN := $(SEEDS:%=runs/td3-fast-seed%)
+MEMORY := $(foreach s,0 1 2,runs/td3_recurrent-seed$(s))
+STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
+PILOTS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
+RECIPE := $(RUN)/python recipes
+
 .PHONY: train test test-slow check format clean paper trade bench
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3: about a minute on two cores
@@ -26,9 +35,10 @@ format: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev  ## ratios of speed, measured side by side: about eight minutes on two cores
 	$(RUN)/python -m benchmarks $(ARGS)
+	$(RECIPE)/publish.py docs/performance.md
 
-# What the discount and the offset of the alignment term trade, and what the paper's state costs: seven trainings.
-trade: runs/td3_gradient_guided-fast-seed0/eval.json
+# What the discount and the offset of the alignment term trade, and what the paper's state costs: ten trainings, seven of them of a minute.
+trade: runs/td3_gradient_guided-fast-seed0/eval.json $(MEMORY:%=%/eval.json)
 	for gamma in 0.97 0.995; do test -e runs/trade-gamma$$gamma || \
 	  $(RECIPE)/td3_gradient_guided.py --gamma $$gamma --out runs/trade-gamma$$gamma || exit; done
 	for gamma in 0.9 0.97 0.995; do test -e runs/trade-gamma$$gamma-offset0 || $(RECIPE)/td3_gradient_guided.py \
@@ -41,21 +51,16 @@ trade: runs/td3_gradient_guided-fast-seed0/eval.json
 	  $(foreach g,0.97 0.995,"γ $(g), offset π/4=runs/trade-gamma$(g)") \
 	  $(foreach g,0.9 0.97 0.995,"γ $(g), offset 0=runs/trade-gamma$(g)-offset0") > docs/results/trade.md
 	$(RECIPE)/results_table.py "as published=runs/td3_gradient_guided-fast-seed0" \
-	  "without the difference=runs/no-difference" "the paper's eight numbers=runs/literal-state" > docs/results/state.md
+	  "without the difference=runs/no-difference" "the paper's eight numbers=runs/literal-state" \
+	  $(foreach s,0 1 2,"the eight numbers with a memory (seed $(s))=runs/td3_recurrent-seed$(s)") > docs/results/state.md
 
-# The paper's Section 4. Runs that are there are used as they are; ten trainings take about a quarter of an hour on two
+# The paper's Section 4. Runs that are there are used as they are; eighteen trainings take about half an hour on two
 # cores, everything else about a minute.
-SEEDS := 0 1 2 3 4
-GUIDED := $(SEEDS:%=runs/td3_gradient_guided-fast-seed%)
-PLAIN := $(SEEDS:%=runs/td3-fast-seed%)
-STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
-PILOTS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
-RECIPE := $(RUN)/python recipes
-
-paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json)  ## every table and figure of Section 4
+paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json) $(MEMORY:%=%/eval.json)  ## every table and figure of Section 4
 	rm -rf runs/comparison runs/comparison-paper-100 runs/comparison-zeta0.001
-	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(PILOTS) --out runs/comparison
-	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(PILOTS) --tasks paper-100 --out runs/comparison-paper-100
+	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%) $(PILOTS) --out runs/comparison
+	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%) $(PILOTS) \
+	  --tasks paper-100 --out runs/comparison-paper-100
 	$(RECIPE)/evaluate.py $(STRICT:%=gg_td3=%) secant parallel --zeta 0.001 --out runs/comparison-zeta0.001
 	$(RECIPE)/figures.py --results runs/comparison --gg-td3 $(GUIDED) --td3 $(PLAIN) --out docs/figures
 	cp runs/td3_gradient_guided-fast-seed0/trajectories.png docs/figures/
@@ -72,6 +77,9 @@ runs/td3_gradient_guided-fast-seed%/eval.json: | $(VENV)/.installed
 
 runs/td3-fast-seed%/eval.json: | $(VENV)/.installed
 	$(RECIPE)/td3.py --seed $*
+
+runs/td3_recurrent-seed%/eval.json: | $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_recurrent.py --seed $*
 
 runs/td3_gradient_guided-zeta0.001-seed%/eval.json: | $(VENV)/.installed
 	$(RECIPE)/td3_gradient_guided.py --zeta 0.001 --total-frames 409600 --seed $* --out $(@D)

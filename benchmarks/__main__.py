@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import torch
 from tqdm import tqdm
 
-from benchmarks import env, fields, training, update
+from benchmarks import env, fields, profile_training, training, update
 from benchmarks.timing import Row
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -79,11 +79,12 @@ def main() -> None:
     for part in tqdm(parts, desc="ratios"):
         rows += part()
     per_second, costs, seconds = env.steps_per_second(), env.cost_by_number(), training.to_the_papers_figures()
+    parts_of_time = profile_training.table(profile_training.shares())
     speed = f"Raw step of {env.VEHICLES} vehicles: {per_second / 1e6:.2f} million vehicle-steps a second.\n"
     machine = f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__.partition('+')[0]}"
     took = f"Measured in {time.perf_counter() - began:.0f} s on {machine}.\n"
     print(f"\n{table(rows)}\n{speed}\nFrom the start of the process to SR 97 %, SPL 88.4 % [s]:\n")
-    print(f"{seconds_table(seconds)}\n{took}")
+    print(f"{seconds_table(seconds)}\n{parts_of_time}\n{took}")
     content = {"rows": [asdict(row) for row in rows], "steps_per_second": per_second, "cost_by_number": costs}
     content |= {"seconds_to_the_papers_figures": seconds, "machine": machine}
     options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -91,6 +92,7 @@ def main() -> None:
     if options.publish:
         (DOCS / "results" / "performance.md").write_text(f"{table(rows)}\n{speed}{took}")
         (DOCS / "results" / "time_to_paper.md").write_text(seconds_table(seconds))
+        (DOCS / "results" / "profile.md").write_text(parts_of_time)
         cost_figure(costs).savefig(DOCS / "figures" / "cost-by-vehicles.png", dpi=110)
 
 

@@ -6,6 +6,7 @@ Run as ``python -m benchmarks.fields``: about a minute. Each row is a ratio of t
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from datetime import datetime
 
 import ppigrf
@@ -28,16 +29,11 @@ def positions(count: int = POINTS) -> tuple[torch.Tensor, torch.Tensor]:
     return latitude, longitude
 
 
-def rows(repeats: int = 15) -> list[dict[str, str | float]]:
-    """Times of the models, as they are called in use.
+def rows(repeats: int = 11) -> list[Row]:
+    """Times of the models as they are used: a time is the mean of five calls, one after the other.
 
     Args:
         repeats: pairs of times behind each row.
-
-    Returns:
-        For each comparison ``what``, ``ours_ms``, ``theirs_ms`` (medians), ``ratio`` (median of theirs over ours, pair
-        by pair) and its quartiles ``low`` and ``high``. For the gradient "theirs" is value and gradient, "ours" the
-        value.
     """
     latitude, longitude = positions()
     few = latitude[:1024], longitude[:1024]
@@ -49,58 +45,33 @@ def rows(repeats: int = 15) -> list[dict[str, str | float]]:
     def peer(altitude_km: float = 0.0) -> object:
         return ppigrf.igrf(east, north, altitude_km, DATE, coeff_fn=ppigrf.ppigrf.shc_fn_igrf13)
 
-    compared = (
-        alternate(f"IGRF, {POINTS} points, ppigrf", lambda: igrf(latitude, longitude), peer, repeats=repeats),
-        alternate(
-            f"IGRF at given altitudes, {POINTS} points, ppigrf",
-            lambda: igrf(latitude, longitude, height),
-            lambda: peer(100.0),
-            repeats=repeats,
-        ),
-        alternate(
-            f"IGRF, {POINTS} points, value and gradient against value",
+    def row(what: str, first: Callable[[], object], second: Callable[[], object], goal: str, inner: int = 5) -> Row:
+        return alternate(what, first, second, repeats=repeats, goal=goal, inner=inner)
+
+    given = row("at given altitudes: ppigrf / IGRF", lambda: igrf(latitude, longitude, height), lambda: peer(100.0), "")
+    return [
+        row(f"{POINTS} points: ppigrf / IGRF", lambda: igrf(latitude, longitude), peer, "≥ 30"),
+        given,
+        row(f"{POINTS} points: ppigrf / RegionalField", lambda: region(latitude, longitude), peer, "≥ 300"),
+        row(
+            f"{POINTS} points: IGRF value and gradient / value",
             lambda: igrf(latitude, longitude),
             lambda: igrf.value_and_gradient(latitude, longitude),
-            repeats=repeats,
+            "≤ 3",
         ),
-        alternate(
-            f"RegionalField, {POINTS} points, ppigrf", lambda: region(latitude, longitude), peer, repeats=repeats
-        ),
-        alternate(
-            "RegionalField, 1024 points, value and gradient against value",
+        row(
+            "1024 points: RegionalField value and gradient / value",
             lambda: region(*few),
             lambda: region.value_and_gradient(*few),
-            repeats=repeats,
+            "≤ 3",
             inner=20,
         ),
-    )
-    return [_as_dict(row) for row in compared]
-
-
-def _as_dict(row: Row) -> dict[str, str | float]:
-    return {
-        "what": row.what,
-        "ours_ms": row.first_ms,
-        "theirs_ms": row.second_ms,
-        "ratio": row.ratio,
-        "low": row.low,
-        "high": row.high,
-    }
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="of torch, one table for each")
-    parser.add_argument("--repeats", type=int, default=15, help="pairs of times behind each row")
-    args = parser.parse_args()
-    for threads in args.threads:
-        torch.set_num_threads(threads)
-        print(f"threads: {threads}")
-        for row in rows(args.repeats):
-            print(
-                "{ratio:7.1f} ({low:.1f} to {high:.1f})  {ours_ms:8.3f} ms, {theirs_ms:8.3f} ms  {what}".format(**row)
-            )
+    ]
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="of torch, rows for each")
+    for threads in parser.parse_args().threads:
+        torch.set_num_threads(threads)
+        print(f"threads: {threads}", *rows(), sep="\n")

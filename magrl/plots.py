@@ -28,15 +28,15 @@ PATH, START, TARGET = "#404040", "#D55E00", "#CC79A7"
 NAVIGATOR_NAMES = {
     "gg_td3": "Gradient-Guided TD3",
     "td3": "TD3",
+    "recurrent": "recurrent TD3",
     "ga": "GA",
     "pso": "PSO",
     "afsa": "AFSA",
     "secant": "secant",
     "parallel": "parallel",
 }
-NAVIGATOR_COLOURS = dict(
-    zip(NAVIGATOR_NAMES, ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"), strict=True)
-)
+_COLOURS = ("#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+NAVIGATOR_COLOURS = dict(zip(NAVIGATOR_NAMES, _COLOURS, strict=True))
 LINES = ("#0072B2", "#D55E00", "#009E73")
 TRAINING_PANELS = {
     "return of the last 200 episodes": {"return": "return"},

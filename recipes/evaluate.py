@@ -33,7 +33,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
-from magrl import td3
+from magrl import recurrent, td3
 from magrl.env import GeomagneticNavEnv
 from magrl.metaheuristics import METAHEURISTICS
 from magrl.metrics import episode_measures, flown, summarise
@@ -42,7 +42,9 @@ from magrl.plots import NAVIGATOR_NAMES
 from magrl.runs import WandbRun, create_run_folder
 from magrl.tasks import named_tasks
 
+TRAINED = {"gg_td3": td3.load_policy, "td3": td3.load_policy, "recurrent": recurrent.load_policy}
 LABELS = NAVIGATOR_NAMES | {
+    "recurrent": "recurrent TD3 (the paper's eight numbers)",
     "secant": "secant (no training, fair)",
     "parallel": "parallel (true gradient, an oracle)",
 }
@@ -62,7 +64,7 @@ class Config:
     """What is flown, over what, and where the results go."""
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
-    """gg_td3=RUN, td3=RUN, ga, pso, afsa, parallel, secant; as many as wanted."""
+    """gg_td3=RUN, td3=RUN, recurrent=RUN, ga, pso, afsa, parallel, secant; as many as wanted."""
     tasks: Literal["test-1000", "paper-100", "figure-4-1"] = "test-1000"
     """A frozen task set."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
@@ -86,12 +88,12 @@ def navigator(text: str, env: GeomagneticNavEnv, mode: str, seed: int) -> Tensor
     name, _, run = text.partition("=")
     name, _, own_mode = name.partition(":")
     makers: dict[str, Callable[..., TensorDictModuleBase]] = {**NAVIGATORS, **METAHEURISTICS}
-    if name in ("gg_td3", "td3"):
+    if name in TRAINED:
         if not run:
             raise ValueError(f"{name} needs the folder of a finished run: {name}=RUN")
-        return td3.load_policy(Path(run) / "policy.pt")
+        return TRAINED[name](Path(run) / "policy.pt")
     if name not in makers or run or (own_mode and name not in METAHEURISTICS):
-        raise ValueError(f"unknown navigator {text!r}: choose from gg_td3=RUN, td3=RUN, {', '.join(makers)}")
+        raise ValueError(f"unknown navigator {text!r}: choose from {'=RUN, '.join(TRAINED)}=RUN, {', '.join(makers)}")
     return makers[name](env, own_mode or mode, seed)
 
 
