@@ -396,7 +396,7 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
             done = tally.frames >= config.total_frames or tally.episodes >= (config.total_episodes or math.inf)
             if done or tally.frames // config.num_envs % config.eval_every == 0:
                 small = summarise(episode_measures(td3.evaluation_rollout(small_env, policy)))
-                best.offer(small["spl"], learner.actor)
+                best.offer(small["spl"] - small["steps_all"], learner.actor)  # short paths, in few moves
                 row = {"frames": tally.frames, "episodes": tally.episodes, "updates": learner.updates}
                 row |= {"seconds": run.seconds, **tally.row()}
                 row |= {"loss_critic": learner.loss_critic.item(), "loss_actor": learner.loss_actor.item()}
