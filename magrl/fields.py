@@ -20,7 +20,10 @@ from typing_extensions import Self
 
 from magrl import harmonics
 from magrl.elements import elements_gradient, measured_elements
-from magrl.geodesy import WGS84_A_KM, WGS84_E2
+from magrl.geodesy import WGS84_A_KM, WGS84_E2, check_number, check_numbers, check_tensor, check_type
+
+LEAST_ALTITUDE_KM = -100.0
+"""Below that there are sources, and no expansion of this kind holds."""
 
 Date = datetime | str | float
 """A ``datetime``, ISO text such as ``"2022-01-01"``, or a decimal year such as ``2022.0``."""
@@ -71,7 +74,7 @@ def _igrf_tables(generation: int) -> tuple[list[datetime], np.ndarray]:
     from ppigrf import ppigrf  # heavy (pandas), and only ever needed here
 
     files = {13: ppigrf.shc_fn_igrf13, 14: ppigrf.shc_fn_igrf14}
-    if generation not in files:
+    if not isinstance(generation, int) or generation not in files:
         raise ValueError(f"IGRF generation {generation!r} is not available: choose from {sorted(files)}")
     g, h = ppigrf.read_shc(files[generation])
     n, m = np.array(list(g.columns)).T
@@ -138,12 +141,12 @@ class SphericalHarmonicField(Float64Module):
 
     def __init__(self, gauss: Tensor, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
         super().__init__()
+        check_type(Tensor, gauss=gauss)
+        check_number(1, whole=True, chunk=chunk)
         if gauss.ndim != 2 or gauss.shape[0] != gauss.shape[1] or gauss.shape[0] < 2:
             raise ValueError(f"gauss must be a square (N + 1, N + 1) table with N >= 1, got shape {tuple(gauss.shape)}")
         if not torch.isfinite(torch.view_as_real(gauss.to(torch.complex128))).all():
             raise ValueError("gauss holds coefficients that are not finite")
-        if chunk < 1:
-            raise ValueError(f"chunk must be at least one point, got {chunk}")
         self.degree = gauss.shape[0] - 1
         self.altitude_km = _checked_altitude(altitude_km)
         self.chunk = int(chunk)
@@ -205,9 +208,11 @@ class SphericalHarmonicField(Float64Module):
         self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None
     ) -> tuple[torch.Size, list[Tensor]]:
         inputs = (latitude, longitude, self.altitude_km if altitude_km is None else altitude_km)
+        check_tensor(**{f"input {i}": x for i, x in enumerate(inputs) if isinstance(x, Tensor)})
         tensors = [torch.as_tensor(x, dtype=torch.float64, device=self.value_weights.device) for x in inputs]
         check_positions(tensors[0], tensors[1])
-        _require(tensors[2].abs() < math.inf, tensors[2], "altitude_km {} is not a finite number")
+        sound = (tensors[2] >= LEAST_ALTITUDE_KM) & (tensors[2] < math.inf)
+        _require(sound, tensors[2], f"altitude_km {{}} is not a finite number from {LEAST_ALTITUDE_KM} km on")
         tensors = list(torch.broadcast_tensors(*tensors))
         return tensors[0].shape, [x.reshape(-1) for x in tensors]
 
@@ -241,6 +246,7 @@ def in_chunks(function: Callable[..., Tensor], points: Sequence[Tensor], rows: i
     Returns:
         ``(rows, P)``.
     """
+    check_number(1, whole=True, chunk=chunk)
     count = points[0].shape[-1]
     if count <= chunk:
         return function(*points)
@@ -372,6 +378,7 @@ def elements_at(field: FieldModel, position: Tensor) -> Tensor:
     Returns:
         ``(..., 3)``: D [deg], I [deg], B_H [nT].
     """
+    check_tensor(2, position=position)
     return measured_elements(field(position[..., 0], position[..., 1]))
 
 
@@ -384,7 +391,12 @@ def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]
 
     Returns:
         Two ``(3,)``: D [deg], I [deg], B_H [nT].
+
+    Raises:
+        ValueError: for no position at all.
     """
+    if not position.numel():
+        raise ValueError(f"position must hold at least one place, got shape {tuple(position.shape)}")
     values = elements_at(field, position).reshape(-1, 3)
     return values.amin(0), values.amax(0)
 
@@ -399,6 +411,7 @@ def elements_gradient_at(field: FieldModel, position: Tensor) -> Tensor:
     Returns:
         ``(..., 3, 2)``: element unit per km, northward and eastward.
     """
+    check_tensor(2, position=position)
     return elements_gradient(*field.value_and_gradient(position[..., 0], position[..., 1]))
 
 
@@ -408,6 +421,7 @@ def check_positions(latitude: Tensor, longitude: Tensor) -> None:
     Raises:
         ValueError: naming the first latitude beyond 90 degrees or value that is not finite.
     """
+    check_tensor(latitude=latitude, longitude=longitude)
     _require(latitude.abs() <= 90, latitude, "latitude {} is not between -90 and 90 degrees")
     _require(longitude.abs() < math.inf, longitude, "longitude {} is not a finite number of degrees")
 
@@ -426,6 +440,7 @@ def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> 
     Raises:
         ValueError: with the values.
     """
+    check_numbers(2, latitudes=latitude, longitudes=longitude)
     south, north = latitude
     west, east = longitude
     if not (-90 <= south < north <= 90):
@@ -438,8 +453,5 @@ def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> 
 
 
 def _checked_altitude(altitude_km: float) -> float:
-    if not math.isfinite(altitude_km):
-        raise ValueError(f"altitude_km {altitude_km} is not a finite number")
-    if altitude_km < -100:
-        raise ValueError(f"altitude_km {altitude_km} is below the Earth's crust: sources lie outside the model there")
+    check_number(LEAST_ALTITUDE_KM, altitude_km=altitude_km)
     return float(altitude_km)

@@ -25,6 +25,8 @@ import math
 import torch
 from torch import Tensor
 
+from magrl.geodesy import check_number
+
 REFERENCE_RADIUS_KM = 6371.2
 """Geomagnetic reference radius [km]: the ``a`` of the expansion."""
 
@@ -153,6 +155,7 @@ def chebyshev_nodes(count: int, device: torch.device | None = None) -> tuple[Ten
         >>> (to_coefficients @ torch.cos(2 * angles)).round().abs()
         tensor([0., 0., 1.], dtype=torch.float64)
     """
+    check_number(1, whole=True, count=count)
     k = torch.arange(count, dtype=torch.float64, device=device)
     angles = (k + 0.5) * (math.pi / count)
     matrix = torch.cos(k.unsqueeze(-1) * angles) * (2 / count)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magrl.fields import FieldModel, Float64Module, check_box, in_chunks
-from magrl.geodesy import curvature_radii
+from magrl.geodesy import check_number, check_tensor, curvature_radii
 from magrl.harmonics import chebyshev, chebyshev_nodes
 
 
@@ -54,10 +54,8 @@ class RegionalField(Float64Module):
     ) -> None:
         super().__init__()
         check_box(latitude, longitude)
-        if degree < 1:
-            raise ValueError(f"degree must be at least 1, got {degree}")
-        if not tolerance_nt > 0:
-            raise ValueError(f"tolerance_nt must be positive, got {tolerance_nt}")
+        check_number(1, whole=True, degree=degree)
+        check_number(0, above=True, tolerance_nt=tolerance_nt)
         self.latitude, self.longitude, self.degree = tuple(latitude), tuple(longitude), int(degree)
         self.tolerance_nt = float(tolerance_nt)
         angles, from_nodes = chebyshev_nodes(degree + 1)
@@ -104,6 +102,7 @@ class RegionalField(Float64Module):
 
     def _evaluate(self, latitude: Tensor, longitude: Tensor, rows: int) -> Tensor:
         """The first 3 rows or all 9 of what the coefficients stand for: ``(rows, ...)``."""
+        check_tensor(latitude=latitude, longitude=longitude)
         position = torch.stack(torch.broadcast_tensors(latitude.double(), longitude.double()))
         sums = partial(self._sums, self.coefficients[: rows * (self.degree + 1)])
         return in_chunks(sums, [position.reshape(2, -1)], rows, self.CHUNK).reshape(rows, *position.shape[1:])

@@ -38,6 +38,18 @@ def test_named_tests_exist(name: str) -> None:
     assert re.search(rf"^(def|class) {test}\b" if test else "", (ROOT / path).read_text(), re.MULTILINE)
 
 
+def test_tests_of_promises_exist() -> None:
+    rows = [line for line in (ROOT / "docs" / "reliability.md").read_text().splitlines() if line.startswith("| ")]
+    for row in rows[1:]:
+        named = re.findall(r"`(test_\w+\.py)?(?:::)?(test_\w+)?`", row.split("|")[2])
+        assert named, row
+        file = ""
+        for path, test in named:
+            file = path or file
+            source = (ROOT / "tests" / file).read_text()
+            assert re.search(rf"^def {test}\b" if test else "", source, re.MULTILINE), f"{file}::{test}"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):

@@ -425,7 +425,7 @@ def test_a_chunk_of_no_points_is_refused(chunk):
 
 @pytest.mark.parametrize("altitude_km", [math.nan, math.inf, -101.0])
 def test_a_bad_altitude_is_refused_in_the_constructor(altitude_km):
-    with pytest.raises(ValueError, match=f"altitude_km {altitude_km}"):
+    with pytest.raises(ValueError, match=f"altitude_km .* got {altitude_km}"):
         IGRF(PAPER_DATE, altitude_km=altitude_km)
 
 
@@ -529,10 +529,10 @@ def test_a_missed_tolerance_is_refused_with_its_numbers(igrf, degree, tolerance_
         ((-10, 0), (160, 160), {}, r"longitudes \(160, 160\)"),
         ((-10, 0), (0, 361), {}, r"longitudes \(0, 361\)"),
         ((-10, 0), (math.nan, 170), {}, "longitudes"),
-        ((-10, 0), (160, 170), {"degree": 0}, "degree must be at least 1, got 0"),
-        ((-10, 0), (160, 170), {"tolerance_nt": 0.0}, "tolerance_nt must be positive, got 0"),
-        ((-10, 0), (160, 170), {"tolerance_nt": -1.0}, "tolerance_nt must be positive, got -1"),
-        ((-10, 0), (160, 170), {"tolerance_nt": math.nan}, "tolerance_nt must be positive, got nan"),
+        ((-10, 0), (160, 170), {"degree": 0}, "degree .* got 0"),
+        ((-10, 0), (160, 170), {"tolerance_nt": 0.0}, "tolerance_nt .* got 0"),
+        ((-10, 0), (160, 170), {"tolerance_nt": -1.0}, "tolerance_nt .* got -1"),
+        ((-10, 0), (160, 170), {"tolerance_nt": math.nan}, "tolerance_nt .* got nan"),
     ],
 )
 def test_bad_boxes_and_settings_are_refused(igrf, latitude, longitude, options, message):

@@ -362,7 +362,11 @@ FIELDS: dict[str, list[Refused | Nan]] = {
     "harmonics.gradient_table": [
         refused(lambda: harmonics.gradient_table(zeros(2, 3, dtype=torch.complex128)), RuntimeError, "(3)", "(2)")
     ],
-    "harmonics.chebyshev_nodes": [refused(lambda: harmonics.chebyshev_nodes("a"), TypeError, "str")],
+    "harmonics.chebyshev_nodes": [
+        refused(lambda: harmonics.chebyshev_nodes("a"), ValueError, "count", "'a'"),
+        refused(lambda: harmonics.chebyshev_nodes(0), ValueError, "count", "0"),
+        refused(lambda: harmonics.chebyshev_nodes(1.5), ValueError, "count", "1.5"),
+    ],
     "harmonics.separate": [
         refused(lambda: harmonics.separate(zeros(3, 13, **FLOAT64), 2), RuntimeError, "(7)", "(6)"),
         refused(lambda: harmonics.separate(zeros(3, 12), 2), RuntimeError, "Float", "Double"),
@@ -405,8 +409,13 @@ FIELDS: dict[str, list[Refused | Nan]] = {
         refused(lambda: fields.SphericalHarmonicField(zeros(2, 3)), ValueError, "(2, 3)"),
         refused(lambda: fields.SphericalHarmonicField(GAUSS + NAN), ValueError, "gauss", "not finite"),
         refused(lambda: fields.SphericalHarmonicField(GAUSS, chunk=0), ValueError, "chunk", "0"),
-        refused(lambda: fields.SphericalHarmonicField(GAUSS, altitude_km=NAN), ValueError, "altitude_km nan"),
-        refused(lambda: fields.SphericalHarmonicField(GAUSS, altitude_km=-200.0), ValueError, "altitude_km -200"),
+        refused(lambda: fields.SphericalHarmonicField(GAUSS, altitude_km=NAN), ValueError, "altitude_km", "nan"),
+        refused(lambda: fields.SphericalHarmonicField(GAUSS, altitude_km=-200.0), ValueError, "altitude_km", "-200.0"),
+        refused(lambda: fields.SphericalHarmonicField(5), TypeError, "gauss", "5"),
+        refused(lambda: fields.SphericalHarmonicField(GAUSS, chunk=1.5), ValueError, "chunk", "1.5"),
+        refused(lambda: fields.SphericalHarmonicField(GAUSS, altitude_km="a"), ValueError, "altitude_km", "'a'"),
+        refused(lambda: fields.SphericalHarmonicField(GAUSS)(t(0.0), t(0.0), -200.0), ValueError, "altitude_km -200.0"),
+        refused(lambda: fields.SphericalHarmonicField(GAUSS)(t(1j), t(0.0)), TypeError, "complex64"),
         *bad_places(fields.SphericalHarmonicField(GAUSS)),
     ],
     "fields.SphericalHarmonicField.value_and_gradient": bad_places(
@@ -415,18 +424,20 @@ FIELDS: dict[str, list[Refused | Nan]] = {
     "fields.IGRF": [
         refused(lambda: fields.IGRF("2031-01-01"), ValueError, "2031-01-01", "2030"),
         refused(lambda: fields.IGRF(2022.0, 12), ValueError, "12", "[13, 14]"),
-        refused(lambda: fields.IGRF(2022.0, altitude_km=INF), ValueError, "altitude_km inf"),
+        refused(lambda: fields.IGRF(2022.0, altitude_km=INF), ValueError, "altitude_km", "inf"),
+        refused(lambda: fields.IGRF(2022.0, "13"), ValueError, "'13'", "[13, 14]"),
         *bad_places(lambda *place: igrf()(*place)),
     ],
-    "fields.in_chunks": [refused(lambda: fields.in_chunks(torch.sin, [zeros(5)], 1, 0), ValueError, "zero")],
+    "fields.in_chunks": [refused(lambda: fields.in_chunks(torch.sin, [zeros(5)], 1, 0), ValueError, "chunk", "0")],
     "fields.elements_at": [
+        refused(lambda: fields.elements_at(igrf(), zeros(4, 3)), ValueError, "(4, 3)"),
         refused(lambda: fields.elements_at(igrf(), t(-95.0, 0.0)), ValueError, "latitude -95.0"),
         refused(lambda: fields.elements_at(lambda latitude, _: latitude, zeros(4, 2)), ValueError, "b_ned", "(4,)"),
         Nan(lambda: fields.elements_at(box(), t(5.0, 165.0))),
     ],
     "fields.elements_range": [
         refused(lambda: fields.elements_range(igrf(), t(0.0, NAN)), ValueError, "longitude nan"),
-        refused(lambda: fields.elements_range(igrf(), zeros(0, 2)), IndexError, "dim 0"),
+        refused(lambda: fields.elements_range(igrf(), zeros(0, 2)), ValueError, "(0, 2)"),
         Nan(lambda: fields.elements_range(box(), torch.tensor([[5.0, 165.0], [-5.0, 165.0]]))),
     ],
     "fields.elements_gradient_at": [
@@ -439,6 +450,7 @@ FIELDS: dict[str, list[Refused | Nan]] = {
         refused(lambda: fields.check_positions(zeros(1), t(INF)), ValueError, "longitude inf"),
     ],
     "fields.check_box": [
+        refused(lambda: fields.check_box(5, (0, 1)), ValueError, "5"),
         refused(lambda: fields.check_box((1, 1), (0, 1)), ValueError, "(1, 1)"),
         refused(lambda: fields.check_box((0, NAN), (0, 1)), ValueError, "(0, nan)"),
         refused(lambda: fields.check_box((0, 1), (170, -170)), ValueError, "(170, -170)", "(170, 190)"),
@@ -447,6 +459,8 @@ FIELDS: dict[str, list[Refused | Nan]] = {
     "regional.RegionalField": [
         refused(lambda: regional.RegionalField(igrf(), (0, -1), (0, 1)), ValueError, "(0, -1)"),
         refused(lambda: regional.RegionalField(igrf(), (0, 1), (0, 1), degree=0), ValueError, "degree", "0"),
+        refused(lambda: regional.RegionalField(igrf(), (0, 1), (0, 1), degree=1.5), ValueError, "degree", "1.5"),
+        refused(lambda: box()(t(1j), t(0.0)), TypeError, "complex64"),
         refused(
             lambda: regional.RegionalField(igrf(), (0, 1), (0, 1), tolerance_nt=NAN), ValueError, "tolerance_nt", "nan"
         ),
