@@ -6,6 +6,7 @@ Run as ``python -m benchmarks.fields``: about a minute. Each row is a ratio of t
 from __future__ import annotations
 
 import argparse
+import resource
 from collections.abc import Callable
 from datetime import datetime
 
@@ -13,7 +14,7 @@ import ppigrf
 import torch
 
 from benchmarks.timing import Row, alternate
-from magrl.fields import IGRF
+from magrl.fields import IGRF, FieldModel
 from magrl.regional import RegionalField
 
 DATE, GENERATION = datetime(2022, 1, 1), 13
@@ -69,9 +70,24 @@ def rows(repeats: int = 11) -> list[Row]:
     ]
 
 
+def peak_gib(model: FieldModel, count: int = 10_000_000) -> float:
+    """Peak memory of this process after value and gradient at many points [GiB]."""
+    model.value_and_gradient(*positions(count))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="of torch, rows for each")
-    for threads in parser.parse_args().threads:
-        torch.set_num_threads(threads)
-        print(f"threads: {threads}", *rows(), sep="\n")
+    parser.add_argument(
+        "--memory", action="store_true", help="instead: peak memory at 10 million points, one model a run"
+    )
+    parser.add_argument("--model", choices=["igrf", "regional"], default="igrf", help="for --memory")
+    options = parser.parse_args()
+    if options.memory:
+        model = IGRF(DATE, GENERATION)
+        print(f"{options.model}: {peak_gib(model if options.model == 'igrf' else RegionalField(model, *BOX)):.2f} GiB")
+    else:
+        for threads in options.threads:
+            torch.set_num_threads(threads)
+            print(f"threads: {threads}", *rows(), sep="\n")
