@@ -5,8 +5,8 @@ from it where it will go. But journeys begin northward, and the last turn is one
 that adds up its turns knows its heading. Here an LSTM learns to do that, and its estimate stands where the networks of
 :mod:`magrl.td3` read the heading.
 
-Only training knows more: the critics, which do not fly, read the true heading (``heading_vector``), and the memory can be
-taught by it. The policy reads ``observation``, made of the eight numbers, and what it remembers.
+Only training knows more: the critics, which do not fly, read the true heading (``heading_vector``), and the memory can
+be taught by it. The policy reads ``observation``, made of the eight numbers, and what it remembers.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 The state of Eq. 3-1 does not hold the heading that turns are counted from, so the memoryless agent of
 td3_gradient_guided.py stands still on it. This one remembers: an LSTM adds up the turns (magrl/recurrent.py). The true
-heading is used in training, by the critics, and never by the policy that flies. Expected: 95 to 100 % of 1000 tasks that
-it never saw, SPL 87 to 97 %. The run folder is that of the other recipes.
+heading is used in training, by the critics, and never by the policy that flies. Expected: 95 to 100 % of 1000 tasks
+that it never saw, SPL 87 to 97 %. The run folder is that of the other recipes.
 """
 
 from __future__ import annotations
@@ -110,8 +110,8 @@ class Config:
     memory_rate: float = 5.0
     """Learning rate of the memory, in units of that of the actor."""
     heading_weight: float = 0.0
-    """Weight of the error of the estimated heading in the loss of the actor, which teaches the memory what it should be;
-    0 leaves that to the critics."""
+    """Weight of the error of the estimated heading in the loss of the actor, which teaches the memory what it should
+    be; 0 leaves that to the critics."""
     exploration_noise: float = 0.5
     """Standard deviation of the noise on actions in [-1, 1]. It has to be large at first, while the policy is the same
     everywhere: critics that have seen few actions mislead the actor for long."""
