@@ -316,7 +316,8 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
         boxes = axes.boxplot(values, patch_artist=True, showmeans=True, flierprops={"ms": 2, "alpha": 0.4})
         for box, name in zip(boxes["boxes"], measures, strict=True):
             box.set(facecolor=NAVIGATOR_COLOURS[name], alpha=0.6)
-        names = [NAVIGATOR_NAMES[name].replace("Gradient-Guided", "GG") for name in measures]
+        short = {"gg_td3": "GG TD3", "recurrent": "recurrent"}  # the full names would run into each other
+        names = [short.get(name, NAVIGATOR_NAMES[name]) for name in measures]
         axes.set_xticks(range(1, len(names) + 1), names)
         axes.set(ylabel=label, title=f"({letter})")
         axes.grid(alpha=0.3, axis="y")
