@@ -33,12 +33,16 @@ def test_field_and_gradient(benchmark, field: FieldModel, places) -> None:
 
 @pytest.mark.parametrize("vehicles", [64, 1024, 16384])
 def test_step(benchmark, vehicles: int) -> None:
-    benchmark(env.Stepper(GeomagneticNavEnv(num_envs=vehicles, seed=0)))
+    stepper = env.Stepper(GeomagneticNavEnv(num_envs=vehicles, seed=0))
+    benchmark(stepper)
+    assert stepper.state.shape == (vehicles,)
 
 
 @pytest.mark.parametrize("vehicles", [64, 1024])
 def test_guided_collection(benchmark, vehicles: int) -> None:
-    benchmark(env.Collecting(vehicles))
+    collecting = env.Collecting(vehicles)
+    benchmark(collecting)
+    assert next(collecting.batches).numel() == vehicles
 
 
 def test_gradient_step(benchmark) -> None:

@@ -269,7 +269,7 @@ def make_loss(
         loss_function="l2",
         policy_noise=policy_noise,
         noise_clip=noise_clip,
-        deactivate_vmap=True,  # two critics in a Python loop cost less than one vmap over them
+        deactivate_vmap=True,  # the networks stand: there is nothing to map over
     )
     loss.make_value_estimator(gamma=gamma)
     return loss

@@ -1,6 +1,6 @@
 """Recurrent TD3: train an agent that reads the paper's eight numbers and no heading.
 
-    python recipes/td3_recurrent.py     # about three and a half minutes on one core
+    python recipes/td3_recurrent.py     # about four minutes on one core
 
 The state of Eq. 3-1 does not hold the heading that turns are counted from, so the memoryless agent of
 td3_gradient_guided.py stands still on it. This one remembers: an LSTM adds up the turns (magrl/recurrent.py). The true
