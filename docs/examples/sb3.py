@@ -3,8 +3,7 @@
     pip install -c constraints.txt ".[bench]"
     python docs/examples/sb3.py --algorithm sac
 
-Expected with seed 0: 98 of 100 tasks flown to their destination, SPL 0.889, after 85 s of processor time on one core.
-docs/gymnasium.md has what TD3 reaches in as many moves.
+Prints the success rate and SPL on 100 tasks that the agent never saw, after a minute or two.
 """
 
 from __future__ import annotations
