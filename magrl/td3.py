@@ -194,6 +194,8 @@ class LeanTD3Loss(TD3Loss):
             networks[role] = [copy.deepcopy(network) for _ in params]
             for holder, held in zip(networks[role], params, strict=True):
                 held.to_module(holder)
+            if network is self.qvalue_network:  # one tensor in, one out: no need to dress them
+                networks[role] = [critic.module for critic in networks[role]]
         for critic in networks["critics"]:
             critic.requires_grad_()
         return networks
@@ -217,11 +219,12 @@ class LeanTD3Loss(TD3Loss):
         with torch.no_grad():
             (actor,) = self._standing["target actor"]
             seen = actor(after.select(*self.actor_network.in_keys))
-            seen["action"] = (seen["action"] + noise).clamp(self.min_action, self.max_action)
-            value = torch.minimum(*(critic(seen)["state_action_value"] for critic in self._standing["target critics"]))
+            chosen = (seen["action"] + noise).clamp(self.min_action, self.max_action)
+            there = torch.cat((after["observation"], chosen), -1)
+            value = torch.minimum(*(critic(there) for critic in self._standing["target critics"]))
             target = after["reward"] + self.value_estimator.gamma * (~after["terminated"]).to(value.dtype) * value
-        here = tensordict.select(*self.qvalue_network.in_keys)
-        first, second = (critic(here)["state_action_value"] - target for critic in self._standing["critics"])
+        here = torch.cat((tensordict["observation"], action), -1)
+        first, second = (critic(here) - target for critic in self._standing["critics"])
         return (first.square() + second.square()).mean(), {"target_value": target}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -234,8 +237,9 @@ class LeanTD3Loss(TD3Loss):
             A scalar, and ``logits`` ``(B, 2)``, the actor's outputs before the tanh, with their gradient.
         """
         (actor,), (critic,) = self._standing["actor"], self._standing["asked critic"]
-        seen = critic(actor(tensordict.select(*self.actor_network.in_keys)))
-        return -seen["state_action_value"].mean(), {"logits": seen["logits"]}
+        seen = actor(tensordict.select(*self.actor_network.in_keys))
+        value = critic(torch.cat((seen["observation"], seen["action"]), -1))
+        return -value.mean(), {"logits": seen["logits"]}
 
 
 class LeanSoftUpdate(SoftUpdate):

@@ -352,7 +352,7 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
         spec=env.action_spec_unbatched,
         sigma_init=config.exploration_noise,
         sigma_end=config.final_exploration_noise,
-        annealing_num_steps=config.total_frames,
+        annealing_num_steps=math.ceil(config.total_frames / config.num_envs),
         device=env.device,
     )
     collector = make_collector(config, env, view, TensorDictSequential(learner.actor, noise), guided=guided)
@@ -383,12 +383,13 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
             batch = batch.reshape(-1)
             check_finite(batch, f"after {tally.frames} frames")
             buffer.extend(batch.select(*TRANSITION))
-            noise.step(batch.numel())
+            noise.step()
             tally.add(batch, alignment.term(batch, batch["next"]) if alignment else None)
             left = max(0.0, 1 - tally.frames / config.total_frames)
             learner.anneal(left)
-            for _ in range(config.updates_per_batch if len(buffer) >= config.batch_size else 0):
-                learner.update(buffer.sample(), left * config.saturation_weight)
+            if len(buffer) >= config.batch_size:
+                for transitions in buffer.sample(config.updates_per_batch * config.batch_size).split(config.batch_size):
+                    learner.update(transitions, left * config.saturation_weight)
             learner.check()
             if config.collectors > 1:
                 collector.update_policy_weights_()

@@ -16,6 +16,7 @@ from ppigrf import igrf
 from ppigrf.ppigrf import shc_fn_igrf13
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from magrl.env import PRIVILEGED_KEYS, GeomagneticNavEnv, flown_box, paper_field
@@ -23,6 +24,7 @@ from magrl.fields import IGRF
 from magrl.geodesy import geodesic, move
 from magrl.regional import RegionalField
 from magrl.tasks import PAPER_REGION, Region, Tasks
+from magrl.td3 import guidance_transforms
 
 ANTIMERIDIAN = Region((-5.0, 5.0), (175.0, 185.0))
 HIGH_LATITUDE = Region((60.0, 70.0), (10.0, 30.0))
@@ -799,3 +801,21 @@ def test_options_reach_the_data() -> None:
     td = make(tasks=tasks, field=IGRF(1950.0, 13)).reset()
     assert td["field"][0, 2].item() == pytest.approx(math.hypot(north, east), rel=1e-6)
     assert td["field"][0, 2].item() != pytest.approx(35467.990, rel=1e-4)
+
+
+def test_step_and_guidance_trace_as_one_graph() -> None:
+    """Nothing in them breaks the graph of torch.compile, and the graph gives the same numbers."""
+    env = make(4)
+    td = env.rand_action(env.reset())
+    guidance = Compose(*guidance_transforms(env, 3.0, 0.785))
+    TransformedEnv(env, guidance).reset()
+    before = guidance._reset(td.clone(), td.clone())
+
+    def step(before: TensorDictBase) -> TensorDictBase:
+        return guidance._step(before, env._step(before))
+
+    traced = torch.compile(step, fullgraph=True, backend="aot_eager")(before)
+    plain = step(before)
+    assert {"field", "reward", "gradient_heading"} <= set(plain.keys())
+    for key, value in plain.items():
+        torch.testing.assert_close(traced[key], value, rtol=0, atol=0, msg=lambda text, key=key: f"{key}: {text}")
