@@ -79,13 +79,16 @@ def main() -> None:
     for part in tqdm(parts, desc="ratios"):
         rows += part()
     per_second, costs, seconds = env.steps_per_second(), env.cost_by_number(), training.to_the_papers_figures()
-    parts_of_time = profile_training.table(profile_training.shares())
-    speed = f"Raw step of {env.VEHICLES} vehicles: {per_second / 1e6:.2f} million vehicle-steps a second.\n"
+    parts_of_time, memory = profile_training.table(profile_training.shares()), fields.peak_memory()
+    speed = f"Raw step of {env.VEHICLES} vehicles: {per_second / 1e6:.2f} million vehicle-steps a second.\n\n"
+    speed += f"Peak memory, value and gradient at 10 million points: {memory['igrf']:.2f} GiB with IGRF, "
+    speed += f"{memory['regional']:.2f} GiB with RegionalField.\n\n"
     machine = f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__.partition('+')[0]}"
     took = f"Measured in {time.perf_counter() - began:.0f} s on {machine}.\n"
-    print(f"\n{table(rows)}\n{speed}\nFrom the start of the process to SR 97 %, SPL 88.4 % [s]:\n")
+    print(f"\n{table(rows)}\n{speed}From the start of the process to SR 97 %, SPL 88.4 % [s]:\n")
     print(f"{seconds_table(seconds)}\n{parts_of_time}\n{took}")
     content = {"rows": [asdict(row) for row in rows], "steps_per_second": per_second, "cost_by_number": costs}
+    content |= {"peak_gib": memory}
     content |= {"seconds_to_the_papers_figures": seconds, "machine": machine}
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(content, indent=2) + "\n")

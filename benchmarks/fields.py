@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import argparse
 import resource
-from collections.abc import Callable
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import datetime
 
 import ppigrf
@@ -30,12 +34,29 @@ def positions(count: int = POINTS) -> tuple[torch.Tensor, torch.Tensor]:
     return latitude, longitude
 
 
-def rows(repeats: int = 11) -> list[Row]:
+@contextmanager
+def threads_of_torch(count: int) -> Iterator[None]:
+    """So many threads, and as many as before afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def rows(repeats: int = 11, threads: int = 1) -> list[Row]:
     """Times of the models as they are used: a time is the mean of five calls, one after the other.
 
     Args:
         repeats: pairs of times behind each row.
+        threads: of torch. One is fair beside ppigrf, which never uses more.
     """
+    with threads_of_torch(threads):
+        return _rows(repeats)
+
+
+def _rows(repeats: int) -> list[Row]:
     latitude, longitude = positions()
     few = latitude[:1024], longitude[:1024]
     igrf = IGRF(DATE, GENERATION)
@@ -49,11 +70,17 @@ def rows(repeats: int = 11) -> list[Row]:
     def row(what: str, first: Callable[[], object], second: Callable[[], object], goal: str, inner: int = 5) -> Row:
         return alternate(what, first, second, repeats=repeats, goal=goal, inner=inner)
 
-    given = row("at given altitudes: ppigrf / IGRF", lambda: igrf(latitude, longitude, height), lambda: peer(100.0), "")
-    return [
+    found = [
         row(f"{POINTS} points: ppigrf / IGRF", lambda: igrf(latitude, longitude), peer, "≥ 30"),
-        given,
+        row("at given altitudes: ppigrf / IGRF", lambda: igrf(latitude, longitude, height), lambda: peer(100.0), ""),
         row(f"{POINTS} points: ppigrf / RegionalField", lambda: region(latitude, longitude), peer, "≥ 300"),
+    ]
+    if shutil.which("g++") or shutil.which("clang++"):  # what torch.compile needs
+        compiled = torch.compile(region.forward, dynamic=False)
+        what = f"{POINTS} points: ppigrf / RegionalField, compiled"
+        found.append(row(what, lambda: compiled(latitude, longitude), peer, "≥ 300"))
+    return [
+        *found,
         row(
             f"{POINTS} points: IGRF value and gradient / value",
             lambda: igrf(latitude, longitude),
@@ -70,6 +97,15 @@ def rows(repeats: int = 11) -> list[Row]:
     ]
 
 
+def peak_memory() -> dict[str, float]:
+    """Peak memory of a process that evaluates value and gradient at 10 million points, by model [GiB]."""
+    command = [sys.executable, "-m", "benchmarks.fields", "--memory", "--model"]
+    return {
+        model: float(subprocess.run([*command, model], check=True, capture_output=True, text=True).stdout)
+        for model in ("igrf", "regional")
+    }
+
+
 def peak_gib(model: FieldModel, count: int = 10_000_000) -> float:
     """Peak memory of this process after value and gradient at many points [GiB]."""
     model.value_and_gradient(*positions(count))
@@ -80,14 +116,13 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="of torch, rows for each")
     parser.add_argument(
-        "--memory", action="store_true", help="instead: peak memory at 10 million points, one model a run"
+        "--memory", action="store_true", help="instead: peak memory at 10 million points [GiB], one model a run"
     )
     parser.add_argument("--model", choices=["igrf", "regional"], default="igrf", help="for --memory")
     options = parser.parse_args()
     if options.memory:
         model = IGRF(DATE, GENERATION)
-        print(f"{options.model}: {peak_gib(model if options.model == 'igrf' else RegionalField(model, *BOX)):.2f} GiB")
+        print(f"{peak_gib(model if options.model == 'igrf' else RegionalField(model, *BOX)):.2f}")
     else:
         for threads in options.threads:
-            torch.set_num_threads(threads)
-            print(f"threads: {threads}", *rows(), sep="\n")
+            print(f"threads: {threads}", *rows(threads=threads), sep="\n")

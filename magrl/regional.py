@@ -38,7 +38,7 @@ class RegionalField(Float64Module):
         True
     """
 
-    CHUNK = 2560
+    CHUNK = 10240
     """Points evaluated at a time: bounds the memory, beyond that of the answer, at about 2 kB a point."""
     coefficients: Tensor
     scaling: Tensor
