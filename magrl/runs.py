@@ -1,4 +1,4 @@
-"""What a training leaves behind: its folder, its curves, its pictures, and its wandb run."""
+"""What a training leaves behind: its folder, its curves, its pictures, and its run in a logger."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import contextlib
 import csv
 import json
 import math
-import shutil
 import signal
-import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
@@ -21,9 +20,7 @@ from filelock import FileLock, Timeout
 from matplotlib.figure import Figure
 
 from magrl.geodesy import check_type
-
-WANDB_PROJECT = "magrl"
-WANDB_MODES = ("offline", "online", "disabled")
+from magrl.loggers import check_logger, open_log
 
 
 def create_run_folder(path: Path | str) -> Path:
@@ -99,19 +96,20 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 class RunLog:
-    """Writes a run to its folder and, unless that is disabled, to wandb, through TorchRL's logger.
+    """Writes a run to its folder and, unless that is disabled, to a logger (:mod:`magrl.loggers`).
 
     Args:
         folder: from :func:`create_run_folder`.
         columns: of ``train.csv``, in order.
         config: written to ``config.json`` and shown by wandb.
+        logger: ``wandb``, ``tensorboard`` or ``csv``.
         wandb_mode: ``offline`` (no network, no login), ``online``, or ``disabled`` (nothing of wandb is written).
         group: runs that belong together.
         tags: to filter runs by.
         resumed: whether the run goes on; its files stay as they are until :meth:`load_state_dict`.
 
     Raises:
-        ValueError: for another mode.
+        ValueError: for another logger or mode, or a logger that is not installed.
     """
 
     def __init__(
@@ -120,22 +118,23 @@ class RunLog:
         columns: Sequence[str],
         config: Mapping[str, Any],
         *,
+        logger: str = "wandb",
         wandb_mode: str = "disabled",
         group: str = "",
         tags: Sequence[str] = (),
         resumed: bool = False,
     ) -> None:
         check_type(Path, folder=folder)
-        _check_mode(wandb_mode)
+        check_logger(logger, wandb_mode)
         self.folder, self.columns, self.rows = folder, tuple(columns), list[dict[str, float]]()
-        self._wandb_options = (folder, wandb_mode, config, group, tags)
+        self._open_log = partial(open_log, logger, folder, config, wandb_mode=wandb_mode, group=group, tags=tuple(tags))
         self._began = time.perf_counter()
         if not resumed:
             write_json(folder / "config.json", config)
             self._open([], uuid.uuid4().hex[:8])
 
     def _open(self, rows: Sequence[Mapping[str, float]], wandb_id: str) -> None:
-        """Starts ``train.csv`` with some rows, and the wandb run."""
+        """Starts ``train.csv`` and the logger, both with some rows."""
         aside = self.folder / "train.csv.aside"
         self._file = aside.open("w", newline="")
         self._writer = csv.DictWriter(self._file, self.columns)
@@ -143,7 +142,9 @@ class RunLog:
         for row in rows:
             self._write(row)
         aside.replace(self.folder / "train.csv")
-        self._wandb = WandbRun(*self._wandb_options, run_id=wandb_id)
+        self._log = self._open_log(run_id=wandb_id)
+        for row in rows:
+            self._log.row(row)
 
     def _write(self, row: Mapping[str, float]) -> None:
         self.rows.append(dict(row))
@@ -158,23 +159,25 @@ class RunLog:
     def row(self, row: Mapping[str, float]) -> None:
         """Adds a row of curves; it is in the file when this returns. ``frames`` is the step."""
         self._write(row)
-        self._wandb.row(row)
+        self._log.row(row)
 
     def figure(self, name: str, figure: Figure) -> None:
         """Saves a picture as ``<name>.png``."""
         path = self.folder / f"{name}.png"
         figure.savefig(path, dpi=120)
-        self._wandb.picture(name, path)
+        self._log.picture(name, path)
 
-    def result(self, result: Mapping[str, float]) -> None:
-        """Writes ``eval.json``; wandb gets a table and its summary."""
+    def result(self, result: Mapping[str, float], navigator: str = "") -> None:
+        """Writes ``eval.json``; wandb also gets a row of its table of navigators, final values, and ``policy.pt``."""
         write_json(self.folder / "eval.json", result)
-        self._wandb.table("final/table", [["measure", "value"], *([key, f"{x:.6g}"] for key, x in result.items())])
-        self._wandb.summary({f"final/{key}": value for key, value in result.items()})
+        self._log.table("eval/navigators", [{"navigator": navigator, **result}])
+        self._log.summary({f"final/{key}": value for key, value in result.items()})
+        if (self.folder / "policy.pt").is_file():
+            self._log.artifact(self.folder / "policy.pt", {"navigator": navigator, **result})
 
     def state_dict(self) -> dict[str, Any]:
-        """The rows so far, the time that they took, and the wandb run that they went to."""
-        return {"rows": list(self.rows), "seconds": self.seconds, "wandb_id": self._wandb.run_id}
+        """The rows so far, the time that they took, and the run of wandb that they went to."""
+        return {"rows": list(self.rows), "seconds": self.seconds, "wandb_id": self._log.run_id}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Goes on from those rows; later ones that are in the file are dropped."""
@@ -182,119 +185,6 @@ class RunLog:
         self._open(state_dict["rows"], str(state_dict["wandb_id"]))
 
     def close(self) -> None:
-        """Closes the files and the wandb run."""
+        """Closes the files and the logger."""
         self._file.close()
-        self._wandb.close()
-
-
-class WandbRun:
-    """A run of wandb, or nothing at all where that is disabled: every method may be called either way.
-
-    What goes wrong in wandb (a folder that cannot be written, a full disk) is said once and never stops the caller.
-
-    Args:
-        folder: of the run; wandb gets the folder ``wandb`` in it.
-        mode: ``offline`` (no network, no login), ``online`` or ``disabled``.
-        config: shown with the run.
-        group: runs that belong together.
-        tags: to filter runs by.
-        run_id: of the run; one that exists is gone on with.
-
-    Raises:
-        ValueError: for another mode.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        mode: str,
-        config: Mapping[str, Any],
-        group: str = "",
-        tags: Sequence[str] = (),
-        *,
-        run_id: str = "",
-    ) -> None:
-        check_type(Path, folder=folder)
-        _check_mode(mode)
-        self.folder, self.run_id = folder, run_id or uuid.uuid4().hex[:8]
-        self._logger: Any = None
-        if mode != "disabled":
-            options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags)}
-            self._try(lambda: setattr(self, "_logger", _wandb_logger(folder, mode, config, options)))
-
-    def _try(self, action: Callable[[], Any]) -> None:
-        try:
-            action()
-        except Exception as error:
-            self._logger = None
-            print(f"wandb failed and is left out from here on: {error}", file=sys.stderr)
-
-    def row(self, row: Mapping[str, float]) -> None:
-        """Points of curves; ``frames`` is the step."""
-        for key, value in row.items():
-            if self._logger and key != "frames" and math.isfinite(value):
-                self._try(lambda: self._logger.log_scalar(_panel(key), value, step=int(row["frames"])))  # noqa: B023
-
-    def picture(self, name: str, path: Path) -> None:
-        """A picture that lies in a file."""
-        if self._logger:
-            import wandb
-
-            self._try(lambda: self._logger.experiment.log({f"figures/{name}": wandb.Image(str(path))}))
-
-    def table(self, name: str, rows: Sequence[Sequence[str]]) -> None:
-        """A table of texts, as HTML: a wandb.Table would put the absolute path of its staging folder into the run."""
-        if self._logger:
-            import wandb
-
-            lines = ("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-            html = f"<table>{''.join(lines)}</table>"
-            self._try(lambda: self._logger.experiment.log({name: wandb.Html(html, inject=False)}))
-
-    def summary(self, values: Mapping[str, float]) -> None:
-        """Final values."""
-        if self._logger:
-            self._try(lambda: self._logger.experiment.summary.update(dict(values)))
-
-    def close(self) -> None:
-        """Ends the run, and removes wandb's own debug logs, which are full of this machine's paths."""
-        if self._logger:
-            self._try(lambda: self._logger.experiment.finish())
-            for link in (self.folder / "wandb").glob("debug*.log"):
-                link.unlink()
-            for logs in (self.folder / "wandb").glob("*run-*/logs"):
-                shutil.rmtree(logs)
-
-
-def _check_mode(mode: str) -> None:
-    if mode not in WANDB_MODES:
-        raise ValueError(f"the mode of wandb must be one of {', '.join(WANDB_MODES)}, got {mode!r}")
-
-
-def _panel(key: str) -> str:
-    """The wandb panel of a column: what it starts with, or ``train``."""
-    for prefix in ("eval", "reward", "loss"):
-        if key.startswith(prefix + "_"):
-            return f"{prefix}/{key.removeprefix(prefix + '_')}"
-    return f"train/{key}"
-
-
-def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], options: Mapping[str, Any]) -> Any:
-    """TorchRL's wandb logger, writing under the run folder and telling nothing of the machine."""
-    import wandb
-    from torchrl.record.loggers import get_logger
-
-    private = wandb.Settings(
-        silent=True,
-        console="off",
-        host="private",
-        disable_git=True,
-        disable_code=True,
-        disable_job_creation=True,
-        x_disable_meta=True,
-        x_disable_stats=True,
-        x_disable_machine_info=True,
-    )
-    wandb_kwargs = {"project": WANDB_PROJECT, "mode": mode, "config": dict(config), "settings": private}
-    wandb_kwargs |= {"log_env_packages": False, **options}
-    return get_logger("wandb", logger_name=str(folder), experiment_name=folder.name, wandb_kwargs=wandb_kwargs)
+        self._log.close()

@@ -35,11 +35,12 @@ from tqdm import tqdm
 
 from magrl import recurrent, td3
 from magrl.env import GeomagneticNavEnv
+from magrl.loggers import WandbMode, WandbRun
 from magrl.metaheuristics import METAHEURISTICS
 from magrl.metrics import episode_measures, flown, summarise
 from magrl.navigators import NAVIGATORS
 from magrl.plots import NAVIGATOR_NAMES
-from magrl.runs import WandbRun, create_run_folder
+from magrl.runs import create_run_folder
 from magrl.tasks import named_tasks
 
 TRAINED = {"gg_td3": td3.load_policy, "td3": td3.load_policy, "recurrent": recurrent.load_policy}
@@ -75,8 +76,8 @@ class Config:
     """Of navigators that draw random numbers."""
     out: Path = Path("runs/evaluation")
     """Folder of the results; refused if it holds anything."""
-    wandb_mode: Literal["offline", "online", "disabled"] = "offline"
-    """offline needs neither network nor login."""
+    wandb_mode: WandbMode = "offline"
+    """offline needs neither network nor login, disabled writes nothing of wandb."""
 
 
 def navigator(text: str, env: GeomagneticNavEnv, mode: str, seed: int) -> TensorDictModuleBase:
@@ -224,9 +225,9 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
     text = table(summaries, config.mode)
     (folder / "table.md").write_text(text)
     (folder / "short.md").write_text(short_table(summaries, config.mode))
-    run = WandbRun(folder, config.wandb_mode, {"tasks": config.tasks, "zeta": config.zeta}, "evaluation")
-    lines = [line for line in text.splitlines() if not line.startswith("|---")]
-    run.table("eval/navigators", [[cell.strip() for cell in line.strip("|").split("|")] for line in lines])
+    settings = {"tasks": config.tasks, "zeta": config.zeta, "mode": config.mode, "seed": config.seed}
+    run = WandbRun(folder, config.wandb_mode, settings, "evaluation", list(summaries))
+    run.table("eval/navigators", runs)
     run.close()
     return summaries
 

@@ -40,6 +40,7 @@ from tqdm import tqdm
 from magrl import plots, td3
 from magrl.checkpoints import BestPolicy, Checkpoints, RunningEpisodes, check_finite
 from magrl.env import GeomagneticNavEnv
+from magrl.loggers import Logger, WandbMode, check_logger
 from magrl.metrics import TrainingTally, episode_measures, summarise
 from magrl.runs import RunLog, StopRequest, create_run_folder, locked
 from magrl.tasks import FIRST_RESERVED_SEED, TEST_SEED, VALIDATION_SEED, task_set
@@ -64,8 +65,10 @@ class Config:
     """Run folder of a training that was cut off, to go on with: its settings are used, and no others."""
     device: str = "cpu"
     """Where everything runs: cpu, cuda, cuda:0 …"""
-    wandb_mode: Literal["offline", "online", "disabled"] = "offline"
-    """offline needs neither network nor login."""
+    logger: Logger = "wandb"
+    """Where the curves go beside train.csv (docs/logging.md); tensorboard is an extra."""
+    wandb_mode: WandbMode = "offline"
+    """Of the logger wandb: offline needs neither network nor login, disabled writes nothing of wandb."""
     collectors: int = 1
     """Processes that collect; with more than one, runs are not repeatable to the bit."""
     collector_backend: Literal["process", "ray"] = "process"
@@ -147,8 +150,9 @@ class Config:
             )
             if not fits and field.default is not None:
                 raise ValueError(f"{field.name} must be of type {kind.__name__}, got {value!r}")
-        choices = {"preset": ("fast", "paper"), "wandb_mode": ("offline", "online", "disabled")}
-        for name, known in (choices | {"collector_backend": ("process", "ray")}).items():
+        check_logger(self.logger, self.wandb_mode)
+        choices = {"preset": ("fast", "paper"), "collector_backend": ("process", "ray")}
+        for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {known}, got {getattr(self, name)!r}")
         counts = ("num_envs", "total_frames", "updates_per_batch", "batch_size", "buffer_size", "policy_delay")
@@ -369,7 +373,8 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
         parts["episodes"] = RunningEpisodes(collector, base)
     checkpoints = Checkpoints(folder / "checkpoints", parts)
     resumed = config.resume is not None and bool(checkpoints.files())  # before the first one, the seed leads there
-    run = RunLog(folder, COLUMNS, settings, wandb_mode=config.wandb_mode, resumed=resumed, **labels)
+    labels |= {"logger": config.logger, "wandb_mode": config.wandb_mode}
+    run = RunLog(folder, COLUMNS, settings, resumed=resumed, **labels)
     checkpoints.parts["run"] = run
     if resumed:
         checkpoints.load()
@@ -436,7 +441,7 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
     result |= {"training_seconds": seconds}
     result |= {"seconds_to_97_sr_88_spl": next((r["seconds"] for r in run.rows if passes_paper(r)), math.nan)}
     run.figure("trajectories", plots.trajectories_figure(rollout, base.field, base.region))
-    run.result(result)
+    run.result(result, navigator=name)
     run.close()
     checkpoints.clear()
     report(folder, result)

@@ -21,7 +21,6 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 import tyro
@@ -36,6 +35,7 @@ from tqdm import tqdm
 
 from magrl import plots, recurrent, td3
 from magrl.env import GeomagneticNavEnv
+from magrl.loggers import Logger, WandbMode, check_logger
 from magrl.metrics import TrainingTally, episode_measures, summarise
 from magrl.runs import RunLog, create_run_folder
 from magrl.tasks import FIRST_RESERVED_SEED, PAPER_DISTANCE_KM, TEST_SEED, VALIDATION_SEED, task_set
@@ -58,8 +58,10 @@ class Config:
     """Run folder; by default runs/td3_recurrent-seed<seed>."""
     device: str = "cpu"
     """Where everything runs: cpu, cuda, cuda:0 …"""
-    wandb_mode: Literal["offline", "online", "disabled"] = "offline"
-    """offline needs neither network nor login."""
+    logger: Logger = "wandb"
+    """Where the curves go beside train.csv (docs/logging.md); tensorboard is an extra."""
+    wandb_mode: WandbMode = "offline"
+    """Of the logger wandb: offline needs neither network nor login, disabled writes nothing of wandb."""
 
     # Environment
     num_envs: int = 512
@@ -141,6 +143,7 @@ class Config:
     """Tasks of the final evaluation."""
 
     def __post_init__(self) -> None:
+        check_logger(self.logger, self.wandb_mode)
         counts = ("num_envs", "total_frames", "train_steps", "memory_size", "updates_per_step", "num_slices")
         counts += ("slice_length", "policy_delay", "eval_every", "eval_tasks_small", "eval_tasks")
         positive = ("learning_rate", "final_learning_rate", "memory_rate", "reward_scale", "zeta", "clip_memory")
@@ -228,7 +231,8 @@ def train(config: Config) -> dict[str, float]:
     )
 
     settings = {**asdict(config), "out": folder.name}
-    run = RunLog(folder, COLUMNS, settings, wandb_mode=config.wandb_mode, group="td3_recurrent", tags=["td3_recurrent"])
+    labels = {"group": "td3_recurrent", "tags": ["td3_recurrent"]}
+    run = RunLog(folder, COLUMNS, settings, logger=config.logger, wandb_mode=config.wandb_mode, **labels)
     tally = TrainingTally(base.destination_weight, config.reward_scale)
     kept, kept_weights = -1.0, None
     updates, loss_critic = 0, torch.zeros(())
@@ -288,7 +292,7 @@ def train(config: Config) -> dict[str, float]:
     reached = (r["seconds"] for r in run.rows if r["eval_success_rate"] >= 97 and r["eval_spl"] >= 88.4)
     result["seconds_to_97_sr_88_spl"] = next(reached, math.nan)
     run.figure("trajectories", plots.trajectories_figure(rollout, base.field, base.region))
-    run.result(result)
+    run.result(result, navigator="td3_recurrent")
     run.close()
     print(
         f"\n{result['num_tasks']} unseen tasks: SR {result['success_rate']:.1f} %, SPL {result['spl']:.1f} %, "

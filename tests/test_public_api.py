@@ -34,6 +34,7 @@ from magrl import (
     guidance,
     gymnasium_env,
     harmonics,
+    loggers,
     metaheuristics,
     metrics,
     navigators,
@@ -1014,14 +1015,28 @@ RUNS: dict[str, list[Refused | Nan]] = {
     "runs.RunLog": [
         refused(lambda: runs.RunLog("here", [], {}), TypeError, "folder", "'here'"),
         refused(lambda: run_log(wandb_mode="sometimes"), ValueError, "'sometimes'", "offline"),
+        refused(lambda: run_log(logger="paper"), ValueError, "'paper'", "csv"),
     ],
     "runs.RunLog.row": [refused(lambda: run_log().row({"framse": 1.0}), ValueError, "framse")],
     "runs.RunLog.figure": [refused(lambda: run_log().figure("a", 5), AttributeError, "int")],
     "runs.RunLog.result": [refused(lambda: run_log().result({"a": {1}}), TypeError, "set")],
     "runs.RunLog.load_state_dict": [refused(lambda: run_log().load_state_dict({}), KeyError, "seconds")],
-    "runs.WandbRun": [
-        refused(lambda: runs.WandbRun("here", "disabled", {}), TypeError, "folder", "'here'"),
-        refused(lambda: runs.WandbRun(folder(), "sometimes", {}), ValueError, "'sometimes'"),
+    "loggers.check_logger": [
+        refused(lambda: loggers.check_logger("paper"), ValueError, "'paper'", "tensorboard"),
+        refused(lambda: loggers.check_logger("wandb", "sometimes"), ValueError, "'sometimes'", "offline"),
+    ],
+    "loggers.panels": [refused(lambda: loggers.panels({"frames": 1, "return": "a"}), ValueError, "'a'")],
+    "loggers.open_log": [
+        refused(lambda: loggers.open_log("paper", folder(), {}), ValueError, "'paper'"),
+        refused(lambda: loggers.open_log("csv", "here", {}), TypeError, "folder", "'here'"),
+    ],
+    "loggers.ScalarLog": [
+        refused(lambda: loggers.ScalarLog("here", "csv"), TypeError, "folder", "'here'"),
+        refused(lambda: loggers.ScalarLog(folder(), "paper"), ValueError, "'paper'"),
+    ],
+    "loggers.WandbRun": [
+        refused(lambda: loggers.WandbRun("here", "disabled", {}), TypeError, "folder", "'here'"),
+        refused(lambda: loggers.WandbRun(folder(), "sometimes", {}), ValueError, "'sometimes'"),
     ],
     "checkpoints.Checkpoints": [
         refused(lambda: checkpoints.Checkpoints(folder(), {}, 0), ValueError, "keep", "0"),
@@ -1109,10 +1124,12 @@ EXEMPT = {
     "metaheuristics.base.Metaheuristic.first_state": "draws for as many vehicles as forward has selected",
     "transforms.base.ObservationTransform": "a base without a constructor: the rows are those of its children",
     "runs.StopRequest": "takes no arguments",
-    "runs.WandbRun.row": "what goes wrong in wandb is said once and never stops the caller",
-    "runs.WandbRun.picture": "what goes wrong in wandb is said once and never stops the caller",
-    "runs.WandbRun.table": "what goes wrong in wandb is said once and never stops the caller",
-    "runs.WandbRun.summary": "what goes wrong in wandb is said once and never stops the caller",
+    "loggers.CurveLog": "a base; the rows are those of its children",
+    "loggers.CurveLog.row": "what goes wrong in a logger is said once and never stops the caller",
+    "loggers.CurveLog.picture": "what goes wrong in a logger is said once and never stops the caller",
+    "loggers.CurveLog.table": "what goes wrong in a logger is said once and never stops the caller",
+    "loggers.CurveLog.summary": "what goes wrong in a logger is said once and never stops the caller",
+    "loggers.CurveLog.artifact": "what goes wrong in a logger is said once and never stops the caller",
     "gymnasium_env.register": "takes no arguments",
 }
 

@@ -136,6 +136,7 @@ def test_folder_in_use_is_refused(recipe, tmp_path: Path) -> None:
         {"zeta": 0.0},
         {"alignment_weight": math.inf},
         {"exploration_noise": -0.1},
+        {"logger": "paper"},
     ],
     ids=str,
 )

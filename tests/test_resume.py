@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from magrl import td3
-from magrl.runs import StopRequest, WandbRun, create_run_folder, locked
+from magrl.loggers import WandbRun
+from magrl.runs import StopRequest, create_run_folder, locked
 
 ROOT = Path(__file__).parent.parent
 SMALL = shlex.split(
@@ -111,7 +112,7 @@ with locked(Path(sys.argv[1])):
         ('{"guided": true, "gamma": 2.0}', "gamma must be between 0 and"),
         ('{"guided": true, "gamma": "0.9"}', "gamma"),
         ('{"guided": true, "num_envs": 2.5}', "num_envs"),
-        ('{"guided": true, "wandb_mode": "loud"}', "wandb_mode must be one of"),
+        ('{"guided": true, "wandb_mode": "loud"}', "mode of wandb must be one of"),
     ],
 )
 def test_what_is_no_run_is_not_resumed(tmp_path: Path, content: str | None, said: str) -> None:
@@ -148,13 +149,14 @@ def test_stop_request_waits_and_a_second_one_does_not() -> None:
 
 
 def test_failing_wandb_is_told_and_left_out(tmp_path: Path, monkeypatch, capsys) -> None:
-    from magrl import runs
+    from magrl import loggers
 
     class Broken:
-        def log_scalar(self, *_: object, **__: object) -> None:
+        @property
+        def experiment(self) -> None:
             raise OSError("no space left")
 
-    monkeypatch.setattr(runs, "_wandb_logger", lambda *_: Broken())
+    monkeypatch.setattr(loggers, "_wandb_logger", lambda *_: Broken())
     log = WandbRun(tmp_path, "offline", {})
     log.row({"frames": 1, "loss": 2.0, "return": 3.0})
     log.summary({"a": 1.0})
@@ -163,12 +165,12 @@ def test_failing_wandb_is_told_and_left_out(tmp_path: Path, monkeypatch, capsys)
 
 
 def test_wandb_that_cannot_start_is_left_out(tmp_path: Path, monkeypatch, capsys) -> None:
-    from magrl import runs
+    from magrl import loggers
 
     def unwritable(*_: object) -> None:
         raise PermissionError("wandb folder")
 
-    monkeypatch.setattr(runs, "_wandb_logger", unwritable)
+    monkeypatch.setattr(loggers, "_wandb_logger", unwritable)
     log = WandbRun(tmp_path, "offline", {})
     log.row({"frames": 1, "loss": 2.0})
     log.close()
