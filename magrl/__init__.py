@@ -16,6 +16,8 @@ _HOMES = {
     "Region": "tasks",
     "Tasks": "tasks",
     "task_set": "tasks",
+    "World": "worlds",
+    "load_world": "worlds",
     "AlignmentReward": "transforms",
     "AngleVector": "transforms",
     "FieldGradient": "transforms",

@@ -57,6 +57,7 @@ def paper_field(
     max_move_km: float = 50.0,
     date: Date = PAPER_DATE,
     generation: int = PAPER_GENERATION,
+    altitude_km: float = 0.0,
 ) -> RegionalField:
     """IGRF on a region and on the margin into which a vehicle can stray.
 
@@ -66,6 +67,7 @@ def paper_field(
         max_move_km: longest move, so that the place where a vehicle is lost is still inside [km].
         date: see :data:`magrl.fields.Date`.
         generation: of IGRF, 13 or 14.
+        altitude_km: over the ellipsoid, at which the field is read [km]; moves and gradients are over the ground.
 
     Raises:
         ValueError: for a date outside the model, or a box too large for the expansion.
@@ -75,7 +77,7 @@ def paper_field(
         (-15.5, 5.5)
     """
     box = flown_box(region, margin_deg, max_move_km)
-    return RegionalField(IGRF(date, generation), box.latitude, box.longitude)
+    return RegionalField(IGRF(date, generation, altitude_km=altitude_km), box.latitude, box.longitude)
 
 
 def flown_box(region: Region, margin_deg: float, max_move_km: float) -> Region:

@@ -101,6 +101,29 @@ def policy_config(
     )
 
 
+def check_fits(config: PolicyConfig, env: GeomagneticNavEnv) -> None:
+    """Refuses an environment whose field is not one that a policy was trained in, and its observations scaled for.
+
+    A quarter of the range to either side is let through: what a journey across half the region changes, and more than
+    the field does in some years.
+
+    Raises:
+        ValueError: naming the element and both ranges.
+    """
+    check_type(PolicyConfig, config=config)
+    check_type(GeomagneticNavEnv, env=env)
+    there = (x.tolist() for x in elements_range(env.field, env.region.grid(81).to(env.device)))
+    for name, unit, least, most, low, high in zip(
+        ("D", "I", "B_H"), ("°", "°", " nT"), config.field_low, config.field_high, *there, strict=True
+    ):
+        slack = (most - least) / 4
+        if low < least - slack or high > most + slack:
+            raise ValueError(
+                f"the policy was trained where {name} is {least:.1f} to {most:.1f}{unit}; here it is {low:.1f} to "
+                f"{high:.1f}{unit}: train one for this region and date"
+            )
+
+
 def observation_transforms(config: PolicyConfig) -> list[Transform]:
     """From the public keys to ``observation``, the input of the networks."""
     check_type(PolicyConfig, config=config)

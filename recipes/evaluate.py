@@ -2,6 +2,7 @@
 
     python recipes/evaluate.py secant parallel                          # no training needed
     python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso:flown --out runs/comparison
+    python recipes/evaluate.py secant --world my.toml --export flights.kml   # your own tasks, onto a map
 
 A trained agent is named with its run folder; several runs of one name are averaged, and their spread is shown.
 Metaheuristics take `--mode look-ahead` (the field at every candidate's end is read for free: an oracle) or
@@ -21,7 +22,7 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -33,7 +34,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
-from magrl import recurrent, td3
+from magrl import export, recurrent, td3
 from magrl.env import GeomagneticNavEnv
 from magrl.loggers import WandbMode, WandbRun
 from magrl.metaheuristics import METAHEURISTICS
@@ -41,7 +42,8 @@ from magrl.metrics import episode_measures, flown, summarise
 from magrl.navigators import NAVIGATORS
 from magrl.plots import NAVIGATOR_NAMES
 from magrl.runs import create_run_folder
-from magrl.tasks import named_tasks
+from magrl.tasks import TEST_SEED, Tasks, named_tasks
+from magrl.worlds import World, load_world
 
 TRAINED = {"gg_td3": td3.load_policy, "td3": td3.load_policy, "recurrent": recurrent.load_policy}
 LABELS = NAVIGATOR_NAMES | {
@@ -66,8 +68,13 @@ class Config:
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
     """gg_td3=RUN, td3=RUN, recurrent=RUN, ga, pso, afsa, parallel, secant; as many as wanted."""
-    tasks: Literal["test-1000", "paper-100", "figure-4-1"] = "test-1000"
-    """A frozen task set."""
+    tasks: Literal["test-1000", "paper-100", "figure-4-1"] | None = None
+    """A frozen task set in the paper's region; test-1000 unless there is a world."""
+    world: Path | None = None
+    """TOML or JSON file of an own region, date and altitude (docs/own_data.md): its tasks are flown, or, where it lists
+    none, 1000 random ones."""
+    export: Path | None = None
+    """File of all journeys: .geojson, .gpx or .kml."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
     """How metaheuristics evaluate a candidate."""
     zeta: float = 0.01
@@ -84,7 +91,8 @@ def navigator(text: str, env: GeomagneticNavEnv, mode: str, seed: int) -> Tensor
     """A navigator from its name on the command line.
 
     Raises:
-        ValueError: for an unknown name, a trained agent without a run, or a run where none belongs.
+        ValueError: for an unknown name, a trained agent without a run, one that was trained in another place, or a run
+            where none belongs.
     """
     name, _, run = text.partition("=")
     name, _, own_mode = name.partition(":")
@@ -92,7 +100,12 @@ def navigator(text: str, env: GeomagneticNavEnv, mode: str, seed: int) -> Tensor
     if name in TRAINED:
         if not run:
             raise ValueError(f"{name} needs the folder of a finished run: {name}=RUN")
-        return TRAINED[name](Path(run) / "policy.pt")
+        policy = TRAINED[name](Path(run) / "policy.pt")
+        try:
+            td3.check_fits(policy.config, env)
+        except ValueError as error:
+            raise ValueError(f"{text}: {error}") from error
+        return policy
     if name not in makers or run or (own_mode and name not in METAHEURISTICS):
         raise ValueError(f"unknown navigator {text!r}: choose from {'=RUN, '.join(TRAINED)}=RUN, {', '.join(makers)}")
     return makers[name](env, own_mode or mode, seed)
@@ -100,8 +113,31 @@ def navigator(text: str, env: GeomagneticNavEnv, mode: str, seed: int) -> Tensor
 
 def make_env(config: Config, tasks: str) -> GeomagneticNavEnv:
     """The environment of a task set: one vehicle for each task."""
-    chosen = named_tasks(tasks)
-    return GeomagneticNavEnv(num_envs=len(chosen.start), tasks=chosen, zeta=config.zeta, seed=config.seed)
+    return env_of(config, World(), named_tasks(tasks))
+
+
+def env_of(config: Config, world: World, tasks: Tasks) -> GeomagneticNavEnv:
+    """An environment with one vehicle for each task."""
+    options = world.options()
+    return GeomagneticNavEnv(num_envs=len(tasks.start), tasks=tasks, zeta=config.zeta, seed=config.seed, **options)
+
+
+def envs(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, Sequence[str]]:
+    """Where all navigators fly, where they fly one example, and the names of the tasks.
+
+    Raises:
+        ValueError: for a world that is none, or tasks of the paper's region in it.
+    """
+    if config.world is None:
+        env = make_env(config, config.tasks or "test-1000")
+        return env, make_env(config, "figure-4-1"), [f"task {number}" for number in range(env.num_envs)]
+    if config.tasks is not None:
+        raise ValueError(f"--tasks {config.tasks} lies in the paper's region: leave it out, or --world")
+    world = load_world(config.world)
+    tasks = world.tasks or world.random_tasks(1000, TEST_SEED)
+    example = Tasks(tasks.start[:1], tasks.target[:1])
+    names = world.names or [f"task {number}" for number in range(len(tasks.start))]
+    return env_of(config, world, tasks), env_of(config, world, example), names
 
 
 def path_rows(label: str, rollout: TensorDictBase) -> list[dict[str, float | str]]:
@@ -198,15 +234,18 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
     torchrl_logger.setLevel("WARNING")
     if not config.navigators:
         raise ValueError("name at least one navigator, for example: secant")
-    env, example = make_env(config, config.tasks), make_env(config, "figure-4-1")
+    if config.export:
+        export.check_suffix(config.export)
+    env, example, names = envs(config)
     makers = [(text.partition("=")[0], text) for text in config.navigators]
     pairs = [[navigator(text, e, config.mode, config.seed) for e in (env, example)] for _, text in makers]
     folder = create_run_folder(config.out)
     summaries: dict[str, list[dict[str, float]]] = {}
-    episodes, runs, paths = [], [], []
+    episodes, runs, paths, flights = [], [], [], []
     for (name, text), (pilot, example_pilot) in zip(tqdm(makers, unit="navigator"), pairs, strict=True):
         began = time.perf_counter()
-        measured = episode_measures(td3.evaluation_rollout(env, pilot))
+        rollout = td3.evaluation_rollout(env, pilot)
+        measured = episode_measures(rollout)
         readings = getattr(pilot, "field_readings", torch.zeros(1)).double().mean().item()
         summary = summarise(measured) | {"field_readings": readings, "seconds": time.perf_counter() - began}
         number = len(summaries.setdefault(name, []))
@@ -217,6 +256,8 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
             {"navigator": name, "run": number, "task": task, **{key: columns[key][task] for key in MEASURES}}
             for task in range(env.num_envs)
         ]
+        if config.export:
+            flights += export.flights(rollout, names, navigator=name, run=number)
         if number == 0:
             paths += path_rows(name, td3.evaluation_rollout(example, example_pilot))
     for file, rows in (("episodes", episodes), ("runs", runs), ("paths", paths)):
@@ -225,7 +266,10 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
     text = table(summaries, config.mode)
     (folder / "table.md").write_text(text)
     (folder / "short.md").write_text(short_table(summaries, config.mode))
-    settings = {"tasks": config.tasks, "zeta": config.zeta, "mode": config.mode, "seed": config.seed}
+    if config.export:
+        export.write_flights(config.export, flights)
+    place = {"tasks": config.tasks, "world": config.world and config.world.name}
+    settings = {**place, "zeta": config.zeta, "mode": config.mode, "seed": config.seed}
     run = WandbRun(folder, config.wandb_mode, settings, "evaluation", list(summaries))
     run.table("eval/navigators", runs)
     run.close()

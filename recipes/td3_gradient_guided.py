@@ -3,6 +3,7 @@
     python recipes/td3_gradient_guided.py                  # preset fast, about a minute on two cores
     python recipes/td3_gradient_guided.py --preset paper   # Table 1 as printed; many hours on a CPU
     python recipes/td3_gradient_guided.py --resume RUN     # go on after a kill, exactly
+    python recipes/td3_gradient_guided.py --world my.toml  # your own region, date and altitude: docs/own_data.md
 
 Preset `fast` is expected to fly more than 99.5 % of 1000 tasks that it never saw to their destination, on paths
 within 3 % of the shortest. The run folder holds the policy, the curves, the numbers and the pictures.
@@ -18,9 +19,10 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 import argparse
 import json
 import math
+import shutil
 import sys
 import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -43,7 +45,8 @@ from magrl.env import GeomagneticNavEnv
 from magrl.loggers import Logger, WandbMode, check_logger
 from magrl.metrics import TrainingTally, episode_measures, summarise
 from magrl.runs import RunLog, StopRequest, create_run_folder, locked
-from magrl.tasks import FIRST_RESERVED_SEED, TEST_SEED, VALIDATION_SEED, task_set
+from magrl.tasks import FIRST_RESERVED_SEED, TEST_SEED, VALIDATION_SEED
+from magrl.worlds import World, load_world
 
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
@@ -77,6 +80,8 @@ class Config:
     """Seconds between checkpoints, from which --resume RUN goes on."""
 
     # Environment
+    world: Path | None = None
+    """TOML or JSON file of an own region, date and altitude (docs/own_data.md); by default the paper's."""
     num_envs: int = 512
     """Vehicles that fly at the same time."""
     total_frames: int = 204_800
@@ -225,9 +230,16 @@ def read_config(folder: Path, *, guided: bool) -> Config:
         if settings.pop("guided") is not guided:
             raise ValueError(f"it was begun by {'td3.py' if guided else 'td3_gradient_guided.py'}")
         settings = {key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()}
+        if settings.get("world") is not None:
+            settings["world"] = folder / Path(settings["world"]).name
         return Config(**settings | {"out": folder, "resume": folder})
     except (TypeError, ValueError, AttributeError, LookupError) as error:
         raise ValueError(f"cannot resume from {folder / 'config.json'}: {error}") from error
+
+
+def world_of(config: Config) -> World:
+    """Where the journeys lie: the user's own place, or the paper's."""
+    return load_world(config.world) if config.world else World()
 
 
 def make_env(base: GeomagneticNavEnv, config: Config, view: td3.PolicyConfig, *, guided: bool) -> TransformedEnv:
@@ -243,6 +255,7 @@ def worker_env(config: Config, view: td3.PolicyConfig, index: int, *, guided: bo
     """The share of the vehicles that one of several collecting processes flies, on tasks of its own."""
     seed = (config.seed + 1_000_003 * (index + 1)) % FIRST_RESERVED_SEED
     options = {"zeta": config.zeta, "start_heading": config.start_heading, "device": config.device}
+    options |= world_of(config).options()
     base = GeomagneticNavEnv(num_envs=config.num_envs // config.collectors, seed=seed, **options)
     return make_env(base, config, view, guided=guided)
 
@@ -322,8 +335,12 @@ class Learner:
 def train(config: Config, *, guided: bool = True) -> dict[str, float]:
     """Trains, evaluates and writes the run folder; returns what is in its ``eval.json``."""
     name = "td3_gradient_guided" if guided else "td3"
-    folder = config.out or Path("runs") / f"{name}-{config.preset}-seed{config.seed}"
+    world_of(config).options()  # what is wrong with it is said before there is a folder
+    place = f"-{config.world.stem}" if config.world else ""
+    folder = config.out or Path("runs") / f"{name}-{config.preset}{place}-seed{config.seed}"
     with locked(config.resume or create_run_folder(folder)):
+        if config.world and not config.resume:
+            config = replace(config, world=shutil.copyfile(config.world, folder / f"world{config.world.suffix}"))
         return train_in(folder, config, name=name, guided=guided)
 
 
@@ -334,9 +351,11 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
 
     # Environments: physical units below, the agent's view and the guidance on top
     options = {"zeta": config.zeta, "start_heading": config.start_heading, "device": config.device}
+    world = world_of(config)
+    options |= world.options()
     base = GeomagneticNavEnv(num_envs=config.num_envs, seed=config.seed, **options)
     small_env, final_env = (
-        GeomagneticNavEnv(num_envs=count, tasks=task_set(count, seed), field=base.field, seed=seed, **options)
+        GeomagneticNavEnv(num_envs=count, tasks=world.random_tasks(count, seed), seed=seed, **options)
         for count, seed in ((config.eval_tasks_small, VALIDATION_SEED), (config.eval_tasks, TEST_SEED))
     )
     view = td3.policy_config(
@@ -365,6 +384,7 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
 
     # Everything that a training is made of, so that it can be put aside and taken up again
     settings = {**asdict(config), "out": folder.name, "resume": None, "guided": guided}
+    settings["world"] = config.world and config.world.name
     labels = {"group": f"{name}-{config.preset}", "tags": [name, config.preset]}
     tally, best = TrainingTally(base.destination_weight, config.reward_scale), BestPolicy()
     parts = {"learner": learner, "noise": noise, "buffer": buffer, "tally": tally, "best": best}

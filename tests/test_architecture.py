@@ -10,8 +10,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "magrl"
 LEVELS = (
     {"geodesy", "harmonics", "elements", "guidance"},
-    {"fields", "regional", "tasks", "metrics", "plots"},
-    {"env", "transforms"},
+    {"fields", "regional", "tasks", "metrics", "plots", "export"},
+    {"env", "transforms", "worlds"},
     {"td3", "loggers", "runs", "navigators", "checkpoints", "gymnasium_env", "recurrent"},
     {"metaheuristics"},
 )

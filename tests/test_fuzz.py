@@ -13,6 +13,7 @@ import torch
 from magrl import td3
 from magrl.checkpoints import Checkpoints, read_checkpoint, save_tensors
 from magrl.env import GeomagneticNavEnv
+from magrl.worlds import World, load_world
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
 import td3_gradient_guided as recipe
@@ -102,6 +103,32 @@ def test_settings_of_runs(tmp_path: Path) -> None:
         )
 
     fuzz(path, lambda: recipe.read_config(tmp_path, guided=True), sound, ValueError, 2)
+
+
+@pytest.mark.parametrize("suffix", [".toml", ".json"])
+def test_worlds(tmp_path: Path, suffix: str) -> None:
+    """A mutant may be another world, but then it is a sound one."""
+    path = tmp_path / f"world{suffix}"
+    region, task = {"latitude": [40, 50], "longitude": [-30, -20]}, {"start": [41.0, -29.0], "target": [44.5, -24.0]}
+    content = {"region": region, "field": {"date": "2026-07-01", "generation": 14, "altitude_km": 0.5}}
+    content |= {"journeys": {"distance_range_km": [300, 500]}, "tasks": [{"name": "a name", **task}, task]}
+    tables = [f"[{name}]\n{lines(content[name])}" for name in ("region", "field", "journeys")]
+    tables += [f"[[tasks]]\n{lines(task)}" for task in content["tasks"]]
+    path.write_text("\n".join(tables) if suffix == ".toml" else json.dumps(content))
+
+    def sound(found: object) -> bool:
+        assert isinstance(found, World)
+        if found.tasks is not None:
+            assert found.region.contains(torch.stack(found.tasks)).all()
+            assert len(found.names) == len(found.tasks.start)
+        return found.altitude_km >= 0 and found.generation in (13, 14)
+
+    fuzz(path, lambda: load_world(path), sound, ValueError, 3)
+
+
+def lines(table: dict) -> str:
+    """A table as TOML, whose numbers, texts and lists are written as in JSON."""
+    return "\n".join(f"{key} = {json.dumps(value)}" for key, value in table.items())
 
 
 @pytest.mark.parametrize("cells", [(60000, 60000), (10**9,), (0,), (-1,), ("a",), ()])

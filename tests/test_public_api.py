@@ -29,6 +29,7 @@ from magrl import (
     checkpoints,
     elements,
     env,
+    export,
     fields,
     geodesy,
     guidance,
@@ -44,6 +45,7 @@ from magrl import (
     runs,
     tasks,
     td3,
+    worlds,
 )
 from magrl.metaheuristics import base
 from magrl.tasks import PAPER_REGION, Region
@@ -552,6 +554,7 @@ ENV: dict[str, list[Refused | Nan]] = {
         refused(lambda: env.paper_field(margin_deg="a"), ValueError, "margin_deg", "'a'"),
         refused(lambda: env.paper_field(date="May"), ValueError, "'May'"),
         refused(lambda: env.paper_field(generation=12), ValueError, "12"),
+        refused(lambda: env.paper_field(altitude_km=NAN), ValueError, "altitude_km", "nan"),
         refused(lambda: env.paper_field(margin_deg=90.0), ValueError, "(-90.0, 90.0)"),
     ],
     "env.GeomagneticNavEnv": [
@@ -1002,6 +1005,60 @@ RECURRENT: dict[str, list[Refused | Nan]] = {
     ],
 }
 
+
+def place(*positions: object) -> list[export.Flight]:
+    """A journey through some places."""
+    return [export.Flight("a", positions, {})]
+
+
+EXPORT: dict[str, list[Refused | Nan]] = {
+    "export.Flight": [refused(lambda: export.Flight("a", []), TypeError, "properties")],
+    "export.flights": [
+        refused(lambda: export.flights(5, []), TypeError, "rollout", "5"),
+        refused(lambda: export.flights(flight(), ["one"]), ValueError, "2 journeys", "1 names"),
+    ],
+    **{
+        f"export.{name}": [
+            refused(lambda f=function: f(place((0, 0))), ValueError, "two places", "(0, 0)"),
+            refused(lambda f=function: f(place((0, 0), (91, 0))), ValueError, "position", "(91, 0)"),
+            refused(lambda f=function: f(place((0, 0), (NAN, 0))), ValueError, "position", "nan"),
+            refused(lambda f=function: f(place((0, 0), "ab")), ValueError, "position", "'ab'"),
+        ]
+        for name, function in (("to_geojson", export.to_geojson), ("to_gpx", export.to_gpx), ("to_kml", export.to_kml))
+    },
+    "export.cut": [refused(lambda: export.cut([(0, 0), (0, 181)]), ValueError, "position", "(0, 181)")],
+    "export.check_suffix": [
+        refused(lambda: export.check_suffix("a.shp"), ValueError, "'a.shp'", ".geojson, .gpx, .kml"),
+        refused(lambda: export.check_suffix(5), TypeError, "path", "5"),
+    ],
+    "export.write_flights": [refused(lambda: export.write_flights("a.shp", []), ValueError, "'a.shp'")],
+}
+
+WORLDS: dict[str, list[Refused | Nan]] = {
+    "worlds.World": [
+        refused(lambda: worlds.World(5), TypeError, "region", "5"),
+        refused(lambda: worlds.World(distance_range_km=(5, 4)), ValueError, "distance_range_km", "(5, 4)"),
+        refused(lambda: worlds.World(date="May"), ValueError, "'May'"),
+        refused(lambda: worlds.World(generation=12), ValueError, "12"),
+        *bad_numbers(worlds.World, altitude_km=(-1.0, NAN, 601.0, "a")),
+        refused(lambda: worlds.World(tasks=tasks.Tasks(zeros(1, 2), zeros(1, 2) + 50)), ValueError, "[0.0, 0.0]"),
+        refused(lambda: worlds.World(names=("a",)), ValueError, "('a',)"),
+    ],
+    "worlds.World.random_tasks": [refused(lambda: worlds.World().random_tasks(0, 1), ValueError, "num_tasks", "0")],
+    "worlds.load_world": [
+        refused(lambda: worlds.load_world(5), TypeError, "path", "5"),
+        refused(lambda: worlds.load_world("nowhere.toml"), FileNotFoundError, "nowhere.toml"),
+        refused(lambda: worlds.load_world(written(1)), ValueError, "content.pt", "'.pt'"),
+    ],
+    "td3.check_fits": [
+        refused(lambda: td3.check_fits(5, nav()), TypeError, "config", "5"),
+        refused(lambda: td3.check_fits(config(), 5), TypeError, "env", "5"),
+        refused(
+            lambda: td3.check_fits(config(field_high=(10.0, -40.0, 4e4)), nav()), ValueError, "I is", "-50.0 to -40.0°"
+        ),
+    ],
+}
+
 RUNS: dict[str, list[Refused | Nan]] = {
     "runs.create_run_folder": [
         refused(lambda: runs.create_run_folder(5), TypeError, "int"),
@@ -1103,6 +1160,8 @@ ROWS = (
     | PLOTS
     | TD3
     | RECURRENT
+    | EXPORT
+    | WORLDS
     | RUNS
 )
 
