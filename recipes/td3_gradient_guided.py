@@ -17,12 +17,11 @@ import os
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 import argparse
-import json
 import math
 import shutil
 import sys
 import time
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -45,6 +44,7 @@ from magrl.env import GeomagneticNavEnv
 from magrl.loggers import Logger, WandbMode, check_logger
 from magrl.metrics import TrainingTally, episode_measures, summarise
 from magrl.runs import RunLog, StopRequest, create_run_folder, locked
+from magrl.settings import check_settings, read_settings, resume_folder
 from magrl.tasks import FIRST_RESERVED_SEED, TEST_SEED, VALIDATION_SEED
 from magrl.worlds import World, load_world
 
@@ -148,18 +148,7 @@ class Config:
     """Tasks of the final evaluation."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, kind = getattr(self, field.name), type(field.default)
-            fits = isinstance(value, (int, float) if kind is float else kind) and (kind is bool) == isinstance(
-                value, bool
-            )
-            if not fits and field.default is not None:
-                raise ValueError(f"{field.name} must be of type {kind.__name__}, got {value!r}")
         check_logger(self.logger, self.wandb_mode)
-        choices = {"preset": ("fast", "paper"), "collector_backend": ("process", "ray")}
-        for name, known in choices.items():
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name} must be one of {known}, got {getattr(self, name)!r}")
         counts = ("num_envs", "total_frames", "updates_per_batch", "batch_size", "buffer_size", "policy_delay")
         counts += ("eval_every", "eval_tasks_small", "eval_tasks", "collectors")
         positive = ("learning_rate", "final_learning_rate", "reward_scale", "zeta")
@@ -171,9 +160,7 @@ class Config:
         ranges |= dict.fromkeys(("exploration_noise", "final_exploration_noise", "policy_noise"), (0, 10))
         ranges |= dict.fromkeys(("noise_clip", "saturation_weight", "init_random_frames"), (0, math.inf))
         ranges |= dict.fromkeys(("alignment_weight", "alignment_offset"), (-1e6, 1e6))
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name} must be between {low} and {high}, got {getattr(self, name)}")
+        check_settings(self, ranges)
         if self.buffer_size < self.batch_size:
             raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
         if self.num_envs % self.collectors:
@@ -208,33 +195,13 @@ PRESETS = {
 
 def parse(recipe: str, args: list[str] | None = None) -> Config:
     """Reads the command line: the preset first, then what overrides it; or the settings of the run to go on with."""
+    if folder := resume_folder(args):
+        config = read_settings(folder, Config, guided=recipe != "td3.py")
+        return config if config.world is None else replace(config, world=folder / Path(config.world).name)
     first = argparse.ArgumentParser(add_help=False)
     first.add_argument("--preset", choices=sorted(PRESETS), default="fast")
-    first.add_argument("--resume", type=Path)
-    known, others = first.parse_known_args(args)
-    if known.resume is None or {"-h", "--help"} & set(others):
-        return tyro.cli(Config, default=PRESETS[known.preset], args=args, prog=recipe, description=__doc__)
-    if others:
-        raise ValueError(f"--resume takes its settings from the run: leave out {' '.join(others)}")
-    return read_config(known.resume, guided=recipe != "td3.py")
-
-
-def read_config(folder: Path, *, guided: bool) -> Config:
-    """The settings of a run that was begun and is not complete."""
-    if not (folder / "config.json").is_file():
-        raise ValueError(f"there is no run to resume in {folder}: it holds no config.json")
-    if (folder / "eval.json").is_file():
-        raise ValueError(f"the run in {folder} is complete: its numbers are in {folder / 'eval.json'}")
-    try:
-        settings = json.loads((folder / "config.json").read_text())
-        if settings.pop("guided") is not guided:
-            raise ValueError(f"it was begun by {'td3.py' if guided else 'td3_gradient_guided.py'}")
-        settings = {key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()}
-        if settings.get("world") is not None:
-            settings["world"] = folder / Path(settings["world"]).name
-        return Config(**settings | {"out": folder, "resume": folder})
-    except (TypeError, ValueError, AttributeError, LookupError) as error:
-        raise ValueError(f"cannot resume from {folder / 'config.json'}: {error}") from error
+    preset = first.parse_known_args(args)[0].preset
+    return tyro.cli(Config, default=PRESETS[preset], args=args, prog=recipe, description=__doc__)
 
 
 def world_of(config: Config) -> World:

@@ -1,6 +1,7 @@
 """Recurrent TD3: train an agent that reads the paper's eight numbers and no heading.
 
-    python recipes/td3_recurrent.py     # about four minutes on one core
+    python recipes/td3_recurrent.py                # about four minutes on one core
+    python recipes/td3_recurrent.py --resume RUN   # go on after a kill, exactly
 
 The state of Eq. 3-1 does not hold the heading that turns are counted from, so the memoryless agent of
 td3_gradient_guided.py stands still on it. This one remembers: an LSTM adds up the turns (magrl/recurrent.py). The true
@@ -15,17 +16,20 @@ import os
 # A busy neighbour on the machine makes libgomp's spinning threads many times slower; this has to come before torch.
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
-import copy
 import math
 import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
+from td3_gradient_guided import passes_paper, report
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl import torchrl_logger
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
@@ -34,10 +38,12 @@ from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from magrl import plots, recurrent, td3
+from magrl.checkpoints import BestPolicy, Checkpoints, RunningEpisodes, check_finite
 from magrl.env import GeomagneticNavEnv
 from magrl.loggers import Logger, WandbMode, check_logger
 from magrl.metrics import TrainingTally, episode_measures, summarise
-from magrl.runs import RunLog, create_run_folder
+from magrl.runs import RunLog, StopRequest, create_run_folder, locked
+from magrl.settings import check_settings, read_settings, resume_folder
 from magrl.tasks import FIRST_RESERVED_SEED, PAPER_DISTANCE_KM, TEST_SEED, VALIDATION_SEED, task_set
 
 SEEN = ("observation", "heading_vector", *recurrent.STATE_KEYS)
@@ -56,12 +62,16 @@ class Config:
     """Of networks, exploration and training tasks."""
     out: Path | None = None
     """Run folder; by default runs/td3_recurrent-seed<seed>."""
+    resume: Path | None = None
+    """Run folder of a training that was cut off, to go on with: its settings are used, and no others."""
     device: str = "cpu"
     """Where everything runs: cpu, cuda, cuda:0 …"""
     logger: Logger = "wandb"
     """Where the curves go beside train.csv (docs/logging.md); tensorboard is an extra."""
     wandb_mode: WandbMode = "offline"
     """Of the logger wandb: offline needs neither network nor login, disabled writes nothing of wandb."""
+    checkpoint_every: float = 30.0
+    """Seconds between checkpoints, from which --resume RUN goes on."""
 
     # Environment
     num_envs: int = 512
@@ -156,19 +166,20 @@ class Config:
         ranges |= dict.fromkeys(("noise_clip", "saturation_weight", "heading_weight"), (0, math.inf))
         ranges |= dict.fromkeys(("alignment_weight", "alignment_offset"), (-1e6, 1e6))
         ranges["buffer_size"] = (self.num_envs * self.steps_per_batch, math.inf)
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name} must be between {low} and {high}, got {getattr(self, name)}")
+        ranges["checkpoint_every"] = (0, math.inf)
+        check_settings(self, ranges)
 
 
-def train(config: Config) -> dict[str, float]:
-    """Trains, evaluates and writes the run folder; returns what is in its ``eval.json``."""
-    folder = create_run_folder(config.out or Path("runs") / f"td3_recurrent-seed{config.seed}")
-    torchrl_logger.setLevel("WARNING")
-    torch.manual_seed(config.seed)
+def parse(args: list[str] | None = None) -> Config:
+    """Reads the command line, or the settings of the run to go on with."""
+    if folder := resume_folder(args):
+        return read_settings(folder, Config, recurrent=True)
+    return tyro.cli(Config, args=args, prog="td3_recurrent.py", description=__doc__)
 
-    # Environments: physical units below; the agent's view, the privileged heading and the guidance on top
-    options = {"zeta": config.zeta, "device": config.device}
+
+def make_envs(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, GeomagneticNavEnv]:
+    """Environments in physical units: for training, for the evaluations during it, and for the final one."""
+    options: dict[str, Any] = {"zeta": config.zeta, "device": config.device}
     base = GeomagneticNavEnv(
         num_envs=config.num_envs,
         distance_range_km=(config.shortest_task_km, PAPER_DISTANCE_KM[1]),
@@ -176,145 +187,234 @@ def train(config: Config) -> dict[str, float]:
         seed=config.seed,
         **options,
     )
-    small_env, final_env = (
+    small, final = (
         GeomagneticNavEnv(num_envs=count, tasks=task_set(count, seed), field=base.field, seed=seed, **options)
         for count, seed in ((config.eval_tasks_small, VALIDATION_SEED), (config.eval_tasks, TEST_SEED))
     )
-    view = td3.policy_config(base, config.num_cells, layer_norm=True, observe_heading=False)
-    actor = recurrent.make_actor(view, config.memory_size, base.device)
-    guidance = td3.guidance_transforms(base, config.alignment_weight, config.alignment_offset)
-    rewards = [RewardSum(), RewardScaling(loc=0.0, scale=config.reward_scale)]
-    env = TransformedEnv(
-        base, Compose(*guidance, *recurrent.training_transforms(view, actor), td3.action_transform(view), *rewards)
-    )
-    policy = recurrent.RecurrentPolicy(view, config.memory_size, actor).to(env.device)
+    return base, small, final
 
-    # Loss and optimisers
-    critic = recurrent.make_critic(view, env.device)
-    loss = recurrent.make_loss(
-        actor, critic, gamma=config.gamma, policy_noise=config.policy_noise, noise_clip=config.noise_clip
-    )
-    soft_update = SoftUpdate(loss, tau=config.tau)
-    critics = list(loss.qvalue_network_params.flatten_keys().values())
-    memory, others = recurrent.parameter_groups(loss)
-    groups = ((critics, 1.0), (others, 1.0), (memory, config.memory_rate))
-    critic_optimiser, actor_optimiser, memory_optimiser = optimisers = [
-        torch.optim.Adam(params, lr=rate * config.learning_rate, fused=True) for params, rate in groups
-    ]
 
-    # Collection and replay: [time, vehicle], so that a vehicle's steps follow each other
-    frames_per_batch = config.steps_per_batch * config.num_envs
-    noise = AdditiveGaussianModule(
-        spec=env.action_spec_unbatched,
-        sigma_init=config.exploration_noise,
-        sigma_end=config.final_exploration_noise,
-        annealing_num_steps=int(config.noise_share * config.total_frames),
-        device=env.device,
-    )
-    share = config.random_share
-    random = EGreedyModule(spec=env.action_spec_unbatched, eps_init=share, eps_end=share, device=env.device)
-    collector = Collector(
-        env,
-        TensorDictSequential(actor, noise, random),
-        frames_per_batch=frames_per_batch,
-        total_frames=config.total_frames,
-        device=env.device,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(config.buffer_size, ndim=2, device=env.device),
-        sampler=SliceSampler(
-            slice_len=config.slice_length, end_key=("next", "done"), strict_length=False, cache_values=True
-        ),
-        batch_size=config.num_slices * config.slice_length,
-    )
+class Learner:
+    """TD3 with a memory: the networks, TorchRL's loss over them, and their optimisers."""
 
-    settings = {**asdict(config), "out": folder.name}
-    labels = {"group": "td3_recurrent", "tags": ["td3_recurrent"]}
-    run = RunLog(folder, COLUMNS, settings, logger=config.logger, wandb_mode=config.wandb_mode, **labels)
-    tally = TrainingTally(base.destination_weight, config.reward_scale)
-    kept, kept_weights = -1.0, None
-    updates, loss_critic = 0, torch.zeros(())
-    losses = dict.fromkeys(("value", "heading", "saturation"), torch.zeros(()))
-    began, interrupted = time.perf_counter(), False
-    progress = tqdm(total=config.total_frames, unit="frame", unit_scale=True, desc="td3_recurrent", mininterval=0.5)
-    try:
-        for iteration, batch in enumerate(collector, start=1):
-            buffer.extend(batch.select(*TRANSITION))
-            batch = batch.reshape(-1)
-            noise.step(batch.numel())
-            tally.add(batch, guidance[-1].term(batch, batch["next"]))
-            left = max(0.0, 1 - tally.frames / config.total_frames)
-            for optimiser, (_, rate) in zip(optimisers, groups, strict=True):
-                anneal(optimiser, rate * config.learning_rate, rate * config.final_learning_rate, left)
+    def __init__(self, config: Config, view: td3.PolicyConfig, device: torch.device) -> None:
+        self.config, self.updates = config, 0
+        self.actor = recurrent.make_actor(view, config.memory_size, device)
+        noise = {"policy_noise": config.policy_noise, "noise_clip": config.noise_clip}
+        self.loss = recurrent.make_loss(self.actor, recurrent.make_critic(view, device), gamma=config.gamma, **noise)
+        self.soft_update = SoftUpdate(self.loss, tau=config.tau)
+        self.memory, others = recurrent.parameter_groups(self.loss)
+        self.rates = (1.0, 1.0, config.memory_rate)
+        weights = (list(self.loss.qvalue_network_params.flatten_keys().values()), others, self.memory)
+        self.critic_optimiser, self.actor_optimiser, self.memory_optimiser = self.optimisers = tuple(
+            torch.optim.Adam(group, lr=rate * config.learning_rate, fused=True)
+            for group, rate in zip(weights, self.rates, strict=True)
+        )
+        self.losses = dict.fromkeys(("critic", "value", "heading", "saturation"), torch.zeros(()))
 
-            for _ in range(config.steps_per_batch * config.updates_per_step):
-                slices = buffer.sample()
-                loss_critic = recurrent.value_loss(loss, slices)
-                step(loss_critic, critic_optimiser)
-                updates += 1
-                if updates % config.policy_delay == 0:
-                    losses = recurrent.actor_losses(loss, slices)
-                    total = losses["value"] + config.heading_weight * losses["heading"]
-                    total = total + left * config.saturation_weight * losses["saturation"]
-                    step(total, actor_optimiser, memory_optimiser, clip=(memory, config.clip_memory))
-                    soft_update.step()
+    def anneal(self, left: float) -> None:
+        """Sets the learning rates on their lines, of which the share ``left`` is still to go."""
+        for optimiser, rate in zip(self.optimisers, self.rates, strict=True):
+            start, end = rate * self.config.learning_rate, rate * self.config.final_learning_rate
+            for group in optimiser.param_groups:
+                group["lr"] = end + left * (start - end)
 
-            if iteration % config.eval_every == 0 or tally.frames >= config.total_frames:
-                small = summarise(episode_measures(td3.evaluation_rollout(small_env, policy)))
-                if small["spl"] > kept:
-                    kept, kept_weights = small["spl"], copy.deepcopy(actor.state_dict())
-                row = {"frames": tally.frames, "episodes": tally.episodes, "updates": updates}
-                row |= {"seconds": time.perf_counter() - began, **tally.row(), "loss_critic": loss_critic.item()}
-                row |= {"loss_actor": losses["value"].item(), "loss_heading": losses["heading"].item()}
-                run.row(row | {f"eval_{key}": small[key] for key in EVALUATED})
-                progress.set_postfix_str(f"SR {small['success_rate']:.1f} %, SPL {small['spl']:.1f} %")
-            progress.update(batch.numel())
-    except KeyboardInterrupt:
-        interrupted = True
-    seconds = time.perf_counter() - began
-    progress.close()
-    collector.shutdown()
+    def update(self, slices: TensorDictBase, saturation_weight: float) -> None:
+        """One gradient step of the critics and, every ``policy_delay`` of them, of the actor and the targets."""
+        self.losses["critic"] = recurrent.value_loss(self.loss, slices)
+        self.losses["critic"].backward()
+        step(self.critic_optimiser)
+        self.updates += 1
+        if self.updates % self.config.policy_delay == 0:
+            self.losses |= recurrent.actor_losses(self.loss, slices)
+            total = self.losses["value"] + self.config.heading_weight * self.losses["heading"]
+            (total + saturation_weight * self.losses["saturation"]).backward()
+            torch.nn.utils.clip_grad_norm_(self.memory, self.config.clip_memory)
+            step(self.actor_optimiser, self.memory_optimiser)
+            self.soft_update.step()
 
-    # What is left behind: the policy that was best on the small set, its numbers on tasks that it never saw, pictures
-    actor.load_state_dict(kept_weights or actor.state_dict())
-    recurrent.save_policy(folder / "policy.pt", policy)
-    if run.rows:
-        run.figure("training", plots.training_figure(run.rows))
-    if interrupted:
-        run.close()
-        print(f"\nStopped after {tally.frames} frames; the policy so far is {folder / 'policy.pt'}", file=sys.stderr)
-        raise SystemExit(130)
-    rollout = td3.evaluation_rollout(final_env, policy)
-    result = summarise(episode_measures(rollout)) | {"seed": config.seed, "tasks_seed": TEST_SEED}
-    result |= {"frames": tally.frames, "episodes": tally.episodes, "updates": updates, "training_seconds": seconds}
-    reached = (r["seconds"] for r in run.rows if r["eval_success_rate"] >= 97 and r["eval_spl"] >= 88.4)
-    result["seconds_to_97_sr_88_spl"] = next(reached, math.nan)
-    run.figure("trajectories", plots.trajectories_figure(rollout, base.field, base.region))
-    run.result(result, navigator="td3_recurrent")
-    run.close()
-    print(
-        f"\n{result['num_tasks']} unseen tasks: SR {result['success_rate']:.1f} %, SPL {result['spl']:.1f} %, "
-        f"{result['steps']:.1f} steps, ends {result['navigation_error_km']:.1f} km from the destination\n"
-        f"trained for {seconds:.0f} s; numbers, curves and pictures are in {folder}"
-    )
+    def check(self) -> None:
+        """Stops at a loss or a weight that is not a number."""
+        what = f"after update {self.updates}"
+        check_finite(((f"loss_{name}", loss) for name, loss in self.losses.items()), what)
+        check_finite(self.loss.named_parameters(), what)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, targets, moments of Adam, counts."""
+        optimisers = [optimiser.state_dict() for optimiser in self.optimisers]
+        losses = {name: loss.item() for name, loss in self.losses.items()}
+        return {"loss": self.loss.state_dict(), "optimisers": optimisers, "updates": self.updates, "losses": losses}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Goes on from there."""
+        self.loss.load_state_dict(state_dict["loss"])
+        for optimiser, state in zip(self.optimisers, state_dict["optimisers"], strict=True):
+            optimiser.load_state_dict(state)
+        self.updates = state_dict["updates"]
+        self.losses = {name: torch.tensor(loss) for name, loss in state_dict["losses"].items()}
+
+
+class Training:
+    """Everything that a training is made of, so that it can be put aside and taken up again."""
+
+    def __init__(self, folder: Path, config: Config) -> None:
+        self.folder, self.config = folder, config
+        self.base, self.small_env, self.final_env = make_envs(config)
+        view = td3.policy_config(self.base, config.num_cells, layer_norm=True, observe_heading=False)
+        self.learner = Learner(config, view, self.base.device)
+        guidance = td3.guidance_transforms(self.base, config.alignment_weight, config.alignment_offset)
+        self.alignment = guidance[-1]
+        sight = recurrent.training_transforms(view, self.learner.actor)
+        rewards = [RewardSum(), RewardScaling(loc=0.0, scale=config.reward_scale)]
+        self.env = TransformedEnv(self.base, Compose(*guidance, *sight, td3.action_transform(view), *rewards))
+        self.policy = recurrent.RecurrentPolicy(view, config.memory_size, self.learner.actor).to(self.env.device)
+        self.noise, self.collector = self._collection()
+        self.buffer = self._buffer()
+        self.tally, self.best = TrainingTally(self.base.destination_weight, config.reward_scale), BestPolicy()
+        parts = {"learner": self.learner, "noise": self.noise, "buffer": self.buffer, "tally": self.tally}
+        parts |= {"best": self.best, "random": GlobalRNGState(), "episodes": RunningEpisodes(self.collector, self.base)}
+        self.checkpoints = Checkpoints(folder / "checkpoints", parts)
+        resumed = config.resume is not None and bool(self.checkpoints.files())  # before the first one, the seed leads
+        self.run_log = self._run_log(resumed=resumed)
+        self.checkpoints.parts["run"] = self.run_log
+        if resumed:
+            self.checkpoints.load()
+
+    def _collection(self) -> tuple[AdditiveGaussianModule, Collector]:
+        """The noise on actions, and what collects with it."""
+        config, spec, device = self.config, self.env.action_spec_unbatched, self.env.device
+        noise = AdditiveGaussianModule(
+            spec=spec,
+            sigma_init=config.exploration_noise,
+            sigma_end=config.final_exploration_noise,
+            annealing_num_steps=int(config.noise_share * config.total_frames),
+            device=device,
+        )
+        random = EGreedyModule(spec=spec, eps_init=config.random_share, eps_end=config.random_share, device=device)
+        collector = Collector(
+            self.env,
+            TensorDictSequential(self.learner.actor, noise, random),
+            frames_per_batch=config.steps_per_batch * config.num_envs,
+            total_frames=config.total_frames,
+            device=device,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
+        return noise, collector
+
+    def _buffer(self) -> TensorDictReplayBuffer:
+        """Replay in [time, vehicle], so that a vehicle's steps follow each other."""
+        length = self.config.slice_length
+        return TensorDictReplayBuffer(
+            storage=LazyTensorStorage(self.config.buffer_size, ndim=2, device=self.env.device),
+            sampler=SliceSampler(slice_len=length, end_key=("next", "done"), strict_length=False, cache_values=True),
+            batch_size=self.config.num_slices * length,
+        )
+
+    def _run_log(self, *, resumed: bool) -> RunLog:
+        settings = {**asdict(self.config), "out": self.folder.name, "resume": None, "recurrent": True}
+        labels: dict[str, Any] = {"group": "td3_recurrent", "tags": ["td3_recurrent"]}
+        where: dict[str, Any] = {"logger": self.config.logger, "wandb_mode": self.config.wandb_mode}
+        return RunLog(self.folder, COLUMNS, settings, resumed=resumed, **where, **labels)
+
+    def run(self) -> int | None:
+        """Trains to the end, or until a signal asks to stop; the exit code that it asks for."""
+        frames, done, saved = self.config.total_frames, False, time.perf_counter()
+        batch_frames = self.config.steps_per_batch * self.config.num_envs
+        bar = {"initial": self.tally.frames, "desc": "td3_recurrent", "mininterval": 0.5}
+        progress = tqdm(total=frames, unit="frame", unit_scale=True, **bar)
+        with StopRequest() as stop, progress:
+            for batch in self.collector:
+                self.learn(batch)
+                done = self.tally.frames >= frames
+                if done or self.tally.frames // batch_frames % self.config.eval_every == 0:
+                    progress.set_postfix_str(self.evaluate())
+                progress.update(batch.numel())
+                if done:
+                    break
+                if stop.exit_code or time.perf_counter() - saved >= self.config.checkpoint_every:
+                    self.checkpoints.save(self.tally.frames)
+                    saved = time.perf_counter()
+                if stop.exit_code:
+                    break
+        self.collector.shutdown()
+        return None if done else stop.exit_code
+
+    def learn(self, batch: TensorDictBase) -> None:
+        """Stores some steps of all vehicles, ``(N, T)``, and learns from what is stored."""
+        check_finite(batch, f"after {self.tally.frames} frames")
+        self.buffer.extend(batch.select(*TRANSITION))
+        batch = batch.reshape(-1)
+        self.noise.step(batch.numel())
+        self.tally.add(batch, self.alignment.term(batch, batch["next"]))
+        left = max(0.0, 1 - self.tally.frames / self.config.total_frames)
+        self.learner.anneal(left)
+        for _ in range(self.config.steps_per_batch * self.config.updates_per_step):
+            self.learner.update(self.buffer.sample(), left * self.config.saturation_weight)
+        self.learner.check()
+
+    def evaluate(self) -> str:
+        """Flies the small task set, keeps the policy if it is the best so far, and adds a row of curves; in short."""
+        small = summarise(episode_measures(td3.evaluation_rollout(self.small_env, self.policy)))
+        self.best.offer(small["spl"], self.learner.actor)
+        row = {"frames": self.tally.frames, "episodes": self.tally.episodes, "updates": self.learner.updates}
+        row |= {"seconds": self.run_log.seconds, **self.tally.row()}
+        for column, name in (("loss_critic", "critic"), ("loss_actor", "value"), ("loss_heading", "heading")):
+            row[column] = self.learner.losses[name].item()
+        self.run_log.row(row | {f"eval_{key}": small[key] for key in EVALUATED})
+        return f"SR {small['success_rate']:.1f} %, SPL {small['spl']:.1f} %"
+
+    def save_policy(self) -> None:
+        """Writes the policy that was best on the small set, and the curves."""
+        self.learner.actor.load_state_dict(self.best.weights or self.learner.actor.state_dict())
+        recurrent.save_policy(self.folder / "policy.pt", self.policy)
+        if self.run_log.rows:
+            self.run_log.figure("training", plots.training_figure(self.run_log.rows))
+
+    def conclude(self, seconds: float) -> dict[str, float]:
+        """Flies tasks that the policy never saw, and writes its numbers and pictures."""
+        rollout = td3.evaluation_rollout(self.final_env, self.policy)
+        result = summarise(episode_measures(rollout)) | {"seed": self.config.seed, "tasks_seed": TEST_SEED}
+        result |= {"frames": self.tally.frames, "episodes": self.tally.episodes, "updates": self.learner.updates}
+        reached = (row["seconds"] for row in self.run_log.rows if passes_paper(row))
+        result |= {"training_seconds": seconds, "seconds_to_97_sr_88_spl": next(reached, math.nan)}
+        self.run_log.figure("trajectories", plots.trajectories_figure(rollout, self.base.field, self.base.region))
+        self.run_log.result(result, navigator="td3_recurrent")
+        self.checkpoints.clear()
+        return result
+
+
+def train(config: Config) -> dict[str, float]:
+    """Trains, evaluates and writes the run folder; returns what is in its ``eval.json``."""
+    folder = config.out or Path("runs") / f"td3_recurrent-seed{config.seed}"
+    with locked(config.resume or create_run_folder(folder)):
+        return train_in(folder, config)
+
+
+def train_in(folder: Path, config: Config) -> dict[str, float]:
+    """The training itself, in a folder that is this process's own."""
+    torchrl_logger.setLevel("WARNING")
+    torch.manual_seed(config.seed)
+    training = Training(folder, config)
+    exit_code = training.run()
+    seconds = training.run_log.seconds
+    training.save_policy()
+    if exit_code:
+        training.run_log.close()
+        print(
+            f"\nStopped after {training.tally.frames} frames; the policy so far is {folder / 'policy.pt'}\n"
+            f"To go on: --resume {folder}",
+            file=sys.stderr,
+        )
+        raise SystemExit(exit_code)
+    result = training.conclude(seconds)
+    training.run_log.close()
+    report(folder, result)
     return result
 
 
-def anneal(optimiser: torch.optim.Optimizer, start: float, end: float, left: float) -> None:
-    """Sets the learning rate on the line from ``start`` to ``end``, of which the share ``left`` is still to go."""
-    for group in optimiser.param_groups:
-        group["lr"] = end + left * (start - end)
-
-
-def step(
-    loss: torch.Tensor, *optimisers: torch.optim.Optimizer, clip: tuple[list[torch.Tensor], float] | None = None
-) -> None:
-    """One gradient step, with the norm of some gradients clipped."""
-    loss.backward()
-    if clip is not None:
-        torch.nn.utils.clip_grad_norm_(*clip)
+def step(*optimisers: torch.optim.Optimizer) -> None:
+    """Moves the weights, and forgets the gradients."""
     for optimiser in optimisers:
         optimiser.step()
         optimiser.zero_grad()
@@ -323,8 +423,8 @@ def step(
 def main() -> None:
     """The command: what cannot be run as asked is said in a line, without a traceback."""
     try:
-        train(tyro.cli(Config, prog="td3_recurrent.py", description=__doc__))
-    except (FileExistsError, ValueError) as error:
+        train(parse())
+    except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"td3_recurrent.py: {error}")
 
 

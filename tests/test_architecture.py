@@ -12,7 +12,7 @@ LEVELS = (
     {"geodesy", "harmonics", "elements", "guidance"},
     {"fields", "regional", "tasks", "metrics", "plots", "export"},
     {"env", "transforms", "worlds"},
-    {"td3", "loggers", "runs", "navigators", "checkpoints", "gymnasium_env", "recurrent"},
+    {"td3", "loggers", "runs", "settings", "navigators", "checkpoints", "gymnasium_env", "recurrent"},
     {"metaheuristics"},
 )
 LEVEL = {module: level for level, modules in enumerate(LEVELS) for module in modules}

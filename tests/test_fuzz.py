@@ -13,6 +13,7 @@ import torch
 from magrl import td3
 from magrl.checkpoints import Checkpoints, read_checkpoint, save_tensors
 from magrl.env import GeomagneticNavEnv
+from magrl.settings import read_settings
 from magrl.worlds import World, load_world
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
@@ -102,7 +103,7 @@ def test_settings_of_runs(tmp_path: Path) -> None:
             if value is not None
         )
 
-    fuzz(path, lambda: recipe.read_config(tmp_path, guided=True), sound, ValueError, 2)
+    fuzz(path, lambda: read_settings(tmp_path, recipe.Config, guided=True), sound, ValueError, 2)
 
 
 @pytest.mark.parametrize("suffix", [".toml", ".json"])

@@ -12,10 +12,11 @@ import math
 import pkgutil
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import pytest
@@ -43,6 +44,7 @@ from magrl import (
     recurrent,
     regional,
     runs,
+    settings,
     tasks,
     td3,
     worlds,
@@ -110,6 +112,23 @@ def config(**options: Any) -> td3.PolicyConfig:
 
 def folder() -> Path:
     return Path(tempfile.mkdtemp())
+
+
+def begun(config_json: str) -> Path:
+    """The folder of a run with these settings."""
+    run = folder()
+    (run / "config.json").write_text(config_json)
+    return run
+
+
+@dataclass
+class Options:
+    """Settings as a recipe's."""
+
+    count: int = 1
+    share: float = 0.5
+    flag: bool = False
+    mode: Literal["quiet", "verbose"] = "quiet"
 
 
 def axes() -> Any:
@@ -1147,6 +1166,29 @@ RUNS: dict[str, list[Refused | Nan]] = {
     ],
 }
 
+SETTINGS: dict[str, list[Refused | Nan]] = {
+    "settings.check_settings": [
+        refused(lambda: settings.check_settings(Options(count=1.5), {}), ValueError, "count", "int", "1.5"),
+        refused(lambda: settings.check_settings(Options(count=True), {}), ValueError, "count", "int", "True"),
+        refused(lambda: settings.check_settings(Options(flag=1), {}), ValueError, "flag", "bool", "1"),
+        refused(lambda: settings.check_settings(Options(share="a"), {}), ValueError, "share", "float", "'a'"),
+        refused(lambda: settings.check_settings(Options(mode="loud"), {}), ValueError, "mode", "'quiet'", "'loud'"),
+        refused(lambda: settings.check_settings(Options(share=NAN), {"share": (0, 1)}), ValueError, "share", "nan"),
+        refused(lambda: settings.check_settings(Options(share=2), {"share": (0, 1)}), ValueError, "share", "1", "2"),
+        refused(lambda: settings.check_settings(5, {}), TypeError, "dataclass"),
+    ],
+    "settings.resume_folder": [
+        refused(lambda: settings.resume_folder(["--resume", "run", "--seed", "1"]), ValueError, "--seed 1"),
+    ],
+    "settings.read_settings": [
+        refused(lambda: settings.read_settings("here", Options), TypeError, "folder", "'here'"),
+        refused(lambda: settings.read_settings(Path("nowhere"), Options), ValueError, "nowhere", "config.json"),
+        refused(lambda: settings.read_settings(begun("[1]"), Options), ValueError, "config.json", "resume"),
+        refused(lambda: settings.read_settings(begun('{"a": false}'), Options, a=True), ValueError, "{'a': True}"),
+        refused(lambda: settings.read_settings(begun('{"wings": 2}'), Options), ValueError, "wings"),
+    ],
+}
+
 ROWS = (
     GEODESY
     | ELEMENTS
@@ -1163,6 +1205,7 @@ ROWS = (
     | EXPORT
     | WORLDS
     | RUNS
+    | SETTINGS
 )
 
 EXEMPT = {

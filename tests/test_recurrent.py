@@ -5,6 +5,8 @@ import dataclasses
 import importlib.util
 import json
 import math
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -301,6 +303,7 @@ SMALL = {
 
 @pytest.fixture(scope="module")
 def recipe():
+    sys.path.insert(0, str(RECIPE.parent))  # it reports as the other recipe does
     spec = importlib.util.spec_from_file_location("td3_recurrent", RECIPE)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -315,7 +318,7 @@ def settings(recipe, out: Path, **options):
 def test_run_folder(recipe, tmp_path: Path) -> None:
     out = tmp_path / "run"
     result = recipe.train(settings(recipe, out))
-    names = {"config.json", "train.csv", "policy.pt", "eval.json", "training.png", "trajectories.png"}
+    names = {".lock", "config.json", "train.csv", "policy.pt", "eval.json", "training.png", "trajectories.png"}
     assert {path.name for path in out.iterdir()} == names
     written = json.loads((out / "eval.json").read_text())
     assert (written["num_tasks"], written["seed"], written["frames"], written["updates"]) == (6, 0, 640, 40)
@@ -339,10 +342,74 @@ def test_same_seed_same_weights(recipe, tmp_path: Path) -> None:
     assert not all(torch.equal(one[key], other[key]) for key in tensors)
 
 
+def outcome(folder: Path) -> tuple[list[dict[str, str]], dict[str, torch.Tensor]]:
+    """The curves without their timing, and the weights."""
+    with (folder / "train.csv").open() as file:
+        rows = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+    weights = recurrent.load_policy(folder / "policy.pt").state_dict()
+    return rows, {key: value for key, value in weights.items() if isinstance(value, torch.Tensor)}
+
+
+@pytest.mark.parametrize(
+    ("frames", "number"),
+    [(448, signal.SIGINT), (192, signal.SIGTERM)],
+    ids=["after an evaluation", "before any"],
+)
+def test_stopped_training_goes_on_as_if_it_had_not(recipe, tmp_path: Path, monkeypatch, capsys, frames, number) -> None:
+    """Journeys of 24 moves, 4 a batch: the memory and the journeys under way are those that the checkpoint held."""
+    calls = []
+
+    def stopped(*args):
+        calls.append(args)
+        if len(calls) == frames // 64:
+            os.kill(os.getpid(), number)
+        return anneal(*args)
+
+    anneal = recipe.Learner.anneal
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    monkeypatch.setattr(recipe.Learner, "anneal", stopped)
+    with pytest.raises(SystemExit) as stop:
+        recipe.train(settings(recipe, run))
+    assert stop.value.code == 128 + number
+    assert f"Stopped after {frames} frames" in capsys.readouterr().err
+    assert recurrent.load_policy(run / "policy.pt").memory_size == 8
+    assert not (run / "eval.json").exists()
+    monkeypatch.setattr(recipe.Learner, "anneal", anneal)
+    recipe.train(recipe.parse(["--resume", str(run)]))
+    recipe.train(settings(recipe, whole))
+    (rows, weights), (expected, expected_weights) = outcome(run), outcome(whole)
+    assert rows == expected
+    assert all(torch.equal(weights[key], expected_weights[key]) for key in expected_weights)
+    assert not (run / "checkpoints").exists()
+
+
+def test_weight_that_is_none_stops_the_training(recipe, tmp_path: Path, monkeypatch) -> None:
+    update = recipe.Learner.update
+
+    def poisoned(self, *args):
+        update(self, *args)
+        if self.updates == 8:  # the last of a batch, so that no loss is computed with it
+            with torch.no_grad():
+                self.memory[0][0] = float("nan")
+
+    monkeypatch.setattr(recipe.Learner, "update", poisoned)
+    with pytest.raises(FloatingPointError, match=r"after update \d+: .*lstm.* is not finite in rows \[0"):
+        recipe.train(settings(recipe, tmp_path / "run"))
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_run_of_another_recipe_is_not_resumed(recipe, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"guided": true}')
+    with pytest.raises(ValueError, match=r"another recipe: it must have {'recurrent': True}"):
+        recipe.parse(["--resume", str(tmp_path)])
+
+
 @pytest.mark.parametrize(
     "bad",
     [
         {"num_envs": 0},
+        {"memory_size": "8"},
+        {"wandb_mode": "loud"},
         {"gamma": 1.0},
         {"steps_per_batch": 1},
         {"buffer_size": 63},
