@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector
 
 from magrl.env import GeomagneticNavEnv
+from magrl.geodesy import check_number
 
 CHECKPOINT_FORMAT = 1
 _PATTERN = "checkpoint-*.pt"
@@ -46,6 +47,10 @@ class Checkpoints:
         parts: by name, whatever has ``state_dict`` and ``load_state_dict``.
         keep: how many files are kept; more than one, so that a damaged newest one is no loss.
 
+    Raises:
+        TypeError: for a part that has no state, by its name.
+        ValueError: for a number of files below one.
+
     Example:
         >>> import tempfile
         >>> layer, other = nn.Linear(2, 1), nn.Linear(2, 1)
@@ -59,8 +64,10 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path | str, parts: dict[str, Stateful], keep: int = 2) -> None:
-        if keep < 1:
-            raise ValueError(f"keep must be at least 1, got {keep}")
+        check_number(1, whole=True, keep=keep)
+        for name, part in parts.items():
+            if not (hasattr(part, "state_dict") and hasattr(part, "load_state_dict")):
+                raise TypeError(f"the part {name} must have state_dict and load_state_dict, got {part!r}")
         self.folder, self.parts, self.keep = Path(folder), dict(parts), keep
 
     def files(self) -> list[Path]:
@@ -74,8 +81,10 @@ class Checkpoints:
             frames: how far the training is; part of the file's name.
 
         Raises:
+            ValueError: for a number of frames that is none.
             OSError: if it cannot be written; the checkpoints that are there stay as they are.
         """
+        check_number(0, whole=True, frames=frames)
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"checkpoint-{frames:012d}.pt"
         content = {
@@ -247,7 +256,12 @@ class BestPolicy:
         self.weights: dict[str, Any] | None = None
 
     def offer(self, score: float, module: nn.Module) -> None:
-        """Keeps the weights of ``module`` if they score better than any before."""
+        """Keeps the weights of ``module`` if they score better than any before.
+
+        Raises:
+            ValueError: for a score that is NaN or infinite: no later one would ever be better or worse.
+        """
+        check_number(score=score)
         if score > self.score:
             self.score, self.weights = score, copy.deepcopy(module.state_dict())
 

@@ -25,7 +25,7 @@ from torchrl.envs import CatTensors, Compose, Transform, TransformedEnv
 
 from magrl import td3
 from magrl.env import GeomagneticNavEnv
-from magrl.geodesy import geodesic
+from magrl.geodesy import check_type, geodesic
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 OBSERVATIONS = ("flat", "dict")
@@ -72,7 +72,7 @@ def navigation_env(
         **options: of :class:`magrl.env.GeomagneticNavEnv`.
 
     Raises:
-        TypeError: for an option that the environment does not have.
+        TypeError: for an option that the environment does not have, or ``scale_actions`` that is no bool.
         ValueError: for any option out of its range, naming it and its value.
 
     Example:
@@ -81,6 +81,7 @@ def navigation_env(
     """
     _check_choice("observation", observation, OBSERVATIONS)
     _check_choice("reward", reward, REWARDS)
+    check_type(bool, scale_actions=scale_actions)
     known = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "num_envs"}
     if unknown := sorted(options.keys() - known):
         # In Python's own words: TorchRL's GymEnv looks for them to find out what it can pass.

@@ -25,7 +25,7 @@ import math
 import torch
 from torch import Tensor
 
-from magrl.geodesy import check_number
+from magrl.geodesy import check_number, check_tensor
 
 REFERENCE_RADIUS_KM = 6371.2
 """Geomagnetic reference radius [km]: the ``a`` of the expansion."""
@@ -40,12 +40,17 @@ def differentiate(table: Tensor) -> Tensor:
     Returns:
         Complex ``(..., 3, N + 2, N + 2)``: derivatives along x, y, z, per unit of the reference radius.
 
+    Raises:
+        TypeError: for a table of real numbers.
+        ValueError: for one that is not square.
+
     Example:
         >>> monopole = torch.ones(1, 1, dtype=torch.complex128)
         >>> differentiate(monopole)[2].real  # d(1/r)/dz = -z/r^3
         tensor([[ 0.,  0.],
                 [-1.,  0.]], dtype=torch.float64)
     """
+    _check_table(table=table)
     size = table.shape[-1]
     n = torch.arange(size, dtype=torch.float64, device=table.device).unsqueeze(-1)
     m = torch.arange(size, dtype=torch.float64, device=table.device)
@@ -65,6 +70,17 @@ def differentiate(table: Tensor) -> Tensor:
     return torch.stack(((lowered - raised) / 2, 1j * (lowered + raised) / 2, dz), -3)
 
 
+def _check_table(*, single: bool = False, **tables: Tensor) -> None:
+    """Refuses what is no complex square table or, unless a ``single`` one is wanted, a batch of them."""
+    for name, table in tables.items():
+        if not isinstance(table, Tensor) or not table.is_complex():
+            kind = table.dtype if isinstance(table, Tensor) else f"{table!r}"
+            raise TypeError(f"{name} must be a tensor of complex numbers g - i h, got {kind}")
+        if table.ndim < 2 or table.shape[-1] != table.shape[-2] or (single and table.ndim != 2):
+            wanted = "(N + 1, N + 1)" if single else "(..., N + 1, N + 1)"
+            raise ValueError(f"{name} must have the shape {wanted}, got {tuple(table.shape)}")
+
+
 def basis(ecef_km: Tensor, degree: int) -> Tensor:
     """Solid harmonics ``(a/r)^(n+1) S_nm cos m.lon`` and ``... sin m.lon`` at given points.
 
@@ -75,10 +91,19 @@ def basis(ecef_km: Tensor, degree: int) -> Tensor:
     Returns:
         ``((degree + 1) * (degree + 2), P)``: for each degree its orders 0 to n, for each order cosine and sine.
 
+    Raises:
+        ValueError: for another shape, the centre of the Earth, where nothing is finite, or a degree below 0.
+
     Example:
         >>> basis(torch.tensor([[0.0, 0.0, REFERENCE_RADIUS_KM]]), 1).squeeze(-1)  # at the pole only m = 0 lives
         tensor([1., 0., 1., 0., 0., 0.])
     """
+    check_tensor(3, ecef_km=ecef_km)
+    check_number(0, whole=True, degree=degree)
+    if ecef_km.ndim != 2:
+        raise ValueError(f"ecef_km must have the shape (P, 3), got {tuple(ecef_km.shape)}")
+    if (ecef_km == 0).all(-1).any():
+        raise ValueError("ecef_km holds the centre of the Earth, (0, 0, 0), where the harmonics are infinite")
     x, y, z = (ecef_km / REFERENCE_RADIUS_KM).unbind(-1)
     inverse_r2 = 1 / (x * x + y * y + z * z)
     x, y, z = x * inverse_r2, y * inverse_r2, z * inverse_r2
@@ -109,12 +134,17 @@ def field_table(gauss: Tensor) -> Tensor:
     Returns:
         ``(3, K)`` weights of Bx, By, Bz [nT] over :func:`basis` of degree N + 1.
 
+    Raises:
+        TypeError: for a table of real numbers.
+        ValueError: for one of another shape.
+
     Example:
         >>> g10 = torch.zeros(2, 2, dtype=torch.complex128)
         >>> g10[1, 0] = -30000.0
         >>> field_table(g10).shape
         torch.Size([3, 12])
     """
+    _check_table(single=True, gauss=gauss)
     return _weights(-differentiate(gauss))
 
 
@@ -127,10 +157,15 @@ def gradient_table(gauss: Tensor) -> Tensor:
     Returns:
         ``(9, K)`` weights of dB_i/dx_j [nT/km], row-major in (i, j), over :func:`basis` of degree N + 2.
 
+    Raises:
+        TypeError: for a table of real numbers.
+        ValueError: for one of another shape.
+
     Example:
         >>> gradient_table(torch.zeros(2, 2, dtype=torch.complex128)).shape
         torch.Size([9, 20])
     """
+    _check_table(single=True, gauss=gauss)
     return _weights(differentiate(-differentiate(gauss)).flatten(0, 1)) / REFERENCE_RADIUS_KM
 
 

@@ -269,7 +269,7 @@ def test_check_finite_lets_large_numbers_pass() -> None:
 
 
 def test_keep_must_hold_something(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="keep must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="keep must be a whole number from 1 on, got 0"):
         Checkpoints(tmp_path, {}, keep=0)
 
 

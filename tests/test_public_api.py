@@ -346,6 +346,18 @@ GUIDANCE = {
 }
 
 GAUSS = zeros(2, 2, dtype=torch.complex128)
+
+
+def bad_tables(function: Callable[[Any], object], name: str) -> list[Refused]:
+    """What is no square table of complex numbers."""
+    return [
+        refused(lambda: function(zeros(2, 2)), TypeError, name, "float32"),
+        refused(lambda: function("a"), TypeError, name, "'a'"),
+        refused(lambda: function(GAUSS[0]), ValueError, name, "(2,)"),
+        refused(lambda: function(GAUSS[:1]), ValueError, name, "(1, 2)"),
+    ]
+
+
 PLACE = (t(-5.0), t(165.0))
 
 
@@ -371,18 +383,23 @@ def bad_places(field: Callable[..., object]) -> list[Refused]:
 
 FIELDS: dict[str, list[Refused | Nan]] = {
     "harmonics.differentiate": [
-        refused(lambda: harmonics.differentiate(zeros(2, 3, dtype=torch.complex128)), RuntimeError, "(3)", "(2)"),
+        *bad_tables(harmonics.differentiate, "table"),
         Nan(lambda: harmonics.differentiate(torch.full((1, 1), NAN, dtype=torch.complex128))[2, 1, 0].real),
     ],
     "harmonics.basis": [
-        refused(lambda: harmonics.basis(t(1j, 0, 0).unsqueeze(0), 1), NotImplementedError, "Complex"),
+        *bad_vectors(lambda x: harmonics.basis(x, 1), "ecef_km"),
+        refused(lambda: harmonics.basis(torch.ones(3), 1), ValueError, "ecef_km", "(P, 3)", "(3,)"),
+        refused(lambda: harmonics.basis(torch.eye(3)[:2] * t(0.0, 1.0, 1.0), 1), ValueError, "centre", "(0, 0, 0)"),
+        *bad_numbers(lambda **d: harmonics.basis(torch.ones(1, 3), **d), degree=(-1, 1.5, "a")),
         Nan(lambda: harmonics.basis(t(NAN, 1.0, 1.0).unsqueeze(0), 1)[2:]),
     ],
     "harmonics.field_table": [
-        refused(lambda: harmonics.field_table(zeros(2, 3, dtype=torch.complex128)), RuntimeError, "(3)", "(2)")
+        *bad_tables(harmonics.field_table, "gauss"),
+        refused(lambda: harmonics.field_table(GAUSS.expand(5, 2, 2)), ValueError, "gauss", "(5, 2, 2)"),
     ],
     "harmonics.gradient_table": [
-        refused(lambda: harmonics.gradient_table(zeros(2, 3, dtype=torch.complex128)), RuntimeError, "(3)", "(2)")
+        *bad_tables(harmonics.gradient_table, "gauss"),
+        refused(lambda: harmonics.gradient_table(GAUSS.expand(5, 2, 2)), ValueError, "gauss", "(5, 2, 2)"),
     ],
     "harmonics.chebyshev_nodes": [
         refused(lambda: harmonics.chebyshev_nodes("a"), ValueError, "count", "'a'"),
@@ -1116,10 +1133,13 @@ RUNS: dict[str, list[Refused | Nan]] = {
     ],
     "checkpoints.Checkpoints": [
         refused(lambda: checkpoints.Checkpoints(folder(), {}, 0), ValueError, "keep", "0"),
+        refused(lambda: checkpoints.Checkpoints(folder(), {}, 1.5), ValueError, "keep", "1.5"),
         refused(lambda: checkpoints.Checkpoints(5, {}), TypeError, "int"),
+        refused(lambda: checkpoints.Checkpoints(folder(), {"a": 5}), TypeError, "part a", "state_dict", "5"),
     ],
     "checkpoints.Checkpoints.save": [
-        refused(lambda: checkpoints.Checkpoints(folder(), {}).save("a"), ValueError, "str"),
+        refused(lambda: checkpoints.Checkpoints(folder(), {}).save("a"), ValueError, "frames", "'a'"),
+        refused(lambda: checkpoints.Checkpoints(folder(), {}).save(-1), ValueError, "frames", "-1"),
         refused(lambda: checkpoints.Checkpoints(written(1), {}).save(1), FileExistsError, "content.pt"),
     ],
     "checkpoints.read_checkpoint": [
@@ -1136,7 +1156,10 @@ RUNS: dict[str, list[Refused | Nan]] = {
         refused(lambda: checkpoints.RunningEpisodes(None, nav()).load_state_dict({}), KeyError, "running")
     ],
     "checkpoints.BestPolicy.offer": [
-        refused(lambda: checkpoints.BestPolicy().offer("a", nn.Linear(1, 1)), TypeError, "str"),
+        *(
+            refused(lambda v=v: checkpoints.BestPolicy().offer(v, nn.Linear(1, 1)), ValueError, "score", repr(v))
+            for v in (NAN, INF, "a")
+        ),
     ],
     "checkpoints.BestPolicy.load_state_dict": [
         refused(lambda: checkpoints.BestPolicy().load_state_dict({}), KeyError, "score")
@@ -1150,6 +1173,7 @@ RUNS: dict[str, list[Refused | Nan]] = {
         refused(lambda: gymnasium_env.navigation_env(0), ValueError, "num_envs", "0"),
         refused(lambda: gymnasium_env.navigation_env(observation="flag"), ValueError, "observation", "'flag'"),
         refused(lambda: gymnasium_env.navigation_env(reward=5), ValueError, "reward", "5"),
+        refused(lambda: gymnasium_env.navigation_env(scale_actions="a"), TypeError, "scale_actions", "'a'"),
         refused(lambda: gymnasium_env.navigation_env(wings=2), TypeError, "'wings'"),
         refused(lambda: gymnasium_env.navigation_env(alignment_weight=NAN), ValueError, "weight", "nan"),
     ],
