@@ -654,6 +654,23 @@ class TestMinMaxNorm:
         obs = torch.sigmoid(td["agents", "place"]) * 2 - 1
         torch.testing.assert_close(td["agents", "obs"], obs, rtol=1e-5, atol=1e-6)
 
+    @pytest.mark.parametrize(
+        ("key", "error", "says"),
+        [
+            ("objective", ValueError, "needs bounds for 'objective', but its spec is Unbounded"),
+            ("nope", RuntimeError, "found no spec for 'nope'"),
+        ],
+    )
+    def test_bounds_that_the_env_does_not_know(self, key: str, error: type[Exception], says: str) -> None:
+        env = TransformedEnv(nav(2), MinMaxNorm([key], ["scaled"]))
+        with pytest.raises(error, match=says):
+            env.transform.normalize(key, torch.zeros(2, 1))
+
+    def test_action_that_is_missing(self) -> None:
+        norm = MinMaxNorm([], in_keys_inv=["action"], bounds={"action": (0.0, 1.0)})
+        with pytest.raises(KeyError, match=r"'action', which is not among \['x'\]"):
+            norm.inv(TensorDict({"x": torch.zeros(2)}, [2]))
+
     def test_actions_alone(self) -> None:
         """Nothing but actions to scale: the usual case of an env whose observations are left as they are."""
         env = TransformedEnv(nav(2), MinMaxNorm(in_keys_inv=["action"]))
