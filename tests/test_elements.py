@@ -68,7 +68,7 @@ def test_angles_on_the_axes(b_ned, declination, inclination):
 def test_declination_is_zero_at_a_magnetic_pole(north, east, down):
     b_ned = f64(north, east, down)
     assert measured_elements(b_ned).tolist() == [0.0, math.copysign(90.0, down), 0.0]
-    assert float(seven_elements(b_ned).B_F) == 5e4
+    assert (float(seven_elements(b_ned).D), float(seven_elements(b_ned).B_F)) == (0.0, 5e4)
 
 
 def test_no_field_at_all_is_no_nan():
@@ -107,6 +107,14 @@ def test_jacobian_at_a_magnetic_pole_is_zero_where_it_is_undefined():
     assert torch.isfinite(jacobian).all()
     assert torch.equal(jacobian[[0, 2]], torch.zeros(2, 3, dtype=torch.float64))
     assert torch.equal(jacobian[:, 2], torch.zeros(3, dtype=torch.float64))
+
+
+def test_jacobian_of_a_unit_field():
+    """North alone: D turns with the east, I with what points down, B_H with the north."""
+    expected = torch.zeros(3, 3, dtype=torch.float64)
+    expected[0, 1] = expected[1, 2] = math.degrees(1)
+    expected[2, 0] = 1
+    torch.testing.assert_close(elements_jacobian(f64(1.0, 0.0, 0.0)), expected, rtol=1e-14, atol=0)
 
 
 def test_gradient_is_the_chain_rule():

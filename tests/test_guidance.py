@@ -282,7 +282,7 @@ def test_nearly_parallel_gradients_are_flagged(crossing_deg, scale, dtype):
 
 def test_the_least_crossing_can_be_chosen():
     gradient, here = f64(1.0, 0.0, 1.0, 1.0).reshape(2, 2), torch.zeros(2, dtype=torch.float64)
-    for least_deg, expected in ((44.0, True), (46.0, False)):
+    for least_deg, expected in ((0.0, True), (44.0, True), (46.0, False), (89.0, False)):
         _, valid = parallel_approach(here, here + 1, gradient, min_crossing=math.radians(least_deg))
         assert bool(valid) == expected
 

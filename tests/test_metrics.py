@@ -97,6 +97,11 @@ def test_a_pause_is_neither_a_turn_nor_a_deviation() -> None:
     assert got["heading_mae_deg"] == pytest.approx(0, abs=1e-3)
 
 
+def test_a_short_move_is_a_move() -> None:
+    got = measures([(0.01, 0.0), (0.02, 90.0)], point(100.0, 0.0), False)
+    assert got["smoothness_deg"] == pytest.approx(90, abs=1e-3)
+
+
 def test_only_the_first_episode_counts() -> None:
     done = torch.tensor([[[False], [True], [False], [True]], [[False]] * 4])
     assert flown(done).tolist() == [[True, True, False, False], [True] * 4]
@@ -129,6 +134,17 @@ def test_summary_of_one_success_and_one_failure() -> None:
     assert (summary["success_rate_low"], summary["success_rate_high"]) == (100 * low, 100 * high)
 
 
+def test_summary_at_the_edge_of_a_distance_and_of_two_paths() -> None:
+    """Ten kilometres are within ten; the mean of two values, drawn anew, is one of them or between."""
+    episodes = dict.fromkeys(("length_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.ones(2))
+    episodes |= {"success": torch.tensor([True, True]), "steps": torch.tensor([9, 9])}
+    summary = summarise(
+        episodes | {"navigation_error_km": torch.tensor([10.0, 25.0]), "spl": torch.tensor([0.5, 0.75])}
+    )
+    assert (summary["success_rate_within_10km"], summary["success_rate_within_25km"]) == (50, 100)
+    assert (summary["spl_low"], summary["spl_high"]) == (50, 75)
+
+
 def test_summary_without_success_is_nan_and_not_zero() -> None:
     episodes = episode_measures(journey([(50.0, 180.0)] * 3, point(300.0, 0.0), False, 3))
     assert math.isnan(summarise(episodes)["steps"])
@@ -141,6 +157,16 @@ def test_summary_without_success_is_nan_and_not_zero() -> None:
 )
 def test_wilson_interval(rate: float, count: int, expected: tuple[float, float]) -> None:
     assert wilson_interval(rate, count) == pytest.approx(expected, abs=1e-4)
+
+
+def test_wilson_interval_of_half_a_standard_error() -> None:
+    """By hand: centre 0.2125, half-width 0.06447, both over 1.025."""
+    assert wilson_interval(0.2, 10, z=0.5) == pytest.approx((0.14442, 0.27021), abs=1e-5)
+
+
+def test_wilson_interval_stays_within_all_and_nothing() -> None:
+    assert all(wilson_interval(1.0, count)[1] <= 1 for count in range(1, 500))
+    assert all(wilson_interval(0.0, count)[0] >= 0 for count in range(1, 500))
 
 
 def test_bootstrap_interval_of_a_known_spread() -> None:
@@ -159,22 +185,64 @@ def test_shortest_is_the_geodesic() -> None:
     assert measures([(50.0, 0.0)], target, False)["shortest_km"] == pytest.approx(float(expected))
 
 
+def steps(*ended: tuple[float, bool], running: int = 0, reward: float = 0.0) -> TensorDict:
+    """Transitions of vehicles whose journeys end (return, success), and of some that fly on."""
+    count = len(ended) + running
+    following = TensorDict(
+        reward=torch.full((count, 1), reward),
+        episode_reward=torch.tensor([[value] for value, _ in ended] + [[7.0]] * running),
+        success=torch.tensor([[success] for _, success in ended] + [[False]] * running),
+        done=torch.tensor([[True]] * len(ended) + [[False]] * running),
+        batch_size=[count],
+    )
+    return TensorDict(next=following, batch_size=[count])
+
+
 def test_tally_splits_the_reward_and_averages_the_last_episodes() -> None:
     tally = TrainingTally(destination_weight=200.0, reward_scale=0.5, window=2)
-    column = torch.ones(3, 1)
-    following = TensorDict(
-        reward=0.5 * torch.tensor([[201.0], [1.0], [1.0]]),
-        episode_reward=torch.tensor([[300.0], [100.0], [7.0]]),
-        success=torch.tensor([[True], [False], [False]]),
-        done=torch.tensor([[True], [True], [False]]),
-        batch_size=[3],
-    )
-    tally.add(TensorDict(next=following, batch_size=[3]), 0.25 * column)
+    batch = steps((300.0, True), (100.0, False), running=1)
+    batch["next", "reward"] = 0.5 * torch.tensor([[201.0], [1.0], [1.0]])
+    tally.add(batch, torch.full((3, 1), 0.25))
     assert (tally.frames, tally.episodes) == (3, 2)
     row = tally.row()
     assert row["return"] == 200
     assert row["success_rate"] == 50
-    assert row["reward_destination"] == pytest.approx(200 / 3)
+    assert row["reward_destination"] == pytest.approx(200 / 3, rel=1e-12)
     assert row["reward_alignment"] == pytest.approx(0.25)
     assert row["reward_proximity"] == pytest.approx(0.75)
     assert math.isnan(tally.row()["reward_proximity"])
+
+
+def test_tally_adds_up_and_forgets_the_oldest_episodes() -> None:
+    tally = TrainingTally(destination_weight=0.0, reward_scale=1.0, window=1)
+    tally.add(steps((300.0, False), (100.0, True), running=2, reward=2.0), None)
+    tally.add(steps((50.0, True), reward=4.0), None)
+    assert (tally.frames, tally.episodes) == (5, 3)
+    expected = {"return": 50, "success_rate": 100, "reward_destination": 0, "reward_proximity": 3}
+    assert tally.row() == {**expected, "reward_alignment": 0}
+
+
+def test_tally_averages_two_hundred_episodes() -> None:
+    tally = TrainingTally(200.0, 1.0)
+    for value in range(201):
+        tally.add(steps((float(value), value > 100)), None)
+    assert (tally.row()["return"], tally.row()["success_rate"]) == (100.5, 50)  # the first of them is forgotten
+
+
+def test_tally_of_no_episode_is_nan() -> None:
+    tally = TrainingTally(200.0, 1.0)
+    tally.add(steps(running=3, reward=1.0), None)
+    row = tally.row()
+    assert math.isnan(row["return"])
+    assert math.isnan(row["success_rate"])
+    assert row["reward_proximity"] == 1
+
+
+def test_tally_goes_on_from_its_state() -> None:
+    one, other = TrainingTally(200.0, 1.0), TrainingTally(200.0, 1.0)
+    one.add(steps((300.0, True), (100.0, False), running=1, reward=2.0), torch.ones(3, 1))
+    other.load_state_dict(one.state_dict())
+    for tally in (one, other):
+        tally.add(steps((20.0, True), reward=4.0), torch.zeros(1, 1))
+    assert (other.frames, other.episodes) == (one.frames, one.episodes) == (4, 3)
+    assert other.row() == one.row()

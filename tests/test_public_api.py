@@ -281,6 +281,7 @@ ELEMENTS = {
     "elements.elements_gradient": [
         *bad_vectors(lambda b: elements.elements_gradient(b, zeros(2, 3, 2)), "b_ned"),
         refused(lambda: elements.elements_gradient(zeros(3), zeros(3, 3)), ValueError, "b_gradient", "(3, 3)"),
+        refused(lambda: elements.elements_gradient(zeros(3), zeros(1, 2)), ValueError, "b_gradient", "(1, 2)"),
         refused(lambda: elements.elements_gradient(zeros(2, 3), zeros(4, 3, 2)), RuntimeError, "(2)", "(4)"),
         Nan(lambda: elements.elements_gradient(torch.ones(3), zeros(3, 2) + NAN)),
     ],
