@@ -661,6 +661,8 @@ TRANSFORMS: dict[str, list[Refused | Nan]] = {
     ],
     "transforms.observation.FieldGradient": [
         refused(lambda: FieldGradient("IGRF"), ValueError, "value_and_gradient", "str"),
+        refused(lambda: FieldGradient(torch.sum)(TensorDict(position=zeros(2))), ValueError, "values (E,), got ()"),
+        refused(lambda: FieldGradient(torch.sin)(TensorDict(position=zeros(3))), ValueError, "position", "(3,)"),
         refused(lambda: FieldGradient(igrf(), ["a", "b"]), ValueError, "['a', 'b']"),
         refused(lambda: FieldGradient(igrf())(TensorDict(position=t(-95.0, 0.0))), ValueError, "-95.0"),
     ],

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.func import jacfwd, vmap
 from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
 
 from magrl import guidance
 from magrl.elements import element_index
 from magrl.fields import FieldModel, elements_gradient_at
-from magrl.geodesy import check_number, wrap_angle
+from magrl.geodesy import check_number, check_tensor, wrap_angle
 from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list, several_keys
 
 
@@ -93,12 +96,17 @@ class TargetDifference(ObservationTransform):
 
 
 class FieldGradient(ObservationTransform):
-    """The true horizontal gradient of D, I, B_H at a position. Privileged: for rewards and named oracles only.
+    """The true horizontal gradient of a field at a position. Privileged: for rewards and named oracles only.
 
     Args:
-        field: the field model, usually ``env.field``.
-        in_keys: one position ``(..., 2)``: latitude, longitude [deg].
-        out_keys: one gradient ``(..., 3, 2)``: D [deg/km], I [deg/km], B_H [nT/km], northward and eastward.
+        field: the field model, usually ``env.field``, for the gradient of D, I, B_H. In another domain, any function
+            of a position ``(2,)`` that returns values ``(E,)`` and can be differentiated by torch.
+        in_keys: one position ``(..., 2)``: latitude, longitude [deg]; for a function, whatever it takes.
+        out_keys: one gradient ``(..., 3, 2)``: D [deg/km], I [deg/km], B_H [nT/km], northward and eastward. Of a
+            function ``(..., E, 2)``: value unit per unit of position, along the two axes of the position.
+
+    Raises:
+        ValueError: for a field that is neither, more keys than one, or a function whose values are not ``(E,)``.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -106,33 +114,51 @@ class FieldGradient(ObservationTransform):
         >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
         >>> TransformedEnv(base, FieldGradient(base.field)).reset()["field_gradient"].shape
         torch.Size([2, 3, 2])
+        >>> from tensordict import TensorDict
+        >>> FieldGradient(lambda p: p**2)(TensorDict(position=torch.tensor([1.0, 3.0])))["field_gradient"]
+        tensor([[2., 0.],
+                [0., 6.]])
     """
 
     def __init__(
         self,
-        field: FieldModel,
+        field: FieldModel | Callable[[Tensor], Tensor],
         in_keys: NestedKey | Keys = ("position",),
         out_keys: NestedKey | Keys = ("field_gradient",),
     ) -> None:
         super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
         expect_keys(self, 1, 1)
-        if not hasattr(field, "value_and_gradient"):
-            raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {type(field).__name__}")
+        if not hasattr(field, "value_and_gradient") and not callable(field):
+            raise ValueError(
+                "field must have value_and_gradient(latitude, longitude), or be a function of a position (2,), "
+                f"got {type(field).__name__}"
+            )
         self.field = field
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         values = self._read(next_tensordict)
         if values is not None:
-            gradient = elements_gradient_at(self.field, values[0])
-            next_tensordict.set(self.out_keys[0], gradient.to(torch.get_default_dtype()))
+            next_tensordict.set(self.out_keys[0], self._apply_transform(values[0]))
         return next_tensordict
+
+    def _apply_transform(self, position: Tensor) -> Tensor:
+        if hasattr(self.field, "value_and_gradient"):
+            return elements_gradient_at(cast(FieldModel, self.field), position).to(torch.get_default_dtype())
+        check_tensor(2, position=position)
+        gradient = vmap(jacfwd(self.field))(position.reshape(-1, 2))
+        if gradient.ndim != 3:
+            raise ValueError(f"field must turn a position (2,) into values (E,), got {tuple(gradient.shape[1:-1])}")
+        return gradient.reshape(*position.shape[:-1], *gradient.shape[1:])
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         leaf = self._leaf(observation_spec, self.in_keys[0])
         if leaf.shape[-1:] != (2,):
             raise ValueError(f"FieldGradient reads positions of shape (..., 2), got {tuple(leaf.shape)}")
-        shape = (*leaf.shape[:-1], 3, 2)
-        observation_spec[self.out_keys[0]] = Unbounded(shape, device=leaf.device, dtype=torch.get_default_dtype())
+        shape, dtype = torch.Size((*leaf.shape[:-1], 3, 2)), torch.get_default_dtype()
+        if not hasattr(self.field, "value_and_gradient"):
+            like = self._apply_transform(leaf.zero())
+            shape, dtype = like.shape, like.dtype
+        observation_spec[self.out_keys[0]] = Unbounded(shape, device=leaf.device, dtype=dtype)
         return observation_spec
 
 

@@ -93,7 +93,8 @@ class MinMaxNorm(ObservationTransform):
         finite = torch.isfinite(high - low) & (low > -extreme) & (high < extreme)
         if not (finite & (low < high)).all():
             raise ValueError(
-                f"MinMaxNorm needs finite bounds that rise for {key!r}, got low {low.tolist()}, high {high.tolist()}"
+                f"MinMaxNorm needs finite bounds that rise for {key!r}, got low {low.tolist()}, high {high.tolist()}: "
+                f"give bounds={{{key!r}: (low, high)}} with a number on every side"
             )
         index = self._bounded_keys.index(key)
         setattr(self, f"low_{index}", low.clone())
