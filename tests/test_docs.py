@@ -47,7 +47,7 @@ def test_tests_of_promises_exist() -> None:
         for path, test in named:
             file = path or file
             source = (ROOT / "tests" / file).read_text()
-            assert re.search(rf"^def {test}\b" if test else "", source, re.MULTILINE), f"{file}::{test}"
+            assert re.search(rf"^ *def {test}\b" if test else "", source, re.MULTILINE), f"{file}::{test}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

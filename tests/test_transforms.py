@@ -17,6 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.collectors import Collector
 from torchrl.data import (
     Binary,
     Bounded,
@@ -85,6 +86,12 @@ class LinearField:
 
 LINEAR_FIELD_GRADIENT = torch.tensor([[math.degrees(1e-3), 0.0], [0.0, math.degrees(2e-3)], [0.5, 0.0]])
 """By hand: D turns by 30/30000 rad/km northward, I by 60/30000 rad/km eastward, B_H grows by 0.5 nT/km northward."""
+
+
+def hyperbola_and_wave(position: Tensor) -> Tensor:
+    """Two values at a place: the gradients are (east, north) and (0, cos east)."""
+    north, east = position.unbind(-1)
+    return torch.stack((north * east, torch.sin(east)), -1)
 
 
 class PlaneEnv(EnvBase):
@@ -219,6 +226,10 @@ def gradient_plane() -> Transform:
     return FieldGradient(LinearField(), [nested("place")], [nested("gradient")])
 
 
+def function_gradient_plane() -> Transform:
+    return FieldGradient(hyperbola_and_wave, [nested("place")], [nested("gradient")])
+
+
 def heading_plane() -> Transform:
     keys = [nested(name) for name in ("scent", "scent_there", "slope")]
     return GradientHeading(keys, [nested("way"), nested("way_valid")], pair=(0, 1))
@@ -241,8 +252,12 @@ ENV_CASES = {
     "AngleVector-nav": EnvCase(nav, partial(AngleVector, ["heading"], ["course"])),
     "AngleVector-plane": EnvCase(double_plane, partial(AngleVector, [nested("angle")], [nested("course")])),
     "TargetDifference-nav": EnvCase(nav, TargetDifference),
+    "TargetDifference-plane": EnvCase(
+        double_plane, partial(TargetDifference, [nested("scent"), nested("scent_there")], [nested("left")])
+    ),
     "FieldGradient-nav": EnvCase(nav, gradient_nav),
     "FieldGradient-plane": EnvCase(PlaneEnv, gradient_plane),
+    "FieldGradient-function": EnvCase(double_plane, function_gradient_plane),
     "GradientHeading-nav": EnvCase(sloped, partial(GradientHeading, pair=("I", "B_H"))),
     "GradientHeading-plane": EnvCase(double_plane, heading_plane),
     "AlignmentReward-nav": EnvCase(guided, AlignmentReward),
@@ -251,8 +266,35 @@ ENV_CASES = {
 }
 env_cases = pytest.mark.parametrize("case", ENV_CASES.values(), ids=ENV_CASES.keys())
 # Each of these starts processes: one env for each transform is enough.
-PARALLEL = [name for name in ENV_CASES if name.endswith("-nav")] + ["MinMaxNorm-plane"]
+NAV = [name for name in ENV_CASES if name.endswith("-nav")]
+PARALLEL = [*NAV, "MinMaxNorm-plane"]
+nav_cases = pytest.mark.parametrize("case", [ENV_CASES[name] for name in NAV], ids=NAV)
 parallel_cases = pytest.mark.parametrize("case", [ENV_CASES[name] for name in PARALLEL], ids=PARALLEL)
+
+
+def as_tuple(key: NestedKey) -> tuple[str, ...]:
+    return key if isinstance(key, tuple) else (key,)
+
+
+def with_bounds_of(env: TransformedEnv, transform: Transform) -> Transform:
+    """A transform that stands alone, with the state of the env's last one."""
+    attached = env.transform[-1] if isinstance(env.transform, Compose) else env.transform
+    transform.load_state_dict(attached.state_dict())
+    return transform
+
+
+def begun(env: EnvBase) -> TensorDictBase:
+    """The same first observation whenever it is asked for."""
+    torch.manual_seed(1)
+    env.set_seed(1)
+    return env.reset()
+
+
+def collected(env: EnvBase, **options: object) -> TensorDict:
+    """Three steps of a collector that moves at random, the same ones whenever it is asked for."""
+    begun(env)
+    (batch,) = Collector(env, None, frames_per_batch=6, total_frames=6, **options)
+    return batch
 
 
 def transformed(case: EnvCase) -> TransformedEnv:
@@ -277,6 +319,30 @@ class TestConformanceInEnvs:
     @env_cases
     def test_trans_serial_env_check(self, case: EnvCase) -> None:
         check_env_specs(TransformedEnv(SerialEnv(2, case.base), case.transform()))
+
+    @env_cases
+    def test_transform_env(self, case: EnvCase) -> None:
+        """A step of the transformed env is one of the plain env with the transform around it as a module."""
+        env, plain = transformed(case), case.base()
+        transform = with_bounds_of(env, case.transform())
+        start, plain_start = begun(env), begun(plain)
+        inside = env.step(env.rand_action(start))
+        action = transform.inv(inside.clone()).select(*plain.action_keys)
+        around = transform(plain.step(plain_start.update(action)))
+        if not isinstance(transform, AlignmentReward):
+            around["next"] = transform(around["next"])
+        for name in (*env.observation_keys, *(("next", *as_tuple(k)) for k in env.observation_keys + env.reward_keys)):
+            torch.testing.assert_close(inside[name], around[name], rtol=1e-5, atol=1e-6)
+
+    @nav_cases
+    def test_postproc(self, case: EnvCase) -> None:
+        """On what a collector hands out, a transform writes what it would have written inside the env."""
+        env = transformed(case)
+        transform = with_bounds_of(env, case.transform())
+        inside, after = collected(env), collected(case.base(), postproc=transform)
+        for name in transform.out_keys:
+            name = ("next", name) if name == "reward" else name
+            torch.testing.assert_close(after[name], inside[name], rtol=1e-5, atol=1e-5)
 
     @parallel_cases
     def test_parallel_trans_env_check(self, case: EnvCase) -> None:
@@ -391,6 +457,15 @@ DATA_CASES = {
         lambda rand: {"x": rand(2)},
         lambda td: {"y": LINEAR_FIELD_GRADIENT.expand(*td["x"].shape[:-1], 3, 2)},
     ),
+    "FieldGradient-function": DataCase(
+        lambda key: FieldGradient(hyperbola_and_wave, [key("x")], [key("y")]),
+        lambda rand: {"x": rand(2)},
+        lambda td: {
+            "y": torch.stack(
+                (td["x"].flip(-1), torch.stack((torch.zeros_like(td["x"][..., 0]), td["x"][..., 1].cos()), -1)), -2
+            )
+        },
+    ),
     "GradientHeading": DataCase(
         lambda key: GradientHeading([key("x"), key("x_there"), key("slope")], [key("y"), key("valid")], pair=(0, 1)),
         lambda rand: {
@@ -426,7 +501,7 @@ def as_key(name: str, key: KeyNamer) -> NestedKey:
     """The key of a row's entry; ``"next x"`` is ``x`` of the step after."""
     *prefix, name = name.split()
     full = key(name)
-    return (*prefix, *(full if isinstance(full, tuple) else (full,))) if prefix else full
+    return (*prefix, *as_tuple(full)) if prefix else full
 
 
 def data_of(
@@ -452,15 +527,15 @@ class TestConformanceOnData:
     @pytest.mark.parametrize("dtype", DTYPES)
     @pytest.mark.parametrize("batch", BATCHES)
     @data_cases
-    def test_transform_no_env(
-        self, case: DataCase, batch: tuple[int, ...], dtype: torch.dtype, key: KeyNamer, request: pytest.FixtureRequest
-    ) -> None:
+    def test_transform_no_env(self, case: DataCase, batch: tuple[int, ...], dtype: torch.dtype, key: KeyNamer) -> None:
         td, expected = data_of(case, key, batch, dtype)
         given, tensors = td.clone(), dict(td.items(True, True))
-        out = case.transform(key)(td)
+        transform = case.transform(key)
+        out = transform(td)
         check_outputs(out, expected)
         for name, value in expected.items():
-            gradient = "FieldGradient" in request.node.callspec.id  # written in the default dtype, as float64 is costly
+            # The gradient of D, I, B_H is written in the default dtype, as float64 is costly.
+            gradient = isinstance(transform, FieldGradient) and hasattr(transform.field, "value_and_gradient")
             assert gradient or out[name].dtype == (value.dtype if value.dtype == torch.bool else dtype), name
         for name in given.keys(True, True):
             assert name in expected or torch.equal(out[name], given[name]), name
@@ -495,6 +570,23 @@ class TestConformanceOnData:
         for _ in range(2):  # the second sample shows that the first was not written back into the storage
             sample = rb.sample()
             check_outputs(sample, {name: value[sample["row"]] for name, value in expected.items()})
+
+    @key_namers
+    @data_cases
+    def test_transform_inverse(self, case: DataCase, key: KeyNamer) -> None:
+        """Nothing comes in for an env here: what a transform has written stays as it is. MinMaxNorm has its own."""
+        transform = case.transform(key)
+        td = transform(data_of(case, key)[0])
+        assert (transform.inv(td.clone()) == td).all()
+
+    @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+    @key_namers
+    @data_cases
+    def test_transform_compiled(self, case: DataCase, key: KeyNamer, backend: str) -> None:
+        """As one graph: ``fullgraph`` refuses to break it."""
+        td, expected = data_of(case, key)
+        torch.compiler.reset()
+        check_outputs(torch.compile(case.transform(key), fullgraph=True, backend=backend)(td), expected)
 
     @pytest.mark.parametrize(
         "copied", [Transform.clone, copy.deepcopy, copy.copy, lambda t: pickle.loads(pickle.dumps(t))]
@@ -597,6 +689,10 @@ WRONG_SHAPES = {
     "AngleVector": (lambda: AngleVector(["field"], ["y"]), r"\(2, 3\)"),
     "TargetDifference": (lambda: TargetDifference(["field", "move"]), r"\(2, 3\).*\(2, 2\)"),
     "FieldGradient": (lambda: FieldGradient(field(), ["field"]), r"\(2, 3\)"),
+    "FieldGradient function": (
+        lambda: FieldGradient(lambda position: position.sum(-1), out_keys=["slope"]),
+        r"values \(E,\), got \(\)",
+    ),
     "GradientHeading target": (lambda: GradientHeading(["field", "move", "field_gradient"]), r"\(2, 3\), \(2, 2\)"),
     "GradientHeading gradient": (lambda: GradientHeading(["field", "target_field", "field"]), r"\(2, 3\), \(2, 3\)$"),
     "GradientHeading element": (lambda: GradientHeading(pair=(0, 3)), r"\[0, 3\].*\(2, 3\)"),
@@ -713,6 +809,20 @@ class TestMinMaxNorm:
         assert rb._storage.get(slice(None))["action"].flatten().tolist() == [0.0, 12.5, 25.0, 50.0]
         sample = rb.sample()
         assert torch.equal(sample["scaled"], scaled[sample["row"]])
+
+    @key_namers
+    @pytest.mark.parametrize("dtype", DTYPES)
+    @pytest.mark.parametrize("compiled", [False, True])
+    def test_transform_inverse(self, key: KeyNamer, dtype: torch.dtype, compiled: bool) -> None:
+        keys = [[key("x")], [key("y")]]
+        norm = MinMaxNorm(*keys, *keys, bounds={key("x"): (torch.tensor([0.0, -2.0]), torch.tensor([10.0, 2.0]))})
+        torch.compiler.reset()
+        inv = torch.compile(norm.inv, fullgraph=True, backend="eager") if compiled else norm.inv
+        scaled = 2 * torch.rand(3, 2, dtype=dtype) - 1
+        td = inv(TensorDict({}, 3).set(key("y"), scaled))
+        assert td[key("x")].dtype == dtype
+        torch.testing.assert_close(td[key("x")], torch.stack((5 * scaled[:, 0] + 5, 2 * scaled[:, 1]), -1))
+        torch.testing.assert_close(norm(td.exclude(key("y")))[key("y")], scaled)
 
     @pytest.mark.parametrize("interval", [(-1.0, 1.0), (0.0, 1.0), (-2.0, 6.0)])
     @pytest.mark.parametrize("dtype", DTYPES)
