@@ -30,7 +30,13 @@ _DIGEST_LENGTH = 64
 
 
 class Stateful(Protocol):
-    """What can be put aside and taken up again."""
+    """What can be put aside and taken up again.
+
+    Example:
+        >>> part: Stateful = nn.Linear(2, 1)  # as are optimisers, buffers and collectors
+        >>> sorted(part.state_dict())
+        ['bias', 'weight']
+    """
 
     def state_dict(self) -> dict[str, Any]:
         """All of its state, as tensors, numbers and texts."""
@@ -139,7 +145,18 @@ class Checkpoints:
 
 
 class DamagedCheckpointError(ValueError):
-    """A file that is truncated, altered, or no checkpoint at all."""
+    """A file that is truncated, altered, or no checkpoint at all.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "notes.txt"
+        >>> _ = path.write_text("no checkpoint")
+        >>> try:
+        ...     load_tensors(path)
+        ... except DamagedCheckpointError as error:
+        ...     print(path.name in str(error))
+        True
+    """
 
 
 def read_checkpoint(path: Path | str) -> dict[str, Any]:
@@ -151,6 +168,13 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
     Raises:
         DamagedCheckpointError: naming the file, if it is not whole.
         ValueError: if it is of another format.
+
+    Example:
+        >>> import tempfile
+        >>> path = Checkpoints(tempfile.mkdtemp(), {"layer": nn.Linear(2, 1)}).save(100)
+        >>> content = read_checkpoint(path)
+        >>> content["frames"], list(content["parts"])
+        (100, ['layer'])
     """
     content = load_tensors(path)
     if not isinstance(content, dict) or set(content) != {"format", "frames", "parts"}:
@@ -173,6 +197,13 @@ def save_tensors(content: Any, path: Path) -> None:
 
     Raises:
         OSError: if it cannot be written; what was there stays.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "numbers.pt"
+        >>> save_tensors({"speed": torch.ones(2)}, path)
+        >>> load_tensors(path)
+        {'speed': tensor([1., 1.])}
     """
     archive = io.BytesIO()
     torch.save(content, archive)
@@ -196,6 +227,19 @@ def load_tensors(path: Path | str) -> Any:
 
     Raises:
         DamagedCheckpointError: naming the file and what is wrong with it.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "numbers.pt"
+        >>> save_tensors([1, 2], path)
+        >>> load_tensors(path)
+        [1, 2]
+        >>> _ = path.write_bytes(path.read_bytes()[:-1])  # a byte is lost
+        >>> try:
+        ...     load_tensors(path)
+        ... except DamagedCheckpointError as error:
+        ...     print(str(error).partition(": ")[2])
+        its SHA-256 is not the one that it was written with
     """
     try:
         content = Path(path).read_bytes()
@@ -220,6 +264,14 @@ class RunningEpisodes:
     Args:
         collector: whose episodes they are.
         env: the navigation environment inside it.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> collector = Collector(env, frames_per_batch=4, total_frames=8)
+        >>> first = next(iter(collector))
+        >>> RunningEpisodes(collector, env).state_dict()["frames"]
+        4
+        >>> collector.shutdown()
     """
 
     def __init__(self, collector: Collector, env: GeomagneticNavEnv) -> None:
@@ -249,7 +301,16 @@ class RunningEpisodes:
 
 
 class BestPolicy:
-    """The weights that scored best so far."""
+    """The weights that scored best so far.
+
+    Example:
+        >>> best, layer = BestPolicy(), nn.Linear(1, 1)
+        >>> for score in (90.0, 95.0, 80.0):
+        ...     _ = nn.init.constant_(layer.weight, score)
+        ...     best.offer(score, layer)
+        >>> best.score, best.weights["weight"].item()
+        (95.0, 95.0)
+    """
 
     def __init__(self) -> None:
         self.score = float("-inf")

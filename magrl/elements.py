@@ -20,7 +20,13 @@ UNITS = ("deg", "deg", "nT")
 
 
 class Elements(NamedTuple):
-    """The seven elements of Eq. 2-1, each ``(...)``: D, I [deg]; B_H, B_x, B_y, B_z, B_F [nT]."""
+    """The seven elements of Eq. 2-1, each ``(...)``: D, I [deg]; B_H, B_x, B_y, B_z, B_F [nT].
+
+    Example:
+        >>> elements = seven_elements(torch.tensor([3.0, 4.0, 12.0]))
+        >>> elements.B_H, elements.B_F
+        (tensor(5.), tensor(13.))
+    """
 
     D: Tensor
     I: Tensor  # noqa: E741 - the element's name in the field's literature

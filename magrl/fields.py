@@ -30,7 +30,19 @@ Date = datetime | str | float
 
 
 class FieldModel(Protocol):
-    """What an environment asks of a field: the two calls of this module's models."""
+    """What an environment asks of a field: the two calls of this module's models.
+
+    Example:
+        >>> class UniformField:
+        ...     def __call__(self, latitude, longitude):
+        ...         return torch.tensor([30000.0, 0.0, 30000.0]).expand(*latitude.shape, 3)
+        ...
+        ...     def value_and_gradient(self, latitude, longitude):
+        ...         return self(latitude, longitude), torch.zeros(*latitude.shape, 3, 2)
+        >>> model: FieldModel = UniformField()
+        >>> elements_at(model, torch.zeros(2))
+        tensor([    0.,    45., 30000.])
+    """
 
     def __call__(self, latitude: Tensor, longitude: Tensor, /) -> Tensor:
         """Field vector north, east, down, ``(..., 3)`` [nT]."""
@@ -115,7 +127,13 @@ def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
 
 
 class Float64Module(nn.Module):
-    """A module that follows device moves but keeps its dtype: float32 coefficients would cost metres."""
+    """A module that follows device moves but keeps its dtype: float32 coefficients would cost metres.
+
+    Example:
+        >>> field = IGRF("2022-01-01").half()
+        >>> isinstance(field, Float64Module), field.value_weights.dtype
+        (True, torch.float64)
+    """
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
@@ -132,6 +150,14 @@ class SphericalHarmonicField(Float64Module):
 
     Raises:
         ValueError: for a table of another shape, or that is not finite.
+
+    Example:
+        >>> dipole = torch.zeros(2, 2, dtype=torch.complex128)
+        >>> dipole[1, 0] = -30000.0  # g of degree 1, order 0
+        >>> field = SphericalHarmonicField(dipole)
+        >>> field(torch.tensor([0.0, 90.0]), torch.tensor(0.0)).round().abs()  # north; at the pole twice that, down
+        tensor([[29902.,     0.,     0.],
+                [    0.,     0., 60410.]], dtype=torch.float64)
     """
 
     value_weights: Tensor
@@ -245,6 +271,11 @@ def in_chunks(function: Callable[..., Tensor], points: Sequence[Tensor], rows: i
 
     Returns:
         ``(rows, P)``.
+
+    Example:
+        >>> in_chunks(lambda x: torch.stack((x, x * x)), [torch.arange(5.0)], rows=2, chunk=2)
+        tensor([[ 0.,  1.,  2.,  3.,  4.],
+                [ 0.,  1.,  4.,  9., 16.]])
     """
     check_number(1, whole=True, chunk=chunk)
     count = points[0].shape[-1]
@@ -365,6 +396,7 @@ class IGRF(SphericalHarmonicField):
         self.generation = generation
 
     def extra_repr(self) -> str:
+        """The date, the generation and the default height."""
         return f"date={self.date.isoformat()}, generation={self.generation}, altitude_km={self.altitude_km}"
 
 
@@ -377,6 +409,11 @@ def elements_at(field: FieldModel, position: Tensor) -> Tensor:
 
     Returns:
         ``(..., 3)``: D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> paper = IGRF("2022-01-01", generation=13)
+        >>> [round(x, 2) for x in elements_at(paper, torch.tensor([-2.0, 162.0])).tolist()]
+        [8.02, -16.15, 35466.61]
     """
     check_tensor(2, position=position)
     return measured_elements(field(position[..., 0], position[..., 1]))
@@ -394,6 +431,12 @@ def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]
 
     Raises:
         ValueError: for no position at all.
+
+    Example:
+        >>> corners = torch.tensor([[-10.0, 160.0], [-10.0, 170.0], [0.0, 160.0], [0.0, 170.0]])
+        >>> low, high = elements_range(IGRF("2022-01-01"), corners)
+        >>> (high - low).round(decimals=1)
+        tensor([  3.1000,  22.4000, 783.4000], dtype=torch.float64)
     """
     if not position.numel():
         raise ValueError(f"position must hold at least one place, got shape {tuple(position.shape)}")
@@ -410,6 +453,12 @@ def elements_gradient_at(field: FieldModel, position: Tensor) -> Tensor:
 
     Returns:
         ``(..., 3, 2)``: element unit per km, northward and eastward.
+
+    Example:
+        >>> elements_gradient_at(IGRF("2022-01-01"), torch.tensor([-5.0, 165.0])).round(decimals=4)
+        tensor([[-0.0012,  0.0015],
+                [ 0.0173,  0.0030],
+                [ 0.1423, -0.4990]], dtype=torch.float64)
     """
     check_tensor(2, position=position)
     return elements_gradient(*field.value_and_gradient(position[..., 0], position[..., 1]))
@@ -420,6 +469,12 @@ def check_positions(latitude: Tensor, longitude: Tensor) -> None:
 
     Raises:
         ValueError: naming the first latitude beyond 90 degrees or value that is not finite.
+
+    Example:
+        >>> check_positions(torch.tensor([0.0, 95.0]), torch.zeros(2))
+        Traceback (most recent call last):
+            ...
+        ValueError: latitude 95.0 is not between -90 and 90 degrees
     """
     check_tensor(latitude=latitude, longitude=longitude)
     _require(latitude.abs() <= 90, latitude, "latitude {} is not between -90 and 90 degrees")
@@ -439,6 +494,13 @@ def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> 
 
     Raises:
         ValueError: with the values.
+
+    Example:
+        >>> check_box((-10, 0), (170, 190))
+        >>> check_box((0, -10), (170, 190))
+        Traceback (most recent call last):
+            ...
+        ValueError: latitudes (0, -10) must rise from south to north within [-90, 90] degrees
     """
     check_numbers(2, latitudes=latitude, longitudes=longitude)
     south, north = latitude

@@ -285,6 +285,11 @@ def products(axis_km: Tensor, z_km: Tensor, degree: int) -> tuple[Tensor, Tensor
 
     Returns:
         ``(F, P)`` products ``(a/r)^(d+1) T_i(cos theta)``, and ``(P,)`` what lifts odd orders, ``(a/r) sin theta``.
+
+    Example:
+        >>> features, lift = products(torch.tensor([REFERENCE_RADIUS_KM]), torch.zeros(1), degree=1)  # at the equator
+        >>> features.squeeze(-1), lift
+        (tensor([1., 0.]), tensor([1.]))
     """
     inverse = REFERENCE_RADIUS_KM / (axis_km * axis_km + z_km * z_km)
     ratio2, z = REFERENCE_RADIUS_KM * inverse, z_km * inverse
@@ -309,6 +314,10 @@ def waves(cos_lon: Tensor, sin_lon: Tensor, lift: Tensor, degree: int) -> Tensor
 
     Returns:
         ``(2 * degree + 1, P)``.
+
+    Example:
+        >>> waves(torch.tensor([0.0]), torch.tensor([1.0]), torch.ones(1), degree=1).squeeze(-1)  # at 90 degrees east
+        tensor([1., 1., 0.])
     """
     rows = [torch.stack((torch.zeros_like(cos_lon), torch.ones_like(cos_lon))), torch.stack((sin_lon, cos_lon))]
     minus = -rows[0], -rows[1]

@@ -170,6 +170,14 @@ class WandbRun(CurveLog):
 
     Raises:
         ValueError: for another mode.
+
+    Example:
+        >>> import tempfile
+        >>> run = WandbRun(Path(tempfile.mkdtemp()), "disabled", {"seed": 0})
+        >>> run.row({"frames": 512, "return": -3.5})
+        >>> run.close()
+        >>> list(run.folder.iterdir())
+        []
     """
 
     def __init__(

@@ -62,6 +62,14 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
 
     Source:
         SPL: Anderson et al., On evaluation of embodied navigation agents (2018).
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> from magrl.navigators import Secant
+        >>> rollout = GeomagneticNavEnv(num_envs=2, seed=0).rollout(50, Secant(), break_when_any_done=False)
+        >>> episodes = episode_measures(rollout)
+        >>> episodes["success"], episodes["steps"]
+        (tensor([True, True]), tensor([12, 12]))
     """
     check_type(TensorDictBase, rollout=rollout)
     if rollout.ndim != 2 or 0 in rollout.shape:
@@ -133,6 +141,15 @@ def summarise(episodes: dict[str, Tensor]) -> dict[str, float]:
     Raises:
         ValueError: for no episode, or successes that are not bool.
         KeyError: for a measure that is missing.
+
+    Example:
+        >>> flown_km, left_km = torch.tensor([500.0, 480.0]), torch.tensor([8.0, 200.0])
+        >>> ends = {"success": torch.tensor([True, False]), "steps": torch.tensor([10, 50])}
+        >>> ends["spl"] = torch.tensor([0.8, 0.0])
+        >>> angles = dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.zeros(2))
+        >>> summary = summarise({**ends, **angles, "length_km": flown_km, "navigation_error_km": left_km})
+        >>> summary["success_rate"], summary["trajectory_length_m"], summary["steps"]
+        (50.0, 500000.0, 10.0)
     """
     success = episodes["success"]
     if success.dtype != torch.bool or success.ndim != 1 or not len(success):
@@ -222,6 +239,15 @@ class TrainingTally:
         destination_weight: the env's reward at arrival, which is told from the rest of the base reward by it.
         reward_scale: factor that the collected reward carries.
         window: episodes that ``return`` and ``success_rate`` are averaged over, as in Figs. 4-2 and 4-3.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> after = TensorDict(reward=torch.tensor([[1.0], [203.0]]), episode_reward=torch.tensor([[5.0], [230.0]]))
+        >>> after["success"] = after["done"] = torch.tensor([[False], [True]])
+        >>> tally = TrainingTally(destination_weight=200.0, reward_scale=1.0)
+        >>> tally.add(TensorDict(next=after, batch_size=[2]), alignment=None)
+        >>> tally.frames, tally.episodes, tally.row()["return"]
+        (2, 1, 230.0)
     """
 
     def __init__(self, destination_weight: float, reward_scale: float, window: int = 200) -> None:

@@ -123,6 +123,10 @@ def element_indices(elements: Sequence[str], least: int) -> list[int]:
 
     Raises:
         ValueError: for an unknown name, one that is repeated, or fewer than ``least``.
+
+    Example:
+        >>> element_indices(("D", "B_H"), least=2)
+        [0, 2]
     """
     if isinstance(elements, str) or not isinstance(elements, Sequence):
         raise ValueError(f"elements must be a sequence of D, I, B_H, got {elements!r}")
@@ -144,6 +148,23 @@ class Navigator(TensorDictModuleBase):
 
     Raises:
         ValueError: for a bound out of its range.
+
+    Example:
+        >>> class DueEast(Navigator):
+        ...     def __init__(self):
+        ...         super().__init__(max_move_km=50.0, max_turn_rad=math.pi / 2)
+        ...         self.in_keys = ["heading", "step_count"]
+        ...
+        ...     def first_memory(self, seen):
+        ...         return {}
+        ...
+        ...     def decide(self, seen, memory):
+        ...         heading = seen["heading"].squeeze(-1)
+        ...         east, way = torch.full_like(heading, math.pi / 2), torch.full_like(heading, 30.0)
+        ...         return steer(heading, east, way, self.max_move_km, self.max_turn_rad)
+        >>> GeomagneticNavEnv(num_envs=1, seed=0).rollout(2, DueEast())["action"].round(decimals=2)
+        tensor([[[30.0000,  1.5700],
+                 [30.0000,  0.0000]]])
     """
 
     oracle: bool = False
@@ -166,6 +187,7 @@ class Navigator(TensorDictModuleBase):
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action`` ``(N, 2)``: distance [km] and turn [rad]."""
         seen = tensordict.select(*self.in_keys)
         self.memory = memory = self._recall(seen)
         step = seen["step_count"].squeeze(-1)

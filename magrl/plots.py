@@ -63,6 +63,10 @@ def rgb_array(draw: Callable[..., None], size_px: int, *args: Any) -> np.ndarray
 
     Raises:
         ValueError: for a size that is no positive whole number.
+
+    Example:
+        >>> rgb_array(lambda axes, x: axes.plot(x), 100, [1, 3, 2]).shape
+        (100, 100, 3)
     """
     check_number(1, whole=True, size_px=size_px)
     figure = Figure(figsize=(7, 7), dpi=(size_px + 0.01) / 7, layout="constrained")
@@ -79,6 +83,13 @@ def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
         axes: where to draw.
         field: any model of :mod:`magrl.fields`.
         region: what to show.
+
+    Example:
+        >>> from magrl.fields import IGRF
+        >>> figure = Figure()
+        >>> draw_contours(figure.subplots(), IGRF("2022-01-01"), Region((-10, 0), (160, 170)))
+        >>> figure.axes[0].get_legend_handles_labels()[1]
+        ['D [deg]', 'I [deg]', '$B_H$ [nT]']
     """
     check_type(Axes, axes=axes)
     check_type(Region, region=region)
@@ -113,6 +124,14 @@ def draw_journeys(axes: Axes, field: FieldModel, region: Region, paths: Sequence
 
     Raises:
         ValueError: for no path, or another number of targets.
+
+    Example:
+        >>> from magrl.fields import IGRF
+        >>> axes, target = Figure().subplots(), torch.tensor([[-8.0, 164.0]])
+        >>> path = torch.tensor([[-2.0, 162.0], [-4.0, 163.0]])
+        >>> draw_journeys(axes, IGRF("2022-01-01"), Region((-10, 0), (160, 170)), [path], target)
+        >>> axes.get_xlabel()
+        'longitude [° E]'
     """
     check_type(Region, region=region)
     check_tensor(2, targets=targets)
@@ -147,6 +166,11 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
 
     Raises:
         ValueError: for no row, or one without ``frames``.
+
+    Example:
+        >>> rows = [{"frames": 1000, "return": -5.0}, {"frames": 2000, "return": 20.0, "success_rate": 10.0}]
+        >>> [axes.get_title() for axes in training_figure(rows).axes]
+        ['return of the last 200 episodes', 'mean reward of a step', 'success [%]', 'loss']
     """
     if not rows or not all("frames" in row for row in rows):
         raise ValueError(f"each row of a training must have its frames, got {list(rows)[:1]}")
@@ -175,6 +199,13 @@ def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Regi
         field: any model of :mod:`magrl.fields`.
         region: where tasks lie.
         journeys: how many to show.
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> figure = trajectories_figure(env.rollout(3), env.field, env.region)
+        >>> figure.axes[0].get_ylabel()
+        'latitude [° N]'
     """
     check_type(TensorDictBase, rollout=rollout)
     check_number(1, whole=True, journeys=journeys)
@@ -212,6 +243,11 @@ def learning_curves(
 
     Raises:
         ValueError: for a navigator that has no name and colour here.
+
+    Example:
+        >>> figure = learning_curves({"td3": [([0, 100], [0.0, 50.0]), ([0, 100], [10.0, 70.0])]}, "SPL [%]")
+        >>> figure.axes[0].get_legend().get_texts()[0].get_text()
+        'TD3, 2 seeds'
     """
     _check_navigators(curves)
     check_number(2, whole=True, points=points)
@@ -247,6 +283,14 @@ def compared_trajectories(
 
     Raises:
         ValueError: for a navigator that has no name and colour here.
+
+    Example:
+        >>> from magrl.fields import IGRF
+        >>> from magrl.tasks import named_tasks
+        >>> track = ([-2.0, -8.0], [162.0, 164.0])
+        >>> figure = compared_trajectories({"secant": track}, IGRF("2022-01-01"), named_tasks("figure-4-1"))
+        >>> figure.axes[0].lines[-1].get_label()
+        'destination'
     """
     _check_navigators(tracks)
     check_type(Tasks, task=task)
@@ -274,6 +318,14 @@ def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: Fiel
 
     Raises:
         ValueError: for a navigator that has no name and colour here.
+
+    Example:
+        >>> from magrl.fields import IGRF
+        >>> from magrl.tasks import named_tasks
+        >>> flight = {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0], "L": [0.0, 50.0]}
+        >>> figure = convergence({"secant": flight}, IGRF("2022-01-01"), named_tasks("figure-4-1"))
+        >>> [axes.get_title() for axes in figure.axes]
+        ['(a)', '(b)', '(c)', '(d)']
     """
     _check_navigators(series)
     check_type(Tasks, task=task)
@@ -302,6 +354,12 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
 
     Raises:
         ValueError: for a navigator that has no name and colour here, or none at all.
+
+    Example:
+        >>> measures = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
+        >>> figure = box_plots({"secant": dict.fromkeys(measures, [1.0, 2.0, 4.0])})
+        >>> figure.axes[3].get_ylabel()
+        'navigation error [km]'
     """
     _check_navigators(measures)
     labels = {

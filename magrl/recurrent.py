@@ -57,12 +57,30 @@ class LastMove(nn.Module):
 
 
 def observation_transforms(config: td3.PolicyConfig) -> list[Transform]:
-    """From the public keys to ``observation``, which holds no heading, for training and flight alike."""
+    """From the public keys to ``observation``, which holds no heading, for training and flight alike.
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> view = td3.policy_config(env, (8,), layer_norm=True)
+        >>> Compose(*observation_transforms(view))(env.reset())["observation"].shape
+        torch.Size([2, 11])
+    """
     return td3.observation_transforms(replace(config, observe_heading=False))
 
 
 def training_transforms(config: td3.PolicyConfig, actor: TensorDictSequential) -> list[Transform]:
-    """What a training environment needs: the memory's first state, ``is_init``, and the heading for the critics."""
+    """What a training environment needs: the memory's first state, ``is_init``, and the heading for the critics.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> view = td3.policy_config(base, (8,), layer_norm=True)
+        >>> env = TransformedEnv(base, Compose(*training_transforms(view, make_actor(view, memory_size=4))))
+        >>> env.reset()["hidden"].shape
+        torch.Size([2, 1, 4])
+    """
     memory = next(module for module in actor.modules() if isinstance(module, LSTMModule))
     privileged = AngleVector("heading", "heading_vector")
     return [InitTracker(), memory.make_tensordict_primer(), *observation_transforms(config), privileged]
@@ -112,7 +130,14 @@ def make_actor(config: td3.PolicyConfig, memory_size: int, device: torch.device 
 
 
 def make_critic(config: td3.PolicyConfig, device: torch.device | None = None) -> ValueOperator:
-    """The value of an action, for training only: it reads the true heading beside ``observation``."""
+    """The value of an action, for training only: it reads the true heading beside ``observation``.
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> critic = make_critic(td3.policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True))
+        >>> critic.in_keys
+        ['observation', 'heading_vector', 'action']
+    """
     critic = td3.make_critic(replace(config, observe_heading=True), device)
     return ValueOperator(critic.module, in_keys=["observation", "heading_vector", "action"])
 
@@ -131,6 +156,13 @@ def make_loss(
 
     Returns:
         The loss; :func:`value_loss` and :func:`actor_losses` evaluate it on slices.
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> view = td3.policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True)
+        >>> loss = make_loss(make_actor(view, 4), make_critic(view), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        >>> "heading_vector" in loss.in_keys
+        True
     """
     # The loss hands its critics what its actor reads or writes, so the heading has to pass by the actor.
     beside = TensorDictModule(nn.Identity(), ["heading_vector"], ["heading_vector"])
@@ -148,7 +180,16 @@ def make_loss(
 
 
 def parameter_groups(loss: TD3Loss) -> tuple[list[Tensor], list[Tensor]]:
-    """The actor's parameters: those of its memory, and the others."""
+    """The actor's parameters: those of its memory, and the others.
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> view = td3.policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=False)
+        >>> loss = make_loss(make_actor(view, 4), make_critic(view), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        >>> memory, others = parameter_groups(loss)
+        >>> len(memory), len(others)
+        (4, 6)
+    """
     named = loss.actor_network_params.flatten_keys(".").items()
     trained = [(name, value) for name, value in named if value.requires_grad]
     return [v for n, v in trained if ".lstm." in n], [v for n, v in trained if ".lstm." not in n]
@@ -166,6 +207,18 @@ def value_loss(loss: TD3Loss, slices: TensorDictBase) -> Tensor:
 
     Returns:
         A scalar with a gradient for the critics.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> view = td3.policy_config(base, (8,), layer_norm=True)
+        >>> actor = make_actor(view, memory_size=4)
+        >>> env = TransformedEnv(base, Compose(*training_transforms(view, actor), td3.action_transform(view)))
+        >>> slices = env.rollout(3, actor).reshape(-1)  # two slices of three steps
+        >>> loss = make_loss(actor, make_critic(view), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        >>> value_loss(loss, slices).requires_grad
+        True
     """
     begins = slices["is_init"].squeeze(-1)
     first = slices[begins].select(*loss.actor_network.in_keys)
@@ -191,6 +244,18 @@ def actor_losses(loss: TD3Loss, slices: TensorDictBase) -> dict[str, Tensor]:
     Returns:
         ``value``, less the first critic's value of the actor's actions; ``heading``, the mean square error of the
         estimated heading's cosine and sine; ``saturation``, as :func:`magrl.td3.saturation_penalty`.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> view = td3.policy_config(base, (8,), layer_norm=True)
+        >>> actor = make_actor(view, memory_size=4)
+        >>> env = TransformedEnv(base, Compose(*training_transforms(view, actor), td3.action_transform(view)))
+        >>> slices = env.rollout(3, actor).reshape(-1)  # two slices of three steps
+        >>> loss = make_loss(actor, make_critic(view), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        >>> sorted(actor_losses(loss, slices))
+        ['heading', 'saturation', 'value']
     """
     seen = slices.select(*loss.actor_network.in_keys)
     with set_recurrent_mode(True), loss.actor_network_params.to_module(loss.actor_network):
@@ -232,6 +297,7 @@ class RecurrentPolicy(TensorDictModuleBase):
         self.state: TensorDictBase | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action`` ``(N, 2)``: distance [km] and turn [rad]; remembers the move."""
         seen = self.observe(tensordict.select(*self.in_keys))
         seen["is_init"] = seen["step_count"] == 0
         if self.state is None or self.state.shape != seen.shape or self.state.device != seen.device:
@@ -243,7 +309,14 @@ class RecurrentPolicy(TensorDictModuleBase):
 
 
 def save_policy(path: Path | str, policy: RecurrentPolicy) -> None:
-    """Writes a policy: its configuration and its weights, as plain tensors and numbers."""
+    """Writes a policy: its configuration and its weights, as plain tensors and numbers.
+
+    Example:
+        >>> import tempfile
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> view = td3.policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True)
+        >>> save_policy(Path(tempfile.mkdtemp()) / "policy.pt", RecurrentPolicy(view, memory_size=4))
+    """
     weights = {key: value.cpu() for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
     content = {"recurrent_format": POLICY_FORMAT, "config": asdict(policy.config), "memory_size": policy.memory_size}
     save_tensors(content | {"weights": weights}, Path(path))
@@ -259,6 +332,15 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> Recurre
     Raises:
         FileNotFoundError: if there is none.
         ValueError: for a file that is no recurrent policy, or with weights of other shapes.
+
+    Example:
+        >>> import tempfile
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> view = td3.policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True)
+        >>> path = Path(tempfile.mkdtemp()) / "policy.pt"
+        >>> save_policy(path, RecurrentPolicy(view, memory_size=4))
+        >>> load_policy(path).memory_size
+        4
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no policy file at {path}")

@@ -141,6 +141,7 @@ class RegionalField(Float64Module):
         return float((self(*points) - model(*points).to("cpu", torch.float64)).abs().max())
 
     def extra_repr(self) -> str:
+        """The box, the degree and the error that was measured."""
         return (
             f"latitude={self.latitude}, longitude={self.longitude}, degree={self.degree}, error_nt={self.error_nt:.1e}"
         )

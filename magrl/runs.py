@@ -47,6 +47,17 @@ def locked(folder: Path) -> Iterator[None]:
 
     Raises:
         FileExistsError: if another process writes it.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with locked(folder):
+        ...     try:
+        ...         with locked(folder):
+        ...             pass
+        ...     except FileExistsError:
+        ...         print("one writer at a time")
+        one writer at a time
     """
     check_type(Path, folder=folder)
     lock = FileLock(folder / ".lock")
@@ -89,7 +100,15 @@ class StopRequest:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes numbers and texts in their order; NaN, which JSON lacks, becomes null."""
+    """Writes numbers and texts in their order; NaN, which JSON lacks, becomes null.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "eval.json"
+        >>> write_json(path, {"steps": 9, "spl": math.nan})
+        >>> json.loads(path.read_text())
+        {'steps': 9, 'spl': None}
+    """
     check_type(Path, path=path)
     clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in content.items()}
     path.write_text(json.dumps(clean, indent=2, allow_nan=False) + "\n")
@@ -110,6 +129,14 @@ class RunLog:
 
     Raises:
         ValueError: for another logger or mode, or a logger that is not installed.
+
+    Example:
+        >>> import tempfile
+        >>> log = RunLog(Path(tempfile.mkdtemp()), ["frames", "return"], {"seed": 0})
+        >>> log.row({"frames": 512, "return": -3.5})
+        >>> log.close()
+        >>> (log.folder / "train.csv").read_text().split()
+        ['frames,return', '512,-3.5']
     """
 
     def __init__(

@@ -107,7 +107,13 @@ FIRST_RESERVED_SEED = 2_000_000_000
 
 
 class Tasks(NamedTuple):
-    """Journeys: where they start and end, each ``(..., 2)`` latitude, longitude [deg], float64."""
+    """Journeys: where they start and end, each ``(..., 2)`` latitude, longitude [deg], float64.
+
+    Example:
+        >>> ends = torch.tensor([[-2.0, 162.0]]), torch.tensor([[-8.0, 164.0]])
+        >>> Tasks(*ends).target
+        tensor([[ -8., 164.]])
+    """
 
     start: Tensor
     target: Tensor
@@ -168,6 +174,12 @@ def check_distance_range(region: Region, distance_range_km: tuple[float, float])
 
     Raises:
         ValueError: with the values.
+
+    Example:
+        >>> check_distance_range(PAPER_REGION, (500, 300))
+        Traceback (most recent call last):
+            ...
+        ValueError: distance_range_km (500, 300) must be two rising numbers from 0 on
     """
     check_type(Region, region=region)
     check_numbers(2, distance_range_km=distance_range_km)
@@ -301,6 +313,11 @@ def check_tasks(tasks: Tasks, within: Region) -> Tasks:
 
     Raises:
         ValueError: for other shapes, an empty set, positions that are not on Earth, or outside ``within``.
+
+    Example:
+        >>> tasks = Tasks(torch.tensor([[-2.0, 522.0]]), torch.tensor([[-8.0, 164.0]]))
+        >>> check_tasks(tasks, within=PAPER_REGION).start
+        tensor([[ -2., 162.]], dtype=torch.float64)
     """
     check_type(Region, within=within)
     if not isinstance(tasks, (tuple, list)) or len(tasks) != 2:

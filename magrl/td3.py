@@ -54,6 +54,11 @@ class PolicyConfig:
     Raises:
         ValueError: for bounds that are not finite or do not rise, a move or a turn that is not positive, widths that
             are no positive whole numbers, or switches that are not bool.
+
+    Example:
+        >>> low, high = (8.0, -40.0, 33000.0), (12.0, -10.0, 37000.0)
+        >>> PolicyConfig((32, 32), True, True, True, low, high, max_move_km=50.0, max_turn_rad=1.5).num_cells
+        (32, 32)
     """
 
     num_cells: tuple[int, ...]
@@ -86,7 +91,13 @@ def policy_config(
     observe_heading: bool = True,
     observe_difference: bool = True,
 ) -> PolicyConfig:
-    """The configuration of a policy for an environment, scaled to the range of the field over its region."""
+    """The configuration of a policy for an environment, scaled to the range of the field over its region.
+
+    Example:
+        >>> view = policy_config(GeomagneticNavEnv(seed=0), (32, 32), layer_norm=True)
+        >>> [round(x, 1) for x in view.field_low], view.max_move_km
+        ([7.3, -31.6, 34720.5], 50.0)
+    """
     check_type(GeomagneticNavEnv, env=env)
     low, high = (tuple(x.tolist()) for x in elements_range(env.field, env.region.grid(81).to(env.device)))
     return PolicyConfig(
@@ -125,7 +136,14 @@ def check_fits(config: PolicyConfig, env: GeomagneticNavEnv) -> None:
 
 
 def observation_transforms(config: PolicyConfig) -> list[Transform]:
-    """From the public keys to ``observation``, the input of the networks."""
+    """From the public keys to ``observation``, the input of the networks.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> view = policy_config(env, (32, 32), layer_norm=True)
+        >>> Compose(*observation_transforms(view))(env.reset())["observation"].shape
+        torch.Size([2, 13])
+    """
     check_type(PolicyConfig, config=config)
     low, high = torch.tensor(config.field_low), torch.tensor(config.field_high)
     keys = ["field", "target_field", "move"]
@@ -146,20 +164,39 @@ def observation_transforms(config: PolicyConfig) -> list[Transform]:
 
 
 def action_transform(config: PolicyConfig) -> MinMaxNorm:
-    """From the networks' action in [-1, 1] to kilometres and radians."""
+    """From the networks' action in [-1, 1] to kilometres and radians.
+
+    Example:
+        >>> view = policy_config(GeomagneticNavEnv(seed=0), (32, 32), layer_norm=True)
+        >>> action_transform(view).denormalize("action", torch.tensor([0.0, 1.0]))
+        tensor([25.0000,  1.5708])
+    """
     check_type(PolicyConfig, config=config)
     high = torch.tensor((config.max_move_km, config.max_turn_rad))
     return MinMaxNorm(in_keys_inv=["action"], bounds={"action": (high * torch.tensor((0, -1)), high)})
 
 
 def guidance_transforms(env: GeomagneticNavEnv, weight: float, offset: float) -> list[Transform]:
-    """What makes TD3 gradient-guided: the theoretical heading, and the reward for holding it."""
+    """What makes TD3 gradient-guided: the theoretical heading, and the reward for holding it.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> env = TransformedEnv(base, Compose(*guidance_transforms(base, weight=3.0, offset=0.0)))
+        >>> env.rollout(3)["gradient_heading"].shape
+        torch.Size([2, 3, 1])
+    """
     check_type(GeomagneticNavEnv, env=env)
     return [FieldGradient(env.field), GradientHeading(), AlignmentReward(weight=weight, offset=offset)]
 
 
 def observation_size(config: PolicyConfig) -> int:
-    """Number of entries in ``observation``."""
+    """Number of entries in ``observation``.
+
+    Example:
+        >>> observation_size(policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True))
+        13
+    """
     check_type(PolicyConfig, config=config)
     return 8 + 3 * config.observe_difference + 2 * config.observe_heading
 
@@ -180,6 +217,12 @@ def make_actor(config: PolicyConfig, device: torch.device | None = None) -> Tens
     """The deterministic policy, ``observation`` ``(..., K)`` to ``action`` ``(..., 2)`` in [-1, 1].
 
     Its ``logits``, before the tanh, start at zero bias: half the longest move, no turn.
+
+    Example:
+        >>> view = policy_config(GeomagneticNavEnv(seed=0), (32, 32), layer_norm=True)
+        >>> seen = TensorDict(observation=torch.zeros(5, 13), batch_size=[5])
+        >>> make_actor(view)(seen)["action"].shape
+        torch.Size([5, 2])
     """
     network = _mlp(observation_size(config), 2, config, device)
     nn.init.zeros_(network[-1].bias)
@@ -191,7 +234,14 @@ def make_actor(config: PolicyConfig, device: torch.device | None = None) -> Tens
 
 
 def make_critic(config: PolicyConfig, device: torch.device | None = None) -> ValueOperator:
-    """The value of an action, ``observation`` and ``action`` to ``state_action_value`` ``(..., 1)``."""
+    """The value of an action, ``observation`` and ``action`` to ``state_action_value`` ``(..., 1)``.
+
+    Example:
+        >>> view = policy_config(GeomagneticNavEnv(seed=0), (32, 32), layer_norm=True)
+        >>> seen = TensorDict(observation=torch.zeros(5, 13), action=torch.zeros(5, 2), batch_size=[5])
+        >>> make_critic(view)(seen)["state_action_value"].shape
+        torch.Size([5, 1])
+    """
     return ValueOperator(_mlp(observation_size(config) + 2, 1, config, device), in_keys=["observation", "action"])
 
 
@@ -201,6 +251,15 @@ class LeanTD3Loss(TD3Loss):
     Its networks stand, each with its own parameters in it, where the parent fills one network anew with the parameters
     of each at every call; and the actor asks only the critic that its gradient comes from (Eq. 3-13), where the parent
     evaluates both and drops one. Parameters, targets and state are the parent's, and share its memory.
+
+    Example:
+        >>> view = policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True)
+        >>> actor, critic = make_actor(view), make_critic(view)
+        >>> spec = Bounded(-1.0, 1.0, (2,))
+        >>> loss = LeanTD3Loss(actor, critic, action_spec=spec, loss_function="l2", deactivate_vmap=True)
+        >>> value, extra = loss.actor_loss(TensorDict(observation=torch.zeros(5, 13), batch_size=[5]))
+        >>> value.shape, extra["logits"].shape
+        (torch.Size([]), torch.Size([5, 2]))
     """
 
     @cached_property
@@ -266,7 +325,20 @@ class LeanTD3Loss(TD3Loss):
 
 
 class LeanSoftUpdate(SoftUpdate):
-    """TorchRL's soft update of all targets in one call."""
+    """TorchRL's soft update of all targets in one call.
+
+    Example:
+        >>> view = policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True)
+        >>> loss = make_loss(make_actor(view), make_critic(view), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        >>> source, target = loss.actor_network_params, loss.target_actor_network_params
+        >>> update = LeanSoftUpdate(loss, tau=0.25)
+        >>> for weights, value in ((source, 1.0), (target, 0.0)):
+        ...     for weight in weights.data.values(True, True):
+        ...         _ = weight.fill_(value)
+        >>> update.step()
+        >>> next(target.data.values(True, True)).unique()
+        tensor([0.2500])
+    """
 
     def step(self) -> None:
         """Moves each target by its share towards its source."""
@@ -284,6 +356,15 @@ def make_loss(
 
     Raises:
         ValueError: for a discount outside [0, 1], or a noise that is negative.
+
+    Example:
+        >>> view = policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True)
+        >>> loss = make_loss(make_actor(view), make_critic(view), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        >>> seen, ended = torch.zeros(5, 13), torch.ones(5, 1, dtype=torch.bool)
+        >>> after = TensorDict(observation=seen, reward=torch.ones(5, 1), terminated=ended)
+        >>> batch = TensorDict(observation=seen, action=torch.zeros(5, 2), next=after, batch_size=[5])
+        >>> loss.value_loss(batch)[1]["target_value"].T
+        tensor([[1., 1., 1., 1., 1.]])
     """
     check_type(TensorDictSequential, actor=actor)
     check_type(ValueOperator, critic=critic)
@@ -314,6 +395,10 @@ def saturation_penalty(logits: Tensor) -> Tensor:
 
     Returns:
         A scalar with a gradient for the actor.
+
+    Example:
+        >>> saturation_penalty(torch.tensor([[1.0, -3.0]]))
+        tensor(5.)
     """
     check_tensor(logits=logits)
     return logits.square().mean()
@@ -345,12 +430,19 @@ class FieldPolicy(TensorDictModuleBase):
         self.actor = make_actor(config) if actor is None else actor
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action`` ``(..., 2)``: distance [km] and turn [rad]."""
         seen = self.observe(tensordict.select(*self.in_keys))
         return tensordict.set("action", self.act.denormalize("action", self.actor(seen)["action"]))
 
 
 def save_policy(path: Path | str, policy: FieldPolicy) -> None:
-    """Writes a policy: its configuration and its weights, as plain tensors and numbers."""
+    """Writes a policy: its configuration and its weights, as plain tensors and numbers.
+
+    Example:
+        >>> import tempfile
+        >>> policy = FieldPolicy(policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True))
+        >>> save_policy(Path(tempfile.mkdtemp()) / "policy.pt", policy)
+    """
     check_type(FieldPolicy, policy=policy)
     weights = {key: value.cpu() for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
     save_tensors({"format": POLICY_FORMAT, "config": asdict(policy.config), "weights": weights}, Path(path))
@@ -366,6 +458,13 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
     Raises:
         FileNotFoundError: if there is none.
         ValueError: for a file that is no policy, of another format, or with weights of other shapes.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "policy.pt"
+        >>> save_policy(path, FieldPolicy(policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True)))
+        >>> load_policy(path).config.num_cells
+        (8,)
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no policy file at {path}")
@@ -406,6 +505,11 @@ def evaluation_rollout(env: GeomagneticNavEnv, policy: TensorDictModuleBase) -> 
 
     Returns:
         ``(num_envs, T)`` for :func:`magrl.metrics.episode_measures`: vehicles that are done stay as they were.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0, max_steps=3)
+        >>> evaluation_rollout(env, FieldPolicy(policy_config(env, (8,), layer_norm=True))).shape
+        torch.Size([2, 3])
     """
     check_type(EnvBase, env=env)
     if not callable(policy):

@@ -75,6 +75,12 @@ def build(name: str, env: GeomagneticNavEnv, mode: str, seed: int, **options: An
     Raises:
         ValueError: for an unknown algorithm or mode, or an option out of its range.
         TypeError: for another environment, or an option that the algorithm does not have.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> swarm = build("pso", env, "flown", seed=0, population_size=4)
+        >>> swarm.oracle, env.rollout(2, swarm)["action"].shape
+        (False, torch.Size([2, 2, 2]))
     """
     check_type(GeomagneticNavEnv, env=env)
     if name not in ALGORITHMS:

@@ -43,13 +43,25 @@ def reachable(candidate: Tensor, heading: Tensor, max_turn_rad: float) -> tuple[
 
 
 def displacement(distance: Tensor, heading: Tensor) -> Tensor:
-    """North and east of a move, ``(..., 2)``."""
+    """North and east of a move, ``(..., 2)``.
+
+    Example:
+        >>> displacement(torch.tensor([1.0, 2.0]), torch.tensor([0.0, math.pi / 2])).round(decimals=3).abs()
+        tensor([[1., 0.],
+                [0., 2.]])
+    """
     check_tensor(distance=distance, heading=heading)
     return torch.stack((distance * torch.cos(heading), distance * torch.sin(heading)), -1)
 
 
 def take(values: Tensor, index: Tensor) -> Tensor:
-    """Individuals by their number: ``(N, P, ...)`` at ``(N, K)`` is ``(N, K, ...)``."""
+    """Individuals by their number: ``(N, P, ...)`` at ``(N, K)`` is ``(N, K, ...)``.
+
+    Example:
+        >>> take(torch.tensor([[10, 11, 12], [20, 21, 22]]), torch.tensor([[2], [0]]))
+        tensor([[12],
+                [20]])
+    """
     check_tensor(index=index)
     if index.ndim != 2 or len(index) != len(values):
         raise ValueError(f"index must be of shape ({len(values)}, K), got {tuple(index.shape)}")
@@ -57,7 +69,13 @@ def take(values: Tensor, index: Tensor) -> Tensor:
 
 
 def in_disc(candidate: Tensor) -> Tensor:
-    """Candidates ``(..., 2)`` with none longer than 1; NaN stays NaN."""
+    """Candidates ``(..., 2)`` with none longer than 1; NaN stays NaN.
+
+    Example:
+        >>> in_disc(torch.tensor([[3.0, 4.0], [0.3, 0.4]]))
+        tensor([[0.6000, 0.8000],
+                [0.3000, 0.4000]])
+    """
     check_tensor(2, candidate=candidate)
     return candidate / candidate.norm(dim=-1, keepdim=True).clamp_min(1)
 
@@ -67,6 +85,14 @@ def checked(name: str, value: float, low: float, high: float, whole: bool = Fals
 
     Raises:
         ValueError: with the name and the value.
+
+    Example:
+        >>> checked("population_size", 8, 2, 100, whole=True)
+        8
+        >>> checked("blend", -1, 0, 10)
+        Traceback (most recent call last):
+            ...
+        ValueError: blend must be a finite number from 0 up to 10, got -1
     """
     option: dict[str, Any] = {name: value}
     check_number(low, high, whole=whole, **option)
@@ -91,6 +117,17 @@ class Metaheuristic(Navigator):
 
     Raises:
         ValueError: for any option out of its range, naming it and its value.
+
+    Example:
+        >>> class RandomSearch(Metaheuristic):
+        ...     def begin(self, population):
+        ...         return {}
+        ...
+        ...     def evolve(self, state, fitness, evaluate):
+        ...         return {"population": self.first_state(fitness)["population"]}
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> GeomagneticNavEnv(num_envs=2, seed=0).rollout(3, RandomSearch(mode="flown"))["action"].shape
+        torch.Size([2, 3, 2])
     """
 
     def __init__(

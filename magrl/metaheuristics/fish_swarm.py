@@ -29,6 +29,14 @@ class ArtificialFishSwarm(Metaheuristic):
         X. Li, Z. Shao and J. Qian, An optimizing method based on autonomous animats: fish-swarm algorithm, Systems
         Engineering: Theory and Practice 22 (2002); as in D. Yazdani et al., Fuzzy adaptive artificial fish swarm
         algorithm, AI (2010).
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> fish = ArtificialFishSwarm(mode="look-ahead", field=env.field, population_size=4, generations=2)
+        >>> moved = env.rollout(1, fish)
+        >>> (moved["next", "objective"] < moved["objective"]).all()
+        tensor(True)
     """
 
     def __init__(

@@ -26,6 +26,13 @@ class GeneticAlgorithm(Metaheuristic):
     Source:
         J. H. Holland, Adaptation in Natural and Artificial Systems (1975); blend crossover: L. J. Eshelman and
         J. D. Schaffer, Real-coded genetic algorithms and interval-schemata, FOGA 2 (1993).
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> moved = env.rollout(1, GeneticAlgorithm(mode="look-ahead", field=env.field))
+        >>> (moved["next", "objective"] < moved["objective"]).all()
+        tensor(True)
     """
 
     def __init__(

@@ -25,6 +25,13 @@ class ParticleSwarm(Metaheuristic):
     Source:
         J. Kennedy and R. Eberhart, Particle swarm optimization, ICNN (1995); inertia: Y. Shi and R. Eberhart, A
         modified particle swarm optimizer, ICEC (1998).
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> moved = env.rollout(1, ParticleSwarm(mode="look-ahead", field=env.field))
+        >>> (moved["next", "objective"] < moved["objective"]).all()
+        tensor(True)
     """
 
     def __init__(

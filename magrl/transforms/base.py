@@ -16,12 +16,25 @@ Keys = Sequence[NestedKey]
 
 
 class ObservationTransform(Transform):
-    """What the transforms that add an observation share: they also run at reset, and on plain TensorDicts."""
+    """What the transforms that add an observation share: they also run at reset, and on plain TensorDicts.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> class Kilometres(ObservationTransform):
+        ...     def _call(self, next_tensordict):
+        ...         (metres,) = self._read(next_tensordict)
+        ...         return next_tensordict.set(self.out_keys[0], metres / 1000)
+        >>> depth = TensorDict(depth_m=torch.tensor([500.0]))
+        >>> Kilometres(in_keys=["depth_m"], out_keys=["depth_km"])(depth)["depth_km"]
+        tensor([0.5000])
+    """
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Reads ``in_keys`` and writes ``out_keys`` of a TensorDict, with or without an environment."""
         return self._call(tensordict)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor] | None:
@@ -56,7 +69,14 @@ class ObservationTransform(Transform):
 
 
 def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
-    """The leaves of a TensorDict or a spec, for messages."""
+    """The leaves of a TensorDict or a spec, for messages.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> sorted_keys(TensorDict(move=torch.zeros(2), next=TensorDict(heading=torch.zeros(1))))
+        ["('next', 'heading')", 'move']
+    """
     check_type((TensorDictBase, Composite), container=container)
     return sorted(str(key) for key in container.keys(True, True))
 
@@ -66,6 +86,10 @@ def key_list(keys: NestedKey | Keys) -> list[NestedKey]:
 
     Raises:
         TypeError: for what is neither.
+
+    Example:
+        >>> key_list("heading"), key_list(("next", "heading")), key_list(["heading", "move"])
+        (['heading'], [('next', 'heading')], ['heading', 'move'])
     """
     if isinstance(keys, str) or (isinstance(keys, tuple) and keys and all(isinstance(k, str) for k in keys)):
         return [unravel_key(keys)]
@@ -77,6 +101,10 @@ def several_keys(keys: Keys) -> list[NestedKey]:
 
     Raises:
         TypeError: for a lone string, or what is no sequence of keys.
+
+    Example:
+        >>> several_keys(("field", "target_field"))
+        ['field', 'target_field']
     """
     if isinstance(keys, str) or not isinstance(keys, Iterable) or not all(isinstance(k, (str, tuple)) for k in keys):
         raise TypeError(f"keys must be a sequence of names or of nested names, got {keys!r}")
@@ -88,6 +116,15 @@ def expect_keys(transform: Transform, num_in: int, num_out: int) -> None:
 
     Raises:
         ValueError: with its keys.
+
+    Example:
+        >>> from torchrl.envs import CatTensors
+        >>> joined = CatTensors(["field", "move"], "observation")
+        >>> expect_keys(joined, 2, 1)
+        >>> expect_keys(joined, 3, 1)
+        Traceback (most recent call last):
+            ...
+        ValueError: CatTensors takes 3 in_keys and 1 out_keys, got ['field', 'move'] and ['observation']
     """
     check_type(Transform, transform=transform)
     if len(transform.in_keys) != num_in or len(transform.out_keys) != num_out:

@@ -45,6 +45,7 @@ class AngleVector(ObservationTransform):
         return next_tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Adds a box of [-1, 1] for each vector."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             leaf = self._leaf(observation_spec, in_key)
             if leaf.shape[-1:] != (1,):
@@ -84,6 +85,7 @@ class TargetDifference(ObservationTransform):
         return next_tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Adds the difference, bounded where both of its parts are."""
         value, target = (self._leaf(observation_spec, key) for key in self.in_keys)
         if value.shape != target.shape:
             raise ValueError(f"{self.in_keys} must have one shape, got {tuple(value.shape)} and {tuple(target.shape)}")
@@ -151,6 +153,7 @@ class FieldGradient(ObservationTransform):
         return gradient.reshape(*position.shape[:-1], *gradient.shape[1:])
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Adds the gradient, unbounded."""
         leaf = self._leaf(observation_spec, self.in_keys[0])
         if leaf.shape[-1:] != (2,):
             raise ValueError(f"FieldGradient reads positions of shape (..., 2), got {tuple(leaf.shape)}")
@@ -225,6 +228,7 @@ class GradientHeading(ObservationTransform):
         return guidance.parallel_approach(torch.zeros_like(error), error, gradient, self.min_crossing)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Adds the heading, in [-pi, pi], and its mask."""
         value, target, gradient = (self._leaf(observation_spec, key) for key in self.in_keys)
         if value.shape != target.shape or gradient.shape != (*value.shape, 2) or max(self.pair) >= value.shape[-1]:
             raise ValueError(

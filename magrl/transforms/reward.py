@@ -75,6 +75,7 @@ class AlignmentReward(Transform):
         return next_tensordict
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Adds the term to the reward under ``next`` of whole transitions."""
         if tensordict.get("next", None) is None:
             raise KeyError(
                 "AlignmentReward needs whole transitions: the reference at the root and the angle and reward under "
@@ -84,6 +85,7 @@ class AlignmentReward(Transform):
         return tensordict
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """The reward without bounds, in the shape that it had or else in that of the angle."""
         key = self.out_keys[0]
         if key in reward_spec.keys(True, True):
             leaf = reward_spec[key]

@@ -185,6 +185,7 @@ class MinMaxNorm(ObservationTransform):
     # Specs
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Adds the scaled entries; those with bounds keep some, scaled."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if in_key in observation_spec.keys(True, True) or in_key not in self.in_keys_inv:
                 leaf = self._leaf(observation_spec, in_key)
@@ -192,6 +193,7 @@ class MinMaxNorm(ObservationTransform):
         return observation_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Scales the specs of what the policy writes, under its name for it."""
         input_spec = super().transform_input_spec(input_spec).clone()
         for in_key, out_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
             for name in ("full_action_spec", "full_state_spec"):
