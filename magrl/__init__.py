@@ -4,7 +4,7 @@ The names below are loaded when first used, so that importing the package costs 
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
@@ -31,6 +31,26 @@ _HOMES = {
     "summarise": "metrics",
 }
 __all__ = ["__version__", *_HOMES]
+
+if TYPE_CHECKING:  # the same names for type checkers and editors
+    from magrl.env import GeomagneticNavEnv as GeomagneticNavEnv
+    from magrl.fields import IGRF as IGRF
+    from magrl.fields import SphericalHarmonicField as SphericalHarmonicField
+    from magrl.metrics import episode_measures as episode_measures
+    from magrl.metrics import summarise as summarise
+    from magrl.regional import RegionalField as RegionalField
+    from magrl.tasks import Region as Region
+    from magrl.tasks import Tasks as Tasks
+    from magrl.tasks import task_set as task_set
+    from magrl.td3 import FieldPolicy as FieldPolicy
+    from magrl.td3 import load_policy as load_policy
+    from magrl.td3 import save_policy as save_policy
+    from magrl.transforms import AlignmentReward as AlignmentReward
+    from magrl.transforms import AngleVector as AngleVector
+    from magrl.transforms import FieldGradient as FieldGradient
+    from magrl.transforms import GradientHeading as GradientHeading
+    from magrl.transforms import MinMaxNorm as MinMaxNorm
+    from magrl.transforms import TargetDifference as TargetDifference
 
 
 def __getattr__(name: str) -> Any:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+import magrl
+
 ROOT = Path(__file__).parent.parent
 LEFT_OUT = shutil.ignore_patterns(".*", "runs", "build", "dist", "wandb", "figures", "*.egg-info", "__pycache__")
 TOUR = """
@@ -42,6 +44,20 @@ for pilot in (navigators.Secant(), metaheuristics.build("pso", plain, "flown", s
 plots.trajectories_figure(rollout, plain.field, plain.region).savefig("journeys.png")
 assert plain.render().shape == (700, 700, 3)
 assert navigation_env(2, seed=0).reset()["observation"].shape == (2, 13)
+"""
+MYPY = """
+[mypy]
+strict = true
+cache_dir = {cache}
+[mypy-torch.*,torchrl.*,tensordict.*,numpy.*,matplotlib.*,gymnasium.*]
+follow_imports = skip
+"""
+SNIPPET = """
+import magrl
+from magrl.navigators import Secant
+
+env = magrl.GeomagneticNavEnv(num_envs=4, region=magrl.Region((-10, 0), (160, 170)), seed=0)
+rate: float = magrl.summarise(magrl.episode_measures(env.rollout(5, Secant())))["success_rate"]
 """
 
 
@@ -92,3 +108,15 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
 def test_wheel_works_without_the_tree(python: Path, tmp_path: Path) -> None:
     assert len(run(python, "-c", TOUR, cwd=tmp_path).splitlines()) == 2
     assert (tmp_path / "journeys.png").stat().st_size > 10_000
+
+
+def test_user_s_code_is_typed(python: Path, tmp_path: Path) -> None:
+    """Under mypy --strict: a script that is right passes, one that is wrong does not, and no public name is Any."""
+    (tmp_path / "mypy.ini").write_text(MYPY.format(cache=tmp_path / "cache"))
+    (tmp_path / "user.py").write_text(SNIPPET + "".join(f"reveal_type(magrl.{name})\n" for name in magrl.__all__))
+    check = (sys.executable, "-m", "mypy", "--config-file", "mypy.ini", "--python-executable", python)
+    said = run(*check, "user.py", cwd=tmp_path)
+    assert said.count("Revealed type is") == len(magrl.__all__)
+    assert 'Revealed type is "Any"' not in said, said
+    wrong = "import magrl\nmagrl.GeomagneticNavEnv(num_envs='four')\n"
+    assert "arg-type" in subprocess.run([*check, "-c", wrong], cwd=tmp_path, capture_output=True, text=True).stdout
