@@ -14,13 +14,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
-from matplotlib.figure import Figure
 
 from magrl.geodesy import check_type
 from magrl.loggers import check_logger, open_log
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def create_run_folder(path: Path | str) -> Path:

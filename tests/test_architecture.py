@@ -50,6 +50,12 @@ def test_nothing_runs_in_a_circle() -> None:
         graph = {module: needs for module, needs in graph.items() if module not in free}
 
 
+def test_only_pictures_need_matplotlib_and_nothing_needs_wandb_or_pandas_to_be_imported() -> None:
+    names = ", ".join(f"magrl.{module}" for module in sorted(LEVEL.keys() - {"plots"}))
+    code = f"import sys, {names}; print([m for m in ('matplotlib', 'pandas', 'wandb') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
 def test_importing_the_package_is_light() -> None:
     code = "import sys, magrl; print(any(m in sys.modules for m in ('torch', 'wandb', 'matplotlib', 'pandas')))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
