@@ -13,7 +13,7 @@ STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
 PILOTS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train test test-slow check format clean paper trade bench
+.PHONY: train test test-slow check format clean paper trade bench docs
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3: about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -32,6 +32,10 @@ check: $(VENV)/.installed-dev  ## lint, format and types
 format: $(VENV)/.installed-dev
 	$(RUN)/ruff format .
 	$(RUN)/ruff check --fix .
+
+docs: $(VENV)/.installed-docs  ## the documentation as pages, in build/docs
+	$(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet docs build/docs
+	@echo "open build/docs/index.html"
 
 bench: $(VENV)/.installed-dev  ## ratios of speed, measured side by side: about eight minutes on two cores
 	$(RUN)/python -m benchmarks $(ARGS)
@@ -96,4 +100,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	touch $@

@@ -18,7 +18,7 @@ from torch import Tensor
 from magrl.geodesy import check_tensor, wrap_angle
 
 OBJECTIVE_FLOORS = (0.05, 0.4, 15.0)
-"""Least |B_T - B_0| of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 25 km of travel each."""
+"""Least ``|B_T - B_0|`` of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 25 km of travel each."""
 
 
 def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Tensor:

@@ -1,0 +1,33 @@
+"""Settings of the documentation: `make docs` builds it into build/docs, without the network."""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+
+import magrl  # noqa: E402 - from this tree, whatever is installed
+
+project, author, version = "magrl", "The magrl developers", magrl.__version__
+project_copyright = author
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.apidoc", "sphinx.ext.viewcode"]
+exclude_patterns = [
+    "results",
+    "api/modules.rst",
+]  # tables that recipes/publish.py puts into the pages, and a second list
+
+suppress_warnings = ["toc.empty_glob"]  # docs/index.md lists every page that there is today
+
+html_theme = "furo"
+html_title = f"magrl {version}"
+
+myst_heading_anchors = 3
+
+apidoc_modules = [{"path": "../magrl", "destination": "api", "separate_modules": True, "module_first": True}]
+apidoc_options = ["members", "show-inheritance"]
+autodoc_default_options = {"ignore-module-all": True}  # a name is described where it is defined, and only there
+autodoc_member_order = "bysource"
+autodoc_inherit_docstrings = False  # TorchRL's are not ours to publish
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_custom_sections = ["Source"]

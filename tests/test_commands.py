@@ -1,0 +1,94 @@
+"""Commands in the documents can be given: their scripts, flags and make targets are there."""
+
+import contextlib
+import importlib.util
+import io
+import re
+import runpy
+import shlex
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+MAKEFILE = (ROOT / "Makefile").read_text()
+RECIPE_OF = {"train": "recipes/td3_gradient_guided.py", "bench": "-m benchmarks"}
+"""What a make target hands its ARGS to."""
+
+
+def shell_lines(text: str) -> list[str]:
+    """The lines of shell blocks, continued ones joined, and commands that stand in the text."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    return lines + re.findall(r"`((?:make|python|pip|\.venv/bin/python) [^`]+)`", prose)
+
+
+def commands(line: str) -> list[list[str]]:
+    """A line as lists of words, without comments, loops and variables that are set before a command."""
+    listed = [shlex.split(part) for part in re.split(r";|&&|\|", re.sub(r"(^|\s)#.*", "", line))]
+    listed = [words[1:] if words[:1] == ["do"] else words for words in listed]
+    while any(words and re.match(r"\w+=", words[0]) for words in listed):
+        listed = [words[1:] if words and re.match(r"\w+=", words[0]) else words for words in listed]
+    return [words for words in listed if words and words[0] not in ("for", "done")]
+
+
+@cache
+def help_text(script: str) -> str:
+    """What a script or a module answers to --help."""
+    said, kept = io.StringIO(), (sys.argv, sys.path[:])
+    sys.argv, sys.path[:] = [script, "--help"], [str(ROOT / "recipes"), *sys.path]
+    try:
+        with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+            if script.startswith("-m "):
+                runpy.run_module(script.removeprefix("-m "), run_name="__main__", alter_sys=True)
+            else:
+                runpy.run_path(str(ROOT / script), run_name="__main__")
+    finally:
+        sys.argv, sys.path[:] = kept
+    return said.getvalue()
+
+
+def has_flags(script: str, words: list[str]) -> None:
+    for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
+        assert re.search(rf"(?<![\w-]){flag}(?![\w-])", help_text(script)), f"{script} has no {flag}"
+
+
+def check_command(words: list[str]) -> None:
+    program, *rest = words
+    if program == "make":
+        for word in rest:
+            name, equals, value = word.partition("=")
+            assert equals or re.search(rf"^{word}:", MAKEFILE, re.MULTILINE), f"make has no target {word}"
+            if name == "ARGS":
+                has_flags(RECIPE_OF[rest[0]], shlex.split(value))
+    elif program in ("python", ".venv/bin/python"):
+        script = f"-m {rest[1]}" if rest[0] == "-m" else rest[0]
+        assert importlib.util.find_spec(rest[1]) if rest[0] == "-m" else (ROOT / script).is_file(), script
+        has_flags(script, rest[1:])
+    elif program == "pip":
+        extras = re.findall(r"^(\w+) = \[", (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+        wanted = re.findall(r"\[([\w,]+)\]", " ".join(rest))
+        assert {extra for text in wanted for extra in text.split(",")} <= set(extras), rest
+    else:
+        raise AssertionError(f"the documents may not ask for {program!r}: no test would know whether it works")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_can_be_given(page: Path, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    for line in shell_lines(page.read_text()):
+        for words in commands(line):
+            check_command(words)
+
+
+def test_flags_in_the_text_exist(monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    scripts = [*(f"recipes/{name}" for name in ("td3_gradient_guided.py", "td3_recurrent.py", "evaluate.py"))]
+    known = "".join(help_text(script) for script in [*scripts, "-m benchmarks", "-m benchmarks.fields"])
+    for page in PAGES:
+        for flag in re.findall(r"`(--[\w-]+)[^`]*`", page.read_text()):
+            assert re.search(rf"(?<![\w-]){flag}(?![\w-])", known), f"{page.name} speaks of {flag}"
