@@ -16,16 +16,16 @@ exclude_patterns = [
     "api/modules.rst",
 ]  # tables that recipes/publish.py puts into the pages, and a second list
 
-suppress_warnings = ["toc.empty_glob"]  # docs/index.md lists every page that there is today
-
 html_theme = "furo"
 html_title = f"magrl {version}"
+html_static_path, html_css_files = ["_static"], ["tables.css"]
 
 myst_heading_anchors = 3
 
-apidoc_modules = [{"path": "../magrl", "destination": "api", "separate_modules": True, "module_first": True}]
+apidoc_modules = [{"path": "../magrl", "destination": "api", "separate_modules": True, "max_depth": 1}]
 apidoc_options = ["members", "show-inheritance"]
 autodoc_default_options = {"ignore-module-all": True}  # a name is described where it is defined, and only there
+apidoc_module_first = True
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False  # TorchRL's are not ours to publish
 napoleon_google_docstring = True

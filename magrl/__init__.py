@@ -1,6 +1,7 @@
 """Navigation by the Earth's magnetic field: a TorchRL environment, transforms and what trains on them.
 
-The names below are loaded when first used, so that importing the package costs no more than Python itself.
+The names in ``magrl.__all__`` are loaded when first used, so that importing the package costs no more than Python
+itself.
 """
 
 from importlib import import_module
