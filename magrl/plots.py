@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from tensordict import TensorDictBase
@@ -19,11 +20,12 @@ from torch import Tensor
 
 from magrl.elements import NAMES, UNITS
 from magrl.fields import FieldModel, elements_at
-from magrl.geodesy import check_number, check_tensor, check_type, wrap_longitude
+from magrl.geodesy import check_number, check_tensor, check_type
 from magrl.metrics import flown
 from magrl.tasks import Region, Tasks
 
 ELEMENT_COLOURS = {"D": "#E69F00", "I": "#0072B2", "B_H": "#009E73"}
+ELEMENT_STYLES = {"D": "solid", "I": "dashed", "B_H": "solid"}
 PATH, START, TARGET = "#404040", "#D55E00", "#CC79A7"
 NAVIGATOR_NAMES = {
     "gg_td3": "Gradient-Guided TD3",
@@ -76,6 +78,29 @@ def rgb_array(draw: Callable[..., None], size_px: int, *args: Any) -> np.ndarray
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+def contour_lines(axes: Axes, field: FieldModel, region: Region) -> dict[str, ContourSet]:
+    """Lines of equal D (isogonics), I (isoclines) and B_H (isodynamics) over a region, without labels.
+
+    Args:
+        axes: where to draw.
+        field: any model of :mod:`magrl.fields`.
+        region: what to show.
+
+    Returns:
+        By the name of the element.
+    """
+    check_type(Axes, axes=axes)
+    check_type(Region, region=region)
+    grid = region.grid(61)
+    values = elements_at(field, grid.to(_device(field))).cpu().numpy()
+    longitude, latitude = grid[0, :, 1].numpy(), grid[:, 0, 0].numpy()
+    contours: dict[str, ContourSet] = {}
+    for index, name in enumerate(NAMES):
+        look: dict[str, Any] = {"colors": ELEMENT_COLOURS[name], "linestyles": ELEMENT_STYLES[name], "linewidths": 0.7}
+        contours[name] = axes.contour(longitude, latitude, values[..., index], 9, **look)
+    return contours
+
+
 def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
     """Contours of D, I and B_H over a region (Fig. 4-1).
 
@@ -91,25 +116,11 @@ def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
         >>> figure.axes[0].get_legend_handles_labels()[1]
         ['D [deg]', 'I [deg]', '$B_H$ [nT]']
     """
-    check_type(Axes, axes=axes)
-    check_type(Region, region=region)
-    grid = region.grid(61)
-    values = elements_at(field, grid.to(_device(field))).cpu().numpy()
-    latitude, longitude = grid[:, 0, 0].numpy(), grid[0, :, 1].numpy()
-    for index, name in enumerate(NAMES):
-        style = "dashed" if name == "I" else "solid"
-        lines = axes.contour(
-            longitude, latitude, values[..., index], 9, colors=ELEMENT_COLOURS[name], linestyles=style, linewidths=0.7
-        )
+    for (name, lines), unit in zip(contour_lines(axes, field, region).items(), UNITS, strict=False):
         axes.clabel(lines, fontsize=7, fmt="%g")
-        axes.plot([], [], color=ELEMENT_COLOURS[name], ls=style, lw=1, label=f"{SYMBOLS[name]} [{UNITS[index]}]")
-    axes.set(
-        xlabel="longitude [° E]",
-        ylabel="latitude [° N]",
-        xlim=(longitude[0], longitude[-1]),
-        ylim=(latitude[0], latitude[-1]),
-    )
-    axes.set_aspect(1 / np.cos(np.radians(latitude.mean())))
+        axes.plot([], [], color=ELEMENT_COLOURS[name], ls=ELEMENT_STYLES[name], lw=1, label=f"{SYMBOLS[name]} [{unit}]")
+    axes.set(xlabel="longitude [° E]", ylabel="latitude [° N]", xlim=region.longitude, ylim=region.latitude)
+    axes.set_aspect(1 / np.cos(np.radians(sum(region.latitude) / 2)))
 
 
 def draw_journeys(axes: Axes, field: FieldModel, region: Region, paths: Sequence[Tensor], targets: Tensor) -> None:
@@ -137,11 +148,8 @@ def draw_journeys(axes: Axes, field: FieldModel, region: Region, paths: Sequence
     check_tensor(2, targets=targets)
     if not len(paths) or targets.shape != (len(paths), 2):
         raise ValueError(f"there must be one target for each path, got {len(paths)} and {tuple(targets.shape)}")
-    centre = sum(region.longitude) / 2
-    unwrapped = [torch.stack((p[:, 0], centre + wrap_longitude(p[:, 1] - centre)), -1) for p in paths]
-    ends = torch.stack((targets[:, 0], centre + wrap_longitude(targets[:, 1] - centre)), -1)
-    points = torch.cat([*unwrapped, ends])
-    draw_contours(axes, field, _around(region, points))
+    unwrapped, ends = [region.unwrapped(path) for path in paths], region.unwrapped(targets)
+    draw_contours(axes, field, region.holding(torch.cat([*unwrapped, ends])))
     for path, end in zip(unwrapped, ends, strict=True):
         axes.plot(*torch.stack((path[0], end)).flip(-1).T, ":", color=TARGET, lw=0.8)
         axes.plot(path[:, 1], path[:, 0], "-", color=PATH, lw=1, marker=".", ms=3, alpha=0.8)
@@ -149,13 +157,6 @@ def draw_journeys(axes: Axes, field: FieldModel, region: Region, paths: Sequence
     axes.plot(starts[:, 1], starts[:, 0], "s", color=START, ms=5, label="start")
     axes.plot(ends[:, 1], ends[:, 0], "^", color=TARGET, ms=6, label="destination")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=5, fontsize=8, frameon=False)
-
-
-def _around(region: Region, points: Tensor) -> Region:
-    """The region, grown to hold the points."""
-    (south, north), (west, east) = region.latitude, region.longitude
-    low, high = points.amin(0).tolist(), points.amax(0).tolist()
-    return Region((min(south, low[0]), max(north, high[0])), (min(west, low[1]), max(east, high[1])))
 
 
 def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:

@@ -81,6 +81,44 @@ class Region:
         longitude = torch.linspace(*self.longitude, points, dtype=torch.float64)
         return torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
 
+    def unwrapped(self, position: Tensor) -> Tensor:
+        """Positions with longitudes counted from the middle of the box, so that no path breaks at the antimeridian.
+
+        Args:
+            position: ``(..., 2)`` latitude, longitude [deg].
+
+        Returns:
+            ``(..., 2)``, longitudes within half a turn of the middle of the box.
+
+        Example:
+            >>> Region((-10, 0), (170, 190)).unwrapped(torch.tensor([-5.0, -175.0]))
+            tensor([ -5., 185.])
+        """
+        check_tensor(2, position=position)
+        middle = sum(self.longitude) / 2
+        latitude, longitude = position.unbind(-1)
+        return torch.stack((latitude, middle + wrap_longitude(longitude - middle)), -1)
+
+    def holding(self, position: Tensor) -> Region:
+        """The box, grown to hold some positions.
+
+        Args:
+            position: ``(..., 2)`` latitude, longitude [deg], unwrapped.
+
+        Raises:
+            ValueError: for no position, or one that is not finite.
+
+        Example:
+            >>> Region((-10, 0), (160, 170)).holding(torch.tensor([[-12.0, 165.0]]))
+            Region(latitude=(-12.0, 0.0), longitude=(160.0, 170.0))
+        """
+        check_tensor(2, position=position)
+        if not position.numel() or not position.isfinite().all():
+            raise ValueError(f"position must hold finite numbers, got {position!r}")
+        low, high = (end(position.reshape(-1, 2), 0).tolist() for end in (torch.amin, torch.amax))
+        (south, north), (west, east) = self.latitude, self.longitude
+        return Region((min(south, low[0]), max(north, high[0])), (min(west, low[1]), max(east, high[1])))
+
     def longest_km(self) -> float:
         """A length that no distance in the box exceeds, tight for boxes up to a quarter of the globe [km]."""
         return _longest_km(self)

@@ -527,6 +527,16 @@ TASKS: dict[str, list[Refused | Nan]] = {
         *bad_vectors(PAPER_REGION.contains, "position", 2),
     ],
     "tasks.Region.expanded": bad_numbers(PAPER_REGION.expanded, margin_deg=(-1.0, NAN, INF, "a", None)),
+    "tasks.Region.unwrapped": [
+        *bad_vectors(PAPER_REGION.unwrapped, "position", 2),
+        Nan(lambda: PAPER_REGION.unwrapped(t(NAN, NAN))),
+    ],
+    "tasks.Region.holding": [
+        *bad_vectors(PAPER_REGION.holding, "position", 2),
+        refused(lambda: PAPER_REGION.holding(zeros(0, 2)), ValueError, "position", "size=(0, 2)"),
+        refused(lambda: PAPER_REGION.holding(t(NAN, 165.0)), ValueError, "position", "nan"),
+        refused(lambda: PAPER_REGION.holding(t(-91.0, 165.0)), ValueError, "-91"),
+    ],
     "tasks.Region.grid": bad_numbers(PAPER_REGION.grid, points=(0, -1, 2.5, "a", True)),
     "tasks.Tasks": [refused(lambda: tasks.Tasks(zeros(2, 2)), TypeError, "target")],
     "tasks.counter_uniform": [
@@ -886,6 +896,11 @@ PLOTS: dict[str, list[Refused | Nan]] = {
     "plots.rgb_array": [
         *bad_numbers(lambda size_px: plots.rgb_array(lambda _: None, size_px), size_px=(0, -1, 1.5, "a")),
         refused(lambda: plots.rgb_array(5, 10), TypeError, "int"),
+    ],
+    "plots.contour_lines": [
+        refused(lambda: plots.contour_lines(5, igrf(), PAPER_REGION), TypeError, "axes", "5"),
+        refused(lambda: plots.contour_lines(axes(), igrf(), 5), TypeError, "region", "5"),
+        refused(lambda: plots.contour_lines(axes(), "IGRF", PAPER_REGION), TypeError, "str"),
     ],
     "plots.draw_contours": [
         refused(lambda: plots.draw_contours(5, igrf(), PAPER_REGION), TypeError, "axes", "5"),

@@ -109,6 +109,20 @@ def test_edges_belong_to_the_region_however_they_round():
     assert not missed
 
 
+@pytest.mark.parametrize("turns", [-2, 0, 1])
+def test_unwrapped(turns):
+    position = f64((0.0, 171.0), (1.0, -171.0), (2.0, 180.0))
+    moved = torch.stack((position[:, 0], position[:, 1] + 360 * turns), -1)
+    torch.testing.assert_close(ANTIMERIDIAN.unwrapped(moved), f64((0.0, 171.0), (1.0, 189.0), (2.0, 180.0)))
+    assert ANTIMERIDIAN.unwrapped(moved.float().expand(4, 3, 2)).shape == (4, 3, 2)
+
+
+def test_holding():
+    inside, outside = f64((-5.0, 165.0)), f64(((-12.0, 165.0), (3.0, 150.0)), ((-5.0, 171.0), (1.0, 160.0)))
+    assert PAPER_REGION.holding(inside) == PAPER_REGION
+    assert PAPER_REGION.holding(outside) == Region((-12, 3), (150, 171))
+
+
 @pytest.mark.parametrize(
     ("region", "margin", "expected"),
     [
