@@ -36,6 +36,7 @@ from tqdm import tqdm
 
 from magrl import export, recurrent, td3
 from magrl.env import GeomagneticNavEnv
+from magrl.geodesy import check_number
 from magrl.loggers import WandbMode, WandbRun
 from magrl.metaheuristics import METAHEURISTICS
 from magrl.metrics import episode_measures, flown, summarise
@@ -111,9 +112,17 @@ def navigator(text: str, env: GeomagneticNavEnv, mode: str, seed: int) -> Tensor
     return makers[name](env, own_mode or mode, seed)
 
 
-def make_env(config: Config, tasks: str) -> GeomagneticNavEnv:
-    """The environment of a task set: one vehicle for each task."""
-    return env_of(config, World(), named_tasks(tasks))
+def make_env(config: Config, tasks: str, num_tasks: int | None = None) -> GeomagneticNavEnv:
+    """The environment of a task set, or of its first tasks: one vehicle for each.
+
+    Raises:
+        ValueError: for a number of tasks that the set does not hold.
+    """
+    chosen = named_tasks(tasks)
+    if num_tasks is not None:
+        check_number(1, len(chosen.start), whole=True, num_tasks=num_tasks)
+        chosen = Tasks(*(end[:num_tasks] for end in chosen))
+    return env_of(config, World(), chosen)
 
 
 def env_of(config: Config, world: World, tasks: Tasks) -> GeomagneticNavEnv:

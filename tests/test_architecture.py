@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "magrl"
 LEVELS = (
     {"geodesy", "harmonics", "elements", "guidance"},
-    {"fields", "regional", "tasks", "metrics", "plots", "export"},
+    {"fields", "regional", "tasks", "metrics", "plots", "export", "replay"},
     {"env", "transforms", "worlds"},
     {"td3", "loggers", "runs", "settings", "navigators", "checkpoints", "gymnasium_env", "recurrent"},
     {"metaheuristics"},

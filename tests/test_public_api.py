@@ -43,6 +43,7 @@ from magrl import (
     plots,
     recurrent,
     regional,
+    replay,
     runs,
     settings,
     tasks,
@@ -958,6 +959,48 @@ NO_CONFIG = {
 }
 
 
+def replay_data(rollouts: Any = None, **options: Any) -> object:
+    sound = {"field": igrf(), "region": PAPER_REGION, "zeta": 0.01}
+    return replay.replay_data({"random": flight()} if rollouts is None else rollouts, **(sound | options))
+
+
+def write_gif(rollout: Any = None, region: Any = PAPER_REGION, **options: Any) -> object:
+    return replay.write_gif(folder() / "a.gif", flight() if rollout is None else rollout, igrf(), region, **options)
+
+
+REPLAY: dict[str, list[Refused | Nan]] = {
+    "replay.replay_data": [
+        *bad_numbers(replay_data, zeta=(0.0, -1.0, NAN, "a")),
+        refused(lambda: replay_data(5), TypeError, "rollouts", "5"),
+        refused(lambda: replay_data({}), ValueError, "rollouts", "{}"),
+        refused(lambda: replay_data({"mine": 5}), TypeError, "'mine'", "5"),
+        refused(lambda: replay_data({"mine": flight()[0]}), ValueError, "(2,)"),
+        refused(lambda: replay_data({"mine": flight().exclude("next")}), KeyError, "next"),
+        refused(lambda: replay_data(region=5), TypeError, "region", "5"),
+        refused(lambda: replay_data(field="IGRF"), TypeError, "str"),
+        refused(lambda: replay_data(title=5), TypeError, "title", "5"),
+    ],
+    "replay.journey_tracks": [
+        refused(lambda: replay.journey_tracks(5, PAPER_REGION), TypeError, "rollout", "5"),
+        refused(lambda: replay.journey_tracks(flight(), 5), TypeError, "region", "5"),
+        refused(lambda: replay.journey_tracks(flight()[0], PAPER_REGION), ValueError, "(2,)"),
+    ],
+    "replay.write_replay": [
+        refused(lambda: replay.write_replay(5, {}), TypeError, "path", "5"),
+        refused(lambda: replay.write_replay(folder() / "a.html", 5), TypeError, "data", "5"),
+        refused(lambda: replay.write_replay(folder() / "a.html", {"title": ""}), KeyError, "contours", "navigators"),
+        refused(lambda: replay.write_replay("nowhere/a.html", replay_data()), FileNotFoundError, "nowhere/a.html"),
+    ],
+    "replay.write_gif": [
+        *bad_numbers(write_gif, frames_per_step=(0, 1.5, "a"), size_px=(0, -1, "a")),
+        refused(lambda: write_gif(5), TypeError, "rollout", "5"),
+        refused(lambda: write_gif(flight()[0]), ValueError, "(2,)"),
+        refused(lambda: write_gif(region=5), TypeError, "region", "5"),
+        refused(lambda: replay.write_gif(5, flight(), igrf(), PAPER_REGION), TypeError, "path", "5"),
+    ],
+}
+
+
 def loss(**options: float) -> object:
     sound = {"gamma": 0.99, "policy_noise": 0.2, "noise_clip": 0.5}
     return td3.make_loss(td3.make_actor(config()), td3.make_critic(config()), **(sound | options))
@@ -1242,6 +1285,7 @@ ROWS = (
     | POLICIES
     | METRICS
     | PLOTS
+    | REPLAY
     | TD3
     | RECURRENT
     | EXPORT
