@@ -13,7 +13,7 @@ STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
 PILOTS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train test test-slow check format clean paper trade bench docs
+.PHONY: train test test-slow check format clean paper trade bench docs replay
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3: about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -41,6 +41,9 @@ bench: $(VENV)/.installed-dev  ## ratios of speed, measured side by side: about 
 	$(RUN)/python -m benchmarks $(ARGS)
 	$(RECIPE)/publish.py docs/performance.md
 
+replay: runs/td3_gradient_guided-fast-seed0/eval.json  ## a page to watch journeys on: replay.html in the run's folder
+	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 $(ARGS)
+
 # What the discount and the offset of the alignment term trade, and what the paper's state costs: ten trainings, seven of them of a minute.
 trade: runs/td3_gradient_guided-fast-seed0/eval.json $(MEMORY:%=%/eval.json)
 	for gamma in 0.97 0.995; do test -e runs/trade-gamma$$gamma || \
@@ -67,7 +70,7 @@ paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json) $(
 	  --tasks paper-100 --out runs/comparison-paper-100
 	$(RECIPE)/evaluate.py $(STRICT:%=gg_td3=%) secant parallel --zeta 0.001 --out runs/comparison-zeta0.001
 	$(RECIPE)/figures.py --results runs/comparison --gg-td3 $(GUIDED) --td3 $(PLAIN) --out docs/figures
-	cp runs/td3_gradient_guided-fast-seed0/trajectories.png docs/figures/
+	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 --gif docs/figures/replay.gif
 	mkdir -p docs/results
 	for name in comparison comparison-paper-100 comparison-zeta0.001; do cp runs/$$name/table.md docs/results/$$name.md; done
 	cp runs/comparison/short.md docs/results/summary.md
