@@ -28,6 +28,7 @@ from magrl.tasks import Region
 PIECES = 4
 """A leg is drawn in so many pieces: a geodesic is no straight line on the map."""
 PLACEHOLDER = "{{replay-data}}"
+_SEEN = ("position", "field", "objective", "heading", "move")
 GIF_COLOURS, STEP_MS = 96, 320
 
 
@@ -163,9 +164,6 @@ def _journey(row: TensorDictBase, track: Tensor, measures: dict[str, Any]) -> di
         "steps": count,
         **{key: round(measures[key], 4) for key in ("shortest_km", "length_km", "navigation_error_km", "spl")},
     }
-
-
-_SEEN = ("position", "field", "objective", "heading", "move")
 
 
 def write_replay(path: Path | str, data: Mapping[str, Any]) -> None:

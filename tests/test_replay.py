@@ -401,6 +401,7 @@ def test_contours_and_vehicles_can_be_chosen(page: Page, data: dict[str, Any]) -
         group = page.locator(f'#map g[data-element="{name}"]')
         assert group.locator("path").count() == len(data["contours"][name])
         assert group.locator("text").count() > 2
+        expect(group.locator("path").first).to_be_visible()
         page.locator(f"#show-{name}").uncheck()
         assert group.count() == 0
     assert page.locator("#map .vehicle").count() == 1
@@ -419,18 +420,33 @@ def colours(page: Page) -> np.ndarray:
     return np.stack([packed >> 16, packed >> 8 & 255, packed & 255], -1)
 
 
-def test_it_is_drawn_in_light_and_in_dark(page: Page) -> None:
-    backgrounds = []
-    for scheme in ("light", "dark"):
-        page.emulate_media(color_scheme=scheme)
-        shown = colours(page)
-        assert len(shown) > 500
-        backgrounds.append(shown[0].mean())
-        for line in ("D", "I", "B_H", "accent"):
-            wanted = page.evaluate(f"getComputedStyle(document.documentElement).getPropertyValue('--{line}')")
-            rgb = [int(wanted.strip()[at : at + 2], 16) for at in (1, 3, 5)]
-            assert (np.abs(shown - rgb).max(1) < 8).any(), f"nothing is {wanted} in {scheme}"
-    assert backgrounds[0] > 200 > 60 > backgrounds[1]
+def palette(page: Page) -> dict[str, np.ndarray]:
+    """The page's named colours in the scheme that it is shown in."""
+    read = "getComputedStyle(document.documentElement).getPropertyValue('--' + name)"
+    names = ("page", "card", "ink", "muted", "accent", *NAMES)
+    found = page.evaluate(f"Object.fromEntries({json.dumps(names)}.map((name) => [name, {read}]))")
+    return {name: np.array([int(text.strip()[at : at + 2], 16) for at in (1, 3, 5)]) for name, text in found.items()}
+
+
+def contrast(one: np.ndarray, other: np.ndarray) -> float:
+    """The contrast ratio of the Web Content Accessibility Guidelines: 4.5 is enough to read by."""
+    linear = [np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4) for c in (one / 255, other / 255)]
+    dark, light = sorted(float(c @ [0.2126, 0.7152, 0.0722]) for c in linear)
+    return (light + 0.05) / (dark + 0.05)
+
+
+@pytest.mark.parametrize(("scheme", "low", "high"), [("light", 230, 255), ("dark", 0, 40)])
+def test_it_is_drawn_and_can_be_read(page: Page, scheme: str, low: int, high: int) -> None:
+    page.emulate_media(color_scheme=scheme)
+    shown, named = colours(page), palette(page)
+    assert len(shown) > 500
+    assert low <= shown[0].mean() <= high
+    for name, colour in named.items():
+        assert (np.abs(shown - colour).max(1) < 8).any(), f"nothing is in the colour of {name}"
+        if name not in ("page", "card"):
+            assert contrast(colour, named["card"]) > 4.5, name
+    assert contrast(named["muted"], named["page"]) > 4.5
+    assert contrast(named["ink"], named["page"]) > 4.5
 
 
 @pytest.mark.parametrize("width", [390, 820])
@@ -438,6 +454,7 @@ def test_it_fits_narrow_screens(page: Page, width: int) -> None:
     page.set_viewport_size({"width": width, "height": 844})
     page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     assert page.evaluate("document.documentElement.scrollWidth") == width
+    assert page.evaluate("$('map').clientWidth === $('map').firstChild.viewBox.baseVal.width")  # drawn anew, not scaled
     for name in ("map", "play", "chart-F"):
         box = page.locator(f"#{name}").bounding_box()
         assert box["x"] >= 0
