@@ -112,17 +112,9 @@ def navigator(text: str, env: GeomagneticNavEnv, mode: str, seed: int) -> Tensor
     return makers[name](env, own_mode or mode, seed)
 
 
-def make_env(config: Config, tasks: str, num_tasks: int | None = None) -> GeomagneticNavEnv:
-    """The environment of a task set, or of its first tasks: one vehicle for each.
-
-    Raises:
-        ValueError: for a number of tasks that the set does not hold.
-    """
-    chosen = named_tasks(tasks)
-    if num_tasks is not None:
-        check_number(1, len(chosen.start), whole=True, num_tasks=num_tasks)
-        chosen = Tasks(*(end[:num_tasks] for end in chosen))
-    return env_of(config, World(), chosen)
+def make_env(config: Config, tasks: str) -> GeomagneticNavEnv:
+    """The environment of a task set: one vehicle for each task."""
+    return env_of(config, World(), named_tasks(tasks))
 
 
 def env_of(config: Config, world: World, tasks: Tasks) -> GeomagneticNavEnv:
@@ -131,20 +123,38 @@ def env_of(config: Config, world: World, tasks: Tasks) -> GeomagneticNavEnv:
     return GeomagneticNavEnv(num_envs=len(tasks.start), tasks=tasks, zeta=config.zeta, seed=config.seed, **options)
 
 
-def envs(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, Sequence[str]]:
-    """Where all navigators fly, where they fly one example, and the names of the tasks.
+def first(tasks: Tasks, count: int) -> Tasks:
+    """The first so many of a list of tasks.
+
+    Raises:
+        ValueError: for a number of tasks that the list does not hold.
+    """
+    check_number(1, len(tasks.start), whole=True, num_tasks=count)
+    return Tasks(*(end[:count] for end in tasks))
+
+
+def journeys(world_file: Path | None, tasks: str | None) -> tuple[World, Tasks]:
+    """Where to fly, and what: the world's tasks, else 1000 random ones there; or a named set of the paper's region.
 
     Raises:
         ValueError: for a world that is none, or tasks of the paper's region in it.
     """
-    if config.world is None:
-        env = make_env(config, config.tasks or "test-1000")
-        return env, make_env(config, "figure-4-1"), [f"task {number}" for number in range(env.num_envs)]
-    if config.tasks is not None:
-        raise ValueError(f"--tasks {config.tasks} lies in the paper's region: leave it out, or --world")
-    world = load_world(config.world)
-    tasks = world.tasks or world.random_tasks(1000, TEST_SEED)
-    example = Tasks(tasks.start[:1], tasks.target[:1])
+    if world_file is None:
+        return World(), named_tasks(tasks or "test-1000")
+    if tasks is not None:
+        raise ValueError(f"--tasks {tasks} lies in the paper's region: leave it out, or --world")
+    world = load_world(world_file)
+    return world, world.tasks or world.random_tasks(1000, TEST_SEED)
+
+
+def envs(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, Sequence[str]]:
+    """Where all navigators fly, where they fly one example, and the names of the tasks.
+
+    Raises:
+        ValueError: see :func:`journeys`.
+    """
+    world, tasks = journeys(config.world, config.tasks)
+    example = first(tasks, 1) if config.world else named_tasks("figure-4-1")
     names = world.names or [f"task {number}" for number in range(len(tasks.start))]
     return env_of(config, world, tasks), env_of(config, world, example), names
 

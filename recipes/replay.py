@@ -20,13 +20,13 @@ from typing import Any, Literal
 
 import tyro
 from evaluate import Config as Evaluation
-from evaluate import label, make_env, navigator
+from evaluate import env_of, first, journeys, label, navigator
 from torchrl import torchrl_logger
 
 from magrl.replay import replay_data, write_gif, write_replay
 from magrl.td3 import evaluation_rollout
 
-DEFAULT_TASKS = {"figure-4-1": 1}  # it has no more
+DEFAULT_TASKS = 12
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,11 @@ class Config:
     navigators: tuple[str, ...] = ("secant", "parallel")
     """Beside the run's policy, as recipes/evaluate.py takes them."""
     num_tasks: int | None = None
-    """The first so many of the task set; 12, or 1 of figure-4-1, by default."""
-    tasks: Literal["test-1000", "paper-100", "figure-4-1"] = "test-1000"
-    """A frozen task set."""
+    """The first so many of the tasks; 12 by default, or all where there are fewer."""
+    tasks: Literal["test-1000", "paper-100", "figure-4-1"] | None = None
+    """A frozen task set in the paper's region; test-1000 unless there is a world."""
+    world: Path | None = None
+    """TOML or JSON file of an own region (docs/own_data.md); that of the run, where it was trained in one."""
     zeta: float | None = None
     """Arrival threshold on the objective; the one that the run was trained with by default."""
     seed: int = 0
@@ -96,11 +98,14 @@ def replay(config: Config) -> Path:
     kind = {True: "gg_td3", False: "td3"}.get(run.get("guided"), "recurrent")
     texts = (f"{kind}={config.run}", *config.navigators)
     zeta = run.get("zeta", 0.01) if config.zeta is None else config.zeta
-    num_tasks = DEFAULT_TASKS.get(config.tasks, 12) if config.num_tasks is None else config.num_tasks
-    env = make_env(Evaluation(texts, zeta=zeta, seed=config.seed), config.tasks, num_tasks)
+    trained_in = config.run / Path(run["world"]).name if isinstance(run.get("world"), str) else None
+    world, tasks = journeys(config.world or trained_in, config.tasks)
+    tasks = first(tasks, min(DEFAULT_TASKS, len(tasks.start)) if config.num_tasks is None else config.num_tasks)
+    env = env_of(Evaluation(texts, zeta=zeta, seed=config.seed), world, tasks)
     pilots = {text: navigator(text, env, "look-ahead", config.seed) for text in texts}
     rollouts = {name: evaluation_rollout(env, pilots[text]) for name, text in labelled(texts).items()}
-    title = f"{config.run.name}, {env.num_envs} of the tasks {config.tasks}"
+    of = config.world or trained_in
+    title = f"{config.run.name}, tasks of {of.name if of else config.tasks or 'test-1000'}"
     out = config.out or config.run / "replay.html"
     write_replay(out, replay_data(rollouts, env.field, env.region, zeta=zeta, title=title))
     if config.gif:

@@ -238,7 +238,7 @@ def test_training_and_evaluation_take_the_same_file(tmp_path: Path) -> None:
     assert (run / "world.toml").read_text() == TOML
     assert json.loads((run / "config.json").read_text())["world"] == "world.toml"
     (run / "eval.json").unlink()
-    assert recipe.read_config(run, guided=True).world == run / "world.toml"
+    assert recipe.parse("td3_gradient_guided.py", ["--resume", str(run)]).world == run / "world.toml"
 
     out, names = tmp_path / "out", (f"gg_td3={run}", "parallel")
     options = {"export": tmp_path / "maps" / "flights.geojson", "wandb_mode": "disabled"}
