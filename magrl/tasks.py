@@ -318,6 +318,8 @@ def task_set(
 
 TASK_SETS = ("test-1000", "paper-100", "figure-4-1")
 """Frozen task sets: 1000 unseen tasks, the paper's 100, and its one task of Fig. 4-1."""
+RANDOM_SETS = {"test-1000": (1000, TEST_SEED), "paper-100": (100, PAPER_SEED)}
+"""How many tasks the random ones of them hold, and their seed."""
 
 
 def named_tasks(name: str) -> Tasks:
@@ -333,10 +335,8 @@ def named_tasks(name: str) -> Tasks:
         >>> named_tasks("figure-4-1").start
         tensor([[ -2., 162.]], dtype=torch.float64)
     """
-    if name == "test-1000":
-        return task_set(1000, TEST_SEED)
-    if name == "paper-100":
-        return task_set(100, PAPER_SEED)
+    if name in RANDOM_SETS:
+        return task_set(*RANDOM_SETS[name])
     if name == "figure-4-1":
         return Tasks(*(torch.tensor([end], dtype=torch.float64) for end in ((-2.0, 162.0), (-8.0, 164.0))))
     raise ValueError(f"unknown task set {name!r}: choose from {', '.join(TASK_SETS)}")

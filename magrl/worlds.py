@@ -16,8 +16,9 @@ from typing import Any
 
 import torch
 
+from magrl import guidance
 from magrl.env import PAPER_DATE, PAPER_GENERATION, paper_field
-from magrl.fields import Date, igrf_coefficients
+from magrl.fields import Date, FieldModel, elements_gradient_at, igrf_coefficients
 from magrl.geodesy import check_number, check_type
 from magrl.regional import RegionalField
 from magrl.tasks import PAPER_DISTANCE_KM, PAPER_REGION, Region, Tasks, check_distance_range, check_tasks, task_set
@@ -32,6 +33,8 @@ MAX_BYTES = 10_000_000
 HIGHEST_KM = 600.0
 """Up to there IGRF is in use, and vehicles move over the ground below them."""
 
+FLOOR_KM = 25.0
+
 
 @dataclass(frozen=True)
 class World:
@@ -45,6 +48,9 @@ class World:
         altitude_km: over the ellipsoid, at which the field is read [km]; distances are those over the ground.
         tasks: journeys to fly; random ones where there are none.
         names: of those tasks.
+        objective_floors: least differences of D, I, B_H that Eq. 2-6 divides by [deg, deg, nT], the paper's region's by
+            default; None for what :data:`FLOOR_KM` of travel change here, as those do there. Where the field is
+            steeper, floors that are too low make of every detour an enormous loss.
 
     Raises:
         ValueError: for distances that the region cannot hold, a date outside the model, an altitude below the ground
@@ -62,6 +68,7 @@ class World:
     altitude_km: float = 0.0
     tasks: Tasks | None = None
     names: tuple[str, ...] = ()
+    objective_floors: tuple[float, float, float] | None = guidance.OBJECTIVE_FLOORS
 
     def __post_init__(self) -> None:
         check_distance_range(self.region, self.distance_range_km)
@@ -86,7 +93,23 @@ class World:
 
     def options(self) -> dict[str, Any]:
         """What :class:`magrl.env.GeomagneticNavEnv` takes of it."""
-        return {"region": self.region, "distance_range_km": self.distance_range_km, "field": self.field()}
+        field = self.field()
+        floors = self.objective_floors or floors_of(field, self.region)
+        place = {"region": self.region, "distance_range_km": self.distance_range_km}
+        return {**place, "field": field, "objective_floors": floors}
+
+
+def floors_of(field: FieldModel, region: Region) -> tuple[float, float, float]:
+    """What :data:`FLOOR_KM` of travel along the gradient change, in the mean over a region: D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> [round(x, 2) for x in floors_of(paper_field(), PAPER_REGION)]
+        [0.05, 0.44, 21.11]
+    """
+    check_type(Region, region=region)
+    slopes = elements_gradient_at(field, region.grid(21)).norm(dim=-1).reshape(-1, 3).mean(0)
+    declination, inclination, intensity = (FLOOR_KM * slopes).tolist()
+    return declination, inclination, intensity
 
 
 def load_world(path: Path | str) -> World:
@@ -145,7 +168,7 @@ def _world(content: Any) -> World:
     tables = _table(content, "the file", required=("region", "field"), optional=("journeys", "tasks"))
     region = _table(tables["region"], "region", required=("latitude", "longitude"))
     field = _table(tables["field"], "field", required=("date",), optional=("generation", "altitude_km"))
-    journeys = _table(tables.get("journeys", {}), "journeys", optional=("distance_range_km",))
+    journeys = _table(tables.get("journeys", {}), "journeys", optional=("distance_range_km", "objective_floors"))
     box = _region(
         _pair(region["latitude"], "region.latitude", "south and north in degrees, such as [40, 50]"),
         _pair(region["longitude"], "region.longitude", "west and east in degrees, such as [-30, -20]"),
@@ -164,6 +187,7 @@ def _world(content: Any) -> World:
         float(altitude),
         tasks,
         names,
+        objective_floors=_floors(journeys.get("objective_floors")),
     )
 
 
@@ -214,12 +238,29 @@ def _table(value: Any, where: str, required: tuple[str, ...] = (), optional: tup
 
 def _pair(value: Any, where: str, right: str) -> tuple[float, float]:
     """Two finite numbers."""
-    if not isinstance(value, list) or len(value) != 2:
-        raise ValueError(f"{where} must be two numbers, {right}, got {_short(value)}")
-    for number in value:
-        if isinstance(number, bool) or not isinstance(number, (int, float)) or not abs(number) < 1e9:
-            raise ValueError(f"{where} must be two numbers, {right}, got {_short(value)}")
-    return float(value[0]), float(value[1])
+    first, second = _numbers(value, 2, where, right)
+    return first, second
+
+
+def _numbers(value: Any, count: int, where: str, right: str) -> tuple[float, ...]:
+    """A list of so many finite numbers."""
+    good = isinstance(value, list) and len(value) == count
+    for number in value if good else ():
+        good &= isinstance(number, (int, float)) and not isinstance(number, bool) and abs(number) < 1e9
+    if not good:
+        raise ValueError(f"{where} must be {count} numbers, {right}, got {_short(value)}")
+    return tuple(map(float, value))
+
+
+def _floors(value: Any) -> tuple[float, float, float] | None:
+    """Least differences of the elements; None where the file leaves them to the region."""
+    if value is None:
+        return None
+    where, right = "journeys.objective_floors", "above 0, of D, I in degrees and of B_H in nT"
+    declination, inclination, intensity = _numbers(value, 3, where, right)
+    if min(declination, inclination, intensity) <= 0:
+        raise ValueError(f"{where} must be 3 numbers, {right}, got {_short(value)}")
+    return declination, inclination, intensity
 
 
 def _date(value: Any) -> Date:

@@ -43,7 +43,7 @@ from magrl.metrics import episode_measures, flown, summarise
 from magrl.navigators import NAVIGATORS
 from magrl.plots import NAVIGATOR_NAMES
 from magrl.runs import create_run_folder
-from magrl.tasks import TEST_SEED, Tasks, named_tasks
+from magrl.tasks import RANDOM_SETS, Tasks, named_tasks
 from magrl.worlds import World, load_world
 
 TRAINED = {"gg_td3": td3.load_policy, "td3": td3.load_policy, "recurrent": recurrent.load_policy}
@@ -70,10 +70,9 @@ class Config:
     navigators: tyro.conf.Positional[tuple[str, ...]]
     """gg_td3=RUN, td3=RUN, recurrent=RUN, ga, pso, afsa, parallel, secant; as many as wanted."""
     tasks: Literal["test-1000", "paper-100", "figure-4-1"] | None = None
-    """A frozen task set in the paper's region; test-1000 unless there is a world."""
+    """A frozen task set; by default the world's own tasks, and test-1000 where there are none."""
     world: Path | None = None
-    """TOML or JSON file of an own region, date and altitude (docs/own_data.md): its tasks are flown, or, where it lists
-    none, 1000 random ones."""
+    """TOML or JSON file of an own region, date, altitude and tasks (docs/own_data.md); by default the paper's."""
     export: Path | None = None
     """File of all journeys: .geojson, .gpx or .kml."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
@@ -137,14 +136,15 @@ def journeys(world_file: Path | None, tasks: str | None) -> tuple[World, Tasks]:
     """Where to fly, and what: the world's tasks, else 1000 random ones there; or a named set of the paper's region.
 
     Raises:
-        ValueError: for a world that is none, or tasks of the paper's region in it.
+        ValueError: for a world that is none, or the paper's one task in it.
     """
     if world_file is None:
         return World(), named_tasks(tasks or "test-1000")
-    if tasks is not None:
-        raise ValueError(f"--tasks {tasks} lies in the paper's region: leave it out, or --world")
+    if tasks == "figure-4-1":
+        raise ValueError("--tasks figure-4-1 lies in the paper's region: leave it out, or --world")
     world = load_world(world_file)
-    return world, world.tasks or world.random_tasks(1000, TEST_SEED)
+    own = world.tasks if tasks is None else None
+    return world, own or world.random_tasks(*RANDOM_SETS[tasks or "test-1000"])
 
 
 def envs(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, Sequence[str]]:
@@ -155,7 +155,7 @@ def envs(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, Sequence
     """
     world, tasks = journeys(config.world, config.tasks)
     example = first(tasks, 1) if config.world else named_tasks("figure-4-1")
-    names = world.names or [f"task {number}" for number in range(len(tasks.start))]
+    names = world.names if tasks is world.tasks else [f"task {number}" for number in range(len(tasks.start))]
     return env_of(config, world, tasks), env_of(config, world, example), names
 
 

@@ -1142,6 +1142,7 @@ WORLDS: dict[str, list[Refused | Nan]] = {
         refused(lambda: worlds.World(names=("a",)), ValueError, "('a',)"),
     ],
     "worlds.World.random_tasks": [refused(lambda: worlds.World().random_tasks(0, 1), ValueError, "num_tasks", "0")],
+    "worlds.floors_of": [refused(lambda: worlds.floors_of(nav().field, 5), TypeError, "region", "5")],
     "worlds.load_world": [
         refused(lambda: worlds.load_world(5), TypeError, "path", "5"),
         refused(lambda: worlds.load_world("nowhere.toml"), FileNotFoundError, "nowhere.toml"),

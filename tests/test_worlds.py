@@ -31,6 +31,7 @@ altitude_km = 10.0
 
 [journeys]
 distance_range_km = [200, 400]
+objective_floors = [0.1, 0.3, 100]
 
 [[tasks]]
 name = "Ponta Delgada to Flores"
@@ -48,7 +49,7 @@ def sound() -> dict[str, Any]:
     return {
         "region": {"latitude": [36, 46], "longitude": [-32, -22]},
         "field": {"date": "2026-07-01", "generation": 14, "altitude_km": 10.0},
-        "journeys": {"distance_range_km": [200, 400]},
+        "journeys": {"distance_range_km": [200, 400], "objective_floors": [0.1, 0.3, 100]},
         "tasks": [
             {"name": "Ponta Delgada to Flores", "start": [37.74, -25.67], "target": [39.45, -31.13]},
             {"start": [40, -30], "target": [42, 332]},
@@ -72,6 +73,7 @@ def test_file_says_all_of_a_world(tmp_path: Path, suffix: str) -> None:
     assert world.region == Region((36, 46), (-32, -22))
     assert (str(world.date)[:10], world.generation, world.altitude_km) == ("2026-07-01", 14, 10.0)
     assert world.distance_range_km == (200, 400)
+    assert world.objective_floors == (0.1, 0.3, 100)
     assert world.names == ("Ponta Delgada to Flores", "task 2")
     assert world.tasks is not None
     assert world.tasks.start.tolist() == [[37.74, -25.67], [40, -30]]
@@ -85,6 +87,7 @@ def test_defaults_of_a_file(tmp_path: Path) -> None:
     assert (world.generation, world.altitude_km, world.distance_range_km) == (14, 0.0, (300, 500))
     assert world.tasks is None
     assert world.names == ()
+    assert world.objective_floors is None
 
 
 def test_default_world_is_the_papers_to_the_bit() -> None:
@@ -119,6 +122,17 @@ def test_random_journeys_lie_in_the_region_and_range() -> None:
     assert (env.distance_range_km, env.region) == ((200, 400), world.region)
 
 
+def test_floors_are_25_km_of_travel_there() -> None:
+    """B_H changes by 445 nT in 100 km round the Azores, and by 52 in the paper's region, whose floor is 15 nT."""
+    world = load_world(RECIPES.parent / "docs" / "examples" / "azores.toml")
+    floors = world.options()["objective_floors"]
+    assert floors == pytest.approx((0.113, 0.268, 110.4), rel=1e-3)
+    assert World().options()["objective_floors"] == (0.05, 0.4, 15.0)
+    paper = World(objective_floors=None).options()["objective_floors"]
+    assert paper == pytest.approx((0.05, 0.4, 15.0), rel=0.5)
+    assert len(world.names) == 3
+
+
 DELETE = object()
 
 
@@ -131,10 +145,10 @@ DELETE = object()
         ("region", DELETE, "region is missing"),
         ("field", DELETE, "field is missing"),
         ("field.date", DELETE, "field: date is missing"),
-        ("region.latitude", [36], "region.latitude must be two numbers"),
+        ("region.latitude", [36], "region.latitude must be 2 numbers"),
         ("region.latitude", [36, "46"], "such as [40, 50], got [36, '46']"),
-        ("region.latitude", [36, True], "region.latitude must be two numbers"),
-        ("region.latitude", [36, float("nan")], "region.latitude must be two numbers"),
+        ("region.latitude", [36, True], "region.latitude must be 2 numbers"),
+        ("region.latitude", [36, float("nan")], "region.latitude must be 2 numbers"),
         ("region.latitude", [46, 36], "region: latitudes (46.0, 36.0) must rise"),
         ("region.latitude", [36, 96], "region: latitudes (36.0, 96.0)"),
         ("region.longitude", [-22, -32], "region: longitudes (-22.0, -32.0)"),
@@ -153,7 +167,13 @@ DELETE = object()
         ("field.altitude_km", "high", "got 'high'"),
         ("journeys.distance_range_km", [500, 300], "distance_range_km (500.0, 300.0) must be two rising numbers"),
         ("journeys.distance_range_km", [3000, 5000], "are more than"),
-        ("journeys.distance_km", [3, 5], "unknown key 'distance_km'; known are distance_range_km"),
+        ("journeys.objective_floors", [0.05, 0.4], "journeys.objective_floors must be 3 numbers, above 0"),
+        (
+            "journeys.objective_floors",
+            [0.05, 0.4, 0],
+            "above 0, of D, I in degrees and of B_H in nT, got [0.05, 0.4, 0]",
+        ),
+        ("journeys.distance_km", [3, 5], "unknown key 'distance_km'; known are distance_range_km, objective_floors"),
         ("tasks", {"start": [1, 2]}, "tasks must be a list"),
         ("tasks", [5], "tasks, entry 1 must be a table with start, target, name, got 5"),
         ("tasks", [{"start": [40, -30]}], "tasks, entry 1: target is missing"),
@@ -250,6 +270,10 @@ def test_training_and_evaluation_take_the_same_file(tmp_path: Path) -> None:
     assert {feature["properties"]["navigator"] for feature in features} == {"gg_td3", "parallel"}
     with pytest.raises(ValueError, match=r"gg_td3=.*trained where D is"):
         evaluate.evaluate(evaluate.Config(names[:1], tasks="figure-4-1", out=tmp_path / "other"))
+    random = evaluate.evaluate(
+        evaluate.Config(("parallel",), tasks="paper-100", world=path, out=tmp_path / "random", wandb_mode="disabled")
+    )
+    assert random["parallel"][0]["num_tasks"] == 100
     with pytest.raises(ValueError, match="--tasks figure-4-1 lies in the paper's region"):
         evaluate.evaluate(evaluate.Config(names, tasks="figure-4-1", world=path, out=tmp_path / "other"))
     with pytest.raises(ValueError, match=r"\.geojson, \.gpx, \.kml"):
