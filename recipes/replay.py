@@ -40,7 +40,7 @@ class Config:
     num_tasks: int | None = None
     """The first so many of the tasks; 12 by default, or all where there are fewer."""
     tasks: Literal["test-1000", "paper-100", "figure-4-1"] | None = None
-    """A frozen task set in the paper's region; test-1000 unless there is a world."""
+    """A frozen task set; the tasks of the world, or test-1000, by default."""
     world: Path | None = None
     """TOML or JSON file of an own region (docs/own_data.md); that of the run, where it was trained in one."""
     zeta: float | None = None
