@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import torch
 from tqdm import tqdm
 
-from benchmarks import env, fields, profile_training, training, update
+from benchmarks import env, fields, imports, profile_training, training, update
 from benchmarks.timing import Row
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -72,6 +72,7 @@ def main() -> None:
     parts = (
         fields.rows,
         env.rows,
+        imports.rows,
         update.rows,
         lambda: [training.whole_training()],
         lambda: [training.first_attempt()],

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from benchmarks import env, profile_training, update
+from benchmarks import env, imports, profile_training, update
 from benchmarks.__main__ import cost_figure, seconds_table, table
 from benchmarks.timing import Row, alternate
 from magrl import td3
@@ -69,3 +69,15 @@ def test_free_field_flies() -> None:
     flown = env.GeomagneticNavEnv(num_envs=4, seed=0)
     flown.field = env.FreeField(4)
     assert torch.isfinite(flown.rollout(2)["next", "field"]).all()
+
+
+def test_imports_are_timed_with_and_without_magrl(monkeypatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(imports, "fresh", asked.append)
+    assert len(imports.rows(repeats=2)) == 2
+    without, with_magrl = asked[0::2], asked[1::2]
+    assert [code + "; from magrl import *" for code in without] == with_magrl
+    assert set(without) == {
+        "import torchrl",
+        "import " + ", ".join(f"torchrl.{x}" for x in imports.PARTS),
+    }
