@@ -13,7 +13,7 @@ STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
 PILOTS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train test test-slow check format clean paper trade bench docs replay
+.PHONY: train test test-slow check format clean paper trade bench docs replay mutate
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3: about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -23,6 +23,10 @@ test: $(VENV)/.installed-dev  ## the fast tests
 
 test-slow: $(VENV)/.installed-dev  ## the tests that train, minutes long
 	$(RUN)/python -m pytest -m slow $(ARGS)
+
+mutate: $(VENV)/.installed-mutation  ## small changes to the mathematics, and the ones that no test notices: ten minutes of a core
+	$(RUN)/mutmut run $(ARGS)
+	$(RUN)/mutmut results
 
 check: $(VENV)/.installed-dev  ## lint, format and types
 	$(RUN)/ruff check .
@@ -92,7 +96,7 @@ runs/td3_gradient_guided-zeta0.001-seed%/eval.json: | $(VENV)/.installed
 	$(RECIPE)/td3_gradient_guided.py --zeta 0.001 --total-frames 409600 --seed $* --out $(@D)
 
 clean:
-	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build mutants .coverage *.egg-info .pytest_cache .ruff_cache .mypy_cache
 
 # torch comes first and alone: with it in place, nothing else pulls another build of it.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -107,4 +111,8 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	touch $@
+
+$(VENV)/.installed-mutation: $(VENV)/.installed-dev
+	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[mutation]'
 	touch $@

@@ -60,6 +60,7 @@ def test_angles_on_the_axes(b_ned, declination, inclination):
     found = seven_elements(f64(*b_ned))
     assert float(found.D) == pytest.approx(declination, abs=1e-13)
     assert float(found.I) == pytest.approx(inclination, abs=1e-13)
+    assert measured_elements(f64(*b_ned))[:2].tolist() == pytest.approx([declination, inclination], abs=1e-13)
 
 
 @pytest.mark.parametrize("down", [5e4, -5e4])

@@ -280,6 +280,10 @@ def test_nearly_parallel_gradients_are_flagged(crossing_deg, scale, dtype):
     assert (float(heading) == 0) == (not expected)
 
 
+def test_an_only_move_is_late():
+    assert late_decay(f64(4.0, -4.0), torch.tensor([1, 1]), 1).tolist() == [0.0, -8.0]
+
+
 def test_the_least_crossing_can_be_chosen():
     gradient, here = f64(1.0, 0.0, 1.0, 1.0).reshape(2, 2), torch.zeros(2, dtype=torch.float64)
     for least_deg, expected in ((0.0, True), (44.0, True), (46.0, False), (89.0, False)):

@@ -104,7 +104,25 @@ def test_a_short_move_is_a_move() -> None:
 
 def test_only_the_first_episode_counts() -> None:
     done = torch.tensor([[[False], [True], [False], [True]], [[False]] * 4])
-    assert flown(done).tolist() == [[True, True, False, False], [True] * 4]
+    assert flown(done).tolist() == flown(done.squeeze(-1)).tolist() == [[True, True, False, False], [True] * 4]
+
+
+def test_a_rollout_of_one_step_is_one() -> None:
+    got = measures([(40.0, 10.0)], point(100.0, 10.0), False, steps=1)
+    assert got["shortest_km"] == pytest.approx(100, abs=1e-3)
+    assert got["navigation_error_km"] == pytest.approx(60, abs=1e-3)
+
+
+def test_vehicles_are_measured_each_on_its_own() -> None:
+    alone = [
+        journey([(50.0, 30.0)] * 4, point(200.0, 30.0), True, 4),
+        journey([(30.0, 0.0), (40.0, 90.0)], point(50.0, 90.0), True, 4),
+        journey([(10.0, 180.0)] * 4, point(300.0, 0.0), False, 4),
+    ]
+    together = episode_measures(torch.cat(alone))
+    for index, one in enumerate(map(episode_measures, alone)):
+        for key, value in one.items():
+            torch.testing.assert_close(together[key][index : index + 1], value, equal_nan=True)
 
 
 def test_summary_of_one_success_and_one_failure() -> None:
@@ -176,7 +194,12 @@ def test_bootstrap_interval_of_a_known_spread() -> None:
     half = 1.96 * values.std().item() / math.sqrt(2000)
     assert low == pytest.approx(values.mean().item() - half, abs=0.005)
     assert high == pytest.approx(values.mean().item() + half, abs=0.005)
-    assert bootstrap_interval(values) == (low, high)
+    assert bootstrap_interval(values) == bootstrap_interval(values, 1000, 0) == (low, high)
+
+
+def test_bootstrap_interval_of_one_draw_is_that_draw() -> None:
+    low, high = bootstrap_interval(torch.arange(10.0), resamples=1)
+    assert low == high
 
 
 def test_shortest_is_the_geodesic() -> None:

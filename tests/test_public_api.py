@@ -157,9 +157,9 @@ def bad_numbers(build: Callable[..., object], **options: tuple[Any, ...]) -> lis
 
 
 def bad_tensors(function: Callable[..., object], *names: str) -> list[Refused]:
-    """Numbers, texts, bools and complex numbers in the place of the first and the last of some tensors."""
+    """Numbers, texts, bools and complex numbers in the place of each of some tensors."""
     rows = []
-    for place in sorted({0, len(names) - 1}):
+    for place in range(len(names)):
         for value, says in ((1.5, "float 1.5"), ("a", "str 'a'"), (t(1j), "complex64"), (zeros(1).bool(), "bool")):
             given = [zeros(1)] * place + [value] + [zeros(1)] * (len(names) - place - 1)
             rows.append(refused(lambda g=given: function(*g), TypeError, names[place], says))
@@ -239,9 +239,20 @@ GEODESY = {
             refused(lambda v=v: geodesy.check_number(x=v), ValueError, "x", repr(v))
             for v in (NAN, INF, "a", None, True, 1j)
         ),
-        refused(lambda: geodesy.check_number(0, above=True, x=0.0), ValueError, "above 0", "0.0"),
-        refused(lambda: geodesy.check_number(0, 1, x=1.5), ValueError, "from 0 up to 1", "1.5"),
-        refused(lambda: geodesy.check_number(whole=True, x=2.0), ValueError, "whole", "2.0"),
+        *(
+            refused(
+                lambda low=low, options=options: geodesy.check_number(*low, **options), ValueError, f"x must be {said}"
+            )
+            for low, options, said in (
+                ((), {"x": NAN}, "a finite number, got nan"),
+                ((), {"high": 1, "x": 1.5}, "a finite number up to 1, got 1.5"),
+                ((0, 1), {"x": 1.5}, "a finite number from 0 up to 1, got 1.5"),
+                ((0,), {"above": True, "x": 0.0}, "a finite number above 0, got 0.0"),
+                ((0, 1), {"above": True, "x": 0.0}, "a finite number above 0 up to 1, got 0.0"),
+                ((), {"whole": True, "x": 2.0}, "a whole number, got 2.0"),
+                ((1,), {"whole": True, "x": 0}, "a whole number from 1 on, got 0"),
+            )
+        ),
     ],
     "geodesy.check_numbers": [
         *(
