@@ -52,6 +52,8 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from magrl.transforms import GradientHeading as GradientHeading
     from magrl.transforms import MinMaxNorm as MinMaxNorm
     from magrl.transforms import TargetDifference as TargetDifference
+    from magrl.worlds import World as World
+    from magrl.worlds import load_world as load_world
 
 
 def __getattr__(name: str) -> Any:

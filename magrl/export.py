@@ -27,7 +27,12 @@ Position = tuple[float, float]
 
 
 class Flight(NamedTuple):
-    """A journey: its name, where it led, and what else is to be said of it."""
+    """A journey: its name, where it led, and what else is to be said of it.
+
+    Example:
+        >>> Flight("home", [(-2.0, 162.0), (-2.4, 162.1)], {"steps": 1}).positions[-1]
+        (-2.4, 162.1)
+    """
 
     name: str
     positions: Sequence[Position]
@@ -96,6 +101,10 @@ def to_gpx(journeys: Sequence[Flight]) -> str:
 
     Raises:
         ValueError: for a journey of one place, or a place that is not on Earth.
+
+    Example:
+        >>> print(to_gpx([Flight("home", [(-2, 162), (-2.4, 162.1)], {"steps": 1})]).splitlines()[7].strip())
+        <trkpt lat="-2.400000000" lon="162.100000000" />
     """
     root = ElementTree.Element("gpx", version="1.1", creator="magrl", xmlns="http://www.topografix.com/GPX/1/1")
     for journey in journeys:
@@ -114,6 +123,11 @@ def to_kml(journeys: Sequence[Flight]) -> str:
 
     Raises:
         ValueError: for a journey of one place, or a place that is not on Earth.
+
+    Example:
+        >>> text = to_kml([Flight("home", [(-2, 162), (-2.5, 162.5)], {"steps": 1})])
+        >>> "162.000000000,-2.000000000,0 162.500000000,-2.500000000,0" in text
+        True
     """
     root = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
     document = ElementTree.SubElement(root, "Document")
@@ -137,6 +151,10 @@ def check_suffix(path: Path | str) -> str:
 
     Raises:
         ValueError: for another than those of :data:`WRITERS`.
+
+    Example:
+        >>> check_suffix("flights.GPX")
+        '.gpx'
     """
     check_type((Path, str), path=path)
     suffix = Path(path).suffix.lower()
@@ -150,6 +168,13 @@ def write_flights(path: Path | str, journeys: Sequence[Flight]) -> None:
 
     Raises:
         ValueError: for another suffix than those of :data:`WRITERS`, or a journey that cannot be drawn.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "flights.geojson"
+        >>> write_flights(path, [Flight("home", [(-2, 162), (-2.4, 162.1)], {"steps": 1})])
+        >>> json.loads(path.read_text())["features"][0]["properties"]
+        {'name': 'home', 'steps': 1}
     """
     text = WRITERS[check_suffix(path)](journeys)
     Path(path).parent.mkdir(parents=True, exist_ok=True)

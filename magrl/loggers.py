@@ -84,6 +84,11 @@ class CurveLog:
     Args:
         name: what is said to have failed, when something does.
         make: opens TorchRL's logger; None for nothing at all.
+
+    Example:
+        >>> log = CurveLog("nothing", None)
+        >>> log.row({"frames": 512, "return": -3.5})
+        >>> log.close()
     """
 
     run_id = ""
@@ -140,6 +145,12 @@ class ScalarLog(CurveLog):
 
     Raises:
         ValueError: for a logger that is unknown or not installed.
+
+    Example:
+        >>> import tempfile
+        >>> log = ScalarLog(Path(tempfile.mkdtemp()), "csv")
+        >>> log.row({"frames": 512, "eval_spl": 90.0})
+        >>> log.close()
     """
 
     def __init__(self, folder: Path, logger: str) -> None:
@@ -265,6 +276,12 @@ def open_log(
 
     Raises:
         ValueError: for another name, one that is not installed, or another mode of wandb.
+
+    Example:
+        >>> import tempfile
+        >>> log = open_log("wandb", Path(tempfile.mkdtemp()), {"seed": 0}, wandb_mode="disabled")
+        >>> type(log).__name__
+        'WandbRun'
     """
     check_logger(logger, wandb_mode)
     if logger == "wandb":

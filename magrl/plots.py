@@ -88,6 +88,12 @@ def contour_lines(axes: Axes, field: FieldModel, region: Region) -> dict[str, Co
 
     Returns:
         By the name of the element.
+
+    Example:
+        >>> from magrl.env import paper_field
+        >>> from magrl.tasks import PAPER_REGION
+        >>> list(contour_lines(Figure().subplots(), paper_field(), PAPER_REGION))
+        ['D', 'I', 'B_H']
     """
     check_type(Axes, axes=axes)
     check_type(Region, region=region)

@@ -99,6 +99,13 @@ def journey_tracks(rollout: TensorDictBase, region: Region) -> list[Tensor]:
 
     Raises:
         ValueError: for a rollout of other dimensions.
+
+    Example:
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(seed=0)
+        >>> track, = journey_tracks(env.rollout(3), env.region)
+        >>> len(track) == 3 * PIECES + 1
+        True
     """
     check_type(TensorDictBase, rollout=rollout)
     check_type(Region, region=region)
@@ -176,6 +183,13 @@ def write_replay(path: Path | str, data: Mapping[str, Any]) -> None:
     Raises:
         KeyError: for what is not of :func:`replay_data`, naming what it lacks.
         ValueError: for numbers that are not finite.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "replay.html"
+        >>> write_replay(path, {"title": "none", "contours": {}, "tasks": [], "navigators": []})
+        >>> path.read_text()[:15]
+        '<!doctype html>'
     """
     check_type((Path, str), path=path)
     check_type(Mapping, data=data)
@@ -209,6 +223,14 @@ def write_gif(
 
     Raises:
         ValueError: for frames or a size that are no positive whole number, or a rollout of other dimensions.
+
+    Example:
+        >>> import tempfile
+        >>> from magrl.env import GeomagneticNavEnv
+        >>> env, path = GeomagneticNavEnv(seed=0), Path(tempfile.mkdtemp()) / "journeys.gif"
+        >>> write_gif(path, env.rollout(1), env.field, env.region, frames_per_step=1, size_px=200)
+        >>> path.read_bytes()[:3]
+        b'GIF'
     """
     check_type((Path, str), path=path)
     check_number(1, whole=True, frames_per_step=frames_per_step, size_px=size_px)

@@ -83,6 +83,19 @@ def read_settings(folder: Path, kind: type[Settings], **marks: bool) -> Settings
 
     Raises:
         ValueError: naming the file and what is wrong with it.
+
+    Example:
+        >>> import tempfile
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Config:
+        ...     seed: int = 0
+        ...     out: Path | None = None
+        ...     resume: Path | None = None
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> _ = (folder / "config.json").write_text('{"seed": 7}')
+        >>> read_settings(folder, Config).seed
+        7
     """
     check_type(Path, folder=folder)
     path, result = folder / "config.json", folder / "eval.json"

@@ -120,6 +120,10 @@ def check_fits(config: PolicyConfig, env: GeomagneticNavEnv) -> None:
 
     Raises:
         ValueError: naming the element and both ranges.
+
+    Example:
+        >>> env = GeomagneticNavEnv(seed=0)
+        >>> check_fits(policy_config(env, (8,), layer_norm=False), env)
     """
     check_type(PolicyConfig, config=config)
     check_type(GeomagneticNavEnv, env=env)

@@ -121,6 +121,14 @@ def load_world(path: Path | str) -> World:
     Raises:
         FileNotFoundError: if there is none.
         ValueError: naming the file, the key, the value and what would be right.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "azores.toml"
+        >>> lines = "[region]", "latitude = [40, 50]", "longitude = [-30, -20]", "[field]", "date = 2026-07-01"
+        >>> _ = path.write_text(chr(10).join(lines))
+        >>> load_world(path).region
+        Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0))
     """
     check_type((Path, str), path=path)
     path = Path(path)

@@ -24,7 +24,7 @@ import torch
 from torchrl.envs import Compose, TransformedEnv
 
 import magrl
-from magrl import guidance, metaheuristics, navigators, plots
+from magrl import guidance, metaheuristics, navigators, plots, replay
 from magrl.gymnasium_env import navigation_env
 
 assert Path(magrl.__file__).is_relative_to(sys.prefix), magrl.__file__
@@ -43,6 +43,7 @@ for pilot in (navigators.Secant(), metaheuristics.build("pso", plain, "flown", s
     print(magrl.summarise(magrl.episode_measures(rollout))["success_rate"])
 plots.trajectories_figure(rollout, plain.field, plain.region).savefig("journeys.png")
 assert plain.render().shape == (700, 700, 3)
+replay.write_replay("page.html", replay.replay_data({"pso": rollout}, plain.field, plain.region, zeta=0.01))
 assert navigation_env(2, seed=0).reset()["observation"].shape == (2, 13)
 """
 MYPY = """
@@ -98,7 +99,8 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         held = {Path(name) for name in archive.namelist()}
     library = {path.relative_to(ROOT) for path in (ROOT / "magrl").rglob("*") if path.suffix == ".py"}
-    assert {path for path in held if path.parts[0] == "magrl"} == library | {Path("magrl/py.typed")}
+    data = {Path("magrl/py.typed"), Path("magrl/templates/replay.html")}
+    assert {path for path in held if path.parts[0] == "magrl"} == library | data
     others = {path.parts[0] for path in held} - {"magrl"}
     assert len(others) == 1
     assert others.pop().endswith(".dist-info")
