@@ -31,10 +31,14 @@ def shell_lines(text: str) -> list[str]:
 
 def commands(line: str) -> list[list[str]]:
     """A line as lists of words, without comments, loops and variables that are set before a command."""
-    listed = [shlex.split(part) for part in re.split(r";|&&|\|", re.sub(r"(^|\s)#.*", "", line))]
-    listed = [words[1:] if words[:1] == ["do"] else words for words in listed]
-    while any(words and re.match(r"\w+=", words[0]) for words in listed):
-        listed = [words[1:] if words and re.match(r"\w+=", words[0]) else words for words in listed]
+    lexer = shlex.shlex(line, posix=True, punctuation_chars=";|&")
+    lexer.whitespace_split = True
+    listed: list[list[str]] = [[]]
+    for word in lexer:
+        if set(word) <= set(";|&"):
+            listed.append([])
+        elif word != "do" and (listed[-1] or not re.match(r"\w+=", word)):
+            listed[-1].append(word)
     return [words for words in listed if words and words[0] not in ("for", "done")]
 
 
@@ -68,6 +72,9 @@ def check_command(words: list[str]) -> None:
             if name == "ARGS" and rest[0] in RECIPE_OF:
                 has_flags(RECIPE_OF[rest[0]], shlex.split(value))
     elif program in ("python", ".venv/bin/python"):
+        if rest[0] == "-c":
+            compile(rest[1], "a command", "exec")
+            return
         script = f"-m {rest[1]}" if rest[0] == "-m" else rest[0]
         assert importlib.util.find_spec(rest[1]) if rest[0] == "-m" else (ROOT / script).is_file(), script
         has_flags(script, rest[1:])
