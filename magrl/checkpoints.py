@@ -21,8 +21,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
+from magrl.checks import check_number
 from magrl.env import GeomagneticNavEnv
-from magrl.geodesy import check_number
 
 CHECKPOINT_FORMAT = 1
 _PATTERN = "checkpoint-*.pt"

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magrl.geodesy import check_tensor
+from magrl.checks import check_tensor
 
 NAMES = ("D", "I", "B_H")
 """The elements that a vehicle measures, in the order of every ``field`` tensor."""

@@ -20,8 +20,9 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
+from magrl.checks import check_number, check_numbers, check_type
 from magrl.fields import IGRF, Date, FieldModel, elements_at, elements_range
-from magrl.geodesy import check_number, check_numbers, check_type, move, wrap_angle
+from magrl.geodesy import move, wrap_angle
 from magrl.regional import RegionalField
 from magrl.tasks import (
     PAPER_DISTANCE_KM,

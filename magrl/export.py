@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 from tensordict import TensorDictBase
 
-from magrl.geodesy import check_numbers, check_type
+from magrl.checks import check_numbers, check_type
 from magrl.metrics import episode_measures, flown
 
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")

@@ -19,8 +19,9 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from magrl import harmonics
+from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.elements import elements_gradient, measured_elements
-from magrl.geodesy import WGS84_A_KM, WGS84_E2, check_number, check_numbers, check_tensor, check_type
+from magrl.geodesy import WGS84_A_KM, WGS84_E2
 
 LEAST_ALTITUDE_KM = -100.0
 """Below that there are sources, and no expansion of this kind holds."""

@@ -15,7 +15,8 @@ import math
 import torch
 from torch import Tensor
 
-from magrl.geodesy import check_tensor, wrap_angle
+from magrl.checks import check_tensor
+from magrl.geodesy import wrap_angle
 
 OBJECTIVE_FLOORS = (0.05, 0.4, 15.0)
 """Least ``|B_T - B_0|`` of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 25 km of travel each."""

@@ -24,8 +24,9 @@ from torchrl.data import Bounded
 from torchrl.envs import CatTensors, Compose, Transform, TransformedEnv
 
 from magrl import td3
+from magrl.checks import check_type
 from magrl.env import GeomagneticNavEnv
-from magrl.geodesy import check_type, geodesic
+from magrl.geodesy import geodesic
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 OBSERVATIONS = ("flat", "dict")

@@ -25,7 +25,7 @@ import math
 import torch
 from torch import Tensor
 
-from magrl.geodesy import check_number, check_tensor
+from magrl.checks import check_number, check_tensor
 
 REFERENCE_RADIUS_KM = 6371.2
 """Geomagnetic reference radius [km]: the ``a`` of the expansion."""

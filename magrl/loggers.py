@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from magrl.geodesy import check_type
+from magrl.checks import check_type
 
 WANDB_PROJECT = "magrl"
 """Where runs go unless WANDB_PROJECT says otherwise."""

@@ -14,7 +14,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.geodesy import check_number, check_tensor, check_type, geodesic, wrap_angle
+from magrl.checks import check_number, check_tensor, check_type
+from magrl.geodesy import geodesic, wrap_angle
 
 WITHIN_KM = (10, 25)
 """Distances at which a second, field-free success rate is reported [km]."""

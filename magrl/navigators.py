@@ -14,10 +14,11 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from magrl.checks import check_number, check_tensor
 from magrl.elements import element_index
 from magrl.env import GeomagneticNavEnv
 from magrl.fields import FieldModel, elements_gradient_at
-from magrl.geodesy import check_number, check_tensor, wrap_angle
+from magrl.geodesy import wrap_angle
 from magrl.guidance import parallel_approach
 
 ELEMENT_SCALE = (1.0, 1.0, 0.01)

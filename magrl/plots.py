@@ -18,9 +18,9 @@ from matplotlib.ticker import EngFormatter
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from magrl.checks import check_number, check_tensor, check_type
 from magrl.elements import NAMES, UNITS
 from magrl.fields import FieldModel, elements_at
-from magrl.geodesy import check_number, check_tensor, check_type
 from magrl.metrics import flown
 from magrl.tasks import Region, Tasks
 

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from magrl.checks import check_number, check_tensor
 from magrl.fields import FieldModel, Float64Module, check_box, in_chunks
-from magrl.geodesy import check_number, check_tensor, curvature_radii
+from magrl.geodesy import curvature_radii
 from magrl.harmonics import chebyshev, chebyshev_nodes
 
 

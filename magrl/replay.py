@@ -19,8 +19,9 @@ from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from magrl.checks import check_number, check_type
 from magrl.fields import FieldModel
-from magrl.geodesy import check_number, check_type, geodesic, move
+from magrl.geodesy import geodesic, move
 from magrl.metrics import episode_measures
 from magrl.plots import PATH, START, TARGET, contour_lines, draw_contours
 from magrl.tasks import Region

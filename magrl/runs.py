@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
-from magrl.geodesy import check_type
+from magrl.checks import check_type
 from magrl.loggers import check_logger, open_log
 
 if TYPE_CHECKING:

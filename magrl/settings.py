@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from magrl.geodesy import check_type
+from magrl.checks import check_type
 
 Settings = TypeVar("Settings")
 

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.fields import check_box, check_positions
-from magrl.geodesy import check_number, check_numbers, check_tensor, check_type, geodesic, move, wrap_longitude
+from magrl.geodesy import geodesic, move, wrap_longitude
 
 MEAN_RADIUS_KM = 6371.0
 TRIES_PER_ROUND = 8

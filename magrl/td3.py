@@ -26,9 +26,9 @@ from torchrl.modules import MLP, TanhModule, ValueOperator
 from torchrl.objectives import SoftUpdate, TD3Loss
 
 from magrl.checkpoints import DamagedCheckpointError, check_finite, load_tensors, save_tensors
+from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.env import GeomagneticNavEnv
 from magrl.fields import elements_range
-from magrl.geodesy import check_number, check_numbers, check_tensor, check_type
 from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")

@@ -17,9 +17,9 @@ from typing import Any
 import torch
 
 from magrl import guidance
+from magrl.checks import check_number, check_type
 from magrl.env import PAPER_DATE, PAPER_GENERATION, paper_field
 from magrl.fields import Date, FieldModel, elements_gradient_at, igrf_coefficients
-from magrl.geodesy import check_number, check_type
 from magrl.regional import RegionalField
 from magrl.tasks import PAPER_DISTANCE_KM, PAPER_REGION, Region, Tasks, check_distance_range, check_tasks, task_set
 

@@ -35,8 +35,8 @@ from torchrl import torchrl_logger
 from tqdm import tqdm
 
 from magrl import export, recurrent, td3
+from magrl.checks import check_number
 from magrl.env import GeomagneticNavEnv
-from magrl.geodesy import check_number
 from magrl.loggers import WandbMode, WandbRun
 from magrl.metaheuristics import METAHEURISTICS
 from magrl.metrics import episode_measures, flown, summarise

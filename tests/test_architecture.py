@@ -9,6 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "magrl"
 LEVELS = (
+    {"checks"},
     {"geodesy", "harmonics", "elements", "guidance"},
     {"fields", "regional", "tasks", "metrics", "plots", "export", "replay"},
     {"env", "transforms", "worlds"},

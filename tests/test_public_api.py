@@ -28,6 +28,7 @@ from torch import Tensor, nn
 import magrl
 from magrl import (
     checkpoints,
+    checks,
     elements,
     env,
     export,
@@ -230,18 +231,18 @@ GEODESY = {
             for k, v in ((0, NAN), (1, NAN), (2, NAN), (3, NAN), (1, INF), (3, INF))
         ),
     ],
-    "geodesy.check_tensor": [
-        refused(lambda: geodesy.check_tensor(x=[1.0]), TypeError, "x", "list [1.0]"),
-        refused(lambda: geodesy.check_tensor(3, 2, x=zeros(3)), ValueError, "x", "(..., 3, 2)", "(3,)"),
+    "checks.check_tensor": [
+        refused(lambda: checks.check_tensor(x=[1.0]), TypeError, "x", "list [1.0]"),
+        refused(lambda: checks.check_tensor(3, 2, x=zeros(3)), ValueError, "x", "(..., 3, 2)", "(3,)"),
     ],
-    "geodesy.check_number": [
+    "checks.check_number": [
         *(
-            refused(lambda v=v: geodesy.check_number(x=v), ValueError, "x", repr(v))
+            refused(lambda v=v: checks.check_number(x=v), ValueError, "x", repr(v))
             for v in (NAN, INF, "a", None, True, 1j)
         ),
         *(
             refused(
-                lambda low=low, options=options: geodesy.check_number(*low, **options), ValueError, f"x must be {said}"
+                lambda low=low, options=options: checks.check_number(*low, **options), ValueError, f"x must be {said}"
             )
             for low, options, said in (
                 ((), {"x": NAN}, "a finite number, got nan"),
@@ -254,13 +255,13 @@ GEODESY = {
             )
         ),
     ],
-    "geodesy.check_numbers": [
+    "checks.check_numbers": [
         *(
-            refused(lambda v=v: geodesy.check_numbers(2, x=v), ValueError, "x", "2 finite", repr(v))
+            refused(lambda v=v: checks.check_numbers(2, x=v), ValueError, "x", "2 finite", repr(v))
             for v in (5, None, (1.0,), (1.0, 2.0, 3.0), "ab", (0.0, NAN), (0.0, True))
         )
     ],
-    "geodesy.check_type": [refused(lambda: geodesy.check_type((int, str), x=1.5), TypeError, "x", "int or str", "1.5")],
+    "checks.check_type": [refused(lambda: checks.check_type((int, str), x=1.5), TypeError, "x", "int or str", "1.5")],
 }
 
 ELEMENTS = {

@@ -16,8 +16,8 @@ from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
+from magrl.checks import check_type
 from magrl.env import GeomagneticNavEnv
-from magrl.geodesy import check_type
 from magrl.metaheuristics.base import MODES, Metaheuristic
 from magrl.metaheuristics.fish_swarm import ArtificialFishSwarm
 from magrl.metaheuristics.genetic import GeneticAlgorithm

@@ -11,8 +11,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from magrl import guidance
+from magrl.checks import check_number, check_numbers, check_tensor
 from magrl.fields import FieldModel, elements_at
-from magrl.geodesy import check_number, check_numbers, check_tensor, move, wrap_angle
+from magrl.geodesy import move, wrap_angle
 from magrl.navigators import Navigator
 
 MODES = ("look-ahead", "flown")

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
-from magrl.geodesy import check_type
+from magrl.checks import check_type
 
 Keys = Sequence[NestedKey]
 

@@ -14,9 +14,10 @@ from torch.func import jacfwd, vmap
 from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
 
 from magrl import guidance
+from magrl.checks import check_number, check_tensor
 from magrl.elements import element_index
 from magrl.fields import FieldModel, elements_gradient_at
-from magrl.geodesy import check_number, check_tensor, wrap_angle
+from magrl.geodesy import wrap_angle
 from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list, several_keys
 
 

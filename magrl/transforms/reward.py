@@ -12,7 +12,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from magrl import guidance
-from magrl.geodesy import check_number
+from magrl.checks import check_number
 from magrl.transforms.base import Keys, key_list, several_keys, sorted_keys
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from magrl.geodesy import check_numbers
+from magrl.checks import check_numbers
 from magrl.transforms.base import Keys, ObservationTransform, key_list, sorted_keys
 
 
