@@ -3,6 +3,7 @@
 import copy
 import math
 from datetime import datetime, timedelta, timezone
+from pathlib import Path
 
 import numpy as np
 import ppigrf
@@ -10,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from magrl.elements import measured_elements
+from magrl.elements import measured_elements, seven_elements
 from magrl.fields import (
     IGRF,
     SphericalHarmonicField,
@@ -28,6 +29,7 @@ LAST_YEAR = {13: 2025, 14: 2030}
 FIRST_INSTANT = datetime(1900, 1, 1)
 PAPER_DATE = "2022-01-01"
 ROUNDING_NT = 1e-8
+DATA = Path(__file__).parent / "data"
 
 
 def f64(*values):
@@ -110,6 +112,26 @@ def test_coefficients_at_an_epoch_and_between_two():
 def test_default_generation_is_14():
     assert torch.equal(igrf_coefficients(2021.0), igrf_coefficients(2021.0, 14))
     assert not torch.equal(igrf_coefficients(2021.0), igrf_coefficients(2021.0, 13))
+
+
+def wmm2025(year):
+    """The Gauss coefficients of the World Magnetic Model: lines of n, m, g, h [nT] and their rates [nT/year]."""
+    gauss = torch.zeros(13, 13, dtype=torch.complex128)
+    for line in (DATA / "wmm2025.cof").read_text().splitlines()[1:-2]:
+        n, m, g, h, g_rate, h_rate = map(float, line.split())
+        gauss[int(n), int(m)] = complex(g + (year - 2025) * g_rate, -h - (year - 2025) * h_rate)
+    return gauss
+
+
+def test_another_model_gives_its_published_values():
+    """WMM2025, whose table is printed to 0.1 nT and 0.01 degrees, sea level and 100 km high, now and in 2027.5."""
+    table = np.loadtxt(DATA / "wmm2025_test_values.txt")
+    assert table.shape == (12, 11)
+    for year, altitude_km, latitude, longitude, *published in table.tolist():
+        found = seven_elements(SphericalHarmonicField(wmm2025(year))(f64(latitude), f64(longitude), altitude_km)[0])
+        nanotesla = (found.B_x, found.B_y, found.B_z, found.B_H, found.B_F)
+        assert [float(x) for x in nanotesla] == pytest.approx(published[:5], rel=0, abs=0.0501)
+        assert [float(x) for x in (found.I, found.D)] == pytest.approx(published[5:], rel=0, abs=0.00501)
 
 
 # --- dates ------------------------------------------------------------------------------------------------------------
