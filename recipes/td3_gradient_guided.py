@@ -197,7 +197,7 @@ def parse(recipe: str, args: list[str] | None = None) -> Config:
     """Reads the command line: the preset first, then what overrides it; or the settings of the run to go on with."""
     if folder := resume_folder(args):
         config = read_settings(folder, Config, guided=recipe != "td3.py")
-        return config if config.world is None else replace(config, world=folder / Path(config.world).name)
+        return config if config.world is None else replace(config, world=folder / Path(str(config.world)).name)
     first = argparse.ArgumentParser(add_help=False)
     first.add_argument("--preset", choices=sorted(PRESETS), default="fast")
     preset = first.parse_known_args(args)[0].preset
