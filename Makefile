@@ -41,7 +41,7 @@ docs: $(VENV)/.installed-docs  ## the documentation as pages, in build/docs
 	$(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet docs build/docs
 	@echo "open build/docs/index.html"
 
-bench: $(VENV)/.installed-dev  ## ratios of speed, measured side by side: about eight minutes on two cores
+bench: $(VENV)/.installed-dev  ## ratios of speed, measured side by side: about nine minutes on two cores
 	$(RUN)/python -m benchmarks $(ARGS)
 	$(RECIPE)/publish.py docs/performance.md
 

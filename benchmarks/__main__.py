@@ -1,4 +1,4 @@
-"""Every figure of docs/performance.md, measured side by side: `python -m benchmarks`, about eight minutes on two cores.
+"""Every figure of docs/performance.md, measured side by side: `python -m benchmarks`, about nine minutes on two cores.
 
 Prints a table of ratios, and writes it with the rest to runs/benchmarks.json, and as a table and a picture for the
 documents where --publish is given.
