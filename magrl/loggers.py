@@ -37,12 +37,12 @@ def check_logger(logger: str, wandb_mode: str = "offline") -> None:
         >>> check_logger("csv")
         >>> check_logger("paper")
         Traceback (most recent call last):
-        ValueError: the logger must be one of wandb, tensorboard, csv, got 'paper'
+        ValueError: logger must be one of wandb, tensorboard, csv, got 'paper'
     """
     if logger not in LOGGERS:
-        raise ValueError(f"the logger must be one of {', '.join(LOGGERS)}, got {logger!r}")
+        raise ValueError(f"logger must be one of {', '.join(LOGGERS)}, got {logger!r}")
     if wandb_mode not in WANDB_MODES:
-        raise ValueError(f"the mode of wandb must be one of {', '.join(WANDB_MODES)}, got {wandb_mode!r}")
+        raise ValueError(f"wandb_mode must be one of {', '.join(WANDB_MODES)}, got {wandb_mode!r}")
     if logger == "tensorboard" and importlib.util.find_spec("tensorboard") is None:
         raise ValueError("the logger tensorboard is not installed: pip install 'magrl[tensorboard]'")
 

@@ -347,7 +347,8 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
     )
     collector = make_collector(config, env, view, TensorDictSequential(learner.actor, noise), guided=guided)
     storage = LazyTensorStorage(config.buffer_size, device=env.device)
-    buffer = TensorDictReplayBuffer(storage=storage, batch_size=config.batch_size)
+    drawn = config.updates_per_batch * config.batch_size  # at once, for all updates between two steps of the vehicles
+    buffer = TensorDictReplayBuffer(storage=storage, batch_size=drawn)
 
     # Everything that a training is made of, so that it can be put aside and taken up again
     settings = {**asdict(config), "out": folder.name, "resume": None, "guided": guided}
@@ -380,7 +381,7 @@ def train_in(folder: Path, config: Config, *, name: str, guided: bool) -> dict[s
             left = max(0.0, 1 - tally.frames / config.total_frames)
             learner.anneal(left)
             if len(buffer) >= config.batch_size:
-                for transitions in buffer.sample(config.updates_per_batch * config.batch_size).split(config.batch_size):
+                for transitions in buffer.sample().split(config.batch_size):
                     learner.update(transitions, left * config.saturation_weight)
             learner.check()
             if config.collectors > 1:
