@@ -113,7 +113,7 @@ with locked(Path(sys.argv[1])):
         ('{"guided": true, "gamma": 2.0}', "gamma must be between 0 and"),
         ('{"guided": true, "gamma": "0.9"}', "gamma"),
         ('{"guided": true, "num_envs": 2.5}', "num_envs"),
-        ('{"guided": true, "wandb_mode": "loud"}', "mode of wandb must be one of"),
+        ('{"guided": true, "wandb_mode": "loud"}', "wandb_mode must be one of"),
     ],
 )
 def test_what_is_no_run_is_not_resumed(tmp_path: Path, content: str | None, said: str) -> None:
