@@ -18,8 +18,8 @@ RECIPE := $(RUN)/python recipes
 train: $(VENV)/.installed  ## train Gradient-Guided TD3: about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
 
-test: $(VENV)/.installed-dev  ## the fast tests
-	$(RUN)/python -m pytest $(ARGS)
+test: $(VENV)/.installed-dev  ## the fast tests, a process a core with a thread each
+	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
 test-slow: $(VENV)/.installed-dev  ## the tests that train, minutes long
 	$(RUN)/python -m pytest -m slow $(ARGS)
