@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cProfile
 import time
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 
+from benchmarks.profile_training import shares_of, table
 from benchmarks.timing import Row, alternate
 from magrl import td3
 from magrl.env import GeomagneticNavEnv
@@ -72,6 +74,27 @@ def rows(repeats: int = 15) -> list[Row]:
     ]
 
 
+PARTS = {
+    "the raw step": ("env.py", "_step"),
+    "the field's gradient, and that of the elements": ("fields.py", "elements_gradient_at"),
+    "the theoretical heading": ("guidance.py", "parallel_approach"),
+    "new journeys": ("env.py", "_reset"),
+}
+"""Of a step in a collector; the rest is TorchRL's merging of resets, copies, specs, and the other transforms."""
+
+
+def shares(steps: int = 100) -> dict[str, float]:
+    """Share of the time of a step in a collector in each part."""
+    collecting, profiler = Collecting(VEHICLES), cProfile.Profile()
+    for _ in range(60):  # until journeys end at different steps
+        collecting()
+    began = time.perf_counter()
+    with profiler:
+        for _ in range(steps):
+            collecting()
+    return shares_of(profiler, PARTS, time.perf_counter() - began)
+
+
 def steps_per_second(seconds: float = 2.0) -> float:
     """Vehicle-steps a second of the raw step."""
     return VEHICLES / time_of(Stepper(GeomagneticNavEnv(num_envs=VEHICLES, seed=0)), seconds)
@@ -104,3 +127,4 @@ if __name__ == "__main__":
     print(f"{steps_per_second() / 1e6:.2f} million vehicle-steps a second")
     for line in cost_by_number():
         print(line)
+    print(table(shares()))

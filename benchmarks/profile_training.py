@@ -34,12 +34,16 @@ def shares(frames: int = 61_440) -> dict[str, float]:
         config = replace(config, out=Path(folder) / "run")
         profiler = cProfile.Profile()
         result = profiler.runcall(recipe.train, config)
-    seconds = dict.fromkeys(PARTS, 0.0)
+    return shares_of(profiler, PARTS, result["training_seconds"])
+
+
+def shares_of(profiler: cProfile.Profile, parts: dict[str, tuple[str, str]], total: float) -> dict[str, float]:
+    """Share of some seconds that was spent in functions, each named by its file and its name; none calls another."""
+    seconds = dict.fromkeys(parts, 0.0)
     for (file, _, name), (_, _, _, cumulative, _) in pstats.Stats(profiler).stats.items():
-        for part, (ending, function) in PARTS.items():
+        for part, (ending, function) in parts.items():
             if Path(file).name == ending and name == function:
                 seconds[part] = max(seconds[part], cumulative)
-    total = result["training_seconds"]
     found = {part: value / total for part, value in seconds.items()}
     return found | {"the rest": 1 - sum(found.values())}
 

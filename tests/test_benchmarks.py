@@ -81,3 +81,9 @@ def test_imports_are_timed_with_and_without_magrl(monkeypatch) -> None:
         "import torchrl",
         "import " + ", ".join(f"torchrl.{x}" for x in imports.PARTS),
     }
+
+
+def test_shares_add_up() -> None:
+    found = env.shares(steps=3)
+    assert sum(found.values()) == pytest.approx(1)
+    assert all(share > 0 for share in found.values())
