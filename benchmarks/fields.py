@@ -53,10 +53,10 @@ def rows(repeats: int = 11, threads: int = 1) -> list[Row]:
         threads: of torch. One is fair beside ppigrf, which never uses more.
     """
     with threads_of_torch(threads):
-        return _rows(repeats)
+        return _rows(repeats, f"{threads} thread{'s' * (threads > 1)}, {POINTS} points")
 
 
-def _rows(repeats: int) -> list[Row]:
+def _rows(repeats: int, points: str) -> list[Row]:
     latitude, longitude = positions()
     few = latitude[:1024], longitude[:1024]
     igrf = IGRF(DATE, GENERATION)
@@ -71,24 +71,29 @@ def _rows(repeats: int) -> list[Row]:
         return alternate(what, first, second, repeats=repeats, goal=goal, inner=inner)
 
     found = [
-        row(f"{POINTS} points: ppigrf / IGRF", lambda: igrf(latitude, longitude), peer, "≥ 30"),
-        row("at given altitudes: ppigrf / IGRF", lambda: igrf(latitude, longitude, height), lambda: peer(100.0), ""),
-        row(f"{POINTS} points: ppigrf / RegionalField", lambda: region(latitude, longitude), peer, "≥ 300"),
+        row(f"{points}: ppigrf / IGRF", lambda: igrf(latitude, longitude), peer, "≥ 30"),
+        row(
+            f"{points} at given altitudes: ppigrf / IGRF",
+            lambda: igrf(latitude, longitude, height),
+            lambda: peer(100.0),
+            "",
+        ),
+        row(f"{points}: ppigrf / RegionalField", lambda: region(latitude, longitude), peer, "≥ 300"),
     ]
     if shutil.which("g++") or shutil.which("clang++"):  # what torch.compile needs
         compiled = torch.compile(region.forward, dynamic=False)
-        what = f"{POINTS} points: ppigrf / RegionalField, compiled"
+        what = f"{points}: ppigrf / RegionalField, compiled"
         found.append(row(what, lambda: compiled(latitude, longitude), peer, "≥ 300"))
     return [
         *found,
         row(
-            f"{POINTS} points: IGRF value and gradient / value",
+            f"{points}: IGRF value and gradient / value",
             lambda: igrf(latitude, longitude),
             lambda: igrf.value_and_gradient(latitude, longitude),
             "≤ 3",
         ),
         row(
-            "1024 points: RegionalField value and gradient / value",
+            f"{points.replace(str(POINTS), '1024')}: RegionalField value and gradient / value",
             lambda: region(*few),
             lambda: region.value_and_gradient(*few),
             "≤ 3",
