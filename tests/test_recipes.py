@@ -5,7 +5,6 @@ import dataclasses
 import importlib.util
 import json
 import math
-import os
 import signal
 import subprocess
 import sys
@@ -25,7 +24,7 @@ SMALL = {
     "batch_size": 32,
     "buffer_size": 1000,
     "init_random_frames": 32,
-    "updates_per_batch": 1,
+    "updates_per_batch": 2,
     "eval_every": 10,
     "eval_tasks_small": 4,
     "eval_tasks": 6,
@@ -65,7 +64,7 @@ def test_run_folder(recipe, tmp_path: Path, guided: bool) -> None:
     assert written["spl"] == result["spl"]
     assert json.loads((out / "config.json").read_text())["guided"] is guided
     assert [int(row["frames"]) for row in rows(out)] == [160, 320]
-    assert [int(row["updates"]) for row in rows(out)] == [9, 19]
+    assert [int(row["updates"]) for row in rows(out)] == [18, 38]
     aligned = [float(row["reward_alignment"]) != 0 for row in rows(out)]
     assert aligned == [guided, guided]
     env = GeomagneticNavEnv(num_envs=3, seed=0)
@@ -84,27 +83,16 @@ def test_same_seed_same_numbers(recipe, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("frames", [240, 96], ids=["after an evaluation", "before any"])
-def test_stopped_training_goes_on_as_if_it_had_not(recipe, tmp_path: Path, monkeypatch, capsys, frames, number) -> None:
+def test_stopped_training_goes_on_as_if_it_had_not(recipe, tmp_path: Path, signalled, capsys, frames, number) -> None:
     """Ctrl-C and SIGTERM: the iteration is finished, the policy and a checkpoint are kept, and --resume is exact."""
-    calls = []
-
-    def stopped(*args):
-        calls.append(args)
-        if len(calls) == frames // 16:
-            os.kill(os.getpid(), number)
-        return anneal(*args)
-
-    anneal = recipe.Learner.anneal
     run, whole = tmp_path / "run", tmp_path / "whole"
-    monkeypatch.setattr(recipe.Learner, "anneal", stopped)
-    with pytest.raises(SystemExit) as stop:
+    with signalled(recipe, frames // 16, number), pytest.raises(SystemExit) as stop:
         recipe.train(settings(recipe, run))
     assert stop.value.code == 128 + number
     assert f"Stopped after {frames} frames" in capsys.readouterr().err
     assert td3.load_policy(run / "policy.pt").config.num_cells == (16, 16)
     assert (run / "training.png").exists() == (frames >= 160)
     assert not (run / "eval.json").exists()
-    monkeypatch.setattr(recipe.Learner, "anneal", anneal)
     recipe.train(recipe.parse("td3_gradient_guided.py", ["--resume", str(run)]))
     recipe.train(settings(recipe, whole))
     assert rows(run) == rows(whole)

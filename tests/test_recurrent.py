@@ -5,7 +5,6 @@ import dataclasses
 import importlib.util
 import json
 import math
-import os
 import signal
 import sys
 from pathlib import Path
@@ -355,26 +354,15 @@ def outcome(folder: Path) -> tuple[list[dict[str, str]], dict[str, torch.Tensor]
     [(448, signal.SIGINT), (192, signal.SIGTERM)],
     ids=["after an evaluation", "before any"],
 )
-def test_stopped_training_goes_on_as_if_it_had_not(recipe, tmp_path: Path, monkeypatch, capsys, frames, number) -> None:
+def test_stopped_training_goes_on_as_if_it_had_not(recipe, tmp_path: Path, signalled, capsys, frames, number) -> None:
     """Journeys of 24 moves, 4 a batch: the memory and the journeys under way are those that the checkpoint held."""
-    calls = []
-
-    def stopped(*args):
-        calls.append(args)
-        if len(calls) == frames // 64:
-            os.kill(os.getpid(), number)
-        return anneal(*args)
-
-    anneal = recipe.Learner.anneal
     run, whole = tmp_path / "run", tmp_path / "whole"
-    monkeypatch.setattr(recipe.Learner, "anneal", stopped)
-    with pytest.raises(SystemExit) as stop:
+    with signalled(recipe, frames // 64, number), pytest.raises(SystemExit) as stop:
         recipe.train(settings(recipe, run))
     assert stop.value.code == 128 + number
     assert f"Stopped after {frames} frames" in capsys.readouterr().err
     assert recurrent.load_policy(run / "policy.pt").memory_size == 8
     assert not (run / "eval.json").exists()
-    monkeypatch.setattr(recipe.Learner, "anneal", anneal)
     recipe.train(recipe.parse(["--resume", str(run)]))
     recipe.train(settings(recipe, whole))
     (rows, weights), (expected, expected_weights) = outcome(run), outcome(whole)

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -71,21 +72,9 @@ def test_training_in_two_processes(backend: str, tmp_path: Path) -> None:
         collector.shutdown()
 
 
-def test_stopped_training_of_several_processes_resumes(tmp_path: Path, monkeypatch) -> None:
+def test_stopped_training_of_several_processes_resumes(tmp_path: Path, signalled) -> None:
     """Other processes start new episodes; everything else goes on, and the frames add up."""
-    import os
-    import signal
-
-    anneal, calls = recipe.Learner.anneal, []
-
-    def stopped(*args):
-        calls.append(args)
-        if len(calls) == 4:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return anneal(*args)
-
-    monkeypatch.setattr(recipe.Learner, "anneal", stopped)
-    with pytest.raises(SystemExit):
+    with signalled(recipe, 4, signal.SIGTERM), pytest.raises(SystemExit):
         recipe.train(replace(SMALL, out=tmp_path / "run"))
     recipe.train(recipe.parse("td3_gradient_guided.py", ["--resume", str(tmp_path / "run")]))
     result = json.loads((tmp_path / "run" / "eval.json").read_text())
