@@ -9,6 +9,7 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +41,11 @@ def records(path: Path) -> Iterator[Any]:
         if left < HEADER:
             at += left
             continue
+        if at + HEADER > len(content):
+            return  # it is still being written
         _, length, kind = struct.unpack_from("<IHB", content, at)
+        if at + HEADER + length > len(content):
+            return
         parts += content[at + HEADER : at + HEADER + length]
         at += HEADER + length
         if kind in (FULL, LAST):
@@ -72,8 +77,16 @@ class Offline(NamedTuple):
         return [dict(zip(table["columns"], row, strict=True)) for row in table["data"]]
 
 
-def read_offline(folder: Path) -> Offline:
-    """Reads one of wandb's own folders."""
+def read_offline(folder: Path, patience: float = 10.0) -> Offline:
+    """Reads one of wandb's own folders, once it is whole: wandb's service may write on after ``finish``."""
+    deadline = time.monotonic() + patience
+    while not (found := read_now(folder)).complete and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return found
+
+
+def read_now(folder: Path) -> Offline:
+    """Reads what there is."""
     (path,) = folder.glob("*.wandb")
     found = Offline(folder, None, {}, [], {}, {}, {}, False)
     for record in records(path):
