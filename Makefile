@@ -1,55 +1,55 @@
-# `make train` and `make test` set up .venv when they must; everything else builds on them.
+# `make train` and `make test` create .venv if necessary. `make help` lists the targets.
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin
 export GOMP_SPINCOUNT ?= 3000
 
-# Runs that the documents are made of
+# Runs that the documentation reports
 SEEDS := 0 1 2 3 4
 GUIDED := $(SEEDS:%=runs/td3_gradient_guided-fast-seed%)
 PLAIN := $(SEEDS:%=runs/td3-fast-seed%)
 MEMORY := $(foreach s,0 1 2,runs/td3_recurrent-seed$(s))
 STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
-PILOTS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
+NAVIGATORS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train test test-slow check format clean paper trade bench docs replay mutate
+.PHONY: train test test-slow check format clean paper trade bench docs replay mutate help
 
-train: $(VENV)/.installed  ## train Gradient-Guided TD3: about a minute on two cores
+train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
 
-test: $(VENV)/.installed-dev  ## the fast tests, a process a core with a thread each
+test: $(VENV)/.installed-dev  ## run the fast tests, one process per core with one thread each
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
-test-slow: $(VENV)/.installed-dev  ## the tests that train, minutes long
+test-slow: $(VENV)/.installed-dev  ## run the slow tests (trainings); several minutes
 	$(RUN)/python -m pytest -m slow $(ARGS)
 
-mutate: $(VENV)/.installed-mutation  ## small changes to the mathematics, and the ones that no test notices: ten minutes of a core
+mutate: $(VENV)/.installed-mutation  ## run mutation tests of the mathematics; ten minutes on one core
 	$(RUN)/mutmut run $(ARGS)
 	$(RUN)/mutmut results
 
-check: $(VENV)/.installed-dev  ## lint, format and types
+check: $(VENV)/.installed-dev  ## check lint, format and types
 	$(RUN)/ruff check .
 	$(RUN)/ruff format --check .
 	$(RUN)/mypy
 
-format: $(VENV)/.installed-dev
+format: $(VENV)/.installed-dev  ## format the code
 	$(RUN)/ruff format .
 	$(RUN)/ruff check --fix .
 
-docs: $(VENV)/.installed-docs  ## the documentation as pages, in build/docs
+docs: $(VENV)/.installed-docs  ## build the documentation in build/docs
 	$(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet docs build/docs
-	@echo "open build/docs/index.html"
+	@echo "Open build/docs/index.html"
 
-bench: $(VENV)/.installed-dev  ## ratios of speed, measured side by side: about nine minutes on two cores
+bench: $(VENV)/.installed-dev  ## run the benchmarks; about nine minutes on two cores
 	$(RUN)/python -m benchmarks $(ARGS)
-	$(RECIPE)/publish.py docs/performance.md
+	$(RECIPE)/tables/publish.py docs/performance.md
 
-replay: runs/td3_gradient_guided-fast-seed0/eval.json  ## a page to watch journeys on: replay.html in the run's folder
+replay: runs/td3_gradient_guided-fast-seed0/eval.json  ## write a replay page, replay.html in the run folder
 	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 $(ARGS)
 
-# What the discount and the offset of the alignment term trade, and what the paper's state costs: ten trainings, seven of them of a minute.
-trade: runs/td3_gradient_guided-fast-seed0/eval.json $(MEMORY:%=%/eval.json)
+# Ablations of the discount factor, the alignment offset and the state: ten trainings, seven of which take one minute each.
+trade: runs/td3_gradient_guided-fast-seed0/eval.json $(MEMORY:%=%/eval.json)  ## run the ablations
 	for gamma in 0.97 0.995; do test -e runs/trade-gamma$$gamma || \
 	  $(RECIPE)/td3_gradient_guided.py --gamma $$gamma --out runs/trade-gamma$$gamma || exit; done
 	for gamma in 0.9 0.97 0.995; do test -e runs/trade-gamma$$gamma-offset0 || $(RECIPE)/td3_gradient_guided.py \
@@ -58,36 +58,36 @@ trade: runs/td3_gradient_guided-fast-seed0/eval.json $(MEMORY:%=%/eval.json)
 	test -e runs/literal-state || $(RECIPE)/td3_gradient_guided.py --no-observe-difference --no-observe-heading \
 	  --out runs/literal-state
 	mkdir -p docs/results
-	$(RECIPE)/results_table.py "γ 0.9, offset π/4=runs/td3_gradient_guided-fast-seed0" \
+	$(RECIPE)/tables/results_table.py "γ 0.9, offset π/4=runs/td3_gradient_guided-fast-seed0" \
 	  $(foreach g,0.97 0.995,"γ $(g), offset π/4=runs/trade-gamma$(g)") \
 	  $(foreach g,0.9 0.97 0.995,"γ $(g), offset 0=runs/trade-gamma$(g)-offset0") > docs/results/trade.md
-	$(RECIPE)/results_table.py "as published=runs/td3_gradient_guided-fast-seed0" \
+	$(RECIPE)/tables/results_table.py "as published=runs/td3_gradient_guided-fast-seed0" \
 	  "without the difference=runs/no-difference" "the paper's eight numbers=runs/literal-state" \
 	  $(foreach s,0 1 2,"the eight numbers with a memory (seed $(s))=runs/td3_recurrent-seed$(s)") > docs/results/state.md
 
-# The paper's Section 4. Runs that are there are used as they are; eighteen trainings take about half an hour on two
-# cores, everything else about a minute.
-paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json) $(MEMORY:%=%/eval.json)  ## every table and figure of Section 4
+# Section 4 of the paper. Existing runs are reused. All trainings take about half an hour on two cores, everything else
+# about a minute.
+paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json) $(MEMORY:%=%/eval.json)  ## make all tables and figures of the paper's Section 4
 	rm -rf runs/comparison runs/comparison-paper-100 runs/comparison-zeta0.001
-	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%) $(PILOTS) --out runs/comparison
-	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%) $(PILOTS) \
+	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%) $(NAVIGATORS) --out runs/comparison
+	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%) $(NAVIGATORS) \
 	  --tasks paper-100 --out runs/comparison-paper-100
 	$(RECIPE)/evaluate.py $(STRICT:%=gg_td3=%) secant parallel --zeta 0.001 --out runs/comparison-zeta0.001
-	$(RECIPE)/figures.py --results runs/comparison --gg-td3 $(GUIDED) --td3 $(PLAIN) --out docs/figures
+	$(RECIPE)/tables/figures.py --results runs/comparison --gg-td3 $(GUIDED) --td3 $(PLAIN) --out docs/figures
 	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 --gif docs/figures/replay.gif
 	mkdir -p docs/results
 	for name in comparison comparison-paper-100 comparison-zeta0.001; do cp runs/$$name/table.md docs/results/$$name.md; done
 	cp runs/comparison/short.md docs/results/summary.md
-	$(RECIPE)/learning_table.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) > docs/results/learning.md
-	$(RECIPE)/results_table.py $(GUIDED) > docs/results/seeds.md
-	$(RECIPE)/path_loss.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) secant parallel > docs/results/path_loss.md
-	$(RECIPE)/publish.py README.md docs/reproduction.md
+	$(RECIPE)/tables/learning_table.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) > docs/results/learning.md
+	$(RECIPE)/tables/results_table.py $(GUIDED) > docs/results/seeds.md
+	$(RECIPE)/tables/path_loss.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) secant parallel > docs/results/path_loss.md
+	$(RECIPE)/tables/publish.py README.md docs/reproduction.md
 
 runs/td3_gradient_guided-fast-seed%/eval.json: | $(VENV)/.installed
 	$(RECIPE)/td3_gradient_guided.py --seed $*
 
 runs/td3-fast-seed%/eval.json: | $(VENV)/.installed
-	$(RECIPE)/td3.py --seed $*
+	$(RECIPE)/td3_gradient_guided.py --preset td3-fast --seed $*
 
 runs/td3_recurrent-seed%/eval.json: | $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(RECIPE)/td3_recurrent.py --seed $*
@@ -95,14 +95,17 @@ runs/td3_recurrent-seed%/eval.json: | $(VENV)/.installed
 runs/td3_gradient_guided-zeta0.001-seed%/eval.json: | $(VENV)/.installed
 	$(RECIPE)/td3_gradient_guided.py --zeta 0.001 --total-frames 409600 --seed $* --out $(@D)
 
-clean:
+help:  ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*  ## /  \1\t/p' $(MAKEFILE_LIST) | expand -t 14
+
+clean:  ## remove .venv and build outputs
 	rm -rf $(VENV) build mutants .coverage *.egg-info .pytest_cache .ruff_cache .mypy_cache
 
-# torch comes first and alone: with it in place, nothing else pulls another build of it.
+# Install torch first, so that no other package installs another build of it.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(RUN)/pip install --quiet --disable-pip-version-check $$(grep '^torch==' constraints.txt)
-	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[recipes]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed

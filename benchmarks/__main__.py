@@ -1,45 +1,60 @@
 """Every figure of docs/performance.md, measured side by side: `python -m benchmarks`, about nine minutes on two cores.
 
-Prints a table of ratios, and writes it with the rest to runs/benchmarks.json, and as a table and a picture for the
-documents where --publish is given.
+Prints each row as it is measured. `--only PART` measures one part. A part that would start after the time limit is
+skipped, and named. Results are written to runs/benchmarks.json, and for the documents where --publish is given.
 """
 
 from __future__ import annotations
 
 import os
 
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # before torch: see recipes/td3_gradient_guided.py
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # read when torch is imported: see recipes/td3_gradient_guided.py
 
 import argparse
-import json
+import importlib
 import math
 import platform
 import statistics
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import torch
-from tqdm import tqdm
 
-from benchmarks import env, fields, imports, profile_training, training, update
-from benchmarks.timing import Row
+from benchmarks.timing import HEADER, Row
+from magrl.files import write_json
 
 DOCS = Path(__file__).parent.parent / "docs"
+COMPARISONS = {
+    "fields": ("fields", "rows"),
+    "env": ("env", "rows"),
+    "imports": ("imports", "rows"),
+    "update": ("update", "rows"),
+    "training": ("training", "whole_training"),
+    "first-attempt": ("training", "first_attempt"),
+}
+"""Parts that give rows of the table: module and function."""
+OTHERS = ("speed", "time-to-paper", "profile", "memory")
+"""Parts that give other figures."""
 
 
-def table(rows: list[Row]) -> str:
-    """Ratios with their quartiles."""
-    lines = ["| what | first ms | second ms | ratio | quartiles | goal |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        cells = (f"{row.first_ms:.3g}", f"{row.second_ms:.3g}", f"{row.ratio:.2f}", f"{row.low:.2f}–{row.high:.2f}")
-        lines.append(f"| {row.what} | {' | '.join(cells)} | {row.goal} |")
-    return "\n".join(lines) + "\n"
+def measure(part: str) -> Any:
+    """Return the rows of a comparison; its module is imported now, so that one part does not load the others'."""
+    module, function = COMPARISONS[part]
+    found = getattr(importlib.import_module(f"benchmarks.{module}"), function)()
+    return [found] if isinstance(found, Row) else found
+
+
+def table(rows: Iterable[Row]) -> str:
+    """Return the Markdown table of some rows."""
+    return HEADER + "".join(f"{row}\n" for row in rows)
 
 
 def seconds_table(seconds: list[float]) -> str:
-    """Times of single runs, and their median."""
+    """Return a table of the times of single runs and their median."""
     known = [value for value in seconds if math.isfinite(value)]
     cells = [f"{value:.1f}" for value in seconds] + [f"**{statistics.median(known):.1f}**" if known else "—"]
     heads = [f"seed {seed}" for seed in range(len(seconds))] + ["median"]
@@ -47,57 +62,110 @@ def seconds_table(seconds: list[float]) -> str:
 
 
 def cost_figure(costs: list[dict[str, float]]) -> plt.Figure:
-    """Cost of a vehicle-step over the number of vehicles."""
+    """Return a figure of the cost of a vehicle-step over the number of vehicles."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     numbers = [row["vehicles"] for row in costs]
-    for key, name, colour in (("raw_us", "raw step", "#0072B2"), ("guided_us", "guided, in a collector", "#D55E00")):
-        axes.loglog(numbers, [row[key] for row in costs], "o-", label=name, color=colour)
+    for key, name, color in (("raw_us", "raw step", "#0072B2"), ("guided_us", "guided, in a collector", "#D55E00")):
+        axes.loglog(numbers, [row[key] for row in costs], "o-", label=name, color=color)
     axes.set_xticks(numbers, [str(number) for number in numbers])
     axes.minorticks_off()
-    axes.set(xlabel="vehicles", ylabel="time for a vehicle-step [µs]")
+    axes.set(xlabel="vehicles", ylabel="time per vehicle-step [µs]")
     axes.grid(alpha=0.3, which="both")
     axes.legend(frameon=False)
     return figure
 
 
-def main() -> None:
-    """Measures, prints, writes."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs/benchmarks.json"))
-    parser.add_argument("--publish", action="store_true", help="write docs/results/performance*.md and the picture")
-    options = parser.parse_args()
+class Report:
+    """What was measured so far.
+
+    Args:
+        limit_s: time after which no further part is started [s].
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self.limit_s, self.began = limit_s, time.perf_counter()
+        self.rows: list[Row] = []
+        self.content: dict[str, Any] = {}
+        self.skipped: list[str] = []
+
+    def take(self, part: str) -> None:
+        """Measure a part and print it, or skip it if the time is over."""
+        if time.perf_counter() - self.began > self.limit_s:
+            self.skipped.append(part)
+            print(f"skipped, the time limit of {self.limit_s:.0f} s is over: --only {part}", flush=True)
+        elif part in COMPARISONS:
+            if not self.rows:
+                print(HEADER, end="", flush=True)
+            for row in measure(part):
+                self.rows.append(row)
+                print(row, flush=True)
+        else:
+            getattr(self, f"_{part.replace('-', '_')}")()
+
+    def _speed(self) -> None:
+        env = importlib.import_module("benchmarks.env")
+        self.content |= {"steps_per_second": env.steps_per_second(), "cost_by_number": env.cost_by_number()}
+        print(f"\nRaw step of {env.VEHICLES} vehicles: {self.content['steps_per_second'] / 1e6:.2f} million steps/s")
+
+    def _time_to_paper(self) -> None:
+        seconds = importlib.import_module("benchmarks.training").to_the_papers_figures()
+        self.content["seconds_to_the_papers_figures"] = seconds
+        print(f"\nFrom process start to SR 97 %, SPL 88.4 % [s]:\n\n{seconds_table(seconds)}", flush=True)
+
+    def _profile(self) -> None:
+        profile = importlib.import_module("benchmarks.profile_training")
+        self.content["profile"] = profile.table(profile.shares())
+        print(f"\n{self.content['profile']}", flush=True)
+
+    def _memory(self) -> None:
+        self.content["peak_gib"] = importlib.import_module("benchmarks.fields").peak_memory()
+        print(f"\nPeak memory, value and gradient at 10 million points [GiB]: {self.content['peak_gib']}", flush=True)
+
+    def summary(self) -> str:
+        """Return where and in how much time this was measured."""
+        machine = (
+            f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__.partition('+')[0]}"
+        )
+        return f"Measured in {time.perf_counter() - self.began:.0f} s on {machine}.\n"
+
+    def write(self, path: Path) -> None:
+        """Write all figures as JSON."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, {"rows": [asdict(row) for row in self.rows], **self.content, "machine": self.summary()})
+
+    def publish(self) -> None:
+        """Write the tables and the figure of the documents; every part must have been measured."""
+        missing = {"steps_per_second", "seconds_to_the_papers_figures", "profile", "peak_gib"} - self.content.keys()
+        if missing or self.skipped:
+            raise SystemExit(f"nothing is published: {sorted(missing) or self.skipped} was not measured")
+        millions, peak = self.content["steps_per_second"] / 1e6, self.content["peak_gib"]
+        speed = f"Raw step of 1024 vehicles: {millions:.2f} million vehicle-steps per second.\n\n"
+        speed += f"Peak memory, value and gradient at 10 million points: {peak['igrf']:.2f} GiB with IGRF, "
+        speed += f"{peak['regional']:.2f} GiB with RegionalField.\n\n"
+        results = DOCS / "results"
+        (results / "performance.md").write_text(f"{table(self.rows)}\n{speed}{self.summary()}")
+        (results / "time_to_paper.md").write_text(seconds_table(self.content["seconds_to_the_papers_figures"]))
+        (results / "profile.md").write_text(self.content["profile"])
+        cost_figure(self.content["cost_by_number"]).savefig(DOCS / "figures" / "cost-by-vehicles.png", dpi=110)
+
+
+def main(args: list[str] | None = None, take: Callable[[Report, str], None] = Report.take) -> None:
+    """Measure, print and write."""
+    parts = [*COMPARISONS, *OTHERS]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--only", choices=parts, action="append", help="one part, may be repeated; all by default")
+    parser.add_argument("--limit-s", type=float, default=840.0, help="time after which no further part starts [s]")
+    parser.add_argument("--out", type=Path, default=Path("runs/benchmarks.json"), help="file of all figures")
+    parser.add_argument("--publish", action="store_true", help="write docs/results/performance.md and its companions")
+    options = parser.parse_args(args)
     torch.manual_seed(0)
-    began = time.perf_counter()
-    rows: list[Row] = []
-    parts = (
-        fields.rows,
-        env.rows,
-        imports.rows,
-        update.rows,
-        lambda: [training.whole_training()],
-        lambda: [training.first_attempt()],
-    )
-    for part in tqdm(parts, desc="ratios"):
-        rows += part()
-    per_second, costs, seconds = env.steps_per_second(), env.cost_by_number(), training.to_the_papers_figures()
-    parts_of_time, memory = profile_training.table(profile_training.shares()), fields.peak_memory()
-    speed = f"Raw step of {env.VEHICLES} vehicles: {per_second / 1e6:.2f} million vehicle-steps a second.\n\n"
-    speed += f"Peak memory, value and gradient at 10 million points: {memory['igrf']:.2f} GiB with IGRF, "
-    speed += f"{memory['regional']:.2f} GiB with RegionalField.\n\n"
-    machine = f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__.partition('+')[0]}"
-    took = f"Measured in {time.perf_counter() - began:.0f} s on {machine}.\n"
-    print(f"\n{table(rows)}\n{speed}From the start of the process to SR 97 %, SPL 88.4 % [s]:\n")
-    print(f"{seconds_table(seconds)}\n{parts_of_time}\n{took}")
-    content = {"rows": [asdict(row) for row in rows], "steps_per_second": per_second, "cost_by_number": costs}
-    content |= {"peak_gib": memory}
-    content |= {"seconds_to_the_papers_figures": seconds, "machine": machine}
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(content, indent=2) + "\n")
+    report = Report(options.limit_s)
+    for part in options.only or parts:
+        take(report, part)
+    print(f"\n{report.summary()}")
+    report.write(options.out)
     if options.publish:
-        (DOCS / "results" / "performance.md").write_text(f"{table(rows)}\n{speed}{took}")
-        (DOCS / "results" / "time_to_paper.md").write_text(seconds_table(seconds))
-        (DOCS / "results" / "profile.md").write_text(parts_of_time)
-        cost_figure(costs).savefig(DOCS / "figures" / "cost-by-vehicles.png", dpi=110)
+        report.publish()
 
 
 if __name__ == "__main__":

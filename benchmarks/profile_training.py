@@ -1,6 +1,6 @@
-"""Where the time of a training goes: `python -m benchmarks.profile_training`, half a minute.
+"""Profile of a training: `python -m benchmarks.profile_training`, half a minute.
 
-The recipe runs under Python's profiler, which adds a little to whatever calls many small functions.
+The recipe runs under Python's profiler, which slows code that calls many small functions a little.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import cProfile
 import pstats
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.training import recipe
@@ -20,25 +19,31 @@ PARTS = {
     "forward: the critics' loss": ("td3.py", "value_loss"),
     "forward: the actor's loss": ("td3.py", "actor_loss"),
     "backward": ("_tensor.py", "backward"),
-    "optimisers": ("adam.py", "step"),
-    "targets": ("td3.py", "step"),
-    "checks for numbers that are none": ("checkpoints.py", "check_finite"),
-    "evaluation": ("td3.py", "evaluation_rollout"),
+    "optimizers": ("adam.py", "step"),
+    "target networks": ("td3.py", "step"),
+    "checks for non-finite values": ("checks.py", "check_finite"),
+    "evaluation": ("rollout.py", "evaluation_rollout"),
 }
 
 
 def shares(frames: int = 61_440) -> dict[str, float]:
-    """Share of the training loop's time in each part."""
+    """Return the share of each part in the time of the training loop."""
     with tempfile.TemporaryDirectory() as folder:
-        config = replace(recipe.Config(), total_frames=frames, wandb_mode="disabled", eval_tasks=10)
-        config = replace(config, out=Path(folder) / "run")
+        out = Path(folder) / "run"
+        config = recipe.FAST.replace(total_frames=frames, wandb_mode="disabled", eval_tasks=10, out=out)
         profiler = cProfile.Profile()
         result = profiler.runcall(recipe.train, config)
     return shares_of(profiler, PARTS, result["training_seconds"])
 
 
 def shares_of(profiler: cProfile.Profile, parts: dict[str, tuple[str, str]], total: float) -> dict[str, float]:
-    """Share of some seconds that was spent in functions, each named by its file and its name; none calls another."""
+    """Return the share of functions in a time.
+
+    Args:
+        profiler: profile.
+        parts: file name and function name of each part; none of them may call another.
+        total: time [s].
+    """
     seconds = dict.fromkeys(parts, 0.0)
     for (file, _, name), (_, _, _, cumulative, _) in pstats.Stats(profiler).stats.items():
         for part, (ending, function) in parts.items():
@@ -49,7 +54,7 @@ def shares_of(profiler: cProfile.Profile, parts: dict[str, tuple[str, str]], tot
 
 
 def table(found: dict[str, float]) -> str:
-    """Shares in per cent."""
+    """Return the shares in percent as a Markdown table."""
     lines = ["| part | % |", "|---|---|", *(f"| {part} | {100 * share:.0f} |" for part, share in found.items())]
     return "\n".join(lines) + "\n"
 

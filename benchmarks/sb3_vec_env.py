@@ -1,7 +1,7 @@
 """stable-baselines3 over a batched Gymnasium environment.
 
-stable-baselines3 brings its own vectors of environments, which step copies one after the other or in processes. A fair
-comparison of training speed gives it what TorchRL has: one batched step for all vehicles.
+The vector environments of stable-baselines3 step copies one after the other, or in processes. A fair comparison of
+training speed gives it what TorchRL has: one batched step for all vehicles.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ class BatchedVecEnv(VecEnv):
     """A ``VecEnv`` whose vehicles live in one Gymnasium ``VectorEnv``.
 
     Args:
-        envs: batched environments that reset in the step in which a journey ends. Gymnasium's vector wrappers may be
+        envs: batched environments that reset in the step in which an episode ends. Gymnasium's vector wrappers may be
             around them, for example ``TransformReward`` to scale rewards.
 
     Raises:
-        ValueError: for environments that reset at another time.
+        ValueError: for environments with another autoreset mode.
 
     Example:
-        >>> import magrl.gymnasium_env
-        >>> envs = gymnasium.make_vec(magrl.gymnasium_env.ENV_ID, num_envs=4)
+        >>> from magrl.envs.gymnasium import ENV_ID
+        >>> envs = gymnasium.make_vec(ENV_ID, num_envs=4)
         >>> BatchedVecEnv(envs).reset().shape
         (4, 13)
     """
@@ -42,18 +42,18 @@ class BatchedVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Starts a journey of every vehicle; after ``seed(s)``, those of that one seed."""
+        """Start an episode of every vehicle; after ``seed(s)``, those of that one seed."""
         observations, _ = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._reset_seeds()
         self._reset_options()
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keeps the actions for :meth:`step_wait`."""
+        """Keep the actions for :meth:`step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Moves every vehicle."""
+        """Move every vehicle."""
         observations, rewards, terminated, truncated, info = self.envs.step(self._actions)
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(cut)} for cut in truncated]
         for index in np.flatnonzero(terminated | truncated):
@@ -63,29 +63,29 @@ class BatchedVecEnv(VecEnv):
         return observations, rewards, terminated | truncated, infos
 
     def close(self) -> None:
-        """Closes the environments."""
+        """Close the environments."""
         self.envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture of each vehicle's journey."""
+        """Return an image of each vehicle's episode."""
         return self.envs.render() or ()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The same attribute for each vehicle: they share one environment."""
+        """Return the same attribute for each vehicle: they share one environment."""
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Sets an attribute of the one environment, for all vehicles together."""
+        """Set an attribute of the shared environment, for all vehicles together."""
         self._all_or_none(indices)
         setattr(self.envs, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Calls a method of the one environment, once for all vehicles."""
+        """Call a method of the shared environment, once for all vehicles."""
         self._all_or_none(indices)
         return [getattr(self.envs, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Whether vehicles have a wrapper of their own; none has."""
+        """Return whether the shared environment is such a wrapper, for each vehicle."""
         return [isinstance(self.envs, wrapper_class)] * len(list(self._get_indices(indices)))
 
     def _all_or_none(self, indices: VecEnvIndices) -> None:

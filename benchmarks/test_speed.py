@@ -6,14 +6,13 @@ import pytest
 import torch
 
 from benchmarks import env, update
-from magrl import td3
-from magrl.env import GeomagneticNavEnv, paper_field
-from magrl.fields import IGRF, FieldModel
+from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.field import IGRF, FieldModel
 
 
 @pytest.fixture(params=["IGRF", "RegionalField"], scope="module")
 def field(request: pytest.FixtureRequest) -> FieldModel:
-    return IGRF("2022-01-01", 13) if request.param == "IGRF" else paper_field()
+    return IGRF("2022-01-01", 13) if request.param == "IGRF" else Scenario().build_field()
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +45,6 @@ def test_guided_collection(benchmark, vehicles: int) -> None:
 
 
 def test_gradient_step(benchmark) -> None:
-    seen = update.view()
-    learner = update.Learner(update.CONFIG, seen, torch.device("cpu"))
-    batch = update.transitions(td3.observation_size(seen))
-    benchmark(learner.update, batch, update.SATURATION)
-    assert torch.isfinite(learner.loss_critic)
+    recipe = update.Recipe(update.OBSERVATION_SIZE)
+    benchmark(recipe.update, update.transitions(update.OBSERVATION_SIZE))
+    assert recipe.updates > 0

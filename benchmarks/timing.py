@@ -1,4 +1,4 @@
-"""Two things timed alternately in one run, so that what slows the machine slows both."""
+"""Two functions timed alternately in one run, so that what slows the machine slows both."""
 
 from __future__ import annotations
 
@@ -7,52 +7,64 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+HEADER = "| baseline | magrl ms | baseline ms | speed-up | quartiles | goal |\n|---|---|---|---|---|---|\n"
+
 
 @dataclass(frozen=True)
 class Row:
-    """A ratio of two times.
+    """A comparison of two times.
 
     Args:
-        what: is compared.
-        first_ms: median time of the first [ms].
-        second_ms: median time of the second [ms].
-        ratio: median of second over first, pair by pair: how many times faster the first is.
-        low: its lower quartile.
-        high: its upper quartile.
-        goal: what the ratio should be, for a reader.
+        what: operation, and the baseline it is compared with.
+        magrl_ms: median time of magrl [ms].
+        baseline_ms: median time of the baseline [ms].
+        speed_up: median of baseline over magrl, pair by pair.
+        low: lower quartile of the speed-up.
+        high: upper quartile of the speed-up.
+        goal: goal of the speed-up, for a reader.
     """
 
     what: str
-    first_ms: float
-    second_ms: float
-    ratio: float
+    magrl_ms: float
+    baseline_ms: float
+    speed_up: float
     low: float
     high: float
     goal: str = ""
 
+    def __str__(self) -> str:
+        """Return a line of the Markdown table that starts with :data:`HEADER`."""
+        cells = (f"{self.magrl_ms:.3g}", f"{self.baseline_ms:.3g}", f"{self.speed_up:.2f}")
+        return f"| {self.what} | {' | '.join(cells)} | {self.low:.2f}–{self.high:.2f} | {self.goal} |"
+
 
 def alternate(
     what: str,
-    first: Callable[[], object],
-    second: Callable[[], object],
+    magrl: Callable[[], object],
+    baseline: Callable[[], object],
     *,
     repeats: int = 15,
     goal: str = "",
     inner: int = 1,
+    limit_s: float = 60.0,
 ) -> Row:
-    """Times two functions in turn, after one call of each that is not counted.
+    """Time two functions in turn, after one call of each that is not counted.
 
     Args:
-        what: is compared.
-        first: function under test.
-        second: what it is compared with.
-        repeats: pairs of times.
-        goal: what the ratio should be.
+        what: operation, and the baseline it is compared with.
+        magrl: function under test.
+        baseline: function that it is compared with.
+        repeats: number of pairs.
+        goal: goal of the speed-up.
         inner: calls that one time is the mean of, for functions of microseconds.
+        limit_s: time after which no further pair is started, once there are five [s].
     """
+    started = time.perf_counter()
     times: tuple[list[float], list[float]] = ([], [])
     for repeat in range(repeats + 1):
-        for function, kept in zip((first, second), times, strict=True):
+        if repeat > 5 and time.perf_counter() - started > limit_s:
+            break
+        for function, kept in zip((magrl, baseline), times, strict=True):
             began = time.perf_counter()
             for _ in range(inner):
                 function()

@@ -1,4 +1,4 @@
-"""Settings of the documentation: `make docs` builds it into build/docs, without the network."""
+"""Sphinx configuration: `make docs` builds the documentation in build/docs, without network access."""
 
 import sys
 from pathlib import Path
@@ -6,15 +6,12 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
-import magrl  # noqa: E402 - from this tree, whatever is installed
+import magrl  # noqa: E402 - this tree, not an installed version
 
 project, author, version = "magrl", "The magrl developers", magrl.__version__
 project_copyright = author
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.apidoc", "sphinx.ext.viewcode"]
-exclude_patterns = [
-    "results",
-    "api/modules.rst",
-]  # tables that recipes/publish.py puts into the pages, and a second list
+exclude_patterns = ["results", "api/modules.rst"]  # tables that are part of the pages, and a second list of modules
 
 html_theme = "furo"
 html_title = f"magrl {version}"
@@ -24,10 +21,11 @@ myst_heading_anchors = 3
 
 apidoc_modules = [{"path": "../magrl", "destination": "api", "separate_modules": True, "max_depth": 1}]
 apidoc_options = ["members", "show-inheritance"]
-autodoc_default_options = {"ignore-module-all": True}  # a name is described where it is defined, and only there
+autodoc_default_options = {"ignore-module-all": True}  # describe a name only where it is defined
 apidoc_module_first = True
 autodoc_member_order = "bysource"
-autodoc_inherit_docstrings = False  # TorchRL's are not ours to publish
+autodoc_inherit_docstrings = False  # do not repeat TorchRL's docstrings
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
+napoleon_use_ivar = True  # attributes as fields of their class, which may also be documented by autodoc
 napoleon_custom_sections = ["Source"]

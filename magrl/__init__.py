@@ -1,59 +1,57 @@
 """Navigation by the Earth's magnetic field: a TorchRL environment, transforms and what trains on them.
 
-The names in ``magrl.__all__`` are loaded when first used, so that importing the package costs no more than Python
-itself.
+Importing the package registers ``magrl/GeomagneticNavigation-v0`` with Gymnasium. The names in ``magrl.__all__`` are
+loaded when first used, so that the import does not load torch.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+import gymnasium as _gymnasium
 
-_HOMES = {
-    "IGRF": "fields",
-    "RegionalField": "regional",
-    "SphericalHarmonicField": "fields",
-    "GeomagneticNavEnv": "env",
-    "Region": "tasks",
-    "Tasks": "tasks",
-    "task_set": "tasks",
-    "World": "worlds",
-    "load_world": "worlds",
-    "AlignmentReward": "transforms",
-    "AngleVector": "transforms",
-    "FieldGradient": "transforms",
-    "GradientHeading": "transforms",
-    "MinMaxNorm": "transforms",
-    "TargetDifference": "transforms",
-    "FieldPolicy": "td3",
-    "load_policy": "td3",
-    "save_policy": "td3",
-    "episode_measures": "metrics",
-    "summarise": "metrics",
+__version__ = "0.2.0"
+
+_PACKAGES = {
+    "field": ("IGRF", "RegionalField", "SphericalHarmonicField"),
+    "transforms": (
+        "AlignmentReward",
+        "AngleVector",
+        "FieldGradient",
+        "GradientHeading",
+        "MinMaxNorm",
+        "ObservationView",
+        "TargetDifference",
+    ),
+    "envs": ("GeomagneticNavEnv", "Region", "Scenario", "Tasks", "load_scenario", "task_set"),
+    "agents": ("FieldPolicy", "load_policy", "save_policy"),
+    "evaluation": ("episode_measures", "evaluation_rollout", "summarize"),
 }
+_HOMES = {name: package for package, names in _PACKAGES.items() for name in names}
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:  # the same names for type checkers and editors
-    from magrl.env import GeomagneticNavEnv as GeomagneticNavEnv
-    from magrl.fields import IGRF as IGRF
-    from magrl.fields import SphericalHarmonicField as SphericalHarmonicField
-    from magrl.metrics import episode_measures as episode_measures
-    from magrl.metrics import summarise as summarise
-    from magrl.regional import RegionalField as RegionalField
-    from magrl.tasks import Region as Region
-    from magrl.tasks import Tasks as Tasks
-    from magrl.tasks import task_set as task_set
-    from magrl.td3 import FieldPolicy as FieldPolicy
-    from magrl.td3 import load_policy as load_policy
-    from magrl.td3 import save_policy as save_policy
+    from magrl.agents import FieldPolicy as FieldPolicy
+    from magrl.agents import load_policy as load_policy
+    from magrl.agents import save_policy as save_policy
+    from magrl.envs import GeomagneticNavEnv as GeomagneticNavEnv
+    from magrl.envs import Region as Region
+    from magrl.envs import Scenario as Scenario
+    from magrl.envs import Tasks as Tasks
+    from magrl.envs import load_scenario as load_scenario
+    from magrl.envs import task_set as task_set
+    from magrl.evaluation import episode_measures as episode_measures
+    from magrl.evaluation import evaluation_rollout as evaluation_rollout
+    from magrl.evaluation import summarize as summarize
+    from magrl.field import IGRF as IGRF
+    from magrl.field import RegionalField as RegionalField
+    from magrl.field import SphericalHarmonicField as SphericalHarmonicField
     from magrl.transforms import AlignmentReward as AlignmentReward
     from magrl.transforms import AngleVector as AngleVector
     from magrl.transforms import FieldGradient as FieldGradient
     from magrl.transforms import GradientHeading as GradientHeading
     from magrl.transforms import MinMaxNorm as MinMaxNorm
+    from magrl.transforms import ObservationView as ObservationView
     from magrl.transforms import TargetDifference as TargetDifference
-    from magrl.worlds import World as World
-    from magrl.worlds import load_world as load_world
 
 
 def __getattr__(name: str) -> Any:
@@ -64,3 +62,11 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted([*globals(), *_HOMES])
+
+
+if "magrl/GeomagneticNavigation-v0" not in _gymnasium.registry:
+    _gymnasium.register(
+        "magrl/GeomagneticNavigation-v0",
+        entry_point="magrl.envs.gymnasium:GeomagneticNavGymEnv",
+        vector_entry_point="magrl.envs.gymnasium:GeomagneticNavVectorEnv",
+    )

@@ -1,6 +1,7 @@
-"""Checks of arguments: what cannot be used is refused by its name and value.
+"""Argument checks. Each error names the argument, the value and what would be right.
 
-Types, shapes and numbers are looked at, the values inside tensors never: that would make an accelerator wait.
+Checks that run in every call read types, shapes and Python numbers, never values inside tensors, since that would wait
+for an accelerator. :func:`check_finite` and :func:`require` do read values.
 """
 
 from __future__ import annotations
@@ -8,20 +9,74 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from numbers import Integral, Real
+from typing import Any
 
 import torch
+from pydantic import BaseModel, ConfigDict, ValidationError
+from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import Self
+
+
+def check_finite(data: TensorDictBase | Iterable[tuple[str, Tensor]], what: str) -> None:
+    """Raise unless every floating-point value is finite.
+
+    Args:
+        data: batch ``(N, ...)``, or pairs of name and tensor.
+        what: context, at the start of the message.
+
+    Raises:
+        FloatingPointError: naming the key and the rows (vehicles of a batch) that hold NaN or an infinite value.
+
+    Example:
+        >>> check_finite([("loss", torch.tensor([1.0, float("nan")]))], "update 7")
+        Traceback (most recent call last):
+            ...
+        FloatingPointError: update 7: loss is not finite in rows [1]
+    """
+    items = data.items(True, True) if isinstance(data, TensorDictBase) else data
+    for key, value in items:
+        # A sum is finite unless an entry is not, or it overflows: one kernel in nearly all cases.
+        if value.is_floating_point() and not torch.isfinite(value.detach().sum()):
+            bad = ~torch.isfinite(value.detach())
+            if bad.any():
+                rows = bad.reshape(len(bad) if bad.ndim else 1, -1).any(1).nonzero().squeeze(-1)[:8].tolist()
+                name = ".".join(key) if isinstance(key, tuple) else key
+                raise FloatingPointError(f"{what}: {name} is not finite in rows {rows}")
+
+
+def require(good: Tensor, values: Tensor, message: str) -> None:
+    """Raise unless every entry of a mask is True; compiled code cannot put the value into the message.
+
+    Args:
+        good: bool mask.
+        values: values of the same shape.
+        message: message with ``{}`` in place of the first value that is not good.
+
+    Raises:
+        ValueError: with the message.
+
+    Example:
+        >>> speed = torch.tensor([3.0, -1.0])
+        >>> require(speed >= 0, speed, "speed {} is negative")
+        Traceback (most recent call last):
+        ValueError: speed -1.0 is negative
+    """
+    if torch.compiler.is_compiling():
+        torch._assert_async(good.all(), message)
+    elif not good.all():
+        raise ValueError(message.format(values[~good].flatten()[0].item()))
 
 
 def check_tensor(*last: int, **tensors: object) -> None:
-    """Refuses what is no tensor of real numbers, or does not end in the dimensions ``last``.
+    """Raise unless each value is a tensor of real numbers whose last dimensions have the sizes ``last``.
 
     Args:
-        last: sizes of the last dimensions; any shape will do without them.
-        tensors: by the name that the message shall give them.
+        last: sizes of the last dimensions; any shape is accepted without them.
+        tensors: values by the name that the message uses.
 
     Raises:
-        TypeError: for what is no tensor, or one of bools or of complex numbers.
+        TypeError: for a value that is not a tensor, or a tensor of bools or complex numbers.
         ValueError: for another shape.
 
     Example:
@@ -42,14 +97,14 @@ def check_tensor(*last: int, **tensors: object) -> None:
 def check_number(
     low: float = -math.inf, high: float = math.inf, *, above: bool = False, whole: bool = False, **numbers: object
 ) -> None:
-    """Refuses what is no finite number from ``low`` to ``high``.
+    """Raise unless each value is a finite number from ``low`` to ``high``.
 
     Args:
-        low: least that is allowed.
-        high: most that is allowed.
-        above: whether ``low`` itself is refused.
-        whole: whether fractions are refused.
-        numbers: by the name that the message shall give them.
+        low: smallest allowed value.
+        high: largest allowed value.
+        above: whether ``low`` itself is excluded.
+        whole: whether the number must be an integer.
+        numbers: values by the name that the message uses.
 
     Raises:
         ValueError: with the name and the value.
@@ -60,8 +115,8 @@ def check_number(
         ValueError: num_envs must be a whole number from 1 on, got 1.5
     """
     for name, value in numbers.items():
-        sound = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
-        if not (sound and math.isfinite(value) and low <= value <= high and not (above and value == low)):  # type: ignore
+        number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
+        if not number or not math.isfinite(value) or not low <= value <= high or (above and value == low):  # type: ignore
             kind = "a whole number" if whole else "a finite number"
             start = "" if low == -math.inf else f" {'above' if above else 'from'} {low:g}"
             end = f" up to {high:g}" if high < math.inf else " on" if start and not above else ""
@@ -69,7 +124,7 @@ def check_number(
 
 
 def check_numbers(count: int, **values: object) -> None:
-    """Refuses what is not ``count`` finite numbers.
+    """Raise unless each value consists of ``count`` finite numbers.
 
     Raises:
         ValueError: with the name and the values.
@@ -87,7 +142,7 @@ def check_numbers(count: int, **values: object) -> None:
 
 
 def check_type(kind: type | tuple[type, ...], **values: object) -> None:
-    """Refuses what is no instance of a class.
+    """Raise unless each value is an instance of a class.
 
     Raises:
         TypeError: with the name and the value.
@@ -101,3 +156,69 @@ def check_type(kind: type | tuple[type, ...], **values: object) -> None:
         if not isinstance(value, kind):
             kinds = kind if isinstance(kind, tuple) else (kind,)
             raise TypeError(f"{name} must be a {' or '.join(k.__name__ for k in kinds)}, got {value!r}")
+
+
+class CheckedModel(BaseModel):
+    """A pydantic model whose errors name the field, the value and what would be right, in one line.
+
+    Fields are strict (no text for a number, no bool for an integer), finite and frozen; unknown names raise an error.
+
+    Raises:
+        ValueError: naming each field that is wrong.
+
+    Example:
+        >>> from pydantic import Field
+        >>> class Options(CheckedModel):
+        ...     tau: float = Field(0.01, gt=0, le=1)
+        >>> Options(tau=2.0)
+        Traceback (most recent call last):
+        ValueError: tau must be less than or equal to 1, got 2.0
+    """
+
+    model_config = ConfigDict(
+        strict=True,
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+        validate_default=True,
+    )
+
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise ValueError(self._message(error)) from None
+
+    def replace(self, **values: Any) -> Self:
+        """Return a copy with other values, validated again."""
+        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | values)
+
+    @classmethod
+    def _message(cls, error: ValidationError) -> str:
+        return "; ".join(dict.fromkeys(cls._sentence(item) for item in error.errors()))
+
+    @classmethod
+    def _sentence(cls, item: Any) -> str:
+        name, kind, value = ".".join(map(str, item["loc"])), item["type"], short(item["input"])
+        if kind == "extra_forbidden":
+            return f"unknown key {name!r}: choose from {', '.join(cls.model_fields)}"
+        if kind == "missing":
+            return f"{name} is missing"
+        if kind == "too_short":
+            return f"{name} must hold at least {item['ctx']['min_length']} value, got {value}"
+        text = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be", 1)
+        if kind == "value_error":
+            return text if not name or text.startswith(name) else f"{name}: {text}"
+        return f"{name} {text}, got {value}"
+
+
+def short(value: object, length: int = 80) -> str:
+    """Return the representation of a value, cut to a length that fits in a message.
+
+    Example:
+        >>> short("x" * 100, 10)
+        "'xxxxxx..."
+    """
+    text = repr(value)
+    return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -1,12 +1,12 @@
 """Positions, moves, distances and bearings on the WGS84 ellipsoid.
 
-Latitudes and longitudes are geodetic and in degrees, distances in kilometres, headings and bearings in
+Latitudes and longitudes are geodetic and in degrees, distances in kilometers, headings and bearings in
 radians clockwise from true north. Every function is pure, batched by broadcasting, and smooth across the
 antimeridian; nothing here divides by the cosine of the latitude, so the poles are ordinary points.
 
-Types, dtypes and shapes are checked, and refused by name. Values are not, because looking at them would make an
-accelerator wait at every step: NaN or infinity in gives NaN out, and a latitude beyond 90 degrees goes on over the
-pole. Only :func:`geodesic` refuses such a latitude.
+Types, dtypes and shapes are checked. Values are not, because reading them would synchronize an accelerator at every
+step: NaN or infinity in gives NaN out, and a latitude beyond 90 degrees continues over the pole. Only :func:`geodesic`,
+:func:`check_positions` and :func:`check_box` check values.
 """
 
 from __future__ import annotations
@@ -17,20 +17,26 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from magrl.checks import check_tensor
+from magrl.checks import check_numbers, check_tensor, require
 
 WGS84_A_KM = 6378.137
 """Semi-major axis of the WGS84 ellipsoid [km]."""
+
+
 WGS84_F = 1 / 298.257223563
 """Flattening of the WGS84 ellipsoid."""
+
+
 WGS84_E2 = WGS84_F * (2 - WGS84_F)
 """First eccentricity squared of the WGS84 ellipsoid."""
+
+
 WGS84_B_KM = WGS84_A_KM * (1 - WGS84_F)
 """Semi-minor axis of the WGS84 ellipsoid [km]."""
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """Wraps an angle to the half-open turn (-pi, pi].
+    """Wrap an angle to the half-open turn (-pi, pi].
 
     Args:
         angle: any shape [rad].
@@ -49,7 +55,7 @@ def wrap_angle(angle: Tensor) -> Tensor:
 
 
 def wrap_longitude(longitude: Tensor) -> Tensor:
-    """Wraps a longitude to (-180, 180] degrees.
+    """Wrap a longitude to (-180, 180] degrees.
 
     Args:
         longitude: any shape [deg].
@@ -67,7 +73,7 @@ def wrap_longitude(longitude: Tensor) -> Tensor:
 
 
 def curvature_radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
-    """Principal radii of curvature of the ellipsoid.
+    """Return the principal radii of curvature of the ellipsoid.
 
     Args:
         latitude: ``(...)`` [deg].
@@ -86,14 +92,14 @@ def curvature_radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def local_frame(latitude: Tensor, longitude: Tensor) -> Tensor:
-    """The north, east and down unit vectors in Earth-centred, Earth-fixed axes.
+    """Return the north, east and down unit vectors in Earth-centered, Earth-fixed (ECEF) axes.
 
     Args:
         latitude: ``(...)`` [deg].
-        longitude: ``(...)`` [deg]; at a pole it says which meridian "north" follows.
+        longitude: ``(...)`` [deg]; at a pole it selects the meridian that north follows.
 
     Returns:
-        ``(..., 3, 3)``: its rows are north, east, down, so that ``frame @ v_ecef`` is ``v_ned``.
+        ``(..., 3, 3)``, rows north, east, down, so that ``frame @ v_ecef`` is ``v_ned``.
 
     Example:
         >>> local_frame(torch.tensor(0.0), torch.tensor(0.0)).round()
@@ -110,12 +116,12 @@ def local_frame(latitude: Tensor, longitude: Tensor) -> Tensor:
 
 
 def to_ecef(latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float = 0.0) -> Tensor:
-    """Geodetic position to Earth-centred, Earth-fixed coordinates.
+    """Convert geodetic positions to Earth-centered, Earth-fixed (ECEF) coordinates.
 
     Args:
         latitude: ``(...)`` [deg].
         longitude: ``(...)`` [deg].
-        altitude_km: height over the ellipsoid, ``(...)`` or a number [km].
+        altitude_km: height above the ellipsoid, ``(...)`` or a number [km].
 
     Returns:
         ``(..., 3)`` [km]: x towards (0, 0), y towards (0, 90 E), z towards the north pole.
@@ -136,15 +142,18 @@ def to_ecef(latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float = 0
 
 
 def from_ecef_surface(ecef: Tensor) -> tuple[Tensor, Tensor]:
-    """Geodetic latitude and longitude of a point on or very near the ellipsoid.
+    """Return geodetic latitude and longitude of points on or very near the ellipsoid.
 
-    One step of Bowring (1976), exact on the surface and within 1e-9 degrees for heights below 10 km.
+    One step of Bowring's method (1976): exact on the surface and within 1e-9 degrees for heights below 10 km.
 
     Args:
         ecef: ``(..., 3)`` [km].
 
     Returns:
         Latitude and longitude, each ``(...)`` [deg], the longitude in [-180, 180].
+
+    Source:
+        B. R. Bowring, Transformation from spatial to geographical coordinates, Survey Review 23 (1976).
 
     Example:
         >>> lat, lon = from_ecef_surface(to_ecef(torch.tensor(-8.0), torch.tensor(164.0)))
@@ -157,7 +166,7 @@ def from_ecef_surface(ecef: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _surface_latitude(horizontal: Tensor, z: Tensor) -> Tensor:
-    """Latitude [deg] of a point on the ellipsoid from its distances to the axis and to the equator's plane [km]."""
+    """Return the latitude [deg] of a point on the ellipsoid from its distances to axis and equatorial plane [km]."""
     up, out = z * WGS84_A_KM, horizontal * WGS84_B_KM
     scale = torch.hypot(up, out)
     top = z + WGS84_E2 / (1 - WGS84_E2) * WGS84_B_KM * (up / scale) ** 3
@@ -165,16 +174,16 @@ def _surface_latitude(horizontal: Tensor, z: Tensor) -> Tensor:
 
 
 def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tensor) -> tuple[Tensor, Tensor]:
-    """Where a short leg at a heading leads (Eq. 2-3 on the ellipsoid).
+    """Return the end of a short move at a heading (Eq. 2-3 on the ellipsoid).
 
-    The leg is the circle that osculates the geodesic at its start, with Euler's radius for that heading. It is
+    The path is the circle that osculates the geodesic at its start, with Euler's radius for that heading. It is
     within 5 mm of the geodesic at 50 km and within 5 m at 500 km, and works at the poles and across the
     antimeridian.
 
     Args:
         latitude: ``(...)`` [deg].
         longitude: ``(...)`` [deg].
-        heading: ``(...)`` at the start of the leg [rad, clockwise from true north].
+        heading: ``(...)`` at the start [rad, clockwise from true north].
         distance_km: ``(...)`` [km].
 
     Returns:
@@ -195,7 +204,7 @@ def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tens
     arc = distance_km / radius
     along, fall = radius * torch.sin(arc), 2 * radius * torch.sin(arc / 2) ** 2
     north, east = along * cos, along * sin
-    # Where the leg ends: outward from the Earth's axis in the plane of its first meridian, along the axis, and across.
+    # End point: outward from the Earth's axis in the plane of the first meridian, along the axis, and across.
     outward = (prime_vertical - fall) * cos_phi - north * sin_phi
     axial = (prime_vertical * (1 - WGS84_E2) - fall) * sin_phi + north * cos_phi
     turned = torch.rad2deg(torch.atan2(east, outward))
@@ -206,10 +215,10 @@ def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tens
 
 
 def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude2: Tensor) -> tuple[Tensor, Tensor]:
-    """Length and first bearing of the geodesic from one point to another.
+    """Return length and initial bearing of the geodesic from one point to another.
 
-    Vincenty's inverse formula, at most 30 iterations: within 1 mm, but for pairs within about one
-    degree of being antipodal, where it does not converge and the answer is NaN.
+    Vincenty's inverse formula, at most 30 iterations: within 1 mm, except for pairs within about one
+    degree of being antipodal, where it does not converge and the result is NaN.
 
     Args:
         latitude1: ``(...)`` of the start [deg].
@@ -222,7 +231,7 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
         zero and zero for coincident points, NaN where an input is NaN or a longitude infinite.
 
     Raises:
-        ValueError: naming a latitude that is beyond 90 degrees.
+        ValueError: for a latitude beyond 90 degrees, with its value.
 
     Source:
         T. Vincenty, Direct and inverse solutions of geodesics on the ellipsoid, Survey Review 23 (1975).
@@ -244,7 +253,7 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
     difference = wrap_angle(lon2 - lon1)
     lam, change = difference, torch.zeros_like(difference)
     for _ in range(30):
-        # atan2 keeps its accuracy where the arc is tiny, which the cosine of it does not.
+        # atan2 is accurate for tiny arcs, where the cosine alone is not.
         x, y = cu2 * torch.sin(lam), cu1 * su2 - su1 * cu2 * torch.cos(lam)
         sin_sigma = torch.hypot(x, y)
         cos_sigma = su1 * su2 + cu1 * cu2 * torch.cos(lam)
@@ -269,3 +278,54 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
     bearing = wrap_angle(torch.atan2(x, y))
     dtype = reduce(torch.promote_types, (x.dtype for x in inputs), torch.float32)
     return torch.where(converged, distance, nan).to(dtype), torch.where(converged, bearing, nan).to(dtype)
+
+
+def check_positions(latitude: Tensor, longitude: Tensor) -> None:
+    """Raise unless positions are finite and latitudes within 90 degrees.
+
+    Args:
+        latitude: any shape [deg].
+        longitude: any shape [deg].
+
+    Raises:
+        TypeError: for values that are not real tensors.
+        ValueError: with the first latitude beyond 90 degrees, or the first non-finite value.
+
+    Example:
+        >>> check_positions(torch.tensor([0.0, 95.0]), torch.zeros(2))
+        Traceback (most recent call last):
+            ...
+        ValueError: latitude 95.0 is not between -90 and 90 degrees
+    """
+    check_tensor(latitude=latitude, longitude=longitude)
+    require(latitude.abs() <= 90, latitude, "latitude {} is not between -90 and 90 degrees")
+    require(longitude.abs() < math.inf, longitude, "longitude {} is not a finite number of degrees")
+
+
+def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> None:
+    """Raise unless a latitude-longitude box is finite, not empty, and rises from south to north and west to east.
+
+    Args:
+        latitude: southern and northern edge [deg].
+        longitude: western and eastern edge [deg]; (170, 190) crosses the antimeridian.
+
+    Raises:
+        ValueError: with the values.
+
+    Example:
+        >>> check_box((-10, 0), (170, 190))
+        >>> check_box((0, -10), (170, 190))
+        Traceback (most recent call last):
+            ...
+        ValueError: latitudes (0, -10) must rise from south to north within [-90, 90] degrees
+    """
+    check_numbers(2, latitudes=latitude, longitudes=longitude)
+    south, north = latitude
+    west, east = longitude
+    if not (-90 <= south < north <= 90):
+        raise ValueError(f"latitudes {latitude} must rise from south to north within [-90, 90] degrees")
+    if not (math.isfinite(west) and math.isfinite(east) and west < east <= west + 360):
+        raise ValueError(
+            f"longitudes {longitude} must rise from west to east by at most 360 degrees "
+            "(write a box across the antimeridian as, for example, (170, 190))"
+        )

@@ -1,10 +1,9 @@
 """The paper's equations as pure functions of tensors: objective, rewards and the parallel approach.
 
-Nothing here knows of environments or keys. Shapes broadcast over leading dimensions; angles are in radians
-clockwise from true north unless a name says otherwise; the last dimension of a ``field`` is the element
-(D [deg], I [deg], B_H [nT]).
+Shapes broadcast over leading dimensions; angles are in radians clockwise from true north unless a name says
+otherwise; the last dimension of a ``field`` is the element (D [deg], I [deg], B_H [nT]).
 
-These run in every step, so types and shapes are checked and values are not: NaN in gives NaN out, but for
+Types and shapes are checked. Values are not, because the functions run in every step: NaN in gives NaN out, except in
 :func:`parallel_approach`, whose mask is False there.
 """
 
@@ -19,22 +18,22 @@ from magrl.checks import check_tensor
 from magrl.geodesy import wrap_angle
 
 OBJECTIVE_FLOORS = (0.05, 0.4, 15.0)
-"""Least ``|B_T - B_0|`` of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 25 km of travel each."""
+"""Smallest ``|B_T - B_0|`` of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 25 km of travel each."""
 
 
 def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Tensor:
-    """The weights 1 / (B_T - B_0)^2 of Eq. 2-6, with each difference floored so that none is infinite.
+    """Return the weights 1 / (B_T - B_0)^2 of Eq. 2-6, with a floor under each difference so that none is infinite.
 
     Args:
-        field: ``(..., E)`` elements where the journey starts.
+        field: ``(..., E)`` elements where the episode starts.
         target_field: ``(..., E)`` elements at the destination.
-        floors: ``(E,)`` least absolute difference, in the element's unit.
+        floors: ``(E,)`` smallest absolute difference, in the element's unit.
 
     Returns:
         ``(..., E)`` weights, per squared unit.
 
     Raises:
-        ValueError: where E is not one number of elements.
+        ValueError: if the last dimensions differ.
 
     Example:
         >>> objective_weights(torch.tensor([8.0, -16.0]), torch.tensor([10.0, -16.0]), torch.tensor([0.05, 0.5]))
@@ -45,10 +44,10 @@ def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Te
 
 
 def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
-    """The normalised distance to the destination in field space, F of Eq. 2-6.
+    """Return the normalized distance to the destination in field space, F of Eq. 2-6.
 
     Args:
-        field: ``(..., E)`` elements here.
+        field: ``(..., E)`` elements at the vehicle.
         target_field: ``(..., E)`` elements at the destination.
         weights: ``(..., E)`` from :func:`objective_weights` at the start.
 
@@ -56,7 +55,7 @@ def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
         ``(..., 1)``, dimensionless: at most E at the start, 0 at the destination.
 
     Raises:
-        ValueError: where E is not one number of elements.
+        ValueError: if the last dimensions differ.
 
     Example:
         >>> objective(torch.tensor([9.0, -16.0]), torch.tensor([10.0, -16.0]), torch.tensor([0.25, 4.0]))
@@ -67,7 +66,17 @@ def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
 
 
 def destination_reward(arrived: Tensor, weight: float) -> Tensor:
-    """Eq. 3-3, first term: ``weight`` at arrival, 0 elsewhere.
+    """Return the first term of Eq. 3-3: ``weight`` at arrival, 0 elsewhere.
+
+    Args:
+        arrived: ``(...)`` bool.
+        weight: zeta_1.
+
+    Returns:
+        ``(...)``.
+
+    Raises:
+        TypeError: if ``arrived`` is not a bool tensor.
 
     Example:
         >>> destination_reward(torch.tensor([True, False]), 200.0)
@@ -79,7 +88,7 @@ def destination_reward(arrived: Tensor, weight: float) -> Tensor:
 
 
 def _check_elements(**fields: Tensor) -> None:
-    """Refuses tensors whose last dimensions, the elements, differ: one of size 1 would be spread over all of them."""
+    """Raise unless all last dimensions, the elements, are equal: one of size 1 would be broadcast to all elements."""
     check_tensor(**fields)
     sizes = {tensor.shape[-1:] for tensor in fields.values()}
     if len(sizes) != 1 or torch.Size() in sizes:
@@ -88,11 +97,11 @@ def _check_elements(**fields: Tensor) -> None:
 
 
 def proximity_reward(objective_before: Tensor, objective_after: Tensor, weight: float) -> Tensor:
-    """Eq. 3-5: pays for what a move takes off the objective.
+    """Return the reward of Eq. 3-5: ``weight`` times the decrease of the objective in a step.
 
     Args:
-        objective_before: ``(...)`` F where the move was chosen.
-        objective_after: ``(...)`` F where it led.
+        objective_before: ``(...)`` F before the move.
+        objective_after: ``(...)`` F after the move.
         weight: zeta_2.
 
     Returns:
@@ -107,17 +116,20 @@ def proximity_reward(objective_before: Tensor, objective_after: Tensor, weight: 
 
 
 def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
-    """The decay of late proximity rewards, which the paper describes without a formula.
+    """Return late proximity rewards after their decay, which the paper describes without a formula.
 
-    Past half of the step limit, ``(n / n_max) |R|`` is taken off: gains shrink and losses grow.
+    After half of the step limit, ``(n / n_max) |R|`` is subtracted: gains shrink and losses grow.
 
     Args:
         proximity: ``(...)`` from :func:`proximity_reward`.
         step: ``(...)`` number of the move, counted from 1.
-        max_steps: the step limit n_max.
+        max_steps: step limit n_max.
 
     Returns:
         ``(...)``.
+
+    Raises:
+        ValueError: for a step limit below 1.
 
     Example:
         >>> late_decay(torch.tensor([4.0, 4.0, -4.0]), torch.tensor([25, 40, 40]), 50)
@@ -131,14 +143,14 @@ def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
 
 
 def alignment_reward(angle: Tensor, reference: Tensor, weight: float, offset: float = math.pi / 4) -> Tensor:
-    """Eq. 3-6: pays for holding an angle close to a reference.
+    """Return the alignment reward of Eq. 3-6: high where an angle is close to a reference.
 
     Args:
         angle: ``(...)`` heading of the move just made [rad].
-        reference: ``(...)`` theoretical heading where it was chosen [rad].
+        reference: ``(...)`` theoretical heading before the move [rad].
         weight: zeta_3 [1/rad].
-        offset: deviation at which the term changes sign [rad]. The paper's pi/4 pays an aligned vehicle for every
-            step it takes, the last ones included; an offset of 0 only ever takes away.
+        offset: deviation at which the term changes sign [rad]. With the paper's pi/4 an aligned vehicle is rewarded for
+            every step; with 0 the term is never positive.
 
     Returns:
         ``(...)``: from ``weight * offset`` down to ``weight * (offset - pi)``.
@@ -154,16 +166,16 @@ def alignment_reward(angle: Tensor, reference: Tensor, weight: float, offset: fl
 def parallel_approach(
     field: Tensor, target_field: Tensor, gradient: Tensor, min_crossing: float = math.radians(2.0)
 ) -> tuple[Tensor, Tensor]:
-    """The heading on which two elements approach their targets in proportion (Eq. 3-15, unambiguous).
+    """Return the heading at which two elements approach their targets in proportion (Eq. 3-15, unambiguous).
 
-    The paper's arctan of a quotient leaves two opposite headings. The one that is meant is the direction of
-    ``J^-1 (B_T - B)``; with the adjugate for the inverse it needs no division, only the sign of the determinant.
+    The paper's arctan of a quotient leaves two opposite headings. The intended one is the direction of
+    ``J^-1 (B_T - B)``; with the adjugate in place of the inverse it needs the sign of the determinant but no division.
 
     Args:
-        field: ``(..., 2)`` two elements here.
+        field: ``(..., 2)`` two elements at the vehicle.
         target_field: ``(..., 2)`` the same at the destination.
         gradient: ``(..., 2, 2)`` their derivatives northward and eastward [element unit / km].
-        min_crossing: least angle at which the two gradients must cross [rad].
+        min_crossing: smallest angle at which the two gradients must cross [rad].
 
     Returns:
         The heading ``(..., 1)`` [rad, (-pi, pi]] and a mask ``(..., 1)``: False, with heading 0, where the gradients
@@ -171,7 +183,7 @@ def parallel_approach(
         input is NaN.
 
     Raises:
-        ValueError: for other shapes, or a crossing angle outside [0, pi/2).
+        ValueError: for shapes that do not match, or a crossing angle outside [0, pi/2).
 
     Source:
         Eqs. 3-12 to 3-15, after the bionic navigation of Wang et al. (2018).

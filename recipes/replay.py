@@ -1,121 +1,144 @@
-"""Writes a page on which journeys can be watched: one file that opens from disk, with nothing to install or download.
+"""Write a page that replays episodes: one file that opens from disk, without installation or network.
 
     python recipes/replay.py runs/A                                     # writes runs/A/replay.html
-    python recipes/replay.py runs/A --navigators secant pso:flown --num-tasks 5 --gif journeys.gif
+    python recipes/replay.py runs/A --navigators secant pso:flown --num-tasks 5 --gif episodes.gif
 
-The run's policy comes first, then the navigators, all over the same tasks. Takes seconds.
+The run's policy comes first, then the other navigators, all on the same tasks. Takes seconds.
 """
 
 from __future__ import annotations
 
 import os
 
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
 import json
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
-from evaluate import Config as Evaluation
-from evaluate import env_of, first, journeys, label, navigator
+from evaluate import TaskSet, choose_tasks, first_tasks, make_env
+from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 
-from magrl.replay import replay_data, write_gif, write_replay
-from magrl.td3 import evaluation_rollout
+from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation import evaluation_rollout
+from magrl.evaluation.navigators import label, make_navigator
+from magrl.evaluation.replay import replay_data, write_gif, write_replay
+from magrl.files import check_writable
+from magrl.training import UsageError, command
 
+RECIPE = "replay.py"
 DEFAULT_TASKS = 12
 
 
 @dataclass(frozen=True)
 class Config:
-    """What is flown, over what, and where the page goes."""
+    """Settings of a replay."""
 
     run: tyro.conf.Positional[Path]
     """Folder of a finished training."""
     navigators: tuple[str, ...] = ("secant", "parallel")
-    """Beside the run's policy, as recipes/evaluate.py takes them."""
+    """Navigators beside the run's policy, as in recipes/evaluate.py."""
     num_tasks: int | None = None
-    """The first so many of the tasks; 12 by default, or all where there are fewer."""
-    tasks: Literal["test-1000", "paper-100", "figure-4-1"] | None = None
-    """A frozen task set; the tasks of the world, or test-1000, by default."""
-    world: Path | None = None
-    """TOML or JSON file of an own region (docs/own_data.md); that of the run, where it was trained in one."""
+    """Number of tasks, the first of the set; 12 by default, or all where there are fewer."""
+    tasks: TaskSet | None = None
+    """Frozen task set; the scenario's own tasks by default, or test-1000 where it has none."""
+    scenario: Path | None = None
+    """TOML or JSON file of an own region (docs/own_data.md); the scenario of the run by default."""
     zeta: float | None = None
-    """Arrival threshold on the objective; the one that the run was trained with by default."""
+    """Arrival threshold on the objective; that of the training by default."""
     seed: int = 0
-    """Of navigators that draw random numbers."""
+    """Random seed of metaheuristics."""
     out: Path | None = None
-    """The page; replay.html in the run's folder by default. A file that is there is replaced."""
+    """The page, replaced if it exists; replay.html in the run's folder by default."""
     gif: Path | None = None
-    """An animated GIF of the run's policy on the same tasks, if wanted."""
+    """Animated GIF of the run's policy on the same tasks; none by default."""
 
 
 def run_config(run: Path) -> dict[str, Any]:
-    """The configuration that a training left in its folder.
+    """Return the settings that a training left in its folder.
 
     Raises:
-        FileNotFoundError: for a folder that is no run's.
-        ValueError: for a file that holds something else.
+        FileNotFoundError: for a folder without a run.
+        ValueError: for a file that does not hold settings.
     """
     path = run / "config.json"
     if not path.is_file():
-        raise FileNotFoundError(f"there is no run at {run}: it should hold config.json and policy.pt")
+        raise FileNotFoundError(f"there is no run at {run}: it must hold config.json and policy.pt")
     try:
         return dict(json.loads(path.read_text()))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path} is not the configuration of a run: {error}") from error
 
 
-def labelled(texts: tuple[str, ...]) -> dict[str, str]:
-    """Navigators by what the page calls them; of several trained agents of one kind, the later ones by folder too.
+def labeled(texts: Sequence[str]) -> dict[str, str]:
+    """Return navigators by label; a second trained agent of one kind is labeled with its folder too.
 
     Raises:
-        ValueError: for one that is named twice.
+        ValueError: for a navigator that is given twice.
     """
     named: dict[str, str] = {}
     for text in texts:
         name, _, run = text.partition("=")
-        known = label(name, "look-ahead")
+        known = label(name)
         known += f" ({Path(run).name})" if run and known in named else ""
         if known in named:
-            raise ValueError(f"{text} is named twice: the page shows each navigator once")
+            raise ValueError(f"{text} is given twice: the page shows each navigator once")
         named[known] = text
     return named
 
 
-def replay(config: Config) -> Path:
-    """Flies the navigators and writes what was asked for.
+def prepare(config: Config) -> tuple[GeomagneticNavEnv, dict[str, TensorDictModuleBase], str, Path]:
+    """Return the environment, navigators by label, and title and path of the page.
 
     Raises:
-        FileNotFoundError: for a folder that is no run's.
-        ValueError: for an unknown navigator, one that is named twice, or more tasks than there are.
+        UsageError: for anything that is wrong with the settings.
+    """
+    try:
+        run = run_config(config.run)
+        trained_in = config.run / Path(run["scenario"]).name if run.get("scenario") else None
+        path = config.scenario or trained_in
+        scenario = choose_tasks(path, config.tasks)
+        assert scenario.tasks is not None
+        available = len(scenario.tasks.start)
+        count = min(DEFAULT_TASKS, available) if config.num_tasks is None else config.num_tasks
+        zeta = run.get("zeta", 0.01) if config.zeta is None else config.zeta
+        env = make_env(first_tasks(scenario, count), zeta, config.seed)
+        kind = {True: "gg_td3", False: "td3"}.get(run.get("guided"), "recurrent")  # type: ignore[call-overload]
+        texts = (f"{kind}={config.run}", *config.navigators)
+        made = {text: make_navigator(text, env, seed=config.seed) for text in texts}
+        navigators = {name: made[text] for name, text in labeled(texts).items()}
+        out = config.out or config.run / "replay.html"
+        for file in filter(None, (out, config.gif)):
+            check_writable(file)
+    except (ValueError, TypeError, OSError) as error:
+        raise UsageError(str(error)) from error
+    title = f"{config.run.name}, tasks of {path.name if path else config.tasks or 'test-1000'}"
+    return env, navigators, title, out
+
+
+def replay(config: Config) -> Path:
+    """Fly the navigators, write the page and the GIF, and return the path of the page.
+
+    Raises:
+        UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    run = run_config(config.run)
-    kind = {True: "gg_td3", False: "td3"}.get(run.get("guided"), "recurrent")
-    texts = (f"{kind}={config.run}", *config.navigators)
-    zeta = run.get("zeta", 0.01) if config.zeta is None else config.zeta
-    trained_in = config.run / Path(run["world"]).name if isinstance(run.get("world"), str) else None
-    world, tasks = journeys(config.world or trained_in, config.tasks)
-    tasks = first(tasks, min(DEFAULT_TASKS, len(tasks.start)) if config.num_tasks is None else config.num_tasks)
-    env = env_of(Evaluation(texts, zeta=zeta, seed=config.seed), world, tasks)
-    pilots = {text: navigator(text, env, "look-ahead", config.seed) for text in texts}
-    rollouts = {name: evaluation_rollout(env, pilots[text]) for name, text in labelled(texts).items()}
-    of = config.world or trained_in
-    title = f"{config.run.name}, tasks of {of.name if of else config.tasks or 'test-1000'}"
-    out = config.out or config.run / "replay.html"
-    write_replay(out, replay_data(rollouts, env.field, env.region, zeta=zeta, title=title))
+    env, navigators, title, out = prepare(config)
+    rollouts = {name: evaluation_rollout(env, navigator) for name, navigator in navigators.items()}
+    write_replay(out, replay_data(rollouts, env.field, env.region, zeta=env.zeta, title=title))
     if config.gif:
         write_gif(config.gif, next(iter(rollouts.values())), env.field, env.region)
     return out
 
 
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line and write the page."""
+    print(f"Open {replay(tyro.cli(Config, args=args, prog=RECIPE, description=__doc__))} in a browser")
+
+
 if __name__ == "__main__":
-    settings = tyro.cli(Config, description=__doc__)
-    try:
-        print(f"open {replay(settings)} in a browser")
-    except (ValueError, OSError) as error:
-        sys.exit(f"replay.py: {error}")
+    command(RECIPE, main)

@@ -1,15 +1,20 @@
-"""One thread is as fast as several on small tensors, and a busy neighbour then costs nothing."""
+"""Settings of all tests, and fixtures of the trainings: one thread is as fast as several on small tensors."""
 
 import contextlib
+import csv
 import itertools
 import os
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # read when torch is imported
 
 import pytest
 import torch
 from hypothesis import settings
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
 
 torch.set_num_threads(1)
 
@@ -21,19 +26,54 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 @pytest.fixture
 def signalled(monkeypatch) -> Callable:
-    """A context in which a recipe's training gets a signal in an iteration, counted from 1."""
+    """Return a context in which a training gets a signal after it has collected batch ``iteration``, counted from 1."""
+    from magrl.training.statistics import TrainingStatistics
 
     @contextlib.contextmanager
-    def context(recipe, iteration: int, number: int) -> Iterator[None]:
-        anneal, calls = recipe.Learner.anneal, itertools.count(1)
+    def context(iteration: int, number: int) -> Iterator[None]:
+        add, calls = TrainingStatistics.add, itertools.count(1)
 
-        def signals(*args) -> None:
+        def signals(self, batch) -> None:
             if next(calls) == iteration:
                 os.kill(os.getpid(), number)
-            anneal(*args)
+            add(self, batch)
 
         with monkeypatch.context() as patch:
-            patch.setattr(recipe.Learner, "anneal", signals)
+            patch.setattr(TrainingStatistics, "add", signals)
             yield
 
     return context
+
+
+@pytest.fixture(scope="session")
+def outcome() -> Callable:
+    """Return a function that reads a run folder: the curves without their timing, and the weights of the policy."""
+    from magrl.agents import load_policy
+
+    def read(folder: Path) -> tuple[list[dict[str, str]], dict[str, torch.Tensor]]:
+        with (folder / "train.csv").open() as file:
+            rows = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+        weights = load_policy(folder / "policy.pt").actor.state_dict()
+        return rows, {key: value for key, value in weights.items() if isinstance(value, torch.Tensor)}
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def same_outcome(outcome: Callable) -> Callable:
+    """Return a function that compares two runs: equal curves, and weights that are equal to the bit."""
+
+    def same(one: Path, other: Path) -> bool:
+        (rows, weights), (expected, expected_weights) = outcome(one), outcome(other)
+        equal = all(torch.equal(weights[key], expected_weights[key]) for key in weights | expected_weights)
+        return rows == expected and equal
+
+    return same
+
+
+@pytest.fixture
+def without_figures(monkeypatch) -> None:
+    """Replace the figures of a training, which take half the time of a small one, by empty files."""
+    from magrl.training.curves import RunLog
+
+    monkeypatch.setattr(RunLog, "figure", lambda self, name, _: (self.folder / f"{name}.png").touch())

@@ -1,8 +1,10 @@
-"""Checkpoints: whole or not there, the one before when the newest is damaged, and nothing in them is executed."""
+"""Checkpoints: complete or absent, the previous one if the newest is damaged, and no code in them is executed."""
 
 import hashlib
+import inspect
 import os
 import pickle
+import re
 import resource
 import signal
 import subprocess
@@ -18,20 +20,16 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
-from magrl.checkpoints import (
-    BestPolicy,
-    Checkpoints,
-    DamagedCheckpointError,
-    RunningEpisodes,
-    check_finite,
-    read_checkpoint,
-    save_tensors,
-)
-from magrl.env import GeomagneticNavEnv
+from magrl.checks import check_finite
+from magrl.envs import GeomagneticNavEnv
+from magrl.files import DamagedFileError, save_tensors
+from magrl.training import checkpoints as module
+from magrl.training.checkpoints import PRIVATE, Checkpoints, RunningEpisodes, read_checkpoint
+from magrl.training.statistics import BestPolicy
 
 
 class Counter:
-    """A part whose whole state is a number."""
+    """A part whose state is a number."""
 
     def __init__(self, value: int = 0) -> None:
         self.value = value
@@ -45,7 +43,7 @@ class Counter:
 
 @pytest.fixture
 def saved(tmp_path: Path) -> tuple[Checkpoints, Counter]:
-    """Checkpoints at 10, 20 and 30 frames, of which two are kept."""
+    """Return checkpoints at 10, 20 and 30 frames, of which two are kept."""
     counter = Counter()
     checkpoints = Checkpoints(tmp_path / "checkpoints", {"counter": counter})
     for frames in (10, 20, 30):
@@ -65,7 +63,7 @@ def test_newest_is_loaded_and_older_ones_rotate(saved) -> None:
 
 
 @pytest.mark.parametrize("damage", ["truncate", "empty", "flip", "other"])
-def test_damaged_newest_is_told_and_the_one_before_is_used(saved, damage: str) -> None:
+def test_damaged_newest_is_reported_and_the_previous_is_used(saved, damage: str) -> None:
     checkpoints, counter = saved
     newest = checkpoints.files()[-1]
     content = bytearray(newest.read_bytes())
@@ -77,12 +75,12 @@ def test_damaged_newest_is_told_and_the_one_before_is_used(saved, damage: str) -
         "other": bytearray(b"no archive at all"),
     }[damage]
     newest.write_bytes(content)
-    with pytest.warns(UserWarning, match=f"{newest.name} is damaged.*trying the one before"):
+    with pytest.warns(UserWarning, match=f"{newest.name} is damaged.*trying the previous checkpoint"):
         assert (checkpoints.load(), counter.value) == (20, 20)
 
 
 def test_every_flipped_bit_is_noticed_or_harmless(saved) -> None:
-    """A flipped bit either is reported, or lies in padding and leaves the content as it was."""
+    """A flipped bit is either reported, or in padding, where it does not change the content."""
     checkpoints, _ = saved
     path = checkpoints.files()[-1]
     whole = path.read_bytes()
@@ -95,13 +93,13 @@ def test_every_flipped_bit_is_noticed_or_harmless(saved) -> None:
         assert content == {"format": 1, "frames": 30, "parts": {"counter": {"value": 30}}}
 
 
-def test_nothing_sound_is_an_error(saved, tmp_path: Path) -> None:
+def test_no_valid_checkpoint_is_an_error(saved, tmp_path: Path) -> None:
     checkpoints, _ = saved
     for path in checkpoints.files():
         path.write_bytes(b"")
-    with pytest.warns(UserWarning, match="damaged"), pytest.raises(FileNotFoundError, match="no sound checkpoint"):
+    with pytest.warns(UserWarning, match="damaged"), pytest.raises(FileNotFoundError, match="no valid checkpoint"):
         checkpoints.load()
-    with pytest.raises(FileNotFoundError, match="no sound checkpoint"):
+    with pytest.raises(FileNotFoundError, match="no valid checkpoint"):
         Checkpoints(tmp_path / "none", {}).load()
 
 
@@ -131,25 +129,25 @@ def test_pickled_code_is_not_executed(saved, tmp_path: Path) -> None:
     checkpoints, _ = saved
     newest, trace = checkpoints.files()[-1], tmp_path / "executed"
     save_tensors({"format": 1, "frames": 1, "parts": {"counter": Malice(trace)}}, newest)
-    with pytest.raises(DamagedCheckpointError):
+    with pytest.raises(DamagedFileError):
         read_checkpoint(newest)
     newest.write_bytes(pickle.dumps(Malice(trace)))
-    with pytest.raises(DamagedCheckpointError):
+    with pytest.raises(DamagedFileError):
         read_checkpoint(newest)
     assert not trace.exists()
 
 
-def test_archive_that_unpacks_to_more_than_it_is_is_refused(saved) -> None:
+def test_compressed_archive_is_refused(saved) -> None:
     newest = saved[0].files()[-1]
     with zipfile.ZipFile(newest, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("archive/data.pkl", bytes(10_000_000))
     body = newest.read_bytes()
     newest.write_bytes(body[:-2] + b"\x40\x00" + hashlib.sha256(body).hexdigest().encode())
-    with pytest.raises(DamagedCheckpointError, match="compressed"):
+    with pytest.raises(DamagedFileError, match="compressed"):
         read_checkpoint(newest)
 
 
-def test_full_disk_is_told_and_leaves_the_others(saved) -> None:
+def test_full_disk_is_reported_and_leaves_the_others(saved) -> None:
     """A real write that fails: the process may write no file larger than 4 KiB."""
     checkpoints, counter = saved
     before = {path: path.read_bytes() for path in checkpoints.folder.iterdir()}
@@ -168,7 +166,7 @@ def test_full_disk_is_told_and_leaves_the_others(saved) -> None:
 
 
 class TensorPart(Counter):
-    """A part that takes room."""
+    """A large part."""
 
     def __init__(self, tensor: torch.Tensor) -> None:
         super().__init__()
@@ -178,8 +176,8 @@ class TensorPart(Counter):
         return {"tensor": self.tensor}
 
 
-def test_kill_while_writing_leaves_the_one_before(tmp_path: Path) -> None:
-    """SIGKILL between any two writes: what is in the folder under a checkpoint's name is whole."""
+def test_kill_while_writing_leaves_complete_files(tmp_path: Path) -> None:
+    """After SIGKILL at any time, every file with the name of a checkpoint is complete."""
     script = """
 import sys, torch
 sys.path.insert(0, sys.argv[2])
@@ -202,8 +200,8 @@ for frames in range(1, 10**6):
         assert read_checkpoint(file)["parts"]["part"]["tensor"].shape == (300_000,)
 
 
-def test_running_episodes_go_on(tmp_path: Path) -> None:
-    """Half of the steps, a checkpoint, the rest in another collector: the same as all the steps in one."""
+def test_running_episodes_continue(tmp_path: Path) -> None:
+    """Half of the steps, a checkpoint, and the rest in another collector equal all steps in one."""
 
     def collector() -> tuple[Collector, RunningEpisodes]:
         base = GeomagneticNavEnv(num_envs=4, seed=5, max_steps=7)
@@ -238,6 +236,37 @@ def test_running_episodes_of_another_environment_are_refused(tmp_path: Path) -> 
         Checkpoints(tmp_path, {"episodes": episodes(RewardSum())}).load()
 
 
+def test_private_attributes_of_torchrl_are_there() -> None:
+    """If this fails, TorchRL changed its collector, and RunningEpisodes must be adapted before any run is resumed."""
+    env = GeomagneticNavEnv(num_envs=2, seed=0)
+    collector = Collector(env, env.rand_action, frames_per_batch=2, total_frames=4)
+    missing = [name for name in PRIVATE if not hasattr(collector, name)]
+    assert not missing, f"torchrl.collectors.Collector has no {missing} any more: see RunningEpisodes"
+    batch = next(iter(collector))
+    assert collector._frames == 2, "Collector._frames no longer counts the collected frames: see RunningEpisodes"
+    assert collector._iter == 0, "Collector._iter no longer counts the batches from 0: see RunningEpisodes"
+    carried = collector._carrier["position"]
+    assert torch.equal(carried, batch["next", "position"][:, -1]), (
+        "Collector._carrier no longer holds the observation from which the next batch starts: see RunningEpisodes"
+    )
+    collector.shutdown()
+
+
+def test_only_listed_private_attributes_are_read() -> None:
+    source = inspect.getsource(module)
+    assert set(re.findall(r"collector\.(_\w+)", source)) == set(PRIVATE)
+
+
+@pytest.mark.parametrize("name", PRIVATE)
+def test_episodes_cannot_be_saved_without_a_private_attribute(name: str) -> None:
+    """An attribute that vanished stops the checkpoint, naming it, instead of saving something else."""
+    env = GeomagneticNavEnv(num_envs=2, seed=0)
+    collector = Collector(env, env.rand_action, frames_per_batch=2, total_frames=4)
+    delattr(collector, name)
+    with pytest.raises(AttributeError, match=name):
+        RunningEpisodes(collector, env).state_dict()
+
+
 def test_best_policy_is_the_best() -> None:
     best, layer = BestPolicy(), nn.Linear(1, 1)
     for score, weight in ((1.0, 10.0), (3.0, 30.0), (2.0, 20.0)):
@@ -262,18 +291,18 @@ def test_check_finite_names_key_and_vehicles(value: float) -> None:
         check_finite(batch, "now")
 
 
-def test_check_finite_lets_large_numbers_pass() -> None:
+def test_check_finite_accepts_large_numbers() -> None:
     check_finite([("large", torch.full((4,), 3e38))], "now")
     with pytest.raises(FloatingPointError, match=r"scalar is not finite in rows \[0\]"):
         check_finite([("scalar", torch.tensor(float("nan")))], "now")
 
 
-def test_keep_must_hold_something(tmp_path: Path) -> None:
+def test_keep_must_be_positive(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="keep must be a whole number from 1 on, got 0"):
         Checkpoints(tmp_path, {}, keep=0)
 
 
-def test_unwritable_folder_is_told(tmp_path: Path) -> None:
+def test_unwritable_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError):
         Checkpoints(tmp_path / "file" / "sub", {}).save(0)

@@ -1,7 +1,8 @@
-"""What the documents say exists."""
+"""The documentation agrees with the code: names, tests, links, examples, tables of keys, options and results."""
 
 import importlib
 import importlib.util
+import inspect
 import math
 import re
 import sys
@@ -13,8 +14,9 @@ import torch
 from torchrl.data import Binary, Bounded, Composite
 from torchrl.envs import Compose, TransformedEnv
 
-from magrl import td3
-from magrl.env import PRIVILEGED_KEYS, GeomagneticNavEnv
+from magrl.agents import FieldPolicy, PolicyConfig, save_policy
+from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
@@ -23,7 +25,21 @@ EXAMPLES = [
     for page in PAGES
     for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
 ]
-THEORY = (ROOT / "docs" / "theory.md").read_text()
+THEORY, ENVIRONMENT, OWN_DATA, RELIABILITY = (
+    (ROOT / "docs" / f"{name}.md").read_text() for name in ("theory", "environment", "own_data", "reliability")
+)
+
+
+def table_rows(text: str, header: str, first: str) -> dict[str, list[str]]:
+    """Return the rows of the first table after ``header`` whose first column is ``first``, by their name in it."""
+    assert header in text, header
+    text = text.partition(header)[2]
+    table = text[text.index(f"| {first} |") :].partition("\n\n")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    return {row[0].strip("`"): row[1:] for row in rows}
+
+
+# Names
 
 
 def test_equations_have_functions_and_tests() -> None:
@@ -34,7 +50,7 @@ def test_equations_have_functions_and_tests() -> None:
         assert re.search(r"`tests/test_\w+\.py::\w+`", row), row
 
 
-@pytest.mark.parametrize("name", sorted(set(re.findall(r"`(magrl(?:\.\w+){2})`", THEORY))))
+@pytest.mark.parametrize("name", sorted(set(re.findall(r"`(magrl(?:\.\w+){2,3})`", THEORY))))
 def test_named_functions_exist(name: str) -> None:
     module, _, attribute = name.rpartition(".")
     assert hasattr(importlib.import_module(module), attribute)
@@ -46,9 +62,10 @@ def test_named_tests_exist(name: str) -> None:
     assert re.search(rf"^(def|class) {test}\b" if test else "", (ROOT / path).read_text(), re.MULTILINE)
 
 
-def test_tests_of_promises_exist() -> None:
-    promises = (ROOT / "docs" / "reliability.md").read_text().partition("\n## ")[0]
-    rows = [line for line in promises.splitlines() if line.startswith("| ")]
+def test_tests_of_guarantees_exist() -> None:
+    guarantees = RELIABILITY.partition("\n## ")[0]
+    rows = [line for line in guarantees.splitlines() if line.startswith("| ")]
+    assert len(rows) >= 20
     for row in rows[1:]:
         named = re.findall(r"`(test_\w+\.py)?(?:::)?(test_\w+)?`", row.split("|")[2])
         assert named, row
@@ -65,13 +82,32 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), target
 
 
+def test_every_page_is_in_the_list_of_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text()
+    for page in ROOT.glob("docs/*.md"):
+        assert page.name == "index.md" or f"(docs/{page.name})" in readme, page.name
+
+
+def test_citation_names_the_version_the_license_and_the_paper() -> None:
+    import magrl
+
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {magrl.__version__}\n" in citation
+    assert "license: MIT\n" in citation
+    for text in (citation, THEORY, (ROOT / "README.md").read_text()):
+        assert re.search(r"arxiv[\s:]2410\.15837", text, re.IGNORECASE)
+
+
+# Examples
+
+
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory) -> Path:
-    """Where a reader stands who has done what docs/start.md says: with a policy, if not a good one, in runs/first."""
+    """Folder of a reader who has followed docs/start.md, with an untrained policy in runs/first."""
     folder = tmp_path_factory.mktemp("reader")
     (folder / "runs" / "first").mkdir(parents=True)
-    policy = td3.FieldPolicy(td3.policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=True))
-    td3.save_policy(folder / "runs" / "first" / "policy.pt", policy)
+    policy = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
+    save_policy(folder / "runs" / "first" / "policy.pt", policy)
     return folder
 
 
@@ -83,19 +119,52 @@ def test_python_examples_run(page: Path, block: str, run_folder: Path, monkeypat
     assert len(names) > 1, "an example should leave something behind"
 
 
-def test_every_option_of_the_environment_is_documented() -> None:
-    import inspect
+# Tables of options
 
-    from magrl.env import GeomagneticNavEnv
 
-    text = (ROOT / "docs" / "environment.md").read_text()
-    for option in set(inspect.signature(GeomagneticNavEnv.__init__).parameters) - {"self"}:
-        assert f"`{option}`" in text, option
+def documented_default(text: str) -> object:
+    """Return the value that a cell of a table gives as a default; None for the word "random"."""
+    text = text.strip("`").replace("π", "math.pi")
+    if text == "random":
+        return None
+    try:
+        return eval(text, {"math": math, "Scenario": Scenario})
+    except (SyntaxError, NameError):
+        return text
+
+
+def test_options_of_the_environment_are_documented() -> None:
+    options = dict(inspect.signature(GeomagneticNavEnv.__init__).parameters)
+    options.pop("self")
+    rows = table_rows(ENVIRONMENT, "## Options", "option")
+    assert list(rows) == list(options)
+    for name in rows.keys() - {"scenario", "device"}:
+        assert documented_default(rows[name][0]) == pytest.approx(options[name].default), name
+    assert documented_default(rows["scenario"][0]) == Scenario()
+
+
+def test_fields_of_a_scenario_are_documented() -> None:
+    rows = table_rows(ENVIRONMENT, "## Scenario", "field")
+    assert list(rows) == list(Scenario.model_fields)
+    for name in rows.keys() - {"region", "date"}:
+        assert documented_default(rows[name][0]) == getattr(Scenario(), name), name
+    assert rows["date"][0] == Scenario().date.date().isoformat()
+
+
+def test_keys_of_a_scenario_file_are_documented() -> None:
+    rows = table_rows(OWN_DATA, "## File format", "key")
+    keys = {name.partition(".")[0].partition("`")[0] for name in rows}
+    assert keys == Scenario.model_fields.keys() - {"field", "names"}
+
+
+# Tables of results
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_tables_are_those_that_were_measured(page: Path) -> None:
-    spec = importlib.util.spec_from_file_location("publish", ROOT / "recipes" / "publish.py")
+    spec = importlib.util.spec_from_file_location("publish", ROOT / "recipes" / "tables" / "publish.py")
+    assert spec is not None
+    assert spec.loader is not None
     publish = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = publish
     spec.loader.exec_module(publish)
@@ -103,15 +172,7 @@ def test_tables_are_those_that_were_measured(page: Path) -> None:
     assert publish.filled(text, ROOT) == text
 
 
-# The table of keys is that of the specs
-
-
-def key_rows(header: str) -> dict[str, list[str]]:
-    """The cells of a table of keys in docs/environment.md, the one after some words."""
-    text = (ROOT / "docs" / "environment.md").read_text().partition(header)[2]
-    table = text[text.index("| key ") :].partition("\n\n")[0]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
-    return {row[0].strip("`"): row[1:] for row in rows}
+# Tables of keys
 
 
 def bounds_of(spec) -> str | list[list[float]]:
@@ -153,24 +214,25 @@ def all_specs(env) -> Composite:
 
 
 def test_table_of_keys_is_that_of_the_environment(env) -> None:
-    rows = key_rows("## Keys")
+    rows = table_rows(ENVIRONMENT, "## Keys", "key")
     assert set(rows) == set(all_specs(env).keys(True, True))
     check_rows(rows, all_specs(env))
     readers = {key: row[-1] for key, row in rows.items()}
-    public = {key for key, reader in readers.items() if reader == "everyone"}
-    assert public == {*td3.PUBLIC_KEYS, "step_count"}
-    others = {"the trainer", "written by policies"}
+    public = {key for key, reader in readers.items() if reader == "all policies"}
+    assert public == {*PUBLIC_KEYS, "step_count"}
+    others = {"training", "written by policies"}
     assert {key for key in readers if readers[key] not in others} - public == set(PRIVILEGED_KEYS)
 
 
 def test_table_of_keys_that_transforms_add(env) -> None:
-    view = td3.policy_config(env, (8,), layer_norm=True)
-    steps = [*td3.guidance_transforms(env, 3.0, 0.0), *td3.observation_transforms(view)]
+    guidance = [FieldGradient(env.field), GradientHeading(), AlignmentReward(out_keys=["reward", "reward_alignment"])]
+    steps = [*guidance, *env.observation_view().observation_transforms()]
     specs = all_specs(TransformedEnv(GeomagneticNavEnv(num_envs=7, seed=0), Compose(*steps)))
-    rows = key_rows("transforms of the guided agent")
+    rows = table_rows(ENVIRONMENT, "transforms of the guided agent", "key")
     added = {key for key in specs.keys(True, True) if not key.endswith("_scaled")} - set(
         all_specs(env).keys(True, True)
     )
     assert set(rows) == added
     check_rows(rows, specs)
-    assert {key for key, row in rows.items() if row[-1] != "everyone"} == {key for key in added if "gradient" in key}
+    privileged = {key for key in added if "gradient" in key or key.startswith("reward")}
+    assert {key for key, row in rows.items() if row[-1] != "all policies"} == privileged

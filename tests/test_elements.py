@@ -1,11 +1,12 @@
 """The magnetic elements of Eq. 2-1: signs, limits, inverse and Jacobian."""
 
+import itertools
 import math
 
 import pytest
 import torch
 
-from magrl.elements import (
+from magrl.field.elements import (
     NAMES,
     UNITS,
     Elements,
@@ -142,9 +143,12 @@ def test_gradient_worked_by_hand():
     torch.testing.assert_close(found, expected, rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_shapes_and_dtypes(shape, dtype):
+def test_shapes_and_dtypes():
+    for shape, dtype in itertools.product(SHAPES, DTYPES):
+        check_shapes_and_dtypes(shape, dtype)
+
+
+def check_shapes_and_dtypes(shape, dtype):
     b_ned = random_fields(*shape, seed=5).to(dtype)
     gradient = torch.ones(*shape, 3, 2, dtype=dtype)
     outputs = {
@@ -167,7 +171,23 @@ def test_measured_elements_are_the_first_three():
         assert torch.equal(measured_elements(b_ned)[:, index], getattr(seven_elements(b_ned), name))
 
 
-@pytest.mark.parametrize("name", ["B_F", "d", "", "H"])
-def test_an_unknown_element_is_refused(name):
-    with pytest.raises(ValueError, match=rf"unknown magnetic element '{name}'.*D, I, B_H"):
-        element_index(name)
+def test_an_unknown_element_is_refused():
+    for name in ("B_F", "d", "", "H"):
+        with pytest.raises(ValueError, match=rf"unknown magnetic element '{name}'.*D, I, B_H"):
+            element_index(name)
+
+
+def test_nan_in_a_component_is_nan_in_what_depends_on_it():
+    """B_H and D depend on north and east, I and B_F on all three; the derivatives of D and B_H downward are zero."""
+    for place in range(3):
+        b_ned = torch.ones(3, dtype=torch.float64)
+        b_ned[place] = math.nan
+        found, jacobian = seven_elements(b_ned), elements_jacobian(b_ned)
+        horizontal = place < 2
+        of_each = torch.stack((found.D, found.I, found.B_H, found.B_F)).isnan().tolist()
+        assert of_each == [horizontal, True, horizontal, True]
+        assert measured_elements(b_ned).isnan().tolist() == [horizontal, True, horizontal]
+        assert jacobian[1].isnan().all()
+        assert (jacobian[[0, 2], :2].isnan() == horizontal).all()
+    assert field_vector(f64(0.0, 0.0, math.nan)).isnan().all()
+    assert elements_gradient(f64(1.0, 1.0, 1.0), torch.full((3, 2), math.nan, dtype=torch.float64)).isnan().all()

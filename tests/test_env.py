@@ -1,14 +1,17 @@
-"""The environment: specs, one move worked by hand, ends of episodes, seeds, independence of vehicles, options."""
+"""The environment: specs, one move by hand, rewards, ends of episodes, seeds, independent vehicles, options, tracks."""
 
 from __future__ import annotations
 
 import copy
+import gc
 import math
 import pickle
 import re
+import weakref
 from collections.abc import Callable
 from datetime import datetime
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
@@ -19,12 +22,11 @@ from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from magrl.env import PRIVILEGED_KEYS, GeomagneticNavEnv, flown_box, paper_field
-from magrl.fields import IGRF
+from magrl.envs import PAPER_REGION, PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, Tasks
+from magrl.envs.specs import REWARD_TERMS
+from magrl.field import IGRF, RegionalField
 from magrl.geodesy import geodesic, move
-from magrl.regional import RegionalField
-from magrl.tasks import PAPER_REGION, Region, Tasks
-from magrl.td3 import guidance_transforms
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
 ANTIMERIDIAN = Region((-5.0, 5.0), (175.0, 185.0))
 HIGH_LATITUDE = Region((60.0, 70.0), (10.0, 30.0))
@@ -35,8 +37,10 @@ def _seeded() -> None:
     torch.manual_seed(0)
 
 
-def make(num_envs: int = 1, **options: object) -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(num_envs=num_envs, **({"seed": 0} | options))
+def make(num_envs: int = 1, **options: Any) -> GeomagneticNavEnv:
+    """An environment of seed 0, from the options of the environment and of its scenario."""
+    scenario = {name: options.pop(name) for name in options.keys() & Scenario.model_fields.keys()}
+    return GeomagneticNavEnv(Scenario(**scenario), num_envs=num_envs, **{"seed": 0} | options)
 
 
 def places(*positions: tuple[float, ...]) -> Tensor:
@@ -88,9 +92,9 @@ def assert_same(a: TensorDictBase, b: TensorDictBase, but: tuple[str, ...] = ())
 # Specs
 
 
-@pytest.mark.parametrize("num_envs", [1, 3, 64])
-def test_specs_match_the_data(num_envs: int) -> None:
-    check_env_specs(make(num_envs), break_when_any_done="both")
+def test_specs_match_the_data() -> None:
+    for num_envs in (1, 3, 64):
+        check_env_specs(make(num_envs), break_when_any_done="both")
 
 
 @pytest.mark.parametrize(
@@ -100,13 +104,13 @@ def test_specs_match_the_data(num_envs: int) -> None:
         {"max_steps": 1},
         {"max_steps": 2, "margin_deg": 0.0},
         {"max_turn_rad": math.pi, "max_move_km": 300.0},
-        {"region": ANTIMERIDIAN, "field": paper_field(ANTIMERIDIAN, generation=14)},
+        {"region": ANTIMERIDIAN, "generation": 14},
         {"region": HIGH_LATITUDE},
         {"region": Region((-80.0, -70.0), (-10.0, 40.0)), "field": IGRF(2027.0)},
     ],
     ids=["random heading", "one step", "no margin", "long legs", "antimeridian", "high latitude", "IGRF itself"],
 )
-def test_specs_match_the_data_with(options: dict[str, object]) -> None:
+def test_specs_match_the_data_with(options: dict[str, Any]) -> None:
     check_env_specs(make(3, **options), break_when_any_done="both")
 
 
@@ -124,27 +128,28 @@ ENTRIES = {
     "success": (1, torch.bool),
 }
 FLAGS = dict.fromkeys(("done", "terminated", "truncated"), (1, torch.bool))
+REWARDS = dict.fromkeys(("reward", "reward_destination", "reward_proximity"), (1, torch.float32))
 
 
-@pytest.mark.parametrize("num_envs", [1, 5])
-def test_keys_shapes_and_dtypes(num_envs: int) -> None:
-    env = make(num_envs)
-    first = env.reset()
-    step = env.rand_step(first.clone())["next"]
-    after = ENTRIES | FLAGS | {"reward": (1, torch.float32)}
-    for td, entries in ((first, ENTRIES | FLAGS), (step, after)):
-        assert {key: (value.shape, value.dtype) for key, value in td.items()} == {
-            key: ((num_envs, size), dtype) for key, (size, dtype) in entries.items()
-        }
-    assert set(env.observation_spec.keys()) == set(ENTRIES)
-    assert env.batch_size == (num_envs,)
-    assert env.batch_locked
+def test_keys_shapes_and_dtypes() -> None:
+    for num_envs in (1, 5):
+        env = make(num_envs)
+        first = env.reset()
+        step = env.rand_step(first.clone())["next"]
+        for td, entries in ((first, ENTRIES | FLAGS), (step, ENTRIES | FLAGS | REWARDS)):
+            assert {key: (value.shape, value.dtype) for key, value in td.items()} == {
+                key: ((num_envs, size), dtype) for key, (size, dtype) in entries.items()
+            }
+        assert set(env.observation_spec.keys()) == set(ENTRIES)
+        assert env.batch_size == (num_envs,)
+        assert env.batch_locked
 
 
 def test_privileged_keys_are_in_the_spec_and_what_is_measured_is_not_privileged() -> None:
     spec = make().observation_spec
     assert set(PRIVILEGED_KEYS) <= set(spec.keys())
     assert {"field", "target_field", "move", "heading", "step_count"} == set(spec.keys()) - set(PRIVILEGED_KEYS)
+    assert {*PUBLIC_KEYS, "step_count"} == set(spec.keys()) - set(PRIVILEGED_KEYS)
 
 
 def test_action_bounds() -> None:
@@ -157,7 +162,7 @@ def test_action_bounds() -> None:
 @pytest.mark.parametrize(
     "options", [{"margin_deg": 0.0}, {"region": HIGH_LATITUDE}, {"max_turn_rad": math.pi, "start_heading": "random"}]
 )
-def test_every_observation_stays_in_its_spec(options: dict[str, object]) -> None:
+def test_every_observation_stays_in_its_spec(options: dict[str, Any]) -> None:
     """From one reset to the next, the lost and the arrived included."""
     env = make(32, max_steps=12, **options)
     td = env.rollout(40, break_when_any_done=False)
@@ -209,7 +214,7 @@ def test_first_observation_is_that_of_the_paper() -> None:
 def test_one_move_by_hand(turn: float, end: tuple[float, float]) -> None:
     (step,) = fly(make(tasks=task(START, TARGET), max_turn_rad=math.pi), (50.0, turn))
     after = step["next"][0]
-    assert after["position"].tolist() == pytest.approx(end, abs=1e-7)  # a centimetre
+    assert after["position"].tolist() == pytest.approx(end, abs=1e-7)  # a centimeter
     assert after["heading"].item() == pytest.approx(turn, abs=1e-6)
     assert after["move"].tolist() == pytest.approx([50.0, turn], abs=1e-6)
     assert after["step_count"].item() == 1
@@ -252,18 +257,20 @@ def test_floors_of_the_objective() -> None:
     assert td["objective"].item() == pytest.approx(float((error**2 * torch.tensor([25.0, 4.0, 1e-4])).sum()), rel=1e-3)
 
 
-@pytest.mark.parametrize("weight", [10.0, 2.5, 0.0])
-def test_late_rewards_decay(weight: float) -> None:
+def test_late_rewards_decay() -> None:
     """Past half of 6 moves, n/6 of the size of the proximity term is taken off: gains shrink and losses grow."""
     turn_back, go_on, stay = (50.0, math.pi), (50.0, 0.0), (0.0, 0.0)
-    env = make(tasks=task(START, TARGET), max_steps=6, max_turn_rad=math.pi, proximity_weight=weight)
-    steps = fly(env, turn_back, stay, go_on, turn_back, turn_back, go_on)  # south, south, north, south, south
-    objective = [3.0, *(step["next", "objective"].item() for step in steps)]
-    assert objective[3] < objective[4] > objective[5] > objective[6]
-    plain = [weight * (before - after) for before, after in pairwise(objective)]
-    taken = [0.0, 0.0, 0.0, 4 / 6, 5 / 6, 1.0]
-    expected = [r - share * abs(r) for r, share in zip(plain, taken, strict=True)]
-    assert [step["next", "reward"].item() for step in steps] == pytest.approx(expected, abs=1e-3)
+    for weight in (10.0, 2.5, 0.0):
+        env = make(tasks=task(START, TARGET), max_steps=6, max_turn_rad=math.pi, proximity_weight=weight)
+        steps = fly(env, turn_back, stay, go_on, turn_back, turn_back, go_on)  # south, south, north, south, south
+        objective = [3.0, *(step["next", "objective"].item() for step in steps)]
+        assert objective[3] < objective[4] > objective[5] > objective[6]
+        plain = [weight * (before - after) for before, after in pairwise(objective)]
+        taken = [0.0, 0.0, 0.0, 4 / 6, 5 / 6, 1.0]
+        expected = [r - share * abs(r) for r, share in zip(plain, taken, strict=True)]
+        for key in ("reward", "reward_proximity"):
+            assert [step["next", key].item() for step in steps] == pytest.approx(expected, abs=1e-3)
+        assert all(step["next", "reward_destination"] == 0 for step in steps)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -283,15 +290,18 @@ LIVELY = {
 class TestArrival:
     here = (-5.0, 165.0)
 
-    @pytest.mark.parametrize("turn", [0.0, 1.0, -1.5])
-    def test_one_known_move_arrives(self, turn: float) -> None:
-        env = make(tasks=task(self.here, moved(self.here, turn, 40.0)))
-        (step,) = fly(env, (40.0, turn))
-        after = step["next"]
-        assert step["objective"].item() > 0.5
-        assert after["objective"].item() < 1e-6
-        assert [bool(after[key]) for key in ("success", "terminated", "done", "truncated")] == [True, True, True, False]
-        assert after["reward"].item() == pytest.approx(200 + 10 * (step["objective"] - after["objective"]).item())
+    def test_one_known_move_arrives(self) -> None:
+        for turn in (0.0, 1.0, -1.5):
+            (step,) = fly(make(tasks=task(self.here, moved(self.here, turn, 40.0))), (40.0, turn))
+            after = step["next"]
+            assert step["objective"].item() > 0.5
+            assert after["objective"].item() < 1e-6
+            flags = [bool(after[key]) for key in ("success", "terminated", "done", "truncated")]
+            assert flags == [True, True, True, False]
+            proximity = 10 * (step["objective"] - after["objective"]).item()
+            assert after["reward"].item() == pytest.approx(200 + proximity)
+            assert after["reward_destination"].item() == 200
+            assert after["reward_proximity"].item() == pytest.approx(proximity)
 
     def test_the_threshold_is_zeta(self) -> None:
         """A move that falls short of it by a little arrives only if zeta is that wide."""
@@ -308,6 +318,7 @@ class TestArrival:
         assert after["terminated"]
         assert not after["truncated"]
         assert after["reward"].item() == pytest.approx(77.0, abs=1e-4)
+        assert after["reward_destination"].item() == 77.0
 
     def test_who_does_not_arrive_gets_nothing(self) -> None:
         target = moved(self.here, 0.0, 40.0)
@@ -317,21 +328,21 @@ class TestArrival:
         assert after["reward"][1] < 100
 
 
-@pytest.mark.parametrize("max_steps", [1, 4])
-def test_truncated_at_the_step_limit(max_steps: int) -> None:
-    steps = fly(make(2, max_steps=max_steps), *[(1.0, 0.1)] * max_steps)
-    for number, step in enumerate(steps, 1):
-        after = step["next"]
-        assert (after["step_count"] == number).all()
-        assert (after["truncated"] == (number == max_steps)).all()
-        assert (after["done"] == (number == max_steps)).all()
-        assert not after["terminated"].any()
+def test_truncated_at_the_step_limit() -> None:
+    for max_steps in (1, 4):
+        steps = fly(make(2, max_steps=max_steps), *[(1.0, 0.1)] * max_steps)
+        for number, step in enumerate(steps, 1):
+            after = step["next"]
+            assert (after["step_count"] == number).all()
+            assert (after["truncated"] == (number == max_steps)).all()
+            assert (after["done"] == (number == max_steps)).all()
+            assert not after["terminated"].any()
 
 
 class TestLost:
     @pytest.fixture
     def env(self) -> GeomagneticNavEnv:
-        """One vehicle 11 km south of the edge of its world, one in the middle."""
+        """One vehicle 11 km south of the edge, one in the middle."""
         tasks = Tasks(places((-0.1, 165.0), (-5.0, 165.0)), places((-3.0, 166.0), (-8.0, 165.0)))
         return make(2, tasks=tasks, margin_deg=0.0, max_turn_rad=math.pi)
 
@@ -386,6 +397,20 @@ def test_an_end_is_either_terminal_or_a_cut(max_steps: int) -> None:
     assert (after["success"] <= after["terminated"]).all()
 
 
+def test_reward_is_the_sum_of_its_terms_and_all_are_reward_keys() -> None:
+    """Over arrivals, losses and truncations, to the rounding of float32."""
+    env = make(32, **LIVELY)
+    assert set(env.reward_keys) == set(env.full_reward_spec.keys()) == {"reward", *REWARD_TERMS} == set(REWARDS)
+    assert not set(env.reset().keys()) & set(REWARDS)
+    after = fly_on(env, random_actions(30, 32))["next"]
+    destination, proximity = (after[term].double() for term in REWARD_TERMS)
+    torch.testing.assert_close(after["reward"].double(), destination + proximity, rtol=1e-6, atol=1e-6)
+    assert torch.equal(destination, 200 * after["success"].double())
+    assert after["success"].any()
+    assert (proximity < 0).any()
+    assert (proximity > 0).any()
+
+
 def test_rollout_until_all_are_done() -> None:
     env = make(8, max_steps=9, margin_deg=0.0, seed=3)
     td = env.rollout(30, break_when_any_done=False, break_when_all_done=True)
@@ -404,7 +429,7 @@ FLOAT64_KEYS = ("position", "target_position", "start_position")
 
 
 def assert_same_flight(a: TensorDictBase, b: TensorDictBase) -> None:
-    """All that is read, earned and decided to the last bit; positions within 0.1 micrometres.
+    """All that is read, earned and decided to the last bit; positions within 0.1 micrometers.
 
     Some kernels treat the last rows of a batch, which do not fill a register, by other instructions, and so the last
     bit of a float64 depends on the size of the batch.
@@ -518,7 +543,7 @@ class TestSeeds:
         make(3, seed=9).reset()
         assert torch.equal(torch.rand(1), expected)
 
-    def test_every_reset_starts_new_journeys(self) -> None:
+    def test_every_reset_starts_new_episodes(self) -> None:
         env = make(3)
         starts = torch.stack([env.reset()["position"] for _ in range(6)]).flatten(0, 1)
         assert len(torch.unique(starts, dim=0)) == 18
@@ -628,8 +653,8 @@ class TestFrozenTasks:
     ],
     ids=["antimeridian", "north", "south"],
 )
-def test_other_regions(region: Region, options: dict[str, object]) -> None:
-    env = make(16, region=region, field=paper_field(region, **options), max_steps=15, start_heading="random")
+def test_other_regions(region: Region, options: dict[str, Any]) -> None:
+    env = make(16, region=region, **options, max_steps=15, start_heading="random")
     check_env_specs(env, break_when_any_done="both")
     env.set_seed(0)
     td = fly_on(env, random_actions(30, 16))
@@ -638,43 +663,17 @@ def test_other_regions(region: Region, options: dict[str, object]) -> None:
     longitude = td["next", "position"][..., 1]
     assert (longitude.abs() <= 180).all()
     distance, _ = geodesic(*td["position"].unbind(-1), *td["next", "position"].unbind(-1))
-    torch.testing.assert_close(distance, td["next", "move"][..., 0].double(), rtol=0, atol=1e-3)  # one metre
+    torch.testing.assert_close(distance, td["next", "move"][..., 0].double(), rtol=0, atol=1e-3)  # one meter
     if region is ANTIMERIDIAN:
         assert ((td["position"][..., 1] * longitude < 0) & (longitude.abs() > 90)).any()
 
 
-REACH = {
-    "paper": (PAPER_REGION, 5.0, 50.0),
-    "high latitude": (HIGH_LATITUDE, 5.0, 50.0),
-    "no margin": (HIGH_LATITUDE, 0.0, 50.0),
-    "a move of just over half a degree": (PAPER_REGION, 5.0, 55.5),
-    "the longest move": (ANTIMERIDIAN, 5.0, 1000.0),
-    "near the pole": (Region((75.0, 84.0), (0.0, 20.0)), 5.0, 50.0),
-    "over the pole": (Region((75.0, 85.0), (0.0, 20.0)), 5.0, 50.0),
-    "over the south pole": (Region((-89.8, -85.0), (0.0, 20.0)), 0.0, 50.0),
-    "all around": (Region((0.0, 10.0), (0.0, 355.0)), 5.0, 50.0),
-}
-
-
-@pytest.mark.parametrize("row", REACH.values(), ids=REACH.keys())
-def test_flown_box_holds_every_place_that_a_move_can_reach(row: tuple[Region, float, float]) -> None:
-    """From the edge of the margin in any direction, by the longest move."""
-    region, margin_deg, max_move_km = row
-    box, edge = flown_box(region, margin_deg, max_move_km), region.expanded(margin_deg)
-    side = edge.grid(41)
-    rim = torch.cat((side[0], side[-1], side[:, 0], side[:, -1]))
-    heading = torch.linspace(-math.pi, math.pi, 73, dtype=torch.float64)
-    inputs = (*rim.unsqueeze(1).unbind(-1), heading, torch.tensor(max_move_km, dtype=torch.float64))
-    reached = torch.stack(move(*inputs), -1)
-    assert box.contains(reached).all()
-
-
-@pytest.mark.parametrize("margin_deg", [0.0, 0.1, 0.2, 0.7, 1.3, 4.9])
-def test_the_default_field_covers_what_is_flown(margin_deg: float) -> None:
-    for region in (PAPER_REGION, Region((-9.9, 0.1), (160.3, 170.7))):
-        field = make(region=region, margin_deg=margin_deg).field
-        assert field.latitude[0] < region.latitude[0] - margin_deg
-        assert field.longitude[1] > region.longitude[1] + margin_deg
+def test_the_default_field_covers_what_is_flown() -> None:
+    for margin_deg in (0.0, 0.1, 0.2, 0.7, 1.3, 4.9):
+        for region in (PAPER_REGION, Region((-9.9, 0.1), (160.3, 170.7))):
+            field = make(region=region, margin_deg=margin_deg).field
+            assert field.latitude[0] < region.latitude[0] - margin_deg
+            assert field.longitude[1] > region.longitude[1] + margin_deg
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -692,27 +691,28 @@ BAD_ACTIONS = {
 }
 
 
-@pytest.mark.parametrize("action", BAD_ACTIONS.values(), ids=BAD_ACTIONS.keys())
-@pytest.mark.parametrize("vehicle", [0, 2])
-def test_bad_actions_are_refused(action: tuple[float, float], vehicle: int) -> None:
-    actions = torch.full((3, 2), 0.5)
-    actions[vehicle] = torch.tensor(action)
+@pytest.mark.parametrize("name", BAD_ACTIONS)
+def test_bad_actions_are_refused(name: str) -> None:
     env = make(3)
-    with pytest.raises(ValueError, match=re.escape("GeomagneticNavEnv: actions of vehicles") + rf".*\[{vehicle}\]"):
-        env.step(env.reset().set("action", actions))
+    state = env.reset()
+    for vehicle in (0, 2):
+        actions = torch.full((3, 2), 0.5)
+        actions[vehicle] = torch.tensor(BAD_ACTIONS[name])
+        message = re.escape("GeomagneticNavEnv: actions of vehicles") + rf".*\[{vehicle}\]"
+        with pytest.raises(ValueError, match=message):
+            env.step(state.clone().set("action", actions))
 
 
-@pytest.mark.parametrize("action", [(50.0001, 0.0), (-0.0001, 0.0), (1.0, math.pi / 2 + 1e-6)])
-def test_rounding_beyond_the_bounds_is_forgiven_and_cut(action: tuple[float, float]) -> None:
-    env = make()
-    after = fly(env, action)[0]["next"]
+def test_rounding_beyond_the_bounds_is_forgiven_and_cut() -> None:
+    actions = torch.tensor([(50.0001, 0.0), (-0.0001, 0.0), (1.0, math.pi / 2 + 1e-6)])
+    env = make(3)
+    after = fly(env, actions)[0]["next"]
     low, high = env.action_spec.space.low, env.action_spec.space.high
     assert ((after["move"] >= low) & (after["move"] <= high)).all()
     assert env.observation_spec.is_in(after.select(*ENTRIES))
 
 
 NAN, INF = float("nan"), float("inf")
-INSIDE = places((-5.0, 165.0))
 BAD_OPTIONS = {
     "num_envs": [0, -1, 1.5, True, "3", None],
     "max_steps": [0, -1, 2.5, True],
@@ -720,68 +720,42 @@ BAD_OPTIONS = {
     "max_turn_rad": [0.0, -1.0, NAN, 4.0],
     "zeta": [0.0, -1.0, NAN, INF],
     "start_heading": ["south", "North", None, 0.0],
-    "objective_floors": [(0.05, 0.4), (0.05, 0.4, 15.0, 1.0), (0.0, 0.4, 15.0), (0.05, NAN, 15.0), (0.05, 0.4, -15.0)],
     "destination_weight": [-1.0, NAN, INF],
     "proximity_weight": [-1.0, NAN, INF],
-    "margin_deg": [-1.0, NAN, INF],
-    "distance_range_km": [(500.0, 300.0), (300.0, 300.0), (-1.0, 300.0), (NAN, 300.0), (300.0, INF), (5000.0, 6000.0)],
+    "render_mode": ["human", "", True],
+    "seed": [-1, 2**64, 0.5],
 }
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [(option, value) for option, values in BAD_OPTIONS.items() for value in values]
-)
-def test_bad_options_are_refused_with_their_value(option: str, value: object) -> None:
-    shown = repr(value) if isinstance(value, str) else str(value)
-    with pytest.raises(ValueError, match=rf"{option}.*{re.escape(shown)}"):
-        GeomagneticNavEnv(**{option: value})
+@pytest.mark.parametrize("option", BAD_OPTIONS)
+def test_bad_options_are_refused_with_their_value(option: str) -> None:
+    scenario = Scenario()
+    for value in BAD_OPTIONS[option]:
+        with pytest.raises(ValueError, match=rf"{option} must.*{re.escape(repr(value))}"):
+            GeomagneticNavEnv(scenario, **{option: value})
 
 
-BAD_TASKS = {
-    "start outside": (Tasks(places((5.1, 165.0)), INSIDE), r"start of task 0.*5.1.*165"),
-    "target outside": (
-        Tasks(INSIDE.expand(2, 2), places((-5.0, 165.0), (-5.0, 154.0))),
-        r"target of task 1.*154",
-    ),
-    "NaN latitude": (Tasks(INSIDE, places((NAN, 165.0))), "latitude nan"),
-    "NaN longitude": (Tasks(places((-5.0, NAN)), INSIDE), "longitude nan"),
-    "off the Earth": (Tasks(places((-95.0, 165.0)), INSIDE), r"latitude -95\.0"),
-    "empty": (Tasks(torch.zeros(0, 2), torch.zeros(0, 2)), r"\(0, 2\)"),
-    "one position": (Tasks(torch.zeros(2), torch.zeros(2)), r"\(2,\)"),
-    "three coordinates": (Tasks(torch.zeros(4, 3), torch.zeros(4, 3)), r"\(4, 3\)"),
-    "unequal": (Tasks(torch.zeros(2, 2), torch.zeros(3, 2)), r"\(2, 2\).*\(3, 2\)"),
-}
+def test_a_scenario_must_be_one() -> None:
+    with pytest.raises(TypeError, match="scenario must be a Scenario, got Region"):
+        GeomagneticNavEnv(PAPER_REGION)
 
 
-@pytest.mark.parametrize("row", BAD_TASKS.values(), ids=BAD_TASKS.keys())
-def test_bad_tasks_are_refused(row: tuple[Tasks, str]) -> None:
-    tasks, message = row
-    with pytest.raises(ValueError, match=message):
-        GeomagneticNavEnv(tasks=tasks)
-
-
-@pytest.mark.parametrize(
-    ("latitude", "longitude"), [((10, 0), (0, 10)), ((0, 10), (10, 0)), ((0, 91), (0, 10)), ((0, 0), (0, 10))]
-)
-def test_bad_regions_are_refused(latitude: tuple[float, float], longitude: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match=re.escape(str(latitude if longitude == (0, 10) else longitude))):
-        GeomagneticNavEnv(region=Region(latitude, longitude))
-
-
-@pytest.mark.parametrize(
-    "box", [((-10.0, 0.0), (160.0, 170.0)), ((-15.5, 5.5), (155.0, 175.5)), ((-15.5, 5.0), (154.5, 175.5))]
-)
-def test_a_field_that_does_not_cover_what_is_flown_is_refused(box: tuple[tuple[float, float], ...]) -> None:
-    small = RegionalField(IGRF("2022-01-01", 13), *box)
-    with pytest.raises(ValueError, match=r"not defined on all of .*-15\.5, 5\.5.*154\.5, 175\.5"):
-        GeomagneticNavEnv(field=small)
+def test_a_field_that_does_not_cover_what_is_flown_is_refused() -> None:
+    for latitude, longitude in (
+        ((-10.0, 0.0), (160.0, 170.0)),
+        ((-15.5, 5.5), (155.0, 175.5)),
+        ((-15.5, 5.0), (154.5, 175.5)),
+    ):
+        small = RegionalField(IGRF("2022-01-01", 13), latitude, longitude)
+        with pytest.raises(ValueError, match=r"not defined on all of .*-15\.5, 5\.5.*154\.5, 175\.5"):
+            make(field=small)
 
 
 def test_a_region_about_a_magnetic_pole_is_refused() -> None:
     """D is not continuous about the southern one, which lies near 64 S 136 E."""
     region = Region((-68.0, -60.0), (130.0, 140.0))
     with pytest.raises(ValueError, match=r"declination turns through south.*-68\.5, -59\.5"):
-        GeomagneticNavEnv(region=region, field=IGRF(2022.0), margin_deg=0.0)
+        make(region=region, field=IGRF(2022.0), margin_deg=0.0)
 
 
 def test_a_field_of_just_the_right_size_is_taken() -> None:
@@ -803,16 +777,87 @@ def test_options_reach_the_data() -> None:
     assert td["field"][0, 2].item() != pytest.approx(35467.990, rel=1e-4)
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# Tracks
+
+
+class TestTracks:
+    def test_a_track_is_the_running_episode_of_its_vehicle(self) -> None:
+        """From its start on, whenever the others are reset."""
+        env = make(6, **LIVELY, render_mode="rgb_array")
+        td, longest = env.reset(), 0
+        expected = [[position] for position in td["position"].tolist()]
+        for action in random_actions(20, 6):
+            step, td = env.step_and_maybe_reset(td.set("action", action))
+            for vehicle, done in enumerate(step["next", "done"].flatten().tolist()):
+                position = td["position"][vehicle].tolist()
+                expected[vehicle] = [position] if done else [*expected[vehicle], position]
+                assert env.track(vehicle).tolist() == expected[vehicle]
+                longest = max(longest, len(expected[vehicle]))
+        assert longest == LIVELY["max_steps"]
+        assert len({len(track) for track in expected}) > 1
+
+    def test_the_last_state_belongs_to_the_track(self) -> None:
+        env = make(max_steps=3, render_mode="rgb_array")
+        steps = fly(env, *[(10.0, 0.1)] * 3)
+        assert steps[-1]["next", "done"]
+        assert env.track(0).shape == (4, 2)
+        assert torch.equal(env.track(0)[-1], steps[-1]["next", "position"][0])
+
+    def test_without_a_render_mode_the_remedy_is_named(self) -> None:
+        env = make(2)
+        env.rollout(2)
+        for call in (env.render, lambda: env.track(0)):
+            with pytest.raises(RuntimeError, match=r"create the environment with render_mode='rgb_array'"):
+                call()
+
+    def test_positions_are_kept_with_a_render_mode_alone(self) -> None:
+        """Training must not pay for pictures: without the mode, no state outlives its step."""
+        for render_mode, is_kept in ((None, False), ("rgb_array", True)):
+            env = make(2, render_mode=render_mode)
+            td = env.reset()
+            start = weakref.ref(td["position"])
+            after = env._step(td.set("action", torch.ones(2, 2)))
+            end = weakref.ref(after["position"])
+            del td, after
+            gc.collect()
+            assert [ref() is not None for ref in (start, end)] == [is_kept] * 2
+
+    def test_bad_calls(self) -> None:
+        env = make(2, render_mode="rgb_array")
+        for call in (env.render, lambda: env.track(0)):
+            with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
+                call()
+        env.reset()
+        for vehicle in (2, -1):
+            with pytest.raises(IndexError, match=f"vehicle {vehicle} .* 2 in the batch"):
+                env.track(vehicle)
+            with pytest.raises(IndexError, match=f"vehicle {vehicle} "):
+                env.render([vehicle])
+        for size_px in (0, 1.5):
+            with pytest.raises(ValueError, match=f"size_px must be a whole number from 1 on, got {size_px}"):
+                env.render(size_px=size_px)
+
+    def test_recording_changes_no_number(self) -> None:
+        actions = random_actions(15, 4)
+        recorded, plain = (fly_on(make(4, **LIVELY, render_mode=mode), actions) for mode in ("rgb_array", None))
+        assert_same(recorded, plain)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Compilation
+
+
 def test_step_and_guidance_trace_as_one_graph() -> None:
     """Nothing in them breaks the graph of torch.compile, and the graph gives the same numbers."""
     env = make(4)
     td = env.rand_action(env.reset())
-    guidance = Compose(*guidance_transforms(env, 3.0, 0.785))
-    TransformedEnv(env, guidance).reset()
-    before = guidance._reset(td.clone(), td.clone())
+    guided = Compose(FieldGradient(env.field), GradientHeading(), AlignmentReward(weight=3.0, offset=0.785))
+    TransformedEnv(env, guided).reset()
+    before = guided._reset(td.clone(), td.clone())
 
     def step(before: TensorDictBase) -> TensorDictBase:
-        return guidance._step(before, env._step(before))
+        return guided._step(before, env._step(before))
 
     traced = torch.compile(step, fullgraph=True, backend="aot_eager")(before)
     plain = step(before)

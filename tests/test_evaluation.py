@@ -4,22 +4,28 @@ import csv
 import importlib.util
 import json
 import math
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
-from test_metrics import journey, point
+from test_metrics import episode, point
 
-from magrl import td3
-from magrl.env import GeomagneticNavEnv
+from magrl import paper
+from magrl.agents import FieldPolicy, save_policy
+from magrl.agents.policy import PolicyConfig
+from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, make_navigator
+from magrl.evaluation.tables import comparison_table, spread
+from magrl.training import UsageError
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 
 
 def load(name: str):
-    spec = importlib.util.spec_from_file_location(name, RECIPES / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(Path(name).name, RECIPES / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
@@ -38,7 +44,8 @@ def run(tmp_path_factory) -> Path:
     folder.mkdir()
     torch.manual_seed(0)
     env = GeomagneticNavEnv(seed=0)
-    td3.save_policy(folder / "policy.pt", td3.FieldPolicy(td3.policy_config(env, (8,), layer_norm=False)))
+    policy = FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False))
+    save_policy(folder / "policy.pt", policy)
     columns = ("frames", "return", "success_rate", "eval_success_rate", "eval_spl")
     rows = [(100, "nan", "nan", 0, 0), (200, 10, 50, 92, 80), (300, 20, 100, 98, 90)]
     with (folder / "train.csv").open("w", newline="") as file:
@@ -68,12 +75,17 @@ def test_every_navigator_flies_the_same_tasks(results: Path) -> None:
 
 
 def test_summary_is_that_of_the_episodes(results: Path) -> None:
-    summary = json.loads((results / "summary.json").read_text())
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    summary = json.loads((results / "summary.json").read_text(), parse_constant=refuse)
     episodes = [r for r in rows(results / "episodes.csv") if r["navigator"] == "secant"]
     assert summary["secant"][0]["spl"] == pytest.approx(sum(float(r["spl"]) for r in episodes))
     assert summary["parallel"][0]["success_rate"] == 100
     assert summary["secant"][0]["success_rate"] > 98
     assert summary["secant"][0]["field_readings"] == 0 < summary["pso"][0]["field_readings"]
+    assert summary["gg_td3"][0]["success_rate"] == 0
+    assert summary["gg_td3"][0]["steps"] is None
 
 
 def test_table_has_the_papers_row_beside_ours(results: Path) -> None:
@@ -83,10 +95,31 @@ def test_table_has_the_papers_row_beside_ours(results: Path) -> None:
     assert labels[:2] == ["Gradient-Guided TD3, paper", "Gradient-Guided TD3"]
     assert "AFSA, flown" in labels
     assert "PSO, look-ahead (an oracle)" in labels
-    assert lines[2].split("|")[3:6] == [" 97 ", " 445564 ", " 88.4 "]
+    assert lines[2].split("|")[3:7] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
     assert lines[3].split("|")[2] == " 2 "
     assert "0.0 ± 0.0" in lines[3]  # twice the same run
-    assert " — " in lines[3]  # that never arrives
+    assert " — " in lines[3]  # without any success
+    short = (results / "short.md").read_text().splitlines()
+    assert [line.split("|")[1] for line in short[2:]] == [f" {name} " for name in labels if ", paper" not in name]
+
+
+def test_papers_row_stands_once_for_both_modes_of_an_algorithm() -> None:
+    measures = dict.fromkeys(("success_rate", "trajectory_length_m", "spl", "steps", "navigation_error_km"), 1.0)
+    measures |= dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "field_readings"), 2.0)
+    measures |= {"success_rate_within_10km": 3.0, "success_rate_within_25km": math.nan, "spl_low": 0.5, "spl_high": 1.5}
+    lines = comparison_table({"ga": [measures], "ga:flown": [measures]}, "look-ahead").splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:]] == [
+        "| GA, paper",
+        "| GA, look-ahead (an oracle)",
+        "| GA, flown",
+    ]
+    assert lines[4] == "| GA, flown | 1 | 1.0 | 1 | 1.00 (0.50–1.50) | 1.00 | 1.0 | 2.0 | 2.0 | 2.0 | 3.0 | — | 2 |"
+
+
+def test_spread_leaves_out_runs_without_a_value() -> None:
+    assert spread([math.nan, 2.0], ".1f") == "2.0"
+    assert spread([1.0, math.nan, 3.0], ".1f") == f"2.0 ± {math.sqrt(2):.1f}"
+    assert spread([math.nan], ".1f") == "—"
 
 
 def test_paths_are_those_of_the_papers_example(results: Path) -> None:
@@ -98,62 +131,137 @@ def test_paths_are_those_of_the_papers_example(results: Path) -> None:
     assert float(last["I"]) == pytest.approx(-26.92, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("gg_td3", "needs the folder"),
-        ("dowsing", "unknown navigator 'dowsing'"),
-        ("secant=runs/a", "unknown navigator"),
-        ("secant:flown", "unknown navigator"),
-        ("ga:dreamt", "dreamt"),
-    ],
-)
-def test_unknown_navigators_are_refused_before_anything_is_written(evaluate, tmp_path, name, message) -> None:
-    config = evaluate.Config(navigators=(name,), tasks="figure-4-1", out=tmp_path / "out", wandb_mode="disabled")
-    with pytest.raises(ValueError, match=message):
-        evaluate.evaluate(config)
-    assert not (tmp_path / "out").exists()
+def test_every_navigator_has_a_label_and_can_be_made(run: Path) -> None:
+    env = GeomagneticNavEnv(num_envs=1, seed=0)
+    for name in NAVIGATOR_NAMES:
+        trained = name in ("gg_td3", "td3", "recurrent")
+        navigator = make_navigator(f"{name}={run}" if trained else name, env)
+        assert navigator(env.reset())["action"].shape == (1, 2)
+        assert NAVIGATOR_NAMES[name] in label(name)
+    assert (label("ga"), label("ga", "flown"), label("ga:look-ahead", "flown")) == (
+        "GA, look-ahead (an oracle)",
+        "GA, flown",
+        "GA, look-ahead (an oracle)",
+    )
+    with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
+        label("dowsing")
 
 
-def test_a_run_without_a_policy_is_said_in_a_line(tmp_path: Path) -> None:
+def test_a_mode_behind_the_name_overrides_the_default() -> None:
+    env = GeomagneticNavEnv(num_envs=1, seed=0)
+    oracles = [
+        make_navigator(text, env, mode).oracle for text in ("pso", "pso:flown") for mode in ("look-ahead", "flown")
+    ]
+    assert oracles == [True, False, False, False]
+
+
+def test_bad_usage_is_refused_before_anything_is_written_or_flown(
+    evaluate, run, results, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(evaluate, "evaluation_rollout", lambda *_: pytest.fail("something was flown"))
+    (tmp_path / "file").touch()
+    (tmp_path / "broken.toml").write_text("region =")
+    cases = [
+        (("gg_td3",), {}, "needs the folder"),
+        (("dowsing",), {}, "unknown navigator 'dowsing'"),
+        (("secant=runs/a",), {}, "unknown navigator"),
+        (("secant:flown",), {}, "unknown navigator"),
+        ((f"td3:flown={run}",), {}, "unknown navigator"),
+        (("ga:dreamt",), {}, "dreamt"),
+        ((), {}, "at least one navigator"),
+        ((f"td3={tmp_path}",), {}, "there is no policy file at"),
+        (("secant",), {"zeta": 0.0}, "zeta must be .* got 0.0"),
+        (("ga",), {"seed": -1}, "seed"),
+        (("secant",), {"wandb_mode": "sometimes"}, "wandb_mode"),
+        (("secant",), {"scenario": tmp_path / "missing.toml"}, "no scenario file at"),
+        (("secant",), {"scenario": tmp_path / "broken.toml"}, "broken.toml"),
+        (("secant",), {"export": tmp_path / "tracks.shp"}, r"\.geojson, \.gpx, \.kml"),
+        (("secant",), {"export": tmp_path / "file" / "tracks.kml"}, "cannot write .*tracks.kml"),
+        (("secant",), {"out": tmp_path / "file" / "out"}, "file"),
+        (("secant",), {"out": results}, "is not empty"),
+    ]
+    before = {path.name for path in results.iterdir()}
+    for navigators, options, message in cases:
+        given = {"tasks": None if "scenario" in options else "figure-4-1", "out": tmp_path / "out"} | options
+        with pytest.raises(UsageError, match=message):
+            evaluate.evaluate(evaluate.Config(navigators, **{"wandb_mode": "disabled", **given}))
+        assert not (tmp_path / "out").exists(), message
+    assert {path.name for path in results.iterdir()} == before
+
+
+def test_only_bad_usage_is_shown_in_one_line(evaluate, tmp_path: Path, monkeypatch) -> None:
+    """A command exits with status 2 and one line; an error while it flies keeps its traceback."""
     command = [sys.executable, RECIPES / "evaluate.py", f"td3={tmp_path}", "--out", tmp_path / "out"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert done.stderr.startswith("evaluate.py: there is no policy file at")
+    assert done.stderr.count("\n") == 1
+
+    def fail(*_: object) -> None:
+        raise ValueError("a fault of the program")
+
+    monkeypatch.setattr(evaluate, "evaluation_rollout", fail)
+    arguments = ["secant", "--tasks", "figure-4-1", "--out", str(tmp_path / "out"), "--wandb-mode", "disabled"]
+    with pytest.raises(ValueError, match="a fault of the program") as error:
+        evaluate.command(evaluate.RECIPE, lambda: evaluate.main(arguments))
+    assert not isinstance(error.value, UsageError)
+
+
+def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, capsys) -> None:
+    cases = {
+        "figures": (["--results", str(tmp_path), "--out", str(tmp_path)], "there is no"),
+        "learning_table": ([f"td3={tmp_path}"], "there is no"),
+        "path_loss": (["dowsing"], "unknown navigator 'dowsing'"),
+        "publish": ([str(tmp_path / "missing.md")], "there is no document"),
+        "results_table": ([str(tmp_path)], "no eval.json"),
+        "sweep_metaheuristics": (["--tasks", "0"], "num_tasks must be a whole number from 1 on, got 0"),
+    }
+    assert cases.keys() == {path.stem for path in (RECIPES / "tables").glob("*.py")}
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(RECIPES)])
+    for name, (arguments, message) in cases.items():
+        script = RECIPES / "tables" / f"{name}.py"
+        monkeypatch.setattr(sys, "argv", [str(script), *arguments])
+        with pytest.raises(SystemExit) as error:
+            runpy.run_path(str(script), run_name="__main__")
+        said = capsys.readouterr()
+        assert error.value.code == 2
+        assert said.err.startswith(f"{name}.py: {message}"), said.err
+        assert said.out == ""
 
 
 def test_figures_are_drawn_from_the_files(results: Path, run: Path, tmp_path: Path) -> None:
-    figures = load("figures")
-    figures.main(figures.Config(results=results, gg_td3=(run, run), out=tmp_path))
+    figures = load("tables/figures")
+    figures.draw(figures.Config(results=results, gg_td3=(run, run), out=tmp_path))
     names = {path.name for path in tmp_path.iterdir()}
     assert {name[:7] for name in names} == {"fig-4-1", "fig-4-2", "fig-4-3", "fig-4-4", "fig-4-5", "fig-4-6", "learnin"}
-    with pytest.raises(SystemExit, match=r"no .*paths\.csv"):
-        figures.main(figures.Config(results=tmp_path, out=tmp_path))
+    with pytest.raises(UsageError, match=r"no .*paths\.csv"):
+        figures.draw(figures.Config(results=tmp_path, out=tmp_path))
+    with pytest.raises(UsageError, match="no column 'reward'"):
+        figures.column([{"return": "1"}], "reward")
 
 
-def test_path_loss_is_what_a_detour_costs(monkeypatch) -> None:
+def test_path_loss_is_what_a_detour_costs() -> None:
     """A square corner of 30 and 40 km for 50 km of way, then straight on: 20 km lost, all of it at the start."""
-    monkeypatch.syspath_prepend(str(RECIPES))
-    loss = load("path_loss")
+    loss = load("tables/path_loss")
     heading = math.degrees(math.atan2(40, 30))
     legs = [(30.0, 0.0), (40.0, 90.0), *[(50.0, heading)] * 3]
-    got = loss.losses(journey(legs, point(200.0, heading), True, 6))
+    got = loss.losses(episode(legs, point(200.0, heading), True, 6))
     assert got["first two moves"] == pytest.approx(20, abs=0.5)  # the course holds while the bearing turns a little
     assert got["between"] == pytest.approx(0, abs=0.5)
     assert got["last two moves"] == pytest.approx(0, abs=0.5)
 
 
 def test_learning_table(run: Path) -> None:
-    learning = load("learning_table")
+    learning = load("tables/learning_table")
     lines = learning.table({"agent": [run, run]}).splitlines()
     cells = [cell.strip() for cell in lines[2].strip("|").split("|")]
     # frames 0 to 100 at 0, then the mean of 0 and 92, then of 92 and 98, over 300 frames
     assert cells == ["agent", "2", "200 ± 0", "300 ± 0", f"{(0 + 46 + 95) / 3:.1f} ± 0.0", "90.00 ± 0.00"]
-    assert learning.spread([1.0, float("nan")], ".0f") == "1, 1 of 2 never"
+    assert learning.reached([1.0, float("nan")], ".0f") == "1, 1 of 2 never"
 
 
 def test_results_table(run: Path, tmp_path: Path) -> None:
-    table = load("results_table")
+    table = load("tables/results_table")
     result = {"seed": 3, "success_rate": 99.5, "spl": 98.0, "trajectory_length_m": 4e5, "steps": 9.0}
     result |= {"navigation_error_km": 10.0, "success_rate_within_10km": 50.0, "success_rate_within_25km": 90.0}
     result |= {"training_seconds": 60.0, "seconds_to_97_sr_88_spl": None}
@@ -161,5 +269,22 @@ def test_results_table(run: Path, tmp_path: Path) -> None:
     lines = table.table((str(tmp_path),)).splitlines()
     assert table.table((f"mine={tmp_path}",)).splitlines()[3:] == [lines[3].replace("seed 3", "mine")]
     assert lines[3] == "| seed 3 | 99.5 | 98.00 | 400000 | 9.00 | 10.0 | 50.0 | 90.0 | 60 | — |"
-    with pytest.raises(SystemExit, match=r"no eval\.json"):
+    published = paper.TABLE_2["gg_td3"]
+    expected = f"| {published.success_rate:.1f} | {published.spl:.2f} | {published.trajectory_length_m:.0f} |"
+    assert lines[2].startswith(f"| paper {expected}")
+    with pytest.raises(UsageError, match=r"no eval\.json"):
         table.table((str(run),))
+
+
+def test_publish_fills_every_document_or_none(tmp_path: Path) -> None:
+    publish = load("tables/publish")
+    (tmp_path / "table.md").write_text("| a |\n")
+    good, bad = tmp_path / "good.md", tmp_path / "bad.md"
+    good.write_text("before\n<!-- table: table.md -->\nold\n<!-- end -->\nafter\n")
+    bad.write_text("<!-- table: missing.md -->\n<!-- end -->\n")
+    kept = good.read_text()
+    with pytest.raises(UsageError, match=r"no table .*missing\.md"):
+        publish.publish(publish.Config((good, bad), root=tmp_path))
+    assert good.read_text() == kept
+    publish.publish(publish.Config((good,), root=tmp_path))
+    assert good.read_text() == "before\n<!-- table: table.md -->\n\n| a |\n\n<!-- end -->\nafter\n"

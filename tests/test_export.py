@@ -1,4 +1,4 @@
-"""Journeys on maps: written files are read again with the standard parsers, and hold the places that were flown."""
+"""Tracks for maps: written files are read again with the standard parsers, and hold the positions of the episodes."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from xml.etree import ElementTree
 
 import pytest
 
-from magrl.env import GeomagneticNavEnv
-from magrl.export import Flight, check_suffix, cut, flights, to_geojson, to_gpx, to_kml, write_flights
+from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation.export import Track, check_suffix, cut, to_geojson, to_gpx, to_kml, tracks, write_tracks
 
 GPX, KML = "{http://www.topografix.com/GPX/1/1}", "{http://www.opengis.net/kml/2.2}"
 AWKWARD = 'a <b> & "c" \x00\x1f ]]> Ñandú'
-STRAIGHT = Flight(AWKWARD, [(10.123456789, 20.987654321), (11.0, 21.5), (1e-7, -1e-7)], {"spl": 0.5, "steps": 2})
-ACROSS = Flight("across", [(0.0, 178.0), (1.0, -179.0), (2.0, 179.5)], {"spl": math.nan})
+STRAIGHT = Track(AWKWARD, [(10.123456789, 20.987654321), (11.0, 21.5), (1e-7, -1e-7)], {"spl": 0.5, "steps": 2})
+ACROSS = Track("across", [(0.0, 178.0), (1.0, -179.0), (2.0, 179.5)], {"spl": math.nan})
 
 
 def gpx_places(text: str) -> list[list[tuple[float, float]]]:
     root = ElementTree.fromstring(text)
     assert (root.tag, root.get("version")) == (f"{GPX}gpx", "1.1")
-    tracks = root.findall(f"{GPX}trk/{GPX}trkseg")
-    return [[(float(p.get("lat")), float(p.get("lon"))) for p in track.findall(f"{GPX}trkpt")] for track in tracks]
+    segments = root.findall(f"{GPX}trk/{GPX}trkseg")
+    return [[(float(p.get("lat")), float(p.get("lon"))) for p in track.findall(f"{GPX}trkpt")] for track in segments]
 
 
 def kml_lines(text: str) -> list[list[list[tuple[float, float]]]]:
@@ -44,27 +44,27 @@ def same(one: list[tuple[float, float]], other: list[tuple[float, float]]) -> bo
     return all(abs(a - b) < 1e-7 for p, q in pairs for a, b in zip(p, q, strict=True))
 
 
-def test_flights_are_those_of_the_rollout() -> None:
+def test_tracks_are_those_of_the_rollout() -> None:
     env = GeomagneticNavEnv(num_envs=2, seed=0)
     rollout = env.rollout(4, break_when_any_done=False)
-    one, other = flights(rollout, ["one", "other"], navigator="chance")
+    one, other = tracks(rollout, ["one", "other"], navigator="chance")
     assert (one.name, other.name) == ("one", "other")
     assert one.positions[0] == tuple(rollout["position"][0, 0].tolist())
     assert one.positions[-1] == tuple(rollout["next", "position"][0, 3].tolist())
     assert len(one.positions) == 5
     assert (one.properties["navigator"], one.properties["steps"], one.properties["success"]) == ("chance", 4, False)
     assert {"spl", "length_km", "shortest_km", "navigation_error_km"} <= one.properties.keys()
-    with pytest.raises(ValueError, match="2 journeys, and 1 names"):
-        flights(rollout, ["one"])
+    with pytest.raises(ValueError, match="each of 2 episodes, got 1"):
+        tracks(rollout, ["one"])
 
 
-def test_a_flight_ends_where_the_episode_does() -> None:
-    """A journey whose first move arrives is a line of two places, whatever the rollout holds after it."""
+def test_a_track_ends_where_the_episode_does() -> None:
+    """An episode whose first move arrives is a line of two places, whatever the rollout holds after it."""
     env = GeomagneticNavEnv(num_envs=1, seed=0, zeta=1e9)
     rollout = env.rollout(3, break_when_any_done=False)
-    (flight,) = flights(rollout, ["short"])
-    assert len(flight.positions) == 2
-    assert flight.properties["success"] is True
+    (track,) = tracks(rollout, ["short"])
+    assert len(track.positions) == 2
+    assert track.properties["success"] is True
 
 
 def test_geojson_is_that_of_rfc_7946() -> None:
@@ -92,7 +92,7 @@ def test_gpx_holds_the_places() -> None:
     assert same(across, ACROSS.positions)
     assert "e-" not in text.lower().split("<trkseg>")[1], "GPX reads no powers of ten"
     assert ElementTree.fromstring(text).find(f"{GPX}trk/{GPX}name").text == 'a <b> & "c" ?? ]]> Ñandú'
-    assert gpx_places(to_gpx([Flight("edge", [(0, 180), (0, 179)], {})]))[0][0] == (0, -180)
+    assert gpx_places(to_gpx([Track("edge", [(0, 180), (0, 179)], {})]))[0][0] == (0, -180)
 
 
 def test_kml_holds_the_places_and_is_cut() -> None:
@@ -126,21 +126,21 @@ def test_lines_are_cut_at_the_antimeridian_alone(places: list, lines: list) -> N
 @pytest.mark.parametrize("writer", [to_geojson, to_gpx, to_kml])
 @pytest.mark.parametrize("places", [[(0, 0)], [(0, 0), (91, 0)], [(0, 0), (0, 181)], [(0, 0), (math.nan, 0)]], ids=str)
 def test_what_cannot_be_drawn_is_refused(writer, places: list) -> None:
-    with pytest.raises(ValueError, match=r"position|two places"):
-        writer([Flight("bad", places, {})])
+    with pytest.raises(ValueError, match=r"position must be|two positions"):
+        writer([Track("bad", places, {})])
 
 
 def test_format_goes_by_the_suffix(tmp_path: Path) -> None:
     for suffix, start in ((".geojson", '{"type"'), (".gpx", "<?xml"), (".KML", "<?xml")):
-        path = tmp_path / "new" / f"flights{suffix}"
-        write_flights(path, [STRAIGHT])
+        path = tmp_path / "new" / f"tracks{suffix}"
+        write_tracks(path, [STRAIGHT])
         assert path.read_text(encoding="utf-8").startswith(start)
-    with pytest.raises(ValueError, match=r"\.geojson, \.gpx, \.kml; 'a\.shp'"):
+    with pytest.raises(ValueError, match=r"\.geojson, \.gpx, \.kml, got 'a\.shp'"):
         check_suffix("a.shp")
-    with pytest.raises(ValueError, match="none of them"):
-        write_flights(tmp_path / "flights", [STRAIGHT])
+    with pytest.raises(ValueError, match="must end in one of"):
+        write_tracks(tmp_path / "tracks", [STRAIGHT])
 
 
-def test_no_journey_is_an_empty_file_of_its_kind() -> None:
+def test_no_episode_is_an_empty_file_of_its_kind() -> None:
     assert json.loads(to_geojson([]))["features"] == []
     assert gpx_places(to_gpx([])) == kml_lines(to_kml([])) == []

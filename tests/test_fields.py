@@ -2,6 +2,8 @@
 
 import copy
 import math
+import re
+from datetime import date as calendar_date
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -11,18 +13,13 @@ import pytest
 import torch
 from torch import nn
 
-from magrl.elements import measured_elements, seven_elements
-from magrl.fields import (
-    IGRF,
-    SphericalHarmonicField,
-    elements_at,
-    elements_gradient_at,
-    igrf_coefficients,
-    parse_date,
-)
+from magrl.field.elements import measured_elements, seven_elements
+from magrl.field.harmonics import REFERENCE_RADIUS_KM
+from magrl.field.igrf import IGRF, igrf_coefficients, parse_date
+from magrl.field.model import elements_at, elements_gradient_at
+from magrl.field.regional import RegionalField
+from magrl.field.spherical import SphericalHarmonicField
 from magrl.geodesy import WGS84_A_KM, WGS84_B_KM, curvature_radii
-from magrl.harmonics import REFERENCE_RADIUS_KM
-from magrl.regional import RegionalField
 
 COEFFICIENT_FILES = {13: ppigrf.ppigrf.shc_fn_igrf13, 14: ppigrf.ppigrf.shc_fn_igrf14}
 LAST_YEAR = {13: 2025, 14: 2030}
@@ -138,7 +135,7 @@ def test_another_model_gives_its_published_values():
 
 
 @pytest.mark.parametrize(
-    "date",
+    "form",
     [
         datetime(2022, 7, 2, 12),
         datetime(2022, 7, 2, 12, tzinfo=timezone.utc),
@@ -152,10 +149,10 @@ def test_another_model_gives_its_published_values():
     ],
     ids=str,
 )
-def test_one_date_in_every_form(date):
-    assert parse_date(date) == datetime(2022, 7, 2, 12)
-    assert parse_date(date).tzinfo is None
-    assert torch.equal(igrf_coefficients(date), igrf_coefficients("2022-07-02T12:00"))
+def test_one_date_in_every_form(form):
+    assert parse_date(form) == datetime(2022, 7, 2, 12)
+    assert parse_date(form).tzinfo is None
+    assert torch.equal(igrf_coefficients(form), igrf_coefficients("2022-07-02T12:00"))
 
 
 @pytest.mark.parametrize(
@@ -185,19 +182,21 @@ def test_a_day_outside_the_model_is_refused_with_its_span(generation, side):
             IGRF(form, generation)
 
 
-@pytest.mark.parametrize(
-    "date", [math.nan, math.inf, -1.0, 0.5, 1e5, "yesterday", "", "2022-13-01", True, None, [2022]]
-)
 @pytest.mark.parametrize("read", [parse_date, IGRF])
-def test_what_is_no_date_is_refused(date, read):
-    with pytest.raises(ValueError, match="date"):
-        read(date)
+def test_bad_dates_are_refused(read):
+    for date in (math.nan, math.inf, -1.0, 0.5, 1e5, "yesterday", "", "2022-13-01", True, None, [2022]):
+        with pytest.raises(ValueError, match="date"):
+            read(date)
 
 
-@pytest.mark.parametrize("generation", [12, 15, 0, "14"])
-def test_other_generations_are_refused(generation):
-    with pytest.raises(ValueError, match=rf"generation {generation!r} is not available.*13, 14"):
-        IGRF(PAPER_DATE, generation)
+def test_a_calendar_date_is_its_midnight():
+    assert parse_date(calendar_date(2022, 7, 2)) == datetime(2022, 7, 2)
+
+
+def test_other_generations_are_refused():
+    for generation in (12, 15, 0, "14"):
+        with pytest.raises(ValueError, match=rf"generation {generation!r} is not available.*13, 14"):
+            IGRF(PAPER_DATE, generation)
 
 
 # --- synthesis --------------------------------------------------------------------------------------------------------
@@ -294,7 +293,7 @@ def test_a_pole_is_an_ordinary_point(igrf, pole):
     torch.testing.assert_close(strength, strength[:1].expand(4), rtol=0, atol=ROUNDING_NT)
     torch.testing.assert_close(field[:, 2], field[:1, 2].expand(4), rtol=0, atol=ROUNDING_NT)
     beside = igrf(torch.full_like(longitude, math.copysign(89.999999, pole)), longitude)
-    torch.testing.assert_close(beside, field, rtol=0, atol=0.01)  # a tenth of a metre away
+    torch.testing.assert_close(beside, field, rtol=0, atol=0.01)  # a tenth of a meter away
     assert all(torch.isfinite(x).all() for x in igrf.value_and_gradient(torch.full_like(longitude, pole), longitude))
 
 
@@ -315,11 +314,15 @@ def test_the_dateline_is_no_seam(igrf):
         torch.testing.assert_close(gradient[:, other], gradient[:, 0], rtol=0, atol=ROUNDING_NT)
 
 
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3), (0,), (2, 0)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("model", ["igrf", "region"])
-def test_batch_shapes_and_dtypes(model, shape, dtype, request):
+def test_batch_shapes_and_dtypes(model, request):
     field = request.getfixturevalue(model)
+    for shape in ((), (3,), (2, 3), (0,), (2, 0)):
+        for dtype in (torch.float32, torch.float64):
+            check_shape_and_dtype(field, shape, dtype)
+
+
+def check_shape_and_dtype(field, shape, dtype):
     latitude, longitude = torch.full(shape, -8.0, dtype=dtype), torch.full(shape, 164.0, dtype=dtype)
     value, gradient = field.value_and_gradient(latitude, longitude)
     for found, expected in (
@@ -405,9 +408,10 @@ def test_chunks_do_not_show(igrf, count):
         torch.testing.assert_close(found, expected, rtol=0, atol=ROUNDING_NT)
 
 
-@pytest.mark.parametrize(
-    ("latitude", "longitude", "altitude_km", "message"),
-    [
+@pytest.mark.parametrize("method", ["forward", "value_and_gradient"])
+def test_positions_off_the_earth_are_refused(igrf, method):
+    """A bad latitude, longitude or altitude beside a good one."""
+    for *position, message in (
         (90.1, 0.0, 0.0, "latitude 90.1"),
         (-90.1, 0.0, 0.0, "latitude -90.1"),
         (math.nan, 0.0, 0.0, "latitude nan"),
@@ -415,40 +419,26 @@ def test_chunks_do_not_show(igrf, count):
         (0.0, math.inf, 0.0, "longitude inf"),
         (0.0, 0.0, math.nan, "altitude_km"),
         (0.0, 0.0, math.inf, "altitude_km"),
-    ],
-)
-@pytest.mark.parametrize("method", ["forward", "value_and_gradient"])
-def test_positions_off_the_earth_are_refused(igrf, latitude, longitude, altitude_km, message, method):
-    good = f64(0.0, 0.0)
-    with pytest.raises(ValueError, match=message):
-        getattr(igrf, method)(good + f64(0.0, latitude), good + f64(0.0, longitude), good + f64(0.0, altitude_km))
+    ):
+        with pytest.raises(ValueError, match=message):
+            getattr(igrf, method)(*(f64(0.0, x) for x in position))
 
 
-@pytest.mark.parametrize("shape", [(4,), (2, 3), (1, 1), (2, 2, 2), (0, 0)])
-def test_a_table_of_another_shape_is_refused(shape):
-    with pytest.raises(ValueError, match="square") as error:
-        SphericalHarmonicField(torch.zeros(shape, dtype=torch.complex128))
-    assert str(shape) in str(error.value)
-
-
-@pytest.mark.parametrize("bad", [complex(math.nan, 0), complex(0, math.nan), complex(math.inf, 0)])
-def test_a_table_that_is_not_finite_is_refused(bad):
-    gauss = torch.zeros(3, 3, dtype=torch.complex128)
-    gauss[1, 1] = bad
-    with pytest.raises(ValueError, match="finite"):
-        SphericalHarmonicField(gauss)
-
-
-@pytest.mark.parametrize("chunk", [0, -5])
-def test_a_chunk_of_no_points_is_refused(chunk):
-    with pytest.raises(ValueError, match=f"{chunk}"):
-        IGRF(PAPER_DATE, chunk=chunk)
-
-
-@pytest.mark.parametrize("altitude_km", [math.nan, math.inf, -101.0])
-def test_a_bad_altitude_is_refused_in_the_constructor(altitude_km):
-    with pytest.raises(ValueError, match=f"altitude_km .* got {altitude_km}"):
-        IGRF(PAPER_DATE, altitude_km=altitude_km)
+def test_bad_tables_and_options_are_refused():
+    for shape in ((4,), (2, 3), (1, 1), (2, 2, 2), (0, 0)):
+        with pytest.raises(ValueError, match=re.escape(f"square (N + 1, N + 1) table with N >= 1, got shape {shape}")):
+            SphericalHarmonicField(torch.zeros(shape, dtype=torch.complex128))
+    for bad in (complex(math.nan, 0), complex(0, math.nan), complex(math.inf, 0)):
+        gauss = torch.zeros(3, 3, dtype=torch.complex128)
+        gauss[1, 1] = bad
+        with pytest.raises(ValueError, match="finite"):
+            SphericalHarmonicField(gauss)
+    for chunk in (0, -5):
+        with pytest.raises(ValueError, match=f"{chunk}"):
+            IGRF(PAPER_DATE, chunk=chunk)
+    for altitude_km in (math.nan, math.inf, -101.0):
+        with pytest.raises(ValueError, match=f"altitude_km .* got {altitude_km}"):
+            IGRF(PAPER_DATE, altitude_km=altitude_km)
 
 
 # --- regional expansion -----------------------------------------------------------------------------------------------
@@ -480,16 +470,14 @@ def test_region_states_the_largest_error(igrf):
     assert 0.5 * coarse.error_nt < found < 1.2 * coarse.error_nt
 
 
-@pytest.mark.parametrize(
-    ("latitude", "longitude"),
-    [(-15.5001, 165.0), (5.5001, 165.0), (-5.0, 154.4999), (-5.0, 175.5001), (-5.0, -15.0), (80.0, 0.0)],
-)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_outside_is_nan_and_never_an_extrapolation(region, latitude, longitude, dtype):
-    position = (torch.tensor([-5.0, latitude], dtype=dtype), torch.tensor([165.0, longitude], dtype=dtype))
-    for found in (region(*position), *region.value_and_gradient(*position)):
+def test_outside_is_nan_and_never_an_extrapolation(region, dtype):
+    """One position inside, six outside."""
+    latitude = torch.tensor([-5.0, -15.5001, 5.5001, -5.0, -5.0, -5.0, 80.0], dtype=dtype)
+    longitude = torch.tensor([165.0, 165.0, 165.0, 154.4999, 175.5001, -15.0, 0.0], dtype=dtype)
+    for found in (region(latitude, longitude), *region.value_and_gradient(latitude, longitude)):
         assert torch.isfinite(found[0]).all()
-        assert torch.isnan(found[1]).all()
+        assert torch.isnan(found[1:]).all()
 
 
 def test_a_position_that_is_nan_gives_nan(region):
@@ -518,12 +506,10 @@ DECIMAL_BOXES = [
 ]
 
 
-@pytest.mark.parametrize(("latitude", "longitude"), DECIMAL_BOXES)
-def test_the_edges_belong_to_the_box_however_they_round(igrf, latitude, longitude):
-    field = RegionalField(igrf, latitude, longitude)
-    south_west, north_east = (f64(*corner) for corner in zip(latitude, longitude, strict=True))
-    found = field(torch.stack((south_west[0], north_east[0])), torch.stack((south_west[1], north_east[1])))
-    assert torch.isfinite(found).all()
+def test_the_edges_belong_to_the_box_however_they_round(igrf):
+    for latitude, longitude in DECIMAL_BOXES:
+        field = RegionalField(igrf, latitude, longitude)
+        assert torch.isfinite(field(f64(*latitude), f64(*longitude))).all(), (latitude, longitude)
 
 
 def test_region_with_a_geographic_pole_on_its_edge(igrf):
@@ -539,9 +525,8 @@ def test_a_missed_tolerance_is_refused_with_its_numbers(igrf, degree, tolerance_
         RegionalField(igrf, (-10, 0), (160, 170), degree=degree, tolerance_nt=tolerance_nt)
 
 
-@pytest.mark.parametrize(
-    ("latitude", "longitude", "options", "message"),
-    [
+def test_bad_boxes_and_settings_are_refused(igrf):
+    for latitude, longitude, options, message in (
         ((0, -10), (160, 170), {}, r"latitudes \(0, -10\)"),
         ((0, 0), (160, 170), {}, r"latitudes \(0, 0\)"),
         ((-10, 91), (160, 170), {}, r"latitudes \(-10, 91\)"),
@@ -555,11 +540,9 @@ def test_a_missed_tolerance_is_refused_with_its_numbers(igrf, degree, tolerance_
         ((-10, 0), (160, 170), {"tolerance_nt": 0.0}, "tolerance_nt .* got 0"),
         ((-10, 0), (160, 170), {"tolerance_nt": -1.0}, "tolerance_nt .* got -1"),
         ((-10, 0), (160, 170), {"tolerance_nt": math.nan}, "tolerance_nt .* got nan"),
-    ],
-)
-def test_bad_boxes_and_settings_are_refused(igrf, latitude, longitude, options, message):
-    with pytest.raises(ValueError, match=message):
-        RegionalField(igrf, latitude, longitude, **options)
+    ):
+        with pytest.raises(ValueError, match=message):
+            RegionalField(igrf, latitude, longitude, **options)
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3)])

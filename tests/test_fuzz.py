@@ -1,29 +1,26 @@
-"""Files from strangers: thousands of mutants of each kind give a clean error, or what the file held before."""
+"""Damaged files: thousands of mutants of each kind give a clear error, or the content of the file."""
 
 import json
 import random
-import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import td3_gradient_guided as recipe
 import torch
 
-from magrl import td3
-from magrl.checkpoints import Checkpoints, read_checkpoint, save_tensors
-from magrl.env import GeomagneticNavEnv
-from magrl.settings import read_settings
-from magrl.worlds import World, load_world
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
-import td3_gradient_guided as recipe
+from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
+from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario
+from magrl.files import save_tensors
+from magrl.training.checkpoints import Checkpoints, read_checkpoint
+from magrl.training.config import resumed_config
 
 MUTANTS = 3000
 
 
 def mutant(whole: bytes, dice: random.Random) -> bytes:
-    """A file with some bytes replaced, inserted, removed, repeated, or cut off."""
+    """Return the content of a file with some bytes replaced, inserted, removed, repeated, or cut off."""
     content = bytearray(whole)
     for _ in range(dice.choice((1, 1, 2, 8))):
         at = dice.randrange(len(content) + 1)
@@ -44,7 +41,7 @@ def mutant(whole: bytes, dice: random.Random) -> bytes:
 def fuzz(
     path: Path, read: Callable[[], object], same: Callable[[object], bool], clean: type[Exception], seed: int
 ) -> int:
-    """Reads mutants of a file; counts those that were read whole."""
+    """Read mutants of a file; return how many were read without an error."""
     whole, dice, survived = path.read_bytes(), random.Random(seed), 0
     assert same(read())
     with warnings.catch_warnings():
@@ -55,26 +52,29 @@ def fuzz(
             try:
                 found = read()
             except clean as error:
-                said = str(error)
-                assert str(path) in said, f"mutant {number} of seed {seed}: {said}"
+                message = str(error)
+                assert str(path) in message, f"mutant {number} of seed {seed}: {message}"
                 continue
             survived += 1
             assert same(found), f"mutant {number} of seed {seed} was read as something else"
     return survived
 
 
+def small_policy() -> FieldPolicy:
+    return FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (4,)))
+
+
 def test_policies(tmp_path: Path) -> None:
-    path = tmp_path / "policy.pt"
-    policy = td3.FieldPolicy(td3.policy_config(GeomagneticNavEnv(seed=0), (4,), layer_norm=True))
-    td3.save_policy(path, policy)
+    path, policy = tmp_path / "policy.pt", small_policy()
+    save_policy(path, policy)
     weights = policy.actor.state_dict()
 
     def same(found: object) -> bool:
-        assert isinstance(found, td3.FieldPolicy)
+        assert isinstance(found, FieldPolicy)
         other = found.actor.state_dict()
         return found.config == policy.config and all(torch.equal(weights[k], other[k]) for k in weights)
 
-    assert fuzz(path, lambda: td3.load_policy(path), same, ValueError, 0) < MUTANTS / 2
+    assert fuzz(path, lambda: load_policy(path), same, ValueError, 0) < MUTANTS / 2
 
 
 def test_checkpoints(tmp_path: Path) -> None:
@@ -89,10 +89,10 @@ def test_checkpoints(tmp_path: Path) -> None:
 
 
 def test_settings_of_runs(tmp_path: Path) -> None:
-    """Settings are texts: a mutant may be other settings, but then they are sound, and of the same kinds."""
+    """A mutant may hold other settings, but then they are valid, and of the same types."""
     path = tmp_path / "config.json"
     settings = {key: value for key, value in vars(recipe.Config()).items() if key not in ("out", "resume")}
-    path.write_text(json.dumps({**settings, "out": "run", "resume": None, "guided": True}))
+    path.write_text(json.dumps({"recipe": recipe.RECIPE, **settings, "out": "run", "resume": None}))
 
     def sound(found: object) -> bool:
         assert isinstance(found, recipe.Config)
@@ -103,41 +103,41 @@ def test_settings_of_runs(tmp_path: Path) -> None:
             if value is not None
         )
 
-    fuzz(path, lambda: read_settings(tmp_path, recipe.Config, guided=True), sound, ValueError, 2)
+    fuzz(path, lambda: resumed_config(tmp_path, recipe.Config, recipe.RECIPE), sound, ValueError, 2)
 
 
 @pytest.mark.parametrize("suffix", [".toml", ".json"])
-def test_worlds(tmp_path: Path, suffix: str) -> None:
-    """A mutant may be another world, but then it is a sound one."""
-    path = tmp_path / f"world{suffix}"
+def test_scenarios(tmp_path: Path, suffix: str) -> None:
+    """A mutant may be another scenario, but then it is a valid one."""
+    path = tmp_path / f"scenario{suffix}"
     region, task = {"latitude": [40, 50], "longitude": [-30, -20]}, {"start": [41.0, -29.0], "target": [44.5, -24.0]}
-    content = {"region": region, "field": {"date": "2026-07-01", "generation": 14, "altitude_km": 0.5}}
-    content |= {"journeys": {"distance_range_km": [300, 500]}, "tasks": [{"name": "a name", **task}, task]}
-    tables = [f"[{name}]\n{lines(content[name])}" for name in ("region", "field", "journeys")]
-    tables += [f"[[tasks]]\n{lines(task)}" for task in content["tasks"]]
-    path.write_text("\n".join(tables) if suffix == ".toml" else json.dumps(content))
+    content = {"date": "2026-07-01", "generation": 14, "altitude_km": 0.5, "distance_range_km": [300, 500]}
+    tables = {"region": region, "tasks": [{"name": "a name", **task}, task]}
+    parts = [lines(content), f"[region]\n{lines(region)}", *(f"[[tasks]]\n{lines(task)}" for task in tables["tasks"])]
+    path.write_text("\n".join(parts) if suffix == ".toml" else json.dumps(content | tables))
 
     def sound(found: object) -> bool:
-        assert isinstance(found, World)
+        assert isinstance(found, Scenario)
         if found.tasks is not None:
-            assert found.region.contains(torch.stack(found.tasks)).all()
+            assert found.edge.contains(torch.stack(found.tasks)).all()
             assert len(found.names) == len(found.tasks.start)
         return found.altitude_km >= 0 and found.generation in (13, 14)
 
-    fuzz(path, lambda: load_world(path), sound, ValueError, 3)
+    fuzz(path, lambda: load_scenario(path), sound, ValueError, 3)
 
 
 def lines(table: dict) -> str:
-    """A table as TOML, whose numbers, texts and lists are written as in JSON."""
+    """Return a table as TOML, whose numbers, texts and lists are written as in JSON."""
     return "\n".join(f"{key} = {json.dumps(value)}" for key, value in table.items())
 
 
 @pytest.mark.parametrize("cells", [(60000, 60000), (10**9,), (0,), (-1,), ("a",), ()])
 def test_policy_that_asks_for_more_than_it_holds(tmp_path: Path, cells: tuple) -> None:
     path = tmp_path / "policy.pt"
-    td3.save_policy(path, td3.FieldPolicy(td3.policy_config(GeomagneticNavEnv(seed=0), (4,), layer_norm=False)))
+    save_policy(path, small_policy())
     content = torch.load(path, weights_only=True)
     content["config"]["num_cells"] = cells
     save_tensors(content, path)
-    with pytest.raises(ValueError, match="another shape"):
-        td3.load_policy(path)
+    with pytest.raises(ValueError, match="does not hold a valid policy") as error:
+        load_policy(path)
+    assert str(path) in str(error.value)

@@ -1,5 +1,6 @@
 """The paper's equations, each against a case worked by hand and in its limits."""
 
+import itertools
 import math
 
 import pytest
@@ -20,6 +21,16 @@ from magrl.guidance import (
 SHAPES = ((), (3,), (2, 3), (0,))
 DTYPES = (torch.float32, torch.float64)
 FLOORS = torch.tensor(OBJECTIVE_FLOORS, dtype=torch.float64)
+
+
+def shapes_and_dtypes(check):
+    """A test that runs a check for every shape and dtype."""
+
+    def test():
+        for shape, dtype in itertools.product(SHAPES, DTYPES):
+            check(shape, dtype)
+
+    return test
 
 
 def f64(*values):
@@ -49,19 +60,16 @@ def test_objective_at_both_ends():
     assert float(objective(target, target, weights)) == 0.0
 
 
-@pytest.mark.parametrize(("element", "floor"), tuple(enumerate(OBJECTIVE_FLOORS)))
-@pytest.mark.parametrize("sign", [1, -1])
-def test_small_differences_are_floored(element, floor, sign):
+def test_small_differences_are_floored():
     """A difference of half the floor counts as the floor, one of twice the floor as itself; none is infinite."""
     start = f64(8.0, -16.0, 35000.0)
-    for difference, counted in ((0.0, floor), (floor / 2, floor), (2 * floor, 2 * floor)):
-        target = start + 1000.0
-        target[element] = start[element] + sign * difference
-        weight = objective_weights(start, target, FLOORS)[element]
-        assert float(weight) == pytest.approx(1 / counted**2, rel=1e-9)
+    for share, counted in ((0.0, 1.0), (0.5, 1.0), (-0.5, 1.0), (2.0, 2.0), (-2.0, 2.0)):
+        target = start + 1000.0 + torch.diag(share * FLOORS - 1000.0)  # one element at a time
+        weights = objective_weights(start, target, FLOORS).diagonal()
+        torch.testing.assert_close(weights, (counted * FLOORS) ** -2, rtol=1e-9, atol=0)
 
 
-def test_floored_objective_of_a_journey_without_a_difference():
+def test_floored_objective_of_an_episode_without_a_difference():
     """With both ends alike, being off by one floor in each element is F = 3."""
     here = f64(8.0, -16.0, 35000.0)
     weights = objective_weights(here, here, FLOORS)
@@ -69,8 +77,7 @@ def test_floored_objective_of_a_journey_without_a_difference():
     assert float(objective(here + FLOORS, here, weights)) == pytest.approx(3.0, rel=1e-9)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("dtype", DTYPES)
+@shapes_and_dtypes
 def test_objective_shapes_and_dtypes(shape, dtype):
     field, target = randn(*shape, 3).to(dtype), randn(*shape, 3, seed=1).to(dtype)
     weights = objective_weights(field, target, FLOORS.to(dtype))
@@ -82,18 +89,18 @@ def test_objective_shapes_and_dtypes(shape, dtype):
 # --- rewards, Eqs. 3-3 to 3-6 -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
-def test_destination_pays_only_at_arrival(shape):
-    assert torch.equal(destination_reward(torch.ones(shape, dtype=torch.bool), 200.0), torch.full(shape, 200.0))
-    assert torch.equal(destination_reward(torch.zeros(shape, dtype=torch.bool), 200.0), torch.zeros(shape))
+def test_destination_pays_only_at_arrival():
+    for shape in ((), (3,), (2, 3)):
+        assert torch.equal(destination_reward(torch.ones(shape, dtype=torch.bool), 200.0), torch.full(shape, 200.0))
+        assert torch.equal(destination_reward(torch.zeros(shape, dtype=torch.bool), 200.0), torch.zeros(shape))
 
 
-@pytest.mark.parametrize(("before", "after", "reward"), [(3.0, 2.5, 5.0), (2.5, 3.0, -5.0), (1.0, 1.0, 0.0)])
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_proximity_pays_what_the_objective_loses(before, after, reward, dtype):
-    found = proximity_reward(torch.tensor(before, dtype=dtype), torch.tensor(after, dtype=dtype), 10.0)
+def test_proximity_pays_what_the_objective_loses(dtype):
+    before, after = torch.tensor([3.0, 2.5, 1.0], dtype=dtype), torch.tensor([2.5, 3.0, 1.0], dtype=dtype)
+    found = proximity_reward(before, after, 10.0)
     assert found.dtype == dtype
-    assert float(found) == reward
+    assert found.tolist() == [5.0, -5.0, 0.0]
 
 
 def test_proximity_adds_up_along_a_path():
@@ -101,23 +108,14 @@ def test_proximity_adds_up_along_a_path():
     assert float(proximity_reward(values[:-1], values[1:], 10.0).sum()) == pytest.approx(30.0, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("step", "gain", "loss"),
-    [
-        (1, 4.0, -4.0),
-        (25, 4.0, -4.0),  # half way: not yet
-        (26, 4.0 * (1 - 0.52), -4.0 * (1 + 0.52)),
-        (40, 0.8, -7.2),
-        (50, 0.0, -8.0),
-    ],
-)
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_late_gains_shrink_and_late_losses_grow(step, gain, loss, dtype):
-    found = late_decay(torch.tensor([4.0, -4.0, 0.0], dtype=dtype), torch.tensor(step), 50)
-    assert found.dtype == dtype
-    torch.testing.assert_close(
-        found, torch.tensor([gain, loss, 0.0], dtype=dtype), rtol=0, atol=8 * torch.finfo(dtype).eps
-    )
+def test_late_gains_shrink_and_late_losses_grow(dtype):
+    step = torch.tensor([[1], [25], [26], [40], [50]])  # 25 is half way: not yet
+    gain = f64(4.0, 4.0, 4.0 * (1 - 0.52), 0.8, 0.0)
+    loss = f64(-4.0, -4.0, -4.0 * (1 + 0.52), -7.2, -8.0)
+    found = late_decay(torch.tensor([4.0, -4.0, 0.0], dtype=dtype), step, 50)
+    expected = torch.stack((gain, loss, torch.zeros_like(gain)), -1).to(dtype)
+    torch.testing.assert_close(found, expected, rtol=0, atol=8 * torch.finfo(dtype).eps)
 
 
 def test_late_decay_of_an_odd_limit_starts_past_its_half():
@@ -130,27 +128,25 @@ def test_late_decay_broadcasts_over_vehicles():
     torch.testing.assert_close(found, torch.tensor([[1.0], [0.4], [0.2], [0.0]]), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("angle_deg", "reference_deg", "deviation_deg"),
-    [
-        (30.0, 30.0, 0.0),
-        (75.0, 30.0, 45.0),
-        (30.0, 75.0, 45.0),
-        (170.0, -170.0, 20.0),  # across south
-        (-170.0, 170.0, 20.0),
-        (180.0, -180.0, 0.0),
-        (-90.0, 90.0, 180.0),
-        (350.0, 10.0, 20.0),
-        (720.0 + 40.0, 10.0, 30.0),
-    ],
-)
 @pytest.mark.parametrize("offset_deg", [45.0, 0.0])
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_alignment(angle_deg, reference_deg, deviation_deg, offset_deg, dtype):
-    angle, reference = (torch.tensor(math.radians(x), dtype=dtype) for x in (angle_deg, reference_deg))
+def test_alignment(offset_deg, dtype):
+    """Angle, reference and the deviation between them [deg]."""
+    rows = f64(
+        *(30.0, 30.0, 0.0),
+        *(75.0, 30.0, 45.0),
+        *(30.0, 75.0, 45.0),
+        *(170.0, -170.0, 20.0),  # across south
+        *(-170.0, 170.0, 20.0),
+        *(180.0, -180.0, 0.0),
+        *(-90.0, 90.0, 180.0),
+        *(350.0, 10.0, 20.0),
+        *(720.0 + 40.0, 10.0, 30.0),
+    ).reshape(-1, 3)
+    angle, reference, deviation = torch.deg2rad(rows).to(dtype).unbind(-1)
     found = alignment_reward(angle, reference, 3.0, math.radians(offset_deg))
-    assert found.dtype == dtype
-    assert float(found) == pytest.approx(3 * math.radians(offset_deg - deviation_deg), abs=60 * torch.finfo(dtype).eps)
+    expected = 3 * (math.radians(offset_deg) - deviation)
+    torch.testing.assert_close(found, expected, rtol=0, atol=60 * torch.finfo(dtype).eps)
 
 
 def test_alignment_by_default_pays_up_to_three_quarters_of_pi():
@@ -158,16 +154,16 @@ def test_alignment_by_default_pays_up_to_three_quarters_of_pi():
     torch.testing.assert_close(found, 3 * f64(math.pi / 4, 0.0, -3 * math.pi / 4), rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_reward_shapes(shape):
-    values = torch.zeros(shape)
-    rewards = (
-        proximity_reward(values, values, 10.0),
-        late_decay(values, torch.ones(shape, dtype=torch.int64), 50),
-        alignment_reward(values, values, 3.0),
-        destination_reward(values.bool(), 200.0),
-    )
-    assert {x.shape for x in rewards} == {torch.Size(shape)}
+def test_reward_shapes():
+    for shape in SHAPES:
+        values = torch.zeros(shape)
+        rewards = (
+            proximity_reward(values, values, 10.0),
+            late_decay(values, torch.ones(shape, dtype=torch.int64), 50),
+            alignment_reward(values, values, 3.0),
+            destination_reward(values.bool(), 200.0),
+        )
+        assert {x.shape for x in rewards} == {torch.Size(shape)}
 
 
 # --- parallel approach, Eq. 3-15 --------------------------------------------------------------------------------------
@@ -200,14 +196,15 @@ def test_approach_worked_by_hand():
 
 
 @pytest.mark.parametrize("name", GRADIENTS)
-@pytest.mark.parametrize("heading_deg", [0, 30, 90, 135, 180, -150, -90, -45])
-@pytest.mark.parametrize("distance", [1.0, 1e-6, 1e4])
-def test_approach_points_at_the_destination_in_every_quadrant(name, heading_deg, distance):
-    gradient, expected = torch.tensor(GRADIENTS[name], dtype=torch.float64), torch.deg2rad(f64(heading_deg))[0]
-    heading, valid = approach_along(gradient, expected, distance)
-    assert bool(valid)
-    assert -math.pi < float(heading) <= math.pi
-    assert abs(float(wrap_angle(heading - expected))) < 1e-12
+def test_approach_points_at_the_destination_in_every_quadrant(name):
+    gradient = torch.tensor(GRADIENTS[name], dtype=torch.float64)
+    expected = torch.deg2rad(f64(0, 30, 90, 135, 180, -150, -90, -45))
+    distance = f64(1.0, 1e-6, 1e4).reshape(3, 1, 1)
+    heading, valid = (x.squeeze(-1) for x in approach_along(gradient, expected, distance))
+    assert heading.shape == (3, 8)
+    assert valid.all()
+    assert ((heading > -math.pi) & (heading <= math.pi)).all()
+    assert wrap_angle(heading - expected).abs().max() < 1e-12
 
 
 def test_both_signs_of_the_determinant_are_tried():
@@ -267,17 +264,18 @@ def test_the_order_of_the_elements_does_not_matter():
     assert wrap_angle(heading - swapped).abs().max() < 1e-12
 
 
-@pytest.mark.parametrize("crossing_deg", [0.0, 1.9, 2.1, 90.0, 177.9, 178.1, 180.0, -1.9, -2.1])
-@pytest.mark.parametrize("scale", [1.0, 1e-4, 1e4])
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_nearly_parallel_gradients_are_flagged(crossing_deg, scale, dtype):
-    crossing = math.radians(crossing_deg)
-    gradient = torch.tensor([[1.0, 0.0], [scale * math.cos(crossing), scale * math.sin(crossing)]], dtype=dtype)
-    heading, valid = parallel_approach(torch.zeros(2, dtype=dtype), torch.ones(2, dtype=dtype), gradient)
-    expected = abs(math.sin(crossing)) > math.sin(math.radians(2))
-    assert bool(valid) == expected
+def test_nearly_parallel_gradients_are_flagged(dtype):
+    crossing = torch.deg2rad(f64(0.0, 1.9, 2.1, 90.0, 177.9, 178.1, 180.0, -1.9, -2.1))
+    first = torch.stack((torch.ones_like(crossing), torch.zeros_like(crossing)), -1).expand(3, -1, -1)
+    second = f64(1.0, 1e-4, 1e4).reshape(3, 1, 1) * torch.stack((crossing.cos(), crossing.sin()), -1)
+    gradient = torch.stack((first, second), -2).to(dtype)
+    here = torch.zeros(3, 9, 2, dtype=dtype)
+    heading, valid = (x.squeeze(-1) for x in parallel_approach(here, here + 1, gradient))
+    expected = torch.tensor([False, False, True, True, True, False, False, False, True])
+    assert torch.equal(valid, expected.expand(3, 9))
     assert torch.isfinite(heading).all()
-    assert (float(heading) == 0) == (not expected)
+    assert torch.equal(heading != 0, valid)
 
 
 def test_an_only_move_is_late():
@@ -320,8 +318,7 @@ def test_one_element_on_target_still_has_a_heading():
         assert float(heading) == pytest.approx(expected, abs=1e-15)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("dtype", DTYPES)
+@shapes_and_dtypes
 def test_approach_shapes_and_dtypes(shape, dtype):
     gradient = torch.tensor(GRADIENTS["paper"], dtype=dtype).expand(*shape, 2, 2)
     heading, valid = approach_along(gradient, torch.full(shape, 2.0, dtype=dtype))

@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -17,35 +18,42 @@ from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict
 from torchrl.envs import Compose, GymEnv, TransformedEnv
 
-from magrl import td3
-from magrl.env import PRIVILEGED_KEYS, GeomagneticNavEnv, paper_field
-from magrl.gymnasium_env import ENV_ID, GeomagneticNavGymEnv, navigation_env, register
-from magrl.metrics import episode_measures
-from magrl.tasks import Tasks, task_set
+from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks, task_set
+from magrl.envs.gymnasium import ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
+from magrl.envs.navigation import navigation_env
+from magrl.evaluation import episode_measures
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
 ROOT = Path(__file__).parent.parent
-FIELD = paper_field()
+PAPER = Scenario(field=Scenario().build_field())
+"""The paper's scenario, with its field built once for all tests."""
 NUM, STEPS = 5, 25
-SHORT = {"field": FIELD, "max_steps": 7, "zeta": 0.3, "distance_range_km": (40, 120)}
-"""Options with which journeys end at every step limit, and some on arrival."""
+SHORT = {"scenario": PAPER.replace(distance_range_km=(40, 120)), "max_steps": 7, "zeta": 0.3}
+"""Options with which episodes end at every step limit, and some on arrival."""
 
 
 def make(**options: Any) -> gymnasium.Env:
-    return gymnasium.make(ENV_ID, **{"field": FIELD} | options)
+    return gymnasium.make(ENV_ID, **{"scenario": PAPER} | options)
 
 
 def make_vec(num_envs: int = NUM, **options: Any) -> gymnasium.vector.VectorEnv:
     return gymnasium.make_vec(
-        ENV_ID, num_envs=num_envs, vectorization_mode="vector_entry_point", **{"field": FIELD} | options
+        ENV_ID, num_envs=num_envs, vectorization_mode="vector_entry_point", **{"scenario": PAPER} | options
     )
 
 
 def torchrl_env(num_envs: int, seed: int, *, guided: bool = True) -> TransformedEnv:
     """The environment of the recipes, built here from their parts."""
     base = GeomagneticNavEnv(num_envs=num_envs, seed=seed, **SHORT)
-    view = td3.policy_config(base, (8,), layer_norm=False)
-    guidance = td3.guidance_transforms(base, 3.0, math.pi / 4) if guided else []
-    return TransformedEnv(base, Compose(*guidance, *td3.observation_transforms(view), td3.action_transform(view)))
+    view = base.observation_view()
+    alignment = AlignmentReward(weight=3.0, offset=math.pi / 4)
+    guidance = [FieldGradient(base.field), GradientHeading(), alignment] if guided else []
+    return TransformedEnv(base, Compose(*guidance, *view.observation_transforms(), view.action_transform()))
+
+
+def between(*ends: tuple[list[float], list[float]]) -> Scenario:
+    """The paper's scenario with tasks from starts to targets."""
+    return PAPER.with_tasks(Tasks(*torch.tensor(ends, dtype=torch.float64).unbind(1)))
 
 
 def random_actions(num: int, seed: int, steps: int = STEPS) -> np.ndarray:
@@ -77,8 +85,8 @@ def test_batch_flies_as_in_torchrl(reward: str) -> None:
         for index in done.nonzero()[0]:
             equal(info["final_obs"][index], step["next", "observation"][index])
         ends, arrivals = ends + done.sum(), arrivals + terminated.sum()
-    assert ends > 3 * NUM, "every vehicle was to fly more than one journey"
-    assert arrivals >= 3, "journeys were to end on arrival, apart from the others"
+    assert ends > 3 * NUM, "every vehicle was to fly more than one episode"
+    assert arrivals >= 3, "episodes were to end on arrival, apart from the others"
 
 
 def test_one_vehicle_flies_as_in_torchrl() -> None:
@@ -98,7 +106,7 @@ def test_one_vehicle_flies_as_in_torchrl() -> None:
             state, (observation, info) = reference.reset(), env.reset()
 
 
-def test_actions_in_kilometres_and_radians() -> None:
+def test_actions_in_kilometers_and_radians() -> None:
     env = make(scale_actions=False, observation="dict")
     assert env.action_space.contains(np.array([50, -math.pi / 2], dtype=np.float32))
     env.reset(seed=0)
@@ -127,13 +135,13 @@ def test_wraps_back_into_torchrl() -> None:
         if native["next", "done"].all():
             return
         wrapped, native = env.step_mdp(wrapped), reference.step_mdp(native)
-    pytest.fail("the journey was to end within its limit")
+    pytest.fail("the episode was to end within its limit")
 
 
 # Seeds
 
 
-def test_seeds_and_journeys() -> None:
+def test_seeds_and_episodes() -> None:
     env = make()
     first, second = env.reset(seed=3)[0], env.reset()[0]
     assert not np.array_equal(first, second)
@@ -142,16 +150,17 @@ def test_seeds_and_journeys() -> None:
     assert not np.array_equal(env.reset(seed=4)[0], first)
 
 
-def test_first_row_of_a_batch_flies_the_journeys_of_the_single_vehicle() -> None:
+def test_first_row_of_a_batch_flies_the_episodes_of_the_single_vehicle() -> None:
     batch = make_vec(observation="dict").reset(seed=3)[0]
     single = make(observation="dict").reset(seed=3)[0]
-    for key in td3.PUBLIC_KEYS:
+    for key in PUBLIC_KEYS:
         np.testing.assert_array_equal(batch[key][0], single[key])
     assert len(np.unique(batch["target_field"], axis=0)) == NUM
 
 
 def test_frozen_tasks_are_flown_in_turn() -> None:
-    env, tasks = make(tasks=task_set(3, 0)), task_set(3, 0)
+    tasks = task_set(3, 0)
+    env = make(scenario=PAPER.with_tasks(tasks), render_mode="rgb_array")
     for index in range(4):
         env.reset()
         position = env.unwrapped.torchrl_env.base_env.track(0)[0]
@@ -185,10 +194,10 @@ def test_bounds_of_the_flat_observation() -> None:
 
 def test_dict_observation_is_the_public_keys() -> None:
     space = make(observation="dict").observation_space
-    assert set(space.keys()) == set(td3.PUBLIC_KEYS)
+    assert set(space.keys()) == set(PUBLIC_KEYS)
     assert not set(space.keys()) & set(PRIVILEGED_KEYS)
-    observation = make(observation="dict", tasks=Tasks(*torch.tensor([[[-2.0, 162.0]], [[-8.0, 164.0]]]).double()))
-    observation, _ = observation.reset()
+    example = between(([-2.0, 162.0], [-8.0, 164.0]))
+    observation, _ = make(observation="dict", scenario=example).reset()
     np.testing.assert_allclose(observation["field"], [8.019, -16.150, 35467.99], atol=1.5)  # the paper's example
 
 
@@ -205,7 +214,7 @@ def test_writing_into_an_observation_does_not_move_the_vehicle() -> None:
         np.testing.assert_array_equal(flown[0][key], flown[1][key])
 
 
-# What is told at the end of a journey
+# What is told at the end of an episode
 
 
 def test_measures_are_those_of_metrics() -> None:
@@ -234,11 +243,10 @@ def test_measures_are_those_of_metrics() -> None:
     assert expected["success"].any()
 
 
-def test_measures_start_anew_with_each_journey() -> None:
-    east = {"tasks": Tasks(*torch.tensor([[[-5.0, 162.0]], [[-5.0, 165.0]]]).double())}
-    env = make(scale_actions=False, max_steps=2, **east)
+def test_measures_start_anew_with_each_episode() -> None:
+    env = make(scale_actions=False, max_steps=2, scenario=between(([-5.0, 162.0], [-5.0, 165.0])))
     env.reset()
-    env.step(np.array([40, 0], dtype=np.float32))  # a journey that is given up
+    env.step(np.array([40, 0], dtype=np.float32))  # an episode that is given up
     for _ in range(2):
         env.reset()
         env.step(np.array([30, math.pi / 2], dtype=np.float32))
@@ -259,8 +267,8 @@ def test_measures_start_anew_with_each_autoreset() -> None:
 
 
 def test_arrival_is_told() -> None:
-    near = Tasks(*torch.tensor([[[-5.0, 162.0]], [[-4.0, 162.0]]]).double())  # 110.6 km due north
-    env = make(scale_actions=False, tasks=near, reward="base")
+    near = between(([-5.0, 162.0], [-4.0, 162.0]))  # 110.6 km due north
+    env = make(scale_actions=False, scenario=near, reward="base")
     env.reset()
     for _ in range(3):
         _, reward, terminated, truncated, info = env.step(np.array([36.86, 0], dtype=np.float32))
@@ -271,10 +279,9 @@ def test_arrival_is_told() -> None:
     assert info["length_km"] == pytest.approx(110.58, abs=1e-3)
 
 
-def test_masks_tell_whose_journey_ended() -> None:
-    near, far = [[-5.0, 162.0], [-4.6, 162.0]], [[-5.0, 162.0], [-1.0, 162.0]]
-    tasks = Tasks(*torch.tensor([near, far]).double().transpose(0, 1))
-    envs = make_vec(2, tasks=tasks, scale_actions=False)
+def test_masks_tell_whose_episode_ended() -> None:
+    scenario = between(([-5.0, 162.0], [-4.6, 162.0]), ([-5.0, 162.0], [-1.0, 162.0]))
+    envs = make_vec(2, scenario=scenario, scale_actions=False)
     envs.reset()
     *_, terminated, truncated, info = envs.step(np.array([[44.2, 0], [44.2, 0]], dtype=np.float32))
     assert terminated.tolist() == [True, False]
@@ -322,15 +329,16 @@ def test_pictures_of_a_batch_and_of_none() -> None:
     assert first.shape == (700, 700, 3)
     assert not np.array_equal(first, second)
     with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
-        assert GeomagneticNavGymEnv(field=FIELD).render() is None
+        assert GeomagneticNavGymEnv(scenario=PAPER).render() is None
+    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
+        assert make_vec(2).render() is None
 
 
 # Bad input
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
+def test_bad_options() -> None:
+    for options, error, message in (
         ({"observation": "pixels"}, ValueError, "observation must be one of 'flat', 'dict', got 'pixels'"),
         ({"reward": "sparse"}, ValueError, "reward must be one of 'guided', 'base', got 'sparse'"),
         ({"render_mode": "ansi"}, ValueError, "render_mode must be one of 'rgb_array', got 'ansi'"),
@@ -338,18 +346,19 @@ def test_pictures_of_a_batch_and_of_none() -> None:
         ({"alignment_weight": math.nan}, ValueError, "weight .*finite.*, got nan"),
         ({"zetta": 1.0}, TypeError, "unexpected keyword argument 'zetta'.*'zeta'"),
         ({"num_envs": 3}, TypeError, "num_envs, got 3: use gymnasium.make_vec"),
-    ],
-)
-def test_bad_options(options: dict[str, Any], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        GeomagneticNavGymEnv(**options)
+        ({"region": 3}, TypeError, "unexpected keyword argument 'region'.*'scenario'"),
+        ({"scenario": 3}, TypeError, "scenario must be a Scenario, got 3"),
+        ({"scale_actions": 1}, TypeError, "scale_actions must be a bool, got 1"),
+    ):
+        with pytest.raises(error, match=message):
+            GeomagneticNavGymEnv(**{"scenario": PAPER} | options)
 
 
 def test_bad_calls() -> None:
-    env, envs = GeomagneticNavGymEnv(field=FIELD, max_steps=1), make_vec(2)
+    env, envs = GeomagneticNavGymEnv(scenario=PAPER, max_steps=1), make_vec(2)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(2))
-    with pytest.raises(ValueError, match=r"no options of reset, got \{'task': 3\}"):
+    with pytest.raises(ValueError, match=r"takes no options, got \{'task': 3\}"):
         env.reset(options={"task": 3})
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"must have shape \(1, 2\).*got shape \(1, 3\)"):
@@ -367,14 +376,28 @@ def test_bad_calls() -> None:
 # What is built on the conventions
 
 
-def test_registering_twice_is_registering_once() -> None:
-    before = gymnasium.spec(ENV_ID)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        register()
-    assert gymnasium.spec(ENV_ID) is before
+def test_importing_magrl_registers_the_id_and_nothing_heavy() -> None:
+    code = f"""
+import sys, warnings
+import gymnasium
+warnings.simplefilter("error")
+import magrl
+heavy = [name for name in ("torch", "torchrl", "matplotlib", "pandas", "wandb") if name in sys.modules]
+before = gymnasium.spec({ENV_ID!r})
+del sys.modules["magrl"]
+import magrl  # a second import keeps the registration
+assert gymnasium.spec({ENV_ID!r}) is before
+print(heavy, before.entry_point, before.vector_entry_point)
+"""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    home = "magrl.envs.gymnasium"
+    assert done.stdout.split() == ["[]", f"{home}:GeomagneticNavGymEnv", f"{home}:GeomagneticNavVectorEnv"]
+
+
+def test_the_id_makes_both_environments() -> None:
     assert type(make().unwrapped) is GeomagneticNavGymEnv
-    assert type(make_vec(1)).__name__ == before.vector_entry_point.split(":")[1]
+    assert type(make_vec(1)) is GeomagneticNavVectorEnv
 
 
 @pytest.mark.parametrize("observation", ["flat", "dict"])
@@ -455,8 +478,7 @@ def test_batched_environment_under_stable_baselines3() -> None:
     assert ended > 2 * NUM
 
 
-@pytest.mark.parametrize("algorithm", ["TD3", "SAC"])
-def test_single_vehicle_trains_under_stable_baselines3(algorithm: str) -> None:
+def test_single_vehicle_trains_under_stable_baselines3() -> None:
     sb3 = pytest.importorskip("stable_baselines3")
     settings = {
         "policy_kwargs": {"net_arch": [16]},
@@ -465,7 +487,7 @@ def test_single_vehicle_trains_under_stable_baselines3(algorithm: str) -> None:
         "device": "cpu",
         "seed": 0,
     }
-    model = getattr(sb3, algorithm)("MlpPolicy", make(**SHORT), **settings).learn(200)
+    model = sb3.TD3("MlpPolicy", make(**SHORT), **settings).learn(200)
     assert model.num_timesteps == 200
     assert len(model.ep_info_buffer) >= 200 // SHORT["max_steps"]
     assert len(model.ep_success_buffer) == len(model.ep_info_buffer)

@@ -6,7 +6,7 @@ import pytest
 import scipy.special
 import torch
 
-from magrl.harmonics import (
+from magrl.field.harmonics import (
     REFERENCE_RADIUS_KM,
     basis,
     chebyshev,
@@ -113,7 +113,7 @@ def test_derivatives_commute():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 8, 15])
-def test_basis_is_the_schmidt_normalised_legendre_functions(degree):
+def test_basis_is_the_schmidt_normalized_legendre_functions(degree):
     ecef = random_points(50, 3)
     x, y, z = ecef.T.numpy() / REFERENCE_RADIUS_KM
     radius, longitude = (x**2 + y**2 + z**2) ** 0.5, torch.atan2(*ecef[:, [1, 0]].T).numpy()
@@ -240,7 +240,7 @@ def test_products_and_waves_worked_by_hand():
 
 @pytest.mark.parametrize("pole", [1.0, -1.0])
 def test_separated_field_at_a_pole(pole):
-    """On the axis every meridian gives the same vector, and its neighbourhood joins on."""
+    """On the axis every meridian gives the same vector, and its neighborhood joins on."""
     table = random_table(5, 14)
     weights = separate(field_table(table), 6)
     longitude = torch.linspace(0, 6, 7, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What wandb, TensorBoard and CSV are shown: an offline run is read back record by record, as `wandb sync` reads it."""
+"""Content of wandb, TensorBoard and CSV logs. An offline run is read back by record, as `wandb sync` reads it."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from typing import Any, NamedTuple
 import pytest
 from matplotlib.figure import Figure
 
-from magrl import loggers
-from magrl.loggers import ScalarLog, WandbRun, check_logger, panels
-from magrl.runs import RunLog, create_run_folder
+from magrl.training import loggers
+from magrl.training.curves import RunLog
+from magrl.training.loggers import ScalarLog, WandbRun, check_logger, panels
+from magrl.training.run_folder import create_run_folder
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 ROWS = (
     {"frames": 512, "updates": 8, "seconds": 2.0, "return": 1.5, "loss_critic": 0.25, "eval_spl": 80.0},
     {"frames": 1024, "updates": 24, "seconds": 4.0, "return": 2.5, "loss_critic": 0.5, "eval_spl": 90.0},
 )
-ROWS = tuple({**row, "reward_alignment": -0.5, "success_rate": float("nan")} for row in ROWS)
+ROWS = tuple({**row, "return_alignment": -0.5, "success_rate": float("nan")} for row in ROWS)
 BLOCK, HEADER, FULL, LAST = 32768, 7, 1, 4
-"""Of the log format of LevelDB, which wandb writes offline runs in."""
+"""Constants of the log format of LevelDB, in which wandb writes offline runs."""
 
 
 def records(path: Path) -> Iterator[Any]:
-    """The records of an offline run: blocks of 32 kB, each part after its checksum, length and kind."""
+    """Yield the records of an offline run: blocks of 32 kB, each part after its checksum, length and kind."""
     from wandb.proto import wandb_internal_pb2
 
     content, at, parts = path.read_bytes(), HEADER, b""
@@ -54,12 +55,12 @@ def records(path: Path) -> Iterator[Any]:
 
 
 def values(items: Any) -> dict[str, Any]:
-    """Items of a config, a history row or a summary as a dictionary of their dotted names."""
+    """Return items of a config, a history row or a summary as a dictionary of their dotted names."""
     return {".".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items}
 
 
 class Offline(NamedTuple):
-    """What an offline run holds."""
+    """Content of an offline run."""
 
     folder: Path
     run: Any
@@ -71,14 +72,14 @@ class Offline(NamedTuple):
     complete: bool
 
     def table(self, name: str) -> list[dict[str, Any]]:
-        """The rows of a table."""
+        """Return the rows of a table."""
         (path,) = (row[f"{name}.path"] for row in self.history if f"{name}.path" in row)
         table = json.loads((self.folder / "files" / path).read_text())
         return [dict(zip(table["columns"], row, strict=True)) for row in table["data"]]
 
 
 def read_offline(folder: Path, patience: float = 10.0) -> Offline:
-    """Reads one of wandb's own folders, once it is whole: wandb's service may write on after ``finish``."""
+    """Read a folder of wandb, once it is complete: the service of wandb may write after ``finish``."""
     deadline = time.monotonic() + patience
     while not (found := read_now(folder)).complete and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -86,7 +87,7 @@ def read_offline(folder: Path, patience: float = 10.0) -> Offline:
 
 
 def read_now(folder: Path) -> Offline:
-    """Reads what there is."""
+    """Read the current content."""
     (path,) = folder.glob("*.wandb")
     found = Offline(folder, None, {}, [], {}, {}, {}, False)
     for record in records(path):
@@ -108,14 +109,14 @@ def read_now(folder: Path) -> Offline:
 
 
 def only(folder: Path) -> Offline:
-    """The one offline run of a run folder."""
+    """Return the one offline run of a run folder."""
     (found,) = (folder / "wandb").glob("offline-run-*")
     return read_offline(found)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run that was logged offline, with everything that a training logs."""
+    """Return the folder of a run that was logged offline, with everything that a training logs."""
     folder = create_run_folder(tmp_path_factory.mktemp("offline") / "a run=1")
     os.environ["A_SECRET_OF_MINE"], os.environ["WANDB_MODE"] = "do-not-tell-anyone", "online"
     try:
@@ -141,17 +142,17 @@ def test_run_has_its_name_group_tags_and_config(finished: Path) -> None:
     assert only(finished).complete
 
 
-def test_curves_lie_in_groups_over_frames(finished: Path) -> None:
+def test_curves_are_grouped_over_frames(finished: Path) -> None:
     offline = only(finished)
     assert offline.axes == {"frames": "", "*": "frames"}
     curves = [row for row in offline.history if "train/return" in row]
     expected = {"frames": 512, "train/updates": 8, "time/seconds": 2, "train/return": 1.5, "eval/spl": 80}
-    expected |= {"reward/alignment": -0.5, "train/loss_critic": 0.25, "_step": 512}
+    expected |= {"return/alignment": -0.5, "train/loss_critic": 0.25, "_step": 512}
     expected |= {"time/frames_per_second": 256, "time/updates_per_second": 4}
     assert {key: curves[0][key] for key in expected} == expected
     assert (curves[1]["frames"], curves[1]["_step"], curves[1]["time/updates_per_second"]) == (1024, 1024, 8)
-    assert {key.partition("/")[0] for key in curves[1] if "/" in key} == {"train", "eval", "reward", "time"}
-    assert not any("success_rate" in row for row in curves), "NaN is no point of a curve"
+    assert {key.partition("/")[0] for key in curves[1] if "/" in key} == {"train", "eval", "return", "time"}
+    assert not any("success_rate" in row for row in curves), "NaN is not a point of a curve"
 
 
 def test_table_picture_policy_and_final_values(finished: Path) -> None:
@@ -168,7 +169,7 @@ def test_table_picture_policy_and_final_values(finished: Path) -> None:
     assert (entry.path, Path(entry.local_path)) == ("policy.pt", finished / "policy.pt")
 
 
-def test_everything_to_sync_lies_in_the_run_folder(finished: Path) -> None:
+def test_everything_to_sync_is_in_the_run_folder(finished: Path) -> None:
     offline = only(finished)
     for artifact in offline.artifacts.values():
         for entry in artifact.manifest.contents:
@@ -177,8 +178,8 @@ def test_everything_to_sync_lies_in_the_run_folder(finished: Path) -> None:
             assert Path(entry.local_path).stat().st_size == entry.size
 
 
-def test_nothing_of_the_machine_is_told(finished: Path) -> None:
-    """But for where the files of artifacts lie, which `wandb sync` reads and does not send."""
+def test_nothing_about_the_machine_is_logged(finished: Path) -> None:
+    """Except the paths of artifacts, which `wandb sync` reads and does not send."""
     private = [os.fsencode(finished.parent), os.fsencode(Path.home()) + b"/", os.fsencode(os.getcwd())]
     private += [b"do-not-tell-anyone", *([host] if len(host := socket.gethostname().encode()) > 4 else [])]
     told = [path.read_bytes() for path in (finished / "wandb").rglob("*") if path.is_file() and path.suffix != ".wandb"]
@@ -191,8 +192,8 @@ def test_nothing_of_the_machine_is_told(finished: Path) -> None:
         assert not any(secret in content for content in told), secret
 
 
-def test_wandb_is_kept_in_the_run_folder_and_reports_nothing(tmp_path: Path, monkeypatch) -> None:
-    """Its crash reports look up a host when it starts, and its data would go to the home folder."""
+def test_wandb_writes_to_the_run_folder_and_reports_nothing(tmp_path: Path, monkeypatch) -> None:
+    """By default its crash reports look up a host when it starts, and its data goes to the home folder."""
     seen: dict[str, str | None] = {}
     names = ("WANDB_ERROR_REPORTING", "WANDB_DATA_DIR", "WANDB_CACHE_DIR")
     monkeypatch.setenv("WANDB_DATA_DIR", "before")
@@ -206,12 +207,12 @@ def test_wandb_is_kept_in_the_run_folder_and_reports_nothing(tmp_path: Path, mon
     assert [os.environ.get(name) for name in names] == [None, "before", None]
 
 
-def test_nothing_at_all_of_wandb_where_it_is_disabled(tmp_path: Path) -> None:
+def test_disabled_wandb_is_not_imported(tmp_path: Path) -> None:
     code = f"""
 import sys
 from pathlib import Path
 from matplotlib.figure import Figure
-from magrl.runs import RunLog
+from magrl.training.curves import RunLog
 log = RunLog(Path({str(tmp_path)!r}), ["frames"], {{}}, wandb_mode="disabled")
 log.row({{"frames": 1}})
 log.figure("picture", Figure())
@@ -222,12 +223,12 @@ print("wandb" in sys.modules)
     home = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "home")}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | home)
     assert done.stdout.strip() == "False", done.stderr
-    names = {"train.csv", "config.json", "picture.png", "eval.json"}
+    names = {"train.csv", "picture.png", "eval.json"}
     assert {path.name for path in tmp_path.iterdir()} - {"home"} == names
 
 
 def resumed(folder: Path, **options: Any) -> RunLog:
-    """A run that logged both rows, was killed, and goes on from a checkpoint after the first."""
+    """Return a run that logged both rows, was killed, and is resumed from a checkpoint after the first."""
     log = RunLog(folder, list(ROWS[0]), {}, **options)
     log.row(ROWS[0])
     state = log.state_dict()
@@ -238,7 +239,7 @@ def resumed(folder: Path, **options: Any) -> RunLog:
     return again
 
 
-def test_resumed_run_of_wandb_goes_on_in_one_curve(tmp_path: Path) -> None:
+def test_resumed_run_of_wandb_continues_its_curve(tmp_path: Path) -> None:
     log = resumed(tmp_path, wandb_mode="offline")
     other = {**ROWS[1], "return": 9.0}
     log.row(other)
@@ -268,7 +269,7 @@ def test_the_same_curves_in_files(tmp_path: Path, name: str) -> None:
 
 
 def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """What TorchRL's CSV logger wrote."""
+    """Return what TorchRL's CSV logger wrote."""
     found = {}
     for path in (folder / "scalars").rglob("*.csv"):
         lines = [line.split(",") for line in path.read_text().splitlines()]
@@ -278,7 +279,7 @@ def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
 
 
 def events(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """What TensorBoard reads."""
+    """Return what TensorBoard reads."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     board = EventAccumulator(str(folder))
@@ -286,7 +287,7 @@ def events(folder: Path) -> dict[str, list[tuple[int, float]]]:
     return {tag: [(event.step, event.value) for event in board.Scalars(tag)] for tag in board.Tags()["scalars"]}
 
 
-def test_tensorboard_that_is_not_there_is_named(tmp_path: Path, monkeypatch) -> None:
+def test_missing_tensorboard_is_named(tmp_path: Path, monkeypatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "tensorboard" else found(name))
     with pytest.raises(ValueError, match=r"pip install 'magrl\[tensorboard\]'"):
@@ -295,13 +296,13 @@ def test_tensorboard_that_is_not_there_is_named(tmp_path: Path, monkeypatch) -> 
     check_logger("csv")
 
 
-def test_failing_files_are_told_and_left_out(tmp_path: Path, capsys) -> None:
+def test_failing_files_are_reported_and_disabled(tmp_path: Path, capsys) -> None:
     (tmp_path / "csv").write_text("in the way")
     log = ScalarLog(tmp_path, "csv")
     log.row(ROWS[0])
     log.close()
     said = capsys.readouterr().err
-    assert said.startswith("csv failed and is left out from here on: ")
+    assert said.startswith("csv failed and is disabled for the rest of this run: ")
     assert said.count("\n") == 1
 
 

@@ -1,4 +1,4 @@
-"""Measures of hand-made journeys: a straight line, a right angle, a failure, one move, standing still."""
+"""Measures of hand-made episodes: a straight line, a right angle, a failure, one move, standing still."""
 
 import math
 
@@ -6,12 +6,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from magrl.envs.measures import path_measures, spl
+from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
+from magrl.evaluation.metrics import episode_measures, first_episode_mask, summarize
 from magrl.geodesy import geodesic, move
-from magrl.metrics import TrainingTally, bootstrap_interval, episode_measures, flown, summarise, wilson_interval
 
 
-def journey(legs: list[tuple[float, float]], target: tuple[float, float], success: bool, steps: int) -> TensorDict:
-    """A rollout ``(1, steps)`` from (-5, 165): legs of (km, heading in degrees), then the last state repeated."""
+def episode(legs: list[tuple[float, float]], target: tuple[float, float], success: bool, steps: int) -> TensorDict:
+    """Return a rollout ``(1, steps)`` from (-5, 165): legs of (km, heading in degrees), then the last state."""
     rows, position = [], torch.tensor([-5.0, 165.0], dtype=torch.float64)
     start, end = position, torch.tensor(target, dtype=torch.float64)
     for index in range(steps):
@@ -35,14 +37,14 @@ def journey(legs: list[tuple[float, float]], target: tuple[float, float], succes
 
 
 def point(distance: float, bearing: float) -> tuple[float, float]:
-    """The point at a distance [km] and bearing [deg] from (-5, 165)."""
+    """Return the point at a distance [km] and bearing [deg] from (-5, 165)."""
     origin = torch.tensor([-5.0, 165.0, math.radians(bearing), distance], dtype=torch.float64)
     latitude, longitude = move(*origin)
     return float(latitude), float(longitude)
 
 
 def measures(*args, steps: int = 6) -> dict[str, float]:
-    return {key: float(value) for key, value in episode_measures(journey(*args, steps=steps)).items()}
+    return {key: float(value) for key, value in episode_measures(episode(*args, steps=steps)).items()}
 
 
 def test_straight_line() -> None:
@@ -104,7 +106,11 @@ def test_a_short_move_is_a_move() -> None:
 
 def test_only_the_first_episode_counts() -> None:
     done = torch.tensor([[[False], [True], [False], [True]], [[False]] * 4])
-    assert flown(done).tolist() == flown(done.squeeze(-1)).tolist() == [[True, True, False, False], [True] * 4]
+    assert (
+        first_episode_mask(done).tolist()
+        == first_episode_mask(done.squeeze(-1)).tolist()
+        == [[True, True, False, False], [True] * 4]
+    )
 
 
 def test_a_rollout_of_one_step_is_one() -> None:
@@ -115,14 +121,41 @@ def test_a_rollout_of_one_step_is_one() -> None:
 
 def test_vehicles_are_measured_each_on_its_own() -> None:
     alone = [
-        journey([(50.0, 30.0)] * 4, point(200.0, 30.0), True, 4),
-        journey([(30.0, 0.0), (40.0, 90.0)], point(50.0, 90.0), True, 4),
-        journey([(10.0, 180.0)] * 4, point(300.0, 0.0), False, 4),
+        episode([(50.0, 30.0)] * 4, point(200.0, 30.0), True, 4),
+        episode([(30.0, 0.0), (40.0, 90.0)], point(50.0, 90.0), True, 4),
+        episode([(10.0, 180.0)] * 4, point(300.0, 0.0), False, 4),
     ]
     together = episode_measures(torch.cat(alone))
     for index, one in enumerate(map(episode_measures, alone)):
         for key, value in one.items():
             torch.testing.assert_close(together[key][index : index + 1], value, equal_nan=True)
+
+
+def test_spl_by_hand() -> None:
+    """A detour, a path shorter than the geodesic, a failure, and a start at the destination."""
+    success = torch.tensor([True, True, False, True])
+    got = spl(success, torch.tensor([300.0, 300.0, 300.0, 100.0]), torch.tensor([400.0, 290.0, 300.0, 0.0]))
+    assert got.tolist() == [0.75, 1.0, 0.0, 1.0]
+    with pytest.raises(TypeError, match=r"success must be bool, got torch\.float32"):
+        spl(torch.ones(1), torch.ones(1), torch.ones(1))
+    with pytest.raises(TypeError, match="length_km must be a tensor"):
+        spl(success, torch.ones(4), 5)
+
+
+def test_path_measures_by_hand() -> None:
+    """One degree of longitude at the equator is 111.3195 km; one degree of latitude there, 110.5744 km."""
+    start, end, target = torch.tensor([[[0.0, 10.0]], [[0.0, 11.0]], [[1.0, 11.0]]], dtype=torch.float64)
+    got = path_measures(torch.tensor([True]), start, end, end, torch.tensor([2 * 111.3195], dtype=torch.float64))
+    assert [got[key].item() for key in ("shortest_km", "navigation_error_km", "spl")] == [
+        pytest.approx(111.3195, abs=1e-4),
+        pytest.approx(0, abs=1e-6),
+        pytest.approx(0.5, abs=1e-6),
+    ]
+    got = path_measures(torch.tensor([False]), start, end, target, torch.tensor([111.3195]))
+    assert got["navigation_error_km"].item() == pytest.approx(110.5744, abs=1e-4)
+    assert (got["spl"].item(), got["length_km"].item()) == (0, pytest.approx(111.3195))
+    with pytest.raises(ValueError, match=r"end must have the shape \(..., 2\)"):
+        path_measures(torch.tensor([True]), start, torch.zeros(1, 3), target, torch.ones(1))
 
 
 def test_summary_of_one_success_and_one_failure() -> None:
@@ -137,7 +170,7 @@ def test_summary_of_one_success_and_one_failure() -> None:
         "heading_mae_deg": torch.tensor([5.0, 90.0]),
         "heading_rmse_deg": torch.tensor([6.0, 95.0]),
     }
-    summary = summarise(episodes)
+    summary = summarize(episodes)
     assert summary["success_rate"] == 50
     assert summary["success_rate_within_10km"] == 50
     assert summary["success_rate_within_25km"] == 100
@@ -153,10 +186,10 @@ def test_summary_of_one_success_and_one_failure() -> None:
 
 
 def test_summary_at_the_edge_of_a_distance_and_of_two_paths() -> None:
-    """Ten kilometres are within ten; the mean of two values, drawn anew, is one of them or between."""
+    """Ten kilometers are within ten; the mean of two values, drawn anew, is one of them or between."""
     episodes = dict.fromkeys(("length_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.ones(2))
     episodes |= {"success": torch.tensor([True, True]), "steps": torch.tensor([9, 9])}
-    summary = summarise(
+    summary = summarize(
         episodes | {"navigation_error_km": torch.tensor([10.0, 25.0]), "spl": torch.tensor([0.5, 0.75])}
     )
     assert (summary["success_rate_within_10km"], summary["success_rate_within_25km"]) == (50, 100)
@@ -164,21 +197,18 @@ def test_summary_at_the_edge_of_a_distance_and_of_two_paths() -> None:
 
 
 def test_summary_without_success_is_nan_and_not_zero() -> None:
-    episodes = episode_measures(journey([(50.0, 180.0)] * 3, point(300.0, 0.0), False, 3))
-    assert math.isnan(summarise(episodes)["steps"])
-    assert summarise(episodes)["spl"] == 0
+    episodes = episode_measures(episode([(50.0, 180.0)] * 3, point(300.0, 0.0), False, 3))
+    assert math.isnan(summarize(episodes)["steps"])
+    assert summarize(episodes)["spl"] == 0
 
 
-@pytest.mark.parametrize(
-    ("rate", "count", "expected"),
-    [(0.5, 10, (0.2366, 0.7634)), (0.0, 20, (0.0, 0.1611)), (1.0, 20, (0.8389, 1.0))],
-)
-def test_wilson_interval(rate: float, count: int, expected: tuple[float, float]) -> None:
-    assert wilson_interval(rate, count) == pytest.approx(expected, abs=1e-4)
+def test_wilson_interval() -> None:
+    for rate, count, expected in ((0.5, 10, (0.2366, 0.7634)), (0.0, 20, (0.0, 0.1611)), (1.0, 20, (0.8389, 1.0))):
+        assert wilson_interval(rate, count) == pytest.approx(expected, abs=1e-4)
 
 
 def test_wilson_interval_of_half_a_standard_error() -> None:
-    """By hand: centre 0.2125, half-width 0.06447, both over 1.025."""
+    """By hand: center 0.2125, half-width 0.06447, both over 1.025."""
     assert wilson_interval(0.2, 10, z=0.5) == pytest.approx((0.14442, 0.27021), abs=1e-5)
 
 
@@ -206,66 +236,3 @@ def test_shortest_is_the_geodesic() -> None:
     target = (-8.0, 164.0)
     expected, _ = geodesic(*torch.tensor([-5.0, 165.0, *target], dtype=torch.float64))
     assert measures([(50.0, 0.0)], target, False)["shortest_km"] == pytest.approx(float(expected))
-
-
-def steps(*ended: tuple[float, bool], running: int = 0, reward: float = 0.0) -> TensorDict:
-    """Transitions of vehicles whose journeys end (return, success), and of some that fly on."""
-    count = len(ended) + running
-    following = TensorDict(
-        reward=torch.full((count, 1), reward),
-        episode_reward=torch.tensor([[value] for value, _ in ended] + [[7.0]] * running),
-        success=torch.tensor([[success] for _, success in ended] + [[False]] * running),
-        done=torch.tensor([[True]] * len(ended) + [[False]] * running),
-        batch_size=[count],
-    )
-    return TensorDict(next=following, batch_size=[count])
-
-
-def test_tally_splits_the_reward_and_averages_the_last_episodes() -> None:
-    tally = TrainingTally(destination_weight=200.0, reward_scale=0.5, window=2)
-    batch = steps((300.0, True), (100.0, False), running=1)
-    batch["next", "reward"] = 0.5 * torch.tensor([[201.0], [1.0], [1.0]])
-    tally.add(batch, torch.full((3, 1), 0.25))
-    assert (tally.frames, tally.episodes) == (3, 2)
-    row = tally.row()
-    assert row["return"] == 200
-    assert row["success_rate"] == 50
-    assert row["reward_destination"] == pytest.approx(200 / 3, rel=1e-12)
-    assert row["reward_alignment"] == pytest.approx(0.25)
-    assert row["reward_proximity"] == pytest.approx(0.75)
-    assert math.isnan(tally.row()["reward_proximity"])
-
-
-def test_tally_adds_up_and_forgets_the_oldest_episodes() -> None:
-    tally = TrainingTally(destination_weight=0.0, reward_scale=1.0, window=1)
-    tally.add(steps((300.0, False), (100.0, True), running=2, reward=2.0), None)
-    tally.add(steps((50.0, True), reward=4.0), None)
-    assert (tally.frames, tally.episodes) == (5, 3)
-    expected = {"return": 50, "success_rate": 100, "reward_destination": 0, "reward_proximity": 3}
-    assert tally.row() == {**expected, "reward_alignment": 0}
-
-
-def test_tally_averages_two_hundred_episodes() -> None:
-    tally = TrainingTally(200.0, 1.0)
-    for value in range(201):
-        tally.add(steps((float(value), value > 100)), None)
-    assert (tally.row()["return"], tally.row()["success_rate"]) == (100.5, 50)  # the first of them is forgotten
-
-
-def test_tally_of_no_episode_is_nan() -> None:
-    tally = TrainingTally(200.0, 1.0)
-    tally.add(steps(running=3, reward=1.0), None)
-    row = tally.row()
-    assert math.isnan(row["return"])
-    assert math.isnan(row["success_rate"])
-    assert row["reward_proximity"] == 1
-
-
-def test_tally_goes_on_from_its_state() -> None:
-    one, other = TrainingTally(200.0, 1.0), TrainingTally(200.0, 1.0)
-    one.add(steps((300.0, True), (100.0, False), running=1, reward=2.0), torch.ones(3, 1))
-    other.load_state_dict(one.state_dict())
-    for tally in (one, other):
-        tally.add(steps((20.0, True), reward=4.0), torch.zeros(1, 1))
-    assert (other.frames, other.episodes) == (one.frames, one.episodes) == (4, 3)
-    assert other.row() == one.row()

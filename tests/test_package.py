@@ -20,12 +20,19 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import gymnasium
+import magrl
+
+assert "torch" not in sys.modules
+assert gymnasium.make("magrl/GeomagneticNavigation-v0").reset(seed=0)[0].shape == (13,)
+
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
-import magrl
-from magrl import guidance, metaheuristics, navigators, plots, replay
-from magrl.gymnasium_env import navigation_env
+from magrl import guidance, navigators
+from magrl.envs.navigation import navigation_env
+from magrl.evaluation import plots, replay
+from magrl.navigators import metaheuristics
 
 assert Path(magrl.__file__).is_relative_to(sys.prefix), magrl.__file__
 assert version("magrl") == magrl.__version__, (version("magrl"), magrl.__version__)
@@ -37,11 +44,11 @@ assert field(torch.tensor(-2.0), torch.tensor(162.0)).shape == (3,)
 base = magrl.GeomagneticNavEnv(num_envs=4, seed=0)
 guided = [magrl.FieldGradient(base.field), magrl.GradientHeading(), magrl.AlignmentReward()]
 assert TransformedEnv(base, Compose(*guided)).rollout(3)["next", "reward"].shape == (4, 3, 1)
-plain = magrl.GeomagneticNavEnv(num_envs=4, seed=0)
+plain = magrl.GeomagneticNavEnv(num_envs=4, seed=0, render_mode="rgb_array")
 for pilot in (navigators.Secant(), metaheuristics.build("pso", plain, "flown", seed=0)):
     rollout = plain.rollout(12, pilot, break_when_any_done=False)
-    print(magrl.summarise(magrl.episode_measures(rollout))["success_rate"])
-plots.trajectories_figure(rollout, plain.field, plain.region).savefig("journeys.png")
+    print(magrl.summarize(magrl.episode_measures(rollout))["success_rate"])
+plots.trajectories_figure(rollout, plain.field, plain.region).savefig("episodes.png")
 assert plain.render().shape == (700, 700, 3)
 replay.write_replay("page.html", replay.replay_data({"pso": rollout}, plain.field, plain.region, zeta=0.01))
 assert navigation_env(2, seed=0).reset()["observation"].shape == (2, 13)
@@ -55,15 +62,17 @@ follow_imports = skip
 """
 SNIPPET = """
 import magrl
-from magrl.navigators import Secant
+from magrl.navigators.secant import Secant
 
-env = magrl.GeomagneticNavEnv(num_envs=4, region=magrl.Region((-10, 0), (160, 170)), seed=0)
-rate: float = magrl.summarise(magrl.episode_measures(env.rollout(5, Secant())))["success_rate"]
+region = magrl.Region((-10, 0), (160, 170))
+scenario = magrl.Scenario(region=region, distance_range_km=(200, 400), date="2026-07-01", generation=14)
+env = magrl.GeomagneticNavEnv(scenario, num_envs=4, seed=0)
+rate: float = magrl.summarize(magrl.episode_measures(env.rollout(5, Secant())))["success_rate"]
 """
 
 
 def run(*command: object, cwd: Path) -> str:
-    """What a command prints, without the tree on Python's path."""
+    """Return the output of a command that runs without the tree on Python's path."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     done = subprocess.run([str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -83,7 +92,7 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def python(wheel: Path, tmp_path_factory) -> Path:
-    """Of an environment with the wheel, which finds everything else where the present environment has it."""
+    """Return Python of an environment with the wheel, which finds all else where the present environment has it."""
     folder = tmp_path_factory.mktemp("user")
     venv.create(folder / "venv", with_pip=False)
     executable = folder / "venv" / "bin" / "python"
@@ -99,7 +108,7 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         held = {Path(name) for name in archive.namelist()}
     library = {path.relative_to(ROOT) for path in (ROOT / "magrl").rglob("*") if path.suffix == ".py"}
-    data = {Path("magrl/py.typed"), Path("magrl/templates/replay.html")}
+    data = {Path("magrl/py.typed"), Path("magrl/evaluation/templates/replay.html")}
     assert {path for path in held if path.parts[0] == "magrl"} == library | data
     others = {path.parts[0] for path in held} - {"magrl"}
     assert len(others) == 1
@@ -109,7 +118,7 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
 
 def test_wheel_works_without_the_tree(python: Path, tmp_path: Path) -> None:
     assert len(run(python, "-c", TOUR, cwd=tmp_path).splitlines()) == 2
-    assert (tmp_path / "journeys.png").stat().st_size > 10_000
+    assert (tmp_path / "episodes.png").stat().st_size > 10_000
 
 
 def test_user_s_code_is_typed(python: Path, tmp_path: Path) -> None:

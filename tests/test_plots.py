@@ -1,4 +1,4 @@
-"""Pictures: drawn from the data that they are given."""
+"""Figures: they show the data that they are given."""
 
 import math
 
@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from magrl import plots
-from magrl.env import GeomagneticNavEnv
-from magrl.metrics import flown
-from magrl.tasks import Region, Tasks
+from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
+from magrl.envs.rendering import draw_tracks
+from magrl.evaluation import plots
+from magrl.evaluation.metrics import first_episode_mask
+from magrl.field import IGRF
+from magrl.training.statistics import RETURN_TERMS
 
 
 @pytest.fixture(scope="module")
 def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(num_envs=4, seed=0)
+    return GeomagneticNavEnv(num_envs=4, seed=0, render_mode="rgb_array")
 
 
 def test_render_shows_the_running_episode(env) -> None:
@@ -45,8 +47,8 @@ def test_track_after_a_partial_reset(env) -> None:
     assert torch.equal(env.track(1), started["position"][1:2])
 
 
-def test_render_before_reset_and_of_a_stranger() -> None:
-    env = GeomagneticNavEnv(num_envs=2, seed=0)
+def test_render_before_reset_and_of_an_unknown_vehicle() -> None:
+    env = GeomagneticNavEnv(num_envs=2, seed=0, render_mode="rgb_array")
     with pytest.raises(RuntimeError, match="call reset"):
         env.render()
     env.reset()
@@ -62,15 +64,30 @@ def test_training_figure_leaves_out_what_is_missing() -> None:
     assert [axes.get_xlabel() for axes in figure.axes[2:]] == ["frames (vehicle-steps)"] * 2
 
 
+def test_training_figure_shows_the_columns_of_a_training() -> None:
+    """Return, its terms, success and losses, each from its column; the labels tell lines of a panel apart."""
+    columns = ["return", *(f"return_{term}" for term in RETURN_TERMS), "success_rate", "eval_success_rate", "eval_spl"]
+    columns += ["loss_critic", "loss_actor"]
+    rows = [{"frames": frames, **{key: 10.0 * i + frames for i, key in enumerate(columns)}} for frames in (1, 2)]
+    panels = plots.training_figure(rows).axes
+    assert [[line.get_ydata()[0] for line in axes.lines] for axes in panels] == [
+        [1],
+        [11, 21, 31],
+        [41, 51, 61],
+        [71, 81],
+    ]
+    assert [text.get_text() for text in panels[1].get_legend().get_texts()] == list(RETURN_TERMS)
+
+
 def test_trajectories_end_where_the_episode_did(env) -> None:
     torch.manual_seed(1)
     rollout = env.rollout(10, break_when_any_done=False)
-    figure = plots.trajectories_figure(rollout, env.field, env.region, journeys=2)
+    figure = plots.trajectories_figure(rollout, env.field, env.region, episodes=2)
     axes = figure.axes[0]
     ends = {
         tuple(np.round((line.get_xdata()[-1], line.get_ydata()[-1]), 6)) for line in axes.lines if len(line.get_xdata())
     }
-    last = flown(rollout["next", "done"]).sum(1)[0] - 1
+    last = first_episode_mask(rollout["next", "done"]).sum(1)[0] - 1
     latitude, longitude = rollout["next", "position"][0, last].tolist()
     assert (round(longitude, 6), round(latitude, 6)) in ends
     assert "deg" in axes.get_legend().get_texts()[0].get_text()
@@ -79,13 +96,12 @@ def test_trajectories_end_where_the_episode_did(env) -> None:
 def test_paths_across_the_antimeridian_do_not_jump() -> None:
     region = Region((-5.0, 5.0), (175.0, 185.0))
     start, target = torch.tensor([[0.0, 179.0]]), torch.tensor([[0.0, -178.0]])
-    from magrl.fields import IGRF
-
-    env = GeomagneticNavEnv(region=region, tasks=Tasks(start, target), max_steps=4, seed=0)
+    scenario = Scenario(region=region, tasks=Tasks(start, target))
+    env = GeomagneticNavEnv(scenario, max_steps=4, seed=0, render_mode="rgb_array")
     state = env.reset()
     for _ in range(3):
         state["action"] = torch.tensor([[50.0, math.pi / 4]])
         state = env.step(state)["next"].exclude("reward")
     figure = plots.Figure()
-    plots.draw_journeys(figure.subplots(), IGRF(2025.0), region, [env.track(0)], target)
+    draw_tracks(figure.subplots(), IGRF(2025.0), region, [env.track(0)], target)
     assert max(abs(np.diff(line.get_xdata())).max() for line in figure.axes[0].lines if len(line.get_xdata()) > 1) < 5

@@ -19,14 +19,14 @@ from hypothesis.strategies import SearchStrategy
 from torch import Tensor
 
 from magrl import geodesy
-from magrl.elements import field_vector, measured_elements, seven_elements
-from magrl.env import GeomagneticNavEnv
-from magrl.fields import IGRF, SphericalHarmonicField
+from magrl.envs import PAPER_REGION, GeomagneticNavEnv, Region, Scenario
+from magrl.field.elements import field_vector, measured_elements, seven_elements
+from magrl.field.igrf import IGRF
+from magrl.field.spherical import SphericalHarmonicField
 from magrl.guidance import objective, objective_weights, parallel_approach
-from magrl.tasks import PAPER_REGION, Region
 from magrl.transforms import MinMaxNorm
 
-MILLIMETRE = 1e-6
+MILLIMETER = 1e-6
 ROUNDING_NT = 1e-6
 
 
@@ -72,15 +72,15 @@ def geodesic(place: tuple[float, float], other: tuple[float, float]) -> tuple[fl
 @given(PLACES, ANGLES, LEGS)
 def test_a_leg_leads_where_geographiclib_says(place: tuple[float, float], heading: float, distance_km: float) -> None:
     end = Geodesic.WGS84.Direct(*place, math.degrees(heading), 1000 * distance_km)
-    assert apart_km(moved(place, heading, distance_km), (end["lat2"], end["lon2"])) < 5 * MILLIMETRE
+    assert apart_km(moved(place, heading, distance_km), (end["lat2"], end["lon2"])) < 5 * MILLIMETER
 
 
 @given(PLACES, ANGLES, LEGS)
 def test_there_and_back(place: tuple[float, float], heading: float, distance_km: float) -> None:
     end = moved(place, heading, distance_km)
     distance, bearing = geodesic(end, place)
-    assert distance == pytest.approx(distance_km, abs=5 * MILLIMETRE)
-    assert apart_km(moved(end, bearing, distance), place) < 10 * MILLIMETRE
+    assert distance == pytest.approx(distance_km, abs=5 * MILLIMETER)
+    assert apart_km(moved(end, bearing, distance), place) < 10 * MILLIMETER
 
 
 @given(PLACES, ANGLES, LEGS, between(-1000, 1000, 180.0, -180.0, 360.0))
@@ -90,7 +90,7 @@ def test_turning_the_globe_turns_the_leg(
     """Nothing on the ellipsoid depends on the longitude: the antimeridian is a meridian as any other."""
     latitude, longitude = moved(place, heading, distance_km)
     turned = moved((place[0], place[1] + turn_deg), heading, distance_km)
-    assert apart_km(turned, (latitude, longitude + turn_deg)) < MILLIMETRE
+    assert apart_km(turned, (latitude, longitude + turn_deg)) < MILLIMETER
     assert -180 <= turned[1] <= 180
 
 
@@ -99,28 +99,28 @@ def test_geodesics_are_those_of_geographiclib(place: tuple[float, float], other:
     line = Geodesic.WGS84.Inverse(*place, *other)
     assume(line["a12"] < 178)  # nearly antipodal pairs may be NaN
     distance, bearing = geodesic(place, other)
-    assert distance == pytest.approx(line["s12"] / 1000, abs=MILLIMETRE)
+    assert distance == pytest.approx(line["s12"] / 1000, abs=MILLIMETER)
     # A bearing is worth as much as what it does at the far end, which is nothing at a pole or at no distance.
     across = 6400 * math.sin(math.radians(line["a12"]))
     deviation = math.remainder(bearing - math.radians(line["azi1"]), 2 * math.pi)
     if abs(place[0]) < 89.9 and abs(other[0]) < 89.9:
-        assert abs(deviation) * across < 100 * MILLIMETRE
+        assert abs(deviation) * across < 100 * MILLIMETER
 
 
 @given(PLACES, PLACES, PLACES)
 def test_distances_are_a_metric(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> None:
     sides = [geodesic(a, b)[0] for a, b in ((one, two), (two, three), (one, three), (two, one))]
     assume(all(math.isfinite(side) for side in sides))
-    assert sides[0] == pytest.approx(sides[3], abs=MILLIMETRE)
-    assert sides[2] <= sides[0] + sides[1] + MILLIMETRE
-    assert sides[0] >= apart_km(one, two) - MILLIMETRE  # no arc is shorter than its chord
+    assert sides[0] == pytest.approx(sides[3], abs=MILLIMETER)
+    assert sides[2] <= sides[0] + sides[1] + MILLIMETER
+    assert sides[0] >= apart_km(one, two) - MILLIMETER  # no arc is shorter than its chord
 
 
 @given(PLACES)
-def test_earth_centred_coordinates_come_back(place: tuple[float, float]) -> None:
+def test_earth_centered_coordinates_come_back(place: tuple[float, float]) -> None:
     latitude, longitude = geodesy.from_ecef_surface(geodesy.to_ecef(*scalars(*place)))
-    assert apart_km((latitude, longitude), place) < MILLIMETRE
-    assert abs(float(latitude) - place[0]) < 1e-7  # a metre across the pole turns it by no more
+    assert apart_km((latitude, longitude), place) < MILLIMETER
+    assert abs(float(latitude) - place[0]) < 1e-7  # a meter across the pole turns it by no more
 
 
 # --- Elements ---------------------------------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ def test_the_field_has_no_sources_and_no_curl(
     b_by_coordinate = (weights * ecef_field(model, *points)).sum(0)
     x_by_coordinate = (weights * geodesy.to_ecef(*points)).sum(0)
     tensor = torch.linalg.solve(x_by_coordinate, b_by_coordinate)  # [j, i] is dB_i / dx_j, in nT/km
-    # Differences of 1e5 nT, good to 1e-11, over kilometres.
+    # Differences of 1e5 nT, good to 1e-11, over kilometers.
     tolerance = 1e-7 * float(tensor.norm()) + 1e-9 * float(model(*scalars(latitude, longitude, altitude_km)).norm())
     assert abs(float(tensor.trace())) < tolerance
     assert float((tensor - tensor.T).abs().max()) < tolerance
@@ -230,7 +230,7 @@ def test_a_pole_has_one_field_from_every_side(
     model: SphericalHarmonicField, pole: int, longitudes: list[float]
 ) -> None:
     longitude = f64(*longitudes, *longitudes)
-    beside = torch.full((len(longitudes),), 90 - 1e-9, dtype=torch.float64)  # a tenth of a millimetre away
+    beside = torch.full((len(longitudes),), 90 - 1e-9, dtype=torch.float64)  # a tenth of a millimeter away
     latitude = pole * torch.cat((torch.full_like(beside, 90.0), beside))
     found = ecef_field(model, latitude, longitude, torch.zeros_like(latitude))
     torch.testing.assert_close(found, found[:1].expand_as(found), rtol=0, atol=1e-4)
@@ -338,20 +338,24 @@ def test_bounds_that_do_not_rise_are_refused(low: float, high: float) -> None:
 
 # --- Environment ------------------------------------------------------------------------------------------------------
 
+SCENARIOS = st.builds(
+    Scenario,
+    region=st.sampled_from((PAPER_REGION, Region((-5, 5), (175, 185)), Region((60, 70), (10, 30)))),
+    distance_range_km=st.sampled_from(((300.0, 500.0), (0.0, 1.0), (100.0, 900.0))),
+    objective_floors=st.tuples(between(0.01, 1), between(0.01, 1), between(1, 100)),
+    margin_deg=between(0, 3, 0.0),
+)
 OPTIONS = st.fixed_dictionaries(
     {
+        "scenario": SCENARIOS,
         "num_envs": st.integers(1, 40),
-        "region": st.sampled_from((PAPER_REGION, Region((-5, 5), (175, 185)), Region((60, 70), (10, 30)))),
-        "distance_range_km": st.sampled_from(((300.0, 500.0), (0.0, 1.0), (100.0, 900.0))),
         "max_steps": st.sampled_from((50, 7, 3)),
         "max_move_km": between(0.1, 300),
         "max_turn_rad": between(0.01, math.pi, math.pi),
         "zeta": between(1e-4, 1),
         "start_heading": st.sampled_from(("north", "random")),
-        "objective_floors": st.tuples(between(0.01, 1), between(0.01, 1), between(1, 100)),
         "destination_weight": between(0, 1000),
         "proximity_weight": between(0, 100),
-        "margin_deg": between(0, 3, 0.0),
         "seed": st.integers(0, 2**32),
     }
 )

@@ -1,20 +1,21 @@
-"""The recipes as their users run them: small, but whole."""
+"""The feedforward recipe as its users run it: small, but complete."""
 
 import csv
-import dataclasses
-import importlib.util
 import json
 import math
+import re
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+import td3_gradient_guided as recipe
+import td3_recurrent
 import torch
 
-from magrl import td3
-from magrl.env import GeomagneticNavEnv
+from magrl import paper
+from magrl.agents import load_policy
+from magrl.envs import GeomagneticNavEnv
+from magrl.training import command, parse_config
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 SMALL = {
@@ -32,29 +33,23 @@ SMALL = {
 }
 
 
+def settings(out: Path, preset: str = "fast", **options) -> recipe.Config:
+    return recipe.PRESETS[preset].replace(out=out, **SMALL | options)
+
+
+def parse(*args: str) -> recipe.Config:
+    return parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, recipe.__doc__, args)
+
+
 @pytest.fixture(scope="module")
-def recipe():
-    spec = importlib.util.spec_from_file_location("td3_gradient_guided", RECIPES / "td3_gradient_guided.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+def trained(tmp_path_factory) -> tuple[Path, dict[str, float]]:
+    """Return the folder and the result of a guided training that was left alone."""
+    out = tmp_path_factory.mktemp("recipes") / "run"
+    return out, recipe.train(settings(out))
 
 
-def settings(recipe, out: Path, **options):
-    return dataclasses.replace(recipe.Config(), out=out, **SMALL | options)
-
-
-def rows(folder: Path) -> list[dict[str, str]]:
-    """The curves of a run, without their timing."""
-    with (folder / "train.csv").open() as file:
-        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
-
-
-@pytest.mark.parametrize("guided", [True, False])
-def test_run_folder(recipe, tmp_path: Path, guided: bool) -> None:
-    out = tmp_path / "run"
-    result = recipe.train(settings(recipe, out), guided=guided)
+def test_run_folder(trained, outcome) -> None:
+    out, result = trained
     names = {".lock", "config.json", "train.csv", "policy.pt", "eval.json", "training.png", "trajectories.png"}
     assert {path.name for path in out.iterdir()} == names
     written = json.loads((out / "eval.json").read_text())
@@ -62,50 +57,92 @@ def test_run_folder(recipe, tmp_path: Path, guided: bool) -> None:
     assert needed <= written.keys()
     assert (written["num_tasks"], written["seed"], written["frames"]) == (6, 0, 320)
     assert written["spl"] == result["spl"]
-    assert json.loads((out / "config.json").read_text())["guided"] is guided
-    assert [int(row["frames"]) for row in rows(out)] == [160, 320]
-    assert [int(row["updates"]) for row in rows(out)] == [18, 38]
-    aligned = [float(row["reward_alignment"]) != 0 for row in rows(out)]
-    assert aligned == [guided, guided]
+    config = json.loads((out / "config.json").read_text())
+    assert (config["recipe"], config["guided"], config["preset"]) == ("td3_gradient_guided.py", True, "fast")
+    rows, _ = outcome(out)
+    assert [int(row["frames"]) for row in rows] == [160, 320]
+    assert [int(row["updates"]) for row in rows] == [18, 38]
+    assert all(math.isfinite(float(row[key])) for row in rows for key in ("loss_critic", "loss_actor"))
+    for picture in ("training.png", "trajectories.png"):
+        assert (out / picture).read_bytes().startswith(b"\x89PNG")
     env = GeomagneticNavEnv(num_envs=3, seed=0)
-    assert env.rollout(2, td3.load_policy(out / "policy.pt"))["action"].isfinite().all()
+    assert env.rollout(2, load_policy(out / "policy.pt"))["action"].isfinite().all()
 
 
-def test_same_seed_same_numbers(recipe, tmp_path: Path) -> None:
-    def trained(name: str, seed: int) -> tuple[dict, list]:
-        recipe.train(settings(recipe, tmp_path / name, seed=seed))
-        return td3.load_policy(tmp_path / name / "policy.pt").state_dict(), rows(tmp_path / name)
-
-    (one, rows_one), (again, rows_again), (_, rows_other) = trained("a", 1), trained("b", 1), trained("c", 2)
-    assert rows_one == rows_again != rows_other
-    assert all(torch.equal(one[key], again[key]) for key in one)
+def returns(folder: Path) -> list[dict[str, float]]:
+    with (folder / "train.csv").open() as file:
+        rows = [{key: float(value) for key, value in row.items() if "return" in key} for row in csv.DictReader(file)]
+    return [row for row in rows if math.isfinite(row["return"])]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("frames", [240, 96], ids=["after an evaluation", "before any"])
-def test_stopped_training_goes_on_as_if_it_had_not(recipe, tmp_path: Path, signalled, capsys, frames, number) -> None:
-    """Ctrl-C and SIGTERM: the iteration is finished, the policy and a checkpoint are kept, and --resume is exact."""
-    run, whole = tmp_path / "run", tmp_path / "whole"
-    with signalled(recipe, frames // 16, number), pytest.raises(SystemExit) as stop:
-        recipe.train(settings(recipe, run))
+TERMS = ("return_destination", "return_proximity", "return_alignment")
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_return_is_the_sum_of_its_terms(tmp_path: Path) -> None:
+    """The unscaled return, whatever the factor on rewards for the critics."""
+    recipe.train(settings(tmp_path / "run", total_frames=960, eval_every=60))
+    (row,) = returns(tmp_path / "run")
+    assert row["return"] == pytest.approx(sum(row[key] for key in TERMS), rel=1e-4)
+    assert all(row[key] != 0 for key in TERMS[1:])
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_training_without_guidance(tmp_path: Path) -> None:
+    """The same recipe without the theoretical heading and its reward."""
+    out = tmp_path / "run"
+    recipe.train(settings(out, "td3-fast", total_frames=960, eval_every=60))
+    (row,) = returns(out)
+    assert math.isnan(row["return_alignment"])
+    assert row["return"] == pytest.approx(row["return_destination"] + row["return_proximity"], rel=1e-4)
+    config = json.loads((out / "config.json").read_text())
+    assert (config["guided"], config["preset"]) == (False, "td3-fast")
+
+
+def test_environment_without_guidance_knows_no_theoretical_heading() -> None:
+    for preset, guided in (("fast", True), ("paper", True), ("td3-fast", False), ("td3-paper", False)):
+        config = parse("--preset", preset)
+        assert config.guided is guided
+        base = GeomagneticNavEnv(num_envs=2, seed=0)
+        state = recipe.make_env(base, base.observation_view(), config).reset()
+        assert ("gradient_heading" in state.keys()) is guided  # noqa: SIM118
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_other_seed_gives_other_weights(trained, tmp_path: Path, outcome) -> None:
+    """That the same seed gives the same weights is part of the tests of resume."""
+    recipe.train(settings(tmp_path / "other", seed=2))
+    (rows, weights), (others, other_weights) = outcome(trained[0]), outcome(tmp_path / "other")
+    assert rows != others
+    assert not all(torch.equal(weights[key], other_weights[key]) for key in weights)
+
+
+@pytest.mark.usefixtures("without_figures")
+@pytest.mark.parametrize(
+    ("frames", "number"),
+    [(240, signal.SIGINT), (96, signal.SIGTERM)],
+    ids=["after an evaluation", "before any"],
+)
+def test_interrupted_training_resumes_exactly(
+    trained, tmp_path: Path, signalled, same_outcome, capsys, frames: int, number: int
+) -> None:
+    """Ctrl-C and SIGTERM: the iteration ends, policy and checkpoint are saved, and --resume is exact."""
+    run = tmp_path / "run"
+    with signalled(frames // 16, number), pytest.raises(SystemExit) as stop:
+        recipe.train(settings(run))
     assert stop.value.code == 128 + number
-    assert f"Stopped after {frames} frames" in capsys.readouterr().err
-    assert td3.load_policy(run / "policy.pt").config.num_cells == (16, 16)
+    said = capsys.readouterr().err
+    assert f"Stopped after {frames} frames" in said
+    assert f"To resume: --resume {run}" in said
+    assert load_policy(run / "policy.pt").config.num_cells == (16, 16)
     assert (run / "training.png").exists() == (frames >= 160)
     assert not (run / "eval.json").exists()
-    recipe.train(recipe.parse("td3_gradient_guided.py", ["--resume", str(run)]))
-    recipe.train(settings(recipe, whole))
-    assert rows(run) == rows(whole)
-    weights, others = (td3.load_policy(folder / "policy.pt").state_dict() for folder in (run, whole))
-    assert all(torch.equal(weights[key], others[key]) for key in weights)
+    recipe.train(parse("--resume", str(run)))
+    assert same_outcome(run, trained[0])
     assert not (run / "checkpoints").exists()
 
 
-def test_folder_in_use_is_refused(recipe, tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").touch()
-    with pytest.raises(FileExistsError, match="in use"):
-        recipe.train(settings(recipe, tmp_path))
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+# Settings and command line
 
 
 @pytest.mark.parametrize(
@@ -121,21 +158,86 @@ def test_folder_in_use_is_refused(recipe, tmp_path: Path) -> None:
         {"init_random_frames": -1},
         {"learning_rate": 0.0},
         {"tau": 2.0},
+        {"tau": 0.0},
         {"zeta": 0.0},
         {"alignment_weight": math.inf},
         {"exploration_noise": -0.1},
+        {"num_cells": ()},
+        {"num_cells": (16, 0)},
+        {"start_heading": "south"},
+        {"guided": 1},
         {"logger": "paper"},
     ],
     ids=str,
 )
-def test_bad_settings_are_refused_by_name(recipe, tmp_path: Path, bad: dict) -> None:
+def test_bad_settings_are_refused_by_name(tmp_path: Path, bad: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
-        settings(recipe, tmp_path / "run", **bad)
+        settings(tmp_path / "run", **bad)
     assert not (tmp_path / "run").exists()
 
 
-def test_paper_preset_is_table_1(recipe) -> None:
-    config = recipe.parse("x", ["--preset", "paper", "--seed", "4"])
+@pytest.mark.parametrize(
+    ("module", "args", "message"),
+    [
+        (recipe, "--device foo", "device 'foo' cannot be used here"),
+        (recipe, "--device cuda:99", "device 'cuda:99' cannot be used here"),
+        (recipe, "--num-cells", "num_cells must hold at least 1 value, got ()"),
+        (recipe, "--gamma 2", "gamma must be less than 1, got 2.0"),
+        (recipe, "--gamma fast", "fast"),
+        (recipe, "--total-farmes 10", "--total-farmes"),
+        (recipe, "--preset slow", "invalid choice: 'slow' (choose from"),
+        (recipe, "--scenario nowhere.toml", "there is no scenario file at nowhere.toml"),
+        (recipe, "--resume nowhere", "there is no run to resume in nowhere: it holds no config.json"),
+        (recipe, "--num-envs 8 --collectors 3", "num_envs 8 cannot be divided evenly among 3 collectors"),
+        (td3_recurrent, "--num-envs 1", "num_envs must be at least 2, got 1"),
+        (td3_recurrent, "--shortest-task-km 600", "shortest_task_km must be below 500, got 600.0"),
+    ],
+)
+def test_bad_usage_exits_with_status_2(module, args: str, message: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    """With a message, without a traceback and without a folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "300")
+    with pytest.raises(SystemExit) as stop:
+        command(module.RECIPE, lambda: module.main(args.split()))
+    said = capsys.readouterr()
+    text = re.sub(r"[\s│]+", " ", said.out + said.err)
+    assert stop.value.code == 2
+    assert message in text
+    assert "Traceback" not in text
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the message of a build or machine without CUDA")
+def test_missing_cuda_is_bad_usage(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        command(recipe.RECIPE, lambda: recipe.main(["--device", "cuda"]))
+    assert stop.value.code == 2
+    assert "device 'cuda' cannot be used here" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_in_use_is_refused_in_one_line(tmp_path: Path, capsys) -> None:
+    (tmp_path / "mine.txt").touch()
+    with pytest.raises(SystemExit) as stop:
+        command(recipe.RECIPE, lambda: recipe.main(["--out", str(tmp_path)]))
+    said = f"td3_gradient_guided.py: the run folder {tmp_path} is not empty: choose another --out\n"
+    assert (stop.value.code, capsys.readouterr().err) == (2, said)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_errors_of_a_training_keep_their_traceback() -> None:
+    """A ValueError inside a training is a bug, not bad usage."""
+
+    def broken() -> None:
+        raise ValueError("a bug")
+
+    with pytest.raises(ValueError, match="a bug"):
+        command("mine.py", broken)
+
+
+def test_paper_preset_is_table_1() -> None:
+    config = parse("--preset", "paper", "--seed", "4")
     table = {
         "learning_rate": 1e-3,
         "final_learning_rate": 1e-3,
@@ -146,47 +248,45 @@ def test_paper_preset_is_table_1(recipe) -> None:
         "batch_size": 256,
         "num_cells": (512, 512, 512),
         "exploration_noise": 0.2,
+        "final_exploration_noise": 0.2,
         "policy_noise": 0.1,
+        "total_episodes": 20_000,
+        "total_frames": 1_000_000,
         "num_envs": 1,
         "updates_per_batch": 1,
         "seed": 4,
         "reward_scale": 1.0,
         "saturation_weight": 0.0,
+        "observe_difference": False,
+        "layer_norm": False,
     }
     assert {key: getattr(config, key) for key in table} == table
+    unguided = parse("--preset", "td3-paper", "--seed", "4")
+    assert unguided == config.replace(preset="td3-paper", guided=False)
 
 
-def test_evaluation_seeds_are_out_of_reach(recipe) -> None:
-    for seed in (recipe.TEST_SEED, recipe.VALIDATION_SEED):
+def test_evaluation_seeds_are_out_of_reach() -> None:
+    for seed in (paper.TEST_SEED, paper.VALIDATION_SEED):
         with pytest.raises(ValueError, match="seed"):
-            dataclasses.replace(recipe.Config(), seed=seed)
+            recipe.Config(seed=seed)
 
 
-@pytest.mark.parametrize("name", ["td3_gradient_guided.py", "td3.py"])
-def test_help_lists_the_flags(name: str, tmp_path: Path) -> None:
-    """Run from elsewhere, as a user may."""
-    run = subprocess.run(
-        [sys.executable, RECIPES / name, "--help"], capture_output=True, text=True, cwd=tmp_path, check=True
-    )
-    for flag in ("--preset", "--seed", "--out", "--device", "--num-envs", "--total-frames", "--wandb-mode"):
-        assert flag in run.stdout
-
-
-def test_what_cannot_run_is_said_in_a_line(tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").touch()
-    command = [sys.executable, RECIPES / "td3.py", "--out", tmp_path]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert run.returncode == 1
-    assert run.stderr.strip() == f"td3.py: the run folder {tmp_path} is in use: choose another --out, or move it away"
+@pytest.mark.parametrize("module", [recipe, td3_recurrent], ids=lambda module: module.__name__)
+def test_help_lists_the_flags(module, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        module.main(["--help"])
+    assert stop.value.code == 0
+    said = capsys.readouterr().out
+    for flag in ("--seed", "--out", "--device", "--num-envs", "--total-frames", "--wandb-mode", "--resume"):
+        assert flag in said
+    assert ("--preset" in said) == (module is recipe)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 6])
-def test_the_agent_learns_to_navigate(recipe, tmp_path: Path, seed: int) -> None:
-    """Half of the preset's frames, on seeds that it was not tuned on: the paper's figures, on 1000 unseen tasks."""
-    config = dataclasses.replace(
-        recipe.Config(), seed=seed, total_frames=102_400, out=tmp_path / "run", wandb_mode="disabled"
-    )
-    result = recipe.train(config)
+def test_the_agent_learns_to_navigate(tmp_path: Path, seed: int) -> None:
+    """Half of the preset's frames, on seeds that were not used for tuning: the paper's results, on 1000 test tasks."""
+    result = recipe.train(recipe.Config(seed=seed, total_frames=102_400, out=tmp_path / "run", wandb_mode="disabled"))
     assert result["success_rate"] >= 97
     assert result["spl"] >= 88.4

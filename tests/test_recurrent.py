@@ -1,29 +1,40 @@
-"""The agent with a memory: what it reads, where its memory starts, how slices are replayed, and its recipe."""
+"""The recurrent agent: its observations, its state, the replay of slices, its loss, and its recipe."""
 
 import csv
-import dataclasses
-import importlib.util
 import json
 import math
 import signal
-import sys
 from pathlib import Path
 
 import pytest
+import td3_recurrent as recipe
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
+from torchrl.data import Bounded, LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import TD3Loss as StockTD3Loss
 
-from magrl import recurrent, td3
-from magrl.checkpoints import save_tensors
-from magrl.env import PRIVILEGED_KEYS, GeomagneticNavEnv
+from magrl.agents import (
+    FieldPolicy,
+    PolicyConfig,
+    RecurrentTD3Loss,
+    load_policy,
+    make_critic,
+    make_recurrent_actor,
+    recurrent_transforms,
+    saturation_penalty,
+    save_policy,
+)
+from magrl.agents.recurrent import STATE_KEYS, LastMove
+from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Scenario
+from magrl.training import UsageError, parse_config
+from magrl.transforms import ObservationView
 
-RECIPE = Path(__file__).parent.parent / "recipes" / "td3_recurrent.py"
-SLICE = 4
+SLICE, CELLS = 4, (16, 16)
 
 
 @pytest.fixture(scope="module")
@@ -32,25 +43,37 @@ def env() -> GeomagneticNavEnv:
 
 
 @pytest.fixture(scope="module")
-def view(env) -> td3.PolicyConfig:
-    return td3.policy_config(env, (16, 16), layer_norm=True, observe_heading=False)
-
-
-def training_env(env: GeomagneticNavEnv, view: td3.PolicyConfig, actor) -> TransformedEnv:
-    base = GeomagneticNavEnv(num_envs=6, seed=3, max_steps=7, field=env.field)
-    return TransformedEnv(base, Compose(*recurrent.training_transforms(view, actor), td3.action_transform(view)))
-
-
-def make_loss(view: td3.PolicyConfig, actor):
-    critic = recurrent.make_critic(view)
-    return recurrent.make_loss(actor, critic, gamma=0.9, policy_noise=0.0, noise_clip=0.5)
+def view(env) -> ObservationView:
+    return env.observation_view(observe_heading=False)
 
 
 @pytest.fixture
-def collected(env, view):
-    """An actor, 24 steps that it took in journeys of at most 7, and slices of those."""
+def actor(view) -> TensorDictSequential:
     torch.manual_seed(0)
-    actor = recurrent.make_actor(view, 8)
+    return make_recurrent_actor(view, CELLS, 8)
+
+
+def make_policy(view: ObservationView, actor: TensorDictSequential | None = None) -> FieldPolicy:
+    return FieldPolicy(PolicyConfig(view, CELLS, memory_size=8), actor)
+
+
+def training_env(env: GeomagneticNavEnv, view: ObservationView, actor) -> TransformedEnv:
+    base = GeomagneticNavEnv(Scenario(field=env.field), num_envs=6, seed=3, max_steps=7)
+    return TransformedEnv(base, Compose(*recurrent_transforms(view, actor), view.action_transform()))
+
+
+def make_heading_critic(view: ObservationView):
+    return make_critic(view.size + 2, CELLS, observation_keys=("observation", "heading_vector"))
+
+
+def make_loss(view: ObservationView, actor, policy_noise: float = 0.0) -> RecurrentTD3Loss:
+    critic = make_heading_critic(view)
+    return RecurrentTD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=0.5)
+
+
+@pytest.fixture
+def collected(env, view, actor):
+    """Return an actor, 24 steps that it took in episodes of at most 7, and slices of those."""
     collector = Collector(
         training_env(env, view, actor),
         actor,
@@ -69,16 +92,27 @@ def collected(env, view):
     return actor, steps, buffer.sample()
 
 
+# Observation and state
+
+
 def test_last_move() -> None:
     """A turn of 30 degrees, a third of the largest, after a move of three quarters of the longest."""
-    seen = torch.zeros(2, 11)
-    seen[:, 6:8] = torch.tensor([[0.5, 1 / 3], [-1.0, 0.0]])
+    moves = torch.tensor([[0.5, 1 / 3], [-1.0, 0.0]])
     expected = torch.tensor([[0.5, 1 / 3, math.sqrt(3) / 2, 0.5], [-1.0, 0.0, 1.0, 0.0]])
-    torch.testing.assert_close(recurrent.LastMove(math.pi / 2)(seen), expected)
+    torch.testing.assert_close(LastMove(math.pi / 2)(moves), expected)
+
+
+def test_last_move_is_that_of_the_environment(env, view) -> None:
+    """``move_scaled`` holds distance and turn, in this order, whatever the columns of the observation."""
+    moves = env.rollout(5)["next"][:, -1]
+    observed = Compose(*view.observation_transforms())(moves.clone())
+    distance, turn = (view.max_move_km / 2 * (observed["move_scaled"][:, 0] + 1), observed["move_scaled"][:, 1])
+    torch.testing.assert_close(distance, moves["move"][:, 0])
+    torch.testing.assert_close(turn * view.max_turn_rad, moves["move"][:, 1])
 
 
 def scrambled(state: TensorDict) -> TensorDict:
-    """A state with noise in everything that a policy on the eight numbers has no business with."""
+    """Return a state with noise in everything that a policy on the eight numbers must not read."""
     state = state.clone()
     for key in ("heading", *PRIVILEGED_KEYS):
         value = state[key]
@@ -87,31 +121,28 @@ def scrambled(state: TensorDict) -> TensorDict:
     return state.update({key: torch.full((6, *shape), math.nan) for key, shape in extra.items()})
 
 
-def test_policy_reads_neither_heading_nor_privileged_keys(env, view) -> None:
-    torch.manual_seed(0)
-    actor = recurrent.make_actor(view, 8)
+def test_policy_reads_neither_heading_nor_privileged_keys(env, view, actor) -> None:
     states = env.rollout(5)
-    flown, blind = (recurrent.RecurrentPolicy(view, 8, actor) for _ in range(2))
+    plain, blind = (make_policy(view, actor) for _ in range(2))
     for step in range(5):
-        action = flown(states[:, step].clone())["action"]
+        action = plain(states[:, step].clone())["action"]
         assert torch.equal(blind(scrambled(states[:, step]))["action"], action)
-    assert not {"heading", *PRIVILEGED_KEYS} & set(flown.in_keys)
-    assert set(actor.in_keys) == {"observation", "is_init", *recurrent.STATE_KEYS}
+    assert not {"heading", *PRIVILEGED_KEYS} & set(plain.in_keys)
+    assert set(actor.in_keys) == {"observation", "move_scaled", "is_init", *STATE_KEYS}
 
 
 def test_observation_in_training_holds_no_heading(env, view) -> None:
-    transforms = Compose(*recurrent.observation_transforms(view))
+    transforms = Compose(*view.observation_transforms())
     state = env.rollout(5)["next"][:, -1]
     turned = state.clone().set("heading", state["heading"] + 1)
-    seen = transforms(state.clone())["observation"]
-    assert seen.shape == (6, 11)
-    assert torch.equal(transforms(turned)["observation"], seen)
+    observed = transforms(state.clone())["observation"]
+    assert observed.shape == (6, 11)
+    assert torch.equal(transforms(turned)["observation"], observed)
 
 
-def test_memory_tells_apart_what_the_eight_numbers_do_not(env, view) -> None:
-    """Two vehicles with the same state and other pasts act differently."""
-    torch.manual_seed(0)
-    policy = recurrent.RecurrentPolicy(view, 8)
+def test_memory_tells_apart_what_the_eight_numbers_do_not(env, view, actor) -> None:
+    """Vehicles with equal observations and different pasts act differently."""
+    policy = make_policy(view, actor)
     states = env.rollout(3)
     for step in range(2):
         policy(states[:, step].clone())
@@ -121,11 +152,9 @@ def test_memory_tells_apart_what_the_eight_numbers_do_not(env, view) -> None:
     assert (action[1:] != action[0]).any(-1).all()
 
 
-def test_memory_starts_anew_with_each_journey(env, view) -> None:
-    torch.manual_seed(0)
-    actor = recurrent.make_actor(view, 8)
+def test_memory_is_reset_at_the_start_of_an_episode(env, view, actor) -> None:
     states = env.rollout(4)
-    policy, fresh = (recurrent.RecurrentPolicy(view, 8, actor) for _ in range(2))
+    policy, fresh = (make_policy(view, actor) for _ in range(2))
     for step in range(3):
         policy(states[:, step].clone())
     restarted = torch.tensor([True, False, True, False, False, True])
@@ -142,14 +171,14 @@ def test_memory_is_reset_in_collected_steps(collected) -> None:
     begins = steps["is_init"].squeeze(-1)
     assert torch.equal(begins, steps["step_count"].squeeze(-1) == 0)
     assert begins.sum() > 6, "no vehicle was reset on the way"
-    for key in recurrent.STATE_KEYS:
+    for key in STATE_KEYS:
         assert (steps[key][begins] == 0).all()
         assert (steps[key][~begins] != 0).any(-1).all()
         inside = ~begins[:, 1:]
         assert torch.equal(steps[key][:, 1:][inside], steps["next", key][:, :-1][inside])
 
 
-def test_slices_stay_within_journeys(collected) -> None:
+def test_slices_stay_within_episodes(collected) -> None:
     _, _, slices = collected
     begins = slices["is_init"].squeeze(-1)
     assert begins[0]
@@ -159,7 +188,7 @@ def test_slices_stay_within_journeys(collected) -> None:
     assert torch.equal(slices["step_count"][1:][inside], slices["step_count"][:-1][inside] + 1)
     lengths = begins.cumsum(0).bincount()[1:]
     assert lengths.max() <= SLICE
-    assert (slices["step_count"][begins] > 0).any(), "no slice begins inside a journey"
+    assert (slices["step_count"][begins] > 0).any(), "no slice begins inside an episode"
 
 
 def test_unrolled_slices_give_what_was_collected(collected) -> None:
@@ -176,112 +205,173 @@ def by_hand(actor, slices: TensorDict) -> list[torch.Tensor]:
     actions = []
     for start, stop in zip(starts, [*starts[1:], len(slices)], strict=True):
         observations = torch.cat((slices["observation"][start : start + 1], slices["next", "observation"][start:stop]))
-        state = {key: slices[key][start] for key in recurrent.STATE_KEYS}
+        state = {key: slices[key][start] for key in STATE_KEYS}
         for index, observation in enumerate(observations):
             step = actor(TensorDict({"observation": observation, "is_init": torch.tensor([False]), **state}))
-            state = {key: step["next", key] for key in recurrent.STATE_KEYS}
+            state = {key: step["next", key] for key in STATE_KEYS}
             if index:
                 actions.append(step["action"])
     return actions
 
 
+# Loss
+
+
+def states_at_next_observations(actor, slices: TensorDict) -> list[TensorDict]:
+    """Return what the actor writes at the next observations: each slice unrolled step by step from its stored state."""
+    starts = slices["is_init"].squeeze(-1).nonzero().squeeze(-1).tolist()
+    written = []
+    for start, stop in zip(starts, [*starts[1:], len(slices)], strict=True):
+        inputs = {
+            key: torch.cat((slices[key][start : start + 1], slices["next", key][start:stop]))
+            for key in ("observation", "move_scaled")
+        }
+        state = {key: slices[key][start] for key in STATE_KEYS}
+        for index in range(stop - start + 1):
+            inputs_now = {key: value[index] for key, value in inputs.items()}
+            step = actor(TensorDict({**inputs_now, "is_init": torch.tensor([False]), **state}))
+            if index:
+                written.append(TensorDict({"action": step["action"], **state}))
+            state = {key: step["next", key] for key in STATE_KEYS}
+    return written
+
+
+def critic_values(loss, params, at, action) -> torch.Tensor:
+    data = TensorDict({**{k: at[k] for k in ("observation", "heading_vector")}, "action": action}, [len(action)])
+    with params.to_module(loss.qvalue_network):
+        return loss.qvalue_network(data)["state_action_value"]
+
+
 def test_target_actions_come_from_an_unrolled_memory(view, collected) -> None:
-    """Eqs. 3-9 and 3-10 by hand; states that were stored after the first step are of no use, since weights move on."""
+    """Eqs. 3-9 and 3-10 by hand. Stored states after the first step are not read, since they are of older weights."""
     actor, _, slices = collected
     slices["next", "reward"] = torch.randn(len(slices), 1)
     loss = make_loss(view, actor)
-    for key in recurrent.STATE_KEYS:
+    for key in STATE_KEYS:
         slices["next", key] = torch.randn_like(slices["next", key])
-    value = recurrent.value_loss(loss, slices.clone())
+    value, _ = loss.value_loss(slices.clone())
     with torch.no_grad():
-        action = torch.stack(by_hand(actor, slices))
-
-        def values(params, at, action):
-            data = TensorDict(
-                {**{k: at[k] for k in ("observation", "heading_vector")}, "action": action}, [len(slices)]
-            )
-            with params.to_module(loss.qvalue_network):
-                return loss.qvalue_network(data)["state_action_value"]
-
+        action = torch.stack([step["action"] for step in states_at_next_observations(actor, slices)])
         targets = loss.target_qvalue_network_params
-        smaller = torch.minimum(*(values(targets[i], slices["next"], action) for i in range(2)))
+        smaller = torch.minimum(*(critic_values(loss, targets[i], slices["next"], action) for i in range(2)))
         target = slices["next", "reward"] + 0.9 * ~slices["next", "terminated"] * smaller
-        current = [values(loss.qvalue_network_params[i], slices, slices["action"]) for i in range(2)]
+        current = [critic_values(loss, loss.qvalue_network_params[i], slices, slices["action"]) for i in range(2)]
     expected = sum(((q - target) ** 2).mean() for q in current)
     torch.testing.assert_close(value, expected)
 
 
-def test_actor_losses_by_hand(view, collected) -> None:
+def test_actor_loss_by_hand(view, collected) -> None:
     actor, _, slices = collected
     loss = make_loss(view, actor)
-    losses = recurrent.actor_losses(loss, slices)
-    with loss.qvalue_network_params.data[0].to_module(loss.qvalue_network):
-        value = loss.qvalue_network(slices.select("observation", "heading_vector", "action"))["state_action_value"]
-    torch.testing.assert_close(losses["value"], -value.mean())
-    torch.testing.assert_close(losses["saturation"], slices["logits"].square().mean())
+    value, outputs = loss.actor_loss(slices)
+    with torch.no_grad():
+        expected = -critic_values(loss, loss.qvalue_network_params[0], slices, slices["action"]).mean()
+    torch.testing.assert_close(value, expected)
+    torch.testing.assert_close(saturation_penalty(outputs["logits"]), slices["logits"].square().mean())
+    torch.testing.assert_close(outputs["heading_estimate"], slices["heading_estimate"])
     angle = torch.stack((torch.cos(slices["heading"]), torch.sin(slices["heading"])), -1).squeeze(-2)
-    torch.testing.assert_close(losses["heading"], ((slices["heading_estimate"] - angle) ** 2).sum(-1).mean())
+    torch.testing.assert_close(slices["heading_vector"], angle)
 
 
-def test_gradients_go_where_they_should(view, collected) -> None:
+def stock_loss(view: ObservationView, actor) -> StockTD3Loss:
+    """Return TorchRL's loss on a recurrent actor; it gives critics what the actor writes, so the heading passes by."""
+    beside = TensorDictModule(torch.nn.Identity(), ["heading_vector"], ["heading_vector"])
+    spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 0.1, "noise_clip": 0.5}
+    stock = StockTD3Loss(TensorDictSequential(actor, beside), make_heading_critic(view), deactivate_vmap=True, **spec)
+    stock.make_value_estimator(gamma=0.9)
+    return stock
+
+
+def test_loss_is_that_of_torchrl(view, collected) -> None:
+    """Values and gradients, to rounding; the stock loss gets the recurrent state with which each slice continues."""
+    actor, _, slices = collected
+    ours = make_loss(view, actor, policy_noise=0.1)
+    stock = stock_loss(view, actor)
+    for name in ("qvalue_network_params", "target_qvalue_network_params"):
+        getattr(stock, name).data.update_(getattr(ours, name).data)
+    prepared = slices.clone()
+    with torch.no_grad():
+        unrolled = states_at_next_observations(actor, slices)
+    prepared["next", "is_init"] = prepared["is_init"]
+    begins = prepared["is_init"].squeeze(-1)
+    for key in STATE_KEYS:
+        states = torch.stack([step[key] for step in unrolled])
+        prepared["next", key] = torch.where(begins[:, None, None], states, prepared["next", key])
+
+    torch.manual_seed(1)
+    value, _ = ours.value_loss(slices.clone())
+    actor_value, _ = ours.actor_loss(slices.clone())
+    torch.manual_seed(1)
+    with set_recurrent_mode(True):
+        stock_value, _ = stock.value_loss(prepared.clone())
+        stock_actor_value, _ = stock.actor_loss(prepared.clone())
+    torch.testing.assert_close(value, stock_value)
+    torch.testing.assert_close(actor_value, stock_actor_value)
+
+    gradients = torch.autograd.grad(value, ours.critic_parameters())
+    half = len(gradients) // 2
+    critics = [torch.stack(pair) for pair in zip(gradients[:half], gradients[half:], strict=True)]
+    expected = torch.autograd.grad(stock_value, list(stock.qvalue_network_params.parameters()))
+    for one, other in zip(critics, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-7)
+    one, other = (
+        torch.autograd.grad(loss_value, [p for p in loss.actor_network_params.parameters() if p.requires_grad])
+        for loss_value, loss in ((actor_value, ours), (stock_actor_value, stock))
+    )
+    assert sum(gradient.abs().sum() > 0 for gradient in one) == len(one)
+    for mine, theirs in zip(one, other, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-7)
+
+
+def test_gradients_reach_their_parameters_only(view, collected) -> None:
     actor, _, slices = collected
     loss = make_loss(view, actor)
-    memory, others = recurrent.parameter_groups(loss)
+    memory, others = loss.memory_parameters(), loss.actor_parameters()
     assert len(memory) + len(others) == len(list(actor.parameters()))
     assert sum(p.numel() for p in memory) == 4 * 8 * (4 + 8 + 2)
-    recurrent.actor_losses(loss, slices)["heading"].backward()
+    _, outputs = loss.actor_loss(slices)
+    (outputs["heading_estimate"] - slices["heading_vector"]).square().mean().backward()
     assert all(p.grad.abs().sum() > 0 for p in memory)
-    recurrent.actor_losses(loss, slices)["value"].backward()
+    loss.actor_loss(slices)[0].backward()
     assert all(p.grad.abs().sum() > 0 for p in others)
-    assert all(p.grad is None for p in loss.qvalue_network_params.values(True, True))
-    recurrent.value_loss(loss, slices).backward()
-    assert all(p.grad is not None for p in loss.qvalue_network_params.values(True, True))
+    assert all(p.grad is None for p in loss.critic_parameters())
+    before = [p.grad.clone() for p in (*memory, *others)]
+    loss.value_loss(slices)[0].backward()
+    assert all(p.grad is not None for p in loss.critic_parameters())
+    assert all(torch.equal(p.grad, old) for p, old in zip((*memory, *others), before, strict=True))
 
 
-def test_critics_see_the_heading(view, collected) -> None:
+def test_critics_read_the_heading(view, collected) -> None:
     _, _, slices = collected
-    critic = recurrent.make_critic(view)
+    critic = make_heading_critic(view)
     turned = slices.clone().set("heading_vector", -slices["heading_vector"])
     assert (critic(slices.clone())["state_action_value"] != critic(turned)["state_action_value"]).all()
 
 
-def test_training_environment_is_sound(env, view) -> None:
-    check_env_specs(training_env(env, view, recurrent.make_actor(view, 8)))
+# Environment and policy
 
 
-def test_policy_acts_alike_in_the_plain_and_in_the_training_environment(env, view) -> None:
-    torch.manual_seed(0)
-    policy = recurrent.RecurrentPolicy(view, 8)
-    plain = GeomagneticNavEnv(num_envs=6, seed=3, max_steps=7, field=env.field)
-    one = plain.rollout(14, policy, break_when_any_done=False)
-    other = training_env(env, view, policy.actor).rollout(14, policy.actor, break_when_any_done=False)
+def test_training_environment_is_sound(env, view, actor) -> None:
+    check_env_specs(training_env(env, view, actor))
+
+
+def test_policy_acts_alike_in_the_plain_and_in_the_training_environment(env, view, actor) -> None:
+    plain = GeomagneticNavEnv(Scenario(field=env.field), num_envs=6, seed=3, max_steps=7)
+    one = plain.rollout(14, make_policy(view, actor), break_when_any_done=False)
+    other = training_env(env, view, actor).rollout(14, actor, break_when_any_done=False)
     assert one["next", "done"].any()
     torch.testing.assert_close(one["next", "position"], other["next", "position"], rtol=0, atol=1e-7)
 
 
-def test_save_and_load_give_the_same_journeys(env, view, tmp_path: Path) -> None:
-    policy = recurrent.RecurrentPolicy(view, 8)
-    recurrent.save_policy(tmp_path / "policy.pt", policy)
-    loaded = recurrent.load_policy(tmp_path / "policy.pt")
-    assert (loaded.config, loaded.memory_size) == (policy.config, 8)
+def test_save_and_load_give_the_same_episodes(env, view, tmp_path: Path) -> None:
+    policy = make_policy(view)
+    save_policy(tmp_path / "policy.pt", policy)
+    loaded = load_policy(tmp_path / "policy.pt")
+    assert loaded.config == policy.config
+    assert loaded.config.memory_size == 8
     states = env.rollout(3)
     for step in range(3):
         assert torch.equal(loaded(states[:, step].clone())["action"], policy(states[:, step].clone())["action"])
-
-
-def test_damaged_policy_is_refused(view, tmp_path: Path) -> None:
-    path = tmp_path / "policy.pt"
-    with pytest.raises(FileNotFoundError, match="no policy file"):
-        recurrent.load_policy(path)
-    td3.save_policy(path, td3.FieldPolicy(view))
-    with pytest.raises(ValueError, match="not the file of a recurrent policy"):
-        recurrent.load_policy(path)
-    recurrent.save_policy(path, recurrent.RecurrentPolicy(view, 8))
-    content = torch.load(path, weights_only=True)
-    for change in ({"recurrent_format": 99}, {"memory_size": 9}, {"memory_size": 0}):
-        save_tensors(content | change, path)
-        with pytest.raises(ValueError, match=r"99|size mismatch|memory_size"):
-            recurrent.load_policy(path)
 
 
 # The recipe
@@ -300,120 +390,115 @@ SMALL = {
 }
 
 
+def settings(out: Path, **options) -> recipe.Config:
+    return recipe.Config(out=out, **SMALL | options)
+
+
+def resume(folder: Path) -> recipe.Config:
+    return parse_config(recipe.Config, {"default": recipe.Config()}, recipe.RECIPE, "", ["--resume", str(folder)])
+
+
 @pytest.fixture(scope="module")
-def recipe():
-    sys.path.insert(0, str(RECIPE.parent))  # it reports as the other recipe does
-    spec = importlib.util.spec_from_file_location("td3_recurrent", RECIPE)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+def trained(tmp_path_factory) -> tuple[Path, dict[str, float]]:
+    """Return the folder and the result of a training that was left alone."""
+    out = tmp_path_factory.mktemp("recurrent") / "run"
+    return out, recipe.train(settings(out))
 
 
-def settings(recipe, out: Path, **options):
-    return dataclasses.replace(recipe.Config(), out=out, **SMALL | options)
-
-
-def test_run_folder(recipe, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    result = recipe.train(settings(recipe, out))
+def test_run_folder(trained) -> None:
+    out, result = trained
     names = {".lock", "config.json", "train.csv", "policy.pt", "eval.json", "training.png", "trajectories.png"}
     assert {path.name for path in out.iterdir()} == names
     written = json.loads((out / "eval.json").read_text())
     assert (written["num_tasks"], written["seed"], written["frames"], written["updates"]) == (6, 0, 640, 40)
     assert written["spl"] == result["spl"]
+    assert json.loads((out / "config.json").read_text())["recipe"] == "td3_recurrent.py"
     with (out / "train.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["frames"]) for row in rows] == [320, 640]
     assert all(math.isfinite(float(row[key])) for row in rows for key in ("loss_critic", "loss_actor", "loss_heading"))
     env = GeomagneticNavEnv(num_envs=3, seed=0)
-    assert env.rollout(2, recurrent.load_policy(out / "policy.pt"))["action"].isfinite().all()
+    assert env.rollout(2, load_policy(out / "policy.pt"))["action"].isfinite().all()
 
 
-def test_same_seed_same_weights(recipe, tmp_path: Path) -> None:
-    def trained(name: str, seed: int) -> dict:
-        recipe.train(settings(recipe, tmp_path / name, seed=seed))
-        return recurrent.load_policy(tmp_path / name / "policy.pt").state_dict()
-
-    one, again, other = trained("a", 1), trained("b", 1), trained("c", 2)
-    tensors = [key for key, value in one.items() if isinstance(value, torch.Tensor)]
-    assert all(torch.equal(one[key], again[key]) for key in tensors)
-    assert not all(torch.equal(one[key], other[key]) for key in tensors)
-
-
-def outcome(folder: Path) -> tuple[list[dict[str, str]], dict[str, torch.Tensor]]:
-    """The curves without their timing, and the weights."""
-    with (folder / "train.csv").open() as file:
-        rows = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
-    weights = recurrent.load_policy(folder / "policy.pt").state_dict()
-    return rows, {key: value for key, value in weights.items() if isinstance(value, torch.Tensor)}
-
-
-@pytest.mark.parametrize(
-    ("frames", "number"),
-    [(448, signal.SIGINT), (192, signal.SIGTERM)],
-    ids=["after an evaluation", "before any"],
-)
-def test_stopped_training_goes_on_as_if_it_had_not(recipe, tmp_path: Path, signalled, capsys, frames, number) -> None:
-    """Journeys of 24 moves, 4 a batch: the memory and the journeys under way are those that the checkpoint held."""
-    run, whole = tmp_path / "run", tmp_path / "whole"
-    with signalled(recipe, frames // 64, number), pytest.raises(SystemExit) as stop:
-        recipe.train(settings(recipe, run))
-    assert stop.value.code == 128 + number
-    assert f"Stopped after {frames} frames" in capsys.readouterr().err
-    assert recurrent.load_policy(run / "policy.pt").memory_size == 8
+@pytest.mark.usefixtures("without_figures")
+def test_interrupted_training_resumes_exactly(trained, tmp_path: Path, signalled, same_outcome, capsys) -> None:
+    """Episodes of 24 moves, 4 per batch: recurrent states and running episodes are those of the checkpoint."""
+    run = tmp_path / "run"
+    with signalled(7, signal.SIGINT), pytest.raises(SystemExit) as stop:
+        recipe.train(settings(run))
+    assert stop.value.code == 130
+    assert "Stopped after 448 frames" in capsys.readouterr().err
+    assert load_policy(run / "policy.pt").config.memory_size == 8
     assert not (run / "eval.json").exists()
-    recipe.train(recipe.parse(["--resume", str(run)]))
-    recipe.train(settings(recipe, whole))
-    (rows, weights), (expected, expected_weights) = outcome(run), outcome(whole)
-    assert rows == expected
-    assert all(torch.equal(weights[key], expected_weights[key]) for key in expected_weights)
+    recipe.train(resume(run))
+    assert same_outcome(run, trained[0])
     assert not (run / "checkpoints").exists()
 
 
-def test_weight_that_is_none_stops_the_training(recipe, tmp_path: Path, monkeypatch) -> None:
-    update = recipe.Learner.update
+def test_non_finite_weight_stops_the_training(tmp_path: Path, monkeypatch) -> None:
+    """After the last update of a batch, so that no loss is computed with it."""
 
-    def poisoned(self, *args):
-        update(self, *args)
-        if self.updates == 8:  # the last of a batch, so that no loss is computed with it
-            with torch.no_grad():
-                self.memory[0][0] = float("nan")
+    class Poisoned(recipe.SoftUpdate):
+        def __init__(self, loss: RecurrentTD3Loss, *, tau: float) -> None:
+            super().__init__(loss, tau=tau)
+            self.weight, self.steps = loss.memory_parameters()[0], 0
 
-    monkeypatch.setattr(recipe.Learner, "update", poisoned)
-    with pytest.raises(FloatingPointError, match=r"after update \d+: .*lstm.* is not finite in rows \[0"):
-        recipe.train(settings(recipe, tmp_path / "run"))
+        def step(self) -> None:
+            super().step()
+            self.steps += 1
+            if self.steps == 4:  # two updates of the targets a batch
+                with torch.no_grad():
+                    self.weight[0] = float("nan")
+
+    monkeypatch.setattr(recipe, "SoftUpdate", Poisoned)
+    with pytest.raises(FloatingPointError, match=r"after update 8: .*lstm.* is not finite in rows \[0"):
+        recipe.train(settings(tmp_path / "run"))
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
-def test_run_of_another_recipe_is_not_resumed(recipe, tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text('{"guided": true}')
-    with pytest.raises(ValueError, match=r"another recipe: it must have {'recurrent': True}"):
-        recipe.parse(["--resume", str(tmp_path)])
+def test_run_of_another_recipe_is_not_resumed(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"recipe": "td3_gradient_guided.py"}')
+    with pytest.raises(UsageError, match=r"the run was started by td3_gradient_guided\.py: resume it with that recipe"):
+        resume(tmp_path)
 
 
 @pytest.mark.parametrize(
     "bad",
     [
         {"num_envs": 0},
+        {"num_envs": 1},
         {"memory_size": "8"},
+        {"memory_size": 0},
         {"wandb_mode": "loud"},
         {"gamma": 1.0},
         {"steps_per_batch": 1},
         {"buffer_size": 63},
         {"shortest_task_km": 0.0},
+        {"shortest_task_km": 500.0},
+        {"num_cells": ()},
+        {"noise_share": 0.0},
+        {"random_share": 1.5},
         {"seed": -1},
     ],
     ids=str,
 )
-def test_bad_settings_are_refused_by_name(recipe, tmp_path: Path, bad: dict) -> None:
+def test_bad_settings_are_refused_by_name(tmp_path: Path, bad: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
-        settings(recipe, tmp_path / "run", **bad)
+        settings(tmp_path / "run", **bad)
+
+
+def test_shortest_task_is_below_the_longest_of_the_scenario(tmp_path: Path) -> None:
+    content = {"region": {"latitude": [40, 50], "longitude": [-30, -20]}, "date": "2026-07-01"}
+    path = tmp_path / "near.json"
+    path.write_text(json.dumps(content | {"distance_range_km": [50, 90]}))
+    with pytest.raises(ValueError, match="shortest_task_km must be below 90, got 100"):
+        settings(tmp_path / "run", scenario=path)
 
 
 @pytest.mark.slow
-def test_the_eight_numbers_suffice_with_a_memory(recipe, tmp_path: Path) -> None:
-    """On a seed that nothing was tuned on."""
-    result = recipe.train(dataclasses.replace(recipe.Config(), seed=5, out=tmp_path / "run", wandb_mode="disabled"))
+def test_the_eight_numbers_suffice_with_a_memory(tmp_path: Path) -> None:
+    """On a seed that was not used for tuning."""
+    result = recipe.train(recipe.Config(seed=5, out=tmp_path / "run", wandb_mode="disabled"))
     assert result["success_rate"] >= 90
     assert result["num_tasks"] == 1000

@@ -1,4 +1,4 @@
-"""The page on which journeys are replayed: its numbers, its safety, and what a real browser makes of it."""
+"""The page that replays episodes: its numbers, its safety, and its behavior in a real browser."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 from tensordict.nn import TensorDictModule
 
-from magrl import td3
-from magrl.elements import NAMES
-from magrl.env import GeomagneticNavEnv, paper_field
-from magrl.fields import elements_at
+from magrl.agents import FieldPolicy, save_policy
+from magrl.agents.policy import PolicyConfig
+from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks, named_tasks
+from magrl.evaluation import episode_measures, evaluation_rollout
+from magrl.evaluation.replay import PIECES, episode_tracks, replay_data, write_gif, write_replay
+from magrl.field import elements_at
+from magrl.field.elements import NAMES
 from magrl.geodesy import geodesic
-from magrl.metrics import episode_measures
 from magrl.navigators import NAVIGATORS
-from magrl.replay import PIECES, journey_tracks, replay_data, write_gif, write_replay
-from magrl.tasks import Region, Tasks, named_tasks
+from magrl.training import UsageError
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 expect.set_options(timeout=20_000)
@@ -40,12 +41,12 @@ HOSTILE = "</script><img src=x onerror=alert(1)><!-- ${1}"
 @pytest.fixture(scope="module")
 def env() -> GeomagneticNavEnv:
     tasks = Tasks(*(end[:3] for end in named_tasks("test-1000")))
-    return GeomagneticNavEnv(num_envs=3, tasks=tasks, seed=0)
+    return GeomagneticNavEnv(Scenario(tasks=tasks), num_envs=3, seed=0)
 
 
 @pytest.fixture(scope="module")
 def rollouts(env: GeomagneticNavEnv) -> dict[str, Any]:
-    return {name: td3.evaluation_rollout(env, NAVIGATORS[name](env, "", 0)) for name in ("secant", "parallel")}
+    return {name: evaluation_rollout(env, NAVIGATORS[name](env, "", 0)) for name in ("secant", "parallel")}
 
 
 @pytest.fixture(scope="module")
@@ -65,25 +66,25 @@ def path(data: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def written(path: Path) -> dict[str, Any]:
-    """What a browser would read out of the page."""
+    """Return the data that a browser reads from the page."""
     return json.loads(re.search(r'id="replay-data">(.*?)</script>', path.read_text(), re.DOTALL)[1])
 
 
-def test_the_page_holds_what_was_flown(path: Path, rollouts: dict[str, Any]) -> None:
+def test_the_page_holds_the_rollouts(path: Path, rollouts: dict[str, Any]) -> None:
     for navigator, rollout in zip(written(path)["navigators"], rollouts.values(), strict=True):
-        for row, journey in zip(rollout, navigator["journeys"], strict=True):
-            count = journey["steps"]
+        for row, episode in zip(rollout, navigator["episodes"], strict=True):
+            count = episode["steps"]
             states = {
                 key: torch.cat((row[key][:1], row["next", key][:count])).double().numpy()
                 for key in ("position", "field", "objective", "move", "heading")
             }
-            np.testing.assert_allclose(journey["track"][::PIECES], states["position"], atol=6e-6)
-            np.testing.assert_allclose(journey["field"], states["field"], atol=6e-5)
-            np.testing.assert_allclose(journey["objective"], states["objective"][:, 0], rtol=6e-4)
-            np.testing.assert_allclose(journey["move_km"], states["move"][:, 0], atol=6e-4)
-            np.testing.assert_allclose(np.radians(journey["turn_deg"]), states["move"][:, 1], atol=1e-4)
+            np.testing.assert_allclose(episode["track"][::PIECES], states["position"], atol=6e-6)
+            np.testing.assert_allclose(episode["field"], states["field"], atol=6e-5)
+            np.testing.assert_allclose(episode["objective"], states["objective"][:, 0], rtol=6e-4)
+            np.testing.assert_allclose(episode["move_km"], states["move"][:, 0], atol=6e-4)
+            np.testing.assert_allclose(np.radians(episode["turn_deg"]), states["move"][:, 1], atol=1e-4)
             np.testing.assert_allclose(
-                np.sin(np.radians(journey["heading_deg"])), np.sin(states["heading"])[:, 0], atol=2e-4
+                np.sin(np.radians(episode["heading_deg"])), np.sin(states["heading"])[:, 0], atol=2e-4
             )
             assert row["next", "done"][:count].flatten().tolist() == [False] * (count - 1) + [True]
 
@@ -92,16 +93,16 @@ def test_measures_are_those_of_the_metrics(data: dict[str, Any], rollouts: dict[
     for navigator, rollout in zip(data["navigators"], rollouts.values(), strict=True):
         measures = episode_measures(rollout)
         for key in ("steps", "shortest_km", "length_km", "navigation_error_km", "spl"):
-            got = [journey[key] for journey in navigator["journeys"]]
+            got = [episode[key] for episode in navigator["episodes"]]
             np.testing.assert_allclose(got, measures[key], atol=6e-5)
-        for journey in navigator["journeys"]:
-            assert journey["outcome"] == "arrived"
-            assert journey["path_km"][-1] == pytest.approx(journey["length_km"], abs=2e-3)
-            assert journey["distance_km"][-1] == pytest.approx(journey["navigation_error_km"], abs=2e-3)
-            assert journey["distance_km"][0] == pytest.approx(journey["shortest_km"], abs=2e-3)
+        for episode in navigator["episodes"]:
+            assert episode["outcome"] == "arrived"
+            assert episode["path_km"][-1] == pytest.approx(episode["length_km"], abs=2e-3)
+            assert episode["distance_km"][-1] == pytest.approx(episode["navigation_error_km"], abs=2e-3)
+            assert episode["distance_km"][0] == pytest.approx(episode["shortest_km"], abs=2e-3)
 
 
-def test_tasks_are_those_that_were_flown(data: dict[str, Any], env: GeomagneticNavEnv) -> None:
+def test_tasks_are_those_of_the_environment(data: dict[str, Any], env: GeomagneticNavEnv) -> None:
     np.testing.assert_allclose([task["start"] for task in data["tasks"]], env.tasks.start, atol=6e-6)
     np.testing.assert_allclose([task["target"] for task in data["tasks"]], env.tasks.target, atol=6e-6)
     np.testing.assert_allclose(
@@ -110,7 +111,7 @@ def test_tasks_are_those_that_were_flown(data: dict[str, Any], env: GeomagneticN
 
 
 def test_pieces_of_a_leg_are_equal_and_on_its_geodesic(env: GeomagneticNavEnv, rollouts: dict[str, Any]) -> None:
-    for track in journey_tracks(rollouts["secant"], env.region):
+    for track in episode_tracks(rollouts["secant"], env.region):
         pieces, _ = geodesic(*track[:-1].T, *track[1:].T)
         legs, _ = geodesic(*track[:-PIECES:PIECES].T, *track[PIECES::PIECES].T)
         np.testing.assert_allclose(
@@ -121,10 +122,10 @@ def test_pieces_of_a_leg_are_equal_and_on_its_geodesic(env: GeomagneticNavEnv, r
 def test_no_track_breaks_at_the_antimeridian() -> None:
     region = Region((-10, 0), (175, 185))
     tasks = Tasks(*(torch.tensor([end], dtype=torch.float64) for end in ((-5.0, 179.0), (-5.0, -178.0))))
-    env = GeomagneticNavEnv(num_envs=1, region=region, tasks=tasks, seed=0)
-    rollout = td3.evaluation_rollout(env, NAVIGATORS["parallel"](env, "", 0))
+    env = GeomagneticNavEnv(Scenario(region=region, tasks=tasks), num_envs=1, seed=0)
+    rollout = evaluation_rollout(env, NAVIGATORS["parallel"](env, "", 0))
     data = replay_data({"parallel": rollout}, env.field, region, zeta=env.zeta)
-    longitude = np.array(data["navigators"][0]["journeys"][0]["track"])[:, 1]
+    longitude = np.array(data["navigators"][0]["episodes"][0]["track"])[:, 1]
     assert longitude[0] == pytest.approx(179)
     assert longitude[-1] == pytest.approx(182, abs=0.2)
     assert np.abs(np.diff(longitude)).max() < 0.5
@@ -133,25 +134,26 @@ def test_no_track_breaks_at_the_antimeridian() -> None:
 
 
 def test_contours_are_where_the_field_has_their_level(data: dict[str, Any]) -> None:
+    field = Scenario().build_field()
     tolerance = {"D": 2e-3, "I": 2e-3, "B_H": 0.5}
     for index, name in enumerate(NAMES):
         assert len({line["level"] for line in data["contours"][name]}) > 4
         for line in data["contours"][name]:
             place = torch.tensor(line["line"], dtype=torch.float64).flip(-1)
-            values = elements_at(paper_field(), place)[:, index]
+            values = elements_at(field, place)[:, index]
             np.testing.assert_allclose(values, line["level"], atol=tolerance[name])
 
 
-def test_a_journey_that_fails_says_how(env: GeomagneticNavEnv) -> None:
-    flights = {}
+def test_a_failed_episode_says_how(env: GeomagneticNavEnv) -> None:
+    rollouts = {}
     for name, distance in (("north", 50.0), ("nowhere", 0.0)):
         action = torch.tensor([distance, 0.0]).expand(3, 2)
         policy = TensorDictModule(lambda _, action=action: action, ["heading"], ["action"])
-        flights[name] = td3.evaluation_rollout(env, policy)
-    north, nowhere = replay_data(flights, env.field, env.region, zeta=env.zeta)["navigators"]
-    assert {journey["outcome"] for journey in north["journeys"]} == {"lost"}
-    assert {journey["outcome"] for journey in nowhere["journeys"]} == {"out of steps"}
-    assert {journey["spl"] for journey in nowhere["journeys"]} == {0}
+        rollouts[name] = evaluation_rollout(env, policy)
+    north, nowhere = replay_data(rollouts, env.field, env.region, zeta=env.zeta)["navigators"]
+    assert {episode["outcome"] for episode in north["episodes"]} == {"lost"}
+    assert {episode["outcome"] for episode in nowhere["episodes"]} == {"out of steps"}
+    assert {episode["spl"] for episode in nowhere["episodes"]} == {0}
 
 
 def test_rollouts_of_different_tasks_are_refused(env: GeomagneticNavEnv, rollouts: dict[str, Any]) -> None:
@@ -183,7 +185,7 @@ def test_names_cannot_break_out_of_the_data(path: Path) -> None:
     assert written(path)["title"] == written(path)["navigators"][1]["label"] == HOSTILE
 
 
-def test_numbers_that_are_none_are_refused(data: dict[str, Any], tmp_path: Path) -> None:
+def test_non_finite_values_are_refused(data: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="JSON compliant"):
         write_replay(tmp_path / "a.html", data | {"zeta": float("nan")})
     assert not (tmp_path / "a.html").exists()
@@ -218,12 +220,12 @@ def recipe(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run whose agent has learned nothing."""
+    """Return the folder of a run whose agent has learned nothing."""
     folder = tmp_path_factory.mktemp("runs") / "agent"
     folder.mkdir()
     torch.manual_seed(0)
-    policy = td3.FieldPolicy(td3.policy_config(GeomagneticNavEnv(seed=0), (8,), layer_norm=False))
-    td3.save_policy(folder / "policy.pt", policy)
+    view = GeomagneticNavEnv(seed=0).observation_view()
+    save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(view, (8,), layer_norm=False)))
     (folder / "config.json").write_text(json.dumps({"guided": True, "zeta": 9.0}))
     return folder
 
@@ -234,7 +236,7 @@ def test_the_recipe_flies_the_run_first(recipe: Any, run: Path, tmp_path: Path) 
     data = written(out)
     labels = [navigator["label"] for navigator in data["navigators"]]
     assert labels == ["Gradient-Guided TD3", "secant (no training, fair)", "parallel (true gradient, an oracle)"]
-    assert {len(navigator["journeys"]) for navigator in data["navigators"]} == {2}
+    assert {len(navigator["episodes"]) for navigator in data["navigators"]} == {2}
     assert data["zeta"] == 9.0  # that of the run, under which any move arrives
     assert "agent" in data["title"]
     assert Image.open(tmp_path / "a.gif").n_frames > 1
@@ -248,32 +250,47 @@ def test_two_agents_of_a_kind_are_told_apart(recipe: Any, run: Path, tmp_path: P
     assert labels == ["Gradient-Guided TD3", "Gradient-Guided TD3 (agent)", "PSO, flown"]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_bad_usage_is_refused_before_anything_is_written(recipe: Any, run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page.html"
+    (tmp_path / "file").touch()
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"navigators": ("dowsing",)}, "unknown navigator 'dowsing'"),
-        ({"navigators": ("secant", "secant")}, "secant is named twice"),
+        ({"navigators": ("secant", "secant")}, "secant is given twice"),
         ({"num_tasks": 0}, "num_tasks must be a whole number from 1 up to 1000, got 0"),
         ({"num_tasks": 101, "tasks": "paper-100"}, "from 1 up to 100, got 101"),
         ({"num_tasks": 2, "tasks": "figure-4-1"}, "from 1 up to 1, got 2"),
         ({"run": Path("nowhere")}, "no run at nowhere"),
         ({"zeta": 0.0}, "zeta"),
-    ],
-)
-def test_bad_choices_are_refused_before_anything_is_written(
-    recipe: Any, run: Path, tmp_path: Path, options: dict[str, Any], message: str
-) -> None:
-    out = tmp_path / "page.html"
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
-        recipe.replay(recipe.Config(**({"run": run, "out": out} | options)))
-    assert not out.exists()
+        ({"gif": tmp_path / "file" / "a.gif"}, "cannot write .*a.gif"),
+        ({"out": tmp_path / "file" / "page.html"}, "cannot write .*page.html"),
+    ]
+    for options, message in cases:
+        with pytest.raises(UsageError, match=message):
+            recipe.replay(recipe.Config(**({"run": run, "out": out} | options)))
+        assert not out.exists()
 
 
-@pytest.mark.parametrize("content", ["[1]", "{", "5"])
-def test_a_configuration_that_is_none_is_refused(recipe: Any, tmp_path: Path, content: str) -> None:
-    (tmp_path / "config.json").write_text(content)
-    with pytest.raises(ValueError, match="not the configuration of a run"):
-        recipe.run_config(tmp_path)
+def test_the_scenario_and_kind_are_those_of_the_training(recipe: Any, run: Path, tmp_path: Path) -> None:
+    """The tasks of the file in the run folder, whatever the path in its settings; a run without guidance is TD3."""
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    settings = {"guided": False, "zeta": 0.5, "scenario": "elsewhere/scenario.json"}
+    (folder / "config.json").write_text(json.dumps(settings))
+    tasks = [{"start": [-2.0, 162.0], "target": [-8.0, 164.0]}, {"start": [-3.0, 163.0], "target": [-6.0, 165.0]}]
+    box = {"latitude": [-10.0, 0.0], "longitude": [160.0, 170.0]}
+    (folder / "scenario.json").write_text(json.dumps({"region": box, "date": "2022-01-01", "tasks": tasks}))
+    data = written(recipe.replay(recipe.Config(folder, navigators=())))
+    assert [task["start"] for task in data["tasks"]] == [task["start"] for task in tasks]
+    assert [navigator["label"] for navigator in data["navigators"]] == ["TD3"]
+    assert data["zeta"] == 0.5
+    assert data["title"] == "run, tasks of scenario.json"
+
+
+def test_a_damaged_configuration_is_refused(recipe: Any, tmp_path: Path) -> None:
+    for content in ("[1]", "{", "5"):
+        (tmp_path / "config.json").write_text(content)
+        with pytest.raises(ValueError, match="not the configuration of a run"):
+            recipe.run_config(tmp_path)
 
 
 # The page in a browser
@@ -314,41 +331,41 @@ def texts(page: Page) -> dict[str, str]:
     return {name: (text or "").replace("−", "-") for name, text in found.items()}
 
 
-def assert_shows(page: Page, journey: dict[str, Any], step: int) -> None:
-    """The read-outs are those of a journey at a step."""
+def assert_shows(page: Page, episode: dict[str, Any], step: int) -> None:
+    """The read-outs are those of an episode at a step."""
     shown, near = texts(page), partial(pytest.approx, abs=0.051)
-    assert shown["now-step"] == f"{step} of {journey['steps']}"
+    assert shown["now-step"] == f"{step} of {episode['steps']}"
     said = re.match(r"Step (\d+) of (\d+), ([\d.]+) km to the destination", shown["status"])
-    assert [float(number) for number in said.groups()] == near([step, journey["steps"], journey["distance_km"][step]])
+    assert [float(number) for number in said.groups()] == near([step, episode["steps"], episode["distance_km"][step]])
     for name in ("distance", "path", "move"):
-        assert float(shown[f"now-{name}"]) == near(journey[f"{name}_km"][step])
-    assert float(shown["now-heading"].strip("°")) == near(journey["heading_deg"][step])
-    assert float(shown["now-objective"]) == pytest.approx(journey["objective"][step], rel=0.06)
-    for name, value in zip(NAMES, journey["field"][step], strict=True):
+        assert float(shown[f"now-{name}"]) == near(episode[f"{name}_km"][step])
+    assert float(shown["now-heading"].strip("°")) == near(episode["heading_deg"][step])
+    assert float(shown["now-objective"]) == pytest.approx(episode["objective"][step], rel=0.06)
+    for name, value in zip(NAMES, episode["field"][step], strict=True):
         assert float(shown[f"here-{name}"].split()[0]) == pytest.approx(value, abs=0.51 if name == "B_H" else 6e-4)
-    assert shown["outcome"] == journey["outcome"]
-    assert shown["steps"] == str(journey["steps"])
-    assert float(shown["spl"]) == near(100 * journey["spl"])
+    assert shown["outcome"] == episode["outcome"]
+    assert shown["steps"] == str(episode["steps"])
+    assert float(shown["spl"]) == near(100 * episode["spl"])
     for name, key in (("length", "length_km"), ("shortest", "shortest_km"), ("error", "navigation_error_km")):
-        assert float(shown[name]) == near(journey[key])
+        assert float(shown[name]) == near(episode[key])
 
 
 def test_it_plays_to_the_end(page: Page, data: dict[str, Any]) -> None:
-    journey = data["navigators"][0]["journeys"][0]
-    assert_shows(page, journey, 0)
+    episode = data["navigators"][0]["episodes"][0]
+    assert_shows(page, episode, 0)
     vehicle = page.locator("#map .vehicle")
     start = vehicle.get_attribute("transform")
     page.get_by_label("Speed").last.select_option("5")
     page.get_by_role("button", name="Play").click()
     expect(page.locator("#play")).to_have_text("Pause")
-    expect(page.locator("#now-step")).to_have_text(f"{journey['steps']} of {journey['steps']}")
+    expect(page.locator("#now-step")).to_have_text(f"{episode['steps']} of {episode['steps']}")
     expect(page.locator("#play")).to_have_text("Play")  # it stops by itself
-    assert_shows(page, journey, journey["steps"])
-    assert page.get_by_label("Step", exact=True).input_value() == str(journey["steps"])
+    assert_shows(page, episode, episode["steps"])
+    assert page.get_by_label("Step", exact=True).input_value() == str(episode["steps"])
     assert vehicle.get_attribute("transform") != start
     assert "arrived" in vehicle.get_attribute("class")
     page.get_by_role("button", name="Play").click()  # and starts anew
-    expect(page.locator("#now-step")).not_to_have_text(f"{journey['steps']} of {journey['steps']}")
+    expect(page.locator("#now-step")).not_to_have_text(f"{episode['steps']} of {episode['steps']}")
 
 
 def test_another_navigator_and_task(page: Page, data: dict[str, Any]) -> None:
@@ -359,20 +376,20 @@ def test_another_navigator_and_task(page: Page, data: dict[str, Any]) -> None:
         page.locator("#navigator").select_option(index=navigator)
         page.locator("#task").select_option(index=task)
         page.locator("#forward").click()
-        assert_shows(page, data["navigators"][navigator]["journeys"][task], 1)
+        assert_shows(page, data["navigators"][navigator]["episodes"][task], 1)
         seen.add((texts(page)["length"], texts(page)["here-D"], page.locator("#map .trail").get_attribute("d")))
     assert len(seen) == 4
 
 
 def test_slider_keys_and_buttons_step(page: Page, data: dict[str, Any]) -> None:
-    journey = data["navigators"][0]["journeys"][0]
-    for key, step in (("ArrowRight", 1), ("ArrowRight", 2), ("ArrowLeft", 1), ("End", journey["steps"]), ("Home", 0)):
+    episode = data["navigators"][0]["episodes"][0]
+    for key, step in (("ArrowRight", 1), ("ArrowRight", 2), ("ArrowLeft", 1), ("End", episode["steps"]), ("Home", 0)):
         page.keyboard.press(key)
-        assert_shows(page, journey, step)
+        assert_shows(page, episode, step)
     page.get_by_label("Step", exact=True).fill("3")
-    assert_shows(page, journey, 3)
+    assert_shows(page, episode, 3)
     page.get_by_role("button", name="One step back").click()
-    assert_shows(page, journey, 2)
+    assert_shows(page, episode, 2)
     page.locator("body").click(position={"x": 5, "y": 5})
     page.keyboard.press("Space")
     expect(page.locator("#play")).to_have_text("Pause")
@@ -383,10 +400,10 @@ def test_slider_keys_and_buttons_step(page: Page, data: dict[str, Any]) -> None:
 def test_a_link_leads_to_a_moment(page: Page, data: dict[str, Any]) -> None:
     page.evaluate("location.hash = 'navigator=2&task=3&step=4'")
     expect(page.locator("#now-step")).to_have_text(re.compile("^4 "))
-    assert_shows(page, data["navigators"][1]["journeys"][2], 4)
+    assert_shows(page, data["navigators"][1]["episodes"][2], 4)
     page.evaluate("location.hash = 'navigator=99&task=x&step=-5'")
     expect(page.locator("#now-step")).to_have_text(re.compile("^0 "))
-    assert_shows(page, data["navigators"][1]["journeys"][0], 0)
+    assert_shows(page, data["navigators"][1]["episodes"][0], 0)
 
 
 def test_names_are_shown_as_text(page: Page) -> None:
@@ -412,8 +429,8 @@ def test_contours_and_vehicles_can_be_chosen(page: Page, data: dict[str, Any]) -
     assert "3 of 3 have arrived" in texts(page)["status"]
 
 
-def colours(page: Page) -> np.ndarray:
-    """The colours of a screenshot, the most frequent one first."""
+def colors(page: Page) -> np.ndarray:
+    """The colors of a screenshot, the most frequent one first."""
     pixels = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).reshape(-1, 3)
     packed, counts = np.unique(pixels @ np.array([65536, 256, 1]), return_counts=True)
     packed = packed[np.argsort(-counts)]
@@ -421,7 +438,7 @@ def colours(page: Page) -> np.ndarray:
 
 
 def palette(page: Page) -> dict[str, np.ndarray]:
-    """The page's named colours in the scheme that it is shown in."""
+    """The page's named colors in the scheme that it is shown in."""
     read = "getComputedStyle(document.documentElement).getPropertyValue('--' + name)"
     names = ("page", "card", "ink", "muted", "accent", *NAMES)
     found = page.evaluate(f"Object.fromEntries({json.dumps(names)}.map((name) => [name, {read}]))")
@@ -438,13 +455,13 @@ def contrast(one: np.ndarray, other: np.ndarray) -> float:
 @pytest.mark.parametrize(("scheme", "low", "high"), [("light", 230, 255), ("dark", 0, 40)])
 def test_it_is_drawn_and_can_be_read(page: Page, scheme: str, low: int, high: int) -> None:
     page.emulate_media(color_scheme=scheme)
-    shown, named = colours(page), palette(page)
+    shown, named = colors(page), palette(page)
     assert len(shown) > 500
     assert low <= shown[0].mean() <= high
-    for name, colour in named.items():
-        assert (np.abs(shown - colour).max(1) < 8).any(), f"nothing is in the colour of {name}"
+    for name, color in named.items():
+        assert (np.abs(shown - color).max(1) < 8).any(), f"nothing is in the color of {name}"
         if name not in ("page", "card"):
-            assert contrast(colour, named["card"]) > 4.5, name
+            assert contrast(color, named["card"]) > 4.5, name
     assert contrast(named["muted"], named["page"]) > 4.5
     assert contrast(named["ink"], named["page"]) > 4.5
 

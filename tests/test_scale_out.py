@@ -4,20 +4,19 @@ import importlib.util
 import json
 import signal
 import sys
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
+import td3_gradient_guided as recipe
 import torch
 
-from magrl import td3
-from magrl.env import GeomagneticNavEnv
+from magrl.agents import make_actor
+from magrl.envs import GeomagneticNavEnv
+from magrl.training import parse_config
+from magrl.training.collectors import make_collector, worker_seed
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
-import td3_gradient_guided as recipe
-
-SMALL = replace(
-    recipe.Config(),
+SMALL = recipe.Config(
     num_envs=8,
     num_cells=(8,),
     batch_size=16,
@@ -36,6 +35,8 @@ BACKENDS = [
     pytest.param("ray", marks=pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is an extra")),
 ]
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 @pytest.fixture(autouse=True, scope="module")
 def _ray_ends_with_the_module():
@@ -45,18 +46,19 @@ def _ray_ends_with_the_module():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_training_in_two_processes(backend: str, tmp_path: Path) -> None:
-    """Weights that change here act there, every vehicle is collected once, and the run is whole."""
-    recipe.train(replace(SMALL, out=tmp_path / "run", collector_backend=backend))
-    result = json.loads((tmp_path / "run" / "eval.json").read_text())
-    assert (result["frames"], result["updates"]) == (80, 9)
-
+def test_weights_reach_the_workers(backend: str) -> None:
+    """Weights that change here act there, and every vehicle is collected once."""
     base = GeomagneticNavEnv(num_envs=8, seed=0)
-    view = td3.policy_config(base, SMALL.num_cells, layer_norm=True)
-    config = replace(SMALL, collector_backend=backend, init_random_frames=0, total_frames=800)
-    actor = td3.make_actor(view)
-    env = recipe.make_env(base, config, view, guided=True)
-    collector = recipe.make_collector(config, env, view, actor, guided=True)
+    view = base.observation_view()
+    actor = make_actor(view.size, SMALL.num_cells)
+    collector = make_collector(
+        recipe.make_env(base, view, SMALL),
+        actor,
+        workers=[partial(recipe.worker_env, SMALL, view, index) for index in range(2)],
+        backend=backend,
+        frames_per_batch=8,
+        total_frames=800,
+    )
     try:
         batches = iter(collector)
         first = next(batches).reshape(-1)
@@ -72,17 +74,26 @@ def test_training_in_two_processes(backend: str, tmp_path: Path) -> None:
         collector.shutdown()
 
 
-def test_stopped_training_of_several_processes_resumes(tmp_path: Path, signalled) -> None:
-    """Other processes start new episodes; everything else goes on, and the frames add up."""
-    with signalled(recipe, 4, signal.SIGTERM), pytest.raises(SystemExit):
-        recipe.train(replace(SMALL, out=tmp_path / "run"))
-    recipe.train(recipe.parse("td3_gradient_guided.py", ["--resume", str(tmp_path / "run")]))
-    result = json.loads((tmp_path / "run" / "eval.json").read_text())
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_interrupted_training_of_several_processes_resumes(backend: str, tmp_path: Path, signalled) -> None:
+    """Other processes start new episodes; everything else continues, and frames and updates add up."""
+    run = tmp_path / "run"
+    with signalled(4, signal.SIGTERM), pytest.raises(SystemExit):
+        recipe.train(SMALL.replace(out=run, collector_backend=backend))
+    recipe.train(parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, "", ["--resume", str(run)]))
+    result = json.loads((run / "eval.json").read_text())
     assert (result["frames"], result["updates"]) == (80, 9)
 
 
-def test_vehicles_that_cannot_be_shared_out_are_refused() -> None:
-    with pytest.raises(ValueError, match="8 vehicles cannot be shared out evenly to 3 collectors"):
-        replace(SMALL, collectors=3)
-    with pytest.raises(ValueError, match="collector_backend must be one of"):
-        replace(SMALL, collector_backend="pigeon")
+def test_vehicles_that_cannot_be_divided_are_refused() -> None:
+    with pytest.raises(ValueError, match="num_envs 8 cannot be divided evenly among 3 collectors"):
+        SMALL.replace(collectors=3)
+    with pytest.raises(ValueError, match="collector_backend must be 'process' or 'ray', got 'pigeon'"):
+        SMALL.replace(collector_backend="pigeon")
+
+
+def test_workers_fly_tasks_of_their_own() -> None:
+    """And none of the tasks of the validation or the test."""
+    seeds = [worker_seed(seed, index) for seed in (0, 1, 1_999_999_999) for index in range(3)]
+    assert len(set(seeds)) == len(seeds)
+    assert all(0 <= seed < 2_000_000_000 for seed in seeds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 import multiprocessing
 import pickle
@@ -33,19 +34,13 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 from magrl import guidance
-from magrl.env import GeomagneticNavEnv, paper_field
-from magrl.fields import elements_at
+from magrl.envs.geomagnetic import GeomagneticNavEnv
+from magrl.envs.region import Region
+from magrl.envs.scenario import Scenario
+from magrl.field.model import elements_at
+from magrl.field.regional import RegionalField
 from magrl.geodesy import move, wrap_angle
-from magrl.regional import RegionalField
-from magrl.tasks import Region
-from magrl.transforms import (
-    AlignmentReward,
-    AngleVector,
-    FieldGradient,
-    GradientHeading,
-    MinMaxNorm,
-    TargetDifference,
-)
+from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
 
@@ -162,11 +157,11 @@ class PlaneEnv(EnvBase):
 
 @cache
 def field() -> RegionalField:
-    return paper_field()
+    return Scenario().build_field()
 
 
-def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(num_envs=num_envs, **({"seed": 0, "field": field()} | options))
+def nav(num_envs: int = 2, scenario: Scenario | None = None, **options: object) -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(scenario or Scenario(field=field()), num_envs=num_envs, **({"seed": 0} | options))
 
 
 def guided(num_envs: int = 2, **options: object) -> TransformedEnv:
@@ -243,6 +238,10 @@ def alignment_apart() -> Transform:
     return AlignmentReward(out_keys=["alignment"])
 
 
+def alignment_twice() -> Transform:
+    return AlignmentReward(out_keys=["reward", "reward_alignment"])
+
+
 double_plane = partial(PlaneEnv, (3,), torch.float64)
 ENV_CASES = {
     "MinMaxNorm-nav": EnvCase(nav, minmax_nav),
@@ -262,6 +261,7 @@ ENV_CASES = {
     "GradientHeading-plane": EnvCase(double_plane, heading_plane),
     "AlignmentReward-nav": EnvCase(guided, AlignmentReward),
     "AlignmentReward-apart": EnvCase(guided, alignment_apart),
+    "AlignmentReward-twice": EnvCase(guided, alignment_twice),
     "AlignmentReward-plane": EnvCase(double_plane, alignment_plane),
 }
 env_cases = pytest.mark.parametrize("case", ENV_CASES.values(), ids=ENV_CASES.keys())
@@ -492,6 +492,14 @@ DATA_CASES = {
             "next r": td["next r"] + td["ok"] * 2.0 * (0.5 - deviation(td["next angle"], td["reference"])),
         },
     ),
+    "AlignmentReward-twice": DataCase(
+        lambda key: AlignmentReward([key("angle"), key("reference")], [key("r"), key("r_alignment")]),
+        lambda rand: {"angle": rand(1), "reference": 3 * rand(1) - 3, "next angle": 3 * rand(1), "next r": rand(1)},
+        lambda td: {
+            "next r": td["next r"] + 3 * (math.pi / 4 - deviation(td["next angle"], td["reference"])),
+            "next r_alignment": 3 * (math.pi / 4 - deviation(td["next angle"], td["reference"])),
+        },
+    ),
 }
 data_cases = pytest.mark.parametrize("case", DATA_CASES.values(), ids=DATA_CASES.keys())
 key_namers = pytest.mark.parametrize("key", [flat, nested])
@@ -523,11 +531,12 @@ def check_outputs(td: TensorDictBase, expected: dict[NestedKey, Tensor]) -> None
 
 
 class TestConformanceOnData:
-    @key_namers
-    @pytest.mark.parametrize("dtype", DTYPES)
-    @pytest.mark.parametrize("batch", BATCHES)
     @data_cases
-    def test_transform_no_env(self, case: DataCase, batch: tuple[int, ...], dtype: torch.dtype, key: KeyNamer) -> None:
+    def test_transform_no_env(self, case: DataCase) -> None:
+        for batch, dtype, key in itertools.product(BATCHES, DTYPES, (flat, nested)):
+            self.check_no_env(case, batch, dtype, key)
+
+    def check_no_env(self, case: DataCase, batch: tuple[int, ...], dtype: torch.dtype, key: KeyNamer) -> None:
         td, expected = data_of(case, key, batch, dtype)
         given, tensors = td.clone(), dict(td.items(True, True))
         transform = case.transform(key)
@@ -541,11 +550,11 @@ class TestConformanceOnData:
             assert name in expected or torch.equal(out[name], given[name]), name
             assert torch.equal(tensors[name], given[name]), f"{name} was written in place"
 
-    @key_namers
     @data_cases
-    def test_transform_compose(self, case: DataCase, key: KeyNamer) -> None:
-        td, expected = data_of(case, key)
-        check_outputs(Compose(case.transform(key))(td), expected)
+    def test_transform_compose(self, case: DataCase) -> None:
+        for key in (flat, nested):
+            td, expected = data_of(case, key)
+            check_outputs(Compose(case.transform(key))(td), expected)
 
     @key_namers
     @data_cases
@@ -558,56 +567,53 @@ class TestConformanceOnData:
         torch.testing.assert_close(out["after"], torch.nn.functional.softplus(out[name]))
         check_outputs(out, expected)
 
-    @pytest.mark.parametrize("buffer", [ReplayBuffer, TensorDictReplayBuffer])
-    @pytest.mark.parametrize("storage", [LazyTensorStorage, ListStorage])
     @data_cases
-    def test_transform_rb(self, case: DataCase, storage: type, buffer: type) -> None:
-        td, expected = data_of(case, nested, (10,))
-        td["row"] = torch.arange(10)
-        rb = buffer(storage=storage(10), batch_size=7)
-        rb.append_transform(case.transform(nested))
-        rb.extend(td)
-        for _ in range(2):  # the second sample shows that the first was not written back into the storage
-            sample = rb.sample()
-            check_outputs(sample, {name: value[sample["row"]] for name, value in expected.items()})
+    def test_transform_rb(self, case: DataCase) -> None:
+        for buffer, storage in itertools.product(
+            (ReplayBuffer, TensorDictReplayBuffer), (LazyTensorStorage, ListStorage)
+        ):
+            td, expected = data_of(case, nested, (10,))
+            td["row"] = torch.arange(10)
+            rb = buffer(storage=storage(10), batch_size=7)
+            rb.append_transform(case.transform(nested))
+            rb.extend(td)
+            for _ in range(2):  # the second sample shows that the first was not written back into the storage
+                sample = rb.sample()
+                check_outputs(sample, {name: value[sample["row"]] for name, value in expected.items()})
+
+    @data_cases
+    def test_transform_inverse(self, case: DataCase) -> None:
+        """Entries that a transform has written stay as they are on the way in. MinMaxNorm has a test of its own."""
+        for key in (flat, nested):
+            transform = case.transform(key)
+            td = transform(data_of(case, key)[0])
+            assert (transform.inv(td.clone()) == td).all()
 
     @key_namers
     @data_cases
-    def test_transform_inverse(self, case: DataCase, key: KeyNamer) -> None:
-        """Nothing comes in for an env here: what a transform has written stays as it is. MinMaxNorm has its own."""
-        transform = case.transform(key)
-        td = transform(data_of(case, key)[0])
-        assert (transform.inv(td.clone()) == td).all()
-
-    @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
-    @key_namers
-    @data_cases
-    def test_transform_compiled(self, case: DataCase, key: KeyNamer, backend: str) -> None:
-        """As one graph: ``fullgraph`` refuses to break it."""
+    def test_transform_compiled(self, case: DataCase, key: KeyNamer) -> None:
+        """As one graph, without breaks. ``aot_eager`` traces as ``eager`` does, and checks the graph further."""
         td, expected = data_of(case, key)
         torch.compiler.reset()
-        check_outputs(torch.compile(case.transform(key), fullgraph=True, backend=backend)(td), expected)
+        check_outputs(torch.compile(case.transform(key), fullgraph=True, backend="aot_eager")(td), expected)
 
-    @pytest.mark.parametrize(
-        "copied", [Transform.clone, copy.deepcopy, copy.copy, lambda t: pickle.loads(pickle.dumps(t))]
-    )
     @data_cases
-    def test_copies_do_the_same(self, case: DataCase, copied: Callable[[Transform], Transform]) -> None:
-        td, expected = data_of(case, flat)
-        check_outputs(copied(case.transform(flat))(td), expected)
+    def test_copies_do_the_same(self, case: DataCase) -> None:
+        for copied in (Transform.clone, copy.deepcopy, copy.copy, lambda t: pickle.loads(pickle.dumps(t))):
+            td, expected = data_of(case, flat)
+            check_outputs(copied(case.transform(flat))(td), expected)
 
-    @key_namers
     @data_cases
-    def test_a_missing_key_is_named(self, case: DataCase, key: KeyNamer, request: pytest.FixtureRequest) -> None:
-        transform = case.transform(key)
-        name = request.node.callspec.id.split("-")[0]
-        td, _ = data_of(case, key)
-        missing = transform.in_keys[-1]
-        del td[missing]
-        with pytest.raises(KeyError) as raised:
-            transform(td)
-        assert name in raised.value.args[0]
-        assert repr(missing) in raised.value.args[0]
+    def test_a_missing_key_is_named(self, case: DataCase) -> None:
+        for key in (flat, nested):
+            transform = case.transform(key)
+            td, _ = data_of(case, key)
+            missing = transform.in_keys[-1]
+            del td[missing]
+            with pytest.raises(KeyError) as raised:
+                transform(td)
+            assert type(transform).__name__ in raised.value.args[0]
+            assert repr(missing) in raised.value.args[0]
 
     @data_cases
     def test_a_missing_key_can_be_tolerated(self, case: DataCase) -> None:
@@ -672,17 +678,16 @@ BAD_OPTIONS = {
     "two inputs of a heading": (lambda: GradientHeading(["x", "y"]), r"GradientHeading.*\['x', 'y'\]"),
     "heading without a mask": (lambda: GradientHeading(out_keys=["x"]), r"GradientHeading.*\['x'\]"),
     "angle without a reference": (lambda: AlignmentReward(["x"]), r"AlignmentReward.*\['x'\]"),
-    "two rewards": (lambda: AlignmentReward(out_keys=["x", "y"]), r"AlignmentReward.*\['x', 'y'\]"),
+    "three rewards": (lambda: AlignmentReward(out_keys=["x", "y", "z"]), r"AlignmentReward.*\['x', 'y', 'z'\]"),
     "weight is NaN": (lambda: AlignmentReward(weight=float("nan")), "weight.*nan"),
     "offset is infinite": (lambda: AlignmentReward(offset=float("inf")), "offset.*inf"),
 }
 
 
-@pytest.mark.parametrize("row", BAD_OPTIONS.values(), ids=BAD_OPTIONS.keys())
-def test_bad_options_are_refused_with_their_value(row: tuple[Callable[[], Transform], str]) -> None:
-    make, message = row
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_bad_options_are_refused_with_their_value() -> None:
+    for make, message in BAD_OPTIONS.values():
+        with pytest.raises(ValueError, match=message):
+            make()
 
 
 WRONG_SHAPES = {
@@ -924,7 +929,7 @@ class TestMinMaxNorm:
         env.rollout(1)
         norm = minmax_nav()
         norm.load_state_dict(env.transform.state_dict())
-        elsewhere = TransformedEnv(nav(3, region=Region((30, 40), (0, 10)), field=None), norm)
+        elsewhere = TransformedEnv(nav(3, Scenario(region=Region((30, 40), (0, 10)))), norm)
         elsewhere.rollout(1)
         assert torch.equal(elsewhere.transform.low_0, env.transform.low_0)
 
@@ -938,7 +943,7 @@ class TestMinMaxNorm:
         norm = MinMaxNorm(["field"], ["f"])
         other = norm.clone()
         first = TransformedEnv(nav(2), norm)
-        second = TransformedEnv(nav(2, region=Region((30, 40), (0, 10)), field=None), other)
+        second = TransformedEnv(nav(2, Scenario(region=Region((30, 40), (0, 10)))), other)
         for env in (first, second):
             space = env.base_env.observation_spec["field"].space
             assert env.reset()["f"].abs().max() <= 1
@@ -965,13 +970,11 @@ class TestMinMaxNorm:
 # AngleVector
 
 
-@pytest.mark.parametrize(
-    ("degrees", "vector"),
-    [(0, (1, 0)), (90, (0, 1)), (180, (-1, 0)), (-90, (0, -1)), (-180, (-1, 0)), (30, (math.sqrt(3) / 2, 0.5))],
-)
-def test_angle_vector_is_cosine_then_sine(degrees: float, vector: tuple[float, float]) -> None:
-    td = TensorDict(heading=torch.tensor([math.radians(degrees)], dtype=torch.float64))
-    assert AngleVector("heading", "course")(td)["course"].tolist() == pytest.approx(vector, abs=1e-15)
+def test_angle_vector_is_cosine_then_sine() -> None:
+    degrees = torch.tensor([[0], [90], [180], [-90], [-180], [30]], dtype=torch.float64)
+    vectors = [[1, 0], [0, 1], [-1, 0], [0, -1], [-1, 0], [math.sqrt(3) / 2, 0.5]]
+    found = AngleVector("heading", "course")(TensorDict(heading=torch.deg2rad(degrees)))["course"]
+    torch.testing.assert_close(found, torch.tensor(vectors, dtype=torch.float64), rtol=0, atol=1e-15)
 
 
 def test_angle_vector_reads_several_angles() -> None:
@@ -985,7 +988,7 @@ def test_angle_vector_reads_several_angles() -> None:
 # FieldGradient
 
 
-def test_field_gradient_is_the_slope_between_neighbours() -> None:
+def test_field_gradient_is_the_slope_between_neighbors() -> None:
     """Central differences over 2 km northward and eastward, on the ellipsoid."""
     env = TransformedEnv(nav(6), FieldGradient(field()))
     td = env.rollout(3)["next"]
@@ -1145,8 +1148,25 @@ class TestAlignmentReward:
         assert float(out["next", "alignment"]) == pytest.approx(3 * (math.pi / 4 - 0.3), abs=1e-5)
         assert "alignment" not in out
 
+    @pytest.mark.parametrize("trusted", [True, False])
+    def test_a_second_out_key_gets_the_term_alone(self, trusted: bool) -> None:
+        td = self.transition(trusted=torch.tensor([trusted]))
+        out = AlignmentReward(["angle", "reference", "trusted"], ["reward", "reward_alignment"])(td)
+        term = 3 * (math.pi / 4 - 0.3) if trusted else 0.0
+        assert float(out["next", "reward"]) == pytest.approx(7 + term, abs=1e-5)
+        assert float(out["next", "reward_alignment"]) == pytest.approx(term, abs=1e-5)
+
+    def test_in_the_env_the_second_out_key_is_what_the_first_one_gained(self) -> None:
+        env = TransformedEnv(guided(4), alignment_twice())
+        td = env.rollout(5)["next"]
+        base = td["reward_destination"] + td["reward_proximity"]
+        assert td["reward_alignment"].std() > 0.5
+        torch.testing.assert_close(td["reward"] - base, td["reward_alignment"], rtol=0, atol=1e-4)
+        assert set(env.reward_keys) >= {"reward", "reward_alignment"}
+        assert isinstance(env.full_reward_spec["reward_alignment"], Unbounded)
+
     def test_without_next_the_error_says_what_is_needed(self) -> None:
-        with pytest.raises(KeyError, match=r"AlignmentReward needs whole transitions.*'next'.*angle"):
+        with pytest.raises(KeyError, match=r"AlignmentReward needs transitions.*'next'.*angle"):
             AlignmentReward(["angle", "reference"])(self.transition().exclude("next"))
 
     @pytest.mark.parametrize(("missing", "named"), [(("next", "angle"), "angle"), ("reference", "reference")])

@@ -1,9 +1,10 @@
-"""MinMaxNorm on Gymnasium's classic control, where some observations have no bounds.
+"""MinMaxNorm on Gymnasium's classic control environments, where some observations have no bounds.
 
     python docs/examples/classic_control.py
 
-MinMaxNorm refuses an open side: there is no line from infinity to 1. Bounds that are given take its place. Prints, in
-seconds, for each number that is observed its bounds in the spec, those that are used, and how far random actions go.
+MinMaxNorm rejects an infinite bound, since it cannot be scaled to 1; `bounds` gives a finite one in its place. Prints
+for each entry of the observation the bounds of the spec, the bounds used, and the scaled range under random actions.
+Takes seconds.
 """
 
 from __future__ import annotations
@@ -24,25 +25,25 @@ class Config:
     """Settings of the rollouts."""
 
     envs: tuple[str, ...] = ("MountainCarContinuous-v0", "Acrobot-v1", "CartPole-v1")
-    """Names in Gymnasium."""
+    """Gymnasium ids."""
     steps: int = 200
-    """Of each rollout."""
+    """Number of steps of each rollout."""
     open_bound: float = 3.0
-    """What is scaled to 1 where the spec has no bound: larger values go on beyond 1."""
+    """Value scaled to 1 where the spec has no bound; larger values are scaled beyond 1."""
     seed: int = 0
-    """Of the starts and the actions."""
+    """Random seed of initial states and actions."""
 
 
 def closed_bounds(spec: Bounded, open_bound: float) -> tuple[Tensor, Tensor]:
-    """The bounds of a spec, with a number on its open sides."""
+    """Return the bounds of a spec, with `open_bound` in place of infinity."""
     return spec.space.low.nan_to_num(neginf=-open_bound), spec.space.high.nan_to_num(posinf=open_bound)
 
 
 def make_env(name: str, open_bound: float | None = None) -> TransformedEnv:
-    """Observations scaled, and actions where they are continuous.
+    """Return an environment with scaled observations, and scaled actions if they are continuous.
 
     Raises:
-        ValueError: by MinMaxNorm, for a spec with an open side and no ``open_bound``.
+        ValueError: from MinMaxNorm, for a spec with an infinite bound and no ``open_bound``.
     """
     base, bounds = GymEnv(name), {}
     if open_bound is not None:
@@ -52,7 +53,7 @@ def make_env(name: str, open_bound: float | None = None) -> TransformedEnv:
 
 
 def refusal(name: str) -> str:
-    """What MinMaxNorm says to an environment with open sides; empty for one without."""
+    """Return the error of MinMaxNorm for an environment with infinite bounds, or an empty string."""
     try:
         make_env(name)
     except ValueError as error:
@@ -61,7 +62,7 @@ def refusal(name: str) -> str:
 
 
 def rows(name: str, config: Config) -> list[str]:
-    """One row of the table for each number that is observed."""
+    """Return one row of the table for each entry of the observation."""
     env = make_env(name, config.open_bound)
     env.set_seed(config.seed)
     spec = env.base_env.observation_spec["observation"]
@@ -74,7 +75,7 @@ def rows(name: str, config: Config) -> list[str]:
 
 
 def main(config: Config) -> list[str]:
-    """Prints the table, then what was refused without bounds; returns the rows."""
+    """Print the table and the errors without `bounds`; return the rows."""
     torch.manual_seed(config.seed)
     table = [row for name in config.envs for row in rows(name, config)]
     print("| environment | number | bounds of its spec | bounds used | scaled, random actions |\n|---|---|---|---|---|")

@@ -1,8 +1,9 @@
-"""MinMaxNorm on TorchRL's pendulum: observations and torque in [-1, 1], and the same physics underneath.
+"""MinMaxNorm on TorchRL's pendulum: observations and torque in [-1, 1], with unchanged dynamics.
 
     python docs/examples/pendulum.py
 
-Prints, in a second, what each entry spans before and after, and how far two flights are apart of which one is scaled.
+Prints the range of each entry before and after scaling, and the largest difference between the rewards of a scaled and
+an unscaled rollout with the same torques. Takes a second.
 """
 
 from __future__ import annotations
@@ -19,29 +20,29 @@ from magrl.transforms import MinMaxNorm
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of the flights."""
+    """Settings of the rollouts."""
 
     steps: int = 200
-    """Of each flight."""
+    """Number of steps of each rollout."""
     seed: int = 0
-    """Of the start and the torques."""
+    """Random seed of the initial state and the torques."""
 
 
 def make_env(seed: int) -> TransformedEnv:
-    """The bounds of the angle, the speed and the torque come from the specs; the env's own keys stay as they are."""
+    """Return a scaled pendulum; the bounds come from its specs, and its own keys are unchanged."""
     norm = MinMaxNorm(in_keys=["th", "thdot"], out_keys=["th_scaled", "thdot_scaled"], in_keys_inv=["action"])
     return TransformedEnv(PendulumEnv(seed=seed), norm)
 
 
 def fly(env: EnvBase, actions: torch.Tensor, seed: int) -> TensorDictBase:
-    """One flight with given actions ``(T, 1)``."""
+    """Return one rollout with given actions ``(T, 1)``."""
     env.set_seed(seed)
     action = iter(actions)
     return env.rollout(len(actions), lambda td: td.set("action", next(action)))
 
 
 def main(config: Config) -> float:
-    """Flies both ways; the largest difference of the rewards."""
+    """Run both rollouts; return the largest difference of their rewards."""
     torch.manual_seed(config.seed)
     env, torque = make_env(config.seed), 2 * torch.rand(config.steps, 1) - 1
     scaled = fly(env, torque, config.seed)

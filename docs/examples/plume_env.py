@@ -1,8 +1,8 @@
-"""Where is this water from? A vehicle in an estuary finds the place of a sample by two dissolved tracers.
+"""Source localization in an estuary: a vehicle finds the place of a water sample by two dissolved tracers.
 
-Two outfalls, one on either bank, each release a tracer that the current carries north and spreads. The vehicle
-measures both concentrations where it is, and knows those of the sample, and its heading: not where it is, nor where the
-outfalls are.
+Two outfalls, one on each bank, release one tracer each, which the current carries north and spreads. The vehicle
+measures both concentrations at its position and knows its heading and the concentrations of the sample. It does not
+know its position or those of the outfalls.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-LOW_KM, HIGH_KM = torch.tensor([0.0, -5.0]), torch.tensor([10.0, 5.0])  # north, east: the estuary between its banks
+LOW_KM, HIGH_KM = torch.tensor([0.0, -5.0]), torch.tensor([10.0, 5.0])  # corners of the estuary: north, east
 OUTFALLS_KM = torch.tensor([[-2.0, -6.0], [-2.0, 6.0]])
-SPREAD_KM = 1.0  # twice the diffusivity over the current: how far a tracer creeps against it
+SPREAD_KM = 1.0  # twice the diffusivity divided by the speed of the current
 ARRIVAL_KM = 0.5
 
 
 def concentration(position: Tensor) -> Tensor:
-    """Logarithms of the two concentrations, as a sensor with as many decades gives them.
+    """Return the logarithms of the two concentrations.
 
-    A steady source in a current that carries it north falls, at a distance r of which x lie northward, as
-    ``exp(-(r - x) / SPREAD_KM) / sqrt(r)``: the far field of advection with diffusion in the plane.
+    In a uniform current to the north, the concentration of a steady source falls with the distance r and its northward
+    part x as ``exp(-(r - x) / SPREAD_KM) / sqrt(r)``: the far field of plane advection and diffusion.
 
     Args:
         position: ``(..., 2)`` north, east [km].
 
     Returns:
-        ``(..., 2)``, 0 where the concentration is that of 1 km north of the outfall.
+        ``(..., 2)``, relative to the concentration 1 km north of the outfall.
     """
     apart = position.unsqueeze(-2) - OUTFALLS_KM
     distance = apart.square().sum(-1).sqrt()
@@ -39,9 +39,14 @@ def concentration(position: Tensor) -> Tensor:
 
 
 class PlumeEnv(EnvBase):
-    """Journeys between random places of the estuary, by moves of up to 1 km after a turn of up to 90 degrees.
+    """Episodes between random places of the estuary, by moves of up to 1 km after turns of up to 90 degrees.
 
-    The reward of a move is what it takes off the difference of the tracers, and 10 for arriving within 0.5 km.
+    The reward of a step is the decrease of the distance between the two tracer vectors, plus 10 for arriving within
+    0.5 km.
+
+    Args:
+        num_envs: number of vehicles.
+        seed: random seed of the tasks and start headings.
     """
 
     batch_locked = True

@@ -1,17 +1,16 @@
-"""stable-baselines3 on the navigation environment: SAC or TD3, many vehicles in one batch.
+"""stable-baselines3 on the navigation environment: SAC or TD3, with many vehicles in one batch.
 
-    pip install -c constraints.txt ".[bench]"
+    pip install -c constraints.txt -e '.[bench]'
     python docs/examples/sb3.py --algorithm sac
 
-Prints the success rate and SPL on 100 tasks that the agent never saw, after a minute or two.
+Prints success rate, SPL (success weighted by path length) and steps on 100 test tasks. Takes one to two minutes.
 """
 
 from __future__ import annotations
 
 import os
 
-# A busy neighbour on the machine makes libgomp's spinning threads many times slower; this has to come before torch.
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
 import sys
 from dataclasses import dataclass
@@ -27,8 +26,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor
 
-from magrl.gymnasium_env import ENV_ID
-from magrl.tasks import TEST_SEED, task_set
+from magrl import Scenario, paper
+from magrl.envs.gymnasium import ENV_ID
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from sb3_vec_env import BatchedVecEnv
@@ -39,25 +38,25 @@ class Config:
     """Settings of a training."""
 
     algorithm: Literal["sac", "td3"] = "sac"
-    """Which of stable-baselines3's algorithms."""
+    """Algorithm of stable-baselines3."""
     num_envs: int = 64
-    """Vehicles that fly at the same time."""
+    """Number of vehicles."""
     total_timesteps: int = 51_200
-    """Moves of all vehicles to train for."""
+    """Steps of all vehicles together."""
     learning_starts: int = 1_024
-    """Moves made at random first."""
+    """Steps with random actions before the policy acts."""
     gradient_steps: int = 8
-    """Updates after each step of all vehicles."""
+    """Gradient steps after each step of all vehicles."""
     learning_rate: float = 1e-3
-    """Of all networks."""
+    """Learning rate of Adam."""
     eval_tasks: int = 100
-    """Tasks of the final evaluation, which no training meets."""
+    """Number of test tasks of the final evaluation."""
     seed: int = 0
-    """Of networks, exploration and tasks."""
+    """Random seed of weights, exploration and tasks."""
 
 
 def make_model(config: Config) -> OffPolicyAlgorithm:
-    """An agent with the networks, the discount and the scale of rewards of the preset `fast` of the recipes."""
+    """Return an agent with the networks, the discount and the reward scale of the recipes' preset `fast`."""
     envs = TransformReward(gymnasium.make_vec(ENV_ID, num_envs=config.num_envs), lambda reward: 0.05 * reward)
     settings: dict[str, Any] = {
         "learning_starts": config.learning_starts,
@@ -79,8 +78,10 @@ def make_model(config: Config) -> OffPolicyAlgorithm:
 
 
 def evaluate(model: OffPolicyAlgorithm, num_tasks: int) -> dict[str, float]:
-    """Flies each of a frozen set of tasks once, all in one batch: the means of their measures."""
-    envs = gymnasium.make_vec(ENV_ID, num_envs=num_tasks, tasks=task_set(num_tasks, TEST_SEED))
+    """Evaluate an agent on frozen test tasks, all in one batch; return the means of their measures."""
+    scenario = Scenario()
+    scenario = scenario.with_tasks(scenario.random_tasks(num_tasks, paper.TEST_SEED))
+    envs = gymnasium.make_vec(ENV_ID, num_envs=num_tasks, scenario=scenario)
     observations, _ = envs.reset(seed=0)
     first = {name: np.full(num_tasks, np.nan) for name in ("success", "spl", "steps")}
     while np.isnan(first["success"]).any():
@@ -94,7 +95,7 @@ def evaluate(model: OffPolicyAlgorithm, num_tasks: int) -> dict[str, float]:
 
 
 def main(config: Config) -> dict[str, float]:
-    """Trains and evaluates."""
+    """Train and evaluate."""
     model = make_model(config)
     model.learn(config.total_timesteps)
     result = evaluate(model, config.eval_tasks)

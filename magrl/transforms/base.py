@@ -1,4 +1,4 @@
-"""What the transforms share: keys, clear errors, and how an observation is added."""
+"""Common base of the transforms: keys, errors, and the addition of an observation."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Keys = Sequence[NestedKey]
 
 
 class ObservationTransform(Transform):
-    """What the transforms that add an observation share: they also run at reset, and on plain TensorDicts.
+    """Base class of transforms that add an observation: they also run at reset, and on plain TensorDicts.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> class Kilometres(ObservationTransform):
+        >>> class Kilometers(ObservationTransform):
         ...     def _call(self, next_tensordict):
-        ...         (metres,) = self._read(next_tensordict)
-        ...         return next_tensordict.set(self.out_keys[0], metres / 1000)
+        ...         (meters,) = self._read(next_tensordict)
+        ...         return next_tensordict.set(self.out_keys[0], meters / 1000)
         >>> depth = TensorDict(depth_m=torch.tensor([500.0]))
-        >>> Kilometres(in_keys=["depth_m"], out_keys=["depth_km"])(depth)["depth_km"]
+        >>> Kilometers(in_keys=["depth_m"], out_keys=["depth_km"])(depth)["depth_km"]
         tensor([0.5000])
     """
 
@@ -34,11 +34,11 @@ class ObservationTransform(Transform):
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Reads ``in_keys`` and writes ``out_keys`` of a TensorDict, with or without an environment."""
+        """Read ``in_keys`` and write ``out_keys`` of a TensorDict, with or without an environment."""
         return self._call(tensordict)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor] | None:
-        """The values at ``in_keys``, or None where keys may be missing and one is."""
+        """Return the values at ``in_keys``, or None if one is missing and missing keys are tolerated."""
         values = [tensordict.get(key, None) for key in self.in_keys]
         missing = [key for key, value in zip(self.in_keys, values, strict=True) if value is None]
         if not missing:
@@ -48,7 +48,7 @@ class ObservationTransform(Transform):
         raise KeyError(f"{type(self).__name__} reads {missing}, which are not among {sorted_keys(tensordict)}")
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Refuses to write over what the environment reads back: its next step would start from the written value.
+        """Raise if an out_key is part of the environment's state: its next step would start from the written value.
 
         Raises:
             ValueError: naming the key.
@@ -69,7 +69,7 @@ class ObservationTransform(Transform):
 
 
 def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
-    """The leaves of a TensorDict or a spec, for messages.
+    """Return the leaves of a TensorDict or a spec as sorted text, for messages.
 
     Example:
         >>> import torch
@@ -82,10 +82,10 @@ def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
 
 
 def key_list(keys: NestedKey | Keys) -> list[NestedKey]:
-    """One key or several, as a list; a tuple of strings is one nested key.
+    """Return one key or several as a list; a tuple of strings is one nested key.
 
     Raises:
-        TypeError: for what is neither.
+        TypeError: for anything else.
 
     Example:
         >>> key_list("heading"), key_list(("next", "heading")), key_list(["heading", "move"])
@@ -97,10 +97,10 @@ def key_list(keys: NestedKey | Keys) -> list[NestedKey]:
 
 
 def several_keys(keys: Keys) -> list[NestedKey]:
-    """Keys as a list, where a sequence of strings is always several of them.
+    """Return keys as a list; a sequence of strings is always several keys.
 
     Raises:
-        TypeError: for a lone string, or what is no sequence of keys.
+        TypeError: for a single string, or anything else that is not a sequence of keys.
 
     Example:
         >>> several_keys(("field", "target_field"))
@@ -112,7 +112,7 @@ def several_keys(keys: Keys) -> list[NestedKey]:
 
 
 def expect_keys(transform: Transform, num_in: int, num_out: int) -> None:
-    """Refuses a transform with another number of keys.
+    """Raise unless a transform has the given numbers of keys.
 
     Raises:
         ValueError: with its keys.

@@ -17,26 +17,27 @@ from magrl.transforms.base import Keys, ObservationTransform, key_list, sorted_k
 
 
 class MinMaxNorm(ObservationTransform):
-    """Scales entries from their bounds to an interval, and actions back.
+    """Scale entries from their bounds to an interval, and actions back.
 
-    Going out of the env, ``in_keys`` are scaled from [low, high] to ``interval`` and written to ``out_keys``. Coming
-    in, the policy's ``out_keys_inv`` are scaled back and written to ``in_keys_inv`` for the env. Values beyond their
-    bounds are scaled by the same line: nothing is clamped. Bounds come from the specs of the env that the transform
-    is attached to, or are given; they are kept without batch dimensions, so that a state_dict fits any batch size.
+    On the way out of the environment, ``in_keys`` are scaled from [low, high] to ``interval`` and written to
+    ``out_keys``. On the way in, the policy's ``out_keys_inv`` are scaled back and written to ``in_keys_inv``. Values
+    beyond their bounds are scaled linearly too, not clamped. Bounds are given, or come from the specs of the
+    environment that the transform is attached to; they have no batch dimensions, so that a state_dict fits any batch
+    size.
 
     Args:
         in_keys: entries to scale.
-        out_keys: where to; in place by default.
-        in_keys_inv: entries of the env to fill from scaled ones, usually ``["action"]``.
-        out_keys_inv: their scaled names; the same by default.
-        bounds: for each env-side key its (low, high), numbers or tensors that broadcast on the last dimensions;
-            keys that are left out take theirs from the specs.
-        interval: what the bounds are mapped to.
+        out_keys: names of the scaled entries; in place by default.
+        in_keys_inv: entries of the environment that are filled from scaled ones, usually ``["action"]``.
+        out_keys_inv: names of those scaled entries; the same by default.
+        bounds: (low, high) of each key of the environment, numbers or tensors that broadcast on the last dimensions;
+            other keys take theirs from the specs.
+        interval: image of the bounds.
 
     Raises:
-        ValueError: for bounds that are not finite or not rising, bounds for a key that is not used, an empty
-            interval, or an in-place key that is part of the env's state.
-        RuntimeError: when bounds are needed that were neither given nor found in a spec.
+        ValueError: for bounds that are not finite and rising, bounds of a key that is not used, an empty interval, or
+            an in-place key that is part of the environment's state.
+        RuntimeError: if bounds are needed that were neither given nor found in a spec.
 
     Example:
         >>> from tensordict import TensorDict
@@ -81,7 +82,7 @@ class MinMaxNorm(ObservationTransform):
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
                 raise ValueError(f"the bounds of {key!r} must be (low, high), got {pair!r}")
             if unravel_key(key) not in self._bounded_keys:
-                raise ValueError(f"bounds are given for {key!r}, which is none of the keys {self._bounded_keys}")
+                raise ValueError(f"bounds are given for {key!r}, which is not among the keys {self._bounded_keys}")
             self._set_bounds(unravel_key(key), *(_as_float(bound) for bound in pair))
 
     # Bounds
@@ -89,7 +90,7 @@ class MinMaxNorm(ObservationTransform):
     def _set_bounds(self, key: NestedKey, low: Tensor, high: Tensor) -> None:
         dtype = torch.promote_types(low.dtype, high.dtype)
         low, high = torch.broadcast_tensors(low.to(dtype), high.to(dtype))
-        extreme = torch.finfo(dtype).max  # how a spec writes that a side is open
+        extreme = torch.finfo(dtype).max  # an open side in a spec
         finite = torch.isfinite(high - low) & (low > -extreme) & (high < extreme)
         if not (finite & (low < high)).all():
             raise ValueError(
@@ -109,7 +110,7 @@ class MinMaxNorm(ObservationTransform):
         return getattr(self, f"low_{index}"), getattr(self, f"high_{index}")
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Reads the bounds of the environment that the transform is attached to, where its specs have any."""
+        """Read the bounds of the environment that the transform is attached to, where its specs have any."""
         super().set_container(container)
         parent = self.parent
         if parent is not None:
@@ -152,14 +153,14 @@ class MinMaxNorm(ObservationTransform):
     # Data
 
     def normalize(self, key: NestedKey, value: Tensor) -> Tensor:
-        """Scales a value of ``key`` from its bounds to the interval: ``(...)`` to ``(...)``, in floats."""
+        """Return a value of ``key`` scaled from its bounds to the interval: ``(...)`` to ``(...)``, floating point."""
         value = _as_float(value)
         low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key))
         start, end = self.interval
         return start + (end - start) * ((value - low) / (high - low))
 
     def denormalize(self, key: NestedKey, value: Tensor) -> Tensor:
-        """Scales a value of ``key`` from the interval back to its bounds: ``(...)`` to ``(...)``."""
+        """Return a value of ``key`` scaled from the interval back to its bounds: ``(...)`` to ``(...)``."""
         low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key))
         start, end = self.interval
         return torch.lerp(low.expand_as(value), high.expand_as(value), (value - start) / (end - start))
@@ -185,7 +186,7 @@ class MinMaxNorm(ObservationTransform):
     # Specs
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Adds the scaled entries; those with bounds keep some, scaled."""
+        """Add the scaled entries; bounded ones stay bounded."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if in_key in observation_spec.keys(True, True) or in_key not in self.in_keys_inv:
                 leaf = self._leaf(observation_spec, in_key)
@@ -193,7 +194,7 @@ class MinMaxNorm(ObservationTransform):
         return observation_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Scales the specs of what the policy writes, under its name for it."""
+        """Scale the specs of the entries that the policy writes, under their scaled names."""
         input_spec = super().transform_input_spec(input_spec).clone()
         for in_key, out_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
             for name in ("full_action_spec", "full_state_spec"):
@@ -214,7 +215,7 @@ class MinMaxNorm(ObservationTransform):
 
 
 def _as_float(value: Tensor | float) -> Tensor:
-    """A tensor of floats: numbers in float64, whole-number tensors in the default dtype."""
+    """Return a floating-point tensor: numbers in float64, integer tensors in the default dtype."""
     if not isinstance(value, Tensor):
         return torch.as_tensor(value, dtype=torch.float64)
     return value if value.is_floating_point() else value.to(torch.get_default_dtype())

@@ -1,0 +1,119 @@
+"""Networks of the feedforward agent: a deterministic actor and a critic, as TensorDict modules."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.modules import MLP, TanhModule, ValueOperator
+
+from magrl.checks import check_number, check_type
+
+Device = torch.device | str | None
+
+
+def make_mlp(inputs: int, outputs: int, num_cells: Sequence[int], *, layer_norm: bool, device: Device = None) -> MLP:
+    """Return a perceptron with ReLU and, if ``layer_norm``, layer normalization after each hidden layer.
+
+    Args:
+        inputs: size of the input.
+        outputs: size of the output.
+        num_cells: width of each hidden layer.
+        layer_norm: whether hidden layers are normalized.
+        device: device of the parameters.
+
+    Raises:
+        ValueError: for a size that is not a whole number from 1 to 65536.
+
+    Example:
+        >>> make_mlp(13, 2, (32, 32), layer_norm=True)(torch.zeros(5, 13)).shape
+        torch.Size([5, 2])
+    """
+    check_number(1, 65536, whole=True, inputs=inputs, outputs=outputs)
+    check_type(Sequence, num_cells=num_cells)
+    for width in num_cells:
+        check_number(1, 65536, whole=True, num_cells=width)
+    norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": width} for width in num_cells]}
+    return MLP(
+        in_features=inputs,
+        out_features=outputs,
+        num_cells=list(num_cells),
+        activation_class=nn.ReLU,
+        activation_kwargs={"inplace": True},  # the layer before it does not need its output to differentiate
+        device=device,
+        **(norm if layer_norm else {}),
+    )
+
+
+def make_actor(
+    observation_size: int, num_cells: Sequence[int], *, layer_norm: bool = True, device: Device = None
+) -> TensorDictSequential:
+    """Return a deterministic actor: ``observation`` ``(..., K)`` to ``logits`` and ``action`` ``(..., 2)``.
+
+    The action is the tanh of the logits. The output bias starts at zero: half the longest move, no turn.
+
+    Args:
+        observation_size: number of entries K of the observation.
+        num_cells: width of each hidden layer.
+        layer_norm: whether hidden layers are normalized.
+        device: device of the parameters.
+
+    Raises:
+        ValueError: for a size that is not a whole number from 1 to 65536.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> obs = TensorDict(observation=torch.zeros(5, 13), batch_size=[5])
+        >>> make_actor(13, (32, 32))(obs)["action"].shape
+        torch.Size([5, 2])
+    """
+    check_number(1, 65534, whole=True, observation_size=observation_size)
+    network = make_mlp(observation_size, 2, num_cells, layer_norm=layer_norm, device=device)
+    return TensorDictSequential(TensorDictModule(network, ["observation"], ["logits"]), make_squash(network))
+
+
+def make_squash(network: MLP) -> TanhModule:
+    """Return the output stage of an actor, ``logits`` to ``action``, and set the output bias of its network to zero.
+
+    Example:
+        >>> squash = make_squash(make_mlp(4, 2, (8,), layer_norm=False))
+        >>> squash.in_keys, squash.out_keys
+        (['logits'], ['action'])
+    """
+    nn.init.zeros_(network[-1].bias)
+    device = network[-1].bias.device
+    squash = TanhModule(in_keys=["logits"], out_keys=["action"])
+    return squash if device.type == "meta" else squash.to(device)
+
+
+def make_critic(
+    observation_size: int,
+    num_cells: Sequence[int],
+    *,
+    layer_norm: bool = True,
+    observation_keys: Sequence[str] = ("observation",),
+    device: Device = None,
+) -> ValueOperator:
+    """Return a critic: observations and ``action`` ``(..., 2)`` to ``state_action_value`` ``(..., 1)``.
+
+    Args:
+        observation_size: number of entries of all observations together.
+        num_cells: width of each hidden layer.
+        layer_norm: whether hidden layers are normalized.
+        observation_keys: keys that are concatenated, before the action.
+        device: device of the parameters.
+
+    Raises:
+        ValueError: for a size that is not a whole number from 1 to 65536.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> batch = TensorDict(observation=torch.zeros(5, 13), action=torch.zeros(5, 2), batch_size=[5])
+        >>> make_critic(13, (32, 32))(batch)["state_action_value"].shape
+        torch.Size([5, 1])
+    """
+    check_number(1, 65534, whole=True, observation_size=observation_size)
+    network = make_mlp(observation_size + 2, 1, num_cells, layer_norm=layer_norm, device=device)
+    return ValueOperator(network, in_keys=[*observation_keys, "action"])

@@ -1,0 +1,200 @@
+"""Trained policies as navigators, and their files: one format for every kind.
+
+A policy reads public keys of the plain environment and writes an action, both in physical units, so that it needs no
+transforms and is used like every other navigator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+from torchrl.envs import Compose
+
+from magrl.agents.networks import Device, make_actor
+from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
+from magrl.checks import check_finite, check_number, check_type
+from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv
+from magrl.files import DamagedFileError, load_tensors, save_tensors
+from magrl.transforms import ObservationView
+
+POLICY_FORMAT = 2
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """All that is needed to rebuild a policy, except its weights.
+
+    Args:
+        view: what the policy observes, and its scaling.
+        num_cells: width of each hidden layer.
+        layer_norm: whether hidden layers are normalized.
+        memory_size: width of the LSTM; 0 for a policy without memory.
+
+    Raises:
+        TypeError: for a view of another type.
+        ValueError: for widths that are not positive whole numbers.
+
+    Example:
+        >>> view = GeomagneticNavEnv(seed=0).observation_view()
+        >>> PolicyConfig(view, (32, 32)).memory_size
+        0
+    """
+
+    view: ObservationView
+    num_cells: tuple[int, ...]
+    layer_norm: bool = True
+    memory_size: int = 0
+
+    def __post_init__(self) -> None:
+        check_type(ObservationView, view=self.view)
+        check_type(bool, layer_norm=self.layer_norm)
+        check_number(0, 65536, whole=True, memory_size=self.memory_size)
+        if not self.num_cells or not all(isinstance(n, int) and 1 <= n <= 65536 for n in self.num_cells):
+            raise ValueError(f"num_cells must be whole numbers from 1 to 65536, got {self.num_cells}")
+
+    def make_actor(self, device: Device = None) -> TensorDictSequential:
+        """Return an actor of this shape, with new weights."""
+        if self.memory_size:
+            shape = (self.view, self.num_cells, self.memory_size)
+            return make_recurrent_actor(*shape, layer_norm=self.layer_norm, device=device)
+        return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
+
+
+class FieldPolicy(TensorDictModuleBase):
+    """A trained agent as a navigator of the plain environment, in physical units.
+
+    A recurrent policy keeps its own state for each vehicle from the start of an episode (``step_count`` 0) on: call it
+    once per step.
+
+    Args:
+        config: what the policy observes, and the shape of its network.
+        actor: trained actor of that shape; one with new weights by default.
+
+    Raises:
+        TypeError: for a configuration of another type.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> policy = FieldPolicy(PolicyConfig(env.observation_view(), (32, 32)))
+        >>> env.rollout(2, policy)["action"].shape
+        torch.Size([2, 2, 2])
+    """
+
+    out_keys: ClassVar[list[str]] = ["action"]
+
+    def __init__(self, config: PolicyConfig, actor: TensorDictSequential | None = None) -> None:
+        super().__init__()
+        check_type(PolicyConfig, config=config)
+        self.config = config
+        heading = ["heading"] if config.view.observe_heading else []
+        self.in_keys = [key for key in PUBLIC_KEYS if key != "heading"] + heading
+        self.in_keys += ["step_count"] if config.memory_size else []
+        self.observe = Compose(*config.view.observation_transforms())
+        self.act = config.view.action_transform()
+        self.actor = config.make_actor() if actor is None else actor
+        self.state: TensorDictBase | None = None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""
+        observed = self.observe(tensordict.select(*self.in_keys))
+        if self.config.memory_size:
+            self._recall(observed)
+        action = self.actor(observed)["action"]
+        if self.config.memory_size:
+            self.state = observed["next"].select(*STATE_KEYS).detach()
+        return tensordict.set("action", self.act.denormalize("action", action))
+
+    def _recall(self, observed: TensorDictBase) -> None:
+        """Add the recurrent state and the mask of the vehicles whose episode starts."""
+        observed["is_init"] = observed["step_count"] == 0
+        if self.state is None or self.state.shape != observed.shape or self.state.device != observed.device:
+            zeros = observed["observation"].new_zeros(*observed.shape, 1, self.config.memory_size)
+            self.state = TensorDict(dict.fromkeys(STATE_KEYS, zeros), observed.shape, device=observed.device)
+        observed.update(self.state)
+
+    def check_fits(self, env: GeomagneticNavEnv) -> None:
+        """Raise unless the field of an environment is within what the policy was trained in.
+
+        Raises:
+            ValueError: naming the element and both ranges.
+        """
+        check_type(GeomagneticNavEnv, env=env)
+        self.config.view.check_covers(env.field, env.region.grid(81).to(env.device))
+
+
+def save_policy(path: Path | str, policy: FieldPolicy) -> None:
+    """Write a policy: its configuration and its weights, as numbers and tensors.
+
+    Raises:
+        TypeError: for another type of policy.
+        OSError: if the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> policy = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
+        >>> save_policy(Path(tempfile.mkdtemp()) / "policy.pt", policy)
+    """
+    check_type(FieldPolicy, policy=policy)
+    weights = {key: value.cpu() for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
+    save_tensors({"format": POLICY_FORMAT, "config": asdict(policy.config), "weights": weights}, Path(path))
+
+
+def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy:
+    """Read a policy that :func:`save_policy` wrote.
+
+    Args:
+        path: ``policy.pt`` of a run.
+        device: device on which the policy acts.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: for a file that is not a policy, of another format, or with weights of other shapes.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "policy.pt"
+        >>> save_policy(path, FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,))))
+        >>> load_policy(path).config.num_cells
+        (8,)
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no policy file at {path}")
+    try:
+        content = load_tensors(path)
+    except DamagedFileError as error:
+        raise ValueError(f"{path} is not a policy file: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} is not a policy file: it must hold format, config and weights")
+    version = content.get("format", content.get("recurrent_format"))
+    if version is not None and version != POLICY_FORMAT:
+        raise ValueError(
+            f"{path} is a policy of format {version!r}; this version reads format {POLICY_FORMAT}: train it again"
+        )
+    if set(content) != {"format", "config", "weights"}:
+        raise ValueError(f"{path} is not a policy file: it must hold format, config and weights")
+    try:
+        policy = _rebuild(content["config"], content["weights"], str(path))
+    except (TypeError, RuntimeError, ValueError, AttributeError, FloatingPointError) as error:
+        raise ValueError(f"{path} does not hold a valid policy: {error}") from error
+    return policy.to(device).eval()
+
+
+def _rebuild(config: Any, weights: Any, name: str) -> FieldPolicy:
+    names = {field.name for field in fields(PolicyConfig)}
+    if not isinstance(config, dict) or set(config) != names or not isinstance(weights, dict):
+        raise ValueError(f"the configuration of a policy must hold exactly {sorted(names)}")
+    rebuilt = PolicyConfig(**{**config, "view": ObservationView(**config["view"])})
+    check_finite(weights.items(), name)
+    # Before anything is allocated: a few bytes may ask for any number of cells.
+    shapes = {key: tuple(value.shape) for key, value in rebuilt.make_actor("meta").state_dict().items()}
+    if {key: tuple(value.shape) for key, value in weights.items()} != shapes:
+        raise ValueError(f"its weights do not have the shapes of {rebuilt}")
+    policy = FieldPolicy(rebuilt)
+    policy.actor.load_state_dict(weights)
+    return policy

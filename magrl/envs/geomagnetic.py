@@ -1,0 +1,342 @@
+"""The navigation environment: a batch of vehicles that measure the magnetic field and move.
+
+It works in physical units and gives the paper's base reward (arrival and proximity). Guidance, scaling and
+concatenation are transforms on top of it. The state lives in the TensorDict; the environment itself holds its options
+and the number of the episode that each vehicle is in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from magrl import guidance
+from magrl.checks import check_number, check_type
+from magrl.envs.region import Region
+from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
+from magrl.envs.scenario import Scenario
+from magrl.envs.specs import bounded, done_spec, field_bounds, observation_spec, reward_spec
+from magrl.envs.tasks import Tasks, counter_uniform, sample_tasks
+from magrl.field import elements_at, elements_range
+from magrl.geodesy import move, wrap_angle
+from magrl.transforms.view import ObservationView
+
+PUBLIC_KEYS = ("field", "target_field", "move", "heading")
+"""Keys that every policy may read, beside ``step_count``."""
+PRIVILEGED_KEYS = (
+    "position",
+    "target_position",
+    "start_position",
+    "objective",
+    "objective_weights",
+    "success",
+)
+"""Keys that a policy may not read if it navigates by the field alone."""
+_HEADING_STREAM = -1  # the counter that separates a start heading from the attempts at placing a task
+
+
+class GeomagneticNavEnv(EnvBase):
+    """Vehicles that cross a region to a destination of which they know only the magnetic elements.
+
+    Each vehicle measures D, I, B_H; it knows those of its destination, its heading from true north and its last move.
+    It chooses how far to turn and then how far to go. It has arrived when the objective F (Eq. 2-6) is below ``zeta``.
+    A vehicle that leaves the region by more than the scenario's margin is lost: the episode ends as a failure.
+
+    Args:
+        scenario: region, field, distances and frozen tasks; by default the paper's. Where it has tasks, vehicle i flies
+            task ``i + k * num_envs`` in episode k, counted around the set.
+        num_envs: number of vehicles in the batch.
+        max_steps: moves after which an episode is truncated.
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn to either side before a move [rad].
+        zeta: arrival threshold on the objective.
+        start_heading: ``"north"``, or ``"random"`` for a uniform heading.
+        destination_weight: reward at arrival, zeta_1.
+        proximity_weight: reward per unit of the objective, zeta_2.
+        render_mode: ``"rgb_array"`` to keep the tracks that :meth:`render` draws, or None.
+        seed: seed of tasks and start headings; random if None.
+        device: device of the batch.
+
+    Raises:
+        ValueError: for an option out of its range, naming it and its value.
+
+    Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
+    move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
+    ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
+    ``objective_weights`` ``(N, 3)``. Action ``(N, 2)``: distance [km], turn [rad]. Rewards ``(N, 1)``: ``reward``, and
+    its terms ``reward_destination`` and ``reward_proximity``.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=4, seed=0)
+        >>> env.rollout(3)["next", "field"].shape
+        torch.Size([4, 3, 3])
+    """
+
+    batch_locked = True
+    episode: Tensor
+
+    def __init__(
+        self,
+        scenario: Scenario | None = None,
+        *,
+        num_envs: int = 1,
+        max_steps: int = 50,
+        max_move_km: float = 50.0,
+        max_turn_rad: float = math.pi / 2,
+        zeta: float = 0.01,
+        start_heading: str = "north",
+        destination_weight: float = 200.0,
+        proximity_weight: float = 10.0,
+        render_mode: str | None = None,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        scenario = Scenario() if scenario is None else scenario
+        check_type(Scenario, scenario=scenario)
+        check_number(1, whole=True, num_envs=num_envs, max_steps=max_steps)
+        check_number(0, 2**64 - 1, whole=True, seed=0 if seed is None else seed)
+        check_number(0, 1000, above=True, max_move_km=max_move_km)  # a move is one short leg
+        check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
+        check_number(0, above=True, zeta=zeta)
+        check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight)
+        if start_heading not in ("north", "random"):
+            raise ValueError(f"start_heading must be 'north' or 'random', got {start_heading!r}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
+        self.num_envs, self.max_steps, self.zeta = num_envs, max_steps, float(zeta)
+        self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
+        self.start_heading, self.render_mode = start_heading, render_mode
+        self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
+        self._tracks = TrackRecorder(max_steps + 1) if render_mode else None
+        self._place(scenario)
+        self.register_buffer("action_low", self._float64((0.0, -self.max_turn_rad)))
+        self.register_buffer("action_high", self._float64((self.max_move_km, self.max_turn_rad)))
+        self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
+        self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
+        self._make_specs(scenario.reachable(max_move_km))
+        self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+
+    def _place(self, scenario: Scenario) -> None:
+        """Build what the scenario describes, on the device of the batch."""
+        self.scenario, self.region, self.edge = scenario, scenario.region, scenario.edge
+        self.tasks = None if scenario.tasks is None else Tasks(*(end.to(self.device) for end in scenario.tasks))
+        field = scenario.build_field(self.max_move_km)
+        self.field = field.to(self.device) if isinstance(field, torch.nn.Module) else field
+        self.register_buffer("objective_floors", self._float64(scenario.floors(self.field)))
+
+    def _float64(self, values: Sequence[float]) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64, device=self.device)
+
+    def observation_view(self, *, observe_heading: bool = True, observe_difference: bool = True) -> ObservationView:
+        """Return what an agent observes of this environment, scaled to the range of the field over the region.
+
+        Args:
+            observe_heading: whether cosine and sine of the heading are observed.
+            observe_difference: whether target elements minus measured elements are observed.
+
+        Example:
+            >>> GeomagneticNavEnv(seed=0).observation_view().size
+            13
+        """
+        low, high = elements_range(self.field, self.region.grid(81).to(self.device))
+        return ObservationView(
+            observe_heading=observe_heading,
+            observe_difference=observe_difference,
+            field_low=tuple(low.tolist()),
+            field_high=tuple(high.tolist()),
+            max_move_km=self.max_move_km,
+            max_turn_rad=self.max_turn_rad,
+        )
+
+    # Specs
+
+    def _make_specs(self, box: Region) -> None:
+        bounds = field_bounds(self.field, box, self.device)
+        observation = observation_spec(self.num_envs, bounds, self.max_move_km, self.max_turn_rad)
+        self.observation_spec = observation.to(self.device)
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
+        self.full_reward_spec = reward_spec(self.num_envs).to(self.device)
+        self.full_done_spec = done_spec(self.num_envs).to(self.device)
+
+    # Reset
+
+    def _set_seed(self, seed: int | None) -> None:
+        check_number(0, 2**64 - 1, whole=True, seed=seed)
+        assert seed is not None  # check_number raised above
+        self.seed = int(seed)
+        self.episode = torch.zeros_like(self.episode)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        """Start the next episode of every vehicle that is named by ``_reset``, or of all."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            chosen, start = self.vehicle, self._start_of(self.vehicle)
+        else:
+            mask = mask.reshape(self.num_envs)
+            chosen = mask.nonzero().squeeze(-1)
+            # The rows of the others are placeholders: the base class puts their running state back.
+            rows = self._start_of(chosen if len(chosen) else self.vehicle[:1])
+            start = rows[(mask.cumsum(0) - 1).clamp_min(0)]
+        # Counted out of place: a rollout or a checkpoint may hold the old tensor.
+        self.episode = self.episode.index_add(0, chosen, torch.ones_like(chosen))
+        if self._tracks is not None:
+            self._tracks.add(start, mask)
+        return start
+
+    def _start_of(self, vehicle: Tensor) -> TensorDict:
+        """Return the first observation of the next episode of some vehicles, ``(P,)``."""
+        episode = self.episode[vehicle]
+        tasks = self._tasks(vehicle, episode)
+        field, target_field = elements_at(self.field, torch.stack(tasks))
+        # Rounded as the vehicle observes it: a move of length 0 must not change the objective.
+        field, target_field = field.float().double(), target_field.float().double()
+        weights = guidance.objective_weights(field, target_field, self.objective_floors).float().double()
+        zeros = field.new_zeros(len(vehicle), 2)
+        flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        return TensorDict(
+            {
+                "field": field.float(),
+                "target_field": target_field.float(),
+                "move": zeros.float(),
+                "heading": self._start_heading(vehicle, episode).float(),
+                "step_count": torch.zeros_like(vehicle).unsqueeze(-1),
+                "position": tasks.start,
+                "target_position": tasks.target,
+                "start_position": tasks.start,
+                "objective": guidance.objective(field, target_field, weights).float(),
+                "objective_weights": weights.float(),
+                "success": flags["done"].clone(),
+                **flags,
+            },
+            batch_size=vehicle.shape,
+            device=self.device,
+        )
+
+    def _tasks(self, vehicle: Tensor, episode: Tensor) -> Tasks:
+        if self.tasks is None:
+            return sample_tasks(self.region, self.scenario.distance_range_km, self.seed, vehicle, episode)
+        index = (vehicle + episode * self.num_envs) % len(self.tasks.start)
+        return Tasks(self.tasks.start[index], self.tasks.target[index])
+
+    def _start_heading(self, vehicle: Tensor, episode: Tensor) -> Tensor:
+        if self.start_heading == "north":
+            return torch.zeros(len(vehicle), 1, dtype=torch.float64, device=self.device)
+        stream = torch.full_like(vehicle, _HEADING_STREAM)
+        uniform = counter_uniform(self.seed, torch.stack((vehicle, episode, stream), -1), 1)
+        return wrap_angle(2 * math.pi * uniform)
+
+    # Step
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._checked_action(tensordict["action"])
+        distance, turn = action.unbind(-1)
+        before = tensordict["position"]
+        heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
+        latitude, longitude = before.unbind(-1)
+        moved = torch.stack(move(latitude, longitude, heading, distance), -1)
+        was_inside, is_inside = self.edge.contains(torch.stack((before, moved))).unbind(0)
+        position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
+        lost = ~(was_inside & is_inside)
+
+        field = elements_at(self.field, position)
+        field = field.float().double()
+        weights = tensordict["objective_weights"].double()
+        objective = guidance.objective(field, tensordict["target_field"].double(), weights)
+        arrived = (objective < self.zeta) & ~lost
+        step = tensordict["step_count"] + 1
+        terminated = arrived | lost
+        truncated = (step >= self.max_steps) & ~terminated
+        proximity = guidance.proximity_reward(tensordict["objective"].double(), objective, self.proximity_weight)
+        proximity = guidance.late_decay(proximity, step, self.max_steps)
+        destination = guidance.destination_reward(arrived, self.destination_weight)
+        after = TensorDict(
+            {
+                "field": field.float(),
+                "target_field": tensordict["target_field"],
+                "move": action.float(),
+                "heading": heading.float().unsqueeze(-1),
+                "step_count": step,
+                "position": position,
+                "target_position": tensordict["target_position"],
+                "start_position": tensordict["start_position"],
+                "objective": objective.float(),
+                "objective_weights": tensordict["objective_weights"],
+                "success": arrived,
+                "reward": (destination + proximity).float(),
+                "reward_destination": destination.float(),
+                "reward_proximity": proximity.float(),
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            batch_size=tensordict.batch_size,
+            device=self.device,
+        )
+        if self._tracks is not None:
+            self._tracks.add(after)
+        return after
+
+    def _checked_action(self, action: Tensor) -> Tensor:
+        """Return the action in float64, rounded into its bounds.
+
+        Raises:
+            ValueError: naming the vehicles whose action is not finite or beyond the bounds by more than rounding.
+        """
+        action = action.double()
+        slack = 1e-5 * (self.action_high - self.action_low)
+        sound = (action >= self.action_low - slack) & (action <= self.action_high + slack)
+        if torch.compiler.is_compiling() or action.is_cuda:
+            torch._assert_async(sound.all(), "GeomagneticNavEnv: an action is not finite or out of bounds")
+        elif not sound.all():
+            bad = (~sound.all(-1)).nonzero().squeeze(-1)
+            raise ValueError(
+                f"GeomagneticNavEnv: actions of vehicles {bad[:8].tolist()} are not finite or out of bounds: "
+                f"{action[bad[:8]].tolist()}; distance [km] must be in [0, {self.max_move_km}] and turn [rad] in "
+                f"[-{self.max_turn_rad:.4f}, {self.max_turn_rad:.4f}]"
+            )
+        return action.clamp(self.action_low, self.action_high)
+
+    # Rendering
+
+    def track(self, vehicle: int) -> Tensor:
+        """Return the positions of a vehicle in its running episode, start first: ``(T, 2)`` latitude, longitude [deg].
+
+        Raises:
+            RuntimeError: without ``render_mode="rgb_array"``, or before the first reset.
+            IndexError: for a vehicle that is not in the batch.
+        """
+        return self._recorded.track(vehicle)
+
+    def render(self, vehicles: Sequence[int] | None = None, *, size_px: int = 700) -> np.ndarray:
+        """Draw the running episodes over the field's contours.
+
+        Args:
+            vehicles: vehicles to draw; the first 16 by default.
+            size_px: height and width [pixels].
+
+        Returns:
+            ``(size_px, size_px, 3)`` uint8 RGB.
+
+        Raises:
+            RuntimeError: without ``render_mode="rgb_array"``, or before the first reset.
+            IndexError: for a vehicle that is not in the batch.
+        """
+        chosen = range(min(self.num_envs, 16)) if vehicles is None else vehicles
+        paths = [self.track(vehicle).cpu() for vehicle in chosen]
+        targets = self._recorded.targets[list(chosen)].cpu()
+        return rgb_array(draw_tracks, size_px, self.field, self.region, paths, targets)
+
+    @property
+    def _recorded(self) -> TrackRecorder:
+        if self._tracks is None:
+            raise RuntimeError("no track is kept: create the environment with render_mode='rgb_array'")
+        return self._tracks

@@ -1,0 +1,300 @@
+"""The environment for Gymnasium: one vehicle as an ``Env``, a batch of them as a ``VectorEnv``.
+
+``import magrl`` registers ``magrl/GeomagneticNavigation-v0``. Both classes run :func:`navigation_env`, the TorchRL
+environment behind the transforms of the recipes, and only convert tensors to arrays: the same seed and the same actions
+give the same bits.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.envs import CatTensors, TransformedEnv
+
+from magrl.envs.geomagnetic import PUBLIC_KEYS
+from magrl.envs.measures import path_measures
+from magrl.envs.navigation import check_choice, navigation_env
+
+ENV_ID = "magrl/GeomagneticNavigation-v0"
+Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+
+
+def _box(*specs: Bounded) -> spaces.Space[Any]:
+    """Return the space of one vehicle, from the specs that are concatenated in an array."""
+    low, high = (
+        torch.cat([getattr(spec.space, end)[0] for spec in specs]).cpu().numpy().astype(np.float32)
+        for end in ("low", "high")
+    )
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _observation_space(env: TransformedEnv, keys: tuple[str, ...]) -> spaces.Space[Any]:
+    """Return the space of one vehicle's observation; its bounds are those of the specs."""
+    spec = env.observation_spec
+    if keys != ("observation",):
+        return spaces.Dict({key: _box(spec[key]) for key in keys})
+    # CatTensors drops the bounds of what it joins.
+    (joined,) = (transform for transform in env.transform if isinstance(transform, CatTensors))
+    return _box(*(spec[key] for key in joined.in_keys))
+
+
+def _array(tensor: Tensor) -> NDArray[Any]:
+    """Return a copy as an array: writing into it does not change the environment."""
+    return np.array(tensor.detach().cpu().numpy())
+
+
+class _Batch:
+    """A batch of vehicles, with arrays in and arrays out.
+
+    Args:
+        num_envs: vehicles in the batch.
+        render_mode: None or ``"rgb_array"``.
+        **options: of :func:`navigation_env`.
+    """
+
+    def __init__(self, num_envs: int, render_mode: str | None, options: dict[str, Any]) -> None:
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, ("rgb_array",))
+        self.render_mode = render_mode
+        if "num_envs" in options:
+            raise TypeError(f"one vehicle has no num_envs, got {options['num_envs']}: use gymnasium.make_vec")
+        self.env = navigation_env(num_envs, render_mode=render_mode, **options)
+        self.keys = ("observation",) if options.get("observation", "flat") == "flat" else PUBLIC_KEYS
+        self.observation_space = _observation_space(self.env, self.keys)
+        self.action_space = _box(self.env.action_spec)
+        self._state: TensorDictBase | None = None
+        self._length_km = torch.zeros(num_envs, dtype=torch.float64, device=self.env.device)
+
+    def reset(self, seed: int | None, options: dict[str, Any] | None) -> Observation:
+        """Start the next episode of every vehicle, or with a seed the first."""
+        if options:
+            raise ValueError(f"reset() of {ENV_ID} takes no options, got {options}")
+        if seed is not None:
+            self.env.set_seed(seed)
+        self._state = self.env.reset()
+        self._length_km = torch.zeros_like(self._length_km)
+        return self.observe(self._state)
+
+    def observe(self, state: TensorDictBase) -> Observation:
+        """Return the observations of all vehicles, ``(N, ...)``."""
+        arrays = {key: _array(state[key]) for key in self.keys}
+        return arrays if len(arrays) > 1 else arrays["observation"]
+
+    def step(self, actions: Any, *, autoreset: bool) -> tuple[TensorDictBase, dict[str, NDArray[Any]]]:
+        """Move every vehicle.
+
+        Returns:
+            The entry ``next`` after a step of TorchRL, and the measures of the ``P`` episodes that ended.
+        """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step(): no episode is running")
+        state = self._state.set("action", self._action(actions))
+        if autoreset:
+            state, self._state = self.env.step_and_maybe_reset(state)
+        else:
+            state = self.env.step(state)
+            self._state = None if state["next", "done"].all() else self.env.step_mdp(state)
+        after = state["next"]
+        done = after["done"].squeeze(-1)
+        self._length_km = self._length_km + after["move"][:, 0].double()
+        measures = _measures(after[done], self._length_km[done]) if done.any() else {}
+        self._length_km = self._length_km.masked_fill(done, 0.0)
+        return after, measures
+
+    def _action(self, actions: Any) -> Tensor:
+        array = np.array(actions, dtype=np.float32)
+        shape = tuple(self.env.action_spec.shape)
+        if array.shape != shape:
+            raise ValueError(f"actions must have shape {shape}, distance and turn, got shape {array.shape}")
+        return torch.from_numpy(array).to(self.env.device)
+
+    def current(self) -> Observation:
+        """Return the observations of the running episodes."""
+        assert self._state is not None
+        return self.observe(self._state)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return an image of each vehicle's episode, ``(H, W, 3)``, or None without a render mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(f"render() needs gymnasium.make({ENV_ID!r}, render_mode='rgb_array')")
+            return None
+        return tuple(self.env.base_env.render([vehicle]) for vehicle in range(self.env.base_env.num_envs))
+
+
+def _measures(end: TensorDictBase, length_km: Tensor) -> dict[str, NDArray[Any]]:
+    """Return the measures of episodes from their last states, named as in ``magrl.evaluation.episode_measures``."""
+    success = end["success"].squeeze(-1)
+    measures = {
+        "success": success,
+        "is_success": success,  # the name that stable-baselines3 and Gymnasium-Robotics read
+        "steps": end["step_count"].squeeze(-1),
+        **path_measures(success, end["start_position"], end["position"], end["target_position"], length_km),
+    }
+    return {name: _array(value) for name, value in measures.items()}
+
+
+class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """One vehicle: ``gymnasium.make("magrl/GeomagneticNavigation-v0", **options)``.
+
+    ``reset(seed=s)`` starts the first episode of vehicle 0 of the TorchRL environment of seed ``s``; each ``reset()``
+    after it starts the next. The ``info`` of an episode's last step holds its measures (``success``, ``is_success``,
+    ``steps``, ``shortest_km``, ``length_km``, ``navigation_error_km``, ``spl``); otherwise it is empty.
+
+    Args:
+        render_mode: None, or ``"rgb_array"``: the track over the field's contours, ``(700, 700, 3)`` uint8.
+        **options: of :func:`navigation_env`, which holds those of :class:`magrl.envs.GeomagneticNavEnv`.
+
+    Raises:
+        TypeError, ValueError: for a bad option, as :func:`navigation_env`.
+
+    Example:
+        >>> env = gymnasium.make(ENV_ID, zeta=0.001)
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> observation.shape, env.action_space
+        ((13,), Box(-1.0, 1.0, (2,), float32))
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 as Gymnasium declares it
+
+    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        self._batch = _Batch(1, render_mode, options)
+        self.render_mode = render_mode
+        self.observation_space = self._batch.observation_space
+        self.action_space = self._batch.action_space
+
+    @property
+    def torchrl_env(self) -> TransformedEnv:
+        """TorchRL environment, a batch of one."""
+        return self._batch.env
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; the class describes the meaning of a seed."""
+        super().reset(seed=seed)
+        return _row(self._batch.reset(seed, options), 0), {}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move the vehicle.
+
+        Args:
+            action: ``(2,)`` distance and turn, in [-1, 1] or in km and rad.
+
+        Raises:
+            gymnasium.error.ResetNeeded: if no episode is running.
+            ValueError: for an action of another shape, not finite, or out of its bounds.
+        """
+        after, measures = self._batch.step(np.asarray(action)[None], autoreset=False)
+        reward, terminated, truncated = (after[key].item() for key in ("reward", "terminated", "truncated"))
+        info = {name: value.item() for name, value in measures.items()}
+        return _row(self._batch.observe(after), 0), reward, terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the running episode over the field's contours, or None without a ``render_mode``."""
+        images = self._batch.render()
+        return images[0] if images else None
+
+
+class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+    """A batch of vehicles: ``gymnasium.make_vec("magrl/GeomagneticNavigation-v0", num_envs=N, **options)``.
+
+    All move in one batched step. A vehicle whose episode ends starts the next in the same step
+    (``AutoresetMode.SAME_STEP``): the observation returned is the first of the new episode, ``info["final_obs"]`` the
+    last of the old one and ``info["final_info"]`` its measures, each with its mask ``_final_obs``, ``_final_info``.
+    ``reset(seed=s)`` is the first reset of the TorchRL environment of ``N`` vehicles and seed ``s``: each row has
+    episodes of its own, those of row 0 are the single environment's.
+
+    Args:
+        num_envs: vehicles in the batch.
+        render_mode: None, or ``"rgb_array"``: an image of each vehicle.
+        **options: of :func:`navigation_env`.
+
+    Raises:
+        TypeError, ValueError: for a bad option, as :func:`navigation_env`.
+
+    Example:
+        >>> envs = gymnasium.make_vec(ENV_ID, num_envs=4, vectorization_mode="vector_entry_point")
+        >>> observations, info = envs.reset(seed=0)
+        >>> observations, rewards, terminations, truncations, info = envs.step(envs.action_space.sample())
+        >>> observations.shape, rewards.shape
+        ((4, 13), (4,))
+    """
+
+    metadata: dict[str, Any] = {**GeomagneticNavGymEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
+        self._batch = _Batch(num_envs, render_mode, options)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.single_observation_space = self._batch.observation_space
+        self.single_action_space = self._batch.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    @property
+    def torchrl_env(self) -> TransformedEnv:
+        """TorchRL environment of the whole batch."""
+        return self._batch.env
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode of every vehicle; the class describes the meaning of a seed."""
+        super().reset(seed=seed)
+        return self._batch.reset(seed, options), {}
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Move every vehicle.
+
+        Args:
+            actions: ``(N, 2)`` distance and turn, in [-1, 1] or in km and rad.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            ValueError: for actions of another shape, not finite, or out of their bounds.
+        """
+        after, measures = self._batch.step(actions, autoreset=True)
+        reward, terminated, truncated = (_array(after[k].squeeze(-1)) for k in ("reward", "terminated", "truncated"))
+        ended = terminated | truncated
+        info = _final(self._batch.observe(after), measures, ended) if measures else {}
+        return self._batch.current(), reward, terminated, truncated, info
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return an image of each vehicle's episode, or None without a ``render_mode``."""
+        return self._batch.render()
+
+
+def _row(observation: Observation, index: int) -> Observation:
+    if isinstance(observation, dict):
+        return {key: value[index] for key, value in observation.items()}
+    return observation[index]
+
+
+def _final(observation: Observation, measures: dict[str, NDArray[Any]], ended: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return Gymnasium's ``info`` of a step in which episodes ended: values, each with its mask."""
+    final_obs = np.full(len(ended), None, dtype=object)
+    for index in np.flatnonzero(ended):
+        final_obs[index] = _row(observation, int(index))
+    final_info: dict[str, Any] = {}
+    for name, values in measures.items():
+        final_info[name] = np.zeros(len(ended), dtype=values.dtype)
+        final_info[name][ended] = values
+        final_info[f"_{name}"] = ended.copy()
+    return {
+        "final_obs": final_obs,
+        "_final_obs": ended.copy(),
+        "final_info": final_info,
+        "_final_info": ended.copy(),
+    }

@@ -1,0 +1,209 @@
+"""Maps: contours of a field and the tracks of vehicles over them, drawn with matplotlib.
+
+Importing this module does not import matplotlib; drawing does. Colors are those of Okabe and Ito, which remain distinct
+under color-vision deficiency.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from magrl.checks import check_number, check_tensor, check_type
+from magrl.envs.region import Region
+from magrl.field.elements import NAMES, UNITS
+from magrl.field.model import FieldModel, elements_at
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.contour import ContourSet
+
+ELEMENT_COLORS = {"D": "#E69F00", "I": "#0072B2", "B_H": "#009E73"}
+ELEMENT_STYLES = {"D": "solid", "I": "dashed", "B_H": "solid"}
+PATH, START, TARGET = "#404040", "#D55E00", "#CC79A7"
+SYMBOLS = {"D": "D", "I": "I", "B_H": "$B_H$"}
+
+
+def rgb_array(draw: Callable[..., None], size_px: int, *args: Any) -> np.ndarray:
+    """Return the image that a drawing function draws.
+
+    Args:
+        draw: called as ``draw(axes, *args)``.
+        size_px: height and width [pixels].
+
+    Returns:
+        ``(size_px, size_px, 3)`` uint8.
+
+    Raises:
+        ValueError: for a size that is not a positive whole number.
+
+    Example:
+        >>> rgb_array(lambda axes, x: axes.plot(x), 100, [1, 3, 2]).shape
+        (100, 100, 3)
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    check_number(1, whole=True, size_px=size_px)
+    figure = Figure(figsize=(7, 7), dpi=(size_px + 0.01) / 7, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    draw(figure.subplots(), *args)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def contour_lines(axes: Axes, field: FieldModel, region: Region) -> dict[str, ContourSet]:
+    """Draw lines of equal D (isogonics), I (isoclines) and B_H (isodynamics) over a region, without labels.
+
+    Args:
+        axes: axes to draw on.
+        field: any model of :mod:`magrl.field`.
+        region: region to show.
+
+    Returns:
+        Contours by the name of the element.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from magrl.field import IGRF
+        >>> list(contour_lines(Figure().subplots(), IGRF("2022-01-01"), Region((-10, 0), (160, 170))))
+        ['D', 'I', 'B_H']
+    """
+    check_type(Region, region=region)
+    grid = region.grid(61)
+    values = elements_at(field, grid.to(_device(field))).cpu().numpy()
+    longitude, latitude = grid[0, :, 1].numpy(), grid[:, 0, 0].numpy()
+    contours: dict[str, ContourSet] = {}
+    for index, name in enumerate(NAMES):
+        look: dict[str, Any] = {"colors": ELEMENT_COLORS[name], "linestyles": ELEMENT_STYLES[name], "linewidths": 0.7}
+        contours[name] = axes.contour(longitude, latitude, values[..., index], 9, **look)
+    return contours
+
+
+def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
+    """Draw labeled contours of D, I and B_H over a region (Fig. 4-1).
+
+    Args:
+        axes: axes to draw on.
+        field: any model of :mod:`magrl.field`.
+        region: region to show.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from magrl.field import IGRF
+        >>> figure = Figure()
+        >>> draw_contours(figure.subplots(), IGRF("2022-01-01"), Region((-10, 0), (160, 170)))
+        >>> figure.axes[0].get_legend_handles_labels()[1]
+        ['D [deg]', 'I [deg]', '$B_H$ [nT]']
+    """
+    for (name, lines), unit in zip(contour_lines(axes, field, region).items(), UNITS, strict=False):
+        axes.clabel(lines, fontsize=7, fmt="%g")
+        axes.plot([], [], color=ELEMENT_COLORS[name], ls=ELEMENT_STYLES[name], lw=1, label=f"{SYMBOLS[name]} [{unit}]")
+    axes.set(xlabel="longitude [° E]", ylabel="latitude [° N]", xlim=region.longitude, ylim=region.latitude)
+    axes.set_aspect(1 / np.cos(np.radians(sum(region.latitude) / 2)))
+
+
+def draw_tracks(axes: Axes, field: FieldModel, region: Region, paths: Sequence[Tensor], targets: Tensor) -> None:
+    """Draw episodes over the field's contours, each from its start (square) to its target (triangle).
+
+    Args:
+        axes: axes to draw on.
+        field: any model of :mod:`magrl.field`.
+        region: region of the tasks; grown to contain all of the paths.
+        paths: one ``(T, 2)`` latitude, longitude [deg] for each episode.
+        targets: ``(len(paths), 2)`` [deg].
+
+    Raises:
+        ValueError: for an empty list of paths, or another number of targets.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from magrl.field import IGRF
+        >>> axes, target = Figure().subplots(), torch.tensor([[-8.0, 164.0]])
+        >>> path = torch.tensor([[-2.0, 162.0], [-4.0, 163.0]])
+        >>> draw_tracks(axes, IGRF("2022-01-01"), Region((-10, 0), (160, 170)), [path], target)
+        >>> axes.get_xlabel()
+        'longitude [° E]'
+    """
+    check_type(Region, region=region)
+    check_tensor(2, targets=targets)
+    if not len(paths) or targets.shape != (len(paths), 2):
+        raise ValueError(f"there must be one target for each path, got {len(paths)} and {tuple(targets.shape)}")
+    unwrapped, ends = [region.unwrapped(path) for path in paths], region.unwrapped(targets)
+    draw_contours(axes, field, region.holding(torch.cat([*unwrapped, ends])))
+    for path, end in zip(unwrapped, ends, strict=True):
+        axes.plot(*torch.stack((path[0], end)).flip(-1).T, ":", color=TARGET, lw=0.8)
+        axes.plot(path[:, 1], path[:, 0], "-", color=PATH, lw=1, marker=".", ms=3, alpha=0.8)
+    starts = torch.stack([path[0] for path in unwrapped])
+    axes.plot(starts[:, 1], starts[:, 0], "s", color=START, ms=5, label="start")
+    axes.plot(ends[:, 1], ends[:, 0], "^", color=TARGET, ms=6, label="destination")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=5, fontsize=8, frameon=False)
+
+
+def _device(field: FieldModel) -> torch.device:
+    buffers = field.buffers() if isinstance(field, torch.nn.Module) else iter(())
+    return next((b.device for b in buffers), torch.device("cpu"))
+
+
+class TrackRecorder:
+    """Positions of the running episodes of a batch, kept for rendering.
+
+    Args:
+        length: states kept; the longest track that can be returned.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> recorder, step = TrackRecorder(length=3), torch.tensor([[0]])
+        >>> for k in range(2):
+        ...     place = torch.tensor([[-2.0 - k, 162.0]])
+        ...     recorder.add(TensorDict(position=place, target_position=place, step_count=step + k, batch_size=[1]))
+        >>> recorder.track(0)
+        tensor([[ -2., 162.],
+                [ -3., 162.]])
+    """
+
+    def __init__(self, length: int) -> None:
+        check_number(1, whole=True, length=length)
+        self._states: deque[tuple[Tensor, Tensor, Tensor]] = deque(maxlen=length)
+
+    def add(self, state: TensorDictBase, started: Tensor | None = None) -> None:
+        """Record a state of every vehicle; at a partial reset, only the rows ``started`` ``(N,)`` are new."""
+        if torch.compiler.is_compiling():
+            return
+        entry = (state["position"], state["step_count"], state["target_position"])
+        if started is not None and self._states:
+            new, last = started.unsqueeze(-1), self._states.pop()
+            position, step, target = (torch.where(new, a, b) for a, b in zip(entry, last, strict=True))
+            entry = (position, step, target)
+        self._states.append(entry)
+
+    def track(self, vehicle: int) -> Tensor:
+        """Return the positions of a vehicle in its running episode, ``(T, 2)`` [deg].
+
+        Raises:
+            RuntimeError: before the first state.
+            IndexError: for a vehicle that is not in the batch.
+        """
+        steps, (count, *_) = self._latest[1], self._latest[1].shape
+        check_number(whole=True, vehicle=vehicle)
+        if not 0 <= vehicle < count:
+            raise IndexError(f"vehicle {vehicle} is not one of the {count} in the batch")
+        since = int(steps[vehicle])
+        return torch.stack([state[0][vehicle] for state in list(self._states)[-(since + 1) :]])
+
+    @property
+    def targets(self) -> Tensor:
+        """Destinations of the running episodes, ``(N, 2)`` [deg]."""
+        return self._latest[2]
+
+    @property
+    def _latest(self) -> tuple[Tensor, Tensor, Tensor]:
+        if not self._states:
+            raise RuntimeError("there is no episode to show: call reset() first")
+        return self._states[-1]

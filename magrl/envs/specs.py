@@ -1,0 +1,124 @@
+"""TensorDict specs of the navigation environment, each for ``N`` vehicles."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+
+from magrl.envs.region import Region
+from magrl.field import FieldModel, elements_range
+
+REWARD_TERMS = ("reward_destination", "reward_proximity")
+"""Terms whose sum is ``reward``."""
+
+
+def bounded(num_envs: int, low: Tensor, high: Tensor) -> Bounded:
+    """Return a float32 box ``(N, K)`` from bounds ``(K,)``.
+
+    Example:
+        >>> bounded(4, torch.tensor([0.0]), torch.tensor([1.0])).shape
+        torch.Size([4, 1])
+    """
+    shape = (num_envs, *low.shape)
+    return Bounded(low.float().expand(shape), high.float().expand(shape), shape)
+
+
+def field_bounds(field: FieldModel, box: Region, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return bounds of the elements over every place in a box, from a grid and 5 % of slack.
+
+    Args:
+        field: field model.
+        box: every place that a vehicle can reach.
+        device: device of the field model.
+
+    Returns:
+        Lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
+
+    Raises:
+        ValueError: for a field that is not defined on all of the box, or whose declination is not continuous there.
+
+    Example:
+        >>> from magrl.field import IGRF
+        >>> low, high = field_bounds(IGRF("2022-01-01"), Region((-10, 0), (160, 170)), torch.device("cpu"))
+        >>> [round(bound) for bound in high.tolist()]
+        [11, -8, 35670]
+    """
+    low, high = elements_range(field, box.grid(81).to(device))
+    if not torch.isfinite(low + high).all():
+        raise ValueError(
+            f"the field is not defined on all of {box}, which a vehicle can reach: take a field of a larger box, or a "
+            "smaller region, margin_deg or max_move_km"
+        )
+    if high[0] - low[0] > 180:
+        raise ValueError(
+            f"the declination turns through south in {box}: D jumps from 180 to -180 degrees there; take a region "
+            "farther from the magnetic pole"
+        )
+    slack = 0.05 * (high - low)
+    limit = torch.tensor((180.0, 90.0, math.inf), dtype=torch.float64, device=device)
+    return (low - slack).maximum(-limit), (high + slack).minimum(limit)
+
+
+def observation_spec(
+    num_envs: int, field_bounds: tuple[Tensor, Tensor], max_move_km: float, max_turn_rad: float
+) -> Composite:
+    """Return the spec of what a step observes, privileged keys included.
+
+    Args:
+        num_envs: number of vehicles N.
+        field_bounds: lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+
+    Example:
+        >>> observation_spec(4, (torch.zeros(3), torch.ones(3)), 50.0, 1.5)["field"].shape
+        torch.Size([4, 3])
+    """
+    low, high = (bound.cpu() for bound in field_bounds)
+    highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
+    return Composite(
+        field=bounded(num_envs, low, high),
+        target_field=bounded(num_envs, low, high),
+        move=bounded(num_envs, highest_move * torch.tensor((0, -1)), highest_move),
+        heading=bounded(num_envs, torch.tensor([-math.pi]), torch.tensor([math.pi])),
+        step_count=Unbounded((num_envs, 1), dtype=torch.int64),
+        position=_position_spec(num_envs),
+        target_position=_position_spec(num_envs),
+        start_position=_position_spec(num_envs),
+        objective=Unbounded((num_envs, 1)),
+        objective_weights=Unbounded((num_envs, 3)),
+        success=_flag(num_envs),
+        shape=(num_envs,),
+    )
+
+
+def reward_spec(num_envs: int) -> Composite:
+    """Return the spec of the reward and its terms.
+
+    Example:
+        >>> sorted(reward_spec(4).keys())
+        ['reward', 'reward_destination', 'reward_proximity']
+    """
+    return Composite({key: Unbounded((num_envs, 1)) for key in ("reward", *REWARD_TERMS)}, shape=(num_envs,))
+
+
+def done_spec(num_envs: int) -> Composite:
+    """Return the spec of the three end-of-episode flags.
+
+    Example:
+        >>> sorted(done_spec(4).keys())
+        ['done', 'terminated', 'truncated']
+    """
+    return Composite({key: _flag(num_envs) for key in ("done", "terminated", "truncated")}, shape=(num_envs,))
+
+
+def _position_spec(num_envs: int) -> Bounded:
+    high = torch.tensor((90.0, 180.0), dtype=torch.float64).expand(num_envs, 2)
+    return Bounded(-high, high, high.shape, dtype=torch.float64)
+
+
+def _flag(num_envs: int) -> Binary:
+    return Binary(1, (num_envs, 1), dtype=torch.bool)

@@ -1,0 +1,258 @@
+"""Export of episodes as tracks for maps and receivers: GeoJSON, GPX, KML.
+
+The vertices of a track are the way-points of the vehicle, at most 50 km apart, so that straight lines on a map deviate
+from the geodesics by some hundred meters at most. Lines are cut at the antimeridian, as RFC 7946 requires in GeoJSON,
+and likewise in KML; a GPX track is a sequence of points and needs no cut.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+from tensordict import TensorDictBase
+
+from magrl.checks import check_numbers, check_type
+from magrl.evaluation.metrics import episode_measures
+from magrl.files import json_ready
+
+MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
+"""Measures among the properties of each track."""
+
+Position = tuple[float, float]
+"""Latitude, longitude [deg]."""
+
+
+class Track(NamedTuple):
+    """The path of an episode.
+
+    Args:
+        name: name of the episode.
+        positions: latitude, longitude [deg] of each way-point, start first.
+        properties: further properties by name, numbers and texts.
+
+    Example:
+        >>> Track("home", [(-2.0, 162.0), (-2.4, 162.1)], {"steps": 1}).positions[-1]
+        (-2.4, 162.1)
+    """
+
+    name: str
+    positions: Sequence[Position]
+    properties: dict[str, Any]
+
+
+def tracks(rollout: TensorDictBase, names: Sequence[str], **properties: Any) -> list[Track]:
+    """Return the track of the first episode of each vehicle.
+
+    Args:
+        rollout: ``(M, T)`` from ``env.rollout``, with the keys of :class:`magrl.envs.GeomagneticNavEnv`.
+        names: names of the ``M`` episodes.
+        properties: properties of every track, beside its measures.
+
+    Raises:
+        ValueError: for another number of names than of episodes.
+
+    Example:
+        >>> from magrl import GeomagneticNavEnv
+        >>> track, = tracks(GeomagneticNavEnv(seed=0).rollout(3), ["home"], navigator="random")
+        >>> len(track.positions), track.properties["navigator"], track.properties["steps"]
+        (4, 'random', 3)
+    """
+    measures = {key: value.tolist() for key, value in episode_measures(rollout).items() if key in MEASURES}
+    if len(names) != len(rollout):
+        raise ValueError(f"names must hold one name for each of {len(rollout)} episodes, got {len(names)}")
+    starts, paths = rollout["start_position"][:, 0].tolist(), rollout["next", "position"].tolist()
+    return [
+        Track(
+            name,
+            [tuple(position) for position in (start, *path[: measures["steps"][row]])],
+            {**properties, **{key: values[row] for key, values in measures.items()}},
+        )
+        for row, (name, start, path) in enumerate(zip(names, starts, paths, strict=True))
+    ]
+
+
+def to_geojson(tracks: Sequence[Track]) -> str:
+    """Return a feature for each track, with its properties (RFC 7946: longitude before latitude, WGS84).
+
+    Raises:
+        ValueError: for a track of fewer than two positions, or a position out of range.
+
+    Example:
+        >>> feature = json.loads(to_geojson([Track("east", [(0, 179), (0, -179)], {})]))["features"][0]
+        >>> feature["geometry"]["coordinates"]
+        [[[179.0, 0.0], [180.0, 0.0]], [[-180.0, 0.0], [-179.0, 0.0]]]
+    """
+    features = []
+    for track in tracks:
+        lines = [[[longitude, latitude] for latitude, longitude in line] for line in cut(track.positions)]
+        kind, coordinates = ("LineString", lines[0]) if len(lines) == 1 else ("MultiLineString", lines)
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": kind, "coordinates": coordinates},
+                "properties": {"name": track.name, **json_ready(track.properties)},
+            }
+        )
+    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+
+
+def to_gpx(tracks: Sequence[Track]) -> str:
+    """Return a GPX 1.1 document with one track for each episode.
+
+    Raises:
+        ValueError: for a track of fewer than two positions, or a position out of range.
+
+    Example:
+        >>> print(to_gpx([Track("home", [(-2, 162), (-2.4, 162.1)], {"steps": 1})]).splitlines()[7].strip())
+        <trkpt lat="-2.400000000" lon="162.100000000" />
+    """
+    root = ElementTree.Element("gpx", version="1.1", creator="magrl", xmlns="http://www.topografix.com/GPX/1/1")
+    for track in tracks:
+        element = ElementTree.SubElement(root, "trk")
+        _add_text(element, "name", track.name)
+        _add_text(element, "desc", _description(track))
+        segment = ElementTree.SubElement(element, "trkseg")
+        for latitude, longitude in _checked(track.positions):
+            west = -180.0 if longitude == 180 else longitude  # longitudes of GPX are below 180
+            ElementTree.SubElement(segment, "trkpt", lat=_number(latitude), lon=_number(west))
+    return _xml(root)
+
+
+def to_kml(tracks: Sequence[Track]) -> str:
+    """Return a KML 2.2 document with one placemark for each track, clamped to the ground.
+
+    Raises:
+        ValueError: for a track of fewer than two positions, or a position out of range.
+
+    Example:
+        >>> text = to_kml([Track("home", [(-2, 162), (-2.5, 162.5)], {"steps": 1})])
+        >>> "162.000000000,-2.000000000,0 162.500000000,-2.500000000,0" in text
+        True
+    """
+    root = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
+    document = ElementTree.SubElement(root, "Document")
+    for track in tracks:
+        placemark = ElementTree.SubElement(document, "Placemark")
+        _add_text(placemark, "name", track.name)
+        _add_text(placemark, "description", _description(track))
+        shape = ElementTree.SubElement(placemark, "MultiGeometry")
+        for line in cut(track.positions):
+            drawn = ElementTree.SubElement(shape, "LineString")
+            _add_text(drawn, "tessellate", "1")
+            _add_text(drawn, "coordinates", " ".join(f"{_number(lon)},{_number(lat)},0" for lat, lon in line))
+    return _xml(root)
+
+
+WRITERS: dict[str, Callable[[Sequence[Track]], str]] = {".geojson": to_geojson, ".gpx": to_gpx, ".kml": to_kml}
+"""Writers by the suffix of the file."""
+
+
+def check_suffix(path: Path | str) -> str:
+    """Return the suffix of a file of tracks, in lower case.
+
+    Raises:
+        ValueError: for a suffix that is not one of :data:`WRITERS`.
+
+    Example:
+        >>> check_suffix("tracks.GPX")
+        '.gpx'
+    """
+    check_type((Path, str), path=path)
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITERS:
+        raise ValueError(f"a file of tracks must end in one of {', '.join(WRITERS)}, got {str(path)!r}")
+    return suffix
+
+
+def write_tracks(path: Path | str, tracks: Sequence[Track]) -> None:
+    """Write tracks in the format given by the suffix of the file; missing folders are created.
+
+    Raises:
+        ValueError: for a suffix that is not one of :data:`WRITERS`, or a track that cannot be drawn.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "tracks.geojson"
+        >>> write_tracks(path, [Track("home", [(-2, 162), (-2.4, 162.1)], {"steps": 1})])
+        >>> json.loads(path.read_text())["features"][0]["properties"]
+        {'name': 'home', 'steps': 1}
+    """
+    text = WRITERS[check_suffix(path)](tracks)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(text, encoding="utf-8")
+
+
+def cut(positions: Sequence[Position]) -> list[list[Position]]:
+    """Cut a line into pieces that do not cross the antimeridian; each ends, and the next starts, on it.
+
+    Args:
+        positions: latitude, longitude [deg], longitudes from -180 to 180.
+
+    Returns:
+        One piece, plus one for each crossing. The latitude of a crossing lies on the straight line on the map.
+
+    Raises:
+        ValueError: for fewer than two positions, or a position out of range.
+
+    Example:
+        >>> cut([(0.0, 179.5), (1.0, -179.5)])
+        [[(0.0, 179.5), (0.5, 180.0)], [(0.5, -180.0), (1.0, -179.5)]]
+    """
+    points = _checked(positions)
+    lines = [[_beside(points[0], points[1])]]
+    for point in points[1:]:
+        latitude, longitude = lines[-1][-1]
+        after = _beside(point, (latitude, longitude))
+        if abs(after[1] - longitude) > 180:
+            side, left = math.copysign(180.0, longitude), 180 - abs(longitude)
+            crossing = latitude + (after[0] - latitude) * left / (left + 180 - abs(after[1]))
+            if left:
+                lines[-1].append((crossing, side))
+            lines.append([(crossing, -side)])
+        lines[-1].append(after)
+    return lines
+
+
+def _beside(point: Position, other: Position) -> Position:
+    """Return a point on the antimeridian with the sign of another one, so that no cut is made between them."""
+    return (point[0], math.copysign(180.0, other[1])) if abs(point[1]) == 180 else point
+
+
+def _checked(positions: Sequence[Position]) -> list[Position]:
+    """Return at least two valid positions as floats."""
+    if len(positions) < 2:
+        raise ValueError(f"a line must have at least two positions, got {list(positions)}")
+    for position in positions:
+        check_numbers(2, position=position)
+        if not (abs(position[0]) <= 90 and abs(position[1]) <= 180):
+            raise ValueError(
+                f"position must be a latitude within 90 and a longitude within 180 degrees, got {position}"
+            )
+    return [(float(latitude), float(longitude)) for latitude, longitude in positions]
+
+
+def _number(value: float) -> str:
+    """Return degrees to a tenth of a millimeter, without the exponent that GPX does not allow."""
+    return f"{value:.9f}"
+
+
+def _description(track: Track) -> str:
+    """Return the properties in one line."""
+    pairs = ((key, f"{x:.3f}" if isinstance(x, float) else x) for key, x in track.properties.items())
+    return ", ".join(f"{key} {value}" for key, value in pairs)
+
+
+def _add_text(parent: ElementTree.Element, tag: str, text: str) -> None:
+    """Add an element with a text; characters that XML does not allow become question marks."""
+    ElementTree.SubElement(parent, tag).text = re.sub(r"[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
+
+
+def _xml(root: ElementTree.Element) -> str:
+    ElementTree.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"

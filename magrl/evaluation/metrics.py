@@ -1,0 +1,160 @@
+"""Measures of each episode of a rollout, and their summary.
+
+Every measure is computed from positions, moves and flags of the environment, never from a shaped reward. Angles are in
+degrees and distances in kilometers.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from magrl.checks import check_type
+from magrl.envs.measures import path_measures
+from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
+from magrl.geodesy import geodesic, wrap_angle
+
+WITHIN_KM = (10, 25)
+"""Distances of the additional success rates that do not depend on the field [km]."""
+
+
+def first_episode_mask(done: Tensor) -> Tensor:
+    """Return the mask of the steps that belong to the first episode of each vehicle.
+
+    Args:
+        done: ``(M, T)`` or ``(M, T, 1)`` bool.
+
+    Returns:
+        ``(M, T)`` bool: True up to and including the first done.
+
+    Raises:
+        TypeError: for ``done`` that is not a tensor.
+        ValueError: for another shape or dtype.
+
+    Example:
+        >>> first_episode_mask(torch.tensor([[False, True, True]]))
+        tensor([[ True,  True, False]])
+    """
+    check_type(Tensor, done=done)
+    if done.dtype != torch.bool or done.ndim not in (2, 3) or done.shape[2:].numel() != 1:
+        raise ValueError(f"done must be bool of shape (M, T) or (M, T, 1), got {done.dtype} of {tuple(done.shape)}")
+    done = done.reshape(done.shape[:2])
+    return done.long().cumsum(1) - done.long() == 0
+
+
+def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
+    """Return the measures of the first episode of each vehicle.
+
+    Args:
+        rollout: ``(M, T)`` from ``env.rollout``, with the keys of :class:`magrl.envs.GeomagneticNavEnv`.
+
+    Returns:
+        Tensors ``(M,)``: ``success`` bool; ``steps``; ``shortest_km``, ``length_km``, ``navigation_error_km`` and
+        ``spl`` as in :func:`magrl.envs.measures.path_measures`; ``smoothness_deg``, the mean interior angle at
+        way-points (180 is straight, NaN without way-points); ``heading_mae_deg`` and ``heading_rmse_deg``, deviations
+        from the bearing to the destination over the moves of nonzero length (NaN without any).
+
+    Raises:
+        ValueError: for a rollout of other dimensions, or without a vehicle or a step.
+        KeyError: for a missing key.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from magrl.navigators import Secant
+        >>> rollout = GeomagneticNavEnv(num_envs=2, seed=0).rollout(50, Secant(), break_when_any_done=False)
+        >>> episodes = episode_measures(rollout)
+        >>> episodes["success"], episodes["steps"]
+        (tensor([True, True]), tensor([12, 12]))
+    """
+    check_type(TensorDictBase, rollout=rollout)
+    if rollout.ndim != 2 or 0 in rollout.shape:
+        raise ValueError(f"a rollout must be of shape (M, T), each at least 1, got {tuple(rollout.shape)}")
+    valid = first_episode_mask(rollout["next", "done"])
+    steps = valid.sum(1)
+    last = (steps - 1).unsqueeze(-1)
+    success = rollout["next", "success"].squeeze(-1).gather(1, last).squeeze(-1)
+    start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
+    end = rollout["next", "position"].gather(1, last.unsqueeze(-1).expand(-1, 1, 2)).squeeze(1)
+    length_km = (rollout["next", "move"][..., 0].double() * valid).sum(1)
+    deviation = _heading_deviation(rollout, valid)
+    return {
+        "success": success,
+        "steps": steps,
+        **path_measures(success, start, end, target, length_km),
+        "smoothness_deg": 180 - _turns(rollout, valid).nanmean(1),
+        "heading_mae_deg": deviation.nanmean(1),
+        "heading_rmse_deg": (deviation**2).nanmean(1).sqrt(),
+    }
+
+
+def _moving(rollout: TensorDictBase, valid: Tensor) -> Tensor:
+    """Return the mask of the moves that have a direction, ``(M, T)``."""
+    return valid & (rollout["next", "move"][..., 0] > 1e-6)
+
+
+def _heading_deviation(rollout: TensorDictBase, valid: Tensor) -> Tensor:
+    """Return the angle between each move and the bearing to the destination at its start, ``(M, T)`` [deg] or NaN."""
+    _, bearing = geodesic(*rollout["position"].unbind(-1), *rollout["target_position"].unbind(-1))
+    angle = wrap_angle(rollout["next", "heading"].squeeze(-1).double() - bearing).abs()
+    return torch.where(_moving(rollout, valid), torch.rad2deg(angle), math.nan)
+
+
+def _turns(rollout: TensorDictBase, valid: Tensor) -> Tensor:
+    """Return the turn between each move and the last move of nonzero length before it, ``(M, T)`` [deg] or NaN."""
+    heading = rollout["next", "heading"].squeeze(-1).double()
+    moving = _moving(rollout, valid)
+    index = torch.arange(heading.shape[1], device=heading.device).expand_as(heading)
+    latest = torch.where(moving, index, -1).cummax(1).values
+    previous = torch.cat((torch.full_like(latest[:, :1], -1), latest[:, :-1]), 1)
+    turn = wrap_angle(heading - heading.gather(1, previous.clamp_min(0))).abs()
+    return torch.where(moving & (previous >= 0), torch.rad2deg(turn), math.nan)
+
+
+def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
+    """Return the summary of a set of episodes, in the paper's units.
+
+    Args:
+        episodes: from :func:`episode_measures`.
+
+    Returns:
+        ``success_rate`` [%] with its Wilson 95 % interval ``success_rate_low`` and ``success_rate_high``;
+        ``success_rate_within_10km`` and ``success_rate_within_25km`` [%], the share of episodes that end within that
+        distance of the destination, whatever the field there; ``spl`` [%] with its bootstrap 95 % interval
+        ``spl_low`` and ``spl_high``; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper,
+        and with the suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``,
+        ``heading_mae_deg`` and ``heading_rmse_deg`` over successes; ``num_tasks``. Means over no success are NaN.
+
+    Raises:
+        ValueError: for no episode, or ``success`` that is not bool.
+        KeyError: for a missing measure.
+
+    Example:
+        >>> length_km, error_km = torch.tensor([500.0, 480.0]), torch.tensor([8.0, 200.0])
+        >>> ends = {"success": torch.tensor([True, False]), "steps": torch.tensor([10, 50])}
+        >>> ends["spl"] = torch.tensor([0.8, 0.0])
+        >>> angles = dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.zeros(2))
+        >>> summary = summarize({**ends, **angles, "length_km": length_km, "navigation_error_km": error_km})
+        >>> summary["success_rate"], summary["trajectory_length_m"], summary["steps"]
+        (50.0, 500000.0, 10.0)
+    """
+    success = episodes["success"]
+    if success.dtype != torch.bool or success.ndim != 1 or not len(success):
+        raise ValueError(f"success must be bool of shape (M,) with M >= 1, got {success!r}")
+    count = len(success)
+    rate = success.double().mean().item()
+    low, high = wilson_interval(rate, count)
+    error, spl = episodes["navigation_error_km"], episodes["spl"]
+    summary = {"success_rate": 100 * rate, "success_rate_low": 100 * low, "success_rate_high": 100 * high}
+    summary |= {f"success_rate_within_{d}km": 100 * (error <= d).double().mean().item() for d in WITHIN_KM}
+    low, high = bootstrap_interval(spl)
+    summary |= {"spl": 100 * spl.mean().item(), "spl_low": 100 * low, "spl_high": 100 * high}
+    summary["trajectory_length_m"] = 1000 * episodes["length_km"][success].mean().item()
+    summary["trajectory_length_m_all"] = 1000 * episodes["length_km"].mean().item()
+    summary["steps"] = episodes["steps"][success].double().mean().item()
+    summary["steps_all"] = episodes["steps"].double().mean().item()
+    for name in ("navigation_error_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"):
+        summary[name] = episodes[name][success].nanmean().item()
+    return summary | {"num_tasks": count}

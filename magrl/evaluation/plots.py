@@ -1,0 +1,262 @@
+"""Figures of trainings and evaluations: functions from data to matplotlib figures, which read and write no files.
+
+A navigator has the same color in every figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+from tensordict import TensorDictBase
+
+from magrl.checks import check_number, check_type
+from magrl.envs.region import Region
+from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours, draw_tracks
+from magrl.envs.tasks import Tasks
+from magrl.evaluation.metrics import first_episode_mask
+from magrl.evaluation.navigators import NAVIGATOR_NAMES
+from magrl.field.elements import NAMES, UNITS
+from magrl.field.model import FieldModel, elements_at
+
+_COLORS = ("#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+NAVIGATOR_COLORS = dict(zip(NAVIGATOR_NAMES, _COLORS, strict=True))
+"""Color of each navigator in every figure."""
+
+LINES = ("#0072B2", "#D55E00", "#009E73")
+
+TRAINING_PANELS = {
+    "return": {"return": "return"},
+    "return by term": {f"return_{term}": term for term in ("destination", "proximity", "alignment")},
+    "success [%]": {
+        "success_rate": "SR, last 200 episodes",
+        "eval_success_rate": "SR, evaluation",
+        "eval_spl": "SPL, evaluation",
+    },
+    "loss": {"loss_critic": "critics", "loss_actor": "actor"},
+}
+"""Curves of each panel: label by column of ``train.csv``. Returns are means over the last 200 episodes."""
+
+
+def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
+    """Return the curves of one training: return, return by term, success rate and SPL, losses.
+
+    Args:
+        rows: rows of a ``train.csv``; missing values and NaN are left out.
+
+    Raises:
+        ValueError: for no row, or a row without ``frames``.
+
+    Example:
+        >>> rows = [{"frames": 1000, "return": -5.0}, {"frames": 2000, "return": 20.0, "success_rate": 10.0}]
+        >>> [axes.get_title() for axes in training_figure(rows).axes]
+        ['return', 'return by term', 'success [%]', 'loss']
+    """
+    if not rows or not all("frames" in row for row in rows):
+        raise ValueError(f"each row of a training must have frames, got {list(rows)[:1]}")
+    figure = Figure(figsize=(10, 7), layout="constrained")
+    frames = np.array([row["frames"] for row in rows])
+    for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, TRAINING_PANELS.items(), strict=True):
+        for color, (column, label) in zip(LINES, columns.items(), strict=False):
+            values = np.array([row.get(column, np.nan) for row in rows], dtype=float)
+            known = np.isfinite(values)
+            axes.plot(frames[known], values[known], color=color, lw=1.2, label=label)
+        axes.set_title(title)
+        axes.grid(alpha=0.3)
+        if len(columns) > 1:
+            axes.legend(fontsize=8)
+    for axes in figure.axes[2:]:
+        axes.set_xlabel("frames (vehicle-steps)")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    return figure
+
+
+def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Region, episodes: int = 24) -> Figure:
+    """Return a map of the first episodes of a rollout over the field's contours.
+
+    Args:
+        rollout: ``(M, T)`` from the environment.
+        field: any model of :mod:`magrl.field`.
+        region: region of the tasks.
+        episodes: number of episodes to show.
+
+    Example:
+        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> figure = trajectories_figure(env.rollout(3), env.field, env.region)
+        >>> figure.axes[0].get_ylabel()
+        'latitude [° N]'
+    """
+    check_type(TensorDictBase, rollout=rollout)
+    check_number(1, whole=True, episodes=episodes)
+    shown = rollout[:episodes].cpu()
+    steps = first_episode_mask(shown["next", "done"]).sum(1)
+    paths = [
+        torch.cat((row["position"][:1], row["next", "position"][:count]))
+        for row, count in zip(shown, steps.tolist(), strict=True)
+    ]
+    figure = Figure(figsize=(8, 8.4), layout="constrained")
+    draw_tracks(figure.subplots(), field, region, paths, shown["target_position"][:, 0])
+    return figure
+
+
+def _check_navigators(named: Mapping[str, Any]) -> None:
+    unknown = [name for name in named if name not in NAVIGATOR_NAMES]
+    if unknown or not named:
+        raise ValueError(f"navigators must be among {', '.join(NAVIGATOR_NAMES)}, got {unknown or dict(named)}")
+
+
+def learning_curves(
+    curves: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]], label: str, points: int = 200
+) -> Figure:
+    """Return learning curves of several trainings of each navigator: single runs, their mean and their range.
+
+    Args:
+        curves: by navigator, for each run its frames and its values; NaN is left out.
+        label: label of the vertical axis.
+        points: number of points of the mean.
+
+    Raises:
+        ValueError: for an unknown navigator.
+
+    Example:
+        >>> figure = learning_curves({"td3": [([0, 100], [0.0, 50.0]), ([0, 100], [10.0, 70.0])]}, "SPL [%]")
+        >>> figure.axes[0].get_legend().get_texts()[0].get_text()
+        'TD3, 2 seeds'
+    """
+    _check_navigators(curves)
+    check_number(2, whole=True, points=points)
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for name, runs in curves.items():
+        known = [np.array(run)[:, np.isfinite(run[1])] for run in runs]
+        known = [run for run in known if run.shape[1]]
+        if not known:
+            continue
+        grid = np.linspace(max(run[0, 0] for run in known), min(run[0, -1] for run in known), points)
+        values = np.array([np.interp(grid, *run) for run in known])
+        axes.plot(grid, values.T, color=NAVIGATOR_COLORS[name], lw=0.5, alpha=0.5)
+        axes.fill_between(grid, values.min(0), values.max(0), color=NAVIGATOR_COLORS[name], alpha=0.15, lw=0)
+        label_text = f"{NAVIGATOR_NAMES[name]}, {len(known)} seed{'s' if len(known) > 1 else ''}"
+        axes.plot(grid, values.mean(0), color=NAVIGATOR_COLORS[name], lw=2, label=label_text)
+    axes.set(xlabel="frames (vehicle-steps)", ylabel=label)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure
+
+
+def compared_trajectories(
+    tracks: Mapping[str, tuple[Sequence[float], Sequence[float]]], field: FieldModel, task: Tasks
+) -> Figure:
+    """Return a map of the paths of several navigators on one task, over the field's contours (Fig. 4-4).
+
+    Args:
+        tracks: by navigator, latitudes and longitudes of its way-points [deg].
+        field: any model of :mod:`magrl.field`.
+        task: one task.
+
+    Raises:
+        ValueError: for an unknown navigator.
+
+    Example:
+        >>> from magrl.field.igrf import IGRF
+        >>> from magrl.envs.tasks import named_tasks
+        >>> track = ([-2.0, -8.0], [162.0, 164.0])
+        >>> figure = compared_trajectories({"secant": track}, IGRF("2022-01-01"), named_tasks("figure-4-1"))
+        >>> figure.axes[0].lines[-1].get_label()
+        'destination'
+    """
+    _check_navigators(tracks)
+    check_type(Tasks, task=task)
+    figure = Figure(figsize=(8, 8.4), layout="constrained")
+    axes = figure.subplots()
+    points = torch.tensor([[lat, lon] for track in tracks.values() for lat, lon in zip(*track, strict=True)])
+    points = torch.cat((points, task.start, task.target))
+    low, high = (points.amin(0) - 0.5).tolist(), (points.amax(0) + 0.5).tolist()
+    draw_contours(axes, field, Region((low[0], high[0]), (low[1], high[1])))
+    for name, (latitude, longitude) in tracks.items():
+        axes.plot(longitude, latitude, "o-", color=NAVIGATOR_COLORS[name], ms=3, lw=1.5, label=NAVIGATOR_NAMES[name])
+    axes.plot(*task.start.flip(-1).T, "s", color=START, ms=8, label="start")
+    axes.plot(*task.target.flip(-1).T, "^", color=TARGET, ms=9, label="destination")
+    axes.legend(fontsize=8, loc="best")
+    return figure
+
+
+def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: FieldModel, task: Tasks) -> Figure:
+    """Return D, I, B_H and the length of moves against the step (Fig. 4-5 a to d).
+
+    Args:
+        series: by navigator, values of ``D``, ``I``, ``B_H`` and ``L`` at each step, the start first.
+        field: any model of :mod:`magrl.field`, for the target's values.
+        task: the task of all navigators.
+
+    Raises:
+        ValueError: for an unknown navigator.
+
+    Example:
+        >>> from magrl.field.igrf import IGRF
+        >>> from magrl.envs.tasks import named_tasks
+        >>> values = {"D": [8.0, 9.0], "I": [-16.0, -27.0], "B_H": [35466.0, 35000.0], "L": [0.0, 50.0]}
+        >>> figure = convergence({"secant": values}, IGRF("2022-01-01"), named_tasks("figure-4-1"))
+        >>> [axes.get_title() for axes in figure.axes]
+        ['(a)', '(b)', '(c)', '(d)']
+    """
+    _check_navigators(series)
+    check_type(Tasks, task=task)
+    targets = dict(zip(NAMES, elements_at(field, task.target[0]).tolist(), strict=True))
+    labels = {name: f"{SYMBOLS[name]} [{unit}]" for name, unit in zip(NAMES, UNITS, strict=True)}
+    labels["L"] = "length of the move [km]"
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    for letter, axes, (key, label) in zip("abcd", figure.subplots(2, 2).flat, labels.items(), strict=True):
+        for name, values in series.items():
+            shown = list(enumerate(values[key]))[key == "L" :]
+            axes.plot(*zip(*shown, strict=True), color=NAVIGATOR_COLORS[name], lw=1.5, label=NAVIGATOR_NAMES[name])
+        if key in targets:
+            axes.axhline(targets[key], color="#404040", ls="--", lw=1, label="at the destination")
+        axes.set(xlabel="step", ylabel=label, title=f"({letter})")
+        axes.grid(alpha=0.3)
+    figure.axes[0].legend(fontsize=8)
+    return figure
+
+
+def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
+    """Return box plots of heading deviation, smoothness and navigation error of successes (Fig. 4-6 a to d).
+
+    Args:
+        measures: by navigator, one value for each episode of ``heading_mae_deg``, ``heading_rmse_deg``,
+            ``smoothness_deg`` and ``navigation_error_km``; NaN is left out.
+
+    Raises:
+        ValueError: for an unknown navigator, or none.
+
+    Example:
+        >>> measures = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
+        >>> figure = box_plots({"secant": dict.fromkeys(measures, [1.0, 2.0, 4.0])})
+        >>> figure.axes[3].get_ylabel()
+        'navigation error [km]'
+    """
+    _check_navigators(measures)
+    labels = {
+        "heading_mae_deg": "MAE of heading deviation [°]",
+        "heading_rmse_deg": "RMSE of heading deviation [°]",
+        "smoothness_deg": "path smoothness [°]",
+        "navigation_error_km": "navigation error [km]",
+    }
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    for letter, axes, (key, label) in zip("abcd", figure.subplots(2, 2).flat, labels.items(), strict=True):
+        values = [np.array(m[key])[np.isfinite(m[key])] for m in measures.values()]
+        boxes = axes.boxplot(values, patch_artist=True, showmeans=True, flierprops={"ms": 2, "alpha": 0.4})
+        for box, name in zip(boxes["boxes"], measures, strict=True):
+            box.set(facecolor=NAVIGATOR_COLORS[name], alpha=0.6)
+        short = {"gg_td3": "GG TD3", "recurrent": "recurrent"}  # the full names would overlap
+        names = [short.get(name, NAVIGATOR_NAMES[name]) for name in measures]
+        axes.set_xticks(range(1, len(names) + 1), names)
+        axes.set(ylabel=label, title=f"({letter})")
+        axes.grid(alpha=0.3, axis="y")
+    return figure

@@ -1,0 +1,278 @@
+"""Replay of episodes: a web page in a single file without dependencies, and an animated GIF.
+
+The page is ``templates/replay.html`` with the data embedded as JSON, escaped so that no name can inject markup.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from magrl.checks import check_number, check_type
+from magrl.envs.region import Region
+from magrl.envs.rendering import PATH, START, TARGET, contour_lines, draw_contours
+from magrl.evaluation.metrics import episode_measures
+from magrl.field.model import FieldModel
+from magrl.geodesy import geodesic, move
+
+PIECES = 4
+"""Pieces in which a move is drawn, since a geodesic is not a straight line on the map."""
+
+PLACEHOLDER = "{{replay-data}}"
+_SEEN = ("position", "field", "objective", "heading", "move")
+GIF_COLORS, STEP_MS = 96, 320
+
+
+def replay_data(
+    rollouts: Mapping[str, TensorDictBase], field: FieldModel, region: Region, *, zeta: float, title: str = ""
+) -> dict[str, Any]:
+    """Return the data of the page, as lists and numbers.
+
+    Args:
+        rollouts: by label of the navigator, ``(M, T)`` from the environment, each over the same tasks.
+        field: field model of the environment.
+        region: region of the tasks; the map is extended to hold all tracks.
+        zeta: arrival threshold on the objective.
+        title: title of the page.
+
+    Returns:
+        ``title``, ``zeta``, ``pieces``, ``region``, ``contours`` of each element, ``tasks`` and ``navigators``. Each
+        navigator has an episode for each task: its values at every step, start first, and its measures. Latitudes,
+        unwrapped longitudes and all angles in degrees, lengths in km, intensities in nT.
+
+    Raises:
+        ValueError: for no rollout, a rollout of other tasks than the first, or a threshold out of its range.
+
+    Example:
+        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> data = replay_data({"random": env.rollout(3)}, env.field, env.region, zeta=env.zeta)
+        >>> len(data["navigators"][0]["episodes"])
+        2
+    """
+    check_type(Mapping, rollouts=rollouts)
+    check_type(Region, region=region)
+    check_type(str, title=title)
+    check_number(0, above=True, zeta=zeta)
+    check_type(TensorDictBase, **{f"the rollout {name!r}": rollout for name, rollout in rollouts.items()})
+    if not rollouts:
+        raise ValueError("rollouts must hold at least one rollout, got {}")
+    first = next(iter(rollouts.values()))
+    for name, rollout in rollouts.items():
+        if any(not torch.equal(rollout[key][:, 0], first[key][:, 0]) for key in ("start_position", "target_position")):
+            raise ValueError(f"the rollout {name!r} is of other tasks than {next(iter(rollouts))!r}")
+    tracks = {name: episode_tracks(rollout, region) for name, rollout in rollouts.items()}
+    target = region.unwrapped(first["target_position"][:, 0])
+    shown = region.holding(torch.cat([target.cpu(), *(track for group in tracks.values() for track in group)]))
+    return {
+        "title": title,
+        "zeta": zeta,
+        "pieces": PIECES,
+        "region": {"latitude": shown.latitude, "longitude": shown.longitude},
+        "contours": _contours(field, shown),
+        "tasks": _tasks(first, region),
+        "navigators": [
+            {"label": name, "episodes": _episodes(rollout, tracks[name])} for name, rollout in rollouts.items()
+        ],
+    }
+
+
+def episode_tracks(rollout: TensorDictBase, region: Region) -> list[Tensor]:
+    """Return the track of the first episode of each vehicle, each move in :data:`PIECES` pieces of its geodesic.
+
+    Args:
+        rollout: ``(M, T)`` from the environment.
+        region: region of the tasks.
+
+    Returns:
+        ``M`` tensors ``(PIECES * steps + 1, 2)``, latitude and unwrapped longitude [deg]; every ``PIECES``-th is a
+        way-point.
+
+    Raises:
+        ValueError: for a rollout of other dimensions.
+
+    Example:
+        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(seed=0)
+        >>> track, = episode_tracks(env.rollout(3), env.region)
+        >>> len(track) == 3 * PIECES + 1
+        True
+    """
+    check_type(TensorDictBase, rollout=rollout)
+    check_type(Region, region=region)
+    rollout = rollout.cpu()
+    steps = episode_measures(rollout)["steps"].tolist()
+    latitude, longitude = rollout["position"].unsqueeze(-2).unbind(-1)
+    share = torch.arange(PIECES, dtype=torch.float64) / PIECES
+    heading, distance = rollout["next", "heading"].double(), rollout["next", "move"][..., :1].double()
+    legs = torch.stack(move(latitude, longitude, heading, distance * share), -1)
+    legs[..., 0, :] = rollout["position"]
+    rows = zip(legs, rollout["next", "position"], steps, strict=True)
+    return [
+        region.unwrapped(torch.cat((leg[:count].flatten(0, 1), after[count - 1 : count]))) for leg, after, count in rows
+    ]
+
+
+def _rounded(values: Tensor, digits: int) -> Any:
+    return np.round(values.double().cpu().numpy(), digits).tolist()
+
+
+def _contours(field: FieldModel, region: Region) -> dict[str, list[dict[str, Any]]]:
+    """Return the lines of each element: their level and their points, longitude first [deg]."""
+    return {
+        name: [
+            {"level": round(float(level), 6), "line": np.round(line, 3).tolist()}
+            for level, lines in zip(contours.levels, contours.allsegs, strict=True)
+            for line in lines
+            if len(line) > 1
+        ]
+        for name, contours in contour_lines(Figure().subplots(), field, region).items()
+    }
+
+
+def _tasks(rollout: TensorDictBase, region: Region) -> list[dict[str, Any]]:
+    """Return start, target and the elements at the target of each task."""
+    start, target = (region.unwrapped(rollout[f"{end}_position"][:, 0]) for end in ("start", "target"))
+    columns = (_rounded(start, 5), _rounded(target, 5), _rounded(rollout["target_field"][:, 0], 4))
+    return [dict(zip(("start", "target", "field"), row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def _episodes(rollout: TensorDictBase, tracks: list[Tensor]) -> list[dict[str, Any]]:
+    """Return the data of the episodes of a navigator."""
+    measures = episode_measures(rollout)
+    rows = [dict(zip(measures, row, strict=True)) for row in zip(*(m.tolist() for m in measures.values()), strict=True)]
+    return [_episode(*each) for each in zip(rollout.cpu(), tracks, rows, strict=True)]
+
+
+def _episode(row: TensorDictBase, track: Tensor, measures: dict[str, Any]) -> dict[str, Any]:
+    """Return the data of an episode ``(T,)``: its values at each step, start first, and its measures."""
+    count = measures["steps"]
+    seen = {key: torch.cat((row[key][:1], row["next", key][:count])) for key in _SEEN}
+    left, _ = geodesic(*seen["position"].unbind(-1), *row["target_position"][0])
+    lost = bool(row["next", "terminated"][count - 1])
+    return {
+        "track": _rounded(track, 5),
+        "field": _rounded(seen["field"], 4),
+        "objective": [float(f"{value:.4g}") for value in seen["objective"].flatten().tolist()],
+        "heading_deg": _rounded(seen["heading"].squeeze(-1).rad2deg() % 360, 2),
+        "move_km": _rounded(seen["move"][:, 0], 4),
+        "turn_deg": _rounded(seen["move"][:, 1].rad2deg(), 2),
+        "path_km": _rounded(seen["move"][:, 0].double().cumsum(0), 4),
+        "distance_km": _rounded(left, 4),
+        "outcome": "arrived" if measures["success"] else "lost" if lost else "out of steps",
+        "steps": count,
+        **{key: round(measures[key], 4) for key in ("shortest_km", "length_km", "navigation_error_km", "spl")},
+    }
+
+
+def write_replay(path: Path | str, data: Mapping[str, Any]) -> None:
+    """Write the page: one file that opens from disk and makes no network requests.
+
+    Args:
+        path: path of the page; an existing file is replaced.
+        data: from :func:`replay_data`.
+
+    Raises:
+        KeyError: for missing keys, naming them.
+        ValueError: for non-finite values.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "replay.html"
+        >>> write_replay(path, {"title": "none", "contours": {}, "tasks": [], "navigators": []})
+        >>> path.read_text()[:15]
+        '<!doctype html>'
+    """
+    check_type((Path, str), path=path)
+    check_type(Mapping, data=data)
+    missing = {"title", "contours", "tasks", "navigators"} - data.keys()
+    if missing:
+        raise KeyError(f"data must come from replay_data; it lacks {', '.join(sorted(missing))}")
+    template = files("magrl.evaluation").joinpath("templates/replay.html").read_text(encoding="utf-8")
+    # Without "<", no text can end the script element that holds the data.
+    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    Path(path).write_text(template.replace(PLACEHOLDER, text), encoding="utf-8")
+
+
+def write_gif(
+    path: Path | str,
+    rollout: TensorDictBase,
+    field: FieldModel,
+    region: Region,
+    *,
+    frames_per_step: int = 3,
+    size_px: int = 640,
+) -> None:
+    """Write the episodes of a rollout over the field's contours as an animated GIF that loops.
+
+    Args:
+        path: path of the image; an existing file is replaced.
+        rollout: ``(M, T)`` from the environment; all episodes are shown.
+        field: field model of the environment.
+        region: region of the tasks.
+        frames_per_step: frames per move.
+        size_px: height and width [pixels].
+
+    Raises:
+        ValueError: for ``frames_per_step`` or ``size_px`` below 1, or a rollout of other dimensions.
+
+    Example:
+        >>> import tempfile
+        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
+        >>> env, path = GeomagneticNavEnv(seed=0), Path(tempfile.mkdtemp()) / "episodes.gif"
+        >>> write_gif(path, env.rollout(1), env.field, env.region, frames_per_step=1, size_px=200)
+        >>> path.read_bytes()[:3]
+        b'GIF'
+    """
+    check_type((Path, str), path=path)
+    check_number(1, whole=True, frames_per_step=frames_per_step, size_px=size_px)
+    frames = list(_frames(rollout, field, region, frames_per_step, size_px))
+    sample = np.hstack([np.asarray(frame) for frame in (frames[0], frames[len(frames) // 2], frames[-1])])
+    palette = Image.fromarray(sample).quantize(GIF_COLORS)  # one for all frames, so that unchanged pixels compress well
+    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    durations = [STEP_MS // frames_per_step] * len(others) + [4 * STEP_MS]
+    first.save(Path(path), "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def _frames(
+    rollout: TensorDictBase, field: FieldModel, region: Region, frames_per_step: int, size_px: int
+) -> Iterator[Image.Image]:
+    """Yield the frames; vehicles that have arrived take the color of destinations."""
+    tracks = [track.numpy() for track in episode_tracks(rollout, region)]
+    success = episode_measures(rollout)["success"].tolist()
+    targets = region.unwrapped(rollout["target_position"][:, 0]).cpu()
+    figure = Figure(figsize=(6.4, 6.4), dpi=(size_px + 0.01) / 6.4, layout="constrained")
+    canvas, axes = FigureCanvasAgg(figure), figure.subplots()
+    draw_contours(axes, field, region.holding(torch.cat([targets, *map(torch.from_numpy, tracks)])))
+    axes.plot(*np.array([track[0] for track in tracks]).T[::-1], "s", color=START, ms=4)
+    axes.plot(*targets.T.flip(0), "^", color=TARGET, ms=7)
+    lines = [axes.plot([], [], lw=1.8, marker="o", ms=6, markevery=[-1])[0] for _ in tracks]
+    last = max(len(track) for track in tracks) - 1
+    times = np.linspace(0, last, last // PIECES * frames_per_step + 1)
+    canvas.draw()
+    figure.set_layout_engine("none")  # a fixed layout in all frames
+    for time in times:
+        for line, track, arrives in zip(lines, tracks, success, strict=True):
+            line.set_data(*_until(track, time).T[::-1])
+            line.set_color(TARGET if arrives and time >= len(track) - 1 else PATH)
+        canvas.draw()
+        yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+
+
+def _until(track: np.ndarray, time: float) -> np.ndarray:
+    """Return a track up to a time in pieces, with an interpolated last point."""
+    knots = np.arange(len(track))
+    now = min(time, len(track) - 1)
+    end = [np.interp(now, knots, column) for column in track.T]
+    return np.vstack((track[: int(now) + 1], end))

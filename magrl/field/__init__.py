@@ -1,0 +1,19 @@
+"""Models of the geomagnetic field: IGRF, spherical harmonic expansions, and fast regional expansions of either."""
+
+from magrl.field.igrf import IGRF, Date, igrf_coefficients, parse_date
+from magrl.field.model import FieldModel, elements_at, elements_gradient_at, elements_range
+from magrl.field.regional import RegionalField
+from magrl.field.spherical import SphericalHarmonicField
+
+__all__ = [
+    "IGRF",
+    "Date",
+    "FieldModel",
+    "RegionalField",
+    "SphericalHarmonicField",
+    "elements_at",
+    "elements_gradient_at",
+    "elements_range",
+    "igrf_coefficients",
+    "parse_date",
+]

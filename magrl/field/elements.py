@@ -1,0 +1,171 @@
+"""Magnetic elements: a field vector as angles and intensities (Eq. 2-1, with signs).
+
+The paper's arccos loses the sign of both angles; ``atan2`` keeps it. Declination and inclination are in degrees,
+intensities in nanotesla. The order of the three elements that a vehicle measures is D, I, B_H everywhere. A NaN
+component makes every element and derivative that depends on it NaN.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_tensor
+
+NAMES = ("D", "I", "B_H")
+"""Elements that a vehicle measures, in the order of every ``field`` tensor."""
+
+
+UNITS = ("deg", "deg", "nT")
+"""Units of :data:`NAMES`."""
+
+
+class Elements(NamedTuple):
+    """The seven elements of Eq. 2-1, each ``(...)``: D, I [deg]; B_H, B_x, B_y, B_z, B_F [nT].
+
+    Example:
+        >>> elements = seven_elements(torch.tensor([3.0, 4.0, 12.0]))
+        >>> elements.B_H, elements.B_F
+        (tensor(5.), tensor(13.))
+    """
+
+    D: Tensor
+    I: Tensor  # noqa: E741 - the element's name in the field's literature
+    B_H: Tensor
+    B_x: Tensor
+    B_y: Tensor
+    B_z: Tensor
+    B_F: Tensor
+
+
+def element_index(name: str) -> int:
+    """Return the column of an element in a ``field`` tensor.
+
+    Args:
+        name: D, I or B_H.
+
+    Raises:
+        ValueError: for another name.
+
+    Example:
+        >>> element_index("B_H")
+        2
+    """
+    if name not in NAMES:
+        raise ValueError(f"unknown magnetic element {name!r}: choose from {', '.join(NAMES)}")
+    return NAMES.index(name)
+
+
+def seven_elements(b_ned: Tensor) -> Elements:
+    """Return the seven elements of a field vector.
+
+    Args:
+        b_ned: ``(..., 3)`` north, east, down [nT].
+
+    Returns:
+        Seven tensors ``(...)``. D is in (-180, 180], I in [-90, 90]; at a magnetic pole, where B_H is zero, D is 0.
+
+    Example:
+        >>> e = seven_elements(torch.tensor([30000.0, 0.0, -40000.0]))
+        >>> float(e.B_F), round(float(e.I), 2)
+        (50000.0, -53.13)
+    """
+    check_tensor(3, b_ned=b_ned)
+    north, east, down = b_ned.unbind(-1)
+    horizontal = torch.hypot(north, east)
+    declination = torch.rad2deg(torch.atan2(east + 0.0, north + 0.0))  # adding zero removes the sign of a zero
+    inclination = torch.rad2deg(torch.atan2(down, horizontal))
+    return Elements(declination, inclination, horizontal, north, east, down, torch.hypot(horizontal, down))
+
+
+def measured_elements(b_ned: Tensor) -> Tensor:
+    """Return D, I, B_H of a field vector: the elements that a vehicle measures.
+
+    Args:
+        b_ned: ``(..., 3)`` north, east, down [nT].
+
+    Returns:
+        ``(..., 3)``: D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> measured_elements(torch.tensor([30000.0, 0.0, 0.0]))
+        tensor([    0.,     0., 30000.])
+    """
+    check_tensor(3, b_ned=b_ned)
+    north, east, down = b_ned.unbind(-1)
+    horizontal = torch.hypot(north, east)
+    # Adding zero removes the sign of a zero.
+    angles = torch.rad2deg(torch.atan2(torch.stack((east + 0.0, down), -1), torch.stack((north + 0.0, horizontal), -1)))
+    return torch.cat((angles, horizontal.unsqueeze(-1)), -1)
+
+
+def field_vector(elements: Tensor) -> Tensor:
+    """Return the field vector of D, I, B_H: the inverse of :func:`measured_elements`.
+
+    Args:
+        elements: ``(..., 3)``: D [deg], I [deg, inside (-90, 90)], B_H [nT].
+
+    Returns:
+        ``(..., 3)`` north, east, down [nT].
+
+    Example:
+        >>> field_vector(torch.tensor([90.0, 0.0, 30000.0])).round()
+        tensor([   -0., 30000.,     0.])
+    """
+    check_tensor(3, elements=elements)
+    declination, inclination = torch.deg2rad(elements[..., :2]).unbind(-1)
+    horizontal = elements[..., 2]
+    return torch.stack(
+        (horizontal * torch.cos(declination), horizontal * torch.sin(declination), horizontal * torch.tan(inclination)),
+        -1,
+    )
+
+
+def elements_jacobian(b_ned: Tensor) -> Tensor:
+    """Return the derivatives of D, I, B_H with respect to the field vector.
+
+    Args:
+        b_ned: ``(..., 3)`` north, east, down [nT].
+
+    Returns:
+        ``(..., 3, 3)``: rows D [deg/nT], I [deg/nT], B_H [1]; columns north, east, down. Where B_H is zero the
+        direction of the horizontal field is undefined; the rows of D and B_H are zero there.
+
+    Example:
+        >>> elements_jacobian(torch.tensor([100.0, 0.0, 0.0]))[0, 1].deg2rad()  # D turns by 1/B_H per nT eastward
+        tensor(0.0100)
+    """
+    check_tensor(3, b_ned=b_ned)
+    north, east, down = b_ned.unbind(-1)
+    horizontal2 = north * north + east * east
+    horizontal = torch.sqrt(horizontal2)
+    total2 = horizontal2 + down * down
+    defined = horizontal2 != 0  # NaN stays NaN
+    inverse = torch.where(defined, 1 / torch.where(defined, horizontal, 1.0), 0.0)
+    inverse_total2 = torch.where(total2 != 0, 1 / torch.where(total2 != 0, total2, 1.0), 0.0)
+    unit_north, unit_east = north * inverse, east * inverse
+    zero = torch.zeros_like(north)
+    d_row = torch.rad2deg(torch.stack((-unit_east * inverse, unit_north * inverse, zero), -1))
+    i_row = torch.stack((-down * unit_north, -down * unit_east, horizontal), -1) * inverse_total2.unsqueeze(-1)
+    h_row = torch.stack((unit_north, unit_east, zero), -1)
+    return torch.stack((d_row, torch.rad2deg(i_row), h_row), -2)
+
+
+def elements_gradient(b_ned: Tensor, b_gradient: Tensor) -> Tensor:
+    """Return the horizontal gradient of D, I, B_H by the chain rule.
+
+    Args:
+        b_ned: ``(..., 3)`` north, east, down [nT].
+        b_gradient: ``(..., 3, 2)`` derivative of each component northward and eastward [nT/km].
+
+    Returns:
+        ``(..., 3, 2)``: D [deg/km], I [deg/km], B_H [nT/km], each northward and eastward.
+
+    Example:
+        >>> elements_gradient(torch.ones(3), torch.zeros(3, 2)).shape
+        torch.Size([3, 2])
+    """
+    check_tensor(3, 2, b_gradient=b_gradient)
+    return elements_jacobian(b_ned) @ b_gradient

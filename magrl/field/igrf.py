@@ -1,0 +1,126 @@
+"""The International Geomagnetic Reference Field and the dates at which it is evaluated."""
+
+from __future__ import annotations
+
+import datetime
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from magrl.checks import short
+from magrl.field.spherical import SphericalHarmonicField
+
+Date = datetime.datetime | datetime.date | str | float
+"""A ``datetime`` or ``date``, ISO text such as ``"2022-01-01"``, or a decimal year such as ``2022.0``."""
+
+
+def parse_date(date: Date) -> datetime.datetime:
+    """Return a date in any of the accepted forms as a naive UTC ``datetime``.
+
+    Args:
+        date: ``datetime`` (aware ones are converted to UTC), ``date`` (its midnight), ISO 8601 text, or decimal year.
+
+    Raises:
+        ValueError: for text that is not an ISO date, a number that is not a year between 1 and 9999, or another type.
+
+    Example:
+        >>> parse_date(2022.5)
+        datetime.datetime(2022, 7, 2, 12, 0)
+    """
+    if isinstance(date, str):
+        try:
+            date = datetime.datetime.fromisoformat(date)
+        except ValueError as error:
+            raise ValueError(f"date {date!r} is not an ISO date such as '2022-01-01'") from error
+    if isinstance(date, datetime.datetime):
+        return date.astimezone(datetime.timezone.utc).replace(tzinfo=None) if date.tzinfo else date
+    if isinstance(date, datetime.date):
+        return datetime.datetime(date.year, date.month, date.day)
+    if isinstance(date, bool) or not isinstance(date, (int, float)):
+        raise ValueError(f"date {date!r} is neither a datetime, nor ISO text, nor a decimal year")
+    if not 1 <= date < 9999:
+        raise ValueError(f"date {short(date)} is not a year between 1 and 9999")
+    year = int(date)
+    start, end = datetime.datetime(year, 1, 1), datetime.datetime(year + 1, 1, 1)
+    return start + datetime.timedelta(seconds=(date - year) * (end - start).total_seconds())
+
+
+@cache
+def _igrf_tables(generation: int) -> tuple[list[datetime.datetime], np.ndarray]:
+    """Return epochs and complex Gauss tables ``(epochs, N + 1, N + 1)`` of one IGRF generation, from ppigrf."""
+    from ppigrf import ppigrf  # imports pandas, so only where it is needed
+
+    files = {13: ppigrf.shc_fn_igrf13, 14: ppigrf.shc_fn_igrf14}
+    if not isinstance(generation, int) or generation not in files:
+        raise ValueError(f"IGRF generation {generation!r} is not available: choose from {sorted(files)}")
+    g, h = ppigrf.read_shc(files[generation])
+    n, m = np.array(list(g.columns)).T
+    table = np.zeros((len(g), n.max() + 1, n.max() + 1), dtype=np.complex128)
+    table[:, n, m] = g.to_numpy() - 1j * h.to_numpy()
+    return [epoch.to_pydatetime() for epoch in g.index], table
+
+
+def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
+    """Return the Gauss coefficients at a date, linear in time between the model's epochs.
+
+    Args:
+        date: see :data:`Date`.
+        generation: 13 or 14.
+
+    Returns:
+        Complex ``(14, 14)`` table ``g - i h`` [nT], Schmidt semi-normalized, degree by order.
+
+    Raises:
+        ValueError: for another generation, or a date outside the model, with its valid span.
+
+    Source:
+        Coefficient files distributed with ppigrf (IAGA IGRF-13 and IGRF-14).
+
+    Example:
+        >>> round(float(igrf_coefficients("2020-01-01")[1, 0].real), 2)
+        -29403.41
+    """
+    epochs, table = _igrf_tables(generation)
+    when = parse_date(date)
+    if not epochs[0] <= when <= epochs[-1]:
+        raise ValueError(
+            f"date {when.isoformat()} is outside IGRF-{generation}, which is valid from {epochs[0].date()} "
+            f"to {epochs[-1].date()}"
+        )
+    right = next(k for k in range(1, len(epochs)) if when <= epochs[k])
+    weight = (when - epochs[right - 1]) / (epochs[right] - epochs[right - 1])
+    return torch.from_numpy((1 - weight) * table[right - 1] + weight * table[right])
+
+
+class IGRF(SphericalHarmonicField):
+    """The International Geomagnetic Reference Field at one date.
+
+    Args:
+        date: ``datetime``, ISO text or decimal year, from 1900.0 to the end of the generation.
+        generation: 13 (to 2025) or 14 (to 2030). The paper's figures are those of 13 at 2022-01-01.
+        altitude_km: default height above the ellipsoid [km].
+        chunk: points evaluated at a time.
+
+    Raises:
+        ValueError: for an unknown generation, or a date outside the model, with the valid span.
+
+    Source:
+        Alken et al., International Geomagnetic Reference Field: the thirteenth generation, EPS 73 (2021);
+        coefficients as distributed with ppigrf.
+
+    Example:
+        >>> igrf = IGRF("2022-01-01", generation=13)
+        >>> igrf(torch.tensor(-2.0), torch.tensor(162.0)).round()
+        tensor([ 35120.,   4947., -10270.], dtype=torch.float64)
+    """
+
+    def __init__(self, date: Date, generation: int = 14, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
+        super().__init__(igrf_coefficients(date, generation), altitude_km=altitude_km, chunk=chunk)
+        self.date = parse_date(date)
+        self.generation = generation
+
+    def extra_repr(self) -> str:
+        """Return the date, the generation and the default height as text."""
+        return f"date={self.date.isoformat()}, generation={self.generation}, altitude_km={self.altitude_km}"

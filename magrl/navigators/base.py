@@ -1,0 +1,182 @@
+"""Base class of navigators (policies without training) and the steering that they share.
+
+A navigator reads keys of the plain :class:`magrl.envs.GeomagneticNavEnv` in physical units and writes ``action``
+``(N, 2)``: distance [km] and turn [rad]. A navigator that reads privileged keys, or the field at places where the
+vehicle has not been, has ``oracle = True``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from magrl.checks import check_number, check_tensor
+from magrl.field.elements import element_index
+from magrl.geodesy import wrap_angle
+
+
+def steer(
+    heading: Tensor, wanted: Tensor, distance_km: Tensor, max_move_km: float, max_turn_rad: float
+) -> tuple[Tensor, Tensor]:
+    """Return the action that moves a distance at a heading.
+
+    Where one turn does not reach that heading, the vehicle turns as far as it can and stays: no path is shorter.
+
+    Args:
+        heading: ``(...)`` present heading [rad].
+        wanted: ``(...)`` heading to move at [rad].
+        distance_km: ``(...)`` distance to move [km].
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+
+    Returns:
+        Distance [km] and turn [rad], each ``(...)``, within their bounds; a NaN heading gives a NaN turn.
+
+    Raises:
+        ValueError: for a bound that is not positive and finite.
+
+    Example:
+        >>> steer(torch.zeros(2), torch.tensor([-1.0, 2.0]), torch.tensor([70.0, 70.0]), 50.0, 1.5)
+        (tensor([50.,  0.]), tensor([-1.0000,  1.5000]))
+    """
+    check_tensor(heading=heading, wanted=wanted, distance_km=distance_km)
+    check_number(0, above=True, max_move_km=max_move_km, max_turn_rad=max_turn_rad)
+    turn = wrap_angle(wanted - heading)
+    within = turn.abs() <= max_turn_rad + 1e-6  # a right angle in float32 is still a right angle
+    distance = torch.where(within, distance_km.clamp(0, max_move_km), 0.0)
+    return distance, turn.clamp(-max_turn_rad, max_turn_rad)
+
+
+def displacement_to(error: Tensor, jacobian: Tensor) -> Tensor:
+    """Return the displacement that closes an error in the elements, by least squares.
+
+    Args:
+        error: ``(..., E)`` target elements minus measured elements, in comparable units.
+        jacobian: ``(..., E, 2)`` change of the elements, in the same units per km north and east.
+
+    Returns:
+        ``(..., 2)`` north, east [km]; finite for singular equations. NaN in gives NaN out.
+
+    Raises:
+        ValueError: for shapes that do not match.
+
+    Example:
+        >>> displacement_to(torch.tensor([2.0, 1.0]), torch.tensor([[0.0, 0.1], [0.5, 0.0]]))
+        tensor([ 2., 20.])
+    """
+    check_tensor(error=error)
+    check_tensor(*error.shape[-1:], 2, jacobian=jacobian)
+    wide, sides = jacobian.double(), error.double().unsqueeze(-1)  # the normal equations halve the digits
+    normal, right = wide.mT @ wide, (wide.mT @ sides).squeeze(-1)
+    ridge = 1e-12 * normal.diagonal(dim1=-2, dim2=-1).sum(-1) + 1e-30
+    a, b, c = normal[..., 0, 0] + ridge, normal[..., 0, 1], normal[..., 1, 1] + ridge
+    north, east = right.unbind(-1)
+    solved = torch.stack((c * north - b * east, a * east - b * north), -1) / (a * c - b * b).unsqueeze(-1)
+    return solved.to(error.dtype)
+
+
+def element_indices(elements: Sequence[str], least: int) -> list[int]:
+    """Return the columns of ``field`` that hold some elements.
+
+    Raises:
+        ValueError: for an unknown name, a repeated name, or fewer than ``least`` names.
+
+    Example:
+        >>> element_indices(("D", "B_H"), least=2)
+        [0, 2]
+    """
+    if isinstance(elements, str) or not isinstance(elements, Sequence):
+        raise ValueError(f"elements must be a sequence of D, I, B_H, got {elements!r}")
+    if len(set(elements)) != len(elements) or len(elements) < least:
+        raise ValueError(f"elements must be at least {least} different names of D, I, B_H, got {tuple(elements)}")
+    return [element_index(name) for name in elements]
+
+
+class Navigator(TensorDictModuleBase):
+    """Base class of untrained policies: action bounds, and a memory of each vehicle for the length of an episode.
+
+    A subclass sets its ``in_keys``, returns the memory at the start of an episode (``step_count`` 0) in
+    :meth:`first_memory`, and chooses the next move in :meth:`decide`. :meth:`decide` is called once for each step of a
+    vehicle, so that calling the navigator twice on one state changes nothing; if ``done`` is among the ``in_keys``, it
+    is not called after the end of an episode.
+
+    Args:
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+
+    Raises:
+        ValueError: for a bound out of its range.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> class DueEast(Navigator):
+        ...     def __init__(self):
+        ...         super().__init__(max_move_km=50.0, max_turn_rad=math.pi / 2)
+        ...         self.in_keys = ["heading", "step_count"]
+        ...
+        ...     def first_memory(self, seen):
+        ...         return {}
+        ...
+        ...     def decide(self, seen, memory):
+        ...         heading = seen["heading"].squeeze(-1)
+        ...         east, way = torch.full_like(heading, math.pi / 2), torch.full_like(heading, 30.0)
+        ...         return steer(heading, east, way, self.max_move_km, self.max_turn_rad)
+        >>> GeomagneticNavEnv(num_envs=1, seed=0).rollout(2, DueEast())["action"].round(decimals=2)
+        tensor([[[30.0000,  1.5700],
+                 [30.0000,  0.0000]]])
+    """
+
+    oracle: bool = False
+    """Whether the navigator reads privileged keys, or the field where the vehicle has not been."""
+
+    def __init__(self, max_move_km: float, max_turn_rad: float) -> None:
+        super().__init__()
+        check_number(0, above=True, max_move_km=max_move_km)
+        check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
+        self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
+        self.out_keys = ["action"]
+        self.memory: TensorDictBase | None = None
+
+    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
+        """Return the memory of vehicles at the start of an episode: tensors ``(N, ...)``."""
+        raise NotImplementedError
+
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return distance [km] and turn [rad], each ``(P,)``, of vehicles in a new state, and update their memory."""
+        raise NotImplementedError
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]."""
+        seen = tensordict.select(*self.in_keys)
+        self.memory = memory = self._recall(seen)
+        step = seen["step_count"].squeeze(-1)
+        if "done" in self.in_keys:  # a rollout steps all vehicles until the last one is done
+            memory["over"] = memory["over"] | seen["done"].squeeze(-1)
+            memory["action"] = torch.where(memory["over"].unsqueeze(-1), 0.0, memory["action"])
+        rows = ((step != memory["decided_at"]) & ~memory["over"]).nonzero().squeeze(-1)
+        if len(rows):
+            part = memory[rows]
+            part["action"] = torch.stack(self.decide(seen[rows], part), -1).to(part["action"].dtype)
+            part["decided_at"] = step[rows]
+            memory[rows] = part
+        return tensordict.set("action", memory["action"].clone())
+
+    def _recall(self, seen: TensorDictBase) -> TensorDictBase:
+        """Return the memory of the batch, reset where an episode starts."""
+        step = seen["step_count"].squeeze(-1)
+        own = {"action": seen["heading"].new_zeros(len(step), 2), "decided_at": torch.full_like(step, -1)}
+        own |= {"field_readings": torch.zeros_like(step), "over": torch.zeros_like(step, dtype=torch.bool)}
+        first = TensorDict(self.first_memory(seen) | own, batch_size=step.shape, device=step.device)
+        if self.memory is None or self.memory.shape != first.shape or self.memory.device != first.device:
+            return first
+        return torch.where(step == 0, first, self.memory)
+
+    @property
+    def field_readings(self) -> Tensor:
+        """``(N,)`` int64: readings of the field in this episode at places where the vehicle has not been."""
+        return torch.zeros(0, dtype=torch.int64) if self.memory is None else self.memory["field_readings"]

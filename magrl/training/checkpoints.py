@@ -1,0 +1,226 @@
+"""Checkpoints that resume a training exactly where it stopped.
+
+A checkpoint is one file, written under another name, synchronized and renamed, so that it is either complete or absent.
+It holds tensors, numbers and text only.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any, Protocol
+
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.collectors import Collector
+
+from magrl.checks import check_number
+from magrl.envs.geomagnetic import GeomagneticNavEnv
+from magrl.files import DamagedFileError, load_tensors, save_tensors
+
+CHECKPOINT_FORMAT = 1
+_PATTERN = "checkpoint-*.pt"
+PRIVATE = ("_carrier", "_frames", "_iter")
+"""Private attributes of TorchRL's ``Collector`` that :class:`RunningEpisodes` saves and restores."""
+
+
+class Stateful(Protocol):
+    """An object whose state can be saved and restored.
+
+    Example:
+        >>> from torch import nn
+        >>> part: Stateful = nn.Linear(2, 1)  # as are optimizers, buffers and collectors
+        >>> sorted(part.state_dict())
+        ['bias', 'weight']
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the whole state, as tensors, numbers and text."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> Any:
+        """Restore that state."""
+
+
+class Checkpoints:
+    """The newest checkpoints of a run, and the parts that they hold.
+
+    Args:
+        folder: folder of the files, created by the first :meth:`save`.
+        parts: objects with ``state_dict`` and ``load_state_dict``, by name.
+        keep: number of files to keep; with two, one damaged file does not lose the training.
+
+    Raises:
+        TypeError: for a part without these methods, naming it.
+        ValueError: for a number of files below 1.
+
+    Example:
+        >>> import tempfile
+        >>> from torch import nn
+        >>> layer, other = nn.Linear(2, 1), nn.Linear(2, 1)
+        >>> folder = tempfile.mkdtemp()
+        >>> Checkpoints(folder, {"layer": layer}).save(100).name
+        'checkpoint-000000000100.pt'
+        >>> Checkpoints(folder, {"layer": other}).load()
+        100
+        >>> bool((layer.weight == other.weight).all())
+        True
+    """
+
+    def __init__(self, folder: Path | str, parts: dict[str, Stateful], keep: int = 2) -> None:
+        check_number(1, whole=True, keep=keep)
+        for name, part in parts.items():
+            if not (hasattr(part, "state_dict") and hasattr(part, "load_state_dict")):
+                raise TypeError(f"the part {name} must have state_dict and load_state_dict, got {part!r}")
+        self.folder, self.parts, self.keep = Path(folder), dict(parts), keep
+
+    def files(self) -> list[Path]:
+        """Return the files of the checkpoints, oldest first."""
+        return sorted(self.folder.glob(_PATTERN))
+
+    def save(self, frames: int) -> Path:
+        """Write a checkpoint and remove the oldest beyond :attr:`keep`.
+
+        Args:
+            frames: frames collected so far; part of the file name.
+
+        Returns:
+            The path of the file.
+
+        Raises:
+            ValueError: for a negative or fractional number of frames.
+            OSError: if it cannot be written; existing checkpoints stay unchanged.
+        """
+        check_number(0, whole=True, frames=frames)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / f"checkpoint-{frames:012d}.pt"
+        content = {
+            "format": CHECKPOINT_FORMAT,
+            "frames": frames,
+            "parts": {name: part.state_dict() for name, part in self.parts.items()},
+        }
+        try:
+            save_tensors(content, path)
+        except Exception as error:
+            kept = f"the newest checkpoint is {self.files()[-1]}" if self.files() else "there is no older checkpoint"
+            raise OSError(f"the checkpoint {path} could not be written ({error}); {kept}") from error
+        for old in self.files()[: -self.keep]:
+            old.unlink()
+        return path
+
+    def load(self) -> int:
+        """Restore every part from the newest valid file, and warn of damaged ones.
+
+        Returns:
+            Frames collected when the checkpoint was saved.
+
+        Raises:
+            FileNotFoundError: if there is no valid checkpoint.
+            ValueError: for a checkpoint of another format, or with other parts.
+        """
+        for path in reversed(self.files()):
+            try:
+                content = read_checkpoint(path)
+            except DamagedFileError as error:
+                warnings.warn(f"{error}; trying the previous checkpoint", stacklevel=2)
+                continue
+            if set(content["parts"]) != set(self.parts):
+                raise ValueError(f"{path} holds {sorted(content['parts'])}, not {sorted(self.parts)}")
+            for name in self.parts:
+                self._restore(name, content["parts"][name], path)
+            return int(content["frames"])
+        raise FileNotFoundError(f"there is no valid checkpoint in {self.folder}")
+
+    def _restore(self, name: str, state: Any, path: Path) -> None:
+        try:
+            self.parts[name].load_state_dict(state)
+        except Exception as error:  # whatever a part raises for the state of another
+            raise ValueError(f"{path}: {name} does not fit this training: {error}") from error
+
+    def clear(self) -> None:
+        """Remove all checkpoints, once a training is complete."""
+        for path in self.folder.glob("checkpoint-*"):
+            path.unlink()
+        if self.folder.is_dir() and not any(self.folder.iterdir()):
+            self.folder.rmdir()
+
+
+def read_checkpoint(path: Path | str) -> dict[str, Any]:
+    """Read a checkpoint, after verifying the checksum of the file.
+
+    Args:
+        path: path of the file.
+
+    Returns:
+        ``format``, ``frames`` and ``parts``.
+
+    Raises:
+        DamagedFileError: naming the file, if it is damaged or not a checkpoint.
+        ValueError: for another format.
+
+    Example:
+        >>> import tempfile
+        >>> from torch import nn
+        >>> path = Checkpoints(tempfile.mkdtemp(), {"layer": nn.Linear(2, 1)}).save(100)
+        >>> content = read_checkpoint(path)
+        >>> content["frames"], list(content["parts"])
+        (100, ['layer'])
+    """
+    content = load_tensors(path)
+    if not isinstance(content, dict) or set(content) != {"format", "frames", "parts"}:
+        raise DamagedFileError(f"{path} is not a checkpoint: it must hold format, frames and parts")
+    if content["format"] != CHECKPOINT_FORMAT:
+        raise ValueError(
+            f"{path} is a checkpoint of format {content['format']!r}; this version reads {CHECKPOINT_FORMAT}"
+        )
+    if not isinstance(content["frames"], int) or not isinstance(content["parts"], dict):
+        raise DamagedFileError(f"{path} is not a checkpoint: frames must be a number and parts a dictionary")
+    return content
+
+
+class RunningEpisodes:
+    """State of the running episodes of a collector and its environment, and the collector's counts.
+
+    TorchRL's collector leaves them out of its own ``state_dict``, so this class reads its private attributes
+    :data:`PRIVATE`, which ``tests/test_checkpoints.py`` guards against a change of TorchRL.
+
+    Args:
+        collector: collector in this process.
+        env: navigation environment inside the collector.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> collector = Collector(env, frames_per_batch=4, total_frames=8)
+        >>> first = next(iter(collector))
+        >>> RunningEpisodes(collector, env).state_dict()["frames"]
+        4
+        >>> collector.shutdown()
+    """
+
+    def __init__(self, collector: Collector, env: GeomagneticNavEnv) -> None:
+        self.collector, self.env = collector, env
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the last observations, the counts of episodes and frames, and the seed of the tasks."""
+        running = self.collector._carrier.flatten_keys(".")
+        return {
+            "running": {key: value for key, value in running.items() if isinstance(value, Tensor)},
+            "episode": self.env.episode,
+            "seed": self.env.seed,
+            "frames": self.collector._frames,
+            "iterations": self.collector._iter,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore collector and environment.
+
+        Raises:
+            ValueError: naming the keys that the episodes of another environment lack.
+        """
+        collector, device = self.collector, self.env.device
+        running = TensorDict(state_dict["running"], batch_size=self.env.batch_size, device=device).unflatten_keys(".")
+        expected = set(collector.env.reset().keys(True, True))
+        if not expected <= set(running.keys(True, True)):
+            raise ValueError(f"running episodes lack {sorted(map(str, expected - set(running.keys(True, True))))}")
+        collector._carrier = running
+        collector._frames, collector._iter = int(state_dict["frames"]), int(state_dict["iterations"])
+        self.env.seed, self.env.episode = int(state_dict["seed"]), state_dict["episode"].to(device)

@@ -1,0 +1,199 @@
+"""Settings that every training recipe shares, the command line, and the settings of a run that is resumed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import torch
+import tyro
+from pydantic import Field, model_validator
+from typing_extensions import Self
+
+from magrl import paper
+from magrl.checks import CheckedModel, check_type
+from magrl.envs import Scenario, load_scenario
+from magrl.training.loggers import Logger, WandbMode, check_logger
+
+Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+PositiveShare = Annotated[float, Field(gt=0, le=1)]
+Discount = Annotated[float, Field(ge=0, lt=1)]
+Widths = Annotated[tuple[Count, ...], Field(min_length=1)]
+Seed = Annotated[int, Field(ge=0, lt=paper.FIRST_RESERVED_SEED)]
+
+
+class UsageError(ValueError):
+    """A command that cannot run as given; its message is shown without a traceback.
+
+    Example:
+        >>> raise UsageError("there is no run to resume in runs/a")
+        Traceback (most recent call last):
+        magrl.training.config.UsageError: there is no run to resume in runs/a
+    """
+
+
+class RunConfig(CheckedModel):
+    """Settings of a run that do not depend on the algorithm.
+
+    Raises:
+        ValueError: naming the setting, its value and what would be right.
+
+    Example:
+        >>> RunConfig(seed=-1)
+        Traceback (most recent call last):
+        ValueError: seed must be greater than or equal to 0, got -1
+    """
+
+    seed: Seed = 0
+    """Random seed of weights, exploration and training tasks."""
+    out: Path | None = None
+    """Run folder; runs/<recipe>-<preset>-seed<seed> by default."""
+    resume: Path | None = None
+    """Folder of an interrupted run to resume, with its settings."""
+    device: str = "cpu"
+    """Device of all tensors: cpu, cuda, cuda:0, ..."""
+    logger: Logger = "wandb"
+    """Logger of the curves, beside train.csv (docs/logging.md); tensorboard is an extra."""
+    wandb_mode: WandbMode = "offline"
+    """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
+    checkpoint_every: NonNegative = 30.0
+    """Time between checkpoints [s]."""
+    scenario: Path | None = None
+    """TOML or JSON file of an own region, date and altitude (docs/own_data.md); the paper's by default."""
+    num_envs: Count = 512
+    """Number of vehicles."""
+    zeta: Positive = 0.01
+    """Arrival threshold on the objective (Eq. 2-7)."""
+    total_frames: Count = 204_800
+    """Steps of all vehicles together."""
+    total_episodes: Count | None = None
+    """Episodes after which training stops, if earlier."""
+    eval_every: Count = 20
+    """Collected batches between evaluations on the validation tasks."""
+    eval_tasks_small: Count = 200
+    """Number of validation tasks, which select the policy that is kept."""
+    eval_tasks: Count = 1000
+    """Number of test tasks of the final evaluation."""
+
+    @model_validator(mode="after")
+    def _available(self) -> Self:
+        check_logger(self.logger, self.wandb_mode)
+        try:
+            torch.zeros(1, device=self.device).item()
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(
+                f"device {self.device!r} cannot be used here ({reason}): choose another, such as cpu"
+            ) from None
+        try:
+            self.load_scenario()
+        except OSError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    def load_scenario(self) -> Scenario:
+        """Return the scenario of the file, or the paper's."""
+        return Scenario() if self.scenario is None else load_scenario(self.scenario)
+
+    def linear(self, name: str, remaining: float) -> float:
+        """Return a setting on its line from ``name`` to ``final_name``, with a share of the training remaining."""
+        start, end = getattr(self, name), getattr(self, f"final_{name}")
+        return end + remaining * (start - end)
+
+
+Config = TypeVar("Config", bound=RunConfig)
+
+
+def parse_config(
+    kind: type[Config], presets: Mapping[str, Config], recipe: str, description: str | None, args: Sequence[str] | None
+) -> Config:
+    """Return the settings of a command line: the preset, then what overrides it; or those of a run to resume.
+
+    Args:
+        kind: class of the settings.
+        presets: settings by name, the first of which is the default.
+        recipe: file name of the recipe.
+        description: text of ``--help``.
+        args: command line; that of this process by default.
+
+    Raises:
+        UsageError: for a run that cannot be resumed, or options beside ``--resume``.
+
+    Example:
+        >>> presets = {"fast": RunConfig(seed=1)}
+        >>> parse_config(RunConfig, presets, "mine.py", None, ["--device", "cpu"]).seed
+        1
+    """
+    first = argparse.ArgumentParser(prog=recipe, add_help=False, allow_abbrev=False)
+    first.add_argument("--resume", type=Path)
+    if len(presets) > 1:
+        first.add_argument("--preset", choices=list(presets))
+    args = sys.argv[1:] if args is None else list(args)
+    helped = {"-h", "--help"} & set(args)
+    known, others = first.parse_known_args(args)
+    preset = getattr(known, "preset", None)
+    if known.resume and not helped:
+        others += ["--preset", preset] if preset else []
+        if others:
+            raise UsageError(f"--resume takes its settings from the run: leave out {' '.join(others)}")
+        return resumed_config(known.resume, kind, recipe)
+    default = presets[preset or next(iter(presets))]
+    return tyro.cli(kind, default=default, args=args, prog=recipe, description=description)
+
+
+def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
+    """Return the settings of an interrupted run, with its folder as ``out`` and ``resume``.
+
+    Args:
+        folder: run folder.
+        kind: class of the settings.
+        recipe: file name of the recipe that resumes it.
+
+    Raises:
+        UsageError: naming the file and what is wrong: no run, a complete run, or one of another recipe or version.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> _ = (folder / "config.json").write_text('{"recipe": "mine.py", "seed": 7}')
+        >>> resumed_config(folder, RunConfig, "mine.py").seed
+        7
+    """
+    check_type(Path, folder=folder)
+    path, result = folder / "config.json", folder / "eval.json"
+    if not path.is_file():
+        raise UsageError(f"there is no run to resume in {folder}: it holds no config.json")
+    if result.is_file():
+        raise UsageError(f"the run in {folder} is complete: its results are in {result}")
+    try:
+        settings = json.loads(path.read_text())
+        if not isinstance(settings, dict) or "recipe" not in settings:
+            raise ValueError("it is not of this version of magrl: start the training again in a new folder")
+        if (begun := settings.pop("recipe")) != recipe:
+            raise ValueError(f"the run was started by {begun}: resume it with that recipe")
+        if settings.get("scenario"):
+            settings["scenario"] = folder / Path(settings["scenario"]).name
+        settings = {key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()}
+        return kind(**settings | {"out": folder, "resume": folder})
+    except (ValueError, TypeError) as error:
+        raise UsageError(f"cannot resume from {path}: {error}") from error
+
+
+def command(recipe: str, train: Callable[[], Any]) -> None:
+    """Run a recipe from the command line: print a :class:`UsageError` in one line and exit with status 2.
+
+    Example:
+        >>> command("mine.py", lambda: None)
+    """
+    try:
+        train()
+    except UsageError as error:
+        print(f"{recipe}: {error}", file=sys.stderr)
+        raise SystemExit(2) from None

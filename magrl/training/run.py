@@ -1,0 +1,287 @@
+"""The run around a training loop: folder, lock, resume, signals, progress, curves, evaluation and best policy."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl import torchrl_logger
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.collectors import BaseCollector, Collector
+from tqdm import tqdm
+from typing_extensions import Self
+
+from magrl import paper
+from magrl.agents import FieldPolicy, save_policy
+from magrl.checks import check_finite
+from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation.metrics import episode_measures, summarize
+from magrl.evaluation.rollout import evaluation_rollout
+from magrl.files import write_json
+from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful
+from magrl.training.config import RunConfig, UsageError
+from magrl.training.curves import RunLog
+from magrl.training.run_folder import create_run_folder, locked
+from magrl.training.signals import StopRequest
+from magrl.training.statistics import RETURN_TERMS, BestPolicy, TrainingStatistics, selection_score
+
+EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
+"""Measures of the validation tasks in ``train.csv``, there with the prefix ``eval_``."""
+
+
+class Run:
+    """A training run, as a context manager around the loop of a recipe.
+
+    ``with Run(config, ...) as run`` claims the folder, writes ``config.json`` and handles signals. :meth:`start` takes
+    the parts of the training and restores them from the newest checkpoint, if there is one. :meth:`batches` iterates
+    over collected batches; after each pass of the loop it checks for non-finite values, evaluates, logs and saves
+    checkpoints. :meth:`finish` evaluates the best policy on the test tasks and writes the results. If an error ends a
+    new run before the first batch, its folder is removed.
+
+    Args:
+        config: settings of the run.
+        recipe: file name of the recipe.
+        name: label of the agent, and first part of the name of the default run folder.
+        losses: names of the losses that the loop puts into ``run.statistics.losses``.
+
+    Raises:
+        UsageError: on entry, for a folder that is in use, or a scenario that cannot be read.
+    """
+
+    def __init__(
+        self, config: RunConfig, *, recipe: str, name: str, losses: tuple[str, ...] = ("loss_critic", "loss_actor")
+    ) -> None:
+        self.config, self.recipe, self.name, self.losses = config, recipe, name, losses
+        self.statistics, self.best, self.stop = TrainingStatistics(), BestPolicy(), StopRequest()
+        self.folder = config.out or Path("runs") / f"{name}-seed{config.seed}"
+        self._exits = contextlib.ExitStack()
+
+    # Folder
+
+    def __enter__(self) -> Self:
+        torchrl_logger.setLevel("WARNING")
+        try:
+            self.scenario = self.config.load_scenario()
+        except (ValueError, OSError) as error:
+            raise UsageError(str(error)) from error
+        if self.config.resume is None:
+            create_run_folder(self.folder)
+        with contextlib.ExitStack() as exits:
+            exits.enter_context(locked(self.folder))
+            if self.config.resume is None:
+                exits.push(self._discard)
+                self._write_config()
+            exits.enter_context(self.stop)
+            self._exits = exits.pop_all()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._exits.__exit__(*error)
+
+    def _discard(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Remove the folder after an error before the first batch, so that the same command can be given again."""
+        if kind is not None and not self.statistics.frames:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _write_config(self) -> None:
+        settings = self.settings
+        if self.config.scenario:
+            shutil.copyfile(self.config.scenario, self.folder / settings["scenario"])
+        write_json(self.folder / "config.json", settings)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings as ``config.json`` holds them: no path of this machine, and the recipe's name."""
+        settings = {"recipe": self.recipe} | self.config.model_dump(mode="json")
+        source = self.config.scenario
+        return settings | {"out": self.folder.name, "resume": None, "scenario": source and f"scenario{source.suffix}"}
+
+    def evaluation_envs(self, **options: Any) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv]:
+        """Return the environments of the validation tasks and of the test tasks.
+
+        Args:
+            options: options of :class:`magrl.envs.GeomagneticNavEnv`.
+        """
+        sets = ((self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED))
+        first, second = (
+            GeomagneticNavEnv(
+                self.scenario.with_tasks(self.scenario.random_tasks(count, seed)), num_envs=count, seed=seed, **options
+            )
+            for count, seed in sets
+        )
+        return first, second
+
+    # Parts
+
+    def start(
+        self,
+        *,
+        policy: FieldPolicy,
+        actor: nn.Module,
+        validation: GeomagneticNavEnv,
+        env: GeomagneticNavEnv,
+        collector: BaseCollector,
+        **parts: Stateful,
+    ) -> None:
+        """Take the parts of the training, and restore them from the newest checkpoint of a run that is resumed.
+
+        Args:
+            policy: agent as a navigator, for evaluations.
+            actor: module whose weights are trained and selected.
+            validation: environment of the validation tasks.
+            env: environment inside the collector; with several collectors, each has its own.
+            collector: source of batches.
+            parts: everything else that checkpoints must hold, such as loss, optimizers and replay buffer.
+        """
+        self.policy, self.actor, self.validation, self.env, self.collector = policy, actor, validation, env, collector
+        self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
+        parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}
+        if isinstance(collector, Collector):  # other processes start new episodes
+            parts["episodes"] = RunningEpisodes(collector, env)
+        self._exits.callback(collector.shutdown)
+        self.checkpoints = Checkpoints(self.folder / "checkpoints", parts)
+        resumed = self.config.resume is not None and bool(
+            self.checkpoints.files()
+        )  # otherwise it starts again from its seed
+        terms = ("return", *(f"return_{term}" for term in RETURN_TERMS))
+        columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", *self.losses)
+        self.log = RunLog(
+            self.folder,
+            (*columns, *(f"eval_{key}" for key in EVALUATED)),
+            self.settings,
+            logger=self.config.logger,
+            wandb_mode=self.config.wandb_mode,
+            group=self.name,
+            tags=[self.name],
+            resumed=resumed,
+        )
+        self._exits.callback(self.log.close)
+        self.checkpoints.parts["run"] = self.log
+        if resumed:
+            self.checkpoints.load()
+
+    @property
+    def remaining(self) -> float:
+        """Remaining share of the training, from 1 to 0."""
+        return max(0.0, 1 - self.statistics.frames / self.config.total_frames)
+
+    # Loop
+
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Yield collected batches until the training is complete or a signal asks to stop.
+
+        Yields:
+            Transitions as the collector returns them.
+
+        Raises:
+            FloatingPointError: at a non-finite value in a batch, a loss or a weight, naming it.
+        """
+        saved = time.perf_counter()
+        bar = {"initial": self.statistics.frames, "desc": self.name, "mininterval": 0.5, "unit_scale": True}
+        with tqdm(total=self.config.total_frames, unit="frame", **bar) as progress:
+            for batch in self.collector:
+                check_finite(batch, f"after {self.statistics.frames} frames")
+                self.statistics.add(batch.reshape(-1))
+                yield batch
+                self._check_weights()
+                if self.complete or self.statistics.iterations % self.config.eval_every == 0:
+                    progress.set_postfix_str(self._evaluate())
+                progress.update(batch.numel())
+                if self.complete:
+                    break
+                if self.stop.exit_code or time.perf_counter() - saved >= self.config.checkpoint_every:
+                    self.checkpoints.save(self.statistics.frames)
+                    saved = time.perf_counter()
+                if self.stop.exit_code:
+                    break
+
+    @property
+    def complete(self) -> bool:
+        """Whether all frames or all episodes have been collected."""
+        limit = self.config.total_episodes or math.inf
+        return self.statistics.frames >= self.config.total_frames or self.statistics.episodes >= limit
+
+    def _check_weights(self) -> None:
+        where = f"after update {self.statistics.updates}"
+        check_finite(self.statistics.losses.items(), where)
+        for module in self._modules.values():
+            check_finite(module.named_parameters(), where)
+
+    def _evaluate(self) -> str:
+        """Evaluate on the validation tasks, keep the best policy, add a row of curves; return a short report."""
+        episodes = episode_measures(evaluation_rollout(self.validation, self.policy))
+        summary = summarize(episodes)
+        limit = self.validation.max_steps
+        self.best.offer(selection_score(summary["spl"], episodes["success"], episodes["steps"], limit), self.actor)
+        row = self.statistics.row() | {"seconds": self.log.seconds}
+        self.log.row(row | {f"eval_{key}": summary[key] for key in EVALUATED})
+        return f"SR {summary['success_rate']:.1f} %, SPL {summary['spl']:.1f} %, return {row['return']:.0f}"
+
+    # Results
+
+    def finish(self, test: GeomagneticNavEnv) -> dict[str, float]:
+        """Save the best policy, evaluate it on the test tasks and write figures and results.
+
+        Args:
+            test: environment of the test tasks.
+
+        Returns:
+            The content of ``eval.json``.
+
+        Raises:
+            SystemExit: after a signal, with its exit code; the policy so far is saved.
+        """
+        from magrl.evaluation import plots  # matplotlib is slow to import, and collecting processes do without
+
+        seconds = self.log.seconds
+        self.actor.load_state_dict(self.best.weights or self.actor.state_dict())
+        save_policy(self.folder / "policy.pt", self.policy)
+        if self.log.rows:
+            self.log.figure("training", plots.training_figure(self.log.rows))
+        if not self.complete:
+            self._report_stop()
+        rollout = evaluation_rollout(test, self.policy)
+        result = summarize(episode_measures(rollout)) | {"seed": self.config.seed, "tasks_seed": paper.TEST_SEED}
+        result |= {key: getattr(self.statistics, key) for key in ("frames", "episodes", "updates")}
+        reached = next((row["seconds"] for row in self.log.rows if passes_paper(row)), math.nan)
+        result |= {"training_seconds": seconds, "seconds_to_97_sr_88_spl": reached}
+        self.log.figure("trajectories", plots.trajectories_figure(rollout, test.field, test.region))
+        self.log.result(result, navigator=self.name)
+        self.checkpoints.clear()
+        self._report(result)
+        return result
+
+    def _report_stop(self) -> None:
+        print(
+            f"\nStopped after {self.statistics.frames} frames; the policy so far is {self.folder / 'policy.pt'}\n"
+            f"To resume: --resume {self.folder}",
+            file=sys.stderr,
+        )
+        raise SystemExit(self.stop.exit_code)
+
+    def _report(self, result: dict[str, float]) -> None:
+        print(
+            f"\n{result['num_tasks']} test tasks: success rate {result['success_rate']:.1f} %, "
+            f"SPL {result['spl']:.1f} %, {result['steps']:.1f} steps, {result['trajectory_length_m'] / 1000:.0f} km, "
+            f"navigation error {result['navigation_error_km']:.1f} km\n"
+            f"Trained in {result['training_seconds']:.0f} s; results, curves and figures are in {self.folder}"
+        )
+
+
+def passes_paper(row: dict[str, float]) -> bool:
+    """Return whether a row of curves reaches the paper's success rate and SPL.
+
+    Example:
+        >>> passes_paper({"eval_success_rate": 98.0, "eval_spl": 90.0})
+        True
+    """
+    published = paper.TABLE_2["gg_td3"]
+    return row["eval_success_rate"] >= published.success_rate and row["eval_spl"] >= round(published.spl, 1)

@@ -1,0 +1,262 @@
+"""Gradient guidance: the gradient of a field, the theoretical heading, and the alignment reward."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.func import jacfwd, vmap
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from magrl import guidance
+from magrl.checks import check_number, check_tensor
+from magrl.field.elements import element_index
+from magrl.field.model import FieldModel, elements_gradient_at
+from magrl.geodesy import wrap_angle
+from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list, several_keys, sorted_keys
+
+
+class FieldGradient(ObservationTransform):
+    """Write the true horizontal gradient of a field at a position. Privileged: for rewards and oracles only.
+
+    Args:
+        field: field model, usually ``env.field``, for the gradient of D, I, B_H; or, in another domain, any function of
+            a position ``(2,)`` that returns values ``(E,)`` and can be differentiated by torch.
+        in_keys: one position ``(..., 2)``: latitude, longitude [deg], or the argument of the function.
+        out_keys: one gradient ``(..., 3, 2)``: D [deg/km], I [deg/km], B_H [nT/km], northward and eastward; of a
+            function ``(..., E, 2)``: unit of the value per unit of position, along the two axes of the position.
+
+    Raises:
+        ValueError: for a field that is neither, more than one key, or a function whose values are not ``(E,)``.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
+        >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> TransformedEnv(base, FieldGradient(base.field)).reset()["field_gradient"].shape
+        torch.Size([2, 3, 2])
+        >>> from tensordict import TensorDict
+        >>> FieldGradient(lambda p: p**2)(TensorDict(position=torch.tensor([1.0, 3.0])))["field_gradient"]
+        tensor([[2., 0.],
+                [0., 6.]])
+    """
+
+    def __init__(
+        self,
+        field: FieldModel | Callable[[Tensor], Tensor],
+        in_keys: NestedKey | Keys = ("position",),
+        out_keys: NestedKey | Keys = ("field_gradient",),
+    ) -> None:
+        super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
+        expect_keys(self, 1, 1)
+        if not hasattr(field, "value_and_gradient") and not callable(field):
+            raise ValueError(
+                "field must have value_and_gradient(latitude, longitude), or be a function of a position (2,), "
+                f"got {type(field).__name__}"
+            )
+        self.field = field
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
+        if values is not None:
+            next_tensordict.set(self.out_keys[0], self._apply_transform(values[0]))
+        return next_tensordict
+
+    def _apply_transform(self, position: Tensor) -> Tensor:
+        if hasattr(self.field, "value_and_gradient"):
+            return elements_gradient_at(cast(FieldModel, self.field), position).to(torch.get_default_dtype())
+        check_tensor(2, position=position)
+        gradient = vmap(jacfwd(self.field))(position.reshape(-1, 2))
+        if gradient.ndim != 3:
+            raise ValueError(f"field must turn a position (2,) into values (E,), got {tuple(gradient.shape[1:-1])}")
+        return gradient.reshape(*position.shape[:-1], *gradient.shape[1:])
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the gradient, unbounded."""
+        leaf = self._leaf(observation_spec, self.in_keys[0])
+        if leaf.shape[-1:] != (2,):
+            raise ValueError(f"FieldGradient reads positions of shape (..., 2), got {tuple(leaf.shape)}")
+        shape, dtype = torch.Size((*leaf.shape[:-1], 3, 2)), torch.get_default_dtype()
+        if not hasattr(self.field, "value_and_gradient"):
+            like = self._apply_transform(leaf.zero())
+            shape, dtype = like.shape, like.dtype
+        observation_spec[self.out_keys[0]] = Unbounded(shape, device=leaf.device, dtype=dtype)
+        return observation_spec
+
+
+class GradientHeading(ObservationTransform):
+    """Write the theoretical heading of the parallel approach (Eq. 3-15), on any pair of elements.
+
+    Privileged if the gradient is: a policy must not read a heading that follows from the true gradient.
+
+    Args:
+        in_keys: present values ``(..., E)``, values at the destination ``(..., E)``, and the gradient ``(..., E, 2)``
+            northward and eastward (or along any two axes that the headings are measured from).
+        out_keys: the heading ``(..., 1)`` [rad] and a mask ``(..., 1)``, False where the gradients are too close to
+            parallel to determine a direction (the heading is 0 there).
+        pair: two elements, by name (``"D"``, ``"I"``, ``"B_H"``) or by index. The difference in D is wrapped.
+        min_crossing_deg: smallest angle at which the two gradients must cross [deg].
+
+    Raises:
+        ValueError: for an unknown element, a pair of equal elements, a crossing angle outside [0, 90), or shapes that
+            do not match.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> here, there = torch.tensor([8.0, -16.0, 35000.0]), torch.tensor([8.0, -20.0, 35000.0])
+        >>> gradient = torch.tensor([[0.0, 0.002], [0.017, 0.0], [0.1, 0.1]])  # D grows eastward, I northward
+        >>> td = TensorDict(field=here, target_field=there, field_gradient=gradient)
+        >>> GradientHeading()(td)["gradient_heading"]  # a lower I is to the south
+        tensor([3.1416])
+    """
+
+    def __init__(
+        self,
+        in_keys: Keys = ("field", "target_field", "field_gradient"),
+        out_keys: Keys = ("gradient_heading", "gradient_heading_valid"),
+        *,
+        pair: tuple[str | int, str | int] = ("D", "I"),
+        min_crossing_deg: float = 2.0,
+    ) -> None:
+        # A sequence of strings is several keys here, never one nested key.
+        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
+        expect_keys(self, 3, 2)
+        check_number(0, 90, min_crossing_deg=min_crossing_deg)
+        if min_crossing_deg == 90:
+            raise ValueError(f"min_crossing_deg must be in [0, 90), got {min_crossing_deg}")
+        if not isinstance(pair, (tuple, list)):
+            raise ValueError(f"pair must be two different elements, by name or by index from 0, got {pair!r}")
+        self.pair = [element_index(name) if isinstance(name, str) else name for name in pair]
+        if len(set(self.pair)) != 2 or not all(isinstance(i, int) and i >= 0 for i in self.pair):
+            raise ValueError(f"pair must be two different elements, by name or by index from 0, got {pair}")
+        self.wraps = [name == "D" for name in pair]
+        self.min_crossing = math.radians(min_crossing_deg)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
+        if values is not None:
+            heading, valid = self._apply_transform(*values)
+            next_tensordict.set(self.out_keys[0], heading)
+            next_tensordict.set(self.out_keys[1], valid)
+        return next_tensordict
+
+    def _apply_transform(self, value: Tensor, target: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        error = (target - value)[..., self.pair]
+        wrapped = torch.rad2deg(wrap_angle(torch.deg2rad(error)))
+        error = torch.where(torch.tensor(self.wraps, device=error.device), wrapped, error)
+        gradient = gradient[..., self.pair, :].to(error.dtype)
+        return guidance.parallel_approach(torch.zeros_like(error), error, gradient, self.min_crossing)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the heading, in [-pi, pi], and its mask."""
+        value, target, gradient = (self._leaf(observation_spec, key) for key in self.in_keys)
+        if value.shape != target.shape or gradient.shape != (*value.shape, 2) or max(self.pair) >= value.shape[-1]:
+            raise ValueError(
+                f"GradientHeading needs values (..., E), targets (..., E) and gradients (..., E, 2) that hold elements "
+                f"{self.pair}, got {tuple(value.shape)}, {tuple(target.shape)}, {tuple(gradient.shape)}"
+            )
+        shape = (*value.shape[:-1], 1)
+        observation_spec[self.out_keys[0]] = Bounded(-math.pi, math.pi, shape, device=value.device, dtype=value.dtype)
+        observation_spec[self.out_keys[1]] = Binary(1, shape, device=value.device, dtype=torch.bool)
+        return observation_spec
+
+
+class AlignmentReward(Transform):
+    """Add the alignment term of Eq. 3-6 to the reward: high where an angle is close to a reference.
+
+    The reference is read before the move, the angle (the heading of the move just made) after it. In a replay buffer or
+    as a module, the angle and the reward are those under ``"next"``.
+
+    Args:
+        in_keys: the angle and the reference [rad], of equal shape; and optionally a mask of the reference, where False
+            makes the term 0.
+        out_keys: one reward, to which the term is added (created if the environment has none of that name), and
+            optionally a second one for the term alone, such as ``["reward", "reward_alignment"]``.
+        weight: zeta_3 [1/rad].
+        offset: deviation at which the term changes sign [rad]. With the paper's pi/4 every aligned step is rewarded, so
+            that slow progress is rewarded too; with 0 the term is never positive.
+
+    Raises:
+        ValueError: for a non-finite weight or offset, or another number of keys.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> step = TensorDict(reference=torch.zeros(1), next=TensorDict(angle=torch.zeros(1), reward=torch.ones(1)))
+        >>> AlignmentReward(["angle", "reference"], weight=4 / math.pi)(step)["next", "reward"]
+        tensor([2.])
+    """
+
+    def __init__(
+        self,
+        in_keys: Keys = ("heading", "gradient_heading", "gradient_heading_valid"),
+        out_keys: NestedKey | Keys = ("reward",),
+        *,
+        weight: float = 3.0,
+        offset: float = math.pi / 4,
+    ) -> None:
+        super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
+        if len(self.in_keys) not in (2, 3) or len(self.out_keys) not in (1, 2):
+            raise ValueError(
+                f"AlignmentReward takes 2 or 3 in_keys (angle, reference, mask) and 1 or 2 out_keys (reward, term), "
+                f"got {self.in_keys} and {self.out_keys}"
+            )
+        check_number(weight=weight, offset=offset)
+        self.weight, self.offset = float(weight), float(offset)
+
+    def term(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
+        """Return the term that is added to the reward of a step, in the shape of the angle."""
+        angle, (reference, *mask) = next_tensordict[self.in_keys[0]], (tensordict[key] for key in self.in_keys[1:])
+        value = guidance.alignment_reward(angle, reference, self.weight, self.offset)
+        return torch.where(mask[0], value, 0.0) if mask else value
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for key, source in zip(self.in_keys, (next_tensordict, tensordict, tensordict), strict=False):
+            if source.get(key, None) is None:
+                if self.missing_tolerance:
+                    return next_tensordict
+                raise KeyError(f"AlignmentReward reads {key!r}, which is not among {sorted_keys(source)}")
+        term = self.term(tensordict, next_tensordict)
+        reward = next_tensordict.get(self.out_keys[0], None)
+        next_tensordict.set(self.out_keys[0], term if reward is None else reward + term)
+        for key in self.out_keys[1:]:
+            next_tensordict.set(key, term)
+        return next_tensordict
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add the term to the reward under ``next`` of transitions."""
+        if tensordict.get("next", None) is None:
+            raise KeyError(
+                "AlignmentReward needs transitions: the reference at the root and the angle and reward under "
+                f"'next', got {sorted_keys(tensordict)}"
+            )
+        self._step(tensordict, tensordict["next"])
+        return tensordict
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """Remove the bounds of the reward; rewards that the environment lacks get the shape of the angle."""
+        for key in self.out_keys:
+            leaf = reward_spec[key] if key in reward_spec.keys(True, True) else self._observed(self.in_keys[0])
+            reward_spec[key] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
+        return reward_spec
+
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Make the reference part of the state, so that batched and parallel environments pass it to the next step."""
+        input_spec = input_spec.clone()
+        if input_spec["full_state_spec"] is None:
+            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
+        for key in self.in_keys[1:]:
+            input_spec["full_state_spec"][key] = self._observed(key).clone()
+        return input_spec
+
+    def _observed(self, key: NestedKey) -> TensorSpec:
+        parent = self.parent
+        spec = Composite() if parent is None else parent.full_observation_spec
+        if key not in spec.keys(True, True):
+            raise KeyError(f"AlignmentReward reads {key!r}, which is not among the observations {sorted_keys(spec)}")
+        return spec[key]

@@ -1,0 +1,67 @@
+"""The public names of the library: what the packages export, and what the modules that are public as a whole define."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from importlib import import_module
+from types import ModuleType
+
+PACKAGES = (
+    "field",
+    "transforms",
+    "envs",
+    "navigators",
+    "navigators.metaheuristics",
+    "agents",
+    "evaluation",
+    "training",
+)
+"""Packages whose ``__all__`` is public."""
+MODULES = ("checks", "files", "geodesy", "guidance", "envs.gymnasium")
+"""Modules whose functions and classes are public."""
+
+
+def homes() -> Iterator[ModuleType]:
+    """Every public package and module."""
+    yield from (import_module(f"magrl.{name}") for name in (*PACKAGES, *MODULES))
+
+
+def is_code(member: object) -> bool:
+    return inspect.isfunction(member) or inspect.isclass(member)
+
+
+def own_names(module: ModuleType) -> Iterator[str]:
+    """Functions and classes that a module defines itself."""
+    for name, member in vars(module).items():
+        if is_code(member) and member.__module__ == module.__name__ and not name.startswith("_"):
+            yield name
+
+
+def public_members() -> dict[str, object]:
+    """Public functions and classes by name, such as ``envs.Region``."""
+    exported = {name: import_module(f"magrl.{name}").__all__ for name in PACKAGES}
+    listed = {name: own_names(import_module(f"magrl.{name}")) for name in MODULES}
+    return {
+        f"{home}.{name}": member
+        for home, names in (exported | listed).items()
+        for name in names
+        if is_code(member := getattr(import_module(f"magrl.{home}"), name))
+    }
+
+
+def new_methods(cls: type) -> Iterator[str]:
+    """Public methods with arguments that no parent has; the rows of a class cover those that override one."""
+    for name, member in vars(cls).items():
+        inherited = any(name in vars(parent) for parent in cls.__mro__[1:])
+        ours = inspect.isfunction(member) and not name.startswith("_") and not inherited
+        if ours and len(inspect.signature(member).parameters) > 1:
+            yield name
+
+
+def public_names() -> Iterator[str]:
+    """Public functions, classes and methods."""
+    for path, member in public_members().items():
+        yield path
+        if inspect.isclass(member):
+            yield from (f"{path}.{method}" for method in new_methods(member))

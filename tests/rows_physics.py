@@ -1,0 +1,388 @@
+"""Bad calls of magrl.checks, files, geodesy, guidance, field and transforms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from refusals import (
+    INF,
+    NAN,
+    Nan,
+    Refused,
+    Rows,
+    bad_numbers,
+    bad_tensors,
+    bad_vectors,
+    folder,
+    int64,
+    refused,
+    t,
+    text_file,
+    zeros,
+)
+from tensordict import TensorDict
+from torch import Tensor
+
+from magrl import checks, field, files, geodesy, guidance, transforms
+
+FOUNDATIONS: Rows = {
+    "geodesy.wrap_angle": [*bad_tensors(geodesy.wrap_angle, "angle"), Nan(lambda: geodesy.wrap_angle(t(NAN, INF)))],
+    "geodesy.wrap_longitude": [
+        *bad_tensors(geodesy.wrap_longitude, "longitude"),
+        Nan(lambda: geodesy.wrap_longitude(t(NAN, -INF))),
+    ],
+    "geodesy.curvature_radii": [
+        *bad_tensors(geodesy.curvature_radii, "latitude"),
+        Nan(lambda: geodesy.curvature_radii(t(NAN, INF))),
+    ],
+    "geodesy.local_frame": [
+        *bad_tensors(geodesy.local_frame, "latitude", "longitude"),
+        Nan(lambda: geodesy.local_frame(t(NAN), t(0.0))[..., 0, :]),
+        Nan(lambda: geodesy.local_frame(t(0.0), t(INF))[..., 1, :2]),
+    ],
+    "geodesy.to_ecef": [
+        *bad_tensors(geodesy.to_ecef, "latitude", "longitude"),
+        refused(lambda: geodesy.to_ecef(zeros(1), zeros(1), t(1j)), TypeError, "altitude_km", "complex64"),
+        Nan(lambda: geodesy.to_ecef(t(NAN, INF, 0.0), t(0.0, 0.0, 0.0), t(0.0, 0.0, NAN))),
+    ],
+    "geodesy.from_ecef_surface": [
+        *bad_vectors(geodesy.from_ecef_surface, "ecef"),
+        Nan(lambda: geodesy.from_ecef_surface(t(NAN, 0.0, 0.0))),
+    ],
+    "geodesy.move": [
+        *bad_tensors(geodesy.move, "latitude", "longitude", "heading", "distance_km"),
+        *(
+            Nan(lambda k=k, v=v: geodesy.move(*[t(0.0)] * k, t(v), *[t(0.0)] * (3 - k)))
+            for k in (0, 2, 3)
+            for v in (NAN, INF)
+        ),
+    ],
+    "geodesy.geodesic": [
+        *bad_tensors(geodesy.geodesic, "latitude1", "longitude1", "latitude2", "longitude2"),
+        refused(lambda: geodesy.geodesic(t(0.0), t(0.0), t(-90.5), t(0.0)), ValueError, "latitude -90.5"),
+        refused(lambda: geodesy.geodesic(t(0.0, 91.0), t(0.0), t(0.0), t(0.0)), ValueError, "latitude 91.0"),
+        refused(lambda: geodesy.geodesic(t(INF), t(0.0), t(0.0), t(0.0)), ValueError, "latitude inf"),
+        *(
+            Nan(lambda k=k, v=v: geodesy.geodesic(*[t(0.0)] * k, t(v), *[t(0.0)] * (3 - k)))
+            for k, v in ((0, NAN), (1, NAN), (2, NAN), (3, NAN), (1, INF), (3, INF))
+        ),
+    ],
+    "checks.check_tensor": [
+        refused(lambda: checks.check_tensor(x=[1.0]), TypeError, "x", "list [1.0]"),
+        refused(lambda: checks.check_tensor(3, 2, x=zeros(3)), ValueError, "x", "(..., 3, 2)", "(3,)"),
+    ],
+    "checks.check_number": [
+        *(
+            refused(lambda v=v: checks.check_number(x=v), ValueError, "x", repr(v))
+            for v in (NAN, INF, "a", None, True, 1j)
+        ),
+        *(
+            refused(
+                lambda low=low, options=options: checks.check_number(*low, **options), ValueError, f"x must be {said}"
+            )
+            for low, options, said in (
+                ((), {"x": NAN}, "a finite number, got nan"),
+                ((), {"high": 1, "x": 1.5}, "a finite number up to 1, got 1.5"),
+                ((0, 1), {"x": 1.5}, "a finite number from 0 up to 1, got 1.5"),
+                ((0,), {"above": True, "x": 0.0}, "a finite number above 0, got 0.0"),
+                ((0, 1), {"above": True, "x": 0.0}, "a finite number above 0 up to 1, got 0.0"),
+                ((), {"whole": True, "x": 2.0}, "a whole number, got 2.0"),
+                ((1,), {"whole": True, "x": 0}, "a whole number from 1 on, got 0"),
+            )
+        ),
+    ],
+    "checks.check_numbers": [
+        *(
+            refused(lambda v=v: checks.check_numbers(2, x=v), ValueError, "x", "2 finite", repr(v))
+            for v in (5, None, (1.0,), (1.0, 2.0, 3.0), "ab", (0.0, NAN), (0.0, True))
+        )
+    ],
+    "checks.check_type": [refused(lambda: checks.check_type((int, str), x=1.5), TypeError, "x", "int or str", "1.5")],
+    "geodesy.check_positions": [
+        refused(lambda: geodesy.check_positions(t(0.0, 90.5), zeros(2)), ValueError, "latitude 90.5"),
+        refused(lambda: geodesy.check_positions(t(NAN), zeros(1)), ValueError, "latitude nan"),
+        refused(lambda: geodesy.check_positions(zeros(1), t(INF)), ValueError, "longitude inf"),
+    ],
+    "geodesy.check_box": [
+        refused(lambda: geodesy.check_box(5, (0, 1)), ValueError, "5"),
+        refused(lambda: geodesy.check_box((1, 1), (0, 1)), ValueError, "(1, 1)"),
+        refused(lambda: geodesy.check_box((0, NAN), (0, 1)), ValueError, "(0, nan)"),
+        refused(lambda: geodesy.check_box((0, 1), (170, -170)), ValueError, "(170, -170)", "(170, 190)"),
+        refused(lambda: geodesy.check_box((0, 1), (0, INF)), ValueError, "(0, inf)"),
+    ],
+    "checks.check_finite": [
+        refused(lambda: checks.check_finite([("a", t(0.0, INF))], "here"), FloatingPointError, "here: a", "[1]"),
+        refused(lambda: checks.check_finite({("a", "b"): t(NAN)}.items(), ""), FloatingPointError, "a.b", "[0]"),
+    ],
+    "checks.require": [
+        refused(lambda: checks.require(t(1.0, NAN) > 0, t(1.0, NAN), "{} is not positive"), ValueError, "nan is not")
+    ],
+    "files.save_tensors": [
+        refused(lambda: files.save_tensors({}, Path("nowhere/at/all.pt")), FileNotFoundError, "nowhere/at/all.pt")
+    ],
+    "files.load_tensors": [
+        refused(lambda: files.load_tensors("nowhere.pt"), files.DamagedFileError, "nowhere.pt"),
+        refused(lambda: files.load_tensors(text_file("a.pt", "no tensors")), files.DamagedFileError, "a.pt"),
+    ],
+    "files.write_json": [
+        refused(lambda: files.write_json("here", {}), TypeError, "path", "'here'"),
+        refused(lambda: files.write_json(folder() / "a.json", {"a": {1}}), TypeError, "set"),
+    ],
+    "files.check_writable": [
+        refused(lambda: files.check_writable(text_file("a", "") / "b.json"), OSError, "cannot write", "b.json")
+    ],
+}
+
+
+def of_elements(function: Callable[[Tensor, Tensor, Tensor], object], *names: str) -> list[Refused | Nan]:
+    """Fields, targets and a third whose last dimensions differ, a single element included."""
+    good = [torch.ones(2, 3)] * 3
+    shapes = ((2, 1), (2, 2), ())
+    wrong = [[*good[:k], torch.ones(shape), *good[k + 1 :]] for k in range(3) for shape in shapes]
+    return [refused(lambda w=w: function(*w), ValueError, *names, "(2, 3)") for w in wrong]
+
+
+GUIDANCE: Rows = {
+    "guidance.objective_weights": [
+        *bad_tensors(guidance.objective_weights, "field", "target_field", "floors"),
+        *of_elements(guidance.objective_weights, "field", "target_field", "floors"),
+        Nan(lambda: guidance.objective_weights(t(NAN), t(1.0), t(1.0))),
+        Nan(lambda: guidance.objective_weights(t(1.0), t(1.0), t(NAN))),
+    ],
+    "guidance.objective": [
+        *bad_tensors(guidance.objective, "field", "target_field", "weights"),
+        *of_elements(guidance.objective, "field", "target_field", "weights"),
+        Nan(lambda: guidance.objective(t(1.0, NAN), t(1.0, 1.0), t(1.0, 1.0))),
+    ],
+    "guidance.destination_reward": [
+        refused(lambda: guidance.destination_reward(t(1.0), 200.0), TypeError, "arrived", "torch.float32"),
+        refused(lambda: guidance.destination_reward(True, 200.0), TypeError, "arrived", "True"),
+        Nan(lambda: guidance.destination_reward(zeros(1).bool(), NAN)),
+    ],
+    "guidance.proximity_reward": [
+        *bad_tensors(lambda a, b: guidance.proximity_reward(a, b, 1.0), "objective_before", "objective_after"),
+        Nan(lambda: guidance.proximity_reward(t(0.0, NAN), t(NAN, 0.0), 1.0)),
+    ],
+    "guidance.late_decay": [
+        *bad_tensors(lambda a, b: guidance.late_decay(a, b, 50), "proximity", "step"),
+        refused(lambda: guidance.late_decay(zeros(1), int64(1), 0), ValueError, "max_steps", "0"),
+        refused(lambda: guidance.late_decay(zeros(1), int64(1), NAN), ValueError, "max_steps", "nan"),
+        Nan(lambda: guidance.late_decay(t(NAN, NAN), torch.tensor([1, 50]), 50)),
+    ],
+    "guidance.alignment_reward": [
+        *bad_tensors(lambda a, b: guidance.alignment_reward(a, b, 3.0), "angle", "reference"),
+        Nan(lambda: guidance.alignment_reward(t(0.0, NAN, INF), t(NAN, 0.0, 0.0), 3.0)),
+    ],
+    "guidance.parallel_approach": [
+        *bad_vectors(lambda x: guidance.parallel_approach(x, zeros(2), zeros(2, 2)), "field", 2),
+        *bad_vectors(lambda x: guidance.parallel_approach(zeros(2), x, zeros(2, 2)), "target_field", 2),
+        *bad_vectors(lambda x: guidance.parallel_approach(zeros(2), zeros(2), x), "gradient", 2)[:2],
+        refused(lambda: guidance.parallel_approach(zeros(2), zeros(2), zeros(3, 2)), ValueError, "gradient", "(3, 2)"),
+        *(
+            refused(
+                lambda a=a: guidance.parallel_approach(zeros(2), zeros(2), zeros(2, 2), a),
+                ValueError,
+                "min_crossing",
+                str(a),
+            )
+            for a in (-0.1, math.pi / 2, NAN)
+        ),
+    ],
+}
+
+GAUSS = torch.zeros(2, 2, dtype=torch.complex128)
+
+
+@cache
+def igrf() -> field.IGRF:
+    return field.IGRF("2022-01-01", 13)
+
+
+@cache
+def box() -> field.RegionalField:
+    return field.RegionalField(igrf(), (-10.0, 0.0), (160.0, 170.0), degree=6, tolerance_nt=1.0)
+
+
+def bad_places(model: Callable[..., object]) -> list[Refused | Nan]:
+    return [
+        refused(lambda: model(t(-95.0), t(0.0)), ValueError, "latitude -95.0"),
+        refused(lambda: model(t(NAN), t(0.0)), ValueError, "latitude nan"),
+        refused(lambda: model(t(0.0), t(INF)), ValueError, "longitude inf"),
+        refused(lambda: model(t(0.0), t(0.0), NAN), ValueError, "altitude_km"),
+    ]
+
+
+FIELDS: Rows = {
+    "field.parse_date": [
+        refused(lambda: field.parse_date("May"), ValueError, "'May'"),
+        *(
+            refused(lambda v=v: field.parse_date(v), ValueError, repr(v))
+            for v in (NAN, INF, 0.5, 10_000, None, True, [])
+        ),
+    ],
+    "field.igrf_coefficients": [
+        refused(lambda: field.igrf_coefficients(1899.5), ValueError, "1899-07-02", "1900"),
+        refused(lambda: field.igrf_coefficients(2031), ValueError, "2031", "2030"),
+        refused(lambda: field.igrf_coefficients(2022, 12), ValueError, "12", "[13, 14]"),
+        refused(lambda: field.igrf_coefficients(2022, "13"), ValueError, "'13'"),
+    ],
+    "field.SphericalHarmonicField": [
+        refused(lambda: field.SphericalHarmonicField(zeros(2, 3)), ValueError, "(2, 3)"),
+        refused(lambda: field.SphericalHarmonicField(GAUSS + NAN), ValueError, "gauss", "non-finite"),
+        refused(lambda: field.SphericalHarmonicField(GAUSS, chunk=0), ValueError, "chunk", "0"),
+        refused(lambda: field.SphericalHarmonicField(GAUSS, altitude_km=NAN), ValueError, "altitude_km", "nan"),
+        refused(lambda: field.SphericalHarmonicField(GAUSS, altitude_km=-200.0), ValueError, "altitude_km", "-200.0"),
+        refused(lambda: field.SphericalHarmonicField(5), TypeError, "gauss", "5"),
+        refused(lambda: field.SphericalHarmonicField(GAUSS, chunk=1.5), ValueError, "chunk", "1.5"),
+        refused(lambda: field.SphericalHarmonicField(GAUSS, altitude_km="a"), ValueError, "altitude_km", "'a'"),
+        refused(lambda: field.SphericalHarmonicField(GAUSS)(t(0.0), t(0.0), -200.0), ValueError, "altitude_km -200.0"),
+        refused(lambda: field.SphericalHarmonicField(GAUSS)(t(1j), t(0.0)), TypeError, "complex64"),
+        *bad_places(field.SphericalHarmonicField(GAUSS)),
+    ],
+    "field.SphericalHarmonicField.value_and_gradient": bad_places(
+        lambda *place: field.SphericalHarmonicField(GAUSS).value_and_gradient(*place)
+    ),
+    "field.IGRF": [
+        refused(lambda: field.IGRF("2031-01-01"), ValueError, "2031-01-01", "2030"),
+        refused(lambda: field.IGRF(2022.0, 12), ValueError, "12", "[13, 14]"),
+        refused(lambda: field.IGRF(2022.0, altitude_km=INF), ValueError, "altitude_km", "inf"),
+        refused(lambda: field.IGRF(2022.0, "13"), ValueError, "'13'", "[13, 14]"),
+        *bad_places(lambda *place: igrf()(*place)),
+    ],
+    "field.elements_at": [
+        refused(lambda: field.elements_at(igrf(), zeros(4, 3)), ValueError, "(4, 3)"),
+        refused(lambda: field.elements_at(igrf(), t(-95.0, 0.0)), ValueError, "latitude -95.0"),
+        refused(lambda: field.elements_at(lambda latitude, _: latitude, zeros(4, 2)), ValueError, "b_ned", "(4,)"),
+        Nan(lambda: field.elements_at(box(), t(5.0, 165.0))),
+    ],
+    "field.elements_range": [
+        refused(lambda: field.elements_range(igrf(), t(0.0, NAN)), ValueError, "longitude nan"),
+        refused(lambda: field.elements_range(igrf(), zeros(0, 2)), ValueError, "(0, 2)"),
+        Nan(lambda: field.elements_range(box(), torch.tensor([[5.0, 165.0], [-5.0, 165.0]]))),
+    ],
+    "field.elements_gradient_at": [
+        refused(lambda: field.elements_gradient_at(igrf(), t(-95.0, 0.0)), ValueError, "latitude -95.0"),
+        Nan(lambda: field.elements_gradient_at(box(), t(5.0, 165.0))[1]),
+    ],
+    "field.RegionalField": [
+        refused(lambda: field.RegionalField(igrf(), (0, -1), (0, 1)), ValueError, "(0, -1)"),
+        refused(lambda: field.RegionalField(igrf(), (0, 1), (0, 1), degree=0), ValueError, "degree", "0"),
+        refused(lambda: field.RegionalField(igrf(), (0, 1), (0, 1), degree=1.5), ValueError, "degree", "1.5"),
+        refused(lambda: box()(t(1j), t(0.0)), TypeError, "complex64"),
+        refused(
+            lambda: field.RegionalField(igrf(), (0, 1), (0, 1), tolerance_nt=NAN), ValueError, "tolerance_nt", "nan"
+        ),
+        refused(lambda: field.RegionalField(igrf(), (0, 60), (0, 90), degree=2), ValueError, "degree 2", "(0, 60)"),
+        Nan(lambda: box()(t(5.0, NAN, -5.0), t(165.0, 165.0, INF))),
+    ],
+    "field.RegionalField.value_and_gradient": [
+        Nan(lambda: box().value_and_gradient(t(5.0, NAN, -5.0), t(165.0, 165.0, NAN))),
+    ],
+}
+
+PAIR = ["here", "there"]
+TRANSFORMS: Rows = {
+    "transforms.AngleVector": [
+        refused(lambda: transforms.AngleVector(5, "b"), TypeError, "5"),
+        refused(lambda: transforms.AngleVector(["a", "b"], "c"), ValueError, "['a', 'b']", "['c']"),
+        refused(lambda: transforms.AngleVector("a", "b")(TensorDict(c=zeros(1))), KeyError, "['a']", "['c']"),
+        Nan(lambda: transforms.AngleVector("a", "b")(TensorDict(a=t(NAN)))["b"]),
+    ],
+    "transforms.TargetDifference": [
+        refused(lambda: transforms.TargetDifference("ab"), TypeError, "'ab'"),
+        refused(lambda: transforms.TargetDifference(["a"]), ValueError, "['a']"),
+        refused(
+            lambda: transforms.TargetDifference(PAIR)(TensorDict(here=zeros(2), there=zeros(3))),
+            RuntimeError,
+            "(3)",
+            "(2)",
+        ),
+        Nan(lambda: transforms.TargetDifference(PAIR)(TensorDict(here=t(NAN), there=t(0.0)))["field_difference"]),
+    ],
+    "transforms.FieldGradient": [
+        refused(lambda: transforms.FieldGradient("IGRF"), ValueError, "value_and_gradient", "str"),
+        refused(
+            lambda: transforms.FieldGradient(torch.sum)(TensorDict(position=zeros(2))),
+            ValueError,
+            "values (E,), got ()",
+        ),
+        refused(
+            lambda: transforms.FieldGradient(torch.sin)(TensorDict(position=zeros(3))), ValueError, "position", "(3,)"
+        ),
+        refused(lambda: transforms.FieldGradient(igrf(), ["a", "b"]), ValueError, "['a', 'b']"),
+        refused(lambda: transforms.FieldGradient(igrf())(TensorDict(position=t(-95.0, 0.0))), ValueError, "-95.0"),
+    ],
+    "transforms.GradientHeading": [
+        *bad_numbers(transforms.GradientHeading, min_crossing_deg=(-1.0, 90.0, NAN, "a")),
+        *bad_numbers(transforms.GradientHeading, pair=(5, "DI", ("D", 0), ("D", -1), ("D", 0.5))),
+        refused(lambda: transforms.GradientHeading(pair=("D", "Z")), ValueError, "'Z'"),
+        refused(lambda: transforms.GradientHeading("abc"), TypeError, "'abc'"),
+    ],
+    "transforms.AlignmentReward": [
+        *bad_numbers(transforms.AlignmentReward, weight=(NAN, INF, "a", None), offset=(NAN, "a")),
+        refused(lambda: transforms.AlignmentReward("angle"), TypeError, "'angle'"),
+        refused(lambda: transforms.AlignmentReward(["a"]), ValueError, "['a']"),
+        refused(lambda: transforms.AlignmentReward(PAIR)(TensorDict(here=zeros(1))), KeyError, "next"),
+    ],
+    "transforms.AlignmentReward.term": [
+        refused(
+            lambda: transforms.AlignmentReward(PAIR).term(TensorDict(), TensorDict(here=zeros(1))), KeyError, "there"
+        ),
+        Nan(lambda: transforms.AlignmentReward(PAIR).term(TensorDict(there=t(NAN)), TensorDict(here=zeros(1)))),
+    ],
+    "transforms.MinMaxNorm": [
+        *bad_numbers(transforms.MinMaxNorm, interval=(5, (1.0,), (1.0, 1.0), (0.0, NAN), ("a", "b")), bounds=(5, "ab")),
+        refused(lambda: transforms.MinMaxNorm(5), TypeError, "5"),
+        refused(lambda: transforms.MinMaxNorm(["x"], bounds={"x": 5}), ValueError, "'x'", "5"),
+        refused(lambda: transforms.MinMaxNorm(["x"], bounds={"x": (1.0, 1.0)}), ValueError, "'x'", "1.0"),
+        refused(lambda: transforms.MinMaxNorm(["x"], bounds={"x": (0.0, NAN)}), ValueError, "'x'", "nan"),
+        refused(lambda: transforms.MinMaxNorm(["x"], bounds={"y": (0.0, 1.0)}), ValueError, "'y'", "['x']"),
+    ],
+    "transforms.MinMaxNorm.normalize": [
+        refused(lambda: transforms.MinMaxNorm(["x"]).normalize("x", zeros(1)), RuntimeError, "'x'"),
+        refused(lambda: transforms.MinMaxNorm(["x"]).normalize("y", zeros(1)), KeyError, "'y'", "['x']"),
+        Nan(lambda: transforms.MinMaxNorm(["x"], bounds={"x": (0.0, 1.0)}).normalize("x", t(NAN))),
+    ],
+    "transforms.MinMaxNorm.denormalize": [
+        refused(lambda: transforms.MinMaxNorm(["x"]).denormalize("y", zeros(1)), KeyError, "'y'", "['x']"),
+        refused(
+            lambda: transforms.MinMaxNorm(["x"], bounds={"x": (zeros(2), torch.ones(2))}).denormalize("x", zeros(3)),
+            RuntimeError,
+            "(2)",
+            "(3)",
+        ),
+        Nan(lambda: transforms.MinMaxNorm(["x"], bounds={"x": (0.0, 1.0)}).denormalize("x", t(NAN))),
+    ],
+}
+
+
+def sound_view(**options: Any) -> transforms.ObservationView:
+    """A sound view but for some options."""
+    sound: dict[str, Any] = {"observe_heading": True, "observe_difference": True, "max_move_km": 50.0}
+    sound |= {"field_low": (0.0, -50.0, 3e4), "field_high": (10.0, 0.0, 4e4), "max_turn_rad": 1.5}
+    return transforms.ObservationView(**(sound | options))
+
+
+NARROW = sound_view(field_high=(10.0, -40.0, 4e4))
+
+VIEWS: Rows = {
+    "transforms.ObservationView": bad_numbers(
+        sound_view,
+        observe_heading=(None,),
+        observe_difference=("no",),
+        field_low=(5, (1.0, 2.0), (NAN, 0.0, 0.0), (99.0, -50.0, 3e4)),
+        field_high=("abc", (0.0, 0.0, INF)),
+        max_move_km=(0.0, -50.0, NAN, "a"),
+        max_turn_rad=(0.0, 4.0, "a"),
+    ),
+    "transforms.ObservationView.check_covers": [
+        refused(lambda: NARROW.check_covers(igrf(), t(-5.0, 165.0)), ValueError, "I is", "-50.0 to -40.0°")
+    ],
+}
+
+ROWS = FOUNDATIONS | GUIDANCE | FIELDS | TRANSFORMS | VIEWS
