@@ -19,12 +19,11 @@ import torch
 
 from benchmarks.timing import Row, alternate
 from magrl import paper
-from magrl.envs import Scenario
 from magrl.field import IGRF, FieldModel, RegionalField
 
 DATE, GENERATION = datetime.fromisoformat(paper.DATE), paper.GENERATION
-REACHABLE = Scenario().reachable(50)
-BOX = REACHABLE.latitude, REACHABLE.longitude
+BOX = tuple((low - 5.5, high + 5.5) for low, high in (paper.LATITUDE, paper.LONGITUDE))
+"""Latitudes and longitudes that the paper's vehicles can reach [deg]."""
 POINTS = 10_000
 
 

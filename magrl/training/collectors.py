@@ -43,7 +43,8 @@ def make_collector(
     """
     options = {"device": env.device, **options}
     if len(workers) <= 1:
-        return Collector(env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options)
+        options |= {"track_traj_ids": False, "auto_register_policy_transforms": False}
+        return Collector(env, policy, return_same_td=True, **options)  # a batch is used before the next one is made
     if backend == "ray":
         options |= {"backend_options": _ray_options(env)}
     return Collector(list(workers), policy, backend=backend, sync=True, **options)
