@@ -35,7 +35,9 @@ COMMAND = [sys.executable, str(ROOT / "recipes" / "td3_gradient_guided.py")]
 def run(*args: str, kill_after: float | None = None) -> tuple[int, str]:
     """Run the recipe to its end, or until some seconds after a file appears; return exit code and stderr."""
     folder = Path(args[-1])
-    with subprocess.Popen([*COMMAND, *args], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
+    options = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
+    one_thread = os.environ | {"OMP_NUM_THREADS": "1"}  # as in this process: other numbers round differently
+    with subprocess.Popen([*COMMAND, *args], env=one_thread, **options) as process:
         if kill_after is not None:
             while process.poll() is None and not list(folder.glob("checkpoints/checkpoint-*.pt")):
                 time.sleep(0.01)
