@@ -207,10 +207,10 @@ class CheckedModel(BaseModel):
             return f"{name} is missing"
         if kind == "too_short":
             return f"{name} must hold at least {item['ctx']['min_length']} value, got {value}"
-        text = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be", 1)
+        text = item["msg"].removeprefix("Value error, ")
         if kind == "value_error":
             return text if not name or text.startswith(name) else f"{name}: {text}"
-        return f"{name} {text}, got {value}"
+        return f"{name} {text.replace('Input should be', 'must be')}, got {value}"
 
 
 def short(value: object, length: int = 80) -> str:

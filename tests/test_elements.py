@@ -191,3 +191,16 @@ def test_nan_in_a_component_is_nan_in_what_depends_on_it():
         assert (jacobian[[0, 2], :2].isnan() == horizontal).all()
     assert field_vector(f64(0.0, 0.0, math.nan)).isnan().all()
     assert elements_gradient(f64(1.0, 1.0, 1.0), torch.full((3, 2), math.nan, dtype=torch.float64)).isnan().all()
+
+
+def test_vectors_of_another_size_are_refused_by_name() -> None:
+    for function, name in (
+        (seven_elements, "b_ned"),
+        (measured_elements, "b_ned"),
+        (elements_jacobian, "b_ned"),
+        (field_vector, "elements"),
+    ):
+        with pytest.raises(ValueError, match=rf"{name} must have the shape \(\.\.\., 3\), got \(2,\)"):
+            function(torch.zeros(2))
+        with pytest.raises(TypeError, match=f"{name} must be a tensor"):
+            function([1.0, 2.0, 3.0])
