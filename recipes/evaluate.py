@@ -5,6 +5,7 @@
     python recipes/evaluate.py secant --scenario my.toml --export tracks.kml    # own tasks, tracks for a map
 
 Trained agents are given with their run folders; several runs of one name are averaged, with their standard deviation.
+An agent that was trained with another arrival threshold, or is not finished, is marked by a warning below the table.
 Metaheuristics evaluate candidate moves in one of two modes, `--mode` or a suffix such as `ga:flown`: `look-ahead` reads
 the field at the end of every candidate for free (an oracle), `flown` makes every candidate a move.
 
@@ -36,7 +37,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import make_navigator
+from magrl.evaluation.navigators import arrival_threshold, check_distinct, make_navigator
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
 from magrl.training import UsageError, command
@@ -63,8 +64,8 @@ class Config:
     """File for the tracks of all episodes: .geojson, .gpx or .kml."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
     """How metaheuristics evaluate a candidate move."""
-    zeta: float = 0.01
-    """Arrival threshold on the objective (Eq. 2-7)."""
+    zeta: float | None = None
+    """Arrival threshold on the objective (Eq. 2-7); that of the runs by default, 0.01 without runs."""
     seed: int = 0
     """Random seed of metaheuristics."""
     out: Path = Path("runs/evaluation")
@@ -82,6 +83,7 @@ class Results:
     episodes: list[dict[str, Any]] = field(default_factory=list)
     paths: list[dict[str, Any]] = field(default_factory=list)
     tracks: list[export.Track] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 def choose_tasks(path: Path | None, tasks: str | None) -> Scenario:
@@ -147,8 +149,10 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def prepare(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, list[tuple[TensorDictModuleBase, ...]]]:
-    """Return the environment, that of the example task, and each navigator for both; create the folder of the results.
+def prepare(
+    config: Config,
+) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, list[tuple[TensorDictModuleBase, ...]], list[str]]:
+    """Return the environment, that of the example task, each navigator for both, and warnings; create the folder.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -159,9 +163,11 @@ def prepare(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, list[
         check_logger("wandb", config.wandb_mode)
         if config.export:
             export.check_suffix(config.export)
+        check_distinct(config.navigators, config.mode)
+        zeta, warnings = arrival_threshold(config.navigators, config.zeta)
         scenario = choose_tasks(config.scenario, config.tasks)
         example = first_tasks(scenario, 1) if config.scenario else Scenario().with_tasks(named_tasks("figure-4-1"))
-        envs = [make_env(place, config.zeta, config.seed) for place in (scenario, example)]
+        envs = [make_env(place, zeta, config.seed) for place in (scenario, example)]
         navigators = [
             tuple(make_navigator(text, env, config.mode, config.seed) for env in envs) for text in config.navigators
         ]
@@ -170,7 +176,7 @@ def prepare(config: Config) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, list[
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
-    return (*envs, navigators)
+    return (*envs, navigators, warnings)
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
@@ -180,9 +186,9 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    env, example_env, navigators = prepare(config)
+    env, example_env, navigators, warnings = prepare(config)
     names = env.scenario.names or tuple(f"task {number}" for number in range(env.num_envs))
-    results = Results()
+    results = Results(warnings=warnings)
     for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
         name, _, run = text.partition("=")
         began = time.perf_counter()
@@ -202,21 +208,22 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
             results.paths += path_rows(name, evaluation_rollout(example_env, example))
-    write(config, results)
+    write(config, env.zeta, results)
     return results.summaries
 
 
-def write(config: Config, results: Results) -> None:
+def write(config: Config, zeta: float, results: Results) -> None:
     """Write the files of the results, and the runs as a table in wandb."""
     for name in ("episodes", "runs", "paths"):
         write_csv(config.out / f"{name}.csv", getattr(results, name))
     write_json(config.out / "summary.json", results.summaries)
-    (config.out / "table.md").write_text(comparison_table(results.summaries, config.mode))
-    (config.out / "short.md").write_text(short_table(results.summaries, config.mode))
+    notes = "".join(f"\nWarning: {text}.\n" for text in results.warnings)
+    (config.out / "table.md").write_text(comparison_table(results.summaries, config.mode) + notes)
+    (config.out / "short.md").write_text(short_table(results.summaries, config.mode) + notes)
     if config.export:
         export.write_tracks(config.export, results.tracks)
     scenario = config.scenario and config.scenario.name
-    settings = {"tasks": config.tasks, "scenario": scenario, "zeta": config.zeta, "mode": config.mode}
+    settings = {"tasks": config.tasks, "scenario": scenario, "zeta": zeta, "mode": config.mode}
     settings |= {"seed": config.seed}
     run = WandbRun(config.out, config.wandb_mode, settings, "evaluation", list(results.summaries))
     run.table("eval/navigators", results.runs)
@@ -226,7 +233,8 @@ def write(config: Config, results: Results) -> None:
 def main(args: Sequence[str] | None = None) -> None:
     """Read the command line, evaluate and print the table."""
     config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
-    print(comparison_table(evaluate(config), config.mode))
+    evaluate(config)
+    print((config.out / "table.md").read_text())
     print(f"Results are in {config.out}")
 
 

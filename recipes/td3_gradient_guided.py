@@ -107,6 +107,8 @@ class Config(RunConfig):
     def _fits(self) -> Self:
         if self.buffer_size < self.batch_size:
             raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
+        if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
+            raise ValueError(f"batch_size {self.batch_size} must not exceed total_frames: no gradient step is possible")
         if self.num_envs % self.collectors:
             raise ValueError(f"num_envs {self.num_envs} cannot be divided evenly among {self.collectors} collectors")
         return self

@@ -373,10 +373,10 @@ class TestLost:
     def test_a_target_beyond_the_edge_does_not_count(self) -> None:
         """Lost is lost, even on a place that reads like the destination."""
         beyond = moved((-0.1, 165.0), 0.0, 20.0)
-        env = make(tasks=task((-0.1, 165.0), (-0.01, 165.0)), margin_deg=0.0, zeta=1e3)
+        env = make(tasks=task((-0.1, 165.0), (-0.01, 165.0)), margin_deg=0.0, zeta=2.9)
         after = fly(env, (20.0, 0.0))[0]["next"]
         assert after["position"][0].tolist() == pytest.approx(beyond, abs=1e-9)
-        assert after["objective"].item() < 1e3
+        assert after["objective"].item() < 2.9
         assert after["terminated"]
         assert not after["success"]
 
@@ -718,7 +718,7 @@ BAD_OPTIONS = {
     "max_steps": [0, -1, 2.5, True],
     "max_move_km": [0.0, -1.0, NAN, INF, 5000.0],
     "max_turn_rad": [0.0, -1.0, NAN, 4.0],
-    "zeta": [0.0, -1.0, NAN, INF],
+    "zeta": [0.0, -1.0, NAN, INF, 3, 3.0, 5.0],
     "start_heading": ["south", "North", None, 0.0],
     "destination_weight": [-1.0, NAN, INF],
     "proximity_weight": [-1.0, NAN, INF],
@@ -733,6 +733,13 @@ def test_bad_options_are_refused_with_their_value(option: str) -> None:
     for value in BAD_OPTIONS[option]:
         with pytest.raises(ValueError, match=rf"{option} must.*{re.escape(repr(value))}"):
             GeomagneticNavEnv(scenario, **{option: value})
+
+
+def test_a_threshold_that_every_start_is_below_is_refused_with_the_reason() -> None:
+    """F of Eq. 2-6 adds at most 1 for each of three elements: the first state of no task is above it."""
+    assert make(64, zeta=2.99).reset()["objective"].max() <= 3
+    with pytest.raises(ValueError, match=r"zeta must be below 3, got 5\.0: the objective F is at most 3 at the start"):
+        make(zeta=5.0)
 
 
 def test_a_scenario_must_be_one() -> None:

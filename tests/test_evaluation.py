@@ -5,6 +5,7 @@ import importlib.util
 import json
 import math
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,8 +17,8 @@ from test_metrics import episode, point
 from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.agents.policy import PolicyConfig
-from magrl.envs import GeomagneticNavEnv
-from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, make_navigator
+from magrl.envs import GeomagneticNavEnv, named_tasks
+from magrl.evaluation.navigators import NAVIGATOR_NAMES, arrival_threshold, label, make_navigator
 from magrl.evaluation.tables import comparison_table, spread
 from magrl.training import UsageError
 
@@ -56,7 +57,10 @@ def run(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def results(evaluate, run: Path, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("results") / "comparison"
-    names = (f"gg_td3={run}", f"gg_td3={run}", "parallel", "secant", "pso", "afsa:flown")
+    runs = [shutil.copytree(run, out.parent / name) for name in ("agent", "other")]
+    for folder in runs:
+        (folder / "eval.json").write_text("{}")
+    names = (*(f"gg_td3={folder}" for folder in runs), "parallel", "secant", "pso", "afsa:flown")
     evaluate.evaluate(evaluate.Config(navigators=names, tasks="paper-100", out=out, wandb_mode="disabled"))
     return out
 
@@ -97,7 +101,7 @@ def test_table_has_the_papers_row_beside_ours(results: Path) -> None:
     assert "PSO, look-ahead (an oracle)" in labels
     assert lines[2].split("|")[3:7] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
     assert lines[3].split("|")[2] == " 2 "
-    assert "0.0 ± 0.0" in lines[3]  # twice the same run
+    assert "0.0 ± 0.0" in lines[3]  # copies of one run
     assert " — " in lines[3]  # without any success
     short = (results / "short.md").read_text().splitlines()
     assert [line.split("|")[1] for line in short[2:]] == [f" {name} " for name in labels if ", paper" not in name]
@@ -171,6 +175,12 @@ def test_bad_usage_is_refused_before_anything_is_written_or_flown(
         ((), {}, "at least one navigator"),
         ((f"td3={tmp_path}",), {}, "there is no policy file at"),
         (("secant",), {"zeta": 0.0}, "zeta must be .* got 0.0"),
+        (("secant",), {"zeta": 3.0}, "zeta must be below 3, got 3.0: the objective F is at most 3 at the start"),
+        (("secant", "ga", "secant"), {}, "^secant is given twice: the same episodes again are no spread over runs"),
+        (("ga", "pso", "ga:look-ahead"), {}, "^ga:look-ahead is given twice"),
+        (("ga:flown", "ga"), {"mode": "flown"}, "^ga is given twice"),
+        ((f"gg_td3={run}", f"gg_td3={run.parent / 'x' / '..' / run.name}"), {}, "is given twice"),
+        ((f"gg_td3={run}", f"td3={run}"), {}, "^td3=.* is given twice"),
         (("ga",), {"seed": -1}, "seed"),
         (("secant",), {"wandb_mode": "sometimes"}, "wandb_mode"),
         (("secant",), {"scenario": tmp_path / "missing.toml"}, "no scenario file at"),
@@ -187,6 +197,56 @@ def test_bad_usage_is_refused_before_anything_is_written_or_flown(
             evaluate.evaluate(evaluate.Config(navigators, **{"wandb_mode": "disabled", **given}))
         assert not (tmp_path / "out").exists(), message
     assert {path.name for path in results.iterdir()} == before
+
+
+@pytest.fixture
+def trained(run: Path, tmp_path: Path):
+    """Return a function that copies the run, as one trained with a threshold; finished unless said otherwise."""
+
+    def copy(name: str, zeta: float, finished: bool = True) -> Path:
+        folder = shutil.copytree(run, tmp_path / name)
+        (folder / "config.json").write_text(json.dumps({"zeta": zeta}))
+        if finished:
+            (folder / "eval.json").write_text("{}")
+        return folder
+
+    return copy
+
+
+def test_the_threshold_is_that_of_the_runs(trained) -> None:
+    """Unless one is chosen; runs that disagree leave no default."""
+    one, same, other = (f"td3={trained(*arguments)}" for arguments in (("a", 0.001), ("b", 0.001), ("c", 0.02)))
+    assert arrival_threshold(["secant"]) == (0.01, [])
+    assert arrival_threshold(["secant", one, same]) == (0.001, [])
+    with pytest.raises(
+        ValueError, match=r"different arrival thresholds, 0\.001 \(.*\), 0\.02 \(.*/c\): choose with --zeta"
+    ):
+        arrival_threshold([one, same, other])
+    zeta, warnings = arrival_threshold([one, other], 0.001)
+    assert zeta == 0.001
+    assert [text.rpartition("/")[2] for text in warnings] == [
+        "c was trained with zeta 0.02 and is evaluated with zeta 0.001"
+    ]
+    Path(one.partition("=")[2], "config.json").write_text("[")
+    with pytest.raises(ValueError, match=r"config\.json is not the configuration of a run"):
+        arrival_threshold([one])
+
+
+def test_what_a_reader_must_know_stands_below_the_table(evaluate, trained, tmp_path: Path, capsys) -> None:
+    names = f"td3={trained('a', 0.02)}", f"td3={trained('b', 0.001, finished=False)}"
+    arguments = ["--tasks", "figure-4-1", "--wandb-mode", "disabled", "--out"]
+    evaluate.main([names[0], *arguments, str(tmp_path / "alone")])
+    assert "Warning" not in capsys.readouterr().out
+    out = tmp_path / "out"
+    with pytest.raises(UsageError, match="different arrival thresholds"):
+        evaluate.main([*names, *arguments, str(out)])
+    evaluate.main([*names, "--zeta", "0.02", *arguments, str(out)])
+    said = capsys.readouterr().out
+    for text in (said, (out / "table.md").read_text(), (out / "short.md").read_text()):
+        warnings = [line for line in text.splitlines() if line.startswith("Warning: ")]
+        assert len(warnings) == 2
+        assert warnings[0].endswith("b was trained with zeta 0.001 and is evaluated with zeta 0.02.")
+        assert warnings[1].endswith("b is not a finished training: it holds no eval.json.")
 
 
 def test_only_bad_usage_is_shown_in_one_line(evaluate, tmp_path: Path, monkeypatch) -> None:
@@ -210,7 +270,7 @@ def test_only_bad_usage_is_shown_in_one_line(evaluate, tmp_path: Path, monkeypat
 def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, capsys) -> None:
     cases = {
         "figures": (["--results", str(tmp_path), "--out", str(tmp_path)], "there is no"),
-        "learning_table": ([f"td3={tmp_path}"], "there is no"),
+        "learning_table": (["runs/A"], "a run must be given as NAME=RUN, such as gg_td3=runs/A, got 'runs/A'"),
         "path_loss": (["dowsing"], "unknown navigator 'dowsing'"),
         "publish": ([str(tmp_path / "missing.md")], "there is no document"),
         "results_table": ([str(tmp_path)], "no eval.json"),
@@ -251,6 +311,21 @@ def test_path_loss_is_what_a_detour_costs() -> None:
     assert got["last two moves"] == pytest.approx(0, abs=0.5)
 
 
+def test_path_loss_takes_every_navigator_once(monkeypatch) -> None:
+    """Metaheuristics too, in both modes, each with its own row."""
+    loss = load("tables/path_loss")
+    monkeypatch.setattr(loss, "named_tasks", lambda _: named_tasks("figure-4-1"))
+    lines = loss.table(["pso:flown", "pso", "secant"]).splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:]] == [
+        "| PSO, flown",
+        "| PSO, look-ahead (an oracle)",
+        "| secant (no training, fair)",
+    ]
+    for texts, message in (([], "name at least one navigator"), (["secant", "secant"], "secant is given twice")):
+        with pytest.raises(UsageError, match=message):
+            loss.table(texts)
+
+
 def test_learning_table(run: Path) -> None:
     learning = load("tables/learning_table")
     lines = learning.table({"agent": [run, run]}).splitlines()
@@ -258,6 +333,22 @@ def test_learning_table(run: Path) -> None:
     # frames 0 to 100 at 0, then the mean of 0 and 92, then of 92 and 98, over 300 frames
     assert cells == ["agent", "2", "200 ± 0", "300 ± 0", f"{(0 + 46 + 95) / 3:.1f} ± 0.0", "90.00 ± 0.00"]
     assert learning.reached([1.0, float("nan")], ".0f") == "1, 1 of 2 never"
+
+
+def test_learning_table_names_what_is_wrong_with_a_run(run: Path, tmp_path: Path) -> None:
+    learning = load("tables/learning_table")
+    assert learning.by_name(["a=x", "b=y", "a=z"]) == {"a": [Path("x"), Path("z")], "b": [Path("y")]}
+    for texts, message in (
+        (["runs/A"], "a run must be given as NAME=RUN, such as gg_td3=runs/A, got 'runs/A'"),
+        (["=runs/A"], "a run must be given as NAME=RUN, such as gg_td3=runs/A, got '=runs/A'"),
+        (["a="], "a run must be given as NAME=RUN"),
+        ([], "name at least one run, such as gg_td3=runs/A"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            learning.by_name(texts)
+    (tmp_path / "train.csv").write_text((run / "train.csv").read_text().splitlines()[0])
+    with pytest.raises(UsageError, match=r"train\.csv has no rows: the training ended before its first evaluation"):
+        learning.table({"a": [tmp_path]})
 
 
 def test_results_table(run: Path, tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+import torch
 
-from magrl.envs import GeomagneticNavEnv
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation.export import Track, check_suffix, cut, to_geojson, to_gpx, to_kml, tracks, write_tracks
 
 GPX, KML = "{http://www.topografix.com/GPX/1/1}", "{http://www.opengis.net/kml/2.2}"
@@ -60,7 +61,8 @@ def test_tracks_are_those_of_the_rollout() -> None:
 
 def test_a_track_ends_where_the_episode_does() -> None:
     """An episode whose first move arrives is a line of two places, whatever the rollout holds after it."""
-    env = GeomagneticNavEnv(num_envs=1, seed=0, zeta=1e9)
+    near = Tasks(*(torch.tensor([end], dtype=torch.float64) for end in ((-5.0, 165.0), (-5.09, 165.0))))
+    env = GeomagneticNavEnv(Scenario(tasks=near), num_envs=1, seed=0, zeta=2.9, max_move_km=10.0)
     rollout = env.rollout(3, break_when_any_done=False)
     (track,) = tracks(rollout, ["short"])
     assert len(track.positions) == 2

@@ -93,6 +93,20 @@ def test_arrival_without_leaving() -> None:
     assert math.isnan(got["heading_mae_deg"])
 
 
+@pytest.mark.parametrize(("success", "distance", "expected"), [(True, 0.0, 1), (False, 0.0, 0), (True, 5.0, 0)])
+def test_start_at_the_destination(success: bool, distance: float, expected: float) -> None:
+    """An episode that has no way to go: not moving is the shortest path, moving is a detour."""
+    got = measures([(distance, 0.0)], (-5.0, 165.0), success)
+    assert (got["shortest_km"], got["spl"]) == (0, expected)
+    assert got["navigation_error_km"] == pytest.approx(distance, abs=1e-6)
+
+
+def test_spl_keeps_nan() -> None:
+    """A length that is not known gives no success."""
+    lengths = torch.tensor([math.nan, 1.0]), torch.tensor([1.0, math.nan])
+    assert spl(torch.tensor([True, True]), *lengths).isnan().all()
+
+
 def test_a_pause_is_neither_a_turn_nor_a_deviation() -> None:
     got = measures([(50.0, 0.0), (0.0, 90.0), (50.0, 0.0)], point(100.0, 0.0), True)
     assert got["smoothness_deg"] == pytest.approx(180, abs=1e-4)
@@ -236,3 +250,35 @@ def test_shortest_is_the_geodesic() -> None:
     target = (-8.0, 164.0)
     expected, _ = geodesic(*torch.tensor([-5.0, 165.0, *target], dtype=torch.float64))
     assert measures([(50.0, 0.0)], target, False)["shortest_km"] == pytest.approx(float(expected))
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: bootstrap_interval([1.0, 2.0]), TypeError, "values must be a tensor"),
+        (lambda: bootstrap_interval(torch.zeros(0)), ValueError, r"values must be of shape \(M,\)"),
+        (lambda: bootstrap_interval(torch.zeros(2, 2)), ValueError, r"values must be of shape \(M,\).*\(2, 2\)"),
+        (lambda: bootstrap_interval(torch.ones(3), 0), ValueError, "resamples must be a whole number from 1 on, got 0"),
+        (
+            lambda: bootstrap_interval(torch.ones(3), 1.5),
+            ValueError,
+            "resamples must be a whole number from 1 on, got 1.5",
+        ),
+        (lambda: bootstrap_interval(torch.ones(3), 1, 0.5), ValueError, "seed must be a whole number, got 0.5"),
+        (lambda: wilson_interval(1.01, 10), ValueError, "rate must be a finite number from 0 up to 1, got 1.01"),
+        (lambda: wilson_interval(-0.01, 10), ValueError, "rate must be a finite number from 0 up to 1, got -0.01"),
+        (lambda: wilson_interval(0.5, 0), ValueError, "count must be a whole number from 1 on, got 0"),
+        (lambda: wilson_interval(0.5, 1.5), ValueError, "count must be a whole number from 1 on, got 1.5"),
+        (lambda: wilson_interval(0.5, 10, z=0.0), ValueError, "z must be a finite number above 0, got 0"),
+    ],
+)
+def test_intervals_refuse_bad_values(call, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_intervals_accept_their_bounds() -> None:
+    assert bootstrap_interval(torch.ones(1), 1, -1) == (1.0, 1.0)
+    for rate in (0.0, 1.0):
+        low, high = wilson_interval(rate, 1)
+        assert 0 <= low < high <= 1

@@ -142,6 +142,27 @@ def test_interrupted_training_resumes_exactly(
     assert not (run / "checkpoints").exists()
 
 
+@pytest.mark.usefixtures("without_figures")
+def test_training_without_a_gradient_step_warns(trained, tmp_path: Path, capsys) -> None:
+    """The first episodes end before the replay buffer holds a batch."""
+    result = recipe.train(settings(tmp_path / "run", total_episodes=1, batch_size=320, zeta=2.9))
+    said = capsys.readouterr().err
+    assert result["updates"] == 0 < trained[1]["updates"]
+    (line,) = [line for line in said.splitlines() if "no gradient step" in line]
+    assert line.startswith(f"Warning: no gradient step was made in {result['frames']} frames")
+    assert "increase total_frames (and total_episodes), or reduce batch_size" in line
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_summary_without_a_success_has_no_nan(tmp_path: Path, capsys) -> None:
+    result = recipe.train(settings(tmp_path / "run", zeta=1e-12))
+    said = capsys.readouterr()
+    assert math.isnan(result["steps"])
+    assert "6 test tasks: success rate 0.0 %, SPL 0.0 %, no episode arrived\n" in said.out
+    assert not re.search(r"\bnan\b", said.out + said.err)
+    assert "gradient step" not in said.err
+
+
 # Settings and command line
 
 
@@ -160,6 +181,8 @@ def test_interrupted_training_resumes_exactly(
         {"tau": 2.0},
         {"tau": 0.0},
         {"zeta": 0.0},
+        {"zeta": 3.0},
+        {"batch_size": 321},
         {"alignment_weight": math.inf},
         {"exploration_noise": -0.1},
         {"num_cells": ()},
@@ -188,6 +211,9 @@ def test_bad_settings_are_refused_by_name(tmp_path: Path, bad: dict) -> None:
         (recipe, "--preset slow", "invalid choice: 'slow' (choose from"),
         (recipe, "--scenario nowhere.toml", "there is no scenario file at nowhere.toml"),
         (recipe, "--resume nowhere", "there is no run to resume in nowhere: it holds no config.json"),
+        (recipe, "--zeta 5", "zeta must be below 3, got 5.0: the objective F is at most 3 at the start"),
+        (recipe, "--total-frames 512", "batch_size 1024 must not exceed total_frames: no gradient step is possible"),
+        (td3_recurrent, "--zeta 3", "zeta must be below 3, got 3.0"),
         (recipe, "--num-envs 8 --collectors 3", "num_envs 8 cannot be divided evenly among 3 collectors"),
         (td3_recurrent, "--num-envs 1", "num_envs must be at least 2, got 1"),
         (td3_recurrent, "--shortest-task-km 600", "shortest_task_km must be below 500, got 600.0"),
@@ -205,6 +231,21 @@ def test_bad_usage_exits_with_status_2(module, args: str, message: str, tmp_path
     assert message in text
     assert "Traceback" not in text
     assert list(tmp_path.iterdir()) == []
+
+
+def test_region_at_a_pole_is_bad_usage(tmp_path: Path, monkeypatch, capsys) -> None:
+    """With file, key and remedy in one message, and before a run folder is made."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "500")
+    Path("polar.toml").write_text("date = 2026-07-01\nregion = {latitude = [75, 85], longitude = [0, 20]}\n")
+    with pytest.raises(SystemExit) as stop:
+        command(recipe.RECIPE, lambda: recipe.main(["--scenario", "polar.toml"]))
+    said = capsys.readouterr()
+    text = re.sub(r"[\s│]+", " ", said.out + said.err)
+    assert stop.value.code == 2
+    assert "polar.toml: region.latitude (75.0, 85.0): with margin_deg 5, vehicles reach a pole" in text
+    assert "reduce margin_deg to 4, or move the region 1° toward the equator" in text
+    assert [path.name for path in tmp_path.iterdir()] == ["polar.toml"]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the message of a build or machine without CUDA")

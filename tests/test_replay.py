@@ -226,7 +226,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     view = GeomagneticNavEnv(seed=0).observation_view()
     save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(view, (8,), layer_norm=False)))
-    (folder / "config.json").write_text(json.dumps({"guided": True, "zeta": 9.0}))
+    (folder / "config.json").write_text(json.dumps({"guided": True, "zeta": 2.9}))
     return folder
 
 
@@ -237,7 +237,7 @@ def test_the_recipe_flies_the_run_first(recipe: Any, run: Path, tmp_path: Path) 
     labels = [navigator["label"] for navigator in data["navigators"]]
     assert labels == ["Gradient-Guided TD3", "secant (no training, fair)", "parallel (true gradient, an oracle)"]
     assert {len(navigator["episodes"]) for navigator in data["navigators"]} == {2}
-    assert data["zeta"] == 9.0  # that of the run, under which any move arrives
+    assert data["zeta"] == 2.9  # that of the run, under which nearly any move arrives
     assert "agent" in data["title"]
     assert Image.open(tmp_path / "a.gif").n_frames > 1
 
@@ -261,6 +261,7 @@ def test_bad_usage_is_refused_before_anything_is_written(recipe: Any, run: Path,
         ({"num_tasks": 2, "tasks": "figure-4-1"}, "from 1 up to 1, got 2"),
         ({"run": Path("nowhere")}, "no run at nowhere"),
         ({"zeta": 0.0}, "zeta"),
+        ({"zeta": 5.0}, "zeta must be below 3, got 5.0"),
         ({"gif": tmp_path / "file" / "a.gif"}, "cannot write .*a.gif"),
         ({"out": tmp_path / "file" / "page.html"}, "cannot write .*page.html"),
     ]

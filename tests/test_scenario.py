@@ -174,8 +174,59 @@ def test_reachable_holds_every_place_that_a_move_can_reach() -> None:
         assert scenario.reachable(max_move_km).contains(reached).all(), name
 
 
+POLAR: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
+    "a margin that ends at the pole": (
+        {"region": Region((75, 85), (0, 20))},
+        "vehicles reach a pole in Region(latitude=(69.5, 90.0), longitude=(-170.0, 190.0)), where all longitudes meet "
+        "and the declination takes every value: reduce margin_deg to 4, or move the region 1° toward the equator",
+        {"margin_deg": 4.0},
+    ),
+    "the same in the south": (
+        {"region": Region((-85, -75), (0, 20))},
+        "reduce margin_deg to 4, or move the region 1° toward the equator",
+        {"region": Region((-84, -74), (0, 20))},
+    ),
+    "both kinds of poles, with whatever margin": (
+        {"region": Region((75, 85), (120, 140))},
+        "takes every value: move the region 6° toward the equator",
+        {"region": Region((69, 79), (120, 140))},
+    ),
+    "the magnetic pole": (
+        {"region": Region((72, 82), (120, 140))},
+        "region.latitude, region.longitude: the declination turns through south in Region(latitude=(66.5, 87.5)",
+        {"margin_deg": 2.0},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", POLAR)
+def test_a_region_near_a_pole_is_refused_with_a_remedy_that_works(name: str, tmp_path: Path) -> None:
+    values, says, remedy = POLAR[name]
+    scenario = Scenario(**values, date="2026-07-01", generation=14)
+    for build in (scenario.build_field, lambda: GeomagneticNavEnv(scenario, seed=0)):
+        with pytest.raises(ValueError, match=r"^region\.latitude") as error:
+            build()
+        assert says in str(error.value)
+        assert "\n" not in str(error.value)
+        assert len(str(error.value)) < 300
+    region = {key: list(getattr(scenario.region, key)) for key in ("latitude", "longitude")}
+    (tmp_path / "polar.json").write_text(json.dumps({"region": region, "date": "2026-07-01"}))
+    with pytest.raises(ValueError, match=r"polar\.json: region\.latitude") as error:
+        load_scenario(tmp_path / "polar.json")
+    assert says in str(error.value)
+    env = GeomagneticNavEnv(scenario.replace(**remedy), num_envs=8, seed=0)
+    after = env.rollout(5, break_when_any_done=False)["next"]
+    assert after["field"].isfinite().all()
+    assert env.field.error_nt < 1e-3
+
+
+def test_an_own_field_may_cover_a_pole() -> None:
+    """It is not expanded; what the environment needs of it, it checks itself."""
+    field = IGRF(2026.5)
+    assert Scenario(region=Region((75, 85), (0, 20)), field=field).build_field() is field
+
+
 INSIDE = places((-5.0, 165.0))
-SET = Tasks(INSIDE, INSIDE)
 BAD_VALUES: list[tuple[str, object, str]] = [
     ("zeta", 0.01, "unknown key 'zeta': choose from region, distance_range_km, date"),
     ("region", ((0, 1), (0, 1)), "region must be a Region, or a table of latitude and longitude"),
@@ -232,6 +283,7 @@ BAD_VALUES: list[tuple[str, object, str]] = [
         Tasks(INSIDE.expand(2, 2), places((-5.0, 165.0), (-5.0, 154.0))),
         "target of task 1 (the first is task 0), [-5.0, 154.0], lies outside Region(latitude=(-15.0, 5.0)",
     ),
+    ("tasks", Tasks(INSIDE, INSIDE), "task 0 (the first is task 0) starts at its destination, [-5.0, 165.0]: move one"),
     ("tasks", Tasks(INSIDE, places((NAN, 165.0))), "tasks: latitude nan"),
     ("tasks", Tasks(places((-5.0, NAN)), INSIDE), "tasks: longitude nan"),
     ("tasks", Tasks(places((-95.0, 165.0)), INSIDE), "tasks: latitude -95.0 is not between -90 and 90 degrees"),
@@ -253,7 +305,7 @@ def test_bad_values_are_refused_with_field_value_and_remedy() -> None:
     assert {name for name, *_ in BAD_VALUES} == {"zeta", *Scenario.model_fields}
     for names in (("a", "b"), ("a", 5)):
         with pytest.raises(ValueError, match="names"):
-            Scenario(tasks=Tasks(INSIDE, INSIDE), names=names)
+            Scenario(tasks=Tasks(INSIDE, places((-6.0, 165.0))), names=names)
 
 
 def test_every_bad_value_of_a_scenario_is_named() -> None:
@@ -365,6 +417,11 @@ BAD_CONTENT: list[tuple[str, object, str]] = [
         "tasks",
         [HERE | {"target": [41, -15]}],
         "tasks: the target of task 0 (the first is task 0), [41.0, -15.0], lies outside",
+    ),
+    (
+        "tasks",
+        [HERE, HERE | {"target": [40, 330.000001]}],
+        "tasks, entry 2: start and target are the same place, [40.0, -30.0]: move one of them, or remove the entry",
     ),
     ("tasks", [HERE | {"start": [140, -30]}], "tasks: latitude 140.0 is not between -90 and 90 degrees"),
     (
@@ -525,6 +582,6 @@ def test_training_and_evaluation_take_the_same_file(tmp_path: Path) -> None:
 def test_a_region_too_large_for_a_field_leaves_no_run_folder(tmp_path: Path) -> None:
     recipe, path = load("td3_gradient_guided"), tmp_path / "big.json"
     path.write_text(json.dumps({"region": {"latitude": [-60, 60], "longitude": [0, 90]}, "date": 2026.5}))
-    with pytest.raises(ValueError, match="shrink the box"):
+    with pytest.raises(ValueError, match=r"big\.json: region.*misses the model by .* nT.*: choose a smaller region"):
         recipe.train(recipe.Config(scenario=path, out=tmp_path / "run", wandb_mode="disabled"))
     assert not (tmp_path / "run").exists()

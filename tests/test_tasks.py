@@ -10,7 +10,7 @@ from geographiclib.geodesic import Geodesic
 from magrl import paper
 from magrl.envs import PAPER_REGION, TASK_SETS, Region, Tasks, named_tasks, task_set
 from magrl.envs import tasks as tasks_module
-from magrl.envs.tasks import check_tasks, counter_uniform, sample_tasks
+from magrl.envs.tasks import check_tasks, counter_uniform, sample_tasks, without_way
 from magrl.geodesy import geodesic, wrap_longitude
 
 ANTIMERIDIAN = Region((-5, 5), (170, 190))
@@ -432,9 +432,18 @@ def test_unsound_tasks_are_refused():
         (f64(GOOD[0], [95.0, 165.0]), f64(*GOOD), "latitude 95"),
         (f64(GOOD[0], [1.0, 165.0]), f64(*GOOD), r"start of task 1 .*, \[1.0, 165.0\], lies outside Region"),
         (f64(*GOOD), f64([-5.0, 150.0], GOOD[1]), r"target of task 0 .*, \[-5.0, 150.0\], lies outside Region"),
+        (f64(*GOOD), f64([-8.0, 164.0], GOOD[1]), r"task 1 .* starts at its destination, \[-2.0, 162.0\]: move"),
+        (f64(*GOOD), f64([-8.0, 164.0], [-2.000008, 522.0]), r"task 1 .* starts at its destination"),  # 0.9 m away
     ):
         with pytest.raises(ValueError, match=message):
             check_tasks(Tasks(start, target), PAPER_REGION)
+
+
+def test_a_task_of_more_than_a_meter_is_one():
+    """1.1 m to the south; and a start at another turn of the same longitude is the same place."""
+    check_tasks(Tasks(f64([-5.0, 165.0]), f64([-5.00001, 165.0])), PAPER_REGION)
+    start, target = f64([-5.0, 165.0], [-5.0, 165.0]), f64([-5.00001, 165.0], [-5.0, -195.0])
+    assert without_way(start, target).tolist() == [False, True]
 
 
 NAMED_SETS = {

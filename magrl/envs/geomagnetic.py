@@ -19,6 +19,7 @@ from torchrl.envs import EnvBase
 
 from magrl import guidance
 from magrl.checks import check_number, check_type
+from magrl.envs.measures import check_zeta
 from magrl.envs.region import Region
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
 from magrl.envs.scenario import Scenario
@@ -56,7 +57,7 @@ class GeomagneticNavEnv(EnvBase):
         max_steps: moves after which an episode is truncated.
         max_move_km: longest move [km].
         max_turn_rad: largest turn to either side before a move [rad].
-        zeta: arrival threshold on the objective.
+        zeta: arrival threshold on the objective, below 3, its largest value at the start.
         start_heading: ``"north"``, or ``"random"`` for a uniform heading.
         destination_weight: reward at arrival, zeta_1.
         proximity_weight: reward per unit of the objective, zeta_2.
@@ -104,7 +105,7 @@ class GeomagneticNavEnv(EnvBase):
         check_number(0, 2**64 - 1, whole=True, seed=0 if seed is None else seed)
         check_number(0, 1000, above=True, max_move_km=max_move_km)  # a move is one short leg
         check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
-        check_number(0, above=True, zeta=zeta)
+        check_zeta(zeta)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight)
         if start_heading not in ("north", "random"):
             raise ValueError(f"start_heading must be 'north' or 'random', got {start_heading!r}")

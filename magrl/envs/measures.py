@@ -1,12 +1,33 @@
-"""Measures of an episode's path, shared by the Gymnasium interface and :mod:`magrl.evaluation`."""
+"""Measures of an episode: its arrival threshold, and its path for Gymnasium and :mod:`magrl.evaluation`."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from magrl.checks import check_tensor, check_type
+from magrl.checks import check_number, check_tensor, check_type
 from magrl.geodesy import geodesic
+
+MAX_OBJECTIVE = 3
+"""Largest objective F at the start: each of the three elements adds at most 1 (Eq. 2-6)."""
+
+
+def check_zeta(zeta: float) -> float:
+    """Return an arrival threshold on the objective; raise unless it lies between 0 and the largest F at the start.
+
+    Raises:
+        ValueError: with the value and the reason.
+
+    Example:
+        >>> check_zeta(5)
+        Traceback (most recent call last):
+        ValueError: zeta must be below 3, got 5: the objective F is at most 3 at the start, so every vehicle has arrived
+    """
+    check_number(0, above=True, zeta=zeta)
+    if zeta >= MAX_OBJECTIVE:
+        known = f"the objective F is at most {MAX_OBJECTIVE} at the start, so every vehicle has arrived"
+        raise ValueError(f"zeta must be below {MAX_OBJECTIVE}, got {zeta!r}: {known}")
+    return zeta
 
 
 def spl(success: Tensor, shortest_km: Tensor, length_km: Tensor) -> Tensor:
@@ -18,7 +39,8 @@ def spl(success: Tensor, shortest_km: Tensor, length_km: Tensor) -> Tensor:
         length_km: ``(...)`` length of the path [km].
 
     Returns:
-        ``(...)`` in [0, 1]: 0 for a failure, 1 for a success on a path no longer than the shortest.
+        ``(...)`` in [0, 1]: 0 for a failure, 1 for a success on a path no longer than the shortest, also where both are
+        0.
 
     Raises:
         TypeError: for ``success`` that is not a bool tensor, or lengths that are not real tensors.
@@ -34,7 +56,8 @@ def spl(success: Tensor, shortest_km: Tensor, length_km: Tensor) -> Tensor:
     check_tensor(shortest_km=shortest_km, length_km=length_km)
     if success.dtype != torch.bool:
         raise TypeError(f"success must be bool, got {success.dtype}")
-    return success * shortest_km / torch.maximum(length_km, shortest_km)
+    longer_km = torch.maximum(length_km, shortest_km)
+    return success * torch.where(longer_km == 0, 1.0, shortest_km / longer_km)
 
 
 def path_measures(success: Tensor, start: Tensor, end: Tensor, target: Tensor, length_km: Tensor) -> dict[str, Tensor]:

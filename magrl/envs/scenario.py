@@ -14,9 +14,18 @@ from pydantic import BeforeValidator, Field, model_validator
 from typing_extensions import Self
 
 from magrl import guidance, paper
-from magrl.checks import CheckedModel, check_number, check_numbers, check_type, short
+from magrl.checks import CheckedModel, check_number, check_type, short
 from magrl.envs.region import PAPER_REGION, Region
-from magrl.envs.tasks import Tasks, check_distance_range, check_tasks, task_set
+from magrl.envs.specs import field_bounds
+from magrl.envs.tasks import (
+    TaskEntry,
+    Tasks,
+    check_distance_range,
+    check_tasks,
+    numbers_validator,
+    task_set,
+    without_way,
+)
 from magrl.field import IGRF, Date, FieldModel, RegionalField, elements_gradient_at, igrf_coefficients, parse_date
 
 if sys.version_info >= (3, 11):
@@ -35,19 +44,6 @@ _SHORTEST_DEGREE_KM = 110.5  # a degree of arc is nowhere shorter on the ellipso
 
 def _tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
-
-
-def _numbers(name: str, count: int, meaning: str) -> Callable[[Any], tuple[float, ...]]:
-    """Return a validator that turns ``count`` finite numbers into a tuple of floats."""
-
-    def check(value: Any) -> tuple[float, ...]:
-        try:
-            check_numbers(count, **{name: value})
-        except (ValueError, OverflowError):
-            raise ValueError(f"{name} must be {count} finite numbers, {meaning}, got {short(value)}") from None
-        return tuple(float(number) for number in value)
-
-    return check
 
 
 def _region(value: object) -> object:
@@ -79,8 +75,8 @@ def _field(value: object) -> object:
     return value
 
 
-_DISTANCES = _numbers("distance_range_km", 2, "shortest and longest in km")
-_FLOORS = _numbers("objective_floors", 3, "of D [deg], I [deg] and B_H [nT]")
+_DISTANCES = numbers_validator("distance_range_km", 2, "shortest and longest in km")
+_FLOORS = numbers_validator("objective_floors", 3, "of D [deg], I [deg] and B_H [nT]")
 
 
 class Scenario(CheckedModel):
@@ -167,13 +163,49 @@ class Scenario(CheckedModel):
             max_move_km: longest move [km].
 
         Raises:
-            ValueError: for a region too large for the expansion.
+            ValueError: for a region too large for the expansion, or too near to a pole of the Earth or of the field;
+                naming the key, the reason and a change that helps.
         """
         if self.field is not None:
             return self.field
+        try:
+            return self._expanded_igrf(max_move_km)
+        except ValueError as error:
+            box = self.reachable(max_move_km)
+            reason = f"region.latitude, region.longitude: {str(error).rpartition(': ')[0]}"  # without its advice
+            if max(map(abs, box.latitude)) == 90:
+                place = f"region.latitude {self.region.latitude}: with margin_deg {self.margin_deg:g}, vehicles reach"
+                reason = f"{place} a pole in {box}, where all longitudes meet and the declination takes every value"
+            raise ValueError(f"{reason}: {self._remedy(max_move_km)}") from error
+
+    def _expanded_igrf(self, max_move_km: float) -> RegionalField:
+        """Return IGRF expanded over every place that a vehicle can reach, with a declination that does not jump."""
         box = self.reachable(max_move_km)
         igrf = IGRF(self.date, self.generation, altitude_km=self.altitude_km)
-        return RegionalField(igrf, box.latitude, box.longitude)
+        field = RegionalField(igrf, box.latitude, box.longitude)
+        field_bounds(field, box, torch.device("cpu"))
+        return field
+
+    def _remedy(self, max_move_km: float) -> str:
+        """Return the smallest changes that give a usable field; each of them was tried."""
+
+        def usable(**changes: Any) -> bool:
+            try:
+                self.replace(tasks=None, names=(), distance_range_km=(0.0, 1.0), **changes)._expanded_igrf(max_move_km)
+            except ValueError:
+                return False
+            return True
+
+        (south, north), longitude = self.region.latitude, self.region.longitude
+        margins = (step / 2 for step in range(min(math.ceil(2 * self.margin_deg), 20) - 1, -1, -1))
+        margin = next((margin for margin in margins if usable(margin_deg=margin)), None)
+        side = math.copysign(1, south + north)
+        shifts = range(1, min(30, int(abs(south + north) / 2)) + 1)
+        regions = ((shift, Region((south - side * shift, north - side * shift), longitude)) for shift in shifts)
+        shift = next((shift for shift, region in regions if usable(region=region)), None)
+        ways = [f"reduce margin_deg to {margin:g}"] if margin is not None else []
+        ways += [f"move the region {shift}° toward the equator"] if shift is not None else []
+        return ", or ".join(ways) or "choose a smaller region away from the poles"
 
     def floors(self, field: FieldModel) -> tuple[float, float, float]:
         """Return the floors of Eq. 2-6, D [deg], I [deg], B_H [nT], from ``field`` where none are given.
@@ -227,7 +259,9 @@ def load_scenario(path: Path | str) -> Scenario:
     check_type((Path, str), path=path)
     path = Path(path)
     try:
-        return _scenario(_content(path))
+        scenario = _scenario(_content(path))
+        scenario.build_field()
+        return scenario
     except FileNotFoundError:
         raise FileNotFoundError(f"there is no scenario file at {path}") from None
     except (ValueError, TypeError, OSError, RecursionError, OverflowError) as error:
@@ -260,33 +294,16 @@ def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
         raise ValueError(f"tasks must be a list of tables with start and target, got {short(listed)}")
     if not listed:
         return (), None
-    entries = [_TaskEntry.read(number, entry) for number, entry in enumerate(listed, start=1)]
+    entries = [TaskEntry.read(number, entry) for number, entry in enumerate(listed, start=1)]
     start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
+    on_earth = (torch.maximum(start[:, 0].abs(), target[:, 0].abs()) <= 90).nonzero().squeeze(-1)
+    if len(nowhere := on_earth[without_way(start[on_earth], target[on_earth])]):
+        number = int(nowhere[0])
+        raise ValueError(
+            f"tasks, entry {number + 1}: start and target are the same place, {list(entries[number].start)}: "
+            "move one of them, or remove the entry"
+        )
     return tuple(e.name for e in entries), Tasks(start, target)
-
-
-def _name(value: object) -> object:
-    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 200:
-        raise ValueError(f"name must be a text of 1 to 200 printable characters, got {short(value)}")
-    return value
-
-
-class _TaskEntry(CheckedModel):
-    """A task in a file."""
-
-    start: Annotated[tuple[float, float], BeforeValidator(_numbers("start", 2, "latitude and longitude in degrees"))]
-    target: Annotated[tuple[float, float], BeforeValidator(_numbers("target", 2, "latitude and longitude in degrees"))]
-    name: Annotated[str, BeforeValidator(_name)]
-
-    @classmethod
-    def read(cls, number: int, entry: Any) -> Self:
-        if not isinstance(entry, dict):
-            raise ValueError(f"tasks, entry {number}, must be a table with start and target, got {short(entry)}")
-        values: dict[str, Any] = {"name": f"task {number}"} | entry
-        try:
-            return cls(**values)
-        except ValueError as error:
-            raise ValueError(f"tasks, entry {number}: {error}") from error
 
 
 def _content(path: Path) -> Any:

@@ -8,19 +8,24 @@ saved to repeat them.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple
 
 import torch
+from pydantic import BeforeValidator
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl import paper
-from magrl.checks import check_number, check_numbers, check_tensor, check_type
+from magrl.checks import CheckedModel, check_number, check_numbers, check_tensor, check_type, short
 from magrl.envs.region import MEAN_RADIUS_KM, PAPER_REGION, Region
 from magrl.geodesy import check_positions, geodesic, move, wrap_longitude
 
 TRIES_PER_ROUND = 8
 MAX_ROUNDS = 1000
 """Rounds of rejection sampling after which a region counts as too small for its distances."""
+SHORTEST_KM = 0.001
+"""Distance from start to destination below which a frozen task counts as without a way to go [km]."""
 
 
 class Tasks(NamedTuple):
@@ -222,6 +227,28 @@ def named_tasks(name: str) -> Tasks:
     raise ValueError(f"unknown task set {name!r}: choose from {', '.join(TASK_SETS)}")
 
 
+def without_way(start: Tensor, target: Tensor) -> Tensor:
+    """Return which tasks start at their destination, to within 1 m.
+
+    Args:
+        start: ``(..., 2)`` latitude, longitude [deg].
+        target: ``(..., 2)`` latitude, longitude [deg].
+
+    Returns:
+        ``(...)`` bool.
+
+    Raises:
+        ValueError: for a latitude beyond 90 degrees.
+
+    Example:
+        >>> start = torch.tensor([[-2.0, 162.0], [-3.0, 180.0]])
+        >>> without_way(start, torch.tensor([[-8.0, 164.0], [-3.0, -180.0]]))
+        tensor([False,  True])
+    """
+    check_tensor(2, start=start, target=target)
+    return geodesic(*start.unbind(-1), *target.unbind(-1))[0] < SHORTEST_KM
+
+
 def check_tasks(tasks: Tasks, within: Region) -> Tasks:
     """Return a copy of tasks in float64 with wrapped longitudes; raise unless all are valid.
 
@@ -230,7 +257,8 @@ def check_tasks(tasks: Tasks, within: Region) -> Tasks:
         within: box in which every start and target must lie.
 
     Raises:
-        ValueError: for other shapes, an empty set, positions that are not on Earth, or outside ``within``.
+        ValueError: for other shapes, an empty set, positions that are not on Earth or outside ``within``, or a task
+            that starts at its destination.
 
     Example:
         >>> tasks = Tasks(torch.tensor([[-2.0, 522.0]]), torch.tensor([[-8.0, 164.0]]))
@@ -253,4 +281,65 @@ def check_tasks(tasks: Tasks, within: Region) -> Tasks:
             raise ValueError(
                 f"the {name} of task {index} (the first is task 0), {position[index].tolist()}, lies outside {within}"
             )
+    if (nowhere := without_way(start, target)).any():
+        index = int(nowhere.nonzero()[0])
+        raise ValueError(
+            f"task {index} (the first is task 0) starts at its destination, {start[index].tolist()}: move one of them, "
+            "or remove the task"
+        )
     return Tasks(*(torch.stack((x[:, 0], wrap_longitude(x[:, 1])), -1) for x in (start, target)))
+
+
+def numbers_validator(name: str, count: int, meaning: str) -> Callable[[Any], tuple[float, ...]]:
+    """Return a pydantic validator that turns ``count`` finite numbers into a tuple of floats.
+
+    Args:
+        name: name of the value in messages.
+        count: how many numbers.
+        meaning: what they are, in messages.
+
+    Example:
+        >>> numbers_validator("start", 2, "latitude and longitude in degrees")([40, -30])
+        (40.0, -30.0)
+    """
+
+    def check(value: Any) -> tuple[float, ...]:
+        try:
+            check_numbers(count, **{name: value})
+        except (ValueError, OverflowError):
+            raise ValueError(f"{name} must be {count} finite numbers, {meaning}, got {short(value)}") from None
+        return tuple(float(number) for number in value)
+
+    return check
+
+
+_DEGREES = "latitude and longitude in degrees"
+
+
+def _name(value: object) -> object:
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 200:
+        raise ValueError(f"name must be a text of 1 to 200 printable characters, got {short(value)}")
+    return value
+
+
+class TaskEntry(CheckedModel):
+    """A task in a file."""
+
+    start: Annotated[
+        tuple[float, float], BeforeValidator(numbers_validator("start", 2, "latitude and longitude in degrees"))
+    ]
+    target: Annotated[
+        tuple[float, float], BeforeValidator(numbers_validator("target", 2, "latitude and longitude in degrees"))
+    ]
+    name: Annotated[str, BeforeValidator(_name)]
+
+    @classmethod
+    def read(cls, number: int, entry: Any) -> Self:
+        """Return an entry of a file, counted from 1."""
+        if not isinstance(entry, dict):
+            raise ValueError(f"tasks, entry {number}, must be a table with start and target, got {short(entry)}")
+        values: dict[str, Any] = {"name": f"task {number}"} | entry
+        try:
+            return cls(**values)
+        except ValueError as error:
+            raise ValueError(f"tasks, entry {number}: {error}") from error

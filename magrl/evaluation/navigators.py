@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from tensordict.nn import TensorDictModuleBase
@@ -14,6 +15,8 @@ from magrl.navigators import METAHEURISTICS, NAVIGATORS
 
 TRAINED = ("gg_td3", "td3", "recurrent")
 """Names of trained agents; each needs a run folder."""
+DEFAULT_ZETA = 0.01
+"""Arrival threshold of an evaluation without runs."""
 
 NAVIGATOR_NAMES = {
     "gg_td3": "Gradient-Guided TD3",
@@ -92,3 +95,76 @@ def label(name: str, default_mode: str = "look-ahead") -> str:
         return _DETAILED_NAMES[base]
     look_ahead = (mode or default_mode) == "look-ahead"
     return _DETAILED_NAMES[base] + (", look-ahead (an oracle)" if look_ahead else ", flown")
+
+
+def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> None:
+    """Raise if a navigator is given twice: the same episodes twice are no spread over runs.
+
+    Args:
+        texts: navigators, as :func:`make_navigator` takes them.
+        default_mode: mode of metaheuristics without one in their text.
+
+    Raises:
+        ValueError: naming the text.
+
+    Example:
+        >>> check_distinct(["gg_td3=runs/A", "gg_td3=runs/B", "ga", "ga:flown"])
+        >>> check_distinct(["td3=runs/A", "td3=runs/A/"])
+        Traceback (most recent call last):
+        ValueError: td3=runs/A/ is given twice: the same episodes again are no spread over runs
+    """
+    seen: set[object] = set()
+    for text in texts:
+        name, _, run = text.partition("=")
+        base, _, mode = name.partition(":")
+        key = Path(run).resolve() if run else (base, mode or (default_mode if base in METAHEURISTICS else ""))
+        if key in seen:
+            raise ValueError(f"{text} is given twice: the same episodes again are no spread over runs")
+        seen.add(key)
+
+
+def arrival_threshold(texts: Sequence[str], zeta: float | None = None) -> tuple[float, list[str]]:
+    """Return the arrival threshold of an evaluation, and what a reader of its results must know about the runs.
+
+    Args:
+        texts: navigators, as :func:`make_navigator` takes them.
+        zeta: threshold that was chosen; None for that of the runs, or 0.01 where none of them states one.
+
+    Returns:
+        The threshold, and a sentence for each run that was trained with another threshold or is not finished.
+
+    Raises:
+        ValueError: for runs with different thresholds if none was chosen, or a damaged ``config.json``.
+
+    Example:
+        >>> arrival_threshold(["secant", "td3=runs/nowhere"])
+        (0.01, ['runs/nowhere is not a finished training: it holds no eval.json'])
+    """
+    named = (text.partition("=") for text in texts)
+    runs = [Path(run) for name, _, run in named if name in TRAINED and run]
+    trained = {run: known for run in runs if (known := _trained_zeta(run)) is not None}
+    if zeta is None:
+        examples = {known: run for run, known in trained.items()}
+        if len(examples) > 1:
+            listed = ", ".join(f"{known:g} ({run})" for known, run in examples.items())
+            raise ValueError(f"the runs were trained with different arrival thresholds, {listed}: choose with --zeta")
+        zeta = next(iter(examples), DEFAULT_ZETA)
+    warnings = [
+        f"{run} was trained with zeta {known:g} and is evaluated with zeta {zeta:g}"
+        for run, known in trained.items()
+        if known != zeta
+    ]
+    unfinished = [run for run in runs if not (run / "eval.json").is_file()]
+    return zeta, warnings + [f"{run} is not a finished training: it holds no eval.json" for run in unfinished]
+
+
+def _trained_zeta(run: Path) -> float | None:
+    """Return the arrival threshold with which a run was trained, or None where its folder does not state it."""
+    path = run / "config.json"
+    if not path.is_file():
+        return None
+    try:
+        zeta = json.loads(path.read_text()).get("zeta")
+        return None if zeta is None else float(zeta)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is not the configuration of a run: {error}") from error

@@ -11,12 +11,13 @@ from typing import Annotated, Any, TypeVar
 
 import torch
 import tyro
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from typing_extensions import Self
 
 from magrl import paper
 from magrl.checks import CheckedModel, check_type
 from magrl.envs import Scenario, load_scenario
+from magrl.envs.measures import check_zeta
 from magrl.training.loggers import Logger, WandbMode, check_logger
 
 Count = Annotated[int, Field(ge=1)]
@@ -27,6 +28,7 @@ PositiveShare = Annotated[float, Field(gt=0, le=1)]
 Discount = Annotated[float, Field(ge=0, lt=1)]
 Widths = Annotated[tuple[Count, ...], Field(min_length=1)]
 Seed = Annotated[int, Field(ge=0, lt=paper.FIRST_RESERVED_SEED)]
+Threshold = Annotated[float, AfterValidator(check_zeta)]
 
 
 class UsageError(ValueError):
@@ -69,8 +71,8 @@ class RunConfig(CheckedModel):
     """TOML or JSON file of an own region, date and altitude (docs/own_data.md); the paper's by default."""
     num_envs: Count = 512
     """Number of vehicles."""
-    zeta: Positive = 0.01
-    """Arrival threshold on the objective (Eq. 2-7)."""
+    zeta: Threshold = 0.01
+    """Arrival threshold on the objective (Eq. 2-7), below 3."""
     total_frames: Count = 204_800
     """Steps of all vehicles together."""
     total_episodes: Count | None = None

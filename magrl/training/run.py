@@ -223,7 +223,8 @@ class Run:
         self.best.offer(selection_score(summary["spl"], episodes["success"], episodes["steps"], limit), self.actor)
         row = self.statistics.row() | {"seconds": self.log.seconds}
         self.log.row(row | {f"eval_{key}": summary[key] for key in EVALUATED})
-        return f"SR {summary['success_rate']:.1f} %, SPL {summary['spl']:.1f} %, return {row['return']:.0f}"
+        earned = f"{row['return']:.0f}" if math.isfinite(row["return"]) else "not known yet"
+        return f"SR {summary['success_rate']:.1f} %, SPL {summary['spl']:.1f} %, return {earned}"
 
     # Results
 
@@ -257,6 +258,12 @@ class Run:
         self.log.result(result, navigator=self.name)
         self.checkpoints.clear()
         self._report(result)
+        if not self.statistics.updates:
+            print(
+                f"Warning: no gradient step was made in {result['frames']} frames, so the policy is untrained: "
+                "increase total_frames (and total_episodes), or reduce batch_size",
+                file=sys.stderr,
+            )
         return result
 
     def _report_stop(self) -> None:
@@ -268,10 +275,15 @@ class Run:
         raise SystemExit(self.stop.exit_code)
 
     def _report(self, result: dict[str, float]) -> None:
+        arrived = (
+            f"{result['steps']:.1f} steps, {result['trajectory_length_m'] / 1000:.0f} km, "
+            f"navigation error {result['navigation_error_km']:.1f} km"
+            if result["success_rate"]
+            else "no episode arrived"
+        )
         print(
             f"\n{result['num_tasks']} test tasks: success rate {result['success_rate']:.1f} %, "
-            f"SPL {result['spl']:.1f} %, {result['steps']:.1f} steps, {result['trajectory_length_m'] / 1000:.0f} km, "
-            f"navigation error {result['navigation_error_km']:.1f} km\n"
+            f"SPL {result['spl']:.1f} %, {arrived}\n"
             f"Trained in {result['training_seconds']:.0f} s; results, curves and figures are in {self.folder}"
         )
 

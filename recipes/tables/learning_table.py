@@ -50,6 +50,8 @@ def curve(run: Path) -> list[tuple[float, float, float]]:
         raise UsageError(f"there is no {path}: is the training complete?")
     with path.open() as file:
         rows = list(csv.DictReader(file))
+    if not rows:
+        raise UsageError(f"{path} has no rows: the training ended before its first evaluation")
     return [(float(row["frames"]), float(row["eval_success_rate"]), float(row["eval_spl"])) for row in rows]
 
 
@@ -90,15 +92,26 @@ def table(names: Mapping[str, Sequence[Path]]) -> str:
     return markdown_table(HEAD, rows)
 
 
+def by_name(texts: Sequence[str]) -> dict[str, list[Path]]:
+    """Return run folders by name.
+
+    Raises:
+        UsageError: for no run, or a run without a name.
+    """
+    groups: dict[str, list[Path]] = {}
+    for text in texts:
+        name, _, folder = text.partition("=")
+        if not name or not folder:
+            raise UsageError(f"a run must be given as NAME=RUN, such as gg_td3={folder or name}, got {text!r}")
+        groups.setdefault(name, []).append(Path(folder))
+    if not groups:
+        raise UsageError("name at least one run, such as gg_td3=runs/A")
+    return groups
+
+
 def main() -> None:
     """Read the command line and print the table."""
-    groups: dict[str, list[Path]] = {}
-    for text in tyro.cli(Runs, prog=RECIPE, description=__doc__).runs:
-        name, equals, folder = text.partition("=")
-        if not equals:
-            raise UsageError(f"runs must be given as NAME=RUN, got {text!r}")
-        groups.setdefault(name, []).append(Path(folder))
-    print(table(groups))
+    print(table(by_name(tyro.cli(Runs, prog=RECIPE, description=__doc__).runs)))
 
 
 if __name__ == "__main__":

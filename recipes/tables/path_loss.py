@@ -23,7 +23,7 @@ from tensordict import TensorDictBase
 from magrl.envs import GeomagneticNavEnv, Scenario, named_tasks
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import label, make_navigator
+from magrl.evaluation.navigators import check_distinct, label, make_navigator
 from magrl.evaluation.tables import markdown_table, spread
 from magrl.geodesy import geodesic
 from magrl.training import UsageError, command
@@ -61,11 +61,14 @@ def table(texts: Sequence[str]) -> str:
     """Return the table: mean and standard deviation over the runs of each navigator.
 
     Raises:
-        UsageError: for an unknown navigator.
+        UsageError: for no navigator, an unknown one, or one that is given twice.
     """
+    if not texts:
+        raise UsageError("name at least one navigator, for example: secant")
     tasks = named_tasks("test-1000")
     env = GeomagneticNavEnv(Scenario(tasks=tasks), num_envs=len(tasks.start), seed=0)
     try:
+        check_distinct(texts)
         navigators = [make_navigator(text, env) for text in texts]
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
