@@ -208,6 +208,11 @@ def box() -> field.RegionalField:
     return field.RegionalField(igrf(), (-10.0, 0.0), (160.0, 170.0), degree=6, tolerance_nt=1.0)
 
 
+@cache
+def bank() -> field.FieldBank:
+    return field.FieldBank(zeros(2, 3, 4, 4), *(torch.tensor([[-10.0, 0.0], [0.0, 10.0]]),) * 2)
+
+
 def bad_places(model: Callable[..., object]) -> list[Refused | Nan]:
     return [
         refused(lambda: model(t(-95.0), t(0.0)), ValueError, "latitude -95.0"),
@@ -282,6 +287,32 @@ FIELDS: Rows = {
     ],
     "field.RegionalField.value_and_gradient": [
         Nan(lambda: box().value_and_gradient(t(5.0, NAN, -5.0), t(165.0, 165.0, NAN))),
+    ],
+    "field.random_planets": [
+        *bad_numbers(
+            lambda count=1, seed=0, **options: field.random_planets(count, seed, **options),
+            count=(0, -1, 1.5, "a"),
+            seed=(-1, 0.5, NAN, None, 2**63),
+            degree=(0, 2.0, NAN),
+            tilt_deg=(-1.0, 181.0, NAN, "a"),
+            strength=(1.0, (1.3, 0.7), (-1.0, 1.0), (1.0, NAN)),
+            spread=(1.0, (2.0, 0.5), (1.0,), (0.5, INF)),
+        ),
+    ],
+    "field.FieldBank": [
+        *bad_tensors(lambda a, b: bank()(a, b, int64(1)), "latitude", "longitude"),
+        refused(lambda: field.FieldBank(5, zeros(1, 2), zeros(1, 2)), TypeError, "expansion", "5"),
+        refused(lambda: field.FieldBank(zeros(1, 3, 4, 5), zeros(1, 2), zeros(1, 2)), ValueError, "(1, 3, 4, 5)"),
+        refused(lambda: field.FieldBank(zeros(2, 3, 4, 4), t(0, 1)[None], t(0, 1)[None]), ValueError, "2 boxes", "1"),
+        refused(lambda: field.FieldBank(zeros(1, 3, 4, 4), t(1, 0)[None], t(0, 1)[None]), ValueError, "(1.0, 0.0)"),
+        refused(lambda: field.FieldBank(zeros(1, 3, 4, 4), t(0, 1)[None], t(0, 361)[None]), ValueError, "361.0"),
+        refused(lambda: bank()(t(0.0), t(0.0), t(0.0)), TypeError, "index", "torch.float32"),
+        refused(lambda: bank()(t(0.0), t(0.0), int64(1) + 2), ValueError, "index 2", "[0, 2)"),
+        Nan(lambda: bank()(t(5.0, NAN, -5.0), t(-5.0, -5.0, INF), int64(3))),
+    ],
+    "field.FieldBank.value_and_gradient": [
+        refused(lambda: bank().value_and_gradient(t(0.0), t(0.0), int64(1) - 1), ValueError, "index -1", "[0, 2)"),
+        Nan(lambda: bank().value_and_gradient(t(5.0, NAN, -5.0), t(-5.0, -5.0, NAN), int64(3))),
     ],
 }
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "magrl"
 FLOORS = (
     {"checks", "geodesy", "files", "paper"},
-    {"field", "guidance"},
+    {"field", "guidance", "tracking"},
     {"transforms"},
     {"envs"},
     {"navigators", "agents"},

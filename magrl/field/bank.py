@@ -1,0 +1,328 @@
+"""Many regional expansions evaluated together: each vehicle flies in a region of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from magrl.checks import check_number, check_tensor, require
+from magrl.field import harmonics
+from magrl.field.harmonics import chebyshev, chebyshev_nodes
+from magrl.field.model import Float64Module, in_chunks
+from magrl.geodesy import curvature_radii, to_ecef
+
+
+class FieldBank(Float64Module):
+    """Chebyshev expansions of many fields, each on a latitude-longitude box, at sea level of the WGS84 ellipsoid.
+
+    Each position comes with the index of its expansion, so a batch of vehicles can be spread over many planets. An
+    evaluation sums the coefficients of each vehicle over the polynomials of its latitude, without a copy of them, then
+    over those of its longitude. :meth:`build` makes a bank from Gauss coefficients. A bank of one box is a
+    :class:`~magrl.field.RegionalField`.
+
+    Args:
+        expansion: ``(K, 3, n, n)`` Chebyshev coefficients of north, east, down [nT], by the order in latitude, then in
+            longitude.
+        latitude: ``(K, 2)`` southern and northern edges [deg], within [-90, 90].
+        longitude: ``(K, 2)`` western and eastern edges [deg], rising; may cross the antimeridian (170 to 190).
+
+    Raises:
+        TypeError: for an argument that is not a tensor of real numbers.
+        ValueError: for another shape, or an empty or reversed box, with its edges.
+
+    Example:
+        >>> from magrl.field import random_planets
+        >>> south, west = torch.tensor([-10.0, 40.0, 45.0]), torch.tensor([160.0, 170.0, -20.0])
+        >>> boxes = torch.stack((south, south + 20), -1), torch.stack((west, west + 20), -1)
+        >>> bank = FieldBank.build(random_planets(2, seed=0), torch.tensor([0, 0, 1]), *boxes)
+        >>> bank(torch.tensor([0.0, 50.0]), torch.tensor([170.0, -10.0]), torch.tensor([0, 2])).shape
+        torch.Size([2, 3])
+    """
+
+    CHUNK = 10240
+    """Positions evaluated at a time; temporary memory is about 3 kB per position."""
+    coefficients: Tensor
+    scaling: Tensor
+    slopes: Tensor
+    error_nt: Tensor
+    """Largest difference from the exact field at the check points of each expansion, ``(K,)`` [nT]; NaN if unknown."""
+
+    def __init__(self, expansion: Tensor, latitude: Tensor, longitude: Tensor) -> None:
+        super().__init__()
+        check_tensor(expansion=expansion)
+        if expansion.ndim != 4 or expansion.shape[1:] != (3, *expansion.shape[-1:] * 2) or expansion.shape[-1] < 2:
+            raise ValueError(f"expansion must have the shape (K, 3, n, n) with n >= 2, got {tuple(expansion.shape)}")
+        terms = expansion.shape[-1]
+        latitude, longitude = _checked_boxes(latitude, longitude)
+        if len(latitude) != len(expansion):
+            raise ValueError(f"latitude must hold {len(expansion)} boxes, as expansion, got {len(latitude)}")
+        self.degree = terms - 1
+        self.register_buffer("coefficients", _product_layout(expansion.double()))
+        self.register_buffer("scaling", _scaling(latitude, longitude).to(expansion.device))
+        self.register_buffer("slopes", _slopes(terms).to(expansion.device), persistent=False)
+        self.register_buffer("error_nt", torch.full_like(self.scaling[:, 0, 0], torch.nan))
+
+    @classmethod
+    def build(
+        cls,
+        gauss: Tensor,
+        planet_index: Tensor,
+        latitude: Tensor,
+        longitude: Tensor,
+        *,
+        degree: int = 12,
+        tolerance_nt: float = 1e-3,
+    ) -> Self:
+        """Expand the fields of planets on boxes, and measure the error of each expansion.
+
+        Args:
+            gauss: complex ``(P, N + 1, N + 1)`` tables ``g - i h`` [nT], for example
+                :func:`~magrl.field.random_planets`.
+            planet_index: ``(K,)`` int64, the planet of each box.
+            latitude: ``(K, 2)`` southern and northern edges [deg], within [-90, 90].
+            longitude: ``(K, 2)`` western and eastern edges [deg], rising; may cross the antimeridian (170 to 190).
+            degree: degree of the expansions in each direction.
+            tolerance_nt: largest error allowed [nT], at points four times as dense as the nodes, corners included.
+
+        Returns:
+            The bank, with the error of each expansion in ``error_nt``.
+
+        Raises:
+            TypeError: for tables that are not complex, or indices that are not int64.
+            ValueError: for another shape, coefficients that are not finite, an index without a planet, an empty or
+                reversed box, or an error above the tolerance, naming the worst box.
+        """
+        check_number(1, whole=True, degree=degree)
+        check_number(0, above=True, tolerance_nt=tolerance_nt)
+        latitude, longitude = (x.cpu() for x in _checked_boxes(latitude, longitude))
+        gauss, planet_index = _checked_planets(gauss, planet_index, len(latitude))
+        weights, planet = _surface_weights(gauss), planet_index.split(_BOXES)
+        boxes = list(zip(planet, latitude.split(_BOXES), longitude.split(_BOXES), strict=True))
+        angles, from_nodes = chebyshev_nodes(degree + 1)
+        samples = (_synthesis(weights[k], *_inside(angles.cos(), lat, lon)) for k, lat, lon in boxes)
+        bank = cls(torch.cat([from_nodes @ x @ from_nodes.T for x in samples]), latitude, longitude)
+        unit = torch.linspace(-1, 1, 4 * degree + 1, dtype=torch.float64)
+        polynomials = chebyshev(unit, degree + 1)
+        errors = []
+        for (k, lat, lon), table in zip(boxes, bank.coefficients.split(_BOXES), strict=True):
+            found = polynomials.T @ table.unflatten(2, (-1, 3)).permute(0, 3, 1, 2) @ polynomials
+            errors.append((found - _synthesis(weights[k], *_inside(unit, lat, lon))).abs().amax((1, 2, 3)))
+        bank.error_nt.copy_(torch.cat(errors))
+        bank._check_error(planet_index, latitude, longitude, float(tolerance_nt))
+        return bank
+
+    def forward(self, latitude: Tensor, longitude: Tensor, index: Tensor) -> Tensor:
+        """Return the field vector.
+
+        Args:
+            latitude: ``(...)`` [deg].
+            longitude: ``(...)`` [deg], any turn.
+            index: ``(...)`` int64, the expansion of each position.
+
+        Returns:
+            ``(..., 3)`` float64: north, east, down [nT]; NaN outside the box (there is no extrapolation).
+
+        Raises:
+            TypeError: for an index of another dtype.
+            ValueError: for an index outside [0, K).
+        """
+        shape, points = self._points(latitude, longitude, index)
+        return in_chunks(self._value, points, 3, self.CHUNK).reshape(3, *shape).movedim(0, -1)
+
+    def value_and_gradient(self, latitude: Tensor, longitude: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the field vector and the exact horizontal gradient of its expansion.
+
+        Args:
+            latitude: ``(...)`` [deg].
+            longitude: ``(...)`` [deg], any turn.
+            index: ``(...)`` int64, the expansion of each position.
+
+        Returns:
+            ``(..., 3)`` [nT] and ``(..., 3, 2)`` [nT/km] northward and eastward at sea level; NaN outside the box.
+
+        Raises:
+            TypeError: for an index of another dtype.
+            ValueError: for an index outside [0, K).
+        """
+        shape, points = self._points(latitude, longitude, index)
+        rows = in_chunks(self._value_and_gradient, points, 9, self.CHUNK).reshape(9, *shape)
+        return rows[:3].movedim(0, -1), rows[3:].unflatten(0, (2, 3)).movedim((1, 0), (-2, -1))
+
+    def _points(self, latitude: Tensor, longitude: Tensor, index: Tensor) -> tuple[torch.Size, list[Tensor]]:
+        """Return the shape of the positions, positions ``(2, P)`` and indices ``(P,)``."""
+        check_tensor(latitude=latitude, longitude=longitude, index=index)
+        _check_index(index, len(self.coefficients))
+        latitude, longitude, index = torch.broadcast_tensors(latitude.double(), longitude.double(), index)
+        return index.shape, [torch.stack((latitude, longitude)).reshape(2, -1), index.reshape(-1)]
+
+    def _value(self, position: Tensor, index: Tensor) -> Tensor:
+        """Return north, east, down: ``(3, P)`` [nT]."""
+        unit = self._unit(position, self.scaling.index_select(0, index))
+        latitude, longitude = chebyshev(unit, self.degree + 1).unbind(1)
+        return self._sum_latitude(index, latitude).mul_(longitude.unsqueeze(1)).sum(0)
+
+    def _value_and_gradient(self, position: Tensor, index: Tensor) -> Tensor:
+        """Return the vector [nT], then the derivative of each component northward and eastward [nT/km]: ``(9, P)``."""
+        scaling = self.scaling.index_select(0, index)
+        polynomials = chebyshev(self._unit(position, scaling), self.degree + 1)
+        slopes = (self.slopes @ polynomials.flatten(1)).reshape(polynomials.shape)
+        both = torch.cat((polynomials[:, 0], slopes[:, 0]), -1)
+        terms = self._sum_latitude(index.repeat(2), both).unflatten(-1, (2, -1))
+        east = (terms[:, :, 0] * slopes[:, 1:]).sum(0)
+        value, north = (terms * polynomials[:, 1:].unsqueeze(1)).sum(0).unbind(1)
+        meridian, prime_vertical = curvature_radii(position[0])
+        radius_km = torch.stack((meridian, prime_vertical * torch.cos(torch.deg2rad(position[0]))))
+        per_km = torch.rad2deg(scaling[..., 1].T / radius_km)
+        return torch.cat((value, north * per_km[0], east * per_km[1]))
+
+    def _sum_latitude(self, index: Tensor, polynomials: Tensor) -> Tensor:
+        """Return the sums over the latitude order: ``(n, P)`` to ``(n, 3, P)``, by longitude order and component."""
+        terms = len(polynomials)
+        rows = index.unsqueeze(-1) * terms + torch.arange(terms, device=index.device)
+        bags = nn.functional.embedding_bag(
+            rows, self.coefficients.flatten(0, 1), per_sample_weights=polynomials.T, mode="sum"
+        )
+        return bags.T.contiguous().unflatten(0, (terms, 3))
+
+    def _unit(self, position: Tensor, scaling: Tensor) -> Tensor:
+        """Return latitude and longitude ``(2, P)`` in half spans from the centers of the boxes; NaN beyond [-1, 1]."""
+        center, per_degree = scaling.movedim(0, -1).unbind(1)
+        north, east = position - center
+        unit = torch.stack((north, torch.sub(east, torch.round(east / 360), alpha=360))) * per_degree
+        # The edges belong to the box, even if scaling rounds them out of it.
+        return unit.masked_fill_(unit.abs() > 1 + 1e-12, float("nan"))
+
+    def _check_error(self, planet_index: Tensor, latitude: Tensor, longitude: Tensor, tolerance_nt: float) -> None:
+        """Raise unless every error is within the tolerance; an error that is NaN is the worst."""
+        worst = int(self.error_nt.nan_to_num(torch.inf).argmax())
+        if not self.error_nt[worst] <= tolerance_nt:
+            raise ValueError(
+                f"the expansion of degree {self.degree} misses the field by {self.error_nt[worst]:.3g} nT in box "
+                f"{worst}, of planet {planet_index[worst]}, latitudes {tuple(latitude[worst].tolist())}, longitudes "
+                f"{tuple(longitude[worst].tolist())}; the tolerance is {tolerance_nt:.3g} nT: raise the degree or "
+                "shrink the boxes"
+            )
+
+    def extra_repr(self) -> str:
+        """Return the number of expansions, their degree and the largest error as text."""
+        return f"expansions={len(self.coefficients)}, degree={self.degree}, error_nt={self.error_nt.max():.1e}"
+
+
+_BOXES = 64
+"""Boxes expanded at a time, and planets prepared at a time: at degree 13, about 30 MB of temporary memory."""
+
+
+def _check_index(index: Tensor, count: int, name: str = "index") -> None:
+    """Raise unless indices are int64 in [0, count); an accelerator does not wait for the answer."""
+    if index.dtype != torch.int64:
+        raise TypeError(f"{name} must be int64, got {index.dtype}")
+    good, message = (index >= 0) & (index < count), f"{name} {{}} is not in [0, {count})"
+    if index.device.type == "cpu":
+        require(good, index, message)
+    else:
+        torch._assert_async(good.all(), message)
+
+
+def _checked_planets(gauss: Tensor, planet_index: Tensor, boxes: int) -> tuple[Tensor, Tensor]:
+    if not isinstance(gauss, Tensor) or not gauss.is_complex():
+        kind = gauss.dtype if isinstance(gauss, Tensor) else f"{gauss!r}"
+        raise TypeError(f"gauss must be a tensor of complex numbers g - i h, got {kind}")
+    if gauss.ndim != 3 or gauss.shape[1] != gauss.shape[2] or gauss.shape[1] < 2:
+        raise ValueError(f"gauss must have the shape (P, N + 1, N + 1) with N >= 1, got {tuple(gauss.shape)}")
+    if not torch.isfinite(torch.view_as_real(gauss)).all():
+        raise ValueError("gauss holds non-finite coefficients")
+    check_tensor(planet_index=planet_index)
+    if planet_index.shape != (boxes,):
+        raise ValueError(f"planet_index must have the shape ({boxes},), as the boxes, got {tuple(planet_index.shape)}")
+    planet_index = planet_index.cpu()
+    _check_index(planet_index, len(gauss), "planet_index")
+    return gauss.to("cpu", torch.complex128), planet_index
+
+
+def _checked_boxes(latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the edges of boxes ``(K, 2)`` as float64."""
+    check_tensor(2, latitude=latitude, longitude=longitude)
+    if latitude.ndim != 2 or latitude.shape != longitude.shape or not len(latitude):
+        shapes = f"{tuple(latitude.shape)} and {tuple(longitude.shape)}"
+        raise ValueError(f"latitude and longitude must have the shape (K, 2) with K >= 1, got {shapes}")
+    latitude, longitude = latitude.double(), longitude.double()
+    (south, north), (west, east) = latitude.T, longitude.T
+    sound = (south >= -90) & (south < north) & (north <= 90)
+    rising = (west < east) & (east <= west + 360)
+    for good, edges, name, rule in (
+        (sound, latitude, "latitudes", "rise from south to north within [-90, 90] degrees"),
+        (rising, longitude, "longitudes", "rise from west to east by at most 360 degrees"),
+    ):
+        if not good.all():
+            k = int((~good).nonzero()[0])
+            raise ValueError(f"{name} {tuple(edges[k].tolist())} of box {k} must {rule}")
+    return latitude, longitude
+
+
+def _product_layout(expansion: Tensor) -> Tensor:
+    """Return coefficients in the layout of the sums: ``(K, 3, n, n)`` to ``(K, n, 3 n)``.
+
+    The latitude order, then, as in RegionalField, the longitude order and within it the component.
+    """
+    return expansion.permute(0, 2, 3, 1).flatten(2).contiguous()
+
+
+def _scaling(latitude: Tensor, longitude: Tensor) -> Tensor:
+    """Return center [deg] and half spans per degree, of latitude and longitude: ``(K, 2, 2)``."""
+    low, high = torch.stack((latitude, longitude), 1).unbind(-1)
+    return torch.stack(((low + high) / 2, 2 / (high - low)), -1)
+
+
+def _slopes(terms: int) -> Tensor:
+    """Return the matrix from Chebyshev polynomials to their derivatives: ``(terms, terms)``."""
+    return nn.functional.pad(torch.from_numpy(np.polynomial.chebyshev.chebder(np.eye(terms)).T.copy()), (0, 1))
+
+
+def _inside(unit: Tensor, latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
+    """Return latitudes and longitudes ``(B, U)`` at fractions of the half spans of boxes ``(B, 2)``."""
+    edges = torch.stack((latitude, longitude))
+    low, high = edges.unsqueeze(-1).unbind(-2)
+    north, east = (high - low) / 2 * unit + (low + high) / 2
+    return north, east
+
+
+def _surface_weights(gauss: Tensor) -> Tensor:
+    """Return weights of Bx, By, Bz on the ellipsoid: ``(P, 3, M, F)`` [nT], over :func:`harmonics.waves` and T_f.
+
+    As in :class:`~magrl.field.SphericalHarmonicField`: 12 polynomials of the sine of the latitude more than the degree
+    leave an error of 1e-9 nT.
+    """
+    degree = gauss.shape[-1]
+    angles, _ = chebyshev_nodes(degree + 12)
+    axis, _, z = to_ecef(90 - torch.rad2deg(angles), torch.zeros_like(angles)).unbind(-1)
+    parts = []
+    for some in gauss.split(_BOXES):
+        tables = torch.cat([harmonics.field_table(table) for table in some])
+        parts.append(harmonics.on_surface(harmonics.separate(tables, degree), axis, z).unflatten(0, (-1, 3)))
+    return torch.cat(parts)
+
+
+def _synthesis(weights: Tensor, latitude: Tensor, longitude: Tensor) -> Tensor:
+    """Return the exact field of planets on grids.
+
+    Args:
+        weights: ``(B, 3, M, F)`` of :func:`_surface_weights`.
+        latitude: ``(B, U)`` [deg].
+        longitude: ``(B, V)`` [deg].
+
+    Returns:
+        ``(B, 3, U, V)`` north, east, down [nT].
+    """
+    degree = weights.shape[2] // 2
+    (sp, cp), (sl, cl) = ((torch.sin(x), torch.cos(x)) for x in (torch.deg2rad(latitude), torch.deg2rad(longitude)))
+    features = chebyshev(sp, weights.shape[3]).movedim(1, 0)
+    orders = (weights.flatten(1, 2) @ features).unflatten(1, (3, -1))
+    odd = torch.cat((torch.arange(1, degree + 1), torch.arange(degree + 1))) % 2 == 1
+    orders[:, :, odd] *= cp[:, None, None]
+    turns = harmonics.waves(cl.flatten(), sl.flatten(), torch.ones_like(cl.flatten()), degree)
+    x, y, z = (orders.mT @ turns.unflatten(1, cl.shape).movedim(1, 0).unsqueeze(1)).unbind(1)
+    sp, cp, sl, cl = sp.unsqueeze(-1), cp.unsqueeze(-1), sl.unsqueeze(-2), cl.unsqueeze(-2)
+    outward, east = cl * x + sl * y, cl * y - sl * x
+    return torch.stack((cp * z - sp * outward, east, -cp * outward - sp * z), 1)

@@ -1,0 +1,136 @@
+"""Random planets: magnetic fields with the spectrum of the Earth's, and nothing else of it.
+
+An agent that learns on one planet learns its map. One that learns on many planets can only learn what their fields have
+in common, which is also true of a place that it never saw.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_number, check_numbers
+from magrl.field.igrf import igrf_coefficients
+
+KNOWN_DEGREE = 13
+"""Highest degree of IGRF."""
+
+
+def power_spectrum(gauss: Tensor) -> Tensor:
+    """Return the mean square field of each degree on the reference sphere (Lowes-Mauersberger spectrum).
+
+    Args:
+        gauss: complex ``(..., N + 1, N + 1)`` table ``g - i h`` [nT].
+
+    Returns:
+        ``(..., N + 1)`` [nT²]: ``(n + 1)`` times the sum of ``g² + h²`` of degree n.
+
+    Source:
+        F. J. Lowes, Spatial power spectrum of the main geomagnetic field, and extrapolation to the core, Geophysical
+        Journal of the Royal Astronomical Society 36 (1974).
+
+    Example:
+        >>> dipole = torch.zeros(2, 2, dtype=torch.complex128)
+        >>> dipole[1, 0] = -30.0
+        >>> power_spectrum(dipole)
+        tensor([   0., 1800.], dtype=torch.float64)
+    """
+    n = torch.arange(1, gauss.shape[-1] + 1, device=gauss.device)
+    return n * torch.view_as_real(gauss).square().sum((-2, -1))
+
+
+def random_planets(
+    count: int,
+    seed: int,
+    *,
+    degree: int = 13,
+    strength: tuple[float, float] = (0.7, 1.3),
+    tilt_deg: float = 40.0,
+    spread: tuple[float, float] = (0.5, 2.0),
+) -> Tensor:
+    """Return Gauss coefficients of planets whose fields have the Earth's spectrum.
+
+    The dipole has the strength of the Earth's, times a random factor, is tilted from the axis of rotation to a random
+    side, and has the polarity of the Earth's. Every other coefficient is normal; its variance is the Earth's power of
+    its degree, shared over the 2n + 1 coefficients of the degree, times a random factor for each planet and degree. All
+    factors and the tilt are uniform. Of IGRF-13 at 2022-01-01, only the power of each degree and the strength of the
+    dipole are used.
+
+    Args:
+        count: number of planets.
+        seed: random seed; the result is a pure function of the arguments.
+        degree: highest degree N. Above 13, the spectrum continues the line through the logarithms of the power of
+            degrees 2 to 13; this is the field of the core, without the crust.
+        strength: smallest and largest strength of the dipole, in units of the Earth's.
+        tilt_deg: largest tilt of the dipole [deg].
+        spread: smallest and largest factor of the variance of a degree.
+
+    Returns:
+        Complex ``(count, N + 1, N + 1)`` tables ``g - i h`` [nT], for :class:`~magrl.field.SphericalHarmonicField` and
+        :class:`~magrl.field.FieldBank`.
+
+    Raises:
+        ValueError: for a count, degree or seed that is not a whole number in its range, or an interval that falls.
+
+    Example:
+        >>> planets = random_planets(1000, seed=0)
+        >>> planets.shape
+        torch.Size([1000, 14, 14])
+        >>> bool((planets[:, 1, 0].real < 0).all())  # as on the Earth, compasses point north
+        True
+    """
+    check_number(1, whole=True, count=count, degree=degree)
+    check_number(0, 2**63 - 1, whole=True, seed=seed)
+    check_number(0, 180, tilt_deg=tilt_deg)
+    _check_interval(strength=strength, spread=spread)
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    variance = _earth_variance(degree)
+    factor = uniform(*spread, count, degree + 1, 1, 1)
+    normal = torch.randn(count, degree + 1, degree + 1, 2, generator=generator, dtype=torch.float64)
+    gauss = torch.view_as_complex(normal * torch.sqrt(variance.reshape(-1, 1, 1) * factor)).tril()
+    gauss[..., 0] = gauss[..., 0].real.to(gauss.dtype)
+    gauss[:, 1, :2] = _dipoles(
+        _earth_dipole() * uniform(*strength, count),
+        torch.deg2rad(uniform(0.0, tilt_deg, count)),
+        uniform(0.0, 2 * math.pi, count),
+    )
+    return gauss
+
+
+def _dipoles(strength: Tensor, tilt: Tensor, side: Tensor) -> Tensor:
+    """Return the coefficients of degree 1 of dipoles [nT] tilted from the south pole to a side [rad]: ``(P, 2)``."""
+    axial = -strength * torch.cos(tilt)
+    return torch.stack((axial.to(torch.complex128), torch.polar(strength * torch.sin(tilt), side)), -1)
+
+
+def _earth_dipole() -> float:
+    """Return the strength of the Earth's dipole [nT]."""
+    return math.sqrt(float(power_spectrum(_earth())[1]) / 2)
+
+
+def _earth_variance(degree: int) -> Tensor:
+    """Return the mean square coefficient of each degree, ``(degree + 1,)`` [nT²]; zero below degree 2."""
+    n = torch.arange(max(degree, KNOWN_DEGREE) + 1, dtype=torch.float64)
+    known = torch.log(power_spectrum(_earth())[2:])
+    line = torch.stack((torch.ones_like(n), n), -1)
+    fit = line @ torch.linalg.lstsq(line[2 : KNOWN_DEGREE + 1], known.unsqueeze(-1)).solution
+    power = torch.exp(torch.cat((known, fit[KNOWN_DEGREE + 1 :, 0])))
+    variance = torch.nn.functional.pad(power, (2, 0)) / ((n + 1) * (2 * n + 1))
+    return variance[: degree + 1]
+
+
+def _earth() -> Tensor:
+    return igrf_coefficients("2022-01-01", 13)
+
+
+def _check_interval(**intervals: tuple[float, float]) -> None:
+    check_numbers(2, **intervals)
+    for name, (low, high) in intervals.items():
+        if not 0 <= low <= high:
+            raise ValueError(f"{name} must rise from a number that is not negative, got {(low, high)}")
