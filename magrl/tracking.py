@@ -170,8 +170,8 @@ def predict(
 ) -> FieldTrack:
     """Return the state after a move, before the reading at its end.
 
-    The value becomes e + g·d. The gradient drifts with the way, so that cov(g) grows by c^2 |d|^2 I, var(e) by
-    c^2 |d|^4 / 4 and cov(e, g) by c^2 |d|^2 d / 2.
+    The value becomes e + g·d. The gradient drifts with the way, so that cov(g) grows by ``c^2 |d|^2 I``, var(e)
+    by ``c^2 |d|^4 / 4`` and cov(e, g) by ``c^2 |d|^2 d / 2``.
 
     Args:
         track: state before the move.
@@ -260,9 +260,9 @@ def estimated_gradient(track: FieldTrack, scales: PerElement = ELEMENT_SCALES) -
 def way_to(track: FieldTrack, target: Tensor, range_km: float, scales: PerElement = ELEMENT_SCALES) -> Way:
     """Return the displacement to the place where the field has given values, and its uncertainty.
 
-    It minimizes the sum over the elements of (r - g·d)^2 / var(d), plus |d|^2 / range^2, with the remaining difference
-    r and the filter's variance of r - g·d. It takes three solves, each with the variances at the solution before it;
-    the first has their mean over ways of the range.
+    It minimizes the sum over the elements of ``(r - g·d)^2 / var(d)``, plus ``|d|^2 / range^2``, with the remaining
+    difference r and the filter's variance of r - g·d. It takes three solves, each with the variances at the solution
+    before it; the first has their mean over ways of the range.
 
     Args:
         track: state.
