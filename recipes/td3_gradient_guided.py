@@ -5,8 +5,7 @@
     python recipes/td3_gradient_guided.py --preset paper      # Table 1 as printed; many hours on a CPU
     python recipes/td3_gradient_guided.py --resume RUN        # resume an interrupted run exactly
 
-Preset `fast` is expected to reach more than 99.5 % of 1000 test tasks, on paths within 3 % of the shortest. The run
-folder holds the policy, the curves, the results and the figures.
+Preset `fast` is expected to reach more than 99.5 % of 1000 test tasks, on paths within 3 % of the shortest.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ import torch
 from pydantic import Field, model_validator
 from tensordict.nn import TensorDictSequential
 from torch.optim import Adam
+from torchrl.collectors import BaseCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
-from typing_extensions import Self
 
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
@@ -104,7 +103,7 @@ class Config(RunConfig):
     """Weight of the penalty on the actor's outputs before the tanh; falls linearly to 0."""
 
     @model_validator(mode="after")
-    def _fits(self) -> Self:
+    def _fits(self) -> Config:
         if self.buffer_size < self.batch_size:
             raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
         if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
@@ -154,6 +153,31 @@ def worker_env(config: Config, view: ObservationView, index: int) -> Transformed
     return make_env(GeomagneticNavEnv(config.load_scenario(), num_envs=num_envs, seed=seed, **options), view, config)
 
 
+def make_collection(
+    env: TransformedEnv, actor: TensorDictSequential, view: ObservationView, config: Config
+) -> tuple[AdditiveGaussianModule, BaseCollector, TensorDictReplayBuffer]:
+    """Return exploration noise, collector and replay buffer; a sample holds all batches of an iteration."""
+    noise = AdditiveGaussianModule(
+        spec=env.action_spec_unbatched,
+        sigma_init=config.exploration_noise,
+        sigma_end=config.final_exploration_noise,
+        annealing_num_steps=math.ceil(config.total_frames / config.num_envs),
+        device=env.device,
+    )
+    collector = make_collector(
+        env,
+        TensorDictSequential(actor, noise),
+        workers=[partial(worker_env, config, view, index) for index in range(config.collectors)],
+        backend=config.collector_backend,
+        frames_per_batch=config.num_envs,
+        total_frames=config.total_frames,
+        init_random_frames=config.init_random_frames,
+    )
+    storage = LazyTensorStorage(config.buffer_size, device=env.device)
+    buffer = TensorDictReplayBuffer(storage=storage, batch_size=config.updates_per_batch * config.batch_size)
+    return noise, collector, buffer
+
+
 def train(config: Config) -> dict[str, float]:
     """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
     torch.manual_seed(config.seed)
@@ -182,31 +206,9 @@ def train(config: Config) -> dict[str, float]:
         critic_optimizer = Adam(loss.critic_parameters(), lr=config.learning_rate, fused=True)
         actor_optimizer = Adam(loss.actor_parameters(), lr=config.learning_rate, fused=True)
 
-        # Collector
-        noise = AdditiveGaussianModule(
-            spec=env.action_spec_unbatched,
-            sigma_init=config.exploration_noise,
-            sigma_end=config.final_exploration_noise,
-            annealing_num_steps=math.ceil(config.total_frames / config.num_envs),
-            device=env.device,
-        )
-        collector = make_collector(
-            env,
-            TensorDictSequential(actor, noise),
-            workers=[partial(worker_env, config, view, index) for index in range(config.collectors)],
-            backend=config.collector_backend,
-            frames_per_batch=config.num_envs,
-            total_frames=config.total_frames,
-            init_random_frames=config.init_random_frames,
-        )
-
-        # Replay buffer: one sample holds the batches of all updates between two steps of the vehicles
-        storage = LazyTensorStorage(config.buffer_size, device=env.device)
-        buffer = TensorDictReplayBuffer(storage=storage, batch_size=config.updates_per_batch * config.batch_size)
-
+        noise, collector, buffer = make_collection(env, actor, view, config)
         run.start(
             policy=FieldPolicy(network, actor).to(env.device),
-            actor=actor,
             validation=validation,
             env=base,
             collector=collector,

@@ -111,11 +111,6 @@ def test_modules_are_short(folder: str, lines: int) -> None:
     assert {str(path.relative_to(ROOT)): count for path, count in found.items() if count > lines} == {}
 
 
-def limit(name: str) -> int:
-    """The whole algorithm of a recipe is one function, from configuration to result."""
-    return 100 if re.match(r"recipes/td3_\w+\.py::train$", name) else 60
-
-
 def test_functions_are_short() -> None:
     paths = [*PACKAGE.rglob("*.py"), *(ROOT / "recipes").rglob("*.py")]
     counts = {
@@ -124,7 +119,7 @@ def test_functions_are_short() -> None:
         for function in functions(ast.parse(path.read_text()))
     }
     assert len(counts) > 300
-    assert {name: count for name, count in counts.items() if count > limit(name)} == {}
+    assert {name: count for name, count in counts.items() if count > 60} == {}
 
 
 # Imports

@@ -125,7 +125,6 @@ class Run:
         self,
         *,
         policy: FieldPolicy,
-        actor: nn.Module,
         validation: GeomagneticNavEnv,
         env: GeomagneticNavEnv,
         collector: BaseCollector,
@@ -135,13 +134,12 @@ class Run:
 
         Args:
             policy: agent as a navigator, for evaluations.
-            actor: module whose weights are trained and selected.
             validation: environment of the validation tasks.
             env: environment inside the collector; with several collectors, each has its own.
             collector: source of batches.
             parts: everything else that checkpoints must hold, such as loss, optimizers and replay buffer.
         """
-        self.policy, self.actor, self.validation, self.env, self.collector = policy, actor, validation, env, collector
+        self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
         parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}
         if isinstance(collector, Collector):  # other processes start new episodes
@@ -220,7 +218,9 @@ class Run:
         episodes = episode_measures(evaluation_rollout(self.validation, self.policy))
         summary = summarize(episodes)
         limit = self.validation.max_steps
-        self.best.offer(selection_score(summary["spl"], episodes["success"], episodes["steps"], limit), self.actor)
+        self.best.offer(
+            selection_score(summary["spl"], episodes["success"], episodes["steps"], limit), self.policy.actor
+        )
         row = self.statistics.row() | {"seconds": self.log.seconds}
         self.log.row(row | {f"eval_{key}": summary[key] for key in EVALUATED})
         earned = f"{row['return']:.0f}" if math.isfinite(row["return"]) else "not known yet"
@@ -243,7 +243,7 @@ class Run:
         from magrl.evaluation import plots  # matplotlib is slow to import, and collecting processes do without
 
         seconds = self.log.seconds
-        self.actor.load_state_dict(self.best.weights or self.actor.state_dict())
+        self.policy.actor.load_state_dict(self.best.weights or self.policy.actor.state_dict())
         save_policy(self.folder / "policy.pt", self.policy)
         if self.log.rows:
             self.log.figure("training", plots.training_figure(self.log.rows))
