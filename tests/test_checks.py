@@ -8,7 +8,7 @@ import torch
 from pydantic import BeforeValidator, Field
 from tensordict import TensorDict
 
-from magrl.checks import CheckedModel, check_finite, short
+from magrl.checks import CheckedModel, check_finite, require, short
 
 
 def even(value: int) -> int:
@@ -76,3 +76,16 @@ def test_at_most_eight_rows_are_named_and_integers_are_ignored() -> None:
         check_finite(TensorDict(next=TensorDict(reward=torch.tensor([0.0, math.inf])), batch_size=[]), "here")
     with pytest.raises(FloatingPointError, match=r"rows \[0\]$"):
         check_finite([("loss", torch.tensor(math.nan))], "here")
+
+
+def test_required_values_are_checked_in_a_compiled_graph_too() -> None:
+    def add_one(x: torch.Tensor) -> torch.Tensor:
+        require(x > 0, x, "x {} must be positive")
+        return x + 1
+
+    compiled = torch.compile(add_one, backend="eager", fullgraph=True)
+    assert compiled(torch.ones(2)).tolist() == [2, 2]
+    with pytest.raises(RuntimeError, match=r"x \{\} must be positive"):
+        compiled(torch.tensor([1.0, -1.0]))
+    with pytest.raises(ValueError, match=r"^x -1\.0 must be positive$"):
+        add_one(torch.tensor([1.0, -1.0]))

@@ -204,3 +204,10 @@ def test_vectors_of_another_size_are_refused_by_name() -> None:
             function(torch.zeros(2))
         with pytest.raises(TypeError, match=f"{name} must be a tensor"):
             function([1.0, 2.0, 3.0])
+
+
+def test_gradients_of_another_size_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"b_gradient must have the shape \(\.\.\., 3, 2\), got \(2, 2\)"):
+        elements_gradient(torch.ones(3), torch.zeros(2, 2))
+    with pytest.raises(ValueError, match=r"b_gradient must have the shape \(\.\.\., 3, 2\), got \(3, 3\)"):
+        elements_gradient(torch.ones(3), torch.zeros(3, 3))

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from magrl.envs.measures import path_measures, spl
+from magrl.envs.measures import check_zeta, path_measures, spl
 from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
 from magrl.evaluation.metrics import episode_measures, first_episode_mask, summarize
 from magrl.geodesy import geodesic, move
@@ -282,3 +282,32 @@ def test_intervals_accept_their_bounds() -> None:
     for rate in (0.0, 1.0):
         low, high = wilson_interval(rate, 1)
         assert 0 <= low < high <= 1
+
+
+def test_measures_refuse_what_they_cannot_use() -> None:
+    flags, lengths, places = torch.ones(2, dtype=torch.bool), torch.ones(2), torch.zeros(2, 2)
+    for call, error, message in (
+        (lambda: check_zeta(3), ValueError, "zeta must be below 3, got 3: the objective F is at most 3"),
+        (lambda: spl([True], lengths, lengths), TypeError, r"success must be a Tensor, got \[True\]"),
+        (lambda: spl(flags.long(), lengths, lengths), TypeError, "success must be bool, got torch.int64"),
+        (lambda: spl(flags, [1.0, 1.0], lengths), TypeError, "shortest_km must be a tensor"),
+        (lambda: path_measures(flags, places[:, :1], places, places, lengths), ValueError, r"start .*\(2, 1\)"),
+        (lambda: path_measures(flags, places, places[:, :1], places, lengths), ValueError, r"end .*\(2, 1\)"),
+        (lambda: path_measures(flags, places, places, places[:, :1], lengths), ValueError, r"target .*\(2, 1\)"),
+        (lambda: first_episode_mask([True]), TypeError, r"done must be a Tensor, got \[True\]"),
+        (lambda: first_episode_mask(torch.zeros(2, 3)), ValueError, "done must be bool of shape"),
+        (lambda: first_episode_mask(flags), ValueError, r"done must be bool of shape .*\(2,\)"),
+        (lambda: first_episode_mask(flags.expand(1, 3, 2)), ValueError, r"done must be bool of shape .*\(1, 3, 2\)"),
+    ):
+        with pytest.raises(error, match=message):
+            call()
+
+
+def test_path_measures_of_batches_of_any_shape() -> None:
+    """One value for each episode, whatever dimensions they are arranged in."""
+    start, end, target = torch.rand(3, 4, 5, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    success, length = torch.ones(4, 5, dtype=torch.bool), torch.full((4, 5), 300.0, dtype=torch.float64)
+    arranged = path_measures(success, start, end, target, length)
+    flat = path_measures(*(x.flatten(0, 1) for x in (success, start, end, target, length)))
+    for name, value in arranged.items():
+        torch.testing.assert_close(value.flatten(), flat[name])
