@@ -10,8 +10,9 @@ from geographiclib.geodesic import Geodesic
 from magrl import paper
 from magrl.envs import PAPER_REGION, TASK_SETS, Region, Tasks, named_tasks, task_set
 from magrl.envs import tasks as tasks_module
-from magrl.envs.tasks import check_tasks, counter_uniform, sample_tasks, without_way
+from magrl.envs.tasks import check_tasks, sample_tasks, without_way
 from magrl.geodesy import geodesic, wrap_longitude
+from magrl.transforms.counters import counter_uniform
 
 ANTIMERIDIAN = Region((-5, 5), (170, 190))
 ARCTIC = Region((80, 90), (-180, 180))

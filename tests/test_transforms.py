@@ -713,7 +713,7 @@ def test_wrong_shapes_are_refused_with_the_shapes(row: tuple[Callable[[], Transf
 
 
 WOULD_BREAK_THE_STATE = {
-    "in place": lambda: MinMaxNorm(["field"]),
+    "in place": lambda: MinMaxNorm(["target_field"]),
     "onto another entry": lambda: MinMaxNorm(["field"], ["target_field"]),
     "angle in place": lambda: AngleVector(["heading"], ["heading"]),
 }

@@ -23,10 +23,11 @@ from magrl.envs.measures import check_zeta
 from magrl.envs.region import Region
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
 from magrl.envs.scenario import Scenario
-from magrl.envs.specs import bounded, done_spec, field_bounds, observation_spec, reward_spec
-from magrl.envs.tasks import Tasks, counter_uniform, sample_tasks
+from magrl.envs.specs import bounded, done_spec, field_bounds, observation_spec, reward_spec, state_spec
+from magrl.envs.tasks import Tasks, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import move, wrap_angle
+from magrl.transforms.counters import counter_uniform
 from magrl.transforms.view import ObservationView
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")
@@ -163,7 +164,7 @@ class GeomagneticNavEnv(EnvBase):
         bounds = field_bounds(self.field, box, self.device)
         observation = observation_spec(self.num_envs, bounds, self.max_move_km, self.max_turn_rad)
         self.observation_spec = observation.to(self.device)
-        self.state_spec = self.observation_spec.clone()
+        self.state_spec = state_spec(self.observation_spec)
         self.action_spec = bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
         self.full_reward_spec = reward_spec(self.num_envs).to(self.device)
         self.full_done_spec = done_spec(self.num_envs).to(self.device)

@@ -13,6 +13,17 @@ from magrl.field import FieldModel, elements_range
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Terms whose sum is ``reward``."""
+STATE_KEYS = (
+    "target_field",
+    "heading",
+    "step_count",
+    "position",
+    "target_position",
+    "start_position",
+    "objective",
+    "objective_weights",
+)
+"""Keys that a step reads: the state of an episode."""
 
 
 def bounded(num_envs: int, low: Tensor, high: Tensor) -> Bounded:
@@ -93,6 +104,17 @@ def observation_spec(
         success=_flag(num_envs),
         shape=(num_envs,),
     )
+
+
+def state_spec(observation: Composite) -> Composite:
+    """Return the spec of the keys that a step reads; a transform may overwrite the others, as ``field``.
+
+    Example:
+        >>> bounds = torch.zeros(3), torch.ones(3)
+        >>> "field" in state_spec(observation_spec(4, bounds, 50.0, 1.5)).keys()
+        False
+    """
+    return Composite({key: observation[key].clone() for key in STATE_KEYS}, shape=observation.shape)
 
 
 def reward_spec(num_envs: int) -> Composite:
