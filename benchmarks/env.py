@@ -1,4 +1,4 @@
-"""Cost of the environment's step: field, framework and number of vehicles."""
+"""Cost of the environment's step: field, framework, number of regions and of vehicles."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 
 from benchmarks.profile_training import shares_of, table
 from benchmarks.timing import Row, alternate
-from magrl.envs import GeomagneticNavEnv
+from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
 VEHICLES = 1024
+REGIONS = 2048
 NUMBERS = [2**k for k in range(6, 15)]
 
 
@@ -45,6 +46,18 @@ class Stepper:
         self.env._step(self.state)
 
 
+class Running:
+    """Random moves with automatic resets, begun when episodes end at different steps."""
+
+    def __init__(self, env: GeomagneticNavEnv, begun: int = 60) -> None:
+        self.env, self.state = env, env.reset()
+        for _ in range(begun):
+            self()
+
+    def __call__(self) -> None:
+        _, self.state = self.env.step_and_maybe_reset(self.env.rand_action(self.state))
+
+
 class Collecting:
     """Steps of the recipe's whole environment in a collector with a random policy, resets included."""
 
@@ -72,10 +85,16 @@ def rows(repeats: int = 15) -> list[Row]:
     free = GeomagneticNavEnv(num_envs=VEHICLES, seed=0)
     step, free_step = Stepper(env), Stepper(free)
     free.field = FreeField(VEHICLES)
+    bank = planet_scenario(REGIONS, seed=0)
+    over_bank, over_one = (
+        Running(GeomagneticNavEnv(scenario, num_envs=VEHICLES, start_heading="random", seed=0))
+        for scenario in (bank, Scenario())
+    )
     options = {"repeats": repeats, "inner": 50}
     return [
         alternate("env step: the same without a field", step, free_step, goal="≥ 0.40", **options),
         alternate("guided env in a Collector: raw env step", Collecting(VEHICLES), step, goal="≥ 0.25", **options),
+        alternate(f"env over {REGIONS} regions: over one", over_bank, over_one, goal="≥ 0.50", **options),
     ]
 
 

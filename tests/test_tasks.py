@@ -10,7 +10,8 @@ from geographiclib.geodesic import Geodesic
 from magrl import paper
 from magrl.envs import PAPER_REGION, TASK_SETS, Region, Tasks, named_tasks, task_set
 from magrl.envs import tasks as tasks_module
-from magrl.envs.tasks import check_tasks, sample_tasks, without_way
+from magrl.envs.task_checks import check_tasks, without_way
+from magrl.envs.tasks import sample_tasks
 from magrl.geodesy import geodesic, wrap_longitude
 from magrl.transforms.counters import counter_uniform
 

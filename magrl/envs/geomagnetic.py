@@ -7,6 +7,7 @@ and the number of the episode that each vehicle is in.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -19,15 +20,15 @@ from torchrl.envs import EnvBase
 
 from magrl import guidance
 from magrl.checks import check_number, check_type
+from magrl.envs import specs
 from magrl.envs.measures import check_zeta
 from magrl.envs.region import Region
+from magrl.envs.regions import Regions
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
 from magrl.envs.scenario import Scenario
-from magrl.envs.specs import bounded, done_spec, field_bounds, observation_spec, reward_spec, state_spec
-from magrl.envs.tasks import Tasks, sample_tasks
+from magrl.envs.tasks import RegionTasks, Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import move, wrap_angle
-from magrl.transforms.counters import counter_uniform
 from magrl.transforms.view import ObservationView
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")
@@ -40,8 +41,7 @@ PRIVILEGED_KEYS = (
     "objective_weights",
     "success",
 )
-"""Keys that a policy may not read if it navigates by the field alone."""
-_HEADING_STREAM = -1  # the counter that separates a start heading from the attempts at placing a task
+"""Keys that a policy may not read if it navigates by the field alone; nor ``region``, where there are many."""
 
 
 class GeomagneticNavEnv(EnvBase):
@@ -49,7 +49,8 @@ class GeomagneticNavEnv(EnvBase):
 
     Each vehicle measures D, I, B_H; it knows those of its destination, its heading from true north and its last move.
     It chooses how far to turn and then how far to go. It has arrived when the objective F (Eq. 2-6) is below ``zeta``.
-    A vehicle that leaves the region by more than the scenario's margin is lost: the episode ends as a failure.
+    A vehicle that leaves the region by more than the scenario's margin is lost: the episode ends as a failure. Where
+    the scenario has many regions, each episode draws its own.
 
     Args:
         scenario: region, field, distances and frozen tasks; by default the paper's. Where it has tasks, vehicle i flies
@@ -72,8 +73,9 @@ class GeomagneticNavEnv(EnvBase):
     Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
     move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
     ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
-    ``objective_weights`` ``(N, 3)``. Action ``(N, 2)``: distance [km], turn [rad]. Rewards ``(N, 1)``: ``reward``, and
-    its terms ``reward_destination`` and ``reward_proximity``.
+    ``objective_weights`` ``(N, 3)``, and over many regions their index ``region`` ``(N, 1)``. Action ``(N, 2)``:
+    distance [km], turn [rad]. Rewards ``(N, 1)``: ``reward``, and its terms ``reward_destination`` and
+    ``reward_proximity``.
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=4, seed=0)
@@ -83,6 +85,9 @@ class GeomagneticNavEnv(EnvBase):
 
     batch_locked = True
     episode: Tensor
+    field: Any  # a field model, or over many regions a bank
+    region: Any  # a Region, or many as Regions
+    edge: Any  # the same with its margin
 
     def __init__(
         self,
@@ -112,6 +117,10 @@ class GeomagneticNavEnv(EnvBase):
             raise ValueError(f"start_heading must be 'north' or 'random', got {start_heading!r}")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        if render_mode and isinstance(scenario.region, Regions):
+            raise ValueError(
+                f"render_mode {render_mode!r} draws one region, the scenario has {len(scenario.region)}: take None"
+            )
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.num_envs, self.max_steps, self.zeta = num_envs, max_steps, float(zeta)
         self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
@@ -123,16 +132,19 @@ class GeomagneticNavEnv(EnvBase):
         self.register_buffer("action_high", self._float64((self.max_move_km, self.max_turn_rad)))
         self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
-        self._make_specs(scenario.reachable(max_move_km))
+        self._make_specs(self.edge.reachable(max_move_km))
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
     def _place(self, scenario: Scenario) -> None:
         """Build what the scenario describes, on the device of the batch."""
-        self.scenario, self.region, self.edge = scenario, scenario.region, scenario.edge
-        self.tasks = None if scenario.tasks is None else Tasks(*(end.to(self.device) for end in scenario.tasks))
+        self.scenario, self.many, tasks = scenario, isinstance(scenario.region, Regions), scenario.tasks
+        self.region, self.edge = scenario.region, scenario.edge
+        if self.many:  # tensors, which move to the device; those of the scenario stay where they are
+            self.region, self.edge = (copy.deepcopy(boxes).to(self.device) for boxes in (self.region, self.edge))
+        self.tasks = None if tasks is None else type(tasks)(*(values.to(self.device) for values in tasks))
         field = scenario.build_field(self.max_move_km)
+        self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
         self.field = field.to(self.device) if isinstance(field, torch.nn.Module) else field
-        self.register_buffer("objective_floors", self._float64(scenario.floors(self.field)))
 
     def _float64(self, values: Sequence[float]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -144,10 +156,18 @@ class GeomagneticNavEnv(EnvBase):
             observe_heading: whether cosine and sine of the heading are observed.
             observe_difference: whether target elements minus measured elements are observed.
 
+        Raises:
+            ValueError: over many regions, which have no range in common.
+
         Example:
             >>> GeomagneticNavEnv(seed=0).observation_view().size
             13
         """
+        if self.many:
+            raise ValueError(
+                f"the observation view is scaled to the field of one region, this environment has {len(self.region)}: "
+                "give it a scenario with one region, or an agent that needs no map"
+            )
         low, high = elements_range(self.field, self.region.grid(81).to(self.device))
         return ObservationView(
             observe_heading=observe_heading,
@@ -160,14 +180,15 @@ class GeomagneticNavEnv(EnvBase):
 
     # Specs
 
-    def _make_specs(self, box: Region) -> None:
-        bounds = field_bounds(self.field, box, self.device)
-        observation = observation_spec(self.num_envs, bounds, self.max_move_km, self.max_turn_rad)
+    def _make_specs(self, box: Region | Regions) -> None:
+        bounds = specs.field_bounds(self.field, box, self.device)
+        many = len(self.region) if self.many else None
+        observation = specs.observation_spec(self.num_envs, bounds, self.max_move_km, self.max_turn_rad, many)
         self.observation_spec = observation.to(self.device)
-        self.state_spec = state_spec(self.observation_spec)
-        self.action_spec = bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
-        self.full_reward_spec = reward_spec(self.num_envs).to(self.device)
-        self.full_done_spec = done_spec(self.num_envs).to(self.device)
+        self.state_spec = specs.state_spec(self.observation_spec)
+        self.action_spec = specs.bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
+        self.full_reward_spec = specs.reward_spec(self.num_envs).to(self.device)
+        self.full_done_spec = specs.done_spec(self.num_envs).to(self.device)
 
     # Reset
 
@@ -197,11 +218,12 @@ class GeomagneticNavEnv(EnvBase):
     def _start_of(self, vehicle: Tensor) -> TensorDict:
         """Return the first observation of the next episode of some vehicles, ``(P,)``."""
         episode = self.episode[vehicle]
-        tasks = self._tasks(vehicle, episode)
-        field, target_field = elements_at(self.field, torch.stack(tasks))
+        start, target, *index = self._tasks(vehicle, episode)
+        field, target_field = elements_at(self.field, torch.stack((start, target)), *index)
         # Rounded as the vehicle observes it: a move of length 0 must not change the objective.
         field, target_field = field.float().double(), target_field.float().double()
-        weights = guidance.objective_weights(field, target_field, self.objective_floors).float().double()
+        floors = self.objective_floors[index[0]] if index else self.objective_floors
+        weights = guidance.objective_weights(field, target_field, floors).float().double()
         zeros = field.new_zeros(len(vehicle), 2)
         flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         return TensorDict(
@@ -211,46 +233,46 @@ class GeomagneticNavEnv(EnvBase):
                 "move": zeros.float(),
                 "heading": self._start_heading(vehicle, episode).float(),
                 "step_count": torch.zeros_like(vehicle).unsqueeze(-1),
-                "position": tasks.start,
-                "target_position": tasks.target,
-                "start_position": tasks.start,
+                "position": start,
+                "target_position": target,
+                "start_position": start,
                 "objective": guidance.objective(field, target_field, weights).float(),
                 "objective_weights": weights.float(),
                 "success": flags["done"].clone(),
                 **flags,
+                **({specs.REGION: index[0].unsqueeze(-1)} if index else {}),
             },
             batch_size=vehicle.shape,
             device=self.device,
         )
 
-    def _tasks(self, vehicle: Tensor, episode: Tensor) -> Tasks:
+    def _tasks(self, vehicle: Tensor, episode: Tensor) -> Tasks | RegionTasks:
         if self.tasks is None:
-            return sample_tasks(self.region, self.scenario.distance_range_km, self.seed, vehicle, episode)
-        index = (vehicle + episode * self.num_envs) % len(self.tasks.start)
-        return Tasks(self.tasks.start[index], self.tasks.target[index])
+            distances, law = self.scenario.distance_range_km, self.scenario.distance_law
+            return sample_tasks(self.region, distances, self.seed, vehicle, episode, law)
+        rows = (vehicle + episode * self.num_envs) % len(self.tasks.start)
+        return type(self.tasks)(*(values[rows] for values in self.tasks))
 
     def _start_heading(self, vehicle: Tensor, episode: Tensor) -> Tensor:
         if self.start_heading == "north":
             return torch.zeros(len(vehicle), 1, dtype=torch.float64, device=self.device)
-        stream = torch.full_like(vehicle, _HEADING_STREAM)
-        uniform = counter_uniform(self.seed, torch.stack((vehicle, episode, stream), -1), 1)
-        return wrap_angle(2 * math.pi * uniform)
+        return random_headings(self.seed, vehicle, episode)
 
     # Step
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self._checked_action(tensordict["action"])
+        action = specs.checked_action(tensordict["action"], self.action_low, self.action_high)
         distance, turn = action.unbind(-1)
         before = tensordict["position"]
         heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
         latitude, longitude = before.unbind(-1)
+        index = (tensordict[specs.REGION].squeeze(-1),) if self.many else ()
         moved = torch.stack(move(latitude, longitude, heading, distance), -1)
-        was_inside, is_inside = self.edge.contains(torch.stack((before, moved))).unbind(0)
+        was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), *index).unbind(0)
         position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
         lost = ~(was_inside & is_inside)
 
-        field = elements_at(self.field, position)
-        field = field.float().double()
+        field = elements_at(self.field, position, *index).float().double()
         weights = tensordict["objective_weights"].double()
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
         arrived = (objective < self.zeta) & ~lost
@@ -279,6 +301,7 @@ class GeomagneticNavEnv(EnvBase):
                 "done": terminated | truncated,
                 "terminated": terminated,
                 "truncated": truncated,
+                **({specs.REGION: tensordict[specs.REGION]} if index else {}),
             },
             batch_size=tensordict.batch_size,
             device=self.device,
@@ -286,26 +309,6 @@ class GeomagneticNavEnv(EnvBase):
         if self._tracks is not None:
             self._tracks.add(after)
         return after
-
-    def _checked_action(self, action: Tensor) -> Tensor:
-        """Return the action in float64, rounded into its bounds.
-
-        Raises:
-            ValueError: naming the vehicles whose action is not finite or beyond the bounds by more than rounding.
-        """
-        action = action.double()
-        slack = 1e-5 * (self.action_high - self.action_low)
-        sound = (action >= self.action_low - slack) & (action <= self.action_high + slack)
-        if torch.compiler.is_compiling() or action.is_cuda:
-            torch._assert_async(sound.all(), "GeomagneticNavEnv: an action is not finite or out of bounds")
-        elif not sound.all():
-            bad = (~sound.all(-1)).nonzero().squeeze(-1)
-            raise ValueError(
-                f"GeomagneticNavEnv: actions of vehicles {bad[:8].tolist()} are not finite or out of bounds: "
-                f"{action[bad[:8]].tolist()}; distance [km] must be in [0, {self.max_move_km}] and turn [rad] in "
-                f"[-{self.max_turn_rad:.4f}, {self.max_turn_rad:.4f}]"
-            )
-        return action.clamp(self.action_low, self.action_high)
 
     # Rendering
 

@@ -14,6 +14,7 @@ from magrl.checks import check_number, check_numbers, check_tensor
 from magrl.geodesy import check_box, geodesic, wrap_longitude
 
 MEAN_RADIUS_KM = 6371.0
+_SHORTEST_DEGREE_KM = 110.5  # a degree of arc is nowhere shorter on the ellipsoid
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,7 @@ class Region:
         Returns:
             ``(..., 1)`` bool, edges included; False for NaN.
         """
-        check_tensor(2, position=position)
-        latitude, longitude = position.unbind(-1)
-        south, north = self.latitude
-        half = (self.longitude[1] - self.longitude[0]) / 2
-        offset = wrap_longitude(longitude - (self.longitude[0] + half))
-        half += 1e-9  # a tenth of a millimeter: the center is rounded, and the edges belong to the box
-        return ((latitude >= south) & (latitude <= north) & (offset.abs() <= half)).unsqueeze(-1)
+        return in_box(position, self.latitude, self.longitude)
 
     def expanded(self, margin_deg: float) -> Region:
         """Return the box with a margin on each side [deg], cut at the poles and at a full turn."""
@@ -65,6 +60,24 @@ class Region:
         west -= min(margin_deg, (360 - (east - west)) / 2)
         east = min(east + margin_deg, west + 360)
         return Region((max(south - margin_deg, -90), min(north + margin_deg, 90)), (west, east))
+
+    def reachable(self, max_move_km: float) -> Region:
+        """Return every place that one move from inside the box can lead to, rounded up to half a degree.
+
+        Raises:
+            ValueError: for a move that is negative or not finite.
+
+        Example:
+            >>> Region((-10, 0), (160, 170)).reachable(50)
+            Region(latitude=(-10.5, 0.5), longitude=(159.5, 170.5))
+        """
+        check_number(0, max_move_km=max_move_km)
+        reach = math.radians(max_move_km / _SHORTEST_DEGREE_KM)
+        nearest_pole = math.radians(90 - max(abs(x) for x in self.latitude))
+        # The farthest that a great circle of this length leads from its meridian; past a pole it leads anywhere.
+        aside = math.degrees(math.asin(math.sin(reach) / math.sin(nearest_pole))) if reach < nearest_pole else 180.0
+        south_north, west_east = (math.ceil(2 * x) / 2 for x in (math.degrees(reach), aside))
+        return Region(self.expanded(south_north).latitude, self.expanded(west_east).longitude)
 
     def grid(self, points: int) -> Tensor:
         """Return an even grid of positions, edges included: ``(points, points, 2)`` latitude, longitude [deg]."""
@@ -118,12 +131,56 @@ class Region:
 
 @cache
 def _longest_km(region: Region) -> float:
-    (south, north), (west, east) = region.latitude, region.longitude
-    if east - west > 90 or north - south > 90:
-        return math.pi * MEAN_RADIUS_KM
-    latitude = torch.tensor((south, min(max(0.0, south), north), north), dtype=torch.float64)
-    corners = torch.tensor((west, east), dtype=torch.float64)
-    return float(geodesic(latitude.unsqueeze(-1), corners[0], latitude, corners[1])[0].max())
+    return float(
+        longest_km(*(torch.tensor([edges], dtype=torch.float64) for edges in (region.latitude, region.longitude)))
+    )
+
+
+def longest_km(latitude: Tensor, longitude: Tensor) -> Tensor:
+    """Return an upper bound of the distances in boxes, tight for boxes up to a quarter of the globe.
+
+    Args:
+        latitude: ``(K, 2)`` southern and northern edges [deg].
+        longitude: ``(K, 2)`` western and eastern edges [deg].
+
+    Returns:
+        ``(K,)`` [km].
+
+    Example:
+        >>> longest_km(torch.tensor([[-10.0, 0.0]]).double(), torch.tensor([[160.0, 170.0]]).double()).round()
+        tensor([1565.], dtype=torch.float64)
+    """
+    (south, north), (west, east) = latitude.T, longitude.T
+    starts = torch.stack((south, torch.zeros_like(south).clamp(south, north), north))
+    distance = geodesic(starts.unsqueeze(1), west, starts, east)[0].amax((0, 1))
+    beyond = ((longitude.diff() > 90) | (latitude.diff() > 90)).squeeze(-1)
+    return distance.masked_fill(beyond, math.pi * MEAN_RADIUS_KM)
+
+
+def in_box(
+    position: Tensor, latitude: tuple[float | Tensor, float | Tensor], longitude: tuple[float | Tensor, float | Tensor]
+) -> Tensor:
+    """Return whether positions lie in a box, or each in a box of its own.
+
+    Args:
+        position: ``(..., 2)`` latitude, longitude [deg].
+        latitude: southern and northern edge [deg], numbers or ``(...)``.
+        longitude: western and eastern edge [deg], numbers or ``(...)``.
+
+    Returns:
+        ``(..., 1)`` bool, edges included; False for NaN.
+
+    Example:
+        >>> in_box(torch.tensor([[0.0, -175.0], [0.0, 165.0]]), (-5, 5), (170, 190))
+        tensor([[ True],
+                [False]])
+    """
+    check_tensor(2, position=position)
+    north, east = position.unbind(-1)
+    half = (longitude[1] - longitude[0]) / 2
+    offset = wrap_longitude(east - (longitude[0] + half))
+    half = half + 1e-9  # a tenth of a millimeter: the center is rounded, and the edges belong to the box
+    return ((north >= latitude[0]) & (north <= latitude[1]) & (offset.abs() <= half)).unsqueeze(-1)
 
 
 PAPER_REGION = Region(paper.LATITUDE, paper.LONGITUDE)

@@ -2,44 +2,36 @@
 
 from __future__ import annotations
 
-import json
 import math
-import sys
-from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import BeforeValidator, Field, model_validator
+from torch import Tensor
 from typing_extensions import Self
 
 from magrl import guidance, paper
-from magrl.checks import CheckedModel, check_number, check_type, short
+from magrl.checks import CheckedModel, short
 from magrl.envs.region import PAPER_REGION, Region
+from magrl.envs.regions import Regions
 from magrl.envs.specs import field_bounds
-from magrl.envs.tasks import (
-    TaskEntry,
-    Tasks,
-    check_distance_range,
-    check_tasks,
-    numbers_validator,
-    task_set,
-    without_way,
+from magrl.envs.task_checks import check_tasks, numbers_validator
+from magrl.envs.tasks import RegionTasks, Tasks, check_distance_range, task_set
+from magrl.field import (
+    IGRF,
+    Date,
+    FieldBank,
+    FieldModel,
+    RegionalField,
+    elements_gradient_at,
+    igrf_coefficients,
+    parse_date,
 )
-from magrl.field import IGRF, Date, FieldModel, RegionalField, elements_gradient_at, igrf_coefficients, parse_date
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-MAX_FILE_BYTES = 10_000_000
-"""Largest scenario file: about fifty thousand tasks."""
 MAX_ALTITUDE_KM = 600.0
 """Highest altitude of a scenario: IGRF is in use up to there, and distances are those over the ground."""
 FLOOR_KM = 25.0
 """Distance of travel whose mean change of each element is the default floor of Eq. 2-6 away from the paper's box."""
-_SHORTEST_DEGREE_KM = 110.5  # a degree of arc is nowhere shorter on the ellipsoid
 
 
 def _tuple(value: object) -> object:
@@ -47,7 +39,7 @@ def _tuple(value: object) -> object:
 
 
 def _region(value: object) -> object:
-    if isinstance(value, Region):
+    if isinstance(value, (Region, Regions)):
         return value
     if not isinstance(value, dict) or value.keys() != {"latitude", "longitude"}:
         raise ValueError(
@@ -67,6 +59,19 @@ def _floors(value: object) -> object:
     if min(floors) <= 0:
         raise ValueError(f"objective_floors must be above 0, got {short(value)}")
     return floors
+
+
+def _tasks(value: object) -> object:
+    if value is None:
+        return None
+    if isinstance(value, (tuple, list)) and len(value) == 2:
+        value = Tasks(*value)
+    if not isinstance(value, (Tasks, RegionTasks)):
+        raise ValueError(f"tasks must be Tasks, or over many regions RegionTasks, got {short(value)}")
+    for name, values in value._asdict().items():
+        if not isinstance(values, torch.Tensor):
+            raise ValueError(f"tasks.{name} must be an instance of Tensor, got {short(values)}")
+    return value
 
 
 def _field(value: object) -> object:
@@ -92,10 +97,13 @@ class Scenario(CheckedModel):
         (29.5, 50.5)
     """
 
-    region: Annotated[Region, BeforeValidator(_region)] = PAPER_REGION
-    """Box of starts and destinations."""
+    region: Annotated[Region | Regions, BeforeValidator(_region)] = PAPER_REGION
+    """Box of starts and destinations; or many boxes, of which every random task draws one, with a bank as ``field``."""
     distance_range_km: Annotated[tuple[float, float], BeforeValidator(_DISTANCES)] = paper.DISTANCE_KM
     """Shortest and longest distance from start to destination of random tasks [km]."""
+    distance_law: Literal["area", "log"] = "area"
+    """Law of the distances of random tasks: both ends uniform over the region given that their distance is in the range
+    (``"area"``), or log-uniform distances in the whole range (``"log"``)."""
     date: Annotated[Date, BeforeValidator(parse_date)] = parse_date(paper.DATE)
     """Date of the field: ``datetime``, ``date``, ISO text or decimal year; kept as a ``datetime``."""
     generation: Literal[13, 14] = paper.GENERATION  # type: ignore[assignment]
@@ -108,18 +116,20 @@ class Scenario(CheckedModel):
     """Least differences of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by, or None for the mean change of each over
     :data:`FLOOR_KM` in the region. Where the field is steep, floors that are too low make every detour very costly."""
     field: Annotated[Any, BeforeValidator(_field)] = None
-    """Own field model (:class:`magrl.field.FieldModel`) in place of IGRF."""
-    tasks: Tasks | None = None
-    """Frozen tasks to fly in place of random ones."""
+    """Own field model (:class:`magrl.field.FieldModel`) in place of IGRF; over many regions a
+    :class:`magrl.field.FieldBank` with an expansion for each, of every place that a vehicle can reach."""
+    tasks: Annotated[Tasks | RegionTasks | None, BeforeValidator(_tasks)] = None
+    """Frozen tasks to fly in place of random ones; over many regions with the region of each."""
     names: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
     """Names of the frozen tasks, or none."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        self._check_bank()
         if self.field is None:
             igrf_coefficients(self.date, self.generation)
         if self.tasks is None:
-            check_distance_range(self.region, self.distance_range_km)
+            check_distance_range(self.region, self.distance_range_km, self.distance_law)
         else:
             object.__setattr__(self, "tasks", self._checked_tasks(self.tasks))
         count = 0 if self.tasks is None else len(self.tasks.start)
@@ -127,18 +137,28 @@ class Scenario(CheckedModel):
             raise ValueError(f"names must hold one name for each of {count} tasks, got {short(self.names)}")
         return self
 
-    def _checked_tasks(self, tasks: Tasks) -> Tasks:
+    def _check_bank(self) -> None:
+        """Raise unless many regions come with a bank, and each with an expansion of its own."""
+        regions = len(self.region) if isinstance(self.region, Regions) else 0
+        expansions = len(self.field) if isinstance(self.field, FieldBank) else 0
+        if regions != expansions:
+            raise ValueError(
+                f"region holds {regions or 'no'} boxes of Regions, and field {expansions or 'no'} expansions of a "
+                "FieldBank: give many regions a bank with one for each, and a single Region a field model or None"
+            )
+
+    def _checked_tasks(self, tasks: Tasks | RegionTasks) -> Tasks | RegionTasks:
         try:
             return check_tasks(tasks, self.edge)
         except ValueError as error:
             raise ValueError(str(error) if str(error).startswith("tasks") else f"tasks: {error}") from error
 
     @property
-    def edge(self) -> Region:
+    def edge(self) -> Region | Regions:
         """Region with its margin: a vehicle beyond it is lost."""
         return self.region.expanded(self.margin_deg)
 
-    def reachable(self, max_move_km: float) -> Region:
+    def reachable(self, max_move_km: float) -> Region | Regions:
         """Return every place that a vehicle can reach: one move beyond the edge, rounded up to half a degree.
 
         Raises:
@@ -148,16 +168,10 @@ class Scenario(CheckedModel):
             >>> Scenario().reachable(50)
             Region(latitude=(-15.5, 5.5), longitude=(154.5, 175.5))
         """
-        check_number(0, max_move_km=max_move_km)
-        reach = math.radians(max_move_km / _SHORTEST_DEGREE_KM)
-        nearest_pole = math.radians(90 - max(abs(x) for x in self.edge.latitude))
-        # The farthest that a great circle of this length leads from its meridian; past a pole it leads anywhere.
-        aside = math.degrees(math.asin(math.sin(reach) / math.sin(nearest_pole))) if reach < nearest_pole else 180.0
-        south_north, west_east = (math.ceil(2 * x) / 2 for x in (math.degrees(reach), aside))
-        return Region(self.edge.expanded(south_north).latitude, self.edge.expanded(west_east).longitude)
+        return self.edge.reachable(max_move_km)
 
     def build_field(self, max_move_km: float = 50.0) -> FieldModel:
-        """Return the own field model, or IGRF expanded over every place that a vehicle can reach.
+        """Return the own field model or bank, or IGRF expanded over every place that a vehicle can reach.
 
         Args:
             max_move_km: longest move [km].
@@ -181,6 +195,7 @@ class Scenario(CheckedModel):
     def _expanded_igrf(self, max_move_km: float) -> RegionalField:
         """Return IGRF expanded over every place that a vehicle can reach, with a declination that does not jump."""
         box = self.reachable(max_move_km)
+        assert isinstance(box, Region)  # many regions have a bank
         igrf = IGRF(self.date, self.generation, altitude_km=self.altitude_km)
         field = RegionalField(igrf, box.latitude, box.longitude)
         field_bounds(field, box, torch.device("cpu"))
@@ -196,6 +211,7 @@ class Scenario(CheckedModel):
                 return False
             return True
 
+        assert isinstance(self.region, Region)
         (south, north), longitude = self.region.latitude, self.region.longitude
         margins = (step / 2 for step in range(min(math.ceil(2 * self.margin_deg), 20) - 1, -1, -1))
         margin = next((margin for margin in margins if usable(margin_deg=margin)), None)
@@ -207,25 +223,29 @@ class Scenario(CheckedModel):
         ways += [f"move the region {shift}° toward the equator"] if shift is not None else []
         return ", or ".join(ways) or "choose a smaller region away from the poles"
 
-    def floors(self, field: FieldModel) -> tuple[float, float, float]:
+    def floors(self, field: FieldModel | FieldBank) -> Tensor:
         """Return the floors of Eq. 2-6, D [deg], I [deg], B_H [nT], from ``field`` where none are given.
+
+        Returns:
+            ``(3,)`` float64; over many regions ``(K, 3)``, each from its own field.
 
         Example:
             >>> scenario = Scenario(objective_floors=None)
-            >>> [round(x, 2) for x in scenario.floors(scenario.build_field())]
-            [0.05, 0.44, 21.11]
+            >>> scenario.floors(scenario.build_field()).round(decimals=2)
+            tensor([ 0.0500,  0.4400, 21.1100], dtype=torch.float64)
         """
         if self.objective_floors is not None:
-            return self.objective_floors
-        slopes = elements_gradient_at(field, self.region.grid(21)).norm(dim=-1).reshape(-1, 3).mean(0)
-        declination, inclination, intensity = (FLOOR_KM * slopes).tolist()
-        return declination, inclination, intensity
+            floors = torch.tensor(self.objective_floors, dtype=torch.float64)
+            return floors.repeat(len(self.region), 1) if isinstance(self.region, Regions) else floors
+        index = (torch.arange(len(self.region)).reshape(-1, 1, 1),) if isinstance(self.region, Regions) else ()
+        slopes = elements_gradient_at(field, self.region.grid(21), *index).norm(dim=-1)
+        return FLOOR_KM * slopes.flatten(-3, -2).mean(-2)
 
-    def random_tasks(self, num_tasks: int, seed: int) -> Tasks:
+    def random_tasks(self, num_tasks: int, seed: int) -> Tasks | RegionTasks:
         """Return a frozen set of random tasks, see :func:`magrl.envs.tasks.task_set`."""
-        return task_set(num_tasks, seed, self.region, self.distance_range_km)
+        return task_set(num_tasks, seed, self.region, self.distance_range_km, self.distance_law)
 
-    def with_tasks(self, tasks: Tasks | None) -> Scenario:
+    def with_tasks(self, tasks: Tasks | RegionTasks | None) -> Scenario:
         """Return the same scenario with other frozen tasks, or with random ones for None.
 
         Example:
@@ -233,103 +253,3 @@ class Scenario(CheckedModel):
             5
         """
         return self.replace(tasks=tasks, names=())
-
-
-def load_scenario(path: Path | str) -> Scenario:
-    """Read a scenario from a TOML or JSON file, whose keys are the fields of :class:`Scenario`.
-
-    ``region`` and ``date`` are required. ``generation`` is 14 and ``objective_floors`` follow the region unless given.
-    ``tasks`` is a list of tables with ``start`` and ``target`` (latitude, longitude in degrees) and perhaps ``name``.
-
-    Args:
-        path: file that ends in ``.toml`` or ``.json``.
-
-    Raises:
-        FileNotFoundError: if it does not exist.
-        ValueError: naming the file, the key, the value and what would be right.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "azores.toml"
-        >>> lines = "date = 2026-07-01", "region = {latitude = [40, 50], longitude = [-30, -20]}"
-        >>> _ = path.write_text(chr(10).join(lines))
-        >>> load_scenario(path).region
-        Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0))
-    """
-    check_type((Path, str), path=path)
-    path = Path(path)
-    try:
-        scenario = _scenario(_content(path))
-        scenario.build_field()
-        return scenario
-    except FileNotFoundError:
-        raise FileNotFoundError(f"there is no scenario file at {path}") from None
-    except (ValueError, TypeError, OSError, RecursionError, OverflowError) as error:
-        raise ValueError(f"{path}: {error or type(error).__name__}") from error
-
-
-def _scenario(content: Any) -> Scenario:
-    if not isinstance(content, dict):
-        raise ValueError(f"a scenario file must hold a table, got {short(content)}")
-    if "journeys" in content or "field" in content:
-        raise ValueError(
-            "the tables [field] and [journeys] are of an earlier version: write their keys (date, generation, "
-            "altitude_km, distance_range_km, objective_floors) at the top of the file, above [region]"
-        )
-    known = [name for name in Scenario.model_fields if name not in ("field", "names")]
-    if unknown := [key for key in content if key not in known]:
-        where = ": write name = ... in each of the tasks" if unknown[0] == "names" else ""
-        raise ValueError(f"unknown key {short(unknown[0])}{where or ': choose from ' + ', '.join(known)}")
-    if missing := [name for name in ("region", "date") if name not in content]:
-        raise ValueError(f"{missing[0]} is missing: a scenario file must hold region and date")
-    values: dict[str, Any] = {"generation": 14, "objective_floors": None} | content
-    if "tasks" in content:
-        values["names"], values["tasks"] = _listed_tasks(content["tasks"])
-    return Scenario(**values)
-
-
-def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
-    """Return names and ends of a list of tables."""
-    if not isinstance(listed, list):
-        raise ValueError(f"tasks must be a list of tables with start and target, got {short(listed)}")
-    if not listed:
-        return (), None
-    entries = [TaskEntry.read(number, entry) for number, entry in enumerate(listed, start=1)]
-    start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
-    on_earth = (torch.maximum(start[:, 0].abs(), target[:, 0].abs()) <= 90).nonzero().squeeze(-1)
-    if len(nowhere := on_earth[without_way(start[on_earth], target[on_earth])]):
-        number = int(nowhere[0])
-        raise ValueError(
-            f"tasks, entry {number + 1}: start and target are the same place, {list(entries[number].start)}: "
-            "move one of them, or remove the entry"
-        )
-    return tuple(e.name for e in entries), Tasks(start, target)
-
-
-def _content(path: Path) -> Any:
-    """Return the parsed file."""
-    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
-    if path.suffix.lower() not in parsers:
-        raise ValueError(f"a scenario file must end in .toml or .json, got {path.suffix!r}")
-    with path.open("rb") as file:
-        content = file.read(MAX_FILE_BYTES + 1)
-    if len(content) > MAX_FILE_BYTES:
-        raise ValueError(f"the file holds more than {MAX_FILE_BYTES} bytes")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"the file is not UTF-8: {error}") from error
-    try:
-        return parsers[path.suffix.lower()](text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"the file is not valid {path.suffix[1:].upper()}: {error}") from error
-
-
-def _json(text: str) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(dict(pairs)) < len(pairs):
-            names = [key for key, _ in pairs]
-            raise ValueError(f"the key {short(next(key for key in names if names.count(key) > 1))} is repeated")
-        return dict(pairs)
-
-    return json.loads(text, object_pairs_hook=unique)

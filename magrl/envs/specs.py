@@ -9,10 +9,13 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from magrl.envs.region import Region
-from magrl.field import FieldModel, elements_range
+from magrl.envs.regions import Regions
+from magrl.field import FieldBank, FieldModel, elements_at
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Terms whose sum is ``reward``."""
+REGION = "region"
+"""Index of the region of each vehicle, where there are many."""
 STATE_KEYS = (
     "target_field",
     "heading",
@@ -22,6 +25,7 @@ STATE_KEYS = (
     "start_position",
     "objective",
     "objective_weights",
+    REGION,
 )
 """Keys that a step reads: the state of an episode."""
 
@@ -37,12 +41,12 @@ def bounded(num_envs: int, low: Tensor, high: Tensor) -> Bounded:
     return Bounded(low.float().expand(shape), high.float().expand(shape), shape)
 
 
-def field_bounds(field: FieldModel, box: Region, device: torch.device) -> tuple[Tensor, Tensor]:
+def field_bounds(field: FieldModel | FieldBank, box: Region | Regions, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return bounds of the elements over every place in a box, from a grid and 5 % of slack.
 
     Args:
-        field: field model.
-        box: every place that a vehicle can reach.
+        field: field model, or a bank of them.
+        box: every place that a vehicle can reach, or that in each region of the bank.
         device: device of the field model.
 
     Returns:
@@ -57,24 +61,46 @@ def field_bounds(field: FieldModel, box: Region, device: torch.device) -> tuple[
         >>> [round(bound) for bound in high.tolist()]
         [11, -8, 35670]
     """
-    low, high = elements_range(field, box.grid(81).to(device))
-    if not torch.isfinite(low + high).all():
+    if isinstance(box, Regions):
+        values = region_elements(field, box)
+    else:
+        values = elements_at(field, box.grid(81).to(device)).reshape(1, -1, 3)
+    lowest, highest = values.amin(1), values.amax(1)
+    undefined, turning = ~torch.isfinite(lowest + highest).all(-1), highest[:, 0] - lowest[:, 0] > 180
+    if undefined.any():
         raise ValueError(
-            f"the field is not defined on all of {box}, which a vehicle can reach: take a field of a larger box, or a "
-            "smaller region, margin_deg or max_move_km"
+            f"the field is not defined on all of {_first(undefined, box)}, which a vehicle can reach: take a field of "
+            "a larger box, or a smaller region, margin_deg or max_move_km"
         )
-    if high[0] - low[0] > 180:
+    if turning.any():
         raise ValueError(
-            f"the declination turns through south in {box}: D jumps from 180 to -180 degrees there; take a region "
-            "farther from the magnetic pole"
+            f"the declination turns through south in {_first(turning, box)}: D jumps from 180 to -180 degrees there; "
+            "take a region farther from the magnetic pole"
         )
+    low, high = lowest.amin(0), highest.amax(0)
     slack = 0.05 * (high - low)
     limit = torch.tensor((180.0, 90.0, math.inf), dtype=torch.float64, device=device)
     return (low - slack).maximum(-limit), (high + slack).minimum(limit)
 
 
+def region_elements(field: FieldModel | FieldBank, regions: Regions, points: int = 11) -> Tensor:
+    """Return the elements of a bank on an even grid of each region: ``(K, points², 3)``, D [deg], I [deg], B_H [nT]."""
+    index = torch.arange(len(regions), device=regions.latitude.device)
+    return elements_at(field, regions.grid(points).flatten(1, 2), index.unsqueeze(-1))
+
+
+def _first(bad: Tensor, box: Region | Regions) -> str:
+    """Return the first bad box as text."""
+    number = int(bad.nonzero()[0])
+    return f"region {number} with its margin, {box[number]}" if isinstance(box, Regions) else f"{box}"
+
+
 def observation_spec(
-    num_envs: int, field_bounds: tuple[Tensor, Tensor], max_move_km: float, max_turn_rad: float
+    num_envs: int,
+    field_bounds: tuple[Tensor, Tensor],
+    max_move_km: float,
+    max_turn_rad: float,
+    num_regions: int | None = None,
 ) -> Composite:
     """Return the spec of what a step observes, privileged keys included.
 
@@ -83,6 +109,7 @@ def observation_spec(
         field_bounds: lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
+        num_regions: number of regions, of which ``region`` is the index; None without that key.
 
     Example:
         >>> observation_spec(4, (torch.zeros(3), torch.ones(3)), 50.0, 1.5)["field"].shape
@@ -90,6 +117,7 @@ def observation_spec(
     """
     low, high = (bound.cpu() for bound in field_bounds)
     highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
+    many = {} if num_regions is None else {"region": Bounded(0, num_regions - 1, (num_envs, 1), dtype=torch.int64)}
     return Composite(
         field=bounded(num_envs, low, high),
         target_field=bounded(num_envs, low, high),
@@ -102,8 +130,39 @@ def observation_spec(
         objective=Unbounded((num_envs, 1)),
         objective_weights=Unbounded((num_envs, 3)),
         success=_flag(num_envs),
+        **many,
         shape=(num_envs,),
     )
+
+
+def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Return actions in float64, rounded into their bounds.
+
+    Args:
+        action: ``(N, 2)`` distance [km], turn [rad].
+        low: ``(2,)`` lowest.
+        high: ``(2,)`` highest.
+
+    Raises:
+        ValueError: naming the vehicles whose action is not finite or beyond the bounds by more than rounding.
+
+    Example:
+        >>> checked_action(torch.tensor([[50.000001, 0.0]]), torch.tensor([0.0, -1.5]), torch.tensor([50.0, 1.5]))
+        tensor([[50.,  0.]], dtype=torch.float64)
+    """
+    action = action.double()
+    slack = 1e-5 * (high - low)
+    sound = (action >= low - slack) & (action <= high + slack)
+    if torch.compiler.is_compiling() or action.is_cuda:
+        torch._assert_async(sound.all(), "GeomagneticNavEnv: an action is not finite or out of bounds")
+    elif not sound.all():
+        bad = (~sound.all(-1)).nonzero().squeeze(-1)
+        raise ValueError(
+            f"GeomagneticNavEnv: actions of vehicles {bad[:8].tolist()} are not finite or out of bounds: "
+            f"{action[bad[:8]].tolist()}; distance [km] must be in [0, {float(high[0])}] and turn [rad] in "
+            f"[-{float(high[1]):.4f}, {float(high[1]):.4f}]"
+        )
+    return action.clamp(low, high)
 
 
 def state_spec(observation: Composite) -> Composite:
@@ -114,7 +173,8 @@ def state_spec(observation: Composite) -> Composite:
         >>> "field" in state_spec(observation_spec(4, bounds, 50.0, 1.5)).keys()
         False
     """
-    return Composite({key: observation[key].clone() for key in STATE_KEYS}, shape=observation.shape)
+    held = [key for key in STATE_KEYS if key in observation.keys()]  # noqa: SIM118 - a Composite is no mapping
+    return Composite({key: observation[key].clone() for key in held}, shape=observation.shape)
 
 
 def reward_spec(num_envs: int) -> Composite:

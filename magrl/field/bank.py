@@ -55,7 +55,7 @@ class FieldBank(Float64Module):
         if expansion.ndim != 4 or expansion.shape[1:] != (3, *expansion.shape[-1:] * 2) or expansion.shape[-1] < 2:
             raise ValueError(f"expansion must have the shape (K, 3, n, n) with n >= 2, got {tuple(expansion.shape)}")
         terms = expansion.shape[-1]
-        latitude, longitude = _checked_boxes(latitude, longitude)
+        latitude, longitude = checked_boxes(latitude, longitude)
         if len(latitude) != len(expansion):
             raise ValueError(f"latitude must hold {len(expansion)} boxes, as expansion, got {len(latitude)}")
         self.degree = terms - 1
@@ -96,7 +96,7 @@ class FieldBank(Float64Module):
         """
         check_number(1, whole=True, degree=degree)
         check_number(0, above=True, tolerance_nt=tolerance_nt)
-        latitude, longitude = (x.cpu() for x in _checked_boxes(latitude, longitude))
+        latitude, longitude = (x.cpu() for x in checked_boxes(latitude, longitude))
         gauss, planet_index = _checked_planets(gauss, planet_index, len(latitude))
         weights, planet = _surface_weights(gauss), planet_index.split(_BOXES)
         boxes = list(zip(planet, latitude.split(_BOXES), longitude.split(_BOXES), strict=True))
@@ -112,6 +112,10 @@ class FieldBank(Float64Module):
         bank.error_nt.copy_(torch.cat(errors))
         bank._check_error(planet_index, latitude, longitude, float(tolerance_nt))
         return bank
+
+    def __len__(self) -> int:
+        """Return the number of expansions."""
+        return len(self.coefficients)
 
     def forward(self, latitude: Tensor, longitude: Tensor, index: Tensor) -> Tensor:
         """Return the field vector.
@@ -153,7 +157,7 @@ class FieldBank(Float64Module):
     def _points(self, latitude: Tensor, longitude: Tensor, index: Tensor) -> tuple[torch.Size, list[Tensor]]:
         """Return the shape of the positions, positions ``(2, P)`` and indices ``(P,)``."""
         check_tensor(latitude=latitude, longitude=longitude, index=index)
-        _check_index(index, len(self.coefficients))
+        check_index(index, len(self.coefficients))
         latitude, longitude, index = torch.broadcast_tensors(latitude.double(), longitude.double(), index)
         return index.shape, [torch.stack((latitude, longitude)).reshape(2, -1), index.reshape(-1)]
 
@@ -214,8 +218,15 @@ _BOXES = 64
 """Boxes expanded at a time, and planets prepared at a time: at degree 13, about 30 MB of temporary memory."""
 
 
-def _check_index(index: Tensor, count: int, name: str = "index") -> None:
-    """Raise unless indices are int64 in [0, count); an accelerator does not wait for the answer."""
+def check_index(index: Tensor, count: int, name: str = "index") -> None:
+    """Raise unless indices are int64 in [0, count); an accelerator does not wait for the answer.
+
+    Example:
+        >>> check_index(torch.tensor([0, 3]), 2)
+        Traceback (most recent call last):
+        ValueError: index 3 is not in [0, 2)
+    """
+    check_tensor(**{name: index})
     if index.dtype != torch.int64:
         raise TypeError(f"{name} must be int64, got {index.dtype}")
     good, message = (index >= 0) & (index < count), f"{name} {{}} is not in [0, {count})"
@@ -237,12 +248,17 @@ def _checked_planets(gauss: Tensor, planet_index: Tensor, boxes: int) -> tuple[T
     if planet_index.shape != (boxes,):
         raise ValueError(f"planet_index must have the shape ({boxes},), as the boxes, got {tuple(planet_index.shape)}")
     planet_index = planet_index.cpu()
-    _check_index(planet_index, len(gauss), "planet_index")
+    check_index(planet_index, len(gauss), "planet_index")
     return gauss.to("cpu", torch.complex128), planet_index
 
 
-def _checked_boxes(latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the edges of boxes ``(K, 2)`` as float64."""
+def checked_boxes(latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the edges of boxes ``(K, 2)`` as float64; raise unless there is one and all are sound.
+
+    Example:
+        >>> checked_boxes(torch.tensor([[-10.0, 0.0]]), torch.tensor([[170.0, 190.0]]))[1]
+        tensor([[170., 190.]], dtype=torch.float64)
+    """
     check_tensor(2, latitude=latitude, longitude=longitude)
     if latitude.ndim != 2 or latitude.shape != longitude.shape or not len(latitude):
         shapes = f"{tuple(latitude.shape)} and {tuple(longitude.shape)}"

@@ -40,6 +40,16 @@ class FieldModel(Protocol):
         """Return the vector and its derivative northward and eastward, ``(..., 3, 2)`` [nT/km]."""
 
 
+class FieldBankModel(Protocol):
+    """Interface of many field models evaluated together, such as :class:`magrl.field.FieldBank`."""
+
+    def __call__(self, latitude: Tensor, longitude: Tensor, index: Tensor, /) -> Tensor:
+        """Return the vector ``(..., 3)`` [nT] of the field that ``index`` ``(...)`` int64 names."""
+
+    def value_and_gradient(self, latitude: Tensor, longitude: Tensor, index: Tensor, /) -> tuple[Tensor, Tensor]:
+        """Return the vector and its derivative northward and eastward, ``(..., 3, 2)`` [nT/km]."""
+
+
 class Float64Module(nn.Module):
     """A module that follows device moves but keeps float64: float32 coefficients would cost meters of position.
 
@@ -86,12 +96,13 @@ def in_chunks(function: Callable[..., Tensor], points: Sequence[Tensor], rows: i
     return out
 
 
-def elements_at(field: FieldModel, position: Tensor) -> Tensor:
+def elements_at(field: FieldModel | FieldBankModel, position: Tensor, index: Tensor | None = None) -> Tensor:
     """Return D, I, B_H of a field at positions.
 
     Args:
-        field: field model.
+        field: field model, or a bank of them.
         position: ``(..., 2)`` latitude, longitude [deg].
+        index: ``(...)`` int64, the field of each position in a bank.
 
     Returns:
         ``(..., 3)``: D [deg], I [deg], B_H [nT].
@@ -104,7 +115,7 @@ def elements_at(field: FieldModel, position: Tensor) -> Tensor:
         [8.02, -16.15, 35466.61]
     """
     check_tensor(2, position=position)
-    return measured_elements(field(position[..., 0], position[..., 1]))
+    return measured_elements(field(*_place(position, index)))
 
 
 def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]:
@@ -134,12 +145,13 @@ def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]
     return values.amin(0), values.amax(0)
 
 
-def elements_gradient_at(field: FieldModel, position: Tensor) -> Tensor:
+def elements_gradient_at(field: FieldModel | FieldBankModel, position: Tensor, index: Tensor | None = None) -> Tensor:
     """Return the horizontal gradient of D, I, B_H of a field at positions.
 
     Args:
-        field: field model.
+        field: field model, or a bank of them.
         position: ``(..., 2)`` latitude, longitude [deg].
+        index: ``(...)`` int64, the field of each position in a bank.
 
     Returns:
         ``(..., 3, 2)``: element unit per km, northward and eastward.
@@ -153,4 +165,9 @@ def elements_gradient_at(field: FieldModel, position: Tensor) -> Tensor:
                 [ 0.1423, -0.4990]], dtype=torch.float64)
     """
     check_tensor(2, position=position)
-    return elements_gradient(*field.value_and_gradient(position[..., 0], position[..., 1]))
+    return elements_gradient(*field.value_and_gradient(*_place(position, index)))
+
+
+def _place(position: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:
+    """Return the arguments of a field model, or of a bank."""
+    return (position[..., 0], position[..., 1], *(() if index is None else (index,)))

@@ -1,0 +1,184 @@
+"""Scenarios over many random regions: of planets that do not exist, to train on, and of the Earth, to evaluate on."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from magrl import paper
+from magrl.checks import check_number
+from magrl.envs.regions import Regions
+from magrl.envs.scenario import Scenario
+from magrl.envs.specs import region_elements
+from magrl.field import Date, FieldBank, igrf_coefficients, parse_date, random_planets
+from magrl.transforms.counters import counter_uniform
+
+REGIONS_PER_PLANET = 2
+MAX_TRIES = 100
+"""Places drawn for a region before its conditions count as impossible."""
+
+
+def planet_scenario(count: int, seed: int, **options: Any) -> Scenario:
+    """Return a scenario over random regions of random planets, two on each (:func:`magrl.field.random_planets`).
+
+    Args:
+        count: number of regions.
+        seed: random seed; the result is a pure function of the arguments.
+        **options: of :func:`region_scenario`.
+
+    Raises:
+        TypeError: for an unknown option.
+        ValueError: as :func:`region_scenario`.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(planet_scenario(4, seed=0), num_envs=3, seed=0)
+        >>> env.reset()["region"].shape
+        torch.Size([3, 1])
+    """
+    check_number(1, whole=True, count=count)
+    check_number(0, 2**63 - 1, whole=True, seed=seed)
+    planets = random_planets(-(-count // REGIONS_PER_PLANET), seed)
+    return region_scenario(planets, torch.arange(count) // REGIONS_PER_PLANET, seed, **options)
+
+
+def earth_scenario(count: int, seed: int, date: Date = "2025-01-01", generation: int = 14, **options: Any) -> Scenario:
+    """Return a scenario over random regions of the Earth (IGRF).
+
+    Args:
+        count: number of regions.
+        seed: random seed; the result is a pure function of the arguments.
+        date: date of the field, as in :class:`Scenario`.
+        generation: generation of IGRF, 13 or 14.
+        **options: of :func:`region_scenario`.
+
+    Raises:
+        TypeError: for an unknown option.
+        ValueError: for a date outside the field model; or as :func:`region_scenario`.
+
+    Example:
+        >>> scenario = earth_scenario(8, seed=0)
+        >>> tasks = scenario.random_tasks(20, seed=1)
+        >>> tasks.start.shape, tasks.region.shape
+        (torch.Size([20, 2]), torch.Size([20]))
+    """
+    check_number(1, whole=True, count=count)
+    check_number(0, 2**63 - 1, whole=True, seed=seed)
+    earth = igrf_coefficients(date, generation).unsqueeze(0)
+    scenario = region_scenario(earth, torch.zeros(count, dtype=torch.int64), seed, **options)
+    return scenario.replace(date=parse_date(date), generation=generation)
+
+
+def region_scenario(
+    gauss: Tensor,
+    planet_index: Tensor,
+    seed: int,
+    *,
+    half_size_deg: float = 10.0,
+    max_latitude: float = 60.0,
+    min_intensity_nt: float = 8000.0,
+    margin_deg: float = 5.0,
+    max_move_km: float = 50.0,
+    degree: int = 12,
+    tolerance_nt: float = 0.1,
+    distance_range_km: tuple[float, float] = paper.DISTANCE_KM,
+    distance_law: Literal["area", "log"] = "area",
+) -> Scenario:
+    """Return a scenario over random regions, each as wide as high at its middle.
+
+    The place of a region is uniform on the sphere, given that B_H is nowhere in it below the limit, and that D is
+    continuous everywhere that a vehicle can reach.
+
+    Args:
+        gauss: complex ``(P, N + 1, N + 1)`` tables ``g - i h`` [nT].
+        planet_index: ``(K,)`` int64, the planet of each region.
+        seed: random seed of the places.
+        half_size_deg: half of the height of a region [degrees of arc].
+        max_latitude: latitude that no region crosses, north or south [deg].
+        min_intensity_nt: lowest B_H in a region [nT].
+        margin_deg: how far beyond its region a vehicle may stray before it is lost [deg].
+        max_move_km: longest move of the environment; the field ends one move beyond the margin.
+        degree: degree of the expansions of the field; larger regions need a higher one.
+        tolerance_nt: largest error of the expansions [nT].
+        distance_range_km: shortest and longest distance of random tasks [km].
+        distance_law: ``"area"`` or ``"log"``, as in :class:`Scenario`.
+
+    Returns:
+        The scenario, with floors of Eq. 2-6 from the field of each region.
+
+    Raises:
+        ValueError: for a number out of its range, conditions for which no place was found, an expansion that misses the
+            field by more than the tolerance, or distances that a region cannot hold; naming it.
+
+    Example:
+        >>> far = region_scenario(random_planets(1, seed=0), torch.zeros(2, dtype=torch.int64), seed=0,
+        ...                       half_size_deg=20, degree=16, distance_range_km=(150, 1800), distance_law="log")
+        >>> len(far.region)
+        2
+    """
+    check_number(0, 90, above=True, max_latitude=max_latitude)
+    check_number(0, max_latitude, above=True, half_size_deg=half_size_deg)
+    check_number(0, min_intensity_nt=min_intensity_nt, margin_deg=margin_deg, max_move_km=max_move_km)
+    region = _placed_regions(
+        gauss, planet_index, seed, (half_size_deg, max_latitude), min_intensity_nt, (margin_deg, max_move_km), degree
+    )
+    box = region.expanded(margin_deg).reachable(max_move_km)
+    bank = FieldBank.build(gauss, planet_index, box.latitude, box.longitude, degree=degree, tolerance_nt=tolerance_nt)
+    return Scenario(
+        region=region,
+        field=bank,
+        margin_deg=margin_deg,
+        objective_floors=None,
+        distance_range_km=distance_range_km,
+        distance_law=distance_law,
+    )
+
+
+def _placed_regions(
+    gauss: Tensor,
+    planet_index: Tensor,
+    seed: int,
+    size: tuple[float, float],
+    min_intensity_nt: float,
+    around: tuple[float, float],
+    degree: int,
+) -> Regions:
+    """Draw a place for each region until it meets the conditions; ``around`` are the margin and the longest move."""
+    edges = torch.empty(len(planet_index), 4, dtype=torch.float64)
+    waiting = torch.arange(len(planet_index))
+    for attempt in range(MAX_TRIES):
+        drawn = _drawn_regions(seed, waiting, attempt, *size)
+        box = drawn.expanded(around[0]).reachable(around[1])
+        planets, count = gauss[planet_index[waiting]], torch.arange(len(waiting))
+        bank = FieldBank.build(planets, count, box.latitude, box.longitude, degree=degree, tolerance_nt=_ANY_ERROR)
+        declination = region_elements(bank, box)[..., 0]
+        strong = region_elements(bank, drawn)[..., 2].amin(1) >= min_intensity_nt
+        good = strong & (declination.amax(1) - declination.amin(1) <= 180)
+        edges[waiting[good]] = torch.cat((drawn.latitude, drawn.longitude), -1)[good]
+        waiting = waiting[~good]
+        if not len(waiting):
+            return Regions(edges[:, :2], edges[:, 2:])
+    raise ValueError(
+        f"no place was found in {MAX_TRIES} tries for region {int(waiting[0])} on planet "
+        f"{int(planet_index[waiting[0]])} with half_size_deg {size[0]:g}, max_latitude {size[1]:g}, min_intensity_nt "
+        f"{min_intensity_nt:g} and margin_deg {around[0]:g}: take smaller regions or a lower limit of the intensity"
+    )
+
+
+_ANY_ERROR = 1e9  # of an expansion by which places are chosen [nT]; that of the scenario is checked
+
+
+def _drawn_regions(seed: int, number: Tensor, attempt: int, half_size_deg: float, max_latitude: float) -> Regions:
+    """Return boxes whose middles are uniform on the sphere between the latitudes that they may not cross."""
+    uniform = counter_uniform(seed, torch.stack((number, torch.full_like(number, attempt)), -1), 2)
+    highest = math.sin(math.radians(max_latitude - half_size_deg))
+    latitude = torch.rad2deg(torch.asin(highest * (2 * uniform[:, 0] - 1)))
+    longitude = 360 * uniform[:, 1] - 180
+    aside = (half_size_deg / torch.cos(torch.deg2rad(latitude))).clamp_max(180)
+    return Regions(
+        torch.stack((latitude - half_size_deg, latitude + half_size_deg), -1),
+        torch.stack((longitude - aside, longitude + aside), -1),
+    )

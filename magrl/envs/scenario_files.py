@@ -1,0 +1,152 @@
+"""Scenario files: TOML or JSON, with the keys of :class:`magrl.envs.Scenario`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import BeforeValidator
+from typing_extensions import Self
+
+from magrl.checks import CheckedModel, check_type, short
+from magrl.envs.scenario import Scenario
+from magrl.envs.task_checks import numbers_validator, without_way
+from magrl.envs.tasks import Tasks
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+MAX_FILE_BYTES = 10_000_000
+"""Largest scenario file: about fifty thousand tasks."""
+_DEGREES = "latitude and longitude in degrees"
+
+
+def _name(value: object) -> object:
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 200:
+        raise ValueError(f"name must be a text of 1 to 200 printable characters, got {short(value)}")
+    return value
+
+
+class TaskEntry(CheckedModel):
+    """A task in a file."""
+
+    start: Annotated[tuple[float, float], BeforeValidator(numbers_validator("start", 2, _DEGREES))]
+    target: Annotated[tuple[float, float], BeforeValidator(numbers_validator("target", 2, _DEGREES))]
+    name: Annotated[str, BeforeValidator(_name)]
+
+    @classmethod
+    def read(cls, number: int, entry: Any) -> Self:
+        """Return an entry of a file, counted from 1."""
+        if not isinstance(entry, dict):
+            raise ValueError(f"tasks, entry {number}, must be a table with start and target, got {short(entry)}")
+        values: dict[str, Any] = {"name": f"task {number}"} | entry
+        try:
+            return cls(**values)
+        except ValueError as error:
+            raise ValueError(f"tasks, entry {number}: {error}") from error
+
+
+def load_scenario(path: Path | str) -> Scenario:
+    """Read a scenario from a TOML or JSON file, whose keys are the fields of :class:`Scenario`.
+
+    ``region`` and ``date`` are required. ``generation`` is 14 and ``objective_floors`` follow the region unless given.
+    ``tasks`` is a list of tables with ``start`` and ``target`` (latitude, longitude in degrees) and perhaps ``name``.
+
+    Args:
+        path: file that ends in ``.toml`` or ``.json``.
+
+    Raises:
+        FileNotFoundError: if it does not exist.
+        ValueError: naming the file, the key, the value and what would be right.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "azores.toml"
+        >>> lines = "date = 2026-07-01", "region = {latitude = [40, 50], longitude = [-30, -20]}"
+        >>> _ = path.write_text(chr(10).join(lines))
+        >>> load_scenario(path).region
+        Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0))
+    """
+    check_type((Path, str), path=path)
+    path = Path(path)
+    try:
+        scenario = _scenario(_content(path))
+        scenario.build_field()
+        return scenario
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no scenario file at {path}") from None
+    except (ValueError, TypeError, OSError, RecursionError, OverflowError) as error:
+        raise ValueError(f"{path}: {error or type(error).__name__}") from error
+
+
+def _scenario(content: Any) -> Scenario:
+    if not isinstance(content, dict):
+        raise ValueError(f"a scenario file must hold a table, got {short(content)}")
+    if "journeys" in content or "field" in content:
+        raise ValueError(
+            "the tables [field] and [journeys] are of an earlier version: write their keys (date, generation, "
+            "altitude_km, distance_range_km, objective_floors) at the top of the file, above [region]"
+        )
+    known = [name for name in Scenario.model_fields if name not in ("field", "names")]
+    if unknown := [key for key in content if key not in known]:
+        where = ": write name = ... in each of the tasks" if unknown[0] == "names" else ""
+        raise ValueError(f"unknown key {short(unknown[0])}{where or ': choose from ' + ', '.join(known)}")
+    if missing := [name for name in ("region", "date") if name not in content]:
+        raise ValueError(f"{missing[0]} is missing: a scenario file must hold region and date")
+    values: dict[str, Any] = {"generation": 14, "objective_floors": None} | content
+    if "tasks" in content:
+        values["names"], values["tasks"] = _listed_tasks(content["tasks"])
+    return Scenario(**values)
+
+
+def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
+    """Return names and ends of a list of tables."""
+    if not isinstance(listed, list):
+        raise ValueError(f"tasks must be a list of tables with start and target, got {short(listed)}")
+    if not listed:
+        return (), None
+    entries = [TaskEntry.read(number, entry) for number, entry in enumerate(listed, start=1)]
+    start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
+    on_earth = (torch.maximum(start[:, 0].abs(), target[:, 0].abs()) <= 90).nonzero().squeeze(-1)
+    if len(nowhere := on_earth[without_way(start[on_earth], target[on_earth])]):
+        number = int(nowhere[0])
+        raise ValueError(
+            f"tasks, entry {number + 1}: start and target are the same place, {list(entries[number].start)}: "
+            "move one of them, or remove the entry"
+        )
+    return tuple(e.name for e in entries), Tasks(start, target)
+
+
+def _content(path: Path) -> Any:
+    """Return the parsed file."""
+    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
+    if path.suffix.lower() not in parsers:
+        raise ValueError(f"a scenario file must end in .toml or .json, got {path.suffix!r}")
+    with path.open("rb") as file:
+        content = file.read(MAX_FILE_BYTES + 1)
+    if len(content) > MAX_FILE_BYTES:
+        raise ValueError(f"the file holds more than {MAX_FILE_BYTES} bytes")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"the file is not UTF-8: {error}") from error
+    try:
+        return parsers[path.suffix.lower()](text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the file is not valid {path.suffix[1:].upper()}: {error}") from error
+
+
+def _json(text: str) -> Any:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(dict(pairs)) < len(pairs):
+            names = [key for key, _ in pairs]
+            raise ValueError(f"the key {short(next(key for key in names if names.count(key) > 1))} is repeated")
+        return dict(pairs)
+
+    return json.loads(text, object_pairs_hook=unique)
