@@ -9,9 +9,8 @@ Arguments and results are in the element's unit and in kilometers, a :class:`Fie
 (:data:`ELEMENT_SCALES`, :data:`DISTANCE_SCALE_KM`), which keep float32 well conditioned. For other elements than D, I,
 B_H, pass ``scales`` and ``curvature``, as tensors where they should stay on an accelerator.
 
-Types, shapes and Python numbers are checked. Values inside tensors are not read, because the functions run in every
-step: NaN in gives NaN out, and a negative standard deviation inside a tensor counts as NaN. Differences are not
-wrapped: a declination that crosses 180 degrees must be continued beyond it.
+Types, shapes and Python numbers are checked. Values inside tensors are not: NaN or a negative standard deviation gives
+NaN. Differences are not wrapped: a declination that crosses 180 degrees must be continued beyond it.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ from magrl.checks import check_number, check_numbers, check_tensor, check_type
 ELEMENT_SCALES = (0.3, 1.5, 100.0)
 """Units of D [deg], I [deg], B_H [nT] in a :class:`FieldTrack`: about their change over 100 km."""
 
-DISTANCE_SCALE_KM = 100.0
-"""Unit of distance in a :class:`FieldTrack` [km]."""
+DISTANCE_SCALE_KM = 100.0  # unit of distance in a FieldTrack
 
 CURVATURE = (0.015, 0.018, 8.0)
 """Standard deviation of the change of a gradient along the way: D, I [deg], B_H [nT], per (100 km)^2."""
@@ -40,11 +38,9 @@ VARIANCE_FLOOR = 1e-4
 DIPOLE_STD = ((0.39, 0.54), (0.27, 0.24), (190.0, 135.0))
 """Deviation of the gradients of D, I [deg], B_H [nT] from a dipole, along and across magnetic north: rms per 100 km."""
 
-EARTH_RADIUS_KM = 6371.2
-"""Reference radius of the geomagnetic field [km]."""
+EARTH_RADIUS_KM = 6371.2  # reference radius of the geomagnetic field
 
-PerElement = Tensor | Sequence[float]
-"""A value of each element: a tensor ``(..., E)`` or E numbers."""
+PerElement = Tensor | Sequence[float]  # a value of each element: (..., E), or E numbers
 
 _LEAST_VARIANCE = 1e-8  # of a remaining difference: keeps the squares of the weights inside float32
 
@@ -125,7 +121,7 @@ def start(
     azimuth: Tensor | None = None,
     scales: PerElement = ELEMENT_SCALES,
 ) -> FieldTrack:
-    """Return the state after the first reading.
+    """Return the state after the first reading, of its dtype.
 
     Args:
         reading: ``(..., E)`` first reading, in the element's unit.
@@ -134,9 +130,6 @@ def start(
         noise_std: standard deviation of its noise, ``(..., E)`` or E numbers; see :data:`VARIANCE_FLOOR`.
         azimuth: ``(...)`` [rad, clockwise from true north], usually of magnetic north; without it, 0.
         scales: units of the elements in the state, ``(..., E)`` or E numbers.
-
-    Returns:
-        The state, of the dtype of ``reading``.
 
     Raises:
         ValueError: for shapes that do not match, or a negative number in ``noise_std``.
@@ -154,15 +147,14 @@ def start(
     unit = _positive("scales", scales, count, reading)
     azimuth = torch.zeros_like(reading[..., 0]) if azimuth is None else azimuth
     check_tensor(azimuth=azimuth)
-    noise = (_positive("noise_std", noise_std, count, reading) / unit).square().clamp_min(VARIANCE_FLOOR)
     per_unit = (DISTANCE_SCALE_KM / unit).unsqueeze(-1)
-    gradient = prior_gradient.to(reading.dtype) * per_unit
-    spread = prior_std.to(reading.dtype).where(prior_std >= 0, math.nan) * per_unit
-    cos, sin = torch.cos(azimuth).to(reading.dtype), torch.sin(azimuth).to(reading.dtype)
-    axes = torch.stack((cos, -sin, sin, cos), -1).unflatten(-1, (2, 2))  # columns along and across
-    root = axes.unsqueeze(-3) * spread.unsqueeze(-2)
-    block = (root.unsqueeze(-2) * root.unsqueeze(-3)).sum(-1)
-    return _track(reading / unit, gradient, noise, torch.zeros_like(gradient), block)
+    north, east = (prior_gradient.to(reading.dtype) * per_unit).unbind(-1)
+    along, across = (prior_std.to(reading.dtype).where(prior_std >= 0, math.nan) * per_unit).square().unbind(-1)
+    cos, sin = torch.cos(azimuth).to(along).unsqueeze(-1), torch.sin(azimuth).to(along).unsqueeze(-1)
+    block = along * cos * cos + across * sin * sin, (along - across) * cos * sin, along * sin * sin + across * cos * cos
+    parts = reading / unit, north, east, _variance(noise_std, count, unit), 0 * along, 0 * along, *block
+    value, north, east, *covariance = (part.movedim(-1, 0) for part in torch.broadcast_tensors(*parts))
+    return _track((value, north, east), covariance)
 
 
 def predict(
@@ -189,20 +181,15 @@ def predict(
     """
     count = _check_track(track)
     check_tensor(2, displacement=displacement)
-    # By parts: 3 x 3 matrix products are slower, and may round to TF32 or, under autocast, to bfloat16.
-    value, gradient, variance, cross, block = _parts(track)
-    drift = _positive("curvature", curvature, count, value) / _positive("scales", scales, count, value)
-    d = (displacement.to(value.dtype) / DISTANCE_SCALE_KM).unsqueeze(-2)  # (..., 1, 2), the same for all elements
-    length2 = d.square().sum(-1)
-    growth = drift.square() * length2
-    moved = cross + (block * d.unsqueeze(-2)).sum(-1)
-    return _track(
-        value + (gradient * d).sum(-1),
-        gradient,
-        variance + ((cross + moved) * d).sum(-1) + growth * length2 / 4,
-        moved + growth.unsqueeze(-1) * d / 2,
-        block + growth[..., None, None] * torch.eye(2, dtype=value.dtype, device=value.device),
-    )
+    drift = _positive("curvature", curvature, count, track.mean) / _positive("scales", scales, count, track.mean)
+    shape = _common(track.mean.shape[:-1], (*displacement.shape[:-1], count), drift.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = _parts(track, shape)
+    dn, de = (displacement.to(value.dtype) / DISTANCE_SCALE_KM).unbind(-1)  # the same for all elements
+    growth = _first(drift, shape).square() * (length2 := dn * dn + de * de)
+    moved1, moved2 = p01 + p11 * dn + p12 * de, p02 + p12 * dn + p22 * de
+    top = p00 + (p01 + moved1) * dn + (p02 + moved2) * de + growth * (length2 / 4)
+    cross = moved1 + growth * (dn / 2), moved2 + growth * (de / 2)
+    return _track((value + north * dn + east * de, north, east), (top, *cross, p11 + growth, p12, p22 + growth))
 
 
 def update(
@@ -229,20 +216,17 @@ def update(
     """
     count = _check_track(track)
     check_tensor(count, reading=reading)
-    value, gradient, variance, cross, block = _parts(track)
-    unit = _positive("scales", scales, count, value)
-    noise = (_positive("noise_std", noise_std, count, value) / unit).square().clamp_min(VARIANCE_FLOOR)
-    total = variance + noise
-    kept, gain, slope = noise / total, variance / total, cross / total.unsqueeze(-1)  # 1 - K_e, K_e, K_g
-    surprise = reading.to(value.dtype) / unit - value
-    mixed = slope.unsqueeze(-1) * cross.unsqueeze(-2)
-    return _track(
-        value + gain * surprise,
-        gradient + slope * surprise.unsqueeze(-1),
-        kept.square() * variance + gain.square() * noise,
-        kept.unsqueeze(-1) * (cross - slope * variance.unsqueeze(-1)) + slope * (gain * noise).unsqueeze(-1),
-        block - mixed - mixed.mT + total[..., None, None] * slope.unsqueeze(-1) * slope.unsqueeze(-2),
-    )
+    unit = _positive("scales", scales, count, track.mean)
+    reading, noise = reading.to(track.mean.dtype) / unit, _variance(noise_std, count, unit)
+    shape = _common(track.mean.shape[:-1], reading.shape, noise.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = _parts(track, shape)
+    noise, surprise = _first(noise, shape), _first(reading, shape) - value
+    total = p00 + noise
+    kept, k0, k1, k2 = noise / total, p00 / total, p01 / total, p02 / total  # 1 - k0; the gain
+    spread, rest1, rest2 = k0 * noise, p01 - total * k1, p02 - total * k2  # the rests are 0 but for rounding
+    top = kept * kept * p00 + k0 * spread, kept * (p01 - k1 * p00) + k1 * spread, kept * (p02 - k2 * p00) + k2 * spread
+    block = p11 - k1 * (p01 + rest1), p12 - k1 * p02 - k2 * rest1, p22 - k2 * (p02 + rest2)
+    return _track((value + k0 * surprise, north + k1 * surprise, east + k2 * surprise), (*top, *block))
 
 
 def estimated_gradient(track: FieldTrack, scales: PerElement = ELEMENT_SCALES) -> Tensor:
@@ -262,16 +246,13 @@ def way_to(track: FieldTrack, target: Tensor, range_km: float, scales: PerElemen
 
     It minimizes the sum over the elements of ``(r - g·d)^2 / var(d)``, plus ``|d|^2 / range^2``, with the remaining
     difference r and the filter's variance of r - g·d. It takes three solves, each with the variances at the solution
-    before it; the first has their mean over ways of the range.
+    before it; the first has their mean over ways of the range. The covariance is the inverse of the normal matrix.
 
     Args:
         track: state.
         target: ``(..., E)`` values at the destination, in the element's unit.
         range_km: prior standard deviation of the way along each axis [km].
         scales: those of :func:`start`.
-
-    Returns:
-        The displacement [km] and its covariance [km^2], the inverse of the normal matrix.
 
     Raises:
         ValueError: for shapes that do not match, or a range that is not above 0.
@@ -285,47 +266,61 @@ def way_to(track: FieldTrack, target: Tensor, range_km: float, scales: PerElemen
     count = _check_track(track)
     check_tensor(count, target=target)
     check_number(0, above=True, range_km=range_km)
-    value, gradient, variance, cross, block = _parts(track)
-    remaining = target.to(value.dtype) / _positive("scales", scales, count, value) - value
-    reach = range_km / DISTANCE_SCALE_KM
-    expected = variance + reach**2 * block.diagonal(dim1=-2, dim2=-1).sum(-1)
+    target = target.to(track.mean.dtype) / _positive("scales", scales, count, track.mean)
+    shape = _common(track.mean.shape[:-1], target.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = _parts(track, shape)
+    ridge = (DISTANCE_SCALE_KM / range_km) ** 2
+    singles, pairs, (i, j) = _solution_terms(_first(target, shape) - value, north, east, ridge)
+    expected, twice1, twice2, twice12 = p00 + (p11 + p22) / ridge, 2 * p01, 2 * p02, 2 * p12
     for _ in range(3):
-        way, way_covariance = _solve(remaining, gradient, 1 / expected.clamp_min(_LEAST_VARIANCE), reach**-2)
-        d = way.unsqueeze(-2)
-        expected = variance + ((2 * cross + (block * d.unsqueeze(-2)).sum(-1)) * d).sum(-1)
-    return Way(way * DISTANCE_SCALE_KM, way_covariance * DISTANCE_SCALE_KM**2)
+        weight = expected.clamp_min(_LEAST_VARIANCE).reciprocal()
+        determinant, dn, de = (weight * singles).sum(1) + (weight[i] * weight[j] * pairs).sum(1)
+        determinant = determinant + ridge**2
+        dn, de = dn / determinant, de / determinant
+        expected = p00 + dn * (twice1 + p11 * dn + twice12 * de) + de * (twice2 + p22 * de)
+    nn, ne, ee = (weight * torch.stack((north * north, north * east, east * east))).sum(1)
+    inverse = torch.stack((ee + ridge, -ne, -ne, nn + ridge), -1) * (DISTANCE_SCALE_KM**2 / determinant).unsqueeze(-1)
+    return Way(torch.stack((dn, de), -1) * DISTANCE_SCALE_KM, inverse.unflatten(-1, (2, 2)))
 
 
-def _solve(remaining: Tensor, gradient: Tensor, weight: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
-    """Return the weighted least-squares solution ``(..., 2)`` and the inverse of its normal matrix.
+def _solution_terms(remaining: Tensor, north: Tensor, east: Tensor, ridge: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the terms, without weights, of the determinant of the normal matrix and of the solution times it.
 
-    Determinant and numerators are sums over pairs of elements (Cauchy-Binet): unlike a c - b^2 they do not cancel in
-    float32 where gradients are nearly parallel.
+    They are of elements ``(3, E, ...)`` and of pairs ``(3, P, ...)`` of elements ``(2, P)`` (Cauchy-Binet): unlike
+    a c - b^2 such sums do not cancel in float32 where gradients are nearly parallel.
     """
-    north, east = gradient.unbind(-1)
-    cross = north.unsqueeze(-1) * east.unsqueeze(-2) - east.unsqueeze(-1) * north.unsqueeze(-2)
-    pairs = weight.unsqueeze(-1) * weight.unsqueeze(-2) * cross
-    a, b, c = ((weight * x * y).sum(-1) for x, y in ((north, north), (north, east), (east, east)))
-    determinant = (pairs * cross).sum((-2, -1)) / 2 + ridge * (a + c + ridge)
-    inverse = torch.stack((c + ridge, -b, -b, a + ridge), -1).unflatten(-1, (2, 2)) / determinant[..., None, None]
-    pulls = (remaining.unsqueeze(-1) * pairs).sum(-2)
-    sides = torch.stack((pulls * east, -pulls * north), -1) + (ridge * weight * remaining).unsqueeze(-1) * gradient
-    return sides.sum(-2) / determinant.unsqueeze(-1), inverse
+    i, j = index = torch.triu_indices(len(north), len(north), 1, device=north.device)
+    (ri, rj), (ni, nj), (ei, ej) = ((x[i], x[j]) for x in (remaining, north, east))
+    crossing = ni * ej - ei * nj
+    singles = torch.stack((north * north + east * east, remaining * north, remaining * east))
+    return ridge * singles, crossing * torch.stack((crossing, ri * ej - rj * ei, rj * ni - ri * nj)), index
 
 
-def _parts(track: FieldTrack) -> tuple[Tensor, ...]:
-    """Return e ``(..., E)``, g ``(..., E, 2)``, var(e) ``(..., E)``, cov(e, g) ``(..., E, 2)`` and cov(g)."""
-    mean, covariance = track
-    return mean[..., 0], mean[..., 1:], covariance[..., 0, 0], covariance[..., 0, 1:], covariance[..., 1:, 1:]
+def _parts(track: FieldTrack, shape: torch.Size) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """Return e, g_N, g_E and the six entries of their covariance by rows, ``(E, ...)`` of a shape ``(..., E)``.
+
+    By parts, as 3 x 3 matrix products are slower, and may round to TF32 or, under autocast, to bfloat16.
+    """
+    mean, covariance = track.mean.expand(*shape, 3), track.covariance.expand(*shape, 3, 3)
+    p0, p1, p2 = covariance.movedim((-2, -1, -3), (0, 1, 2)).contiguous()
+    return mean.movedim((-1, -2), (0, 1)).contiguous().unbind(), (*p0, *p1[1:], p2[2])
 
 
-def _track(value: Tensor, gradient: Tensor, variance: Tensor, cross: Tensor, block: Tensor) -> FieldTrack:
-    """Return the state of parts that broadcast to the same leading dimensions, symmetrized."""
-    shape = torch.broadcast_shapes(value.shape, gradient.shape[:-1], variance.shape, cross.shape[:-1], block.shape[:-2])
-    value, variance = value.expand(shape).unsqueeze(-1), variance.expand(shape).unsqueeze(-1)
-    cross, block = cross.expand(*shape, 2), ((block + block.mT) / 2).expand(*shape, 2, 2)
-    upper, lower = torch.cat((variance, cross), -1).unsqueeze(-2), torch.cat((cross.unsqueeze(-1), block), -1)
-    return FieldTrack(torch.cat((value, gradient.expand(*shape, 2)), -1), torch.cat((upper, lower), -2))
+def _track(mean: Sequence[Tensor], covariance: Sequence[Tensor]) -> FieldTrack:
+    """Return the state of the parts of :func:`_parts`."""
+    p00, p01, p02, p11, p12, p22 = covariance
+    matrix = torch.stack((p00, p01, p02, p01, p11, p12, p02, p12, p22)).unflatten(0, (3, 3))
+    return FieldTrack(torch.stack(tuple(mean)).movedim((0, 1), (-1, -2)), matrix.movedim((0, 1, 2), (-2, -1, -3)))
+
+
+def _first(values: Tensor, shape: torch.Size) -> Tensor:
+    """Return a value of each element ``(..., E)`` as ``(E, ...)``, expanded to a shape ``(..., E)``."""
+    return values.expand(shape).movedim(-1, 0).contiguous()
+
+
+def _common(shape: torch.Size, *others: tuple[int, ...]) -> torch.Size:
+    """Return the shape ``(..., E)`` of all; torch.broadcast_shapes takes longer than ten sums of 1024 vehicles."""
+    return shape if all(x in (shape, shape[-1:]) for x in others) else torch.broadcast_shapes(shape, *others)
 
 
 def _check_track(track: FieldTrack) -> int:
@@ -334,9 +329,14 @@ def _check_track(track: FieldTrack) -> int:
     check_tensor(3, mean=track.mean)
     check_tensor(3, 3, covariance=track.covariance)
     if track.mean.ndim < 2 or track.covariance.shape[:-1] != track.mean.shape:
-        shapes = [tuple(tensor.shape) for tensor in track]
-        raise ValueError(f"mean and covariance must have the shapes (..., E, 3) and (..., E, 3, 3), got {shapes}")
+        wanted = "mean and covariance must have the shapes (..., E, 3) and (..., E, 3, 3)"
+        raise ValueError(f"{wanted}, got {[tuple(tensor.shape) for tensor in track]}")
     return track.mean.shape[-2]
+
+
+def _variance(noise_std: PerElement, count: int, unit: Tensor) -> Tensor:
+    """Return the variance of a reading ``(..., E)`` in squared scaled units, not below the floor."""
+    return (_positive("noise_std", noise_std, count, unit) / unit).square().clamp_min(VARIANCE_FLOOR)
 
 
 def _positive(name: str, values: PerElement, count: int, like: Tensor) -> Tensor:

@@ -3,13 +3,15 @@
     python recipes/evaluate.py secant parallel                                  # without training
     python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso:flown --out runs/comparison
     python recipes/evaluate.py secant --scenario my.toml --export tracks.kml    # own tasks, tracks for a map
+    python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --noise 0.05 0.05 5
 
-Trained agents are given with their run folders; several runs of one name are averaged, with their standard deviation.
-An agent that was trained with another arrival threshold, or is not finished, is marked by a warning below the table.
+Trained agents are given with their run folders. They are flown as they were trained: in their scenario, with their
+arrival threshold, start heading and sensor noise. Runs that differ in one of these need the option that chooses it. An
+agent that was trained otherwise, or is not finished, is marked by a warning below the table.
 Metaheuristics evaluate candidate moves in one of two modes, `--mode` or a suffix such as `ga:flown`: `look-ahead` reads
 the field at the end of every candidate for free (an oracle), `flown` makes every candidate a move.
 
-Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, table.md and short.md.
+Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, settings.json, table.md and short.md.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each ot
 import csv
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,24 +32,31 @@ import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from magrl import paper
 from magrl.checks import check_number
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import arrival_threshold, check_distinct, make_navigator
+from magrl.evaluation.rollout import with_true_field
+from magrl.evaluation.runs import NO_NOISE, Noise, agreed, common_scenario, trained_runs
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
 from magrl.training import UsageError, command
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
 from magrl.training.run_folder import create_run_folder
+from magrl.transforms import with_sensor_noise
 
 RECIPE = "evaluate.py"
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
+FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
+"""Seed of random tasks with --tasks-seed 0: beyond those of trainings and of frozen sets."""
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
-MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg")
+MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency", "spl_to_arrival")
 
 
 @dataclass(frozen=True)
@@ -55,19 +64,27 @@ class Config:
     """Settings of an evaluation."""
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
-    """Navigators: gg_td3=RUN, td3=RUN, recurrent=RUN, ga, pso, afsa, secant, parallel."""
-    tasks: TaskSet | None = None
-    """Frozen task set; the scenario's own tasks by default, or test-1000 where it has none."""
+    """Navigators: anywhere, kalman, secant, run_and_tumble, mean_jacobian, parallel, geodesic, ga, pso, afsa; with a
+    run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, recurrent=RUN, anywhere=RUN."""
+    tasks: TaskSet | int | None = None
+    """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
+    tasks_seed: int | None = None
+    """Seed of random tasks, 0 by default; no training and no frozen set has the same tasks."""
     scenario: Path | None = None
-    """TOML or JSON file of an own region, date, altitude and tasks (docs/own_data.md); the paper's by default."""
+    """TOML or JSON file of an own region, date and tasks (docs/own_data.md); by default that of the runs, or the
+    paper's."""
     export: Path | None = None
     """File for the tracks of all episodes: .geojson, .gpx or .kml."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
     """How metaheuristics evaluate a candidate move."""
     zeta: float | None = None
     """Arrival threshold on the objective (Eq. 2-7); that of the runs by default, 0.01 without runs."""
+    noise: Noise | None = None
+    """Standard deviations of the noise on D [deg], I [deg], B_H [nT]; by default those of the runs, or 0."""
+    start_heading: Literal["north", "random"] | None = None
+    """Heading at the start of an episode; by default that of the runs, or north."""
     seed: int = 0
-    """Random seed of metaheuristics."""
+    """Random seed of metaheuristics, sensor noise and random start headings."""
     out: Path = Path("runs/evaluation")
     """Folder of the results, new or empty."""
     wandb_mode: WandbMode = "offline"
@@ -86,17 +103,26 @@ class Results:
     warnings: list[str] = field(default_factory=list)
 
 
-def choose_tasks(path: Path | None, tasks: str | None) -> Scenario:
+def choose_tasks(path: Path | None, tasks: str | int | None, tasks_seed: int | None = None) -> Scenario:
     """Return a scenario with frozen tasks.
 
     Args:
         path: scenario file; the paper's scenario by default.
-        tasks: task set; by default the scenario's own tasks, or ``test-1000`` where it has none.
+        tasks: task set, or number of random tasks; by default the scenario's own tasks, or ``test-1000`` where it has
+            none.
+        tasks_seed: seed of random tasks; 0 by default.
 
     Raises:
-        ValueError: for a file that is not a scenario, or the paper's example task in another scenario.
+        ValueError: for a file that is not a scenario, the paper's example task in another scenario, or a seed for tasks
+            that are not random.
         FileNotFoundError: for a missing file.
     """
+    if isinstance(tasks, int):
+        check_number(0, 2**62, whole=True, tasks_seed=0 if tasks_seed is None else tasks_seed)
+        scenario = Scenario() if path is None else load_scenario(path)
+        return scenario.with_tasks(scenario.random_tasks(tasks, FIRST_TASKS_SEED + (tasks_seed or 0)))
+    if tasks_seed is not None:
+        raise ValueError(f"--tasks-seed {tasks_seed} needs a number of random tasks, such as --tasks 300")
     if path is None:
         return Scenario().with_tasks(named_tasks(tasks or "test-1000"))
     if tasks == "figure-4-1":
@@ -115,18 +141,20 @@ def first_tasks(scenario: Scenario, num_tasks: int) -> Scenario:
     """
     assert scenario.tasks is not None
     check_number(1, len(scenario.tasks.start), whole=True, num_tasks=num_tasks)
-    tasks = Tasks(*(end[:num_tasks] for end in scenario.tasks))
+    tasks = type(scenario.tasks)(*(values[:num_tasks] for values in scenario.tasks))
     return scenario.replace(tasks=tasks, names=scenario.names[:num_tasks])
 
 
-def make_env(scenario: Scenario, zeta: float, seed: int) -> GeomagneticNavEnv:
+def make_env(scenario: Scenario, zeta: float, seed: int, start_heading: str = "north") -> GeomagneticNavEnv:
     """Return an environment with one vehicle for each frozen task."""
     assert scenario.tasks is not None
-    return GeomagneticNavEnv(scenario, num_envs=len(scenario.tasks.start), zeta=zeta, seed=seed)
+    count = len(scenario.tasks.start)
+    return GeomagneticNavEnv(scenario, num_envs=count, zeta=zeta, seed=seed, start_heading=start_heading)
 
 
 def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]]:
-    """Return the first episode of a rollout, one row per step, for Figs. 4-4 and 4-5."""
+    """Return the first episode of a rollout, one row per step with the true field, for Figs. 4-4 and 4-5."""
+    rollout = with_true_field(rollout)
     count = int(first_episode_mask(rollout["next", "done"]).sum(1)[0])
     states = [rollout[0, 0], *(rollout["next"][0, step] for step in range(count))]
     return [
@@ -149,10 +177,46 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def prepare(
-    config: Config,
-) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv, list[tuple[TensorDictModuleBase, ...]], list[str]]:
-    """Return the environment, that of the example task, each navigator for both, and warnings; create the folder.
+def settle(config: Config) -> tuple[Config, float, list[str]]:
+    """Return the settings with those of the runs where none were chosen, the threshold, and warnings.
+
+    Raises:
+        ValueError: for runs that differ in a setting that was not chosen.
+        FileNotFoundError: for a run without its scenario file.
+    """
+    for level in config.noise or ():
+        check_number(0, noise=level)
+    runs = trained_runs(config.navigators)
+    zeta, warnings = arrival_threshold(config.navigators, config.zeta)
+    heading, others = agreed(
+        runs,
+        lambda run: run.start_heading,
+        config.start_heading,
+        "north",
+        name="start heading",
+        option="--start-heading",
+    )
+    noise, noisy = agreed(runs, lambda run: run.noise, config.noise, NO_NOISE, name="sensor noise", option="--noise")
+    scenario, places = config.scenario, list[str]()
+    if config.tasks != "figure-4-1":  # which lies in the paper's region
+        scenario, places = common_scenario(runs, config.scenario)
+    settled = replace(config, scenario=scenario, start_heading=heading, noise=noise)
+    return settled, zeta, [*warnings, *others, *noisy, *places]
+
+
+@dataclass
+class Prepared:
+    """What an evaluation flies: the environments of the tasks and of the example task, and navigators for both."""
+
+    config: Config
+    env: EnvBase
+    example_env: EnvBase
+    navigators: list[tuple[TensorDictModuleBase, ...]]
+    warnings: list[str]
+
+
+def prepare(config: Config) -> Prepared:
+    """Make environments and navigators, and the folder of the results.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -164,19 +228,21 @@ def prepare(
         if config.export:
             export.check_suffix(config.export)
         check_distinct(config.navigators, config.mode)
-        zeta, warnings = arrival_threshold(config.navigators, config.zeta)
-        scenario = choose_tasks(config.scenario, config.tasks)
+        config, zeta, warnings = settle(config)
+        scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed)
         example = first_tasks(scenario, 1) if config.scenario else Scenario().with_tasks(named_tasks("figure-4-1"))
-        envs = [make_env(place, zeta, config.seed) for place in (scenario, example)]
+        bases = [make_env(place, zeta, config.seed, config.start_heading) for place in (scenario, example)]
+        envs = [with_sensor_noise(base, config.noise, config.seed) for base in bases]
         navigators = [
-            tuple(make_navigator(text, env, config.mode, config.seed) for env in envs) for text in config.navigators
+            tuple(make_navigator(text, base, config.mode, config.seed, config.noise) for base in bases)
+            for text in config.navigators
         ]
         if config.export:
             check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
-    return (*envs, navigators, warnings)
+    return Prepared(config, *envs, navigators, warnings)
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
@@ -186,14 +252,15 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    env, example_env, navigators, warnings = prepare(config)
+    prepared = prepare(config)
+    config, env = prepared.config, prepared.env
     names = env.scenario.names or tuple(f"task {number}" for number in range(env.num_envs))
-    results = Results(warnings=warnings)
-    for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
+    results = Results(warnings=prepared.warnings)
+    for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), prepared.navigators, strict=True):
         name, _, run = text.partition("=")
         began = time.perf_counter()
         rollout = evaluation_rollout(env, navigator)
-        measured = episode_measures(rollout)
+        measured = episode_measures(rollout, env)
         readings = getattr(navigator, "field_readings", torch.zeros(1)).double().mean().item()
         summary = summarize(measured) | {"field_readings": readings, "seconds": time.perf_counter() - began}
         number = len(results.summaries.setdefault(name, []))
@@ -207,25 +274,43 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         if config.export:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
-            results.paths += path_rows(name, evaluation_rollout(example_env, example))
-    write(config, env.zeta, results)
+            results.paths += path_rows(name, evaluation_rollout(prepared.example_env, example))
+    write(config, env, results)
     return results.summaries
 
 
-def write(config: Config, zeta: float, results: Results) -> None:
+def settings(config: Config, env: EnvBase) -> dict[str, Any]:
+    """Return what was flown and how, without a path of this machine."""
+    texts = (text.partition("=") for text in config.navigators)
+    return {
+        "navigators": [f"{name}{equals}{Path(run).name}" for name, equals, run in texts],
+        "tasks": config.tasks,
+        "num_tasks": env.num_envs,
+        "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
+        "scenario": config.scenario and config.scenario.name,
+        "zeta": env.zeta,
+        "noise": config.noise,
+        "start_heading": config.start_heading,
+        "mode": config.mode,
+        "seed": config.seed,
+    }
+
+
+def write(config: Config, env: EnvBase, results: Results) -> None:
     """Write the files of the results, and the runs as a table in wandb."""
     for name in ("episodes", "runs", "paths"):
         write_csv(config.out / f"{name}.csv", getattr(results, name))
     write_json(config.out / "summary.json", results.summaries)
+    write_json(config.out / "settings.json", settings(config, env))
     notes = "".join(f"\nWarning: {text}.\n" for text in results.warnings)
+    if any(config.noise or ()):
+        levels = "{:g} deg, {:g} deg, {:g} nT".format(*config.noise)
+        notes = f"\nStandard deviations of the noise on D, I and B_H: {levels}.\n{notes}"
     (config.out / "table.md").write_text(comparison_table(results.summaries, config.mode) + notes)
     (config.out / "short.md").write_text(short_table(results.summaries, config.mode) + notes)
     if config.export:
         export.write_tracks(config.export, results.tracks)
-    scenario = config.scenario and config.scenario.name
-    settings = {"tasks": config.tasks, "scenario": scenario, "zeta": zeta, "mode": config.mode}
-    settings |= {"seed": config.seed}
-    run = WandbRun(config.out, config.wandb_mode, settings, "evaluation", list(results.summaries))
+    run = WandbRun(config.out, config.wandb_mode, settings(config, env), "evaluation", list(results.summaries))
     run.table("eval/navigators", results.runs)
     run.close()
 

@@ -3,7 +3,8 @@
     python recipes/replay.py runs/A                                     # writes runs/A/replay.html
     python recipes/replay.py runs/A --navigators secant pso:flown --num-tasks 5 --gif episodes.gif
 
-The run's policy comes first, then the other navigators, all on the same tasks. Takes seconds.
+The run's policy comes first, then the other navigators, all on the same tasks, with the start heading and the sensor
+noise of the training. The page shows the true field. Takes seconds.
 """
 
 from __future__ import annotations
@@ -12,23 +13,24 @@ import os
 
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 from evaluate import TaskSet, choose_tasks, first_tasks, make_env
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
+from torchrl.envs import EnvBase
 
-from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
-from magrl.evaluation.navigators import label, make_navigator
+from magrl.evaluation.navigators import DEFAULT_ZETA, label, make_navigator
 from magrl.evaluation.replay import replay_data, write_gif, write_replay
+from magrl.evaluation.rollout import with_true_field
+from magrl.evaluation.runs import read_run, run_config
 from magrl.files import check_writable
 from magrl.training import UsageError, command
+from magrl.transforms import with_sensor_noise
 
 RECIPE = "replay.py"
 DEFAULT_TASKS = 12
@@ -51,27 +53,11 @@ class Config:
     zeta: float | None = None
     """Arrival threshold on the objective; that of the training by default."""
     seed: int = 0
-    """Random seed of metaheuristics."""
+    """Random seed of metaheuristics, sensor noise and random start headings."""
     out: Path | None = None
     """The page, replaced if it exists; replay.html in the run's folder by default."""
     gif: Path | None = None
     """Animated GIF of the run's policy on the same tasks; none by default."""
-
-
-def run_config(run: Path) -> dict[str, Any]:
-    """Return the settings that a training left in its folder.
-
-    Raises:
-        FileNotFoundError: for a folder without a run.
-        ValueError: for a file that does not hold settings.
-    """
-    path = run / "config.json"
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no run at {run}: it must hold config.json and policy.pt")
-    try:
-        return dict(json.loads(path.read_text()))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path} is not the configuration of a run: {error}") from error
 
 
 def labeled(texts: Sequence[str]) -> dict[str, str]:
@@ -91,25 +77,24 @@ def labeled(texts: Sequence[str]) -> dict[str, str]:
     return named
 
 
-def prepare(config: Config) -> tuple[GeomagneticNavEnv, dict[str, TensorDictModuleBase], str, Path]:
+def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], str, Path]:
     """Return the environment, navigators by label, and title and path of the page.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
     """
     try:
-        run = run_config(config.run)
-        trained_in = config.run / Path(run["scenario"]).name if run.get("scenario") else None
-        path = config.scenario or trained_in
+        run = read_run(config.run)
+        path = config.scenario or run.scenario
         scenario = choose_tasks(path, config.tasks)
         assert scenario.tasks is not None
         available = len(scenario.tasks.start)
         count = min(DEFAULT_TASKS, available) if config.num_tasks is None else config.num_tasks
-        zeta = run.get("zeta", 0.01) if config.zeta is None else config.zeta
-        env = make_env(first_tasks(scenario, count), zeta, config.seed)
-        kind = {True: "gg_td3", False: "td3"}.get(run.get("guided"), "recurrent")  # type: ignore[call-overload]
-        texts = (f"{kind}={config.run}", *config.navigators)
-        made = {text: make_navigator(text, env, seed=config.seed) for text in texts}
+        zeta = run_config(config.run).get("zeta", DEFAULT_ZETA) if config.zeta is None else config.zeta
+        base = make_env(first_tasks(scenario, count), zeta, config.seed, run.start_heading)
+        env = with_sensor_noise(base, run.noise, config.seed)
+        texts = (f"{run.kind or 'gg_td3'}={config.run}", *config.navigators)
+        made = {text: make_navigator(text, base, seed=config.seed, noise=run.noise) for text in texts}
         navigators = {name: made[text] for name, text in labeled(texts).items()}
         out = config.out or config.run / "replay.html"
         for file in filter(None, (out, config.gif)):
@@ -128,7 +113,7 @@ def replay(config: Config) -> Path:
     """
     torchrl_logger.setLevel("WARNING")
     env, navigators, title, out = prepare(config)
-    rollouts = {name: evaluation_rollout(env, navigator) for name, navigator in navigators.items()}
+    rollouts = {name: with_true_field(evaluation_rollout(env, flown)) for name, flown in navigators.items()}
     write_replay(out, replay_data(rollouts, env.field, env.region, zeta=env.zeta, title=title))
     if config.gif:
         write_gif(config.gif, next(iter(rollouts.values())), env.field, env.region)

@@ -34,7 +34,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.training import Run, RunConfig, command, parse_config
 from magrl.training.collectors import CollectorBackend, make_collector, worker_seed
 from magrl.training.config import Count, Discount, NonNegative, Positive, PositiveShare, Widths
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, ObservationView
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, ObservationView, SensorNoise
 
 RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
@@ -134,16 +134,17 @@ PRESETS |= {f"td3-{name}": preset.replace(preset=f"td3-{name}", guided=False) fo
 
 
 def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> TransformedEnv:
-    """Add guidance, the agent's view and the scaled reward to the environment."""
+    """Add guidance by the true field, the sensors' noise, the agent's view and the scaled reward to the environment."""
     keys = ["reward", "reward_alignment"]
     guidance = [
         FieldGradient(base.field),
         GradientHeading(),
         AlignmentReward(out_keys=keys, weight=config.alignment_weight, offset=config.alignment_offset),
     ]
+    sensors = [SensorNoise(config.noise, seed=base.seed)] if any(config.noise) else []
     scaling = [*view.observation_transforms(), view.action_transform()]
     rewards = [RewardSum(), RewardScaling(loc=0.0, scale=config.reward_scale)]
-    return TransformedEnv(base, Compose(*(guidance if config.guided else []), *scaling, *rewards))
+    return TransformedEnv(base, Compose(*(guidance if config.guided else []), *sensors, *scaling, *rewards))
 
 
 def worker_env(config: Config, view: ObservationView, index: int) -> TransformedEnv:
@@ -181,9 +182,8 @@ def make_collection(
 def train(config: Config) -> dict[str, float]:
     """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
     torch.manual_seed(config.seed)
-    place = f"-{config.scenario.stem}" if config.scenario else ""
     name = f"td3_gradient_guided-{config.preset}" if config.guided else f"td3-{config.preset.removeprefix('td3-')}"
-    with Run(config, recipe=RECIPE, name=name + place) as run:
+    with Run(config, recipe=RECIPE, name=name) as run:
         # Environments
         options = {"zeta": config.zeta, "start_heading": config.start_heading, "device": config.device}
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)

@@ -41,7 +41,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.training import Run, RunConfig, command, parse_config
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, Discount, NonNegative, Positive, PositiveShare, Share, Widths
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, ObservationView
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, ObservationView, SensorNoise
 
 RECIPE = "td3_recurrent.py"
 LOSSES = ("loss_critic", "loss_actor", "loss_heading")
@@ -66,8 +66,7 @@ class Config(RunConfig):
     alignment_weight: float = 3.0
     """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
     alignment_offset: float = 0.0
-    """Heading deviation at which the alignment reward changes sign [rad]. The paper's pi / 4 pays for short steps, with
-    which a vehicle does not arrive within train_steps."""
+    """Heading deviation at which the alignment reward changes sign [rad]; the paper's pi / 4 pays for short steps."""
 
     # Networks
     num_cells: Widths = (128, 128, 128)
@@ -133,16 +132,17 @@ class Config(RunConfig):
 def make_env(
     base: GeomagneticNavEnv, view: ObservationView, actor: TensorDictSequential, config: Config
 ) -> TransformedEnv:
-    """Add guidance, the agent's view and state, and the scaled reward to the environment."""
+    """Add guidance by the true field, the sensors' noise, the agent's view and state, and the scaled reward."""
     keys = ["reward", "reward_alignment"]
     guidance = [
         FieldGradient(base.field),
         GradientHeading(),
         AlignmentReward(out_keys=keys, weight=config.alignment_weight, offset=config.alignment_offset),
     ]
+    sensors = [SensorNoise(config.noise, seed=base.seed)] if any(config.noise) else []
     scaling = [*recurrent_transforms(view, actor), view.action_transform()]
     rewards = [RewardSum(), RewardScaling(loc=0.0, scale=config.reward_scale)]
-    return TransformedEnv(base, Compose(*guidance, *scaling, *rewards))
+    return TransformedEnv(base, Compose(*guidance, *sensors, *scaling, *rewards))
 
 
 def make_collection(

@@ -11,11 +11,13 @@ import pytest
 import td3_gradient_guided as recipe
 import td3_recurrent
 import torch
+from tensordict import TensorDict
 
 from magrl import paper
-from magrl.agents import load_policy
+from magrl.agents import PolicyConfig, load_policy
 from magrl.envs import GeomagneticNavEnv
-from magrl.training import command, parse_config
+from magrl.training import Run, command, parse_config
+from magrl.transforms import SensorNoise, with_sensor_noise
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 SMALL = {
@@ -163,6 +165,73 @@ def test_summary_without_a_success_has_no_nan(tmp_path: Path, capsys) -> None:
     assert "gradient step" not in said.err
 
 
+# Sensor noise
+
+NOISE = (0.05, 0.05, 5.0)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_training_with_noise_resumes_exactly(tmp_path: Path, signalled, same_outcome) -> None:
+    """With many short episodes, each of which has its own noise: their number is part of the checkpoint."""
+    noisy = {"noise": NOISE, "zeta": 2.9, "start_heading": "random"}
+    recipe.train(settings(tmp_path / "whole", **noisy))
+    with signalled(12, signal.SIGINT), pytest.raises(SystemExit):
+        recipe.train(settings(tmp_path / "run", **noisy))
+    recipe.train(parse("--resume", str(tmp_path / "run")))
+    assert same_outcome(tmp_path / "run", tmp_path / "whole")
+    recipe.train(settings(tmp_path / "perfect", **noisy | {"noise": (0.0, 0.0, 0.0)}))
+    assert not same_outcome(tmp_path / "perfect", tmp_path / "whole")
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["noise"] == list(NOISE)
+    env, policy = GeomagneticNavEnv(num_envs=3, seed=0), load_policy(tmp_path / "run" / "policy.pt")
+    for flown in (env, with_sensor_noise(env, NOISE)):
+        assert flown.rollout(2, policy)["action"].isfinite().all()
+
+
+def first_state(module, noise: tuple[float, ...], seed: int = 5) -> TensorDict:
+    """Return the first observation of a recipe's training environment."""
+    config, base = module.Config(noise=noise), GeomagneticNavEnv(num_envs=4, seed=seed)
+    if module is recipe:
+        return recipe.make_env(base, base.observation_view(), config).reset()
+    view = base.observation_view(observe_heading=False)
+    actor = PolicyConfig(view, (8,), memory_size=4).make_actor()
+    return td3_recurrent.make_env(base, view, actor, config).reset()
+
+
+@pytest.mark.parametrize("module", [recipe, td3_recurrent], ids=lambda module: module.__name__)
+def test_noise_is_observed_and_the_guidance_is_by_the_truth(module) -> None:
+    perfect, noisy = first_state(module, (0.0, 0.0, 0.0)), first_state(module, NOISE)
+    assert "true_field" not in perfect.keys()  # noqa: SIM118
+    for key, other in (("true_field", "field"), ("gradient_heading", "gradient_heading"), ("objective", "objective")):
+        assert torch.equal(noisy[key], perfect[other])
+    assert (noisy["field"] != perfect["field"]).all()
+    expected = SensorNoise(NOISE, seed=5)(noisy.clone().set("field", perfect["field"]))["field"]
+    assert torch.equal(noisy["field"], expected)
+    assert (noisy["observation"] != perfect["observation"])[:, :3].all()  # D, I, B_H come first
+
+
+def test_validation_and_test_have_the_noise_of_the_run(tmp_path: Path) -> None:
+    for noise, share in ((NOISE, 1.0), ((0.0, 0.0, 0.0), 0.0)):
+        config = settings(tmp_path / f"run{share}", noise=noise)
+        with Run(config, recipe=recipe.RECIPE, name="mine") as run:
+            states = [env.reset() for env in run.evaluation_envs(zeta=config.zeta)]
+        first = [state["field"] - state.get("true_field", state["field"]) for state in states]
+        assert [(error != 0).double().mean().item() for error in first] == [share, share]
+        assert not share or not torch.equal(first[0], first[1][:4])
+
+
+def test_run_is_named_after_its_noise() -> None:
+    for options, name in (
+        ({}, "mine"),
+        ({"noise": (0.05, 0.1, 5.0)}, "mine-noise-0.05-0.1-5"),
+        (
+            {"scenario": RECIPES.parent / "docs" / "examples" / "azores.toml", "noise": (0, 0, 1)},
+            "mine-azores-noise-0-0-1",
+        ),
+    ):
+        run = Run(recipe.Config(seed=2, **options), recipe=recipe.RECIPE, name="mine")
+        assert (run.name, run.folder) == (name, Path("runs") / f"{name}-seed2")
+
+
 # Settings and command line
 
 
@@ -190,6 +259,10 @@ def test_summary_without_a_success_has_no_nan(tmp_path: Path, capsys) -> None:
         {"start_heading": "south"},
         {"guided": 1},
         {"logger": "paper"},
+        {"noise": (0.05, -0.05, 5.0)},
+        {"noise": (0.05, math.nan, 5.0)},
+        {"noise": (0.05, 0.05)},
+        {"noise": 0.05},
     ],
     ids=str,
 )
@@ -214,6 +287,8 @@ def test_bad_settings_are_refused_by_name(tmp_path: Path, bad: dict) -> None:
         (recipe, "--zeta 5", "zeta must be below 3, got 5.0: the objective F is at most 3 at the start"),
         (recipe, "--total-frames 512", "batch_size 1024 must not exceed total_frames: no gradient step is possible"),
         (td3_recurrent, "--zeta 3", "zeta must be below 3, got 3.0"),
+        (recipe, "--noise 0.05 -0.05 5", "noise.1 must be greater than or equal to 0, got -0.05"),
+        (td3_recurrent, "--noise 0.05 0.05", "Missing value for argument '--noise'. Expected 3 values"),
         (recipe, "--num-envs 8 --collectors 3", "num_envs 8 cannot be divided evenly among 3 collectors"),
         (td3_recurrent, "--num-envs 1", "num_envs must be at least 2, got 1"),
         (td3_recurrent, "--shortest-task-km 600", "shortest_task_km must be below 500, got 600.0"),

@@ -40,7 +40,16 @@ from magrl.envs.scenario import Scenario
 from magrl.field.model import elements_at
 from magrl.field.regional import RegionalField
 from magrl.geodesy import move, wrap_angle
-from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
+from magrl.tracking import GradientPrior, dipole_prior
+from magrl.transforms import (
+    AlignmentReward,
+    AngleVector,
+    FieldGradient,
+    GradientHeading,
+    MinMaxNorm,
+    TargetDifference,
+    TrackGradient,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
 
@@ -242,6 +251,16 @@ def alignment_twice() -> Transform:
     return AlignmentReward(out_keys=["reward", "reward_alignment"])
 
 
+def track_plane() -> Transform:
+    keys = [nested(name) for name in ("scent", "scent_there", "place", "angle")]
+    outs = [nested(f"track_{k}") for k in range(6)]
+    return TrackGradient(keys, outs, prior=flat_prior, scales=(1.0, 1.0), curvature=(1.0, 1.0), angles=())
+
+
+def flat_prior(reading: Tensor) -> GradientPrior:
+    return GradientPrior(torch.zeros(2, 2), torch.ones(2, 2), torch.zeros_like(reading[..., 0]))
+
+
 double_plane = partial(PlaneEnv, (3,), torch.float64)
 ENV_CASES = {
     "MinMaxNorm-nav": EnvCase(nav, minmax_nav),
@@ -258,11 +277,14 @@ ENV_CASES = {
     "FieldGradient-plane": EnvCase(PlaneEnv, gradient_plane),
     "FieldGradient-function": EnvCase(double_plane, function_gradient_plane),
     "GradientHeading-nav": EnvCase(sloped, partial(GradientHeading, pair=("I", "B_H"))),
+    "GradientHeading-auto": EnvCase(sloped, partial(GradientHeading, pair="auto")),
     "GradientHeading-plane": EnvCase(double_plane, heading_plane),
     "AlignmentReward-nav": EnvCase(guided, AlignmentReward),
     "AlignmentReward-apart": EnvCase(guided, alignment_apart),
     "AlignmentReward-twice": EnvCase(guided, alignment_twice),
     "AlignmentReward-plane": EnvCase(double_plane, alignment_plane),
+    "TrackGradient-nav": EnvCase(nav, TrackGradient),
+    "TrackGradient-plane": EnvCase(double_plane, track_plane),
 }
 env_cases = pytest.mark.parametrize("case", ENV_CASES.values(), ids=ENV_CASES.keys())
 # Each of these starts processes: one env for each transform is enough.
@@ -326,10 +348,12 @@ class TestConformanceInEnvs:
         env, plain = transformed(case), case.base()
         transform = with_bounds_of(env, case.transform())
         start, plain_start = begun(env), begun(plain)
+        if isinstance(transform, TrackGradient):
+            plain_start = transform(plain_start)  # its state, which a step reads
         inside = env.step(env.rand_action(start))
         action = transform.inv(inside.clone()).select(*plain.action_keys)
         around = transform(plain.step(plain_start.update(action)))
-        if not isinstance(transform, AlignmentReward):
+        if not isinstance(transform, (AlignmentReward, TrackGradient)):
             around["next"] = transform(around["next"])
         for name in (*env.observation_keys, *(("next", *as_tuple(k)) for k in env.observation_keys + env.reward_keys)):
             torch.testing.assert_close(inside[name], around[name], rtol=1e-5, atol=1e-6)
@@ -339,6 +363,10 @@ class TestConformanceInEnvs:
         """On what a collector hands out, a transform writes what it would have written inside the env."""
         env = transformed(case)
         transform = with_bounds_of(env, case.transform())
+        if isinstance(transform, TrackGradient):  # a filter needs its state, which the data of the plain env lack
+            with pytest.raises(KeyError, match="state"):
+                collected(case.base(), postproc=transform)
+            return
         inside, after = collected(env), collected(case.base(), postproc=transform)
         for name in transform.out_keys:
             name = ("next", name) if name == "reward" else name
@@ -501,6 +529,11 @@ DATA_CASES = {
         },
     ),
 }
+DATA_CASES["TrackGradient"] = DataCase(
+    lambda key: TrackGradient([key(x) for x in ("x", "y", "move", "angle")], [key(f"o{k}") for k in range(6)]),
+    lambda rand: {"x": 90 * rand(3), "y": 90 * rand(3), "move": rand(2), "angle": rand(1)},
+    lambda td: {"o2": td["x"], "o3": dipole_prior(td["x"]).gradient},  # the first reading and the prior
+)
 data_cases = pytest.mark.parametrize("case", DATA_CASES.values(), ids=DATA_CASES.keys())
 key_namers = pytest.mark.parametrize("key", [flat, nested])
 
@@ -632,6 +665,7 @@ NOT_THERE = {
     "FieldGradient": lambda: FieldGradient(field(), ["nope"]),
     "GradientHeading": lambda: GradientHeading(["field", "target_field", "nope"]),
     "AlignmentReward": lambda: AlignmentReward(["heading", "nope"]),
+    "TrackGradient": lambda: TrackGradient(["nope", "target_field", "move", "heading"]),
 }
 
 
@@ -1022,6 +1056,16 @@ def way(
     return math.degrees(out["gradient_heading"]), bool(out["gradient_heading_valid"])
 
 
+def nav_with_gradient(spread: float) -> TensorDict:
+    """64 places whose gradients point in random directions."""
+    draw = torch.Generator().manual_seed(0)
+    scale = torch.tensor([0.01, 0.02, 1.0])
+    gradient = torch.randn(64, 3, 2, generator=draw) * scale.unsqueeze(-1)
+    here = torch.tensor([8.0, -16.0, 35000.0]).expand(64, 3)
+    there = here + spread * 100 * scale * torch.randn(64, 3, generator=draw)
+    return TensorDict(field=here, target_field=there, field_gradient=gradient, batch_size=[64])
+
+
 D_EAST_I_NORTH_B_SOUTH_EAST = [[0.0, 0.01], [0.02, 0.0], [-1.0, 1.0]]
 
 
@@ -1050,6 +1094,39 @@ class TestGradientHeading:
         heading, valid = way([8.0, -16.0, 35000.0], [7.0, -14.0, 35200.0], D_EAST_I_NORTH_B_SOUTH_EAST, pair=pair)
         assert valid
         assert heading == pytest.approx(math.degrees(math.atan2(300, 100)), abs=1e-9)
+
+    @pytest.mark.parametrize(
+        ("gradient", "pair"),
+        [
+            ([[0.0, 0.01], [0.02, 0.0], [-1.0, 1.0]], ("D", "I")),
+            ([[0.0, 0.01], [-0.001, 0.02], [-1.0, 0.1]], ("D", "B_H")),
+            ([[0.0, 0.0], [0.02, 0.0], [-1.0, 1.0]], ("I", "B_H")),
+        ],
+    )
+    def test_automatic_pair_is_the_one_that_crosses_best(self, gradient: list, pair: tuple[str, str]) -> None:
+        here, there = [179.5, -16.0, 35000.0], [-180.0, -14.0, 35200.0]
+        heading, valid = way(here, there, gradient, pair="auto")
+        assert valid
+        assert heading == way(here, there, gradient, pair=pair)[0]
+
+    def test_automatic_pair_has_no_heading_where_no_two_gradients_cross(self) -> None:
+        parallel = [[0.0, 0.01], [0.0, 0.02], [0.0, 1.0]]
+        for gradient, there in (
+            (parallel, [7.0, -14.0, 35200.0]),
+            (D_EAST_I_NORTH_B_SOUTH_EAST, [8.0, -16.0, 35000.0]),
+        ):
+            assert way([8.0, -16.0, 35000.0], there, gradient, pair="auto") == (0.0, False)
+
+    def test_automatic_pair_in_a_batch_is_chosen_place_by_place(self) -> None:
+        td = nav_with_gradient(2.0)
+        automatic = GradientHeading(pair="auto")(td.clone())
+        fixed = [GradientHeading(pair=pair)(td.clone()) for pair in (("D", "I"), ("D", "B_H"), ("I", "B_H"))]
+        names = ("gradient_heading", "gradient_heading_valid")
+        heading, valid = (torch.stack([out[name] for out in (automatic, *fixed)]) for name in names)
+        assert valid[0].all()
+        same = heading[0] == heading[1:]
+        assert same.any(0).all()
+        assert [bool(same[k].any()) for k in range(3)] == [True, True, True]
 
     def test_by_index_on_two_elements_that_are_not_magnetic(self) -> None:
         env = TransformedEnv(PlaneEnv((4,), torch.float64), heading_plane())

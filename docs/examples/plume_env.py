@@ -68,6 +68,7 @@ class PlumeEnv(EnvBase):
         )
         self.state_spec = self.observation_spec.clone()
         self.action_spec = bounded(torch.tensor([0.0, -math.pi / 2]), torch.tensor([1.0, math.pi / 2]))  # km, rad
+        self.observation_spec["move"] = self.action_spec.clone()
         self.reward_spec = Unbounded((num_envs, 1))
         self.done_spec = Binary(1, (num_envs, 1), dtype=torch.bool)
         self.set_seed(seed)
@@ -78,19 +79,19 @@ class PlumeEnv(EnvBase):
     def _reset(self, _: TensorDictBase | None = None) -> TensorDictBase:
         draws = torch.rand(5, *self.batch_size, generator=self.random)
         start, target = (LOW_KM + (HIGH_KM - LOW_KM) * ends.T for ends in (draws[:2], draws[2:4]))
-        return self._seen(start, target, (2 * draws[4:].T - 1) * math.pi)
+        return self._seen(start, target, (2 * draws[4:].T - 1) * math.pi, torch.zeros_like(start))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         distance, turn = tensordict["action"].split(1, -1)
         heading = torch.remainder(tensordict["heading"] + turn + math.pi, 2 * math.pi) - math.pi
         moved = tensordict["position"] + distance * torch.cat((heading.cos(), heading.sin()), -1)
-        after = self._seen(moved.clamp(LOW_KM, HIGH_KM), tensordict["target_position"], heading)
+        after = self._seen(moved.clamp(LOW_KM, HIGH_KM), tensordict["target_position"], heading, tensordict["action"])
         left_before, left = (
             (td["target_tracers"] - td["tracers"]).norm(dim=-1, keepdim=True) for td in (tensordict, after)
         )
         arrived = (after["position"] - after["target_position"]).norm(dim=-1, keepdim=True) < ARRIVAL_KM
         return after.update({"reward": left_before - left + 10.0 * arrived, "done": arrived, "terminated": arrived})
 
-    def _seen(self, position: Tensor, target: Tensor, heading: Tensor) -> TensorDict:
+    def _seen(self, position: Tensor, target: Tensor, heading: Tensor, move: Tensor) -> TensorDict:
         seen = {"tracers": concentration(position), "target_tracers": concentration(target), "heading": heading}
-        return TensorDict(seen | {"position": position, "target_position": target}, self.batch_size)
+        return TensorDict(seen | {"move": move, "position": position, "target_position": target}, self.batch_size)

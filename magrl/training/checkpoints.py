@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
 
 from magrl.checks import check_number
 from magrl.envs.geomagnetic import GeomagneticNavEnv
@@ -178,7 +179,7 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
 
 
 class RunningEpisodes:
-    """State of the running episodes of a collector and its environment, and the collector's counts.
+    """State of the running episodes of a collector, its environment and its transforms, and the collector's counts.
 
     TorchRL's collector leaves them out of its own ``state_dict``, so this class reads its private attributes
     :data:`PRIVATE`, which ``tests/test_checkpoints.py`` guards against a change of TorchRL.
@@ -200,12 +201,13 @@ class RunningEpisodes:
         self.collector, self.env = collector, env
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the last observations, the counts of episodes and frames, and the seed of the tasks."""
+        """Return the last observations, the counts of episodes and frames, the seed, and what the transforms hold."""
         running = self.collector._carrier.flatten_keys(".")
         return {
             "running": {key: value for key, value in running.items() if isinstance(value, Tensor)},
             "episode": self.env.episode,
             "seed": self.env.seed,
+            "transforms": self.collector.env.state_dict() if self._transformed else {},
             "frames": self.collector._frames,
             "iterations": self.collector._iter,
         }
@@ -224,3 +226,9 @@ class RunningEpisodes:
         collector._carrier = running
         collector._frames, collector._iter = int(state_dict["frames"]), int(state_dict["iterations"])
         self.env.seed, self.env.episode = int(state_dict["seed"]), state_dict["episode"].to(device)
+        if self._transformed:
+            collector.env.load_state_dict(state_dict["transforms"])
+
+    @property
+    def _transformed(self) -> bool:
+        return isinstance(self.collector.env, TransformedEnv)

@@ -29,6 +29,7 @@ Discount = Annotated[float, Field(ge=0, lt=1)]
 Widths = Annotated[tuple[Count, ...], Field(min_length=1)]
 Seed = Annotated[int, Field(ge=0, lt=paper.FIRST_RESERVED_SEED)]
 Threshold = Annotated[float, AfterValidator(check_zeta)]
+Noise = tuple[NonNegative, NonNegative, NonNegative]
 
 
 class UsageError(ValueError):
@@ -73,6 +74,8 @@ class RunConfig(CheckedModel):
     """Number of vehicles."""
     zeta: Threshold = 0.01
     """Arrival threshold on the objective (Eq. 2-7), below 3."""
+    noise: Noise = (0.0, 0.0, 0.0)
+    """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT], in training and evaluations."""
     total_frames: Count = 204_800
     """Steps of all vehicles together."""
     total_episodes: Count | None = None

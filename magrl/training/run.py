@@ -16,13 +16,14 @@ from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import BaseCollector, Collector
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 from typing_extensions import Self
 
 from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import check_finite
-from magrl.envs import GeomagneticNavEnv
+from magrl.envs import GeomagneticNavEnv, Region
 from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
 from magrl.files import write_json
@@ -32,6 +33,7 @@ from magrl.training.curves import RunLog
 from magrl.training.run_folder import create_run_folder, locked
 from magrl.training.signals import StopRequest
 from magrl.training.statistics import RETURN_TERMS, BestPolicy, TrainingStatistics, selection_score
+from magrl.transforms import with_sensor_noise
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
 """Measures of the validation tasks in ``train.csv``, there with the prefix ``eval_``."""
@@ -49,7 +51,8 @@ class Run:
     Args:
         config: settings of the run.
         recipe: file name of the recipe.
-        name: label of the agent, and first part of the name of the default run folder.
+        name: label of the agent, and first part of the name of the default run folder; the name of a scenario file
+            and the sensors' noise are added to it.
         losses: names of the losses that the loop puts into ``run.statistics.losses``.
 
     Raises:
@@ -59,9 +62,12 @@ class Run:
     def __init__(
         self, config: RunConfig, *, recipe: str, name: str, losses: tuple[str, ...] = ("loss_critic", "loss_actor")
     ) -> None:
-        self.config, self.recipe, self.name, self.losses = config, recipe, name, losses
+        self.config, self.recipe, self.losses = config, recipe, losses
+        self.name = f"{name}-{config.scenario.stem}" if config.scenario else name
+        if any(config.noise):
+            self.name += "-noise-" + "-".join(f"{level:g}" for level in config.noise)
         self.statistics, self.best, self.stop = TrainingStatistics(), BestPolicy(), StopRequest()
-        self.folder = config.out or Path("runs") / f"{name}-seed{config.seed}"
+        self.folder = config.out or Path("runs") / f"{self.name}-seed{config.seed}"
         self._exits = contextlib.ExitStack()
 
     # Folder
@@ -104,20 +110,20 @@ class Run:
         source = self.config.scenario
         return settings | {"out": self.folder.name, "resume": None, "scenario": source and f"scenario{source.suffix}"}
 
-    def evaluation_envs(self, **options: Any) -> tuple[GeomagneticNavEnv, GeomagneticNavEnv]:
-        """Return the environments of the validation tasks and of the test tasks.
+    def evaluation_envs(self, **options: Any) -> tuple[EnvBase, EnvBase]:
+        """Return the environments of the validation tasks and of the test tasks, with the sensor noise of the run.
 
         Args:
             options: options of :class:`magrl.envs.GeomagneticNavEnv`.
         """
         sets = ((self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED))
-        first, second = (
-            GeomagneticNavEnv(
-                self.scenario.with_tasks(self.scenario.random_tasks(count, seed)), num_envs=count, seed=seed, **options
-            )
-            for count, seed in sets
-        )
+        first, second = (self._evaluation_env(count, seed, options) for count, seed in sets)
         return first, second
+
+    def _evaluation_env(self, num_tasks: int, seed: int, options: dict[str, Any]) -> EnvBase:
+        scenario = self.scenario.with_tasks(self.scenario.random_tasks(num_tasks, seed))
+        base = GeomagneticNavEnv(scenario, num_envs=num_tasks, seed=seed, **options)
+        return with_sensor_noise(base, self.config.noise, seed)
 
     # Parts
 
@@ -125,7 +131,7 @@ class Run:
         self,
         *,
         policy: FieldPolicy,
-        validation: GeomagneticNavEnv,
+        validation: EnvBase,
         env: GeomagneticNavEnv,
         collector: BaseCollector,
         **parts: Stateful,
@@ -228,7 +234,7 @@ class Run:
 
     # Results
 
-    def finish(self, test: GeomagneticNavEnv) -> dict[str, float]:
+    def finish(self, test: EnvBase) -> dict[str, float]:
         """Save the best policy, evaluate it on the test tasks and write figures and results.
 
         Args:
@@ -254,7 +260,8 @@ class Run:
         result |= {key: getattr(self.statistics, key) for key in ("frames", "episodes", "updates")}
         reached = next((row["seconds"] for row in self.log.rows if passes_paper(row)), math.nan)
         result |= {"training_seconds": seconds, "seconds_to_97_sr_88_spl": reached}
-        self.log.figure("trajectories", plots.trajectories_figure(rollout, test.field, test.region))
+        if isinstance(test.region, Region):
+            self.log.figure("trajectories", plots.trajectories_figure(rollout, test.field, test.region))
         self.log.result(result, navigator=self.name)
         self.checkpoints.clear()
         self._report(result)

@@ -34,21 +34,80 @@ def counter_uniform(seed: int, counters: Tensor, draws: int) -> Tensor:
         >>> bool((counter_uniform(7, rows, 2)[1] == counter_uniform(7, rows[1:], 2)[0]).all())
         True
     """
+    return stream_uniform(counter_stream(seed, counters), draws)
+
+
+def counter_stream(seed: int, counters: Tensor) -> Tensor:
+    """Return the state of a stream of random numbers for each row of counters, for :func:`stream_uniform`.
+
+    Args:
+        seed: any 64-bit integer.
+        counters: ``(..., C)`` int64.
+
+    Returns:
+        ``(...)`` int64.
+
+    Raises:
+        ValueError: for a seed that is not a whole number, or counters that are not rows of int64.
+
+    Example:
+        >>> state = counter_stream(7, torch.tensor([[0, 0], [0, 1]]))
+        >>> bool((stream_uniform(state, 2) == counter_uniform(7, torch.tensor([[0, 0], [0, 1]]), 2)).all())
+        True
+    """
     check_number(whole=True, seed=seed)
-    check_number(1, whole=True, draws=draws)
     if not isinstance(counters, Tensor) or counters.dtype != torch.int64 or not counters.ndim:
         raise ValueError(f"counters must be int64 of shape (..., C), got {counters!r}")
     key = _mix(torch.full(counters.shape[:-1], _signed(seed), dtype=torch.int64, device=counters.device))
     for counter in counters.unbind(-1):
-        key = _mix(key ^ _mix(counter + _signed(0x9E3779B97F4A7C15)))
-    steps = torch.arange(1, draws + 1, device=counters.device) * _signed(0x9E3779B97F4A7C15)
-    return _shift(_mix(key.unsqueeze(-1) + steps), 11).double() * 2.0**-53
+        key = _mix(key ^ _mix(counter + _GOLDEN))
+    return key
+
+
+def stream_uniform(state: Tensor, draws: int) -> Tensor:
+    """Return the next uniform numbers of streams: ``(...)`` int64 to ``(..., draws)`` float64 in [0, 1).
+
+    Raises:
+        ValueError: for a number of draws that is not a positive whole number.
+
+    Example:
+        >>> state = counter_stream(7, torch.tensor([[0, 0]]))
+        >>> bool((stream_uniform(advanced(state, 1), 1) == stream_uniform(state, 2)[:, 1:]).all())
+        True
+    """
+    check_number(1, whole=True, draws=draws)
+    steps = torch.arange(1, draws + 1, device=state.device) * _GOLDEN
+    return _shift(_mix(state.unsqueeze(-1) + steps), 11).double() * 2.0**-53
+
+
+def advanced(state: Tensor, draws: int | Tensor) -> Tensor:
+    """Return the state of streams after some draws, ``(...)`` int64.
+
+    Example:
+        >>> state = torch.tensor([5])
+        >>> bool(advanced(advanced(state, 2), 1) == advanced(state, torch.tensor(3)))
+        True
+    """
+    return state + (draws * _GOLDEN if isinstance(draws, Tensor) else _signed(draws * _GOLDEN))
+
+
+def split(state: Tensor) -> Tensor:
+    """Return the states of new streams, one from the next number of each stream: ``(...)`` int64.
+
+    Example:
+        >>> bool(split(torch.tensor([5])) == torch.tensor([5]))
+        False
+    """
+    return _mix(advanced(state, 1))
 
 
 def _signed(value: int) -> int:
     """Return a 64-bit pattern as a signed integer (two's complement)."""
     value &= 0xFFFFFFFFFFFFFFFF
     return value - (1 << 64) if value >> 63 else value
+
+
+_GOLDEN = _signed(0x9E3779B97F4A7C15)  # the step of SplitMix64
 
 
 def _shift(value: Tensor, bits: int) -> Tensor:

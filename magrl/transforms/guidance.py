@@ -90,8 +90,26 @@ class FieldGradient(ObservationTransform):
         return observation_spec
 
 
+def _pair_indices(pair: object) -> list[int]:
+    """Return two different elements by index.
+
+    Raises:
+        ValueError: for anything else than two different elements, by name or by index.
+    """
+    message = f"pair must be 'auto' or two different elements, by name or by index from 0, got {pair!r}"
+    if not isinstance(pair, (tuple, list)):
+        raise ValueError(message)
+    indices = [element_index(name) if isinstance(name, str) else name for name in pair]
+    if len(set(indices)) != 2 or not all(isinstance(i, int) and i >= 0 for i in indices):
+        raise ValueError(message)
+    return indices
+
+
 class GradientHeading(ObservationTransform):
     """Write the theoretical heading of the parallel approach (Eq. 3-15), on any pair of elements.
+
+    The paper's pair (D, I) crosses well in its region. Elsewhere the gradients of a fixed pair may be parallel;
+    ``pair="auto"`` takes at each place the pair that crosses best, so that the heading is defined wherever one is.
 
     Privileged if the gradient is: a policy must not read a heading that follows from the true gradient.
 
@@ -100,7 +118,8 @@ class GradientHeading(ObservationTransform):
             northward and eastward (or along any two axes that the headings are measured from).
         out_keys: the heading ``(..., 1)`` [rad] and a mask ``(..., 1)``, False where the gradients are too close to
             parallel to determine a direction (the heading is 0 there).
-        pair: two elements, by name (``"D"``, ``"I"``, ``"B_H"``) or by index. The difference in D is wrapped.
+        pair: two elements, by name (``"D"``, ``"I"``, ``"B_H"``) or by index; or ``"auto"``, where the values are D, I,
+            B_H. The difference in D is wrapped.
         min_crossing_deg: smallest angle at which the two gradients must cross [deg].
 
     Raises:
@@ -121,7 +140,7 @@ class GradientHeading(ObservationTransform):
         in_keys: Keys = ("field", "target_field", "field_gradient"),
         out_keys: Keys = ("gradient_heading", "gradient_heading_valid"),
         *,
-        pair: tuple[str | int, str | int] = ("D", "I"),
+        pair: tuple[str | int, str | int] | str = ("D", "I"),
         min_crossing_deg: float = 2.0,
     ) -> None:
         # A sequence of strings is several keys here, never one nested key.
@@ -130,12 +149,8 @@ class GradientHeading(ObservationTransform):
         check_number(0, 90, min_crossing_deg=min_crossing_deg)
         if min_crossing_deg == 90:
             raise ValueError(f"min_crossing_deg must be in [0, 90), got {min_crossing_deg}")
-        if not isinstance(pair, (tuple, list)):
-            raise ValueError(f"pair must be two different elements, by name or by index from 0, got {pair!r}")
-        self.pair = [element_index(name) if isinstance(name, str) else name for name in pair]
-        if len(set(self.pair)) != 2 or not all(isinstance(i, int) and i >= 0 for i in self.pair):
-            raise ValueError(f"pair must be two different elements, by name or by index from 0, got {pair}")
-        self.wraps = [name == "D" for name in pair]
+        self.pair = None if pair == "auto" else _pair_indices(pair)
+        self.wrapped = [0] if pair == "auto" or "D" in pair else []
         self.min_crossing = math.radians(min_crossing_deg)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -147,19 +162,24 @@ class GradientHeading(ObservationTransform):
         return next_tensordict
 
     def _apply_transform(self, value: Tensor, target: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        error = (target - value)[..., self.pair]
-        wrapped = torch.rad2deg(wrap_angle(torch.deg2rad(error)))
-        error = torch.where(torch.tensor(self.wraps, device=error.device), wrapped, error)
-        gradient = gradient[..., self.pair, :].to(error.dtype)
+        error, gradient = target - value, gradient.to(value.dtype)
+        for column in self.wrapped:
+            error[..., column] = torch.rad2deg(wrap_angle(torch.deg2rad(error[..., column])))
+        if self.pair is not None:
+            error, gradient = error[..., self.pair], gradient[..., self.pair, :]
+        else:
+            pair = guidance.best_pair(gradient)
+            error, gradient = error.gather(-1, pair), gradient.gather(-2, pair.unsqueeze(-1).expand(*pair.shape, 2))
         return guidance.parallel_approach(torch.zeros_like(error), error, gradient, self.min_crossing)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the heading, in [-pi, pi], and its mask."""
         value, target, gradient = (self._leaf(observation_spec, key) for key in self.in_keys)
-        if value.shape != target.shape or gradient.shape != (*value.shape, 2) or max(self.pair) >= value.shape[-1]:
+        held = [0, 1, 2] if self.pair is None else self.pair
+        if value.shape != target.shape or gradient.shape != (*value.shape, 2) or max(held) >= value.shape[-1]:
             raise ValueError(
                 f"GradientHeading needs values (..., E), targets (..., E) and gradients (..., E, 2) that hold elements "
-                f"{self.pair}, got {tuple(value.shape)}, {tuple(target.shape)}, {tuple(gradient.shape)}"
+                f"{held}, got {tuple(value.shape)}, {tuple(target.shape)}, {tuple(gradient.shape)}"
             )
         shape = (*value.shape[:-1], 1)
         observation_spec[self.out_keys[0]] = Bounded(-math.pi, math.pi, shape, device=value.device, dtype=value.dtype)

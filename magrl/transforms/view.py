@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torchrl.envs import CatTensors, Transform
 
 from magrl.checks import check_number, check_numbers
-from magrl.field import FieldModel, elements_range
+from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.transforms.observation import AngleVector, TargetDifference
 from magrl.transforms.scaling import MinMaxNorm
 
@@ -46,6 +47,8 @@ class ObservationView:
     max_move_km: float
     max_turn_rad: float
 
+    state_keys: ClassVar[tuple[str, ...]] = ()
+
     def __post_init__(self) -> None:
         check_numbers(3, field_low=self.field_low, field_high=self.field_high)
         if not all(low < high for low, high in zip(self.field_low, self.field_high, strict=True)):
@@ -55,6 +58,11 @@ class ObservationView:
         for name in ("observe_heading", "observe_difference"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
+
+    @property
+    def in_keys(self) -> tuple[str, ...]:
+        """Keys of the environment that are observed."""
+        return ("field", "target_field", "move", *(("heading",) if self.observe_heading else ()))
 
     @property
     def size(self) -> int:
@@ -97,8 +105,10 @@ class ObservationView:
             position: ``(..., 2)`` latitude, longitude [deg].
 
         Raises:
-            ValueError: naming the element and both ranges.
+            ValueError: naming the element and both ranges; or for a bank of fields.
         """
+        if isinstance(field, FieldBank):
+            raise ValueError(f"the policy was trained in one region, this field has {len(field)}: fly it in one")
         there = (end.tolist() for end in elements_range(field, position))
         for name, unit, least, most, low, high in zip(
             ("D", "I", "B_H"), ("°", "°", " nT"), self.field_low, self.field_high, *there, strict=True

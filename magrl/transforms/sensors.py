@@ -1,0 +1,280 @@
+"""Errors of sensors: what is measured is written over what is true, and the true value is kept under a key of its own.
+
+The random numbers of an error are a pure function of (seed, vehicle, episode, reading). Each episode has a stream of
+them, whose state is in the TensorDict, so that a step depends on its input alone. The transform itself only holds the
+streams from which the next episodes split off.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
+
+from magrl.checks import check_number, check_tensor, check_type
+from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list
+from magrl.transforms.counters import advanced, counter_stream, split, stream_uniform
+
+_SENSORS = 1  # second counter: it separates these numbers from others of the same seed
+
+
+class SensorNoise(ObservationTransform):
+    """Add white noise to a reading, independent for each element, at reset and at each step.
+
+    The reading is ``value + std * z`` with a standard normal ``z``. Beside it, the transform writes the true value, the
+    standard deviations (the data sheet of the sensors, which a policy may read) and the state of the random numbers.
+    In ``Compose``, a transform that reads the true value stands before this one, such as ``GradientHeading``.
+
+    Args:
+        std: standard deviation of each element in its unit, E numbers. If all are 0, the reading is the value.
+        in_keys: one value ``(..., E)``.
+        out_keys: its reading ``(..., E)``, in place by default.
+        true_key: key of the true value, or None to leave it out. Privileged: a policy must not read it.
+        std_key: key of the standard deviations ``(..., E)``.
+        stream_key: key of the state of the random numbers ``(..., 1)``, int64.
+        seed: seed of the noise. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
+
+    Raises:
+        ValueError: for standard deviations that are negative or not finite, a seed that is not a whole number, more
+            than one key, or values with another number of elements.
+        KeyError: for a step from a TensorDict without the state of the random numbers.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=1000, seed=0), SensorNoise((0.05, 0.05, 5.0), seed=1))
+        >>> state = env.reset()
+        >>> [round(x, 2) for x in (state["field"] - state["true_field"]).std(0).tolist()]
+        [0.05, 0.05, 4.98]
+    """
+
+    streams: Tensor | None
+    draws = 0
+    """Random numbers that an episode takes before its first reading."""
+
+    def __init__(
+        self,
+        std: Sequence[float],
+        *,
+        in_keys: NestedKey | Keys = ("field",),
+        out_keys: NestedKey | Keys = ("field",),
+        true_key: NestedKey | None = "true_field",
+        std_key: NestedKey = "sensor_std",
+        stream_key: NestedKey = "sensor_stream",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
+        expect_keys(self, 1, 1)
+        check_number(whole=True, seed=seed)
+        self.std, self.seed = check_std(std), int(seed)
+        self.true_key, self.std_key, self.stream_key = true_key, std_key, stream_key
+        self.register_buffer("streams", None)
+
+    def restart(self) -> None:
+        """Begin with the first episode of each vehicle again, so that the episodes repeat their noise."""
+        self.streams = None
+
+    # Data
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        values = self._read(tensordict_reset)
+        if values is not None:
+            stream = self._next_episode(tensordict, tensordict_reset.batch_size, values[0].device)
+            tensordict_reset.set(self.std_key, self._levels(stream).to(values[0].dtype))
+            tensordict_reset.set(self.stream_key, advanced(stream, self.draws).unsqueeze(-1))
+        return self._call(tensordict_reset)
+
+    def _next_episode(self, tensordict: TensorDictBase, batch: torch.Size, device: torch.device) -> Tensor:
+        """Return the streams of new episodes; the rows of vehicles that are not reset are placeholders."""
+        if self.streams is None or self.streams.shape != batch:
+            vehicle = torch.arange(batch.numel(), device=device).reshape(batch)
+            self.streams = counter_stream(self.seed, torch.stack((vehicle, torch.full_like(vehicle, _SENSORS)), -1))
+        stream = split(self.streams)
+        mask = tensordict.get("_reset", None)
+        # Advanced out of place: a checkpoint may hold the old tensor.
+        self.streams = advanced(self.streams, 1 if mask is None else mask.reshape(batch).long())
+        return stream
+
+    def _levels(self, stream: Tensor) -> Tensor:
+        """Return the standard deviations of an episode, ``(..., E)``."""
+        return torch.tensor(self.std, device=stream.device).expand(*stream.shape, -1)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self._read(next_tensordict) is not None:
+            stream, std = (self._written(tensordict, key) for key in (self.stream_key, self.std_key))
+            next_tensordict.set(self.stream_key, advanced(stream, len(self.std)))
+            next_tensordict.set(self.std_key, std)
+        return self._call(next_tensordict)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
+        if values is None:
+            return next_tensordict
+        stream, std = (self._written(next_tensordict, key) for key in (self.stream_key, self.std_key))
+        if self.true_key is not None:
+            next_tensordict.set(self.true_key, values[0])
+        return next_tensordict.set(self.out_keys[0], self._reading(values[0], std, stream))
+
+    def _reading(self, value: Tensor, std: Tensor, stream: Tensor) -> Tensor:
+        """Return what the sensors measure of a value ``(..., E)``."""
+        if not any(self.std):
+            return value
+        uniform = stream_uniform(stream.squeeze(-1), len(self.std))
+        normal = math.sqrt(2) * torch.erfinv(2 * uniform - 1 + 2.0**-53)  # the shift keeps it finite and centered
+        return value + std * normal.to(value.dtype)
+
+    def _written(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            known = "which its reset writes: step from what reset() or step_mdp() returned"
+            raise KeyError(f"{type(self).__name__} reads {key!r}, {known}")
+        return value
+
+    # Specs
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the true value, the standard deviations and the state of the numbers; the reading is unbounded."""
+        leaf = self._leaf(observation_spec, self.in_keys[0])
+        if leaf.shape[-1:] != (len(self.std),):
+            raise ValueError(
+                f"{type(self).__name__} has {len(self.std)} standard deviations, one for each element; "
+                f"{self.in_keys[0]!r} is {tuple(leaf.shape)}"
+            )
+        if self.true_key is not None:
+            observation_spec[self.true_key] = leaf.clone()
+        for key in (self.out_keys[0], self.std_key):
+            observation_spec[key] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
+        shape = (*observation_spec.shape, 1)
+        observation_spec[self.stream_key] = Unbounded(shape, device=leaf.device, dtype=torch.int64)
+        return observation_spec
+
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Make what a step reads part of the state, so that environments in other processes pass it to the step."""
+        input_spec = super().transform_input_spec(input_spec).clone()
+        if input_spec["full_state_spec"] is None:
+            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
+        parent = self.parent
+        if parent is not None:
+            observed = self.transform_observation_spec(parent.full_observation_spec.clone())
+            for key in (self.stream_key, self.std_key):
+                input_spec["full_state_spec"][key] = observed[key]
+        return input_spec
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
+        saved = state_dict.get(f"{prefix}streams")
+        self.streams = None if saved is None else torch.empty_like(saved)
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+class RandomSensorNoise(SensorNoise):
+    """White noise whose standard deviations are drawn for each vehicle and episode, for domain randomization.
+
+    Args:
+        levels: function of uniform numbers ``(..., draws)`` in [0, 1) that returns standard deviations ``(..., E)``.
+        draws: how many uniform numbers it takes.
+        **options: of :class:`SensorNoise`, except ``std``.
+
+    Raises:
+        TypeError: for ``levels`` that cannot be called.
+        ValueError: for ``draws`` that is not a positive whole number.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), RandomSensorNoise(seed=1))
+        >>> std = env.rollout(3)["sensor_std"]
+        >>> bool((std[:, 0] == std[:, 2]).all()), bool((std[0] == std[1]).any())
+        (True, False)
+    """
+
+    def __init__(self, levels: Callable[[Tensor], Tensor] | None = None, *, draws: int = 7, **options: Any) -> None:
+        levels = sensor_levels if levels is None else levels
+        if not callable(levels):
+            raise TypeError(f"levels must be a function of uniform numbers, got {levels!r}")
+        check_number(1, whole=True, draws=draws)
+        elements = len(levels(torch.ones(draws)))
+        super().__init__([1.0] * elements, **options)  # a placeholder: each episode has levels of its own
+        self.levels, self.draws = levels, draws
+
+    def _levels(self, stream: Tensor) -> Tensor:
+        return self.levels(stream_uniform(stream, self.draws))
+
+
+def sensor_levels(uniform: Tensor) -> Tensor:
+    """Return standard deviations of D [deg], I [deg] and B_H [nT] from perfect sensors to poor ones.
+
+    In 15 % of cases there is no noise. Otherwise a common factor is log-uniform over two decades up to 0.15 deg,
+    0.15 deg and 15 nT, each element has a factor of its own, log-uniform from 0.4 to 2.5, and in 30 % of cases that of
+    D is multiplied by a number from 1 to 7, as where the north reference is poor.
+
+    Args:
+        uniform: ``(..., 7)`` uniform numbers in [0, 1).
+
+    Returns:
+        ``(..., 3)``.
+
+    Raises:
+        ValueError: for another number of uniform numbers.
+
+    Example:
+        >>> sensor_levels(torch.tensor([0.5, 0.0, 0.5, 0.5, 0.5, 0.5, 0.5]))
+        tensor([ 0.1500,  0.1500, 15.0000])
+    """
+    check_tensor(7, uniform=uniform)
+    none, common, poor, factor = (uniform[..., k : k + 1] for k in (0, 1, 5, 6))
+    level = 10 ** (-2 * common) * 10 ** (0.8 * uniform[..., 2:5] - 0.4) * uniform.new_tensor((0.15, 0.15, 15.0))
+    declination = torch.where(poor < 0.3, 1 + 6 * factor, 1.0)
+    level = level * torch.cat((declination, torch.ones_like(uniform[..., :2])), -1)
+    return torch.where(none < 0.15, 0.0, level)
+
+
+def check_std(std: Sequence[float]) -> tuple[float, ...]:
+    """Return standard deviations as floats; raise unless they are finite numbers from 0 on.
+
+    Raises:
+        ValueError: with the values.
+
+    Example:
+        >>> check_std((0.05, -0.05, 5))
+        Traceback (most recent call last):
+        ValueError: std must be finite numbers from 0 on, one for each element, got (0.05, -0.05, 5)
+    """
+    try:
+        numbers = list(std)
+        for number in numbers:
+            check_number(0, std=number)
+    except (TypeError, ValueError):
+        numbers = []
+    if not numbers:
+        raise ValueError(f"std must be finite numbers from 0 on, one for each element, got {std!r}")
+    return tuple(float(number) for number in numbers)
+
+
+def with_sensor_noise(env: EnvBase, std: Sequence[float], seed: int = 0) -> EnvBase:
+    """Return an environment whose readings have white noise, or the environment itself if ``std`` is 0 throughout.
+
+    Args:
+        env: environment with the key ``field``.
+        std: standard deviation of each element, as :class:`SensorNoise` takes it.
+        seed: seed of the noise.
+
+    Raises:
+        ValueError: as :class:`SensorNoise`.
+        TypeError: for another environment.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> with_sensor_noise(env, (0.0, 0.0, 0.0)) is env
+        True
+    """
+    noisy = any(check_std(std))
+    check_type(EnvBase, env=env)
+    return TransformedEnv(env, SensorNoise(std, seed=seed)) if noisy else env

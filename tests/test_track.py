@@ -1,0 +1,270 @@
+"""TrackGradient: the filter in the TensorDict, against the pure functions, by row, in both frames, and elsewhere."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from magrl import tracking
+from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.field import elements_gradient_at
+from magrl.field.regional import RegionalField
+from magrl.geodesy import geodesic, wrap_angle
+from magrl.guidance import parallel_approach
+from magrl.tracking import FieldTrack, GradientPrior
+from magrl.transforms import FieldGradient, GradientHeading, TrackGradient
+
+sys.path.append(str(Path(__file__).parent.parent / "docs" / "examples"))
+plume_env = importlib.import_module("plume_env")
+
+STATE = ("track_mean", "track_covariance")
+ESTIMATES = ("estimated_field", "estimated_gradient", "way", "way_covariance")
+NOISE = (0.02, 0.05, 3.0)
+
+
+@cache
+def field() -> RegionalField:
+    return Scenario().build_field()
+
+
+def nav(num_envs: int = 3, **options: object) -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0} | options))
+
+
+def tracked(num_envs: int = 3, *, keys: tuple[str, ...] = (), **options: object) -> TransformedEnv:
+    names = ["field", "target_field", "move", "heading", *keys]
+    return TransformedEnv(nav(num_envs), TrackGradient(names, **options))
+
+
+def flown(env: TransformedEnv, steps: int = 6) -> TensorDictBase:
+    torch.manual_seed(0)
+    return env.rollout(steps, break_when_any_done=False)
+
+
+def first_reading(batch: int = 4, dtype: torch.dtype = torch.float64) -> TensorDict:
+    """Readings of D, I, B_H, targets and headings that are not special."""
+    rand = torch.rand(batch, 7, dtype=dtype, generator=torch.Generator().manual_seed(3))
+    middle, span = torch.tensor((8.0, -16.0, 35e3), dtype=dtype), torch.tensor((2.0, 8.0, 500.0), dtype=dtype)
+    values = {"field": middle + span * rand[:, :3], "target_field": middle + span * rand[:, 3:6]}
+    return TensorDict(
+        values | {"move": torch.zeros(batch, 2, dtype=dtype), "heading": 6 * rand[:, 6:] - 3}, batch_size=batch
+    )
+
+
+def moved(first: TensorDict, km: float, turn: float, change: Tensor) -> TensorDict:
+    """The reading after a move."""
+    after = first.select("target_field").clone()
+    after["heading"] = first["heading"] + turn
+    after["move"] = torch.tensor((km, turn), dtype=change.dtype).expand(len(first), 2)
+    return after.set("field", first["field"] + change)
+
+
+def test_the_estimates_are_those_of_the_pure_functions() -> None:
+    rollout = flown(tracked(noise_std=NOISE))
+    reading = rollout["field"][:, 0]
+    prior = tracking.dipole_prior(reading)
+    track = tracking.start(reading, prior.gradient, prior.std, NOISE, prior.azimuth)
+    for step in rollout["next"].unbind(1):
+        heading = step["heading"]
+        d = step["move"][:, :1] * torch.cat((heading.cos(), heading.sin()), -1)
+        track = tracking.update(tracking.predict(track, d), step["field"], NOISE)
+        way = tracking.way_to(track, step["target_field"], 300.0)
+        torch.testing.assert_close(FieldTrack(*(step[key] for key in STATE)), track)
+        torch.testing.assert_close(step["estimated_field"], track.mean[..., 0] * torch.tensor(tracking.ELEMENT_SCALES))
+        torch.testing.assert_close(step["estimated_gradient"], tracking.estimated_gradient(track))
+        torch.testing.assert_close((step["way"], step["way_covariance"]), tuple(way))
+
+
+def test_the_first_estimate_is_the_reading_and_the_prior() -> None:
+    first = TrackGradient()(first_reading())
+    torch.testing.assert_close(first["estimated_field"], first["field"])
+    torch.testing.assert_close(first["estimated_gradient"], tracking.dipole_prior(first["field"]).gradient)
+
+
+def test_without_noise_it_finds_gradient_and_target() -> None:
+    env = tracked(64, range_km=1000.0)
+    start = flown(env, 12)[:, -1]
+    after = start["next"]
+    true = elements_gradient_at(field(), after["position"]).float()
+    scale = torch.tensor(tracking.ELEMENT_SCALES).unsqueeze(-1) / tracking.DISTANCE_SCALE_KM
+    assert ((after["estimated_gradient"] - true) / scale).norm(dim=(-2, -1)).median() < 0.1
+    way_km, bearing = geodesic(*after["position"].T, *after["target_position"].T)
+    true_way = (way_km * torch.stack((bearing.cos(), bearing.sin()))).T.float()
+    assert ((after["way"] - true_way).norm(dim=-1) / way_km).median() < 0.15
+
+
+def test_partial_reset_restarts_the_chosen_rows_alone() -> None:
+    env = tracked(4)
+    td = flown(env, 3)[:, -1]["next"]
+    chosen = torch.tensor([True, False, False, True])
+    after = env.reset(td.clone().set("_reset", chosen.unsqueeze(-1)))
+    expected = TrackGradient()(after.select("field", "target_field", "move", "heading"))
+    for key in (*STATE, *ESTIMATES):
+        assert torch.equal(after[key][~chosen], td[key][~chosen]), key
+        torch.testing.assert_close(after[key][chosen], expected[key][chosen], msg=key)
+        assert not torch.equal(after[key][chosen], td[key][chosen]), key
+
+
+def test_a_step_depends_on_its_tensordict_alone() -> None:
+    """As stored data are stepped again, by another transform."""
+    rollout = flown(tracked(noise_std=NOISE))
+    again = TrackGradient(noise_std=NOISE)(rollout.exclude(*(("next", key) for key in (*STATE, *ESTIMATES))))
+    for key in (*STATE, *ESTIMATES):
+        torch.testing.assert_close(again["next", key], rollout["next", key], msg=key)
+    env, other = tracked(), tracked()
+    state = step_mdp(flown(env)[:, -1].clone())
+    state["action"] = torch.tensor([30.0, 0.5]).expand(3, 2)
+    for key in (*STATE, *ESTIMATES):
+        assert torch.equal(env.step(state.clone())["next", key], other.step(state.clone())["next", key]), key
+
+
+def test_nothing_but_its_inputs_is_read() -> None:
+    """Privileged keys among them: they may be anything."""
+    rollout = flown(tracked(noise_std=NOISE))
+    public = [*STATE, *(("next", key) for key in ("field", "target_field", "move", "heading"))]
+    again = TrackGradient(noise_std=NOISE)(rollout.select(*public))
+    torch.testing.assert_close(again["next", "way"], rollout["next", "way"])
+
+
+def test_the_frame_of_the_vehicle_by_hand() -> None:
+    first = first_reading(1)
+    first["heading"] = torch.tensor([[math.pi / 2]], dtype=torch.float64)  # east: north is to the left
+    world, vehicle = (TrackGradient(frame=frame)(first.clone()) for frame in ("world", "vehicle"))
+    (north, east), ((nn, ne), (_, ee)) = world["way"][0], world["way_covariance"][0]
+    torch.testing.assert_close(vehicle["way"][0], torch.stack((east, -north)))
+    torch.testing.assert_close(vehicle["way_covariance"][0].flatten(), torch.stack((ee, -ne, -ne, nn)))
+    slope = world["estimated_gradient"]
+    torch.testing.assert_close(vehicle["estimated_gradient"], torch.stack((slope[..., 1], -slope[..., 0]), -1))
+
+
+def test_the_frame_of_the_vehicle_turns_nothing_else() -> None:
+    world, vehicle = (flown(tracked(frame=frame))["next"] for frame in ("world", "vehicle"))
+    for key in (*STATE, "estimated_field"):
+        assert torch.equal(world[key], vehicle[key]), key
+    torch.testing.assert_close(world["way"].norm(dim=-1), vehicle["way"].norm(dim=-1))
+    torch.testing.assert_close(*(torch.linalg.det(td["way_covariance"]) for td in (world, vehicle)))
+    assert not torch.allclose(world["way"], vehicle["way"])
+
+
+@pytest.mark.parametrize("turn", [171.5, -188.0, 360.0])
+def test_a_declination_that_crosses_180_degrees_is_continued(turn: float) -> None:
+    """The zero of D does not matter: only the prior follows it, which is turned back here."""
+
+    def shifted(td: TensorDict) -> TensorDict:
+        td = td.clone()
+        for key in ("field", "target_field"):
+            td[key][:, 0] = torch.remainder(td[key][:, 0] + turn + 180, 360) - 180
+        return td
+
+    def turned_back(reading: Tensor) -> GradientPrior:
+        return tracking.dipole_prior(reading - torch.tensor((turn, 0.0, 0.0), dtype=reading.dtype))
+
+    first = first_reading(64)
+    after = moved(first, 40.0, 0.3, torch.tensor((-0.8, 0.5, 60.0), dtype=torch.float64))
+    steps = TensorDict(TrackGradient()(first.clone()), batch_size=64).set("next", after)
+    shifted_steps = TrackGradient(prior=turned_back)(shifted(first)).set("next", shifted(after))
+    plain = TrackGradient()(steps)["next"]
+    other = TrackGradient(prior=turned_back)(shifted_steps)["next"]
+    for key in ("estimated_gradient", "way", "way_covariance"):
+        torch.testing.assert_close(other[key], plain[key], rtol=1e-8, atol=1e-8, msg=key)
+    torch.testing.assert_close(
+        other["estimated_field"],
+        shifted(plain.select("field", "target_field").set("field", plain["estimated_field"].clone()))["field"],
+    )
+    if abs(turn) < 360:
+        crossed = (shifted(first)["field"] - shifted(after)["field"])[:, 0].abs() > 180
+        assert crossed.any()
+        assert not crossed.all()
+
+
+def test_other_elements_are_not_wrapped() -> None:
+    plain = TrackGradient(angles=())
+    steps = plain(first_reading()).set(
+        "next", moved(first_reading(), 1.0, 0.0, torch.tensor((0.0, 400.0, 0.0)).double())
+    )
+    assert (plain(steps)["next", "estimated_field"][:, 1] > 180).all()
+
+
+def test_the_data_sheet_may_be_a_key() -> None:
+    rows = torch.tensor(NOISE, dtype=torch.float64) * torch.tensor([[1.0], [4.0]], dtype=torch.float64)
+    first = first_reading(2).set("sensor_std", rows)
+    after = moved(first, 40.0, 0.3, torch.tensor((0.3, 0.5, 60.0), dtype=torch.float64)).set("sensor_std", rows)
+    read = TrackGradient(["field", "target_field", "move", "heading", "sensor_std"])
+    both = read(read(first.clone()).set("next", after))["next"]
+    for row, std in enumerate(rows.tolist()):
+        alone = TrackGradient(noise_std=std)
+        expected = alone(alone(first.clone()).set("next", after.clone()))["next"]
+        for key in (*STATE, *ESTIMATES):
+            torch.testing.assert_close(both[key][row], expected[key][row], msg=key)
+
+
+def test_a_step_is_compiled_whole() -> None:
+    torch.compiler.reset()
+    transform = TrackGradient(noise_std=NOISE, frame="vehicle")
+    rollout = flown(tracked(noise_std=NOISE)).exclude(*(("next", key) for key in (*STATE, *ESTIMATES)))
+    expected = transform(rollout.clone())
+    found = torch.compile(transform, fullgraph=True, backend="aot_eager")(rollout)
+    for key in (*STATE, *ESTIMATES):
+        torch.testing.assert_close(found["next", key], expected["next", key], rtol=1e-4, atol=1e-4, msg=key)
+
+
+def test_a_step_without_its_state_is_refused() -> None:
+    first = first_reading()
+    with pytest.raises(KeyError, match=r"track_mean.*track_covariance.*reset\(\) or step_mdp\(\)"):
+        TrackGradient()(first.set("next", first.clone()))
+
+
+def test_shapes_that_do_not_match_are_refused() -> None:
+    for keys, message in (
+        (("move", "target_field", "move", "heading"), r"same shape.*\(3, 2\)"),
+        (("field", "target_field", "move", "move"), r"heading \(3, 1\), got \(3, 2\)"),
+        (("field", "target_field", "move", "heading", "position"), r"same shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            _ = TransformedEnv(nav(), TrackGradient(keys)).specs
+    with pytest.raises(ValueError, match=r"an element for each of its scales"):
+        _ = TransformedEnv(nav(), TrackGradient(scales=(1.0, 1.0), curvature=(1.0, 1.0))).specs
+
+
+@pytest.mark.parametrize("frame", ["world", "vehicle"])
+def test_specs_in_a_chain(frame: str) -> None:
+    env = TransformedEnv(nav(), Compose(TrackGradient(frame=frame)))
+    check_env_specs(env, break_when_any_done="both")
+    assert set(STATE) <= set(env.full_state_spec.keys())
+    assert not set(ESTIMATES) & set(env.full_state_spec.keys())
+
+
+def tracer_prior(reading: Tensor) -> GradientPrior:
+    mean = torch.zeros(*reading.shape, 2)
+    return GradientPrior(mean, torch.ones_like(mean), torch.zeros(reading.shape[:-1]))
+
+
+def test_the_estimated_gradient_of_tracers_leads_to_the_target() -> None:
+    """The figures of docs/transforms.md: nothing here is magnetic, and nothing reads the true gradient."""
+    options = {"scales": (1.0, 1.0), "curvature": (2000.0, 2000.0), "angles": (), "range_km": 5.0}
+    track = TrackGradient(["tracers", "target_tracers", "move", "heading"], prior=tracer_prior, **options)
+    keys = ["estimated_field", "target_tracers", "estimated_gradient"]
+    heading = GradientHeading(keys, ["way_heading", "way_valid"], pair=(0, 1))
+    env = TransformedEnv(plume_env.PlumeEnv(200), Compose(StepCounter(30), track, heading))
+
+    def sway(td: TensorDictBase) -> TensorDictBase:
+        side = math.pi / 6 * (1 - 2 * (td["step_count"] % 2))
+        turn = wrap_angle(td["way_heading"] + side - td["heading"]).clamp(-math.pi / 2, math.pi / 2)
+        return td.set("action", torch.cat((torch.full_like(turn, 0.6), turn), -1))
+
+    rollout = env.rollout(30, sway, break_when_any_done=False, break_when_all_done=True)
+    assert rollout["next", "terminated"].any(1).double().mean() > 0.95
+    third = rollout[:, 2]
+    gradient = FieldGradient(plume_env.concentration, ["position"], ["gradient"])(third.select("position"))["gradient"]
+    true, _ = parallel_approach(third["tracers"], third["target_tracers"], gradient)
+    assert wrap_angle(true - third["way_heading"]).abs().median() < math.radians(3)
