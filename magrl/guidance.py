@@ -208,3 +208,33 @@ def parallel_approach(
     sign = torch.sign(determinant)
     heading = torch.atan2(torch.where(valid, sign * east, 0.0), torch.where(valid, sign * north, 1.0))
     return wrap_angle(heading).unsqueeze(-1), valid.unsqueeze(-1)
+
+
+def best_pair(gradient: Tensor) -> Tensor:
+    """Return the two elements whose gradients cross at the largest angle, that is nearest to a right angle.
+
+    The crossing does not depend on the units of the elements. A gradient that is zero or NaN crosses no other.
+
+    Args:
+        gradient: ``(..., E, 2)`` derivatives of E elements along two axes [element unit / km], E at least 2.
+
+    Returns:
+        ``(..., 2)`` int64: numbers of the two elements, rising; the first pair where several are equal.
+
+    Raises:
+        ValueError: for fewer than two elements, or another last dimension.
+
+    Example:
+        >>> best_pair(torch.tensor([[0.0, 2.0], [0.1, 2.0], [300.0, 0.0]]))  # eastward, nearly eastward, northward
+        tensor([0, 2])
+    """
+    check_tensor(2, gradient=gradient)
+    if gradient.ndim < 2 or gradient.shape[-2] < 2:
+        raise ValueError(f"gradient must hold at least two elements (..., E, 2), got {tuple(gradient.shape)}")
+    count = gradient.shape[-2]
+    pairs = torch.triu_indices(count, count, 1, device=gradient.device)
+    first, second = (gradient[..., index, :] for index in pairs)
+    cross = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]).abs()
+    sine = (cross / (first.norm(dim=-1) * second.norm(dim=-1))).nan_to_num(0.0)
+    # Compared in steps of 1e-6, so that rounding does not decide between equal crossings.
+    return pairs.T[(sine * 1e6).round().argmax(-1)]

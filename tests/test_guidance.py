@@ -10,6 +10,7 @@ from magrl.geodesy import wrap_angle
 from magrl.guidance import (
     OBJECTIVE_FLOORS,
     alignment_reward,
+    best_pair,
     destination_reward,
     late_decay,
     objective,
@@ -325,6 +326,38 @@ def test_approach_shapes_and_dtypes(shape, dtype):
     assert (heading.shape, heading.dtype) == ((*shape, 1), dtype)
     assert (valid.shape, valid.dtype) == ((*shape, 1), torch.bool)
     assert (heading - 2).abs().sum() < 100 * torch.finfo(dtype).eps
+
+
+def test_the_best_pair_crosses_nearest_to_a_right_angle():
+    """Directions of the three gradients [deg]; 170 and 10 degrees cross at 20, as 10 and 30 do."""
+    rows = {
+        (0.0, 80.0, 45.0): [0, 1],
+        (0.0, 30.0, 60.0): [0, 2],
+        (0.0, 179.0, 89.0): [1, 2],
+        (170.0, 10.0, 60.0): [0, 2],
+        (0.0, 0.0, 0.0): [0, 1],
+        (0.0, 90.0, -90.0): [0, 1],  # the first of two that are equal
+    }
+    angle = torch.deg2rad(f64(*rows).reshape(-1, 3))
+    gradient = torch.stack((angle.cos(), angle.sin()), -1)
+    for unit in (f64(1.0, 1.0, 1.0), f64(1e-3, 20.0, 5.0)):  # units do not matter
+        found = best_pair(gradient * unit.unsqueeze(-1))
+        assert found.dtype == torch.int64
+        assert found.tolist() == list(rows.values())
+
+
+@shapes_and_dtypes
+def test_best_pair_shapes_and_dtypes(shape, dtype):
+    gradient = torch.tensor([[1.0, 0.0], [1.0, 0.1], [0.0, 3.0], [1.0, 1.0]], dtype=dtype).expand(*shape, 4, 2)
+    assert torch.equal(best_pair(gradient), torch.tensor([0, 2]).expand(*shape, 2))
+
+
+@pytest.mark.parametrize("bad", [0.0, math.nan])
+def test_a_gradient_that_is_zero_or_nan_is_not_of_the_best_pair(bad):
+    for missing, expected in enumerate(([1, 2], [0, 2], [0, 1])):
+        gradient = f64(1.0, 0.0, 1.0, 1.0, 1.0, 2.0).reshape(3, 2)
+        gradient[missing] = bad
+        assert best_pair(gradient).tolist() == expected
 
 
 def test_a_flag_belongs_to_its_own_vehicle():

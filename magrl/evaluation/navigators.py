@@ -3,41 +3,63 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from tensordict.nn import TensorDictModuleBase
 
-from magrl.agents import load_policy
+from magrl.agents import FieldPolicy, load_policy
+from magrl.agents.pretrained import load_pretrained
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators import METAHEURISTICS, NAVIGATORS
+from magrl.navigators import METAHEURISTICS, NAVIGATOR_CLASSES, NAVIGATORS, Navigator
+from magrl.transforms import TrackView
 
-TRAINED = ("gg_td3", "td3", "recurrent")
-"""Names of trained agents; each needs a run folder."""
+TRAINED = ("gg_td3", "gg_td3_noise", "td3", "recurrent", "anywhere")
+"""Names of trained agents, which take a run folder; ``anywhere`` without one is the pretrained policy."""
+PRETRAINED = ("anywhere",)
+"""Names of trained agents that come with the library."""
 DEFAULT_ZETA = 0.01
 """Arrival threshold of an evaluation without runs."""
 
 NAVIGATOR_NAMES = {
     "gg_td3": "Gradient-Guided TD3",
+    "gg_td3_noise": "Gradient-Guided TD3, trained with noise",
     "td3": "TD3",
     "recurrent": "recurrent TD3",
+    "anywhere": "anywhere",
     "ga": "GA",
     "pso": "PSO",
     "afsa": "AFSA",
     "secant": "secant",
     "parallel": "parallel",
+    "kalman": "Kalman",
+    "mean_jacobian": "mean Jacobian",
+    "geodesic": "geodesic",
+    "run_and_tumble": "run and tumble",
 }
 """Label of each navigator in figures."""
 
 _DETAILED_NAMES = NAVIGATOR_NAMES | {
     "recurrent": "recurrent TD3 (the paper's eight numbers)",
-    "secant": "secant (no training, fair)",
+    "anywhere": "anywhere (TD3 on random planets)",
+    "secant": "secant (quasi-Newton)",
     "parallel": "parallel (true gradient, an oracle)",
+    "kalman": "Kalman (dual control)",
+    "mean_jacobian": "mean Jacobian (quasi-Newton)",
+    "geodesic": "geodesic (both positions, an oracle)",
 }
+"""Label of each navigator in tables."""
 
 
-def make_navigator(text: str, env: GeomagneticNavEnv, mode: str = "look-ahead", seed: int = 0) -> TensorDictModuleBase:
+def make_navigator(
+    text: str,
+    env: GeomagneticNavEnv,
+    mode: str = "look-ahead",
+    seed: int = 0,
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> TensorDictModuleBase:
     """Return the navigator that a text such as ``secant``, ``pso:flown`` or ``gg_td3=RUN`` names.
 
     Args:
@@ -45,6 +67,7 @@ def make_navigator(text: str, env: GeomagneticNavEnv, mode: str = "look-ahead", 
         env: environment that it navigates in.
         mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
+        noise: standard deviations of the sensors, D [deg], I [deg], B_H [nT], for navigators that weigh their readings.
 
     Raises:
         ValueError: for an unknown name, a trained agent without a run or trained in another field, a run or a mode for
@@ -60,18 +83,48 @@ def make_navigator(text: str, env: GeomagneticNavEnv, mode: str = "look-ahead", 
     name, _, run = text.partition("=")
     name, _, own_mode = name.partition(":")
     if name in TRAINED and not own_mode:
-        if not run:
+        if not run and name not in PRETRAINED:
             raise ValueError(f"{name} needs the folder of a finished run: {name}=RUN")
-        policy = load_policy(Path(run) / "policy.pt", device=env.device)
+        policy = load_policy(Path(run) / "policy.pt", env.device) if run else load_pretrained(name, env.device)
+        if isinstance(view := policy.config.view, TrackView):  # it is told what counts as arrived
+            policy = FieldPolicy(replace(policy.config, view=replace(view, zeta=env.zeta)), policy.actor)
+            policy.noise_std = noise
         try:
             policy.check_fits(env)
         except ValueError as error:
             raise ValueError(f"{text}: {error}") from error
         return policy
-    makers: dict[str, Callable[..., TensorDictModuleBase]] = {**NAVIGATORS, **METAHEURISTICS}
-    if name not in makers or run or (own_mode and name not in METAHEURISTICS):
-        raise ValueError(f"unknown navigator {text!r}: choose from {'=RUN, '.join(TRAINED)}=RUN, {', '.join(makers)}")
-    return makers[name](env, own_mode or mode, seed)
+    if name in METAHEURISTICS and not run:
+        return METAHEURISTICS[name](env, own_mode or mode, seed)
+    if name in NAVIGATORS and not run and not own_mode:
+        return NAVIGATORS[name](env, mode, seed, noise)
+    known = ", ".join([*PRETRAINED, *(f"{trained}=RUN" for trained in TRAINED), *NAVIGATORS, *METAHEURISTICS])
+    raise ValueError(f"unknown navigator {text!r}: choose from {known}")
+
+
+def needs(name: str, default_mode: str = "look-ahead") -> str:
+    """Return what a navigator needs beside its readings and the sensors' data sheet, for a column of a table.
+
+    Args:
+        name: name without a run, for example ``pso`` or ``pso:flown``.
+        default_mode: mode of a metaheuristic without one in ``name``.
+
+    Raises:
+        ValueError: for an unknown name.
+
+    Example:
+        >>> needs("secant"), needs("mean_jacobian"), needs("td3")
+        ('nothing', 'a map of the region', 'training in the region')
+        >>> needs("pso"), needs("pso:flown")
+        ('the field at other places', 'nothing')
+    """
+    base, _, mode = name.partition(":")
+    label(base)  # raises for an unknown name
+    if base in METAHEURISTICS:
+        return "the field at other places" if (mode or default_mode) == "look-ahead" else Navigator.needs
+    if base in PRETRAINED:  # trained on planets that share only the spectrum of the field
+        return Navigator.needs
+    return "training in the region" if base in TRAINED else NAVIGATOR_CLASSES[base].needs
 
 
 def label(name: str, default_mode: str = "look-ahead") -> str:
@@ -89,8 +142,8 @@ def label(name: str, default_mode: str = "look-ahead") -> str:
         ('PSO, look-ahead (an oracle)', 'GA, flown')
     """
     base, _, mode = name.partition(":")
-    if base not in NAVIGATOR_NAMES:
-        raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(NAVIGATOR_NAMES)}")
+    if base not in _DETAILED_NAMES:
+        raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(_DETAILED_NAMES)}")
     if base not in METAHEURISTICS:
         return _DETAILED_NAMES[base]
     look_ahead = (mode or default_mode) == "look-ahead"

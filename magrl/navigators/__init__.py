@@ -4,27 +4,80 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from tensordict.nn import TensorDictModuleBase
-
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators.base import Navigator
+from magrl.navigators.geodesic import Geodesic
+from magrl.navigators.kalman import Kalman
+from magrl.navigators.mean_jacobian import MeanJacobian
 from magrl.navigators.metaheuristics import METAHEURISTICS
 from magrl.navigators.parallel import ParallelApproach
+from magrl.navigators.quasi_newton import QuasiNewton
+from magrl.navigators.run_and_tumble import RunAndTumble
 from magrl.navigators.secant import Secant
 
+Noise = tuple[float, float, float]
+_PERFECT: Noise = (0.0, 0.0, 0.0)
 
-def _parallel(env: GeomagneticNavEnv, mode: str, seed: int) -> TensorDictModuleBase:  # noqa: ARG001
+
+def _parallel(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> ParallelApproach:  # noqa: ARG001
     return ParallelApproach(env.field, env.max_move_km, env.max_turn_rad)
 
 
-def _secant(env: GeomagneticNavEnv, mode: str, seed: int) -> TensorDictModuleBase:  # noqa: ARG001
-    return Secant(env.max_move_km, env.max_turn_rad, min(10.0, env.max_move_km))
+def _secant(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> Secant:  # noqa: ARG001
+    return Secant(env.max_move_km, env.max_turn_rad, noise=noise)
 
 
-NAVIGATORS: dict[str, Callable[[GeomagneticNavEnv, str, int], TensorDictModuleBase]] = {
+def _mean_jacobian(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> MeanJacobian:  # noqa: ARG001
+    if env.many:
+        raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
+    places = env.region.grid(21).to(env.device)
+    return MeanJacobian(env.field, places, env.max_move_km, env.max_turn_rad, noise=noise)
+
+
+def _geodesic(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> Geodesic:  # noqa: ARG001
+    return Geodesic(env.max_move_km, env.max_turn_rad)
+
+
+def _run_and_tumble(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> RunAndTumble:  # noqa: ARG001
+    floors = tuple(env.objective_floors.tolist())
+    return RunAndTumble(env.max_move_km, env.max_turn_rad, objective_floors=floors)
+
+
+def _kalman(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> Kalman:  # noqa: ARG001
+    return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps)
+
+
+NAVIGATORS: dict[str, Callable[..., Navigator]] = {
     "parallel": _parallel,
     "secant": _secant,
+    "mean_jacobian": _mean_jacobian,
+    "geodesic": _geodesic,
+    "run_and_tumble": _run_and_tumble,
+    "kalman": _kalman,
 }
-"""Factories by name, called with an environment, a mode and a seed; these two ignore mode and seed."""
+"""Factories by name, called with an environment, a mode and a seed, which these ignore, and perhaps the standard
+deviations of the sensors: D [deg], I [deg], B_H [nT]."""
 
-__all__ = ["METAHEURISTICS", "NAVIGATORS", "Navigator", "ParallelApproach", "Secant"]
+NAVIGATOR_CLASSES: dict[str, type[Navigator]] = {
+    "parallel": ParallelApproach,
+    "secant": Secant,
+    "mean_jacobian": MeanJacobian,
+    "geodesic": Geodesic,
+    "run_and_tumble": RunAndTumble,
+    "kalman": Kalman,
+}
+"""Classes by name, for what they say of themselves (:attr:`Navigator.needs`)."""
+
+__all__ = [
+    "METAHEURISTICS",
+    "NAVIGATORS",
+    "NAVIGATOR_CLASSES",
+    "Geodesic",
+    "Kalman",
+    "MeanJacobian",
+    "Navigator",
+    "ParallelApproach",
+    "QuasiNewton",
+    "RunAndTumble",
+    "Secant",
+]

@@ -2,7 +2,7 @@
 
 A navigator reads keys of the plain :class:`magrl.envs.GeomagneticNavEnv` in physical units and writes ``action``
 ``(N, 2)``: distance [km] and turn [rad]. A navigator that reads privileged keys, or the field at places where the
-vehicle has not been, has ``oracle = True``.
+vehicle has not been, has ``oracle = True``; ``needs`` says in words what it knows beside its own readings.
 """
 
 from __future__ import annotations
@@ -18,6 +18,12 @@ from torch import Tensor
 from magrl.checks import check_number, check_tensor
 from magrl.field.elements import element_index
 from magrl.geodesy import wrap_angle
+
+CURVATURE = (0.015, 0.018, 12.0)
+"""Change of the gradients of D, I [deg], B_H [nT] along the way, per (100 km)^2, typical of the Earth's field.
+
+The error of a linear step grows with it: least squares divide the elements by these values, and all three together then
+lead to the destination wherever any two do."""
 
 
 def steer(
@@ -133,6 +139,9 @@ class Navigator(TensorDictModuleBase):
 
     oracle: bool = False
     """Whether the navigator reads privileged keys, or the field where the vehicle has not been."""
+    needs: str = "nothing"
+    """What it needs beside its readings and the sensors' data sheet: ``"nothing"``, ``"a map of the region"``,
+    ``"the gradient"``, ``"the position"`` or ``"the field at other places"``."""
 
     def __init__(self, max_move_km: float, max_turn_rad: float) -> None:
         super().__init__()

@@ -9,19 +9,25 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from magrl.field.bank import FieldBank
+from magrl.field.elements import NAMES
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.guidance import parallel_approach
-from magrl.navigators.base import Navigator, displacement_to, element_indices, steer
+from magrl.navigators.base import CURVATURE, Navigator, displacement_to, element_indices, steer
 
 
 class ParallelApproach(Navigator):
-    """Parallel approach (Eq. 3-15) with the true gradient at the vehicle's position: an oracle and an upper bound.
+    """Newton steps with the true gradient at the vehicle's position: an oracle.
+
+    By default, each step closes the errors of all three elements by least squares, weighted by the inverse of
+    :data:`magrl.navigators.base.CURVATURE`. With a pair, it is the paper's parallel approach (Eq. 3-15), which fails
+    where the gradients of the pair are nearly parallel.
 
     Args:
-        field: field model, usually ``env.field``.
+        field: field model or bank of them, usually ``env.field``.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        pair: two elements whose errors shrink in proportion.
+        pair: two elements whose errors shrink in proportion, ``("D", "I")`` in the paper; all three for None.
 
     Raises:
         ValueError: for a bound out of its range, or ``pair`` that is not two different elements.
@@ -34,31 +40,36 @@ class ParallelApproach(Navigator):
     """
 
     oracle = True
+    needs = "the gradient"
 
     def __init__(
         self,
-        field: FieldModel,
+        field: FieldModel | FieldBank,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        pair: Sequence[str] = ("D", "I"),
+        pair: Sequence[str] | None = None,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         self.in_keys = ["field", "target_field", "heading", "position", "step_count"]
-        self.field, self.pair = field, element_indices(pair, 2)
-        if len(self.pair) != 2:
+        self.in_keys += ["region"] if isinstance(field, FieldBank) else []
+        self.field, self.elements = field, element_indices(NAMES if pair is None else pair, 2)
+        if pair is not None and len(pair) != 2:
             raise ValueError(f"pair must be two of D, I, B_H, got {tuple(pair)}")
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:  # noqa: ARG002 - no memory
         return {}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
-        here, there = (seen[key][:, self.pair].double() for key in ("field", "target_field"))
-        gradient = elements_gradient_at(self.field, seen["position"])[:, self.pair]
-        way = displacement_to(there - here, gradient)
-        heading, valid = (x.squeeze(-1) for x in parallel_approach(here, there, gradient))
-        # Where the gradients are nearly parallel, least squares still give a useful heading.
-        wanted = torch.where(valid, heading, torch.atan2(way[:, 1], way[:, 0]))
+        here, there = (seen[key][:, self.elements].double() for key in ("field", "target_field"))
+        index = seen["region"].squeeze(-1) if "region" in self.in_keys else None
+        gradient = elements_gradient_at(self.field, seen["position"], index)[:, self.elements]
+        scale = gradient.new_tensor(CURVATURE)[self.elements]
+        way = displacement_to((there - here) / scale, gradient / scale.unsqueeze(-1))
+        wanted = torch.atan2(way[:, 1], way[:, 0])
+        if len(self.elements) == 2:  # where the two gradients are nearly parallel, least squares still give a heading
+            heading, valid = (x.squeeze(-1) for x in parallel_approach(here, there, gradient))
+            wanted = torch.where(valid, heading, wanted)
         now = seen["heading"].squeeze(-1).double()
         return steer(now, wanted, way.norm(dim=-1), self.max_move_km, self.max_turn_rad)

@@ -1,4 +1,4 @@
-"""Quasi-Newton navigator: a Jacobian of the elements estimated along the vehicle's own track."""
+"""Quasi-Newton navigator that knows nothing in advance: two probing legs give a first Jacobian of the elements."""
 
 from __future__ import annotations
 
@@ -9,121 +9,85 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor
-from magrl.navigators.base import Navigator, displacement_to, element_indices, steer
+from magrl.checks import check_number, check_numbers
+from magrl.field.elements import NAMES
+from magrl.navigators.quasi_newton import QuasiNewton
+from magrl.tracking import GradientPrior
 
-ELEMENT_SCALE = (1.0, 1.0, 0.01)
-"""Factors of D [deg], I [deg], B_H [nT] that make their changes along an episode comparable."""
+SLOPES = (0.004, 0.015, 4.0)
+"""Typical gradient of D, I [deg/km], B_H [nT/km]: what a quasi-Newton navigator without a map expects, in size."""
+SHORTEST_PROBE_KM = 0.5
+"""Length of a probing leg with perfect sensors [km]: the rounding of float32 readings does not matter there."""
 
 
-def broyden_update(jacobian: Tensor, displacement: Tensor, change: Tensor, direction: Tensor | None = None) -> Tensor:
-    """Return a Jacobian after the rank-one update that makes it explain the last move.
+def probe_length(noise: Sequence[float]) -> float:
+    """Return the length of a probing leg [km]: longer legs lengthen the path, shorter ones suffer more from noise.
+
+    The noise of an element is expressed by the way over which the element typically changes as much. A position takes
+    two elements, so that the second smallest of the three counts. The loss by both legs grows with their length p, the
+    loss by the wrong direction with (noise / p)^2; their sum is smallest for p proportional to noise^(2/3). The factor
+    is from ``recipes/tables/probe_sweep.py``.
 
     Args:
-        jacobian: ``(..., E, 2)`` element unit per km, north and east.
-        displacement: ``(..., 2)`` last move, north and east [km].
-        change: ``(..., E)`` change of the elements over the move.
-        direction: ``(..., 2)`` direction of the update, which leaves the Jacobian unchanged across it; by default the
-            displacement.
-
-    Returns:
-        ``(..., E, 2)`` with ``J_new displacement = change``; unchanged where there was no move along ``direction``.
-        NaN in gives NaN out.
+        noise: standard deviations of D [deg], I [deg], B_H [nT].
 
     Raises:
-        ValueError: for shapes that do not match.
-
-    Source:
-        C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, Math. Comp. 19 (1965).
+        ValueError: for other than three numbers, or a negative one.
 
     Example:
-        >>> broyden_update(torch.zeros(1, 2), torch.tensor([10.0, 0.0]), torch.tensor([0.2]))
-        tensor([[0.0200, 0.0000]])
+        >>> [round(probe_length(noise), 1) for noise in ((0, 0, 0), (0.02, 0.02, 2), (0.05, 0.05, 5), (0.1, 0.1, 10))]
+        [0.5, 6.1, 11.2, 17.7]
     """
-    direction = displacement if direction is None else direction
-    check_tensor(2, displacement=displacement, direction=direction)
-    check_tensor(change=change)
-    check_tensor(*change.shape[-1:], 2, jacobian=jacobian)
-    surprise = change - (jacobian @ displacement.unsqueeze(-1)).squeeze(-1)
-    along = (direction * displacement).sum(-1)[..., None, None]
-    rank_one = surprise.unsqueeze(-1) * direction.unsqueeze(-2)
-    still = along <= 1e-9  # False for NaN
-    return torch.where(still, jacobian, jacobian + rank_one / torch.where(still, 1.0, along))
+    check_numbers(3, noise=noise)
+    check_number(0, noise=min(noise))
+    noise_km = sorted(std / slope for std, slope in zip(noise, SLOPES, strict=True))[1]
+    return max(SHORTEST_PROBE_KM, 5.0 * noise_km ** (2 / 3))
 
 
-def project(vector: Tensor, onto: Tensor) -> Tensor:
-    """Return the part of a vector along another, ``(..., 2)``; 0 along a zero vector, NaN where either is NaN.
-
-    Example:
-        >>> project(torch.tensor([3.0, 4.0]), torch.tensor([0.0, 2.0]))
-        tensor([0., 4.])
-    """
-    check_tensor(2, vector=vector, onto=onto)
-    square = onto.square().sum(-1, keepdim=True)
-    return (vector * onto).sum(-1, keepdim=True) / torch.where(square > 0, square, 1.0) * onto
-
-
-class Secant(Navigator):
+class Secant(QuasiNewton):
     """Quasi-Newton navigation with a Jacobian estimated along the vehicle's own track: no map, no training, no oracle.
 
     Two short legs across each other give a first Jacobian of the elements by north and east. From then on each move is
-    a quasi-Newton step to the destination's elements, after which Broyden's update corrects the Jacobian.
+    a quasi-Newton step to the destination's elements, and each reading corrects the Jacobian.
 
     Args:
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        probe_km: length of the two legs [km]. Longer legs lengthen the path, shorter ones suffer more from noise.
-        elements: two elements whose contours cross, or all three by least squares.
+        probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest move.
+        elements: all three by default, each weighted by how well it determines the way; or two of them.
+        noise: standard deviations of the sensors, their data sheet: D [deg], I [deg], B_H [nT].
 
     Raises:
-        ValueError: for a bound or a leg out of its range, or fewer than two elements.
-
-    Source:
-        C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, Math. Comp. 19 (1965).
+        ValueError: for a bound or a leg out of its range, fewer than two elements, or a negative standard deviation.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
         >>> env.rollout(2, Secant())["action"][0].round(decimals=2)
-        tensor([[10.0000,  0.0000],
-                [10.0000,  1.5700]])
+        tensor([[0.5000, 0.0000],
+                [0.5000, 1.5700]])
     """
 
     def __init__(
         self,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        probe_km: float = 10.0,
-        elements: Sequence[str] = ("D", "I"),
+        probe_km: float | None = None,
+        elements: Sequence[str] = NAMES,
+        noise: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad)
+        super().__init__(max_move_km, max_turn_rad, elements, noise)
+        probe_km = min(probe_length(noise), self.max_move_km) if probe_km is None else probe_km
         check_number(0, max_move_km, above=True, probe_km=probe_km)
-        self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
-        self.probe_km, self.elements = float(probe_km), element_indices(elements, 2)
-        self.probe_turn = min(math.pi / 2, self.max_turn_rad)
+        self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)
 
-    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
-        here = self._scaled(seen["field"])
-        leg, jacobian = here.new_zeros(len(here), 2), here.new_zeros(*here.shape, 2)
-        return {"here": here, "jacobian": jacobian, "leg": leg, "decisions": torch.zeros_like(leg[:, 0])}
+    def prior(self, reading: Tensor) -> GradientPrior:
+        std = reading.new_tensor([SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
+        return GradientPrior(reading.new_zeros(*reading.shape, 2), std, torch.zeros_like(reading[:, 0]))
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        here, decisions = self._scaled(seen["field"]), memory["decisions"]
-        heading = seen["heading"].squeeze(-1).double()
-        leg = seen["move"][:, :1].double() * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
-        # The second leg updates the Jacobian only across the first, whatever their angle.
-        fresh = leg - project(leg, memory["leg"])
-        direction = torch.where((decisions == 2).unsqueeze(-1), fresh, leg)
-        jacobian = broyden_update(memory["jacobian"], leg, here - memory["here"], direction)
-        memory.update({"here": here, "jacobian": jacobian, "leg": leg, "decisions": decisions + 1})
-        way = displacement_to(self._scaled(seen["target_field"]) - here, jacobian)
-        wanted = torch.atan2(way[:, 1], way[:, 0])
-        distance, turn = steer(heading, wanted, way.norm(dim=-1), self.max_move_km, self.max_turn_rad)
+        decisions = memory["decisions"]
+        distance, turn = super().decide(seen, memory)
         probe_turn = torch.where(decisions == 1, self.probe_turn, 0.0)
         probing = decisions < 2
         return torch.where(probing, self.probe_km, distance), torch.where(probing, probe_turn, turn)
-
-    def _scaled(self, field: Tensor) -> Tensor:
-        """Return the chosen elements in comparable units, ``(N, E)`` float64."""
-        scale = torch.tensor(ELEMENT_SCALE, dtype=torch.float64, device=field.device)
-        return (field.double() * scale)[:, self.elements]

@@ -1,0 +1,64 @@
+"""Quasi-Newton navigator that starts from the mean Jacobian of a region: what a map of twelve numbers is worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_tensor
+from magrl.field.elements import NAMES
+from magrl.field.model import FieldModel, elements_gradient_at
+from magrl.navigators.quasi_newton import QuasiNewton
+from magrl.tracking import GradientPrior
+
+
+class MeanJacobian(QuasiNewton):
+    """Quasi-Newton navigation from the mean Jacobian of a region, without probing legs.
+
+    The map is twelve numbers: mean and standard deviation over the region of the gradients of D, I, B_H northward and
+    eastward. An agent that is trained in one region can learn as much.
+
+    Args:
+        field: field model, usually ``env.field``.
+        position: ``(..., 2)`` places to average over, latitude, longitude [deg], usually ``env.region.grid(21)``.
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+        elements: two or three of D, I, B_H.
+        noise: standard deviations of the sensors, their data sheet: D [deg], I [deg], B_H [nT].
+
+    Raises:
+        ValueError: for a bound out of its range, fewer than two elements or places, or a negative standard deviation.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> env.rollout(50, MeanJacobian(env.field, env.region.grid(21)))["next", "success"].any()
+        tensor(True)
+    """
+
+    needs = "a map of the region"
+
+    def __init__(
+        self,
+        field: FieldModel,
+        position: Tensor,
+        max_move_km: float = 50.0,
+        max_turn_rad: float = math.pi / 2,
+        elements: Sequence[str] = NAMES,
+        noise: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        super().__init__(max_move_km, max_turn_rad, elements, noise)
+        if not hasattr(field, "value_and_gradient"):
+            raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
+        check_tensor(2, position=position)
+        if position.numel() < 4:
+            raise ValueError(f"position must hold at least two places (..., 2), got shape {tuple(position.shape)}")
+        gradients = elements_gradient_at(field, position.reshape(-1, 2).double())[:, self.elements]
+        self.register_buffer("mean", gradients.mean(0))
+        self.register_buffer("std", gradients.std(0))
+
+    def prior(self, reading: Tensor) -> GradientPrior:
+        return GradientPrior(self.mean.expand(*reading.shape, 2), self.std, torch.zeros_like(reading[:, 0]))
