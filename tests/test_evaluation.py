@@ -14,12 +14,18 @@ import pytest
 import torch
 from test_metrics import episode, point
 
-from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.agents.policy import PolicyConfig
 from magrl.envs import GeomagneticNavEnv, named_tasks
-from magrl.evaluation.navigators import NAVIGATOR_NAMES, arrival_threshold, label, make_navigator
-from magrl.evaluation.tables import comparison_table, spread
+from magrl.evaluation.navigators import (
+    NAVIGATOR_NAMES,
+    PRETRAINED,
+    TRAINED,
+    arrival_threshold,
+    label,
+    make_navigator,
+)
+from magrl.evaluation.tables import comparison_table
 from magrl.training import UsageError
 
 RECIPES = Path(__file__).parent.parent / "recipes"
@@ -99,31 +105,20 @@ def test_table_has_the_papers_row_beside_ours(results: Path) -> None:
     assert labels[:2] == ["Gradient-Guided TD3, paper", "Gradient-Guided TD3"]
     assert "AFSA, flown" in labels
     assert "PSO, look-ahead (an oracle)" in labels
-    assert lines[2].split("|")[3:7] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
-    assert lines[3].split("|")[2] == " 2 "
-    assert "0.0 ± 0.0" in lines[3]  # copies of one run
+    assert lines[2].split("|")[4:8] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
+    assert lines[3].split("|")[2:5] == [" training in the region ", " 2 ", " 0.0 [0.0–0.0] "]  # copies of one run
     assert " — " in lines[3]  # without any success
     short = (results / "short.md").read_text().splitlines()
     assert [line.split("|")[1] for line in short[2:]] == [f" {name} " for name in labels if ", paper" not in name]
 
 
 def test_papers_row_stands_once_for_both_modes_of_an_algorithm() -> None:
-    measures = dict.fromkeys(("success_rate", "trajectory_length_m", "spl", "steps", "navigation_error_km"), 1.0)
-    measures |= dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "field_readings"), 2.0)
-    measures |= {"success_rate_within_10km": 3.0, "success_rate_within_25km": math.nan, "spl_low": 0.5, "spl_high": 1.5}
-    lines = comparison_table({"ga": [measures], "ga:flown": [measures]}, "look-ahead").splitlines()
+    lines = comparison_table({"ga": [{"spl": 1.0}], "ga:flown": [{"spl": 1.0}]}, "look-ahead").splitlines()
     assert [line.split(" | ")[0] for line in lines[2:]] == [
         "| GA, paper",
         "| GA, look-ahead (an oracle)",
         "| GA, flown",
     ]
-    assert lines[4] == "| GA, flown | 1 | 1.0 | 1 | 1.00 (0.50–1.50) | 1.00 | 1.0 | 2.0 | 2.0 | 2.0 | 3.0 | — | 2 |"
-
-
-def test_spread_leaves_out_runs_without_a_value() -> None:
-    assert spread([math.nan, 2.0], ".1f") == "2.0"
-    assert spread([1.0, math.nan, 3.0], ".1f") == f"2.0 ± {math.sqrt(2):.1f}"
-    assert spread([math.nan], ".1f") == "—"
 
 
 def test_paths_are_those_of_the_papers_example(results: Path) -> None:
@@ -138,7 +133,7 @@ def test_paths_are_those_of_the_papers_example(results: Path) -> None:
 def test_every_navigator_has_a_label_and_can_be_made(run: Path) -> None:
     env = GeomagneticNavEnv(num_envs=1, seed=0)
     for name in NAVIGATOR_NAMES:
-        trained = name in ("gg_td3", "td3", "recurrent")
+        trained = name in TRAINED and name not in PRETRAINED
         navigator = make_navigator(f"{name}={run}" if trained else name, env)
         assert navigator(env.reset())["action"].shape == (1, 2)
         assert NAVIGATOR_NAMES[name] in label(name)
@@ -269,10 +264,14 @@ def test_only_bad_usage_is_shown_in_one_line(evaluate, tmp_path: Path, monkeypat
 
 def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, capsys) -> None:
     cases = {
+        "earth_table": ([], "name at least one navigator"),
         "figures": (["--results", str(tmp_path), "--out", str(tmp_path)], "there is no"),
         "learning_table": (["runs/A"], "a run must be given as NAME=RUN, such as gg_td3=runs/A, got 'runs/A'"),
         "path_loss": (["dowsing"], "unknown navigator 'dowsing'"),
+        "probe_sweep": (["--zeta", "5"], "zeta must be below 3, got 5"),
         "publish": ([str(tmp_path / "missing.md")], "there is no document"),
+        "noise_table": ([str(tmp_path)], "there is no"),
+        "random_boxes": (["--boxes", "0"], "count must be a whole number from 1 on, got 0"),
         "results_table": ([str(tmp_path)], "no eval.json"),
         "sweep_metaheuristics": (["--tasks", "0"], "num_tasks must be a whole number from 1 on, got 0"),
     }
@@ -319,7 +318,7 @@ def test_path_loss_takes_every_navigator_once(monkeypatch) -> None:
     assert [line.split(" | ")[0] for line in lines[2:]] == [
         "| PSO, flown",
         "| PSO, look-ahead (an oracle)",
-        "| secant (no training, fair)",
+        "| secant (quasi-Newton)",
     ]
     for texts, message in (([], "name at least one navigator"), (["secant", "secant"], "secant is given twice")):
         with pytest.raises(UsageError, match=message):
@@ -331,7 +330,7 @@ def test_learning_table(run: Path) -> None:
     lines = learning.table({"agent": [run, run]}).splitlines()
     cells = [cell.strip() for cell in lines[2].strip("|").split("|")]
     # frames 0 to 100 at 0, then the mean of 0 and 92, then of 92 and 98, over 300 frames
-    assert cells == ["agent", "2", "200 ± 0", "300 ± 0", f"{(0 + 46 + 95) / 3:.1f} ± 0.0", "90.00 ± 0.00"]
+    assert cells == ["agent", "2", "200 [200–200]", "300 [300–300]", "47.0 [47.0–47.0]", "90.00 [90.00–90.00]"]
     assert learning.reached([1.0, float("nan")], ".0f") == "1, 1 of 2 never"
 
 
@@ -351,22 +350,6 @@ def test_learning_table_names_what_is_wrong_with_a_run(run: Path, tmp_path: Path
         learning.table({"a": [tmp_path]})
 
 
-def test_results_table(run: Path, tmp_path: Path) -> None:
-    table = load("tables/results_table")
-    result = {"seed": 3, "success_rate": 99.5, "spl": 98.0, "trajectory_length_m": 4e5, "steps": 9.0}
-    result |= {"navigation_error_km": 10.0, "success_rate_within_10km": 50.0, "success_rate_within_25km": 90.0}
-    result |= {"training_seconds": 60.0, "seconds_to_97_sr_88_spl": None}
-    (tmp_path / "eval.json").write_text(json.dumps(result))
-    lines = table.table((str(tmp_path),)).splitlines()
-    assert table.table((f"mine={tmp_path}",)).splitlines()[3:] == [lines[3].replace("seed 3", "mine")]
-    assert lines[3] == "| seed 3 | 99.5 | 98.00 | 400000 | 9.00 | 10.0 | 50.0 | 90.0 | 60 | — |"
-    published = paper.TABLE_2["gg_td3"]
-    expected = f"| {published.success_rate:.1f} | {published.spl:.2f} | {published.trajectory_length_m:.0f} |"
-    assert lines[2].startswith(f"| paper {expected}")
-    with pytest.raises(UsageError, match=r"no eval\.json"):
-        table.table((str(run),))
-
-
 def test_publish_fills_every_document_or_none(tmp_path: Path) -> None:
     publish = load("tables/publish")
     (tmp_path / "table.md").write_text("| a |\n")
@@ -379,3 +362,17 @@ def test_publish_fills_every_document_or_none(tmp_path: Path) -> None:
     assert good.read_text() == kept
     publish.publish(publish.Config((good,), root=tmp_path))
     assert good.read_text() == "before\n<!-- table: table.md -->\n\n| a |\n\n<!-- end -->\nafter\n"
+
+
+def test_earth_table_flies_each_navigator_at_each_level() -> None:
+    earth = load("tables/earth_table")
+    config = earth.Config(("geodesic", "secant"), tasks=8, regions=2)
+    lines = earth.table(config).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert cells[0][3:] == ["0, 0, 0", "0.02, 0.02, 2", "0.05, 0.05, 5", "0.1, 0.1, 10", "0.5, 0.1, 20"]
+    assert all(cell.startswith("100.0 / 100.0 / ") for cell in cells[2][3:])  # noise does not reach who knows positions
+    assert cells[3][:3] == ["secant (quasi-Newton)", "nothing", "1"]
+    assert len(set(cells[3][3:])) == 5
+    assert earth.cell([(90.0, 80.0, 10.0), (100.0, 90.0, 12.0)]) == "95.0 / 85.0 [80.0] / 11.0"
+    with pytest.raises(UsageError, match="unknown navigator 'dowsing'"):
+        earth.table(earth.Config(("dowsing",), tasks=2, regions=1))

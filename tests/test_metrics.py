@@ -1,15 +1,25 @@
 """Measures of hand-made episodes: a straight line, a right angle, a failure, one move, standing still."""
 
+import itertools
 import math
+from functools import partial
 
 import pytest
+import scipy.stats
 import torch
 from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import RewardSum, TransformedEnv
 
-from magrl.envs.measures import check_zeta, path_measures, spl
-from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
+from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks, planet_scenario
+from magrl.envs.measures import check_zeta, distance_to_arrival, path_efficiency, path_measures, spl
+from magrl.evaluation.intervals import bootstrap_interval, interquartile_mean, stratified_bootstrap, wilson_interval
 from magrl.evaluation.metrics import episode_measures, first_episode_mask, summarize
+from magrl.evaluation.rollout import evaluation_rollout
+from magrl.field import elements_at
 from magrl.geodesy import geodesic, move
+from magrl.guidance import objective
+from magrl.navigators import Secant
 
 
 def episode(legs: list[tuple[float, float]], target: tuple[float, float], success: bool, steps: int) -> TensorDict:
@@ -54,6 +64,7 @@ def test_straight_line() -> None:
     assert got["length_km"] == pytest.approx(200)
     assert got["shortest_km"] == pytest.approx(200, abs=1e-3)
     assert got["spl"] == pytest.approx(1, abs=1e-5)
+    assert got["path_efficiency"] == pytest.approx(1, abs=1e-5)
     assert got["navigation_error_km"] == pytest.approx(0, abs=0.1)
     assert got["smoothness_deg"] == pytest.approx(180, abs=1e-4)
     assert got["heading_mae_deg"] == pytest.approx(0, abs=0.2)  # the bearing turns a little along the geodesic
@@ -71,6 +82,7 @@ def test_right_angle() -> None:
 
 def test_failure_counts_nothing_towards_spl() -> None:
     got = measures([(50.0, 180.0)] * 6, point(300.0, 0.0), False)
+    assert got["path_efficiency"] == pytest.approx(1, abs=1e-5)  # straight, but away
     assert got["success"] == 0
     assert got["spl"] == 0
     assert got["steps"] == 6
@@ -91,6 +103,15 @@ def test_arrival_without_leaving() -> None:
     assert got["length_km"] == 0
     assert got["spl"] == 1
     assert math.isnan(got["heading_mae_deg"])
+    assert math.isnan(got["path_efficiency"])
+
+
+def test_path_efficiency_is_that_of_the_way_made() -> None:
+    """There and back again: 20 km away after 80 km, whatever the destination; never above 1 by rounding."""
+    for target, success in (((20.0, 0.0), True), ((300.0, 90.0), False)):
+        got = measures([(50.0, 0.0), (30.0, 180.0)], point(*target), success)
+        assert got["path_efficiency"] == pytest.approx(0.25, abs=1e-6)
+    assert path_efficiency(torch.tensor([50.1, 10.0]), torch.tensor([50.0, 40.0])).tolist() == [1.0, 0.25]
 
 
 @pytest.mark.parametrize(("success", "distance", "expected"), [(True, 0.0, 1), (False, 0.0, 0), (True, 5.0, 0)])
@@ -165,6 +186,7 @@ def test_path_measures_by_hand() -> None:
         pytest.approx(0, abs=1e-6),
         pytest.approx(0.5, abs=1e-6),
     ]
+    assert got["path_efficiency"].item() == pytest.approx(0.5, abs=1e-6)
     got = path_measures(torch.tensor([False]), start, end, target, torch.tensor([111.3195]))
     assert got["navigation_error_km"].item() == pytest.approx(110.5744, abs=1e-4)
     assert (got["spl"].item(), got["length_km"].item()) == (0, pytest.approx(111.3195))
@@ -180,6 +202,7 @@ def test_summary_of_one_success_and_one_failure() -> None:
         "length_km": torch.tensor([500.0, 1000.0]),
         "navigation_error_km": torch.tensor([8.0, 20.0]),
         "spl": torch.tensor([0.8, 0.0]),
+        "path_efficiency": torch.tensor([0.75, math.nan]),
         "smoothness_deg": torch.tensor([170.0, 90.0]),
         "heading_mae_deg": torch.tensor([5.0, 90.0]),
         "heading_rmse_deg": torch.tensor([6.0, 95.0]),
@@ -190,6 +213,10 @@ def test_summary_of_one_success_and_one_failure() -> None:
     assert summary["success_rate_within_25km"] == 100
     assert summary["spl"] == pytest.approx(40)
     assert (summary["spl_low"], summary["spl_high"]) == pytest.approx((0, 80))  # of two values, both or neither
+    assert [summary[f"path_efficiency{end}"] for end in ("", "_low", "_high")] == [75, 75, 75]  # one of them moved
+    assert "spl_to_arrival" not in summary
+    summary |= summarize(episodes | {"spl_to_arrival": torch.tensor([0.6, 0.0])})
+    assert [summary[f"spl_to_arrival{end}"] for end in ("", "_low", "_high")] == pytest.approx([30, 0, 60])
     assert summary["trajectory_length_m"] == 500_000
     assert summary["trajectory_length_m_all"] == 750_000
     assert (summary["steps"], summary["steps_all"]) == (10, 30)
@@ -201,7 +228,8 @@ def test_summary_of_one_success_and_one_failure() -> None:
 
 def test_summary_at_the_edge_of_a_distance_and_of_two_paths() -> None:
     """Ten kilometers are within ten; the mean of two values, drawn anew, is one of them or between."""
-    episodes = dict.fromkeys(("length_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.ones(2))
+    ones = ("length_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency")
+    episodes = dict.fromkeys(ones, torch.ones(2))
     episodes |= {"success": torch.tensor([True, True]), "steps": torch.tensor([9, 9])}
     summary = summarize(
         episodes | {"navigation_error_km": torch.tensor([10.0, 25.0]), "spl": torch.tensor([0.5, 0.75])}
@@ -214,6 +242,8 @@ def test_summary_without_success_is_nan_and_not_zero() -> None:
     episodes = episode_measures(episode([(50.0, 180.0)] * 3, point(300.0, 0.0), False, 3))
     assert math.isnan(summarize(episodes)["steps"])
     assert summarize(episodes)["spl"] == 0
+    nowhere = {**episodes, "path_efficiency": torch.full((1,), math.nan)}
+    assert all(math.isnan(summarize(nowhere)[f"path_efficiency{end}"]) for end in ("", "_low", "_high"))
 
 
 def test_wilson_interval() -> None:
@@ -246,6 +276,157 @@ def test_bootstrap_interval_of_one_draw_is_that_draw() -> None:
     assert low == high
 
 
+def test_interquartile_mean_by_hand() -> None:
+    """A quarter of 4, 5 and 20 values is 1, 1 and 5; of fewer than 4 nothing is left out."""
+    assert interquartile_mean(torch.tensor([10.0, 1.0, 2.0, 0.0])).item() == 1.5
+    assert interquartile_mean(torch.tensor([[-90.0, 1.0, 2.0, 3.0, 90.0], [1.0, 1.0, 1.0, 9.0, 9.0]])).tolist() == [
+        2,
+        pytest.approx(11 / 3),
+    ]
+    assert interquartile_mean(torch.arange(20.0) ** 2).item() == sum(x * x for x in range(5, 15)) / 10
+    assert interquartile_mean(torch.tensor([1.0, 2.0, 9.0])).item() == 4
+    assert interquartile_mean(torch.tensor([1.0, 2.0, 3.0, math.nan])).isnan()
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 7, 20, 41])
+def test_interquartile_mean_is_that_of_scipy(count: int) -> None:
+    values = torch.rand(6, count, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
+    expected = scipy.stats.trim_mean(values.numpy(), 0.25, axis=1)
+    assert interquartile_mean(values).numpy() == pytest.approx(expected, abs=1e-12)
+
+
+def scores(count: int, seed: int = 0) -> Tensor:
+    return 99 - torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 2
+
+
+def test_stratified_bootstrap_is_that_of_scipy() -> None:
+    """Of one stratum; both ends within the noise of 10 000 resamples."""
+    values = scores(20)
+    expected = scipy.stats.bootstrap(
+        (values.numpy(),),
+        lambda x, axis: scipy.stats.trim_mean(x, 0.25, axis),
+        n_resamples=10_000,
+        method="percentile",
+        rng=1,
+    ).confidence_interval
+    assert stratified_bootstrap([values]) == pytest.approx(tuple(expected), abs=0.01)
+
+
+def test_stratified_bootstrap_draws_within_strata() -> None:
+    """Two groups without any spread: every resample has as many of each, so that the mean is always the same."""
+    low, high = torch.zeros(10), torch.full((10,), 100.0)
+    assert stratified_bootstrap([low, high]) == (50, 50)
+    pooled = stratified_bootstrap([torch.cat((low, high))])
+    assert pooled[0] < 20
+    assert pooled[1] > 80
+
+
+def test_stratified_bootstrap_shrinks_holds_the_mean_and_repeats() -> None:
+    widths = []
+    for count in (5, 20, 80, 320):
+        values = scores(count)
+        low, high = stratified_bootstrap([values])
+        assert low < interquartile_mean(values).item() < high
+        assert stratified_bootstrap([values]) == (low, high)
+        widths.append(high - low)
+    ratios = [after / before for before, after in itertools.pairwise(widths)]
+    assert stratified_bootstrap([values], seed=1) != (low, high)
+    assert all(0.3 < ratio < 0.75 for ratio in ratios), ratios  # four times the runs, half the width
+    assert all(math.isnan(end) for end in stratified_bootstrap([torch.tensor([1.0, math.nan])]))
+
+
+def test_stratified_bootstrap_holds_the_truth() -> None:
+    """In 95 % of 300 experiments of 20 normal scores: 285, and 271 or more in all but one of 10 000 repetitions."""
+    draws = torch.randn(300, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ends = [stratified_bootstrap([row], resamples=500) for row in draws]
+    assert 271 <= sum(low <= 0 <= high for low, high in ends) <= 297
+
+
+def nearest_on_grids(env: GeomagneticNavEnv, state: TensorDict, task: int, half_km: float) -> float:
+    """Return the distance to the nearest place of arrival on a grid, and on finer ones around that place: to 0.5 m."""
+    row = state[task : task + 1]
+    center, nearest = torch.zeros(2, 1, dtype=torch.float64), math.inf
+    for _ in range(4):
+        line = torch.linspace(-half_km, half_km, 121, dtype=torch.float64)
+        north, east = torch.cartesian_prod(line, line).T + center
+        places = torch.stack(move(*row["target_position"].T, torch.atan2(east, north), torch.hypot(north, east)), -1)
+        weights, target_field = row["objective_weights"].double(), row["target_field"].double()
+        f = objective(elements_at(env.field, places), target_field, weights)
+        inside = ((f < env.zeta) & env.edge.contains(places)).squeeze(-1)
+        distance_km, _ = geodesic(*row["start_position"].T, *places[inside].T)
+        nearest, index = (x.item() for x in distance_km.min(0))
+        center, half_km = torch.stack((north[inside], east[inside]))[:, index : index + 1], half_km / 20
+    return nearest
+
+
+def arrival_km(env: GeomagneticNavEnv, state: TensorDict) -> Tensor:
+    keys = ("start_position", "target_position", "objective_weights")
+    return distance_to_arrival(*(state[key] for key in keys), env.field, env.zeta, env.edge)
+
+
+@pytest.mark.parametrize(("zeta", "half_km"), [(0.001, 30.0), (0.01, 90.0), (0.1, 200.0)])
+def test_distance_to_arrival_is_that_of_a_search_on_grids(zeta: float, half_km: float) -> None:
+    env = GeomagneticNavEnv(num_envs=4, seed=2, zeta=zeta)
+    state = env.reset()
+    expected = [nearest_on_grids(env, state, task, half_km) for task in range(4)]
+    assert arrival_km(env, state).tolist() == pytest.approx(expected, abs=0.02)
+
+
+def test_places_outside_the_region_are_no_arrival() -> None:
+    """The destination lies on the northern edge and the start beyond it: the nearest place is on the edge."""
+    tasks = Tasks(torch.tensor([[-3.0, 165.0]]).double(), torch.tensor([[-6.0, 165.0]]).double())
+    env = GeomagneticNavEnv(Scenario(tasks=tasks), seed=0)
+    state = env.reset()
+    free_km = arrival_km(env, state).item()
+    env.edge = Region((-12.0, -6.0), (158.0, 172.0))
+    meridian_km, _ = geodesic(*tasks.start.T, *tasks.target.T)
+    assert arrival_km(env, state).item() == pytest.approx(meridian_km.item(), abs=0.01)
+    assert free_km < meridian_km.item() - 10
+
+
+def test_spl_to_arrival_is_weighted_by_the_nearer_distance() -> None:
+    env = GeomagneticNavEnv(num_envs=8, seed=0)
+    near_km = arrival_km(env, env.reset())
+    env.set_seed(0)
+    transformed = TransformedEnv(env, RewardSum())
+    rollout = evaluation_rollout(transformed, Secant(probe_km=10))
+    got = episode_measures(rollout, transformed)
+    assert got["success"].all()
+    assert got["spl_to_arrival"].tolist() == pytest.approx((near_km / got["length_km"]).tolist())
+    assert (got["spl_to_arrival"] < got["spl"]).all()
+    assert "spl_to_arrival" not in episode_measures(rollout)
+
+
+def test_each_of_many_regions_has_its_own_field() -> None:
+    """Tasks in three regions of other planets: as in an environment of each region alone."""
+    many = planet_scenario(3, seed=0)
+    env = GeomagneticNavEnv(many, num_envs=6, seed=0)
+    rollout = env.rollout(1)
+    start, target, weights, region = (
+        rollout[key][:, 0] for key in ("start_position", "target_position", "objective_weights", "region")
+    )
+    got = distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region.squeeze(-1))
+    assert len(region.unique()) > 1
+    for task, index in enumerate(region.flatten().tolist()):
+        alone = partial(env.field, index=torch.tensor(index))
+        alone.value_and_gradient = partial(env.field.value_and_gradient, index=torch.tensor(index))
+        row = (x[task : task + 1] for x in (start, target, weights))
+        expected = distance_to_arrival(*row, alone, env.zeta, env.edge[index])
+        assert got[task].item() == pytest.approx(expected.item(), abs=1e-6)
+    assert episode_measures(rollout, env)["spl_to_arrival"].isfinite().all()
+
+
+def test_an_episode_without_a_way_is_measured_without_nan() -> None:
+    """The vehicle starts where it has arrived, and stays there or moves."""
+    here = torch.tensor([[-5.0, 165.0]] * 2).double()
+    env = GeomagneticNavEnv(num_envs=2, seed=0)
+    state = env.reset().update({"start_position": here, "target_position": here})
+    assert arrival_km(env, state).tolist() == [0, 0]
+    beside = state.update({"start_position": here + 0.001})
+    assert arrival_km(env, beside).tolist() == [0, 0]
+    assert spl(torch.tensor([True, True]), arrival_km(env, state), torch.tensor([0.0, 5.0])).tolist() == [1, 0]
+
+
 def test_shortest_is_the_geodesic() -> None:
     target = (-8.0, 164.0)
     expected, _ = geodesic(*torch.tensor([-5.0, 165.0, *target], dtype=torch.float64))
@@ -265,6 +446,14 @@ def test_shortest_is_the_geodesic() -> None:
             "resamples must be a whole number from 1 on, got 1.5",
         ),
         (lambda: bootstrap_interval(torch.ones(3), 1, 0.5), ValueError, "seed must be a whole number, got 0.5"),
+        (lambda: interquartile_mean([1.0]), TypeError, "values must be a tensor"),
+        (lambda: interquartile_mean(torch.zeros(2, 0)), ValueError, r"values must be of shape \(\.\.\., R\).*\(2, 0\)"),
+        (lambda: interquartile_mean(torch.tensor(1.0)), ValueError, r"values must be of shape .*\(\)"),
+        (lambda: stratified_bootstrap([]), ValueError, r"strata must each be of shape \(R,\) with R >= 1, got \[\]"),
+        (lambda: stratified_bootstrap([torch.ones(2), torch.ones(0)]), ValueError, r"strata .*\[\(2,\), \(0,\)\]"),
+        (lambda: stratified_bootstrap([[1.0]]), TypeError, "stratum 0 must be a tensor"),
+        (lambda: stratified_bootstrap(5), TypeError, "strata must be a Sequence, got 5"),
+        (lambda: stratified_bootstrap([torch.ones(2)], 0), ValueError, "resamples must be a whole number from 1 on"),
         (lambda: wilson_interval(1.01, 10), ValueError, "rate must be a finite number from 0 up to 1, got 1.01"),
         (lambda: wilson_interval(-0.01, 10), ValueError, "rate must be a finite number from 0 up to 1, got -0.01"),
         (lambda: wilson_interval(0.5, 0), ValueError, "count must be a whole number from 1 on, got 0"),
@@ -294,6 +483,13 @@ def test_measures_refuse_what_they_cannot_use() -> None:
         (lambda: path_measures(flags, places[:, :1], places, places, lengths), ValueError, r"start .*\(2, 1\)"),
         (lambda: path_measures(flags, places, places[:, :1], places, lengths), ValueError, r"end .*\(2, 1\)"),
         (lambda: path_measures(flags, places, places, places[:, :1], lengths), ValueError, r"target .*\(2, 1\)"),
+        (lambda: path_efficiency(1.0, lengths), TypeError, "straight_km must be a tensor"),
+        (
+            lambda: distance_to_arrival(flags, places, places, None, 0.01, None),
+            TypeError,
+            "start must hold real numbers",
+        ),
+        (lambda: distance_to_arrival(places, places, places, None, 0.01, None), ValueError, r"weights must have"),
         (lambda: first_episode_mask([True]), TypeError, r"done must be a Tensor, got \[True\]"),
         (lambda: first_episode_mask(torch.zeros(2, 3)), ValueError, "done must be bool of shape"),
         (lambda: first_episode_mask(flags), ValueError, r"done must be bool of shape .*\(2,\)"),

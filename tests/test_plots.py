@@ -10,7 +10,9 @@ from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import plots
 from magrl.evaluation.metrics import first_episode_mask
+from magrl.evaluation.navigators import NAVIGATOR_NAMES
 from magrl.field import IGRF
+from magrl.navigators import NAVIGATORS
 from magrl.training.statistics import RETURN_TERMS
 
 
@@ -105,3 +107,27 @@ def test_paths_across_the_antimeridian_do_not_jump() -> None:
     figure = plots.Figure()
     draw_tracks(figure.subplots(), IGRF(2025.0), region, [env.track(0)], target)
     assert max(abs(np.diff(line.get_xdata())).max() for line in figure.axes[0].lines if len(line.get_xdata()) > 1) < 5
+
+
+def test_every_navigator_has_a_color_of_its_own() -> None:
+    names = {*NAVIGATOR_NAMES, *NAVIGATORS}
+    assert plots.NAVIGATOR_COLORS.keys() == names
+    assert len(set(plots.NAVIGATOR_COLORS.values())) == len(names)
+
+
+def test_noise_figure_shows_average_and_range_of_runs() -> None:
+    """Four runs of one navigator, one run of another that did not fly at the second level, in its mode."""
+    runs = [{"spl": spl} for spl in (80.0, 90.0, 92.0, 99.0)]
+    levels = {"none": {"gg_td3": runs, "ga": [{"spl": 5.0}]}, "high": {"gg_td3": [{"spl": 70.0}, {"spl": None}]}}
+    axes = plots.noise_figure(levels, "flown").axes[0]
+    assert [line.get_ydata().tolist() for line in axes.lines] == [[91, 70], pytest.approx([5, math.nan], nan_ok=True)]
+    assert [line.get_linestyle() for line in axes.lines] == ["-", "--"]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["Gradient-Guided TD3", "GA, flown"]
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["none", "high"]
+    edge = axes.collections[0].get_paths()[0].vertices
+    assert {tuple(point) for point in edge} == {(0, 80), (0, 99), (1, 70)}
+    for levels in ({}, {"none": {}}):
+        with pytest.raises(ValueError, match="at least one navigator"):
+            plots.noise_figure(levels)
+    with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
+        plots.noise_figure({"none": {"dowsing": runs}})

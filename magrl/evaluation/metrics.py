@@ -11,9 +11,11 @@ import math
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from magrl.checks import check_type
-from magrl.envs.measures import path_measures
+from magrl.envs import GeomagneticNavEnv
+from magrl.envs.measures import distance_to_arrival, path_measures, spl
 from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
 from magrl.geodesy import geodesic, wrap_angle
 
@@ -45,19 +47,23 @@ def first_episode_mask(done: Tensor) -> Tensor:
     return done.long().cumsum(1) - done.long() == 0
 
 
-def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
+def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = None) -> dict[str, Tensor]:
     """Return the measures of the first episode of each vehicle.
 
     Args:
         rollout: ``(M, T)`` from ``env.rollout``, with the keys of :class:`magrl.envs.GeomagneticNavEnv`.
+        env: environment of the rollout, or transforms around it, for ``spl_to_arrival``.
 
     Returns:
-        Tensors ``(M,)``: ``success`` bool; ``steps``; ``shortest_km``, ``length_km``, ``navigation_error_km`` and
-        ``spl`` as in :func:`magrl.envs.measures.path_measures`; ``smoothness_deg``, the mean interior angle at
-        way-points (180 is straight, NaN without way-points); ``heading_mae_deg`` and ``heading_rmse_deg``, deviations
-        from the bearing to the destination over the moves of nonzero length (NaN without any).
+        Tensors ``(M,)``: ``success`` bool; ``steps``; ``shortest_km``, ``length_km``, ``navigation_error_km``, ``spl``
+        and ``path_efficiency`` as in :func:`magrl.envs.measures.path_measures`; ``smoothness_deg``, the mean interior
+        angle at way-points (180 is straight, NaN without way-points); ``heading_mae_deg`` and ``heading_rmse_deg``,
+        deviations from the bearing to the destination over the moves of nonzero length (NaN without any); with ``env``
+        also ``spl_to_arrival``, the SPL whose shortest path leads to the nearest place where a vehicle has arrived
+        (:func:`magrl.envs.measures.distance_to_arrival`) instead of to the destination.
 
     Raises:
+        TypeError: for an ``env`` that is no environment.
         ValueError: for a rollout of other dimensions, or without a vehicle or a step.
         KeyError: for a missing key.
 
@@ -80,7 +86,7 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
     end = rollout["next", "position"].gather(1, last.unsqueeze(-1).expand(-1, 1, 2)).squeeze(1)
     length_km = (rollout["next", "move"][..., 0].double() * valid).sum(1)
     deviation = _heading_deviation(rollout, valid)
-    return {
+    measures = {
         "success": success,
         "steps": steps,
         **path_measures(success, start, end, target, length_km),
@@ -88,6 +94,13 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
         "heading_mae_deg": deviation.nanmean(1),
         "heading_rmse_deg": (deviation**2).nanmean(1).sqrt(),
     }
+    if env is not None:
+        check_type(EnvBase, env=env)
+        weights, region = rollout["objective_weights"][:, 0], rollout.get("region", None)
+        region = None if region is None else region[:, 0, 0]
+        near_km = distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region)
+        measures["spl_to_arrival"] = spl(success, near_km, length_km)
+    return measures
 
 
 def _moving(rollout: TensorDictBase, valid: Tensor) -> Tensor:
@@ -123,9 +136,10 @@ def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
         ``success_rate`` [%] with its Wilson 95 % interval ``success_rate_low`` and ``success_rate_high``;
         ``success_rate_within_10km`` and ``success_rate_within_25km`` [%], the share of episodes that end within that
         distance of the destination, whatever the field there; ``spl`` [%] with its bootstrap 95 % interval
-        ``spl_low`` and ``spl_high``; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper,
-        and with the suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``,
-        ``heading_mae_deg`` and ``heading_rmse_deg`` over successes; ``num_tasks``. Means over no success are NaN.
+        ``spl_low`` and ``spl_high``, likewise ``path_efficiency`` over the episodes that moved, and ``spl_to_arrival``
+        where it was measured; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper, and with
+        the suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
+        ``heading_rmse_deg`` over successes; ``num_tasks``. Means over no episode are NaN.
 
     Raises:
         ValueError: for no episode, or ``success`` that is not bool.
@@ -134,7 +148,7 @@ def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
     Example:
         >>> length_km, error_km = torch.tensor([500.0, 480.0]), torch.tensor([8.0, 200.0])
         >>> ends = {"success": torch.tensor([True, False]), "steps": torch.tensor([10, 50])}
-        >>> ends["spl"] = torch.tensor([0.8, 0.0])
+        >>> ends |= {"spl": torch.tensor([0.8, 0.0]), "path_efficiency": torch.tensor([0.8, 0.3])}
         >>> angles = dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.zeros(2))
         >>> summary = summarize({**ends, **angles, "length_km": length_km, "navigation_error_km": error_km})
         >>> summary["success_rate"], summary["trajectory_length_m"], summary["steps"]
@@ -146,11 +160,13 @@ def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
     count = len(success)
     rate = success.double().mean().item()
     low, high = wilson_interval(rate, count)
-    error, spl = episodes["navigation_error_km"], episodes["spl"]
+    error = episodes["navigation_error_km"]
     summary = {"success_rate": 100 * rate, "success_rate_low": 100 * low, "success_rate_high": 100 * high}
     summary |= {f"success_rate_within_{d}km": 100 * (error <= d).double().mean().item() for d in WITHIN_KM}
-    low, high = bootstrap_interval(spl)
-    summary |= {"spl": 100 * spl.mean().item(), "spl_low": 100 * low, "spl_high": 100 * high}
+    efficiency = episodes["path_efficiency"]
+    summary |= _percent("spl", episodes["spl"]) | _percent("path_efficiency", efficiency[~efficiency.isnan()])
+    if "spl_to_arrival" in episodes:
+        summary |= _percent("spl_to_arrival", episodes["spl_to_arrival"])
     summary["trajectory_length_m"] = 1000 * episodes["length_km"][success].mean().item()
     summary["trajectory_length_m_all"] = 1000 * episodes["length_km"].mean().item()
     summary["steps"] = episodes["steps"][success].double().mean().item()
@@ -158,3 +174,9 @@ def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
     for name in ("navigation_error_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"):
         summary[name] = episodes[name][success].nanmean().item()
     return summary | {"num_tasks": count}
+
+
+def _percent(name: str, values: Tensor) -> dict[str, float]:
+    """Return a mean [%] and its bootstrap 95 % interval; NaN of no values."""
+    low, high = bootstrap_interval(values) if len(values) else (math.nan, math.nan)
+    return {name: 100 * values.mean().item(), f"{name}_low": 100 * low, f"{name}_high": 100 * high}

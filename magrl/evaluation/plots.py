@@ -18,14 +18,19 @@ from magrl.checks import check_number, check_type
 from magrl.envs.region import Region
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours, draw_tracks
 from magrl.envs.tasks import Tasks
+from magrl.evaluation.intervals import interquartile_mean
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import NAVIGATOR_NAMES
+from magrl.evaluation.navigators import label as navigator_label
+from magrl.evaluation.tables import Summaries, known_values
 from magrl.field.elements import NAMES, UNITS
 from magrl.field.model import FieldModel, elements_at
+from magrl.navigators import NAVIGATORS
 
-_COLORS = ("#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
+_COLORS += ["#882255", "#332288", "#44AA99", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
 
-NAVIGATOR_COLORS = dict(zip(NAVIGATOR_NAMES, _COLORS, strict=True))
+NAVIGATOR_COLORS = dict(zip(dict.fromkeys((*NAVIGATOR_NAMES, *NAVIGATORS)), _COLORS, strict=False))
 """Color of each navigator in every figure."""
 
 LINES = ("#0072B2", "#D55E00", "#009E73")
@@ -259,4 +264,40 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
         axes.set_xticks(range(1, len(names) + 1), names)
         axes.set(ylabel=label, title=f"({letter})")
         axes.grid(alpha=0.3, axis="y")
+    return figure
+
+
+def noise_figure(levels: Mapping[str, Summaries], mode: str = "look-ahead") -> Figure:
+    """Return SPL over the noise level: a line for each navigator, and the range of its runs where it has several.
+
+    Args:
+        levels: by noise level, lowest first, the summaries of the runs of each navigator. A level that a navigator did
+            not fly, or flew without an SPL, leaves a gap.
+        mode: mode of metaheuristics without one in their name; ``flown`` is drawn dashed.
+
+    Raises:
+        ValueError: for an unknown navigator, or none.
+
+    Example:
+        >>> levels = {"no noise": {"secant": [{"spl": 99.0}]}, "0.1°, 0.1°, 10 nT": {"secant": [{"spl": 60.0}]}}
+        >>> noise_figure(levels).axes[0].lines[0].get_ydata().tolist()
+        [99.0, 60.0]
+    """
+    names = dict.fromkeys(name for summaries in levels.values() for name in summaries)
+    if not names:
+        raise ValueError(f"levels must hold the summaries of at least one navigator, got {dict(levels)}")
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
+    for name in names:
+        text = navigator_label(name, mode).partition(" (")[0]
+        color, line = NAVIGATOR_COLORS[name.partition(":")[0]], "--" if text.endswith("flown") else "-"
+        runs = [known_values(run.get("spl") for run in summaries.get(name, ())) for summaries in levels.values()]
+        middle = [interquartile_mean(torch.tensor(values)).item() if values else np.nan for values in runs]
+        low, high = ([end(values, default=np.nan) for values in runs] for end in (min, max))
+        axes.plot(middle, marker="o", ms=4, lw=1.5, ls=line, color=color, label=text)
+        axes.fill_between(range(len(runs)), low, high, color=color, alpha=0.2, lw=0)
+    axes.set_xticks(range(len(levels)), list(levels))
+    axes.set(xlabel="standard deviations of the readings of D, I, $B_H$", ylabel="SPL [%]")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
     return figure

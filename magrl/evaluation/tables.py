@@ -1,57 +1,95 @@
-"""Markdown tables that compare navigators, with the paper's results beside them."""
+"""Markdown tables that compare navigators, with the paper's results beside them.
+
+Several runs of a navigator are shown by their interquartile mean, a single one by its mean over the tasks. Parentheses
+hold 95 % intervals: over runs for ten runs or more (stratified bootstrap), over tasks for a single run. Brackets hold
+the smallest and largest of two to nine runs, for which a bootstrap interval would be too narrow.
+"""
 
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Iterable, Mapping, Sequence
 
-from magrl import paper
-from magrl.evaluation.navigators import NAVIGATOR_NAMES, label
+import torch
 
-Summaries = Mapping[str, Sequence[Mapping[str, float]]]
-"""By navigator, one summary (:func:`magrl.evaluation.summarize`) for each of its runs."""
+from magrl import paper
+from magrl.evaluation.intervals import interquartile_mean, stratified_bootstrap
+from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, needs
+
+Summary = Mapping[str, float | None]
+"""From :func:`magrl.evaluation.summarize`; a measure without a value is NaN, or None where it was read from a file."""
+
+Summaries = Mapping[str, Sequence[Summary]]
+"""By navigator, a summary of each of its runs."""
+
+MIN_RUNS = 10
+"""Fewest runs whose bootstrap interval holds the true mean about as often as it says."""
 
 COLUMNS = {
     "SR %": ("success_rate", ".1f"),
     "TL m": ("trajectory_length_m", ".0f"),
     "SPL %": ("spl", ".2f"),
     "TNT steps": ("steps", ".2f"),
+    "worst run, SPL %": ("worst", ".2f"),
+    "SPL to arrival %": ("spl_to_arrival", ".2f"),
+    "path efficiency %": ("path_efficiency", ".2f"),
     "NE km": ("navigation_error_km", ".1f"),
+    "within 10 km %": ("success_rate_within_10km", ".1f"),
     "smoothness °": ("smoothness_deg", ".1f"),
     "MAE °": ("heading_mae_deg", ".1f"),
-    "RMSE °": ("heading_rmse_deg", ".1f"),
-    "within 10 km %": ("success_rate_within_10km", ".1f"),
-    "within 25 km %": ("success_rate_within_25km", ".1f"),
     "readings": ("field_readings", ".0f"),
 }
-"""Heading, measure and number format of the columns of :func:`comparison_table`; the first four are the paper's."""
+"""Heading, measure (or :func:`worst`) and number format of :func:`comparison_table`; the first four are the paper's."""
 
 SHORT_COLUMNS = {
     "SR %": ("success_rate", ".1f"),
     "SPL %": ("spl", ".1f"),
+    "worst run, SPL %": ("worst", ".1f"),
     "TNT steps": ("steps", ".1f"),
     "NE km": ("navigation_error_km", ".1f"),
 }
 """The same of :func:`short_table`."""
 
+INTERVALS = ("success_rate", "spl", "spl_to_arrival", "path_efficiency", "steps")
+"""Measures that are shown with an interval."""
 
-def spread(values: Iterable[float], form: str) -> str:
-    """Return the mean of the finite values, with their standard deviation where there are several.
 
-    Args:
-        values: one value for each run; NaN where a run has none.
-        form: number format.
+def known_values(values: Iterable[float | None]) -> list[float]:
+    """Return the values that are neither None, NaN nor infinite.
 
     Example:
-        >>> spread([1.0, 3.0, float("nan")], ".1f"), spread([2.0], ".0f"), spread([], ".0f")
-        ('2.0 ± 1.4', '2', '—')
+        >>> known_values([1.0, math.nan, None])
+        [1.0]
     """
-    known = [value for value in values if math.isfinite(value)]
-    if not known:
+    return [value for value in values if value is not None and math.isfinite(value)]
+
+
+def mean_of_runs(*strata: Iterable[float | None], form: str, interval: bool = True) -> str:
+    """Return the interquartile mean over runs with its interval, or with the range of fewer than ten runs.
+
+    Args:
+        strata: values of the runs of each stratum (:func:`magrl.evaluation.intervals.stratified_bootstrap`); NaN or
+            None where a run has none.
+        form: number format.
+        interval: whether interval or range are shown.
+
+    Example:
+        >>> mean_of_runs([98.0, 99.0, 99.0, 100.0, None], form=".1f"), mean_of_runs([99.0] * 10, form=".0f")
+        ('99.0 [98.0–100.0]', '99 (99–99)')
+        >>> mean_of_runs([99.0], form=".1f"), mean_of_runs([], form=".1f")
+        ('99.0', '—')
+    """
+    scores = [torch.tensor(values, dtype=torch.float64) for stratum in strata if (values := known_values(stratum))]
+    if not scores:
         return "—"
-    text = format(statistics.fmean(known), form)
-    return text if len(known) == 1 else f"{text} ± {format(statistics.stdev(known), form)}"
+    runs = torch.cat(scores)
+    text = format(interquartile_mean(runs).item(), form)
+    if len(runs) == 1 or not interval:
+        return text
+    if len(runs) < MIN_RUNS:
+        return f"{text} [{runs.min():{form}}–{runs.max():{form}}]"
+    low, high = stratified_bootstrap(scores)
+    return f"{text} ({low:{form}}–{high:{form}})"
 
 
 def row(*cells: object) -> str:
@@ -81,9 +119,7 @@ def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> 
 
 
 def comparison_table(summaries: Summaries, mode: str = "look-ahead") -> str:
-    """Return the paper's Table 2 and the measures of Fig. 4-6 for navigators, below the paper's own rows.
-
-    Several runs show mean ± standard deviation; one run shows the 95 % interval over tasks where a measure has one.
+    """Return the paper's Table 2 and further measures for navigators, below the paper's own rows.
 
     Args:
         summaries: by navigator, one summary for each run, with ``field_readings``.
@@ -91,12 +127,11 @@ def comparison_table(summaries: Summaries, mode: str = "look-ahead") -> str:
 
     Raises:
         ValueError: for an unknown navigator.
-        KeyError: for a missing measure.
 
     Example:
         >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
         >>> print(comparison_table({"td3": [measures]}).splitlines()[2])
-        | TD3, paper | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — |
+        | TD3, paper | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — |
     """
     rows: list[list[object]] = []
     published = set()
@@ -104,9 +139,9 @@ def comparison_table(summaries: Summaries, mode: str = "look-ahead") -> str:
         base = name.partition(":")[0]
         if base in paper.TABLE_2 and base not in published:
             published.add(base)
-            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", 1, *_published(base)])
-        rows.append([label(name, mode), len(results), *(_cell(results, *column) for column in COLUMNS.values())])
-    return markdown_table(["navigator", "runs", *COLUMNS], rows) + "\n"
+            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", 1, *_published(base)])
+        rows.append([label(name, mode), needs(name, mode), len(results), *_cells(results, COLUMNS)])
+    return markdown_table(["navigator", "needs", "runs", *COLUMNS], rows) + "\n"
 
 
 def _published(name: str) -> list[str]:
@@ -114,12 +149,36 @@ def _published(name: str) -> list[str]:
     return [format(values[key], form) if key in values else "—" for key, form in COLUMNS.values()]
 
 
-def _cell(results: Sequence[Mapping[str, float]], key: str, form: str) -> str:
-    text = spread([result[key] for result in results], form)
-    if len(results) > 1 or f"{key}_low" not in results[0]:
-        return text
-    low, high = (format(results[0][f"{key}_{end}"], form) for end in ("low", "high"))
-    return f"{text} ({low}–{high})"
+def _cells(results: Sequence[Summary], columns: Mapping[str, tuple[str, str]]) -> list[str]:
+    return [(worst(results, form) if key == "worst" else cell(results, key, form)) for key, form in columns.values()]
+
+
+def cell(results: Sequence[Summary], key: str, form: str) -> str:
+    """Return a measure of one or several runs.
+
+    Args:
+        results: summary of each run.
+        key: measure; a run without it has no value.
+        form: number format.
+
+    Example:
+        >>> cell([{"spl": 98.0, "spl_low": 97.5, "spl_high": 98.5}], "spl", ".1f")
+        '98.0 (97.5–98.5)'
+    """
+    text = mean_of_runs([result.get(key) for result in results], form=form, interval=key in INTERVALS)
+    ends = known_values(result.get(f"{key}_{end}") for result in results[:1] for end in ("low", "high"))
+    return f"{text} ({ends[0]:{form}}–{ends[1]:{form}})" if len(results) == 1 and ends else text
+
+
+def worst(results: Sequence[Summary], form: str) -> str:
+    """Return the smallest SPL of several runs; a dash for a single one.
+
+    Example:
+        >>> worst([{"spl": 99.0}, {"spl": 98.5}], ".2f"), worst([{"spl": 99.0}], ".2f")
+        ('98.50', '—')
+    """
+    values = known_values(result.get("spl") for result in results)
+    return format(min(values), form) if len(values) > 1 else "—"
 
 
 def short_table(summaries: Summaries, mode: str = "look-ahead") -> str:
@@ -131,18 +190,13 @@ def short_table(summaries: Summaries, mode: str = "look-ahead") -> str:
 
     Raises:
         ValueError: for an unknown navigator.
-        KeyError: for a missing measure.
 
     Example:
         >>> measures = {key: 1.0 for key, _ in SHORT_COLUMNS.values()}
-        >>> print(short_table({"secant": [measures]}).splitlines()[2])
-        | secant (no training, fair) | 1.0 | 1.0 | 1.0 | 1.0 |
+        >>> print(short_table({"secant": [measures]}).splitlines()[2].partition(" | 1.0")[2])
+        | 1.0 | — | 1.0 | 1.0 |
     """
     rows = [
-        [
-            label(name, mode),
-            *(spread([result[key] for result in results], form) for key, form in SHORT_COLUMNS.values()),
-        ]
-        for name, results in summaries.items()
+        [label(name, mode), needs(name, mode), *_cells(results, SHORT_COLUMNS)] for name, results in summaries.items()
     ]
-    return markdown_table(["navigator", *SHORT_COLUMNS], rows) + "\n"
+    return markdown_table(["navigator", "needs", *SHORT_COLUMNS], rows) + "\n"

@@ -18,7 +18,6 @@ from matplotlib.figure import Figure
 from magrl.envs import PAPER_REGION, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import plots
-from magrl.evaluation.navigators import NAVIGATOR_NAMES
 from magrl.training import UsageError, command
 
 RECIPE = "figures.py"
@@ -28,6 +27,8 @@ CURVES = {
     "learning-spl": ("eval_spl", "SPL on the validation tasks [%]"),
 }
 """Column and label of each figure of learning curves."""
+SHOWN = ("gg_td3", "td3", "recurrent", "ga", "pso", "afsa", "secant", "parallel")
+"""Navigators in the figures of evaluations."""
 BOXES = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
 
 Row = Mapping[str, str]
@@ -64,7 +65,7 @@ def grouped(rows: Sequence[Row]) -> dict[str, list[Row]]:
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row["navigator"], []).append(row)
-    return {name: rows for name, rows in groups.items() if name in NAVIGATOR_NAMES}
+    return {name: rows for name, rows in groups.items() if name in SHOWN}
 
 
 def column(rows: Sequence[Row], name: str) -> list[float]:

@@ -2,7 +2,8 @@
 
     python recipes/tables/learning_table.py gg_td3=runs/A gg_td3=runs/B td3=runs/C td3=runs/D
 
-Mean and standard deviation over the runs of each name, on the validation tasks.
+Interquartile mean over the runs of each name on the validation tasks; in parentheses its 95 % interval over ten or more
+runs, in brackets the smallest and the largest of fewer.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 import tyro
 
 from magrl import paper
-from magrl.evaluation.tables import markdown_table, spread
+from magrl.evaluation.tables import markdown_table, mean_of_runs
 from magrl.training import UsageError, command
 
 RECIPE = "learning_table.py"
@@ -36,7 +37,7 @@ class Runs:
     """Runs to compare."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
-    """NAME=RUN; several runs of one name are averaged."""
+    """NAME=RUN; several runs of one name are one row."""
 
 
 def curve(run: Path) -> list[tuple[float, float, float]]:
@@ -70,11 +71,11 @@ def area(points: Sequence[tuple[float, float, float]]) -> float:
 
 
 def reached(values: Sequence[float], form: str) -> str:
-    """Return mean ± standard deviation of the finite values, and how many runs never reached the threshold."""
+    """Return the average of the finite values over runs, and how many runs never reached the threshold."""
     never = sum(not math.isfinite(value) for value in values)
     if never == len(values):
         return "never"
-    return spread(values, form) + (f", {never} of {len(values)} never" if never else "")
+    return mean_of_runs(values, form=form) + (f", {never} of {len(values)} never" if never else "")
 
 
 def table(names: Mapping[str, Sequence[Path]]) -> str:

@@ -24,7 +24,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario, named_tasks
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import check_distinct, label, make_navigator
-from magrl.evaluation.tables import markdown_table, spread
+from magrl.evaluation.tables import markdown_table, mean_of_runs
 from magrl.geodesy import geodesic
 from magrl.training import UsageError, command
 
@@ -58,7 +58,7 @@ def losses(rollout: TensorDictBase) -> dict[str, float]:
 
 
 def table(texts: Sequence[str]) -> str:
-    """Return the table: mean and standard deviation over the runs of each navigator.
+    """Return the table: the interquartile mean over the runs of each navigator, with its interval or range.
 
     Raises:
         UsageError: for no navigator, an unknown one, or one that is given twice.
@@ -76,7 +76,7 @@ def table(texts: Sequence[str]) -> str:
     for text, navigator in zip(texts, navigators, strict=True):
         results.setdefault(text.partition("=")[0], []).append(losses(evaluation_rollout(env, navigator)))
     rows = (
-        [label(name), len(runs), *(spread([run[phase] for run in runs], ".1f") for phase in PHASES)]
+        [label(name), len(runs), *(mean_of_runs([run[phase] for run in runs], form=".1f") for phase in PHASES)]
         for name, runs in results.items()
     )
     return markdown_table(["navigator", "runs", *(f"{phase}, km" for phase in PHASES)], rows)

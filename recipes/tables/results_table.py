@@ -1,15 +1,17 @@
-"""Print a Markdown table of finished runs, one row each, below the paper's row.
+"""Print a Markdown table of finished runs: one row for each group of runs, below the paper's row.
 
     python recipes/tables/results_table.py runs/td3_gradient_guided-fast-seed*
+    python recipes/tables/results_table.py "one thread=runs/a-*" "two threads=runs/b-*" --pooled --each
     python recipes/tables/results_table.py "low gamma=runs/A" "high gamma=runs/B"
 
-Runs without names are followed by their mean, minimum and maximum.
+A folder may be a quoted pattern. A row of ten or more runs shows interquartile means and, where a measure has one, the
+95 % stratified bootstrap interval; of two to nine runs [smallest–largest]; of one run its values.
 """
 
 from __future__ import annotations
 
+import glob
 import json
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,59 +19,100 @@ from pathlib import Path
 import tyro
 
 from magrl import paper
-from magrl.evaluation.tables import markdown_table
+from magrl.evaluation.tables import INTERVALS, Summary, known_values, markdown_table, mean_of_runs
 from magrl.training import UsageError, command
 
 RECIPE = "results_table.py"
 COLUMNS = {
     "SR %": ("success_rate", ".1f"),
     "SPL %": ("spl", ".2f"),
+    "SPL, smallest–largest %": ("range", ".2f"),
     "TL m": ("trajectory_length_m", ".0f"),
     "TNT steps": ("steps", ".2f"),
+    "path efficiency %": ("path_efficiency", ".2f"),
     "NE km": ("navigation_error_km", ".1f"),
     "within 10 km %": ("success_rate_within_10km", ".1f"),
-    "within 25 km %": ("success_rate_within_25km", ".1f"),
     "training s": ("training_seconds", ".0f"),
     "to 97 / 88.4 s": ("seconds_to_97_sr_88_spl", ".0f"),
 }
+Groups = Mapping[str, Sequence[Summary]]
 
 
-@dataclass
-class Runs:
+@dataclass(frozen=True)
+class Config:
     """Runs to show."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
-    """Run folders, each with an eval.json; as NAME=RUN they are shown by name, without statistics."""
+    """Run folders or quoted patterns of them, each with an eval.json; NAME=RUN puts runs of one name into one row."""
+    each: bool = False
+    """Whether each run has a row of its own as well."""
+    pooled: bool = False
+    """Whether a last row takes all runs together, resampled within each group."""
 
 
-def cells(name: str, results: Mapping[str, float | None]) -> list[str]:
-    """Return a row of the table; missing values become dashes."""
-    values = (results.get(key) for key, _ in COLUMNS.values())
-    return [
-        name,
-        *("—" if v is None else format(v, form) for v, (_, form) in zip(values, COLUMNS.values(), strict=True)),
-    ]
-
-
-def table(runs: Sequence[str]) -> str:
-    """Return the table.
+def folders(text: str) -> list[Path]:
+    """Return the run folders that a path or a pattern names, in natural order.
 
     Raises:
-        UsageError: for no run, or a run without ``eval.json``.
+        UsageError: for a folder without ``eval.json``, or a pattern without a match.
     """
-    named = [text.rpartition("=")[::2] for text in runs]
-    missing = [folder for _, folder in named if not (Path(folder) / "eval.json").is_file()]
-    if missing or not runs:
-        raise UsageError(f"no eval.json in {', '.join(missing) or 'no run at all'}: is the training complete?")
-    results = [json.loads((Path(folder) / "eval.json").read_text()) for _, folder in named]
-    rows = [cells("paper", paper.TABLE_2["gg_td3"]._asdict())]
-    rows += [cells(name or f"seed {r['seed']}", r) for (name, _), r in zip(named, results, strict=True)]
-    averages = (("mean", statistics.fmean), ("min", min), ("max", max)) if not named[0][0] else ()
-    for name, statistic in averages:
-        numbers = {key: [r[key] for r in results] for key, _ in COLUMNS.values()}
-        rows.append(cells(name, {key: statistic(v) if None not in v else None for key, v in numbers.items()}))
-    return markdown_table(["", *COLUMNS], rows)
+    found = [Path(text)] if Path(text).exists() else [Path(path) for path in glob.glob(text)]
+    missing = [str(folder) for folder in found if not (folder / "eval.json").is_file()]
+    if missing or not found:
+        raise UsageError(f"no eval.json in {', '.join(missing) or text}: is the training complete?")
+    return sorted(found, key=lambda folder: (len(folder.name), str(folder)))
+
+
+def grouped(texts: Sequence[str]) -> dict[str, list[Summary]]:
+    """Return the results of runs by the name of their group; runs without a name are one group.
+
+    Raises:
+        UsageError: for no run, one that is not complete, or one that is given twice.
+    """
+    if not texts:
+        raise UsageError("name at least one run, for example: runs/td3_gradient_guided-fast-seed0")
+    groups: dict[str, list[Summary]] = {}
+    seen: set[Path] = set()
+    for text in texts:
+        name, _, pattern = text.rpartition("=")
+        for folder in folders(pattern):
+            if folder.resolve() in seen:
+                raise UsageError(f"{folder} is given twice: the same run again is no spread over runs")
+            seen.add(folder.resolve())
+            groups.setdefault(name, []).append(json.loads((folder / "eval.json").read_text()))
+    return groups
+
+
+def cells(*strata: Sequence[Summary]) -> list[str]:
+    """Return the cells of the runs of one or several groups; missing values become dashes."""
+    return [str(sum(map(len, strata))), *(_cell(strata, key, form) for key, form in COLUMNS.values())]
+
+
+def _cell(strata: Sequence[Sequence[Summary]], key: str, form: str) -> str:
+    if key == "range":
+        spl = known_values(run.get("spl") for runs in strata for run in runs)
+        return f"{min(spl):{form}}–{max(spl):{form}}" if len(spl) > 1 else "—"
+    values = ([run.get(key) for run in runs] for runs in strata)
+    return mean_of_runs(*values, form=form, interval=key in INTERVALS)
+
+
+def table(groups: Groups, each: bool = False, pooled: bool = False) -> str:
+    """Return the table of groups of runs."""
+    rows = [["paper", *cells([paper.TABLE_2["gg_td3"]._asdict()])]]
+    for name, runs in groups.items():
+        if each and len(runs) > 1:
+            rows += [[f"{name}, seed {run['seed']}" if name else f"seed {run['seed']}", *cells([run])] for run in runs]
+        rows.append([name or (f"seed {runs[0]['seed']}" if len(runs) == 1 else "all runs"), *cells(runs)])
+    if pooled:
+        rows.append(["together", *cells(*groups.values())])
+    return markdown_table(["", "runs", *COLUMNS], rows)
+
+
+def main() -> None:
+    """Read the command line and print the table."""
+    config = tyro.cli(Config, prog=RECIPE, description=__doc__)
+    print(table(grouped(config.runs), config.each, config.pooled))
 
 
 if __name__ == "__main__":
-    command(RECIPE, lambda: print(table(tyro.cli(Runs, prog=RECIPE, description=__doc__).runs)))
+    command(RECIPE, main)

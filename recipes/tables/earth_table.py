@@ -1,0 +1,114 @@
+"""Fly navigators in random regions all over the Earth, at several levels of sensor noise.
+
+    python recipes/tables/earth_table.py anywhere kalman secant parallel > docs/results/earth.md
+    python recipes/tables/earth_table.py anywhere=runs/A anywhere=runs/B --distance-km 700 1000 --max-steps 120
+
+The regions are those of `magrl.envs.earth_scenario`: seeded, with latitudes of their middles up to 60 degrees and a
+horizontal intensity of at least 8000 nT (IGRF-14 at 2025-01-01). Episodes start at random headings. Navigators without
+training are told the noise of the sensors. Prints a Markdown table: success rate (SR) and success weighted by path
+length (SPL) in percent, and steps over successes; means over several runs of one name, with the lowest SPL in brackets.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import tyro
+from tqdm import tqdm
+
+from magrl import paper
+from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario
+from magrl.evaluation import episode_measures, evaluation_rollout, summarize
+from magrl.evaluation.navigators import check_distinct, label, make_navigator, needs
+from magrl.evaluation.tables import markdown_table
+from magrl.training import UsageError, command
+from magrl.transforms import with_sensor_noise
+
+RECIPE = "earth_table.py"
+Noise = tuple[float, float, float]
+LEVELS: tuple[Noise, ...] = (
+    (0.0, 0.0, 0.0),
+    (0.02, 0.02, 2.0),
+    (0.05, 0.05, 5.0),
+    (0.1, 0.1, 10.0),
+    (0.5, 0.1, 20.0),
+)
+"""Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
+
+
+@dataclass
+class Config:
+    """Navigators and extent of the comparison."""
+
+    navigators: tyro.conf.Positional[tuple[str, ...]]
+    """Navigators, as in recipes/evaluate.py."""
+    tasks: int = 4000
+    """Number of tasks."""
+    regions: int = 128
+    """Number of regions."""
+    distance_km: tuple[float, float] = (300.0, 500.0)
+    """Shortest and longest distance of a task [km]."""
+    max_steps: int = 50
+    """Moves after which an episode ends."""
+    zeta: float = 0.01
+    """Arrival threshold on the objective (Eq. 2-7)."""
+    seed: int = 0
+    """Random seed of regions, tasks, start headings and noise; no training uses it."""
+
+
+def earth(config: Config) -> Scenario:
+    """Return frozen tasks in random regions of the Earth, large enough for the longest distance."""
+    far = config.distance_km[1] > 500
+    size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"half_size_deg": 10, "max_latitude": 70}
+    seed = 3 * paper.FIRST_RESERVED_SEED + config.seed  # beyond those of trainings and of frozen sets
+    scenario = earth_scenario(config.regions, seed=seed, distance_range_km=config.distance_km, **size)
+    return scenario.with_tasks(scenario.random_tasks(config.tasks, seed))
+
+
+def measure(text: str, base: GeomagneticNavEnv, noise: Noise) -> tuple[float, float, float]:
+    """Return SR [%], SPL [%] and steps of a navigator at a level of noise."""
+    env = with_sensor_noise(base, noise, base.seed)
+    summary = summarize(episode_measures(evaluation_rollout(env, make_navigator(text, base, noise=noise))))
+    return summary["success_rate"], summary["spl"], summary["steps"]
+
+
+def table(config: Config) -> str:
+    """Return the table.
+
+    Raises:
+        UsageError: for a navigator or a setting that is wrong.
+    """
+    if not config.navigators:
+        raise UsageError("name at least one navigator, for example: anywhere")
+    try:
+        check_distinct(config.navigators)
+        options = {"max_steps": config.max_steps, "zeta": config.zeta, "start_heading": "random", "seed": config.seed}
+        base = GeomagneticNavEnv(earth(config), num_envs=config.tasks, **options)
+        results: dict[str, list[list[tuple[float, float, float]]]] = {}
+        for text in tqdm(config.navigators, unit="navigator"):
+            results.setdefault(text.partition("=")[0], []).append([measure(text, base, noise) for noise in LEVELS])
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from error
+    heads = [", ".join(f"{level:g}" for level in noise) for noise in LEVELS]
+    rows = [
+        [label(name), needs(name), len(runs), *(cell([run[k] for run in runs]) for k in range(len(LEVELS)))]
+        for name, runs in results.items()
+    ]
+    return markdown_table(["navigator", "needs", "runs", *heads], rows)
+
+
+def cell(runs: Sequence[tuple[float, float, float]]) -> str:
+    """Return the mean SR, SPL and steps of runs, and the lowest SPL of several."""
+    rate, spl, steps = (fmean(values) for values in zip(*runs, strict=True))
+    lowest = f" [{min(run[1] for run in runs):.1f}]" if len(runs) > 1 else ""
+    return f"{rate:.1f} / {spl:.1f}{lowest} / {steps:.1f}"
+
+
+if __name__ == "__main__":
+    command(RECIPE, lambda: print(table(tyro.cli(Config, prog=RECIPE, description=__doc__))))

@@ -1,0 +1,187 @@
+"""Tables of runs: averages, intervals and ranges by hand, groups of runs, and noise levels."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+from matplotlib.image import imread
+from test_evaluation import load
+
+from magrl import paper
+from magrl.evaluation.tables import cell, comparison_table, mean_of_runs, short_table, worst
+from magrl.training import UsageError
+
+RUNS = [97.0, 98.0, 99.0, 100.0]
+
+
+def cells(line: str) -> list[str]:
+    return [text.strip() for text in line.strip("|").split("|")]
+
+
+def interval(text: str) -> tuple[float, float, float]:
+    """Return middle, low and high end of a cell such as ``99.0 (98.5–99.5)``."""
+    found = re.fullmatch(r"([\d.]+) \(([\d.]+)–([\d.]+)\)", text)
+    assert found, text
+    return float(found[1]), float(found[2]), float(found[3])
+
+
+def test_mean_of_runs_by_hand() -> None:
+    """One run, its value; a few, interquartile mean and range; ten or more, the interval, which is narrower."""
+    assert mean_of_runs([99.0], form=".1f") == "99.0"
+    assert mean_of_runs([math.nan, 2.0, None], form=".1f") == "2.0"
+    assert mean_of_runs([None, math.nan], form=".1f") == "—"
+    assert mean_of_runs(RUNS, form=".2f") == "98.50 [97.00–100.00]"
+    assert mean_of_runs([0.0, *RUNS], form=".1f") == "98.0 [0.0–100.0]"
+    assert mean_of_runs(RUNS[:2], RUNS[2:], form=".1f", interval=False) == "98.5"
+    assert "[" in mean_of_runs(RUNS * 2, [99.0], form=".1f")
+    middle, low, high = interval(mean_of_runs(RUNS * 2, RUNS[1:3], form=".3f"))
+    assert 97 < low < middle == 98.5 < high < 100
+
+
+def test_worst_run_and_interval_over_tasks() -> None:
+    assert worst([{"spl": 99.0}, {"spl": None}, {"spl": 98.456}], ".2f") == "98.46"
+    assert worst([{"spl": 99.0}, {"spl": None}], ".2f") == worst([], ".2f") == "—"
+    one = {"spl": 98.0, "spl_low": 97.5, "spl_high": 98.5, "steps": None}
+    assert cell([one], "spl", ".1f") == "98.0 (97.5–98.5)"
+    assert cell([one, one], "spl", ".1f") == "98.0 [98.0–98.0]"
+    assert cell([one], "steps", ".1f") == cell([one], "unknown", ".1f") == "—"
+    assert cell([{**one, "spl": None, "spl_low": None, "spl_high": None}], "spl", ".1f") == "—"
+
+
+def test_rows_of_one_and_of_several_runs() -> None:
+    one = {"success_rate": 100.0, "success_rate_low": 99.6, "success_rate_high": 100.0, "spl": 99.0, "steps": 9.0}
+    one |= {"spl_low": 98.0, "spl_high": 99.5, "path_efficiency": 97.0, "spl_to_arrival": 96.0, "smoothness_deg": 170.0}
+    several = [{**one, "spl": spl} for spl in RUNS]
+    head, _, published, guided, secant = comparison_table({"gg_td3": several, "secant": [one]}).splitlines()
+    rows = [dict(zip(cells(head), cells(line), strict=True)) for line in (published, guided, secant)]
+    assert [row["needs"] for row in rows] == ["—", "training in the region", "nothing"]
+    assert [row["runs"] for row in rows] == ["1", "4", "1"]
+    assert [row["SPL %"] for row in rows] == ["88.41", "98.50 [97.00–100.00]", "99.00 (98.00–99.50)"]
+    assert [row["worst run, SPL %"] for row in rows] == ["—", "97.00", "—"]
+    assert [row["SR %"] for row in rows] == ["97.0", "100.0 [100.0–100.0]", "100.0 (99.6–100.0)"]
+    assert [row["SPL to arrival %"] for row in rows] == ["—", "96.00 [96.00–96.00]", "96.00"]
+    assert [row["smoothness °"] for row in rows] == ["—", "170.0", "170.0"]
+    head, _, guided, _ = short_table({"gg_td3": several, "secant": [one]}).splitlines()
+    assert cells(guided)[2:5] == ["100.0 [100.0–100.0]", "98.5 [97.0–100.0]", "97.0"]
+    with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
+        comparison_table({"dowsing": [one]})
+
+
+def finished(folder: Path, seed: int, **values: float | None) -> Path:
+    """Return a run folder with a result."""
+    folder.mkdir(parents=True)
+    (folder / "eval.json").write_text(json.dumps({"seed": seed, **values}))
+    return folder
+
+
+def test_results_table_of_one_run(tmp_path: Path) -> None:
+    results = load("tables/results_table")
+    run = finished(
+        tmp_path / "run",
+        3,
+        success_rate=99.5,
+        spl=98.0,
+        trajectory_length_m=4e5,
+        steps=9.0,
+        seconds_to_97_sr_88_spl=None,
+    )
+    published = paper.TABLE_2["gg_td3"]
+    lines = results.table(results.grouped([str(run)])).splitlines()
+    assert cells(lines[2])[:4] == ["paper", "1", f"{published.success_rate:.1f}", f"{published.spl:.2f}"]
+    assert cells(lines[3]) == ["seed 3", "1", "99.5", "98.00", "—", "400000", "9.00", "—", "—", "—", "—", "—"]
+    named = results.table(results.grouped([f"a=b={run}"])).splitlines()
+    assert named[3:] == [lines[3].replace("seed 3", "a=b")]
+
+
+def test_results_table_groups_runs(tmp_path: Path) -> None:
+    """Twelve runs with one thread and twelve with two, worse by one; in order of the seeds, and together."""
+    results = load("tables/results_table")
+    for seed in range(12):
+        for threads in (1, 2):
+            finished(tmp_path / f"t{threads}-seed{seed}", seed, spl=100.0 - threads - seed / 10, success_rate=100.0)
+    texts = [f"one thread={tmp_path}/t1-*", f"two threads={tmp_path}/t2-*"]
+    groups = results.grouped(texts)
+    assert [run["seed"] for run in groups["one thread"]] == list(range(12))
+    rows = [cells(line) for line in results.table(groups, pooled=True).splitlines()[3:]]
+    assert [row[:2] for row in rows] == [["one thread", "12"], ["two threads", "12"], ["together", "24"]]
+    assert [row[4] for row in rows] == ["97.90–99.00", "96.90–98.00", "96.90–99.00"]
+    for row, expected in zip(rows, (98.45, 97.45, 97.95), strict=True):
+        middle, low, high = interval(row[3])
+        assert middle == pytest.approx(expected, abs=0.006)
+        assert low < middle < high
+    each = results.table(groups, each=True).splitlines()[3:]
+    assert len(each) == 26
+    assert cells(each[0])[:4] == ["one thread, seed 0", "1", "100.0", "99.00"]
+    unnamed = results.table(results.grouped([f"{tmp_path}/t1-*"]), each=True).splitlines()[3:]
+    assert [cells(line)[0] for line in unnamed[-2:]] == ["seed 11", "all runs"]
+
+
+def test_results_table_says_what_is_wrong(tmp_path: Path) -> None:
+    results = load("tables/results_table")
+    run = finished(tmp_path / "run", 0)
+    (tmp_path / "empty").mkdir()
+    for texts, message in (
+        ([], "name at least one run"),
+        ([str(tmp_path / "empty")], r"no eval\.json in .*empty: is the training complete"),
+        ([f"a={tmp_path}/no*"], r"no eval\.json in .*/no\*"),
+        ([f"{tmp_path}/*"], r"no eval\.json in .*empty"),
+        ([f"a={run}", f"b={tmp_path}/empty/../run"], "run is given twice"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            results.grouped(texts)
+
+
+def evaluation(
+    folder: Path, noise: list[float], summaries: dict[str, list[tuple[float, float | None]]], **other
+) -> Path:
+    """Return a folder as recipes/evaluate.py leaves it: success rate and SPL of each run of a navigator."""
+    folder.mkdir()
+    settings = {"tasks": "test-1000", "zeta": 0.01, "mode": "flown", "noise": noise, **other}
+    (folder / "settings.json").write_text(json.dumps(settings))
+    content = {
+        name: [dict(zip(("success_rate", "spl"), run, strict=True)) for run in runs] for name, runs in summaries.items()
+    }
+    (folder / "summary.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_noise_table_and_figure(tmp_path: Path) -> None:
+    noise = load("tables/noise_table")
+    high = evaluation(tmp_path / "b", [0.05, 0.05, 5], {"gg_td3": [(99.0, 92.0), (100.0, 94.0)], "ga": [(0.0, None)]})
+    low = evaluation(tmp_path / "a", [0, 0, 0], {"gg_td3": [(100.0, 99.0)], "secant": [(100.0, 99.5)]})
+    config = noise.Config((high, low), tmp_path / "new" / "noise.md", tmp_path / "noise.png")
+    noise.make(config)
+    assert config.table.read_text().splitlines()[0] == "| navigator | needs | runs | no noise | 0.05°, 0.05°, 5 nT |"
+    rows = [cells(line) for line in config.table.read_text().splitlines()[2:]]
+    assert [row[2:] for row in rows] == [
+        ["2", "100.0 / 99.0", "99.5 / 93.0"],
+        ["1", "100.0 / 99.5", "—"],
+        ["1", "—", "0.0 / —"],
+    ]
+    assert rows[2][:2] == ["GA, flown", "nothing"]
+    assert imread(config.figure).std() > 0.01
+
+
+def test_noise_table_refuses_evaluations_that_cannot_be_compared(tmp_path: Path) -> None:
+    noise = load("tables/noise_table")
+    flown = {"secant": [(100.0, 99.0)]}
+    clean = evaluation(tmp_path / "clean", [0, 0, 0], flown)
+    again = evaluation(tmp_path / "again", [0, 0, 0], flown)
+    strict = evaluation(tmp_path / "strict", [0.1, 0.1, 10], flown, zeta=0.001)
+    old = evaluation(tmp_path / "old", [0.1, 0.1, 10], flown)
+    (old / "settings.json").write_text("{}")
+    (tmp_path / "file").touch()
+    for folders, message in (
+        ([], "name at least one folder"),
+        ([tmp_path], r"there is no .*settings\.json: is the evaluation complete"),
+        ([old], r"settings\.json holds no noise level"),
+        ([clean, again], r"again has the noise \[0\.0, 0\.0, 0\.0\], as a folder before it"),
+        ([clean, strict], "strict has zeta 0.001, the folders before it 0.01"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            noise.make(noise.Config(tuple(folders), tmp_path / "t.md", tmp_path / "f.png"))
+    with pytest.raises(UsageError, match=r"cannot write .*t\.md"):
+        noise.make(noise.Config((clean,), tmp_path / "file" / "t.md", tmp_path / "f.png"))
+    assert not (tmp_path / "t.md").exists()
