@@ -4,19 +4,34 @@ VENV := .venv
 RUN := $(VENV)/bin
 export GOMP_SPINCOUNT ?= 3000
 
-# Runs that the documentation reports
+# Runs that the documentation reports. Each has one thread, but for those of GUIDED: `make -j2 paper` uses two cores.
 SEEDS := 0 1 2 3 4
-GUIDED := $(SEEDS:%=runs/td3_gradient_guided-fast-seed%)
-PLAIN := $(SEEDS:%=runs/td3-fast-seed%)
+TEN := $(SEEDS) 5 6 7 8 9
+TWENTY := $(TEN) $(TEN:%=1%)
+GUIDED := $(TWENTY:%=runs/td3_gradient_guided-fast-seed%)
+ONE_THREAD := $(TWENTY:%=runs/td3_gradient_guided-fast-one-thread-seed%)
+PLAIN := $(TEN:%=runs/td3-fast-seed%)
+NOISY := $(SEEDS:%=runs/td3_gradient_guided-fast-noise-0.05-0.05-5-seed%)
+AZORES := $(SEEDS:%=runs/td3_gradient_guided-fast-azores-seed%)
 MEMORY := $(foreach s,0 1 2,runs/td3_recurrent-seed$(s))
 STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
-NAVIGATORS := ga pso afsa ga:flown pso:flown afsa:flown secant parallel
+AGENTS := $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%)
+FAIR := secant kalman run_and_tumble
+ORACLES := mean_jacobian parallel geodesic
+SWARMS := ga pso afsa ga:flown pso:flown afsa:flown
+NOISE_LEVELS := 0 0.02 0.05 0.1
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train test test-slow check format clean paper trade bench docs replay mutate help
+.PHONY: train fly anywhere test test-slow check format clean paper trade bench docs replay mutate help
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
+
+fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; seconds
+	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" $(ARGS)
+
+anywhere: $(VENV)/.installed  ## train the agent without a map
+	$(RECIPE)/td3_anywhere.py --preset far $(ARGS)
 
 test: $(VENV)/.installed-dev  ## run the fast tests, one process per core with one thread each
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
@@ -65,35 +80,54 @@ trade: runs/td3_gradient_guided-fast-seed0/eval.json $(MEMORY:%=%/eval.json)  ##
 	  "without the difference=runs/no-difference" "the paper's eight numbers=runs/literal-state" \
 	  $(foreach s,0 1 2,"the eight numbers with a memory (seed $(s))=runs/td3_recurrent-seed$(s)") > docs/results/state.md
 
-# Section 4 of the paper. Existing runs are reused. All trainings take about half an hour on two cores, everything else
-# about a minute.
-paper: $(GUIDED:%=%/eval.json) $(PLAIN:%=%/eval.json) $(STRICT:%=%/eval.json) $(MEMORY:%=%/eval.json)  ## make all tables and figures of the paper's Section 4
-	rm -rf runs/comparison runs/comparison-paper-100 runs/comparison-zeta0.001
-	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%) $(NAVIGATORS) --out runs/comparison
-	$(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%) $(NAVIGATORS) \
-	  --tasks paper-100 --out runs/comparison-paper-100
-	$(RECIPE)/evaluate.py $(STRICT:%=gg_td3=%) secant parallel --zeta 0.001 --out runs/comparison-zeta0.001
+# Section 4 of the paper. Existing runs are reused. All trainings take an hour and a half on two cores (make -j2), everything
+# else a few minutes.
+paper: $(foreach run,$(GUIDED) $(ONE_THREAD) $(PLAIN) $(STRICT) $(MEMORY) $(NOISY) $(AZORES),$(run)/eval.json)  ## make all tables and figures of the paper's Section 4
+	rm -rf runs/comparison runs/comparison-paper-100 runs/comparison-zeta0.001 runs/azores runs/azores-tasks $(NOISE_LEVELS:%=runs/noise-%)
+	$(RECIPE)/evaluate.py $(AGENTS) $(SWARMS) $(FAIR) $(ORACLES) --out runs/comparison
+	$(RECIPE)/evaluate.py $(AGENTS) $(SWARMS) $(FAIR) $(ORACLES) --tasks paper-100 --out runs/comparison-paper-100
+	$(RECIPE)/evaluate.py $(STRICT:%=gg_td3=%) $(FAIR) $(ORACLES) --zeta 0.001 --out runs/comparison-zeta0.001
+	for noise in "0 0 0" "0.02 0.02 2" "0.05 0.05 5" "0.1 0.1 10"; do $(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) \
+	  $(NOISY:%=gg_td3_noise=%) $(FAIR) $(ORACLES) --noise $$noise --out runs/noise-$${noise%% *} || exit; done
+	$(RECIPE)/evaluate.py $(AZORES:%=gg_td3=%) $(FAIR) $(ORACLES) --scenario docs/examples/azores.toml --tasks test-1000 \
+	  --out runs/azores
+	$(RECIPE)/evaluate.py $(AZORES:%=gg_td3=%) $(FAIR) $(ORACLES) --out runs/azores-tasks
 	$(RECIPE)/tables/figures.py --results runs/comparison --gg-td3 $(GUIDED) --td3 $(PLAIN) --out docs/figures
 	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 --gif docs/figures/replay.gif
 	mkdir -p docs/results
 	for name in comparison comparison-paper-100 comparison-zeta0.001; do cp runs/$$name/table.md docs/results/$$name.md; done
 	cp runs/comparison/short.md docs/results/summary.md
+	cp runs/azores/short.md docs/results/own-world.md
+	cp runs/azores-tasks/short.md docs/results/own-world-tasks.md
+	$(RECIPE)/tables/noise_table.py $(NOISE_LEVELS:%=runs/noise-%) --table docs/results/noise.md --figure docs/figures/noise.png
 	$(RECIPE)/tables/learning_table.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) > docs/results/learning.md
-	$(RECIPE)/tables/results_table.py $(GUIDED) > docs/results/seeds.md
-	$(RECIPE)/tables/path_loss.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) secant parallel > docs/results/path_loss.md
-	$(RECIPE)/tables/publish.py README.md docs/reproduction.md
+	$(RECIPE)/tables/results_table.py $(GUIDED:%="two threads=%") $(ONE_THREAD:%="one thread=%") --pooled > docs/results/seeds.md
+	$(RECIPE)/tables/results_table.py $(AZORES) --each > docs/results/azores.md
+	$(RECIPE)/tables/path_loss.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(FAIR) $(ORACLES) > docs/results/path_loss.md
+	$(RECIPE)/tables/probe_sweep.py > docs/results/probe_sweep.md
+	$(RECIPE)/tables/random_boxes.py > docs/results/random_boxes.md
+	$(RECIPE)/tables/publish.py README.md docs/reproduction.md docs/own_data.md
 
 runs/td3_gradient_guided-fast-seed%/eval.json: | $(VENV)/.installed
-	$(RECIPE)/td3_gradient_guided.py --seed $*
+	OMP_NUM_THREADS=2 $(RECIPE)/td3_gradient_guided.py --seed $*
+
+runs/td3_gradient_guided-fast-one-thread-seed%/eval.json: | $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --seed $* --out $(@D)
+
+runs/td3_gradient_guided-fast-noise-0.05-0.05-5-seed%/eval.json: | $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --noise 0.05 0.05 5 --seed $*
+
+runs/td3_gradient_guided-fast-azores-seed%/eval.json: | $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --scenario docs/examples/azores.toml --seed $*
 
 runs/td3-fast-seed%/eval.json: | $(VENV)/.installed
-	$(RECIPE)/td3_gradient_guided.py --preset td3-fast --seed $*
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --preset td3-fast --seed $*
 
 runs/td3_recurrent-seed%/eval.json: | $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(RECIPE)/td3_recurrent.py --seed $*
 
 runs/td3_gradient_guided-zeta0.001-seed%/eval.json: | $(VENV)/.installed
-	$(RECIPE)/td3_gradient_guided.py --zeta 0.001 --total-frames 409600 --seed $* --out $(@D)
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --zeta 0.001 --total-frames 409600 --seed $* --out $(@D)
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## /  \1\t/p' $(MAKEFILE_LIST) | expand -t 14

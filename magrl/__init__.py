@@ -23,7 +23,7 @@ _PACKAGES = {
         "TargetDifference",
     ),
     "envs": ("GeomagneticNavEnv", "Region", "Scenario", "Tasks", "load_scenario", "task_set"),
-    "agents": ("FieldPolicy", "load_policy", "save_policy"),
+    "agents": ("FieldPolicy", "load_policy", "load_pretrained", "save_policy"),
     "evaluation": ("episode_measures", "evaluation_rollout", "summarize"),
 }
 _HOMES = {name: package for package, names in _PACKAGES.items() for name in names}
@@ -32,6 +32,7 @@ __all__ = ["__version__", *_HOMES]
 if TYPE_CHECKING:  # the same names for type checkers and editors
     from magrl.agents import FieldPolicy as FieldPolicy
     from magrl.agents import load_policy as load_policy
+    from magrl.agents import load_pretrained as load_pretrained
     from magrl.agents import save_policy as save_policy
     from magrl.envs import GeomagneticNavEnv as GeomagneticNavEnv
     from magrl.envs import Region as Region

@@ -17,6 +17,7 @@ from refusals import (
     bad_tensors,
     bad_vectors,
     folder,
+    int64,
     refused,
     t,
     text_file,
@@ -28,10 +29,33 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from magrl import agents, training, transforms
-from magrl.envs import PAPER_REGION, GeomagneticNavEnv, Region, Scenario, Tasks, load_scenario, named_tasks, task_set
+from magrl.envs import (
+    PAPER_REGION,
+    GeomagneticNavEnv,
+    Region,
+    Regions,
+    RegionTasks,
+    Scenario,
+    Tasks,
+    earth_scenario,
+    load_scenario,
+    named_tasks,
+    planet_scenario,
+    task_set,
+)
 from magrl.envs.gymnasium import GeomagneticNavGymEnv, GeomagneticNavVectorEnv
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
-from magrl.navigators import Navigator, ParallelApproach, Secant, metaheuristics
+from magrl.navigators import (
+    Geodesic,
+    Kalman,
+    MeanJacobian,
+    Navigator,
+    ParallelApproach,
+    QuasiNewton,
+    RunAndTumble,
+    Secant,
+    metaheuristics,
+)
 
 
 @cache
@@ -57,6 +81,7 @@ def scenario_file(text: str) -> Path:
     return text_file("own.toml", text)
 
 
+TWO_REGIONS = Regions.of([Region((-10, 0), (160, 170)), Region((40, 50), (0, 10))])
 ENVS: Rows = {
     "envs.Region": [
         *(
@@ -67,6 +92,7 @@ ENVS: Rows = {
     ],
     "envs.Region.contains": bad_vectors(PAPER_REGION.contains, "position", 2),
     "envs.Region.expanded": bad_numbers(PAPER_REGION.expanded, margin_deg=(-1.0, NAN, INF, "a", None)),
+    "envs.Region.reachable": bad_numbers(PAPER_REGION.reachable, max_move_km=(-1.0, INF, "a")),
     "envs.Region.unwrapped": [
         *bad_vectors(PAPER_REGION.unwrapped, "position", 2),
         Nan(lambda: PAPER_REGION.unwrapped(t(NAN, NAN))),
@@ -78,6 +104,49 @@ ENVS: Rows = {
         refused(lambda: PAPER_REGION.holding(t(-91.0, 165.0)), ValueError, "-91"),
     ],
     "envs.Region.grid": bad_numbers(PAPER_REGION.grid, points=(0, -1, 2.5, "a", True)),
+    "envs.Regions": [
+        *bad_vectors(lambda edges: Regions(edges, zeros(1, 2)), "latitude", 2),
+        refused(lambda: Regions(zeros(0, 2), zeros(0, 2)), ValueError, "(0, 2)", "K >= 1"),
+        refused(lambda: Regions(zeros(1, 2), zeros(1, 2)), ValueError, "latitudes (0.0, 0.0) of box 0"),
+    ],
+    "envs.Regions.contains": [
+        *bad_vectors(lambda position: TWO_REGIONS.contains(position, int64(1)), "position", 2),
+        refused(lambda: TWO_REGIONS.contains(zeros(1, 2), int64(1) + 2), ValueError, "index 2", "[0, 2)"),
+        refused(lambda: TWO_REGIONS.contains(zeros(1, 2), zeros(1)), TypeError, "index", "float32"),
+    ],
+    "envs.Regions.expanded": bad_numbers(TWO_REGIONS.expanded, margin_deg=(-1.0, NAN, INF, "a", None)),
+    "envs.Regions.reachable": bad_numbers(TWO_REGIONS.reachable, max_move_km=(-1.0, INF, "a")),
+    "envs.Regions.grid": bad_numbers(TWO_REGIONS.grid, points=(1, 0, 2.5, "a", True)),
+    "envs.RegionTasks": [
+        refused(
+            lambda: planet_scenario(2, 0).with_tasks(RegionTasks(zeros(1, 2), zeros(1, 2) + 1, int64(1) + 2)),
+            ValueError,
+            "tasks.region 2",
+            "[0, 2)",
+        )
+    ],
+    "envs.planet_scenario": [
+        *bad_numbers(lambda count: planet_scenario(count, 0), count=(0, 1.5, "a", True)),
+        *bad_numbers(lambda seed: planet_scenario(2, seed), seed=(-1, 1.5, "a", None)),
+        *bad_numbers(
+            lambda **option: planet_scenario(2, 0, **option),
+            half_size_deg=(0, -1.0, 61, NAN, "a"),
+            max_latitude=(0, 91, NAN, "a"),
+            min_intensity_nt=(-1.0, NAN, "a"),
+            margin_deg=(-1.0, INF),
+            max_move_km=(-1.0, INF),
+            degree=(0, 1.5),
+            tolerance_nt=(0.0, NAN),
+            distance_range_km=((500.0, 300.0),),
+            distance_law=("even",),
+        ),
+    ],
+    "envs.earth_scenario": [
+        *bad_numbers(lambda count: earth_scenario(count, 0), count=(0, 1.5, "a", True)),
+        *bad_numbers(lambda date: earth_scenario(2, 0, date), date=("May",)),
+        refused(lambda: earth_scenario(2, 0, "2055-01-01"), ValueError, "2055-01-01"),
+        refused(lambda: earth_scenario(2, 0, generation=12), ValueError, "12"),
+    ],
     "envs.task_set": [
         *bad_numbers(lambda num_tasks: task_set(num_tasks, 0), num_tasks=(0, 1.5, "a", True)),
         *bad_numbers(lambda seed: task_set(1, seed), seed=(1.5, "a", None)),
@@ -193,10 +262,38 @@ NAVIGATORS: Rows = {
         refused(lambda: ParallelApproach(igrf(), pair=("D",)), ValueError, "('D',)"),
         refused(lambda: ParallelApproach(igrf())(TensorDict(field=zeros(2, 3))), KeyError, "target_field"),
     ],
+    "navigators.QuasiNewton": [
+        *bad_numbers(
+            lambda **options: QuasiNewton(**({"max_move_km": 50.0, "max_turn_rad": 1.5} | options)),
+            **BOUNDS,
+            noise=(5, (1.0, 2.0), (1.0, 2.0, NAN)),
+        ),
+        refused(lambda: QuasiNewton(50.0, 1.5, noise=(0.1, -0.1, 5.0)), ValueError, "noise", "-0.1"),
+    ],
+    "navigators.QuasiNewton.prior": [
+        refused(lambda: QuasiNewton(50.0, 1.5).prior(zeros(2, 3)), NotImplementedError, "QuasiNewton", "GradientPrior")
+    ],
     "navigators.Secant": [
-        *bad_numbers(Secant, **BOUNDS, probe_km=(0.0, 60.0, NAN, "a")),
+        *bad_numbers(Secant, **BOUNDS, probe_km=(0.0, 60.0, NAN, "a"), noise=(5, (1.0, 2.0), (1.0, 2.0, NAN))),
         refused(lambda: Secant(elements=("D", "D")), ValueError, "('D', 'D')"),
     ],
+    "navigators.Kalman": bad_numbers(
+        Kalman,
+        **BOUNDS,
+        noise=(5, (1.0,)),
+        max_steps=(0, 1.5),
+        caution=(-1.0, NAN),
+        step_km=(0.0,),
+        range_km=(0.0,),
+    ),
+    "navigators.MeanJacobian": [
+        *bad_numbers(lambda **options: MeanJacobian(igrf(), zeros(4, 2), **options), **BOUNDS, noise=(5, (1.0, NAN))),
+        *bad_numbers(lambda field: MeanJacobian(field, zeros(4, 2)), field=("IGRF", None)),
+        refused(lambda: MeanJacobian(igrf(), zeros(1, 2)), ValueError, "position", "(1, 2)"),
+        refused(lambda: MeanJacobian(igrf(), zeros(3)), ValueError, "position", "(3,)"),
+    ],
+    "navigators.Geodesic": bad_numbers(Geodesic, **BOUNDS),
+    "navigators.RunAndTumble": bad_numbers(RunAndTumble, **BOUNDS, objective_floors=(5, (1, 2), (1, 2, NAN))),
     "navigators.metaheuristics.build": [
         refused(lambda: metaheuristics.build("ants", nav(), "flown", 0), ValueError, "'ants'", "ga"),
         refused(lambda: metaheuristics.build("ga", nav(), "dreamt", 0), ValueError, "'dreamt'"),
@@ -300,6 +397,10 @@ AGENTS: Rows = {
         refused(lambda: agents.load_policy(written({"format": 1})), ValueError, "content.pt", "format 1"),
         refused(lambda: agents.load_policy(text_file("a.pt", "no policy")), ValueError, "a.pt"),
     ],
+    "agents.load_pretrained": [
+        refused(lambda: agents.load_pretrained("nowhere"), ValueError, "nowhere", "anywhere"),
+        refused(lambda: agents.load_pretrained(5), TypeError, "name", "5"),
+    ],
     "agents.TD3Loss": [
         *bad_numbers(td3_loss, **NOISES),
         refused(lambda: td3_loss(actor=5), TypeError, "actor", "5"),
@@ -333,6 +434,7 @@ def entered(**options: Any) -> None:
 TRAINING: Rows = {
     "evaluation.episode_measures": [
         refused(lambda: episode_measures(5), TypeError, "rollout", "5"),
+        refused(lambda: episode_measures(flight(), 5), TypeError, "env", "5"),
         refused(lambda: episode_measures(flight()[0]), ValueError, "(2,)"),
         refused(lambda: episode_measures(flight()[:0]), ValueError, "(0, 2)"),
         refused(lambda: episode_measures(flight().exclude("next")), KeyError, "next"),

@@ -178,6 +178,10 @@ GUIDANCE: Rows = {
         *bad_tensors(lambda a, b: guidance.alignment_reward(a, b, 3.0), "angle", "reference"),
         Nan(lambda: guidance.alignment_reward(t(0.0, NAN, INF), t(NAN, 0.0, 0.0), 3.0)),
     ],
+    "guidance.best_pair": [
+        *bad_vectors(guidance.best_pair, "gradient", 2)[:2],
+        refused(lambda: guidance.best_pair(zeros(1, 2)), ValueError, "two elements", "(1, 2)"),
+    ],
     "guidance.parallel_approach": [
         *bad_vectors(lambda x: guidance.parallel_approach(x, zeros(2), zeros(2, 2)), "field", 2),
         *bad_vectors(lambda x: guidance.parallel_approach(zeros(2), x, zeros(2, 2)), "target_field", 2),
@@ -350,9 +354,84 @@ TRANSFORMS: Rows = {
     ],
     "transforms.GradientHeading": [
         *bad_numbers(transforms.GradientHeading, min_crossing_deg=(-1.0, 90.0, NAN, "a")),
-        *bad_numbers(transforms.GradientHeading, pair=(5, "DI", ("D", 0), ("D", -1), ("D", 0.5))),
+        *bad_numbers(transforms.GradientHeading, pair=(5, "DI", "Auto", ("D", 0), ("D", -1), ("D", 0.5))),
         refused(lambda: transforms.GradientHeading(pair=("D", "Z")), ValueError, "'Z'"),
         refused(lambda: transforms.GradientHeading("abc"), TypeError, "'abc'"),
+    ],
+    "transforms.TrackGradient": [
+        *bad_numbers(transforms.TrackGradient, range_km=(0.0, NAN, "a", None), frame=("north", 5), prior=(5, None)),
+        *bad_numbers(transforms.TrackGradient, noise_std=(5, (0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, NAN))),
+        *bad_numbers(
+            transforms.TrackGradient, scales=(5, (), (1.0, 1.0, 0.0)), curvature=(5, (1.0,), (1.0, 1.0, -1.0))
+        ),
+        *bad_numbers(transforms.TrackGradient, angles=(5, (3,), (-1,), (0.5,))),
+        refused(lambda: transforms.TrackGradient("field"), TypeError, "'field'"),
+        refused(lambda: transforms.TrackGradient(["field"]), ValueError, "4 or 5 in_keys", "['field']"),
+        refused(lambda: transforms.TrackGradient(list("abcde"), noise_std=(0.0,) * 3), ValueError, "'e'", "not both"),
+        refused(lambda: transforms.TrackGradient()(TensorDict(field=zeros(3))), KeyError, "target_field"),
+        Nan(
+            lambda: transforms.TrackGradient()(
+                TensorDict(field=t(NAN, 0.0, 1.0), target_field=zeros(3), move=zeros(2), heading=zeros(1))
+            )["way"]
+        ),
+    ],
+    "transforms.SensorNoise": [
+        *bad_numbers(transforms.SensorNoise, std=(5, (), "ab", (0.1, -0.1), (0.1, NAN), (0.1, INF))),
+        refused(lambda: transforms.SensorNoise((0.1,), seed=0.5), ValueError, "seed", "0.5"),
+        refused(lambda: transforms.SensorNoise((0.1,), in_keys=PAIR), ValueError, "['here', 'there']"),
+        refused(lambda: transforms.SensorNoise((0.1,))(TensorDict(field=zeros(1))), KeyError, "'sensor_stream'"),
+        Nan(
+            lambda: transforms.SensorNoise((1.0,))(TensorDict(field=t(NAN), sensor_std=t(1.0), sensor_stream=int64(1)))[
+                "field"
+            ]
+        ),
+    ],
+    "transforms.RandomSensorNoise": [
+        *bad_numbers(transforms.RandomSensorNoise, draws=(0, 1.5, "a")),
+        refused(lambda: transforms.RandomSensorNoise(5), TypeError, "levels", "5"),
+        refused(lambda: transforms.RandomSensorNoise(draws=3), ValueError, "uniform", "(3,)"),
+    ],
+    "transforms.sensor_levels": bad_vectors(transforms.sensor_levels, "uniform", 7),
+    "transforms.with_sensor_noise": [
+        refused(lambda: transforms.with_sensor_noise(5, (0.1, -1.0)), ValueError, "std", "(0.1, -1.0)"),
+        refused(lambda: transforms.with_sensor_noise(5, (0.1,)), TypeError, "env", "5"),
+    ],
+    "transforms.TrackObservation": [
+        *bad_numbers(
+            lambda **options: transforms.TrackObservation(**({"zeta": 0.01, "max_steps": 50} | options)),
+            zeta=(0.0, -1.0, NAN, "a"),
+            max_steps=(0, 2.5, "a", None),
+        ),
+        refused(lambda: transforms.TrackObservation("field", zeta=0.01, max_steps=50), TypeError, "'field'"),
+        refused(lambda: transforms.TrackObservation(PAIR, zeta=0.01, max_steps=50), ValueError, "8 in_keys", str(PAIR)),
+        refused(
+            lambda: transforms.TrackObservation(zeta=0.01, max_steps=50)(TensorDict(field=zeros(3))),
+            KeyError,
+            "target_field",
+            "sensor_std",
+        ),
+    ],
+    "transforms.TrueWay": [
+        refused(lambda: transforms.TrueWay("position"), TypeError, "'position'"),
+        refused(lambda: transforms.TrueWay(PAIR), ValueError, "3 in_keys", str(PAIR)),
+        refused(lambda: transforms.TrueWay()(TensorDict(position=zeros(2))), KeyError, "target_position", "heading"),
+        Nan(
+            lambda: transforms.TrueWay()(
+                TensorDict(position=t(NAN, 0.0), target_position=zeros(2), heading=zeros(1)),
+            )["true_way"]
+        ),
+    ],
+    "transforms.DetourReward": [
+        *bad_numbers(
+            transforms.DetourReward,
+            arrival=(-1.0, NAN, "a"),
+            detour=(-1.0, INF),
+            step=(-0.1, None),
+            lost_penalty=(-5.0, NAN),
+        ),
+        refused(lambda: transforms.DetourReward("true_way"), TypeError, "'true_way'"),
+        refused(lambda: transforms.DetourReward(PAIR), ValueError, "6 in_keys", str(PAIR)),
+        refused(lambda: transforms.DetourReward()(TensorDict(true_way=zeros(2))), KeyError, "next"),
     ],
     "transforms.AlignmentReward": [
         *bad_numbers(transforms.AlignmentReward, weight=(NAN, INF, "a", None), offset=(NAN, "a")),
@@ -414,6 +493,16 @@ VIEWS: Rows = {
     "transforms.ObservationView.check_covers": [
         refused(lambda: NARROW.check_covers(igrf(), t(-5.0, 165.0)), ValueError, "I is", "-50.0 to -40.0°")
     ],
+    "transforms.TrackView": bad_numbers(
+        lambda **options: transforms.TrackView(
+            **({"zeta": 0.01, "max_steps": 50, "max_move_km": 50.0, "max_turn_rad": 1.5} | options)
+        ),
+        zeta=(0.0, NAN, "a"),
+        max_steps=(0, 2.5, None),
+        max_move_km=(0.0, -50.0, "a"),
+        max_turn_rad=(0.0, 4.0, "a"),
+        range_km=(0.0, INF, "a"),
+    ),
 }
 
 ROWS = FOUNDATIONS | GUIDANCE | FIELDS | TRANSFORMS | VIEWS

@@ -16,6 +16,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 MAKEFILE = (ROOT / "Makefile").read_text()
 RECIPE_OF = {"train": "recipes/td3_gradient_guided.py", "replay": "recipes/replay.py", "bench": "-m benchmarks"}
+RECIPE_OF |= {"fly": "recipes/fly.py", "anywhere": "recipes/td3_anywhere.py"}
 """Scripts that get the ARGS of a make target; pytest and mutmut have their own."""
 TOOLS = {"tensorboard", "wandb", "chromium"}
 """Other programs in the documents, whose flags are not checked."""

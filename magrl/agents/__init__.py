@@ -2,6 +2,7 @@
 
 from magrl.agents.networks import make_actor, make_critic
 from magrl.agents.policy import FieldPolicy, PolicyConfig, load_policy, save_policy
+from magrl.agents.pretrained import load_pretrained
 from magrl.agents.recurrent import RecurrentTD3Loss, make_recurrent_actor, recurrent_transforms
 from magrl.agents.td3 import SoftUpdate, TD3Loss, optimize, saturation_penalty
 
@@ -12,6 +13,7 @@ __all__ = [
     "SoftUpdate",
     "TD3Loss",
     "load_policy",
+    "load_pretrained",
     "make_actor",
     "make_critic",
     "make_recurrent_actor",

@@ -6,6 +6,7 @@ transforms and is used like every other navigator.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,12 +19,15 @@ from torchrl.envs import Compose
 
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
-from magrl.checks import check_finite, check_number, check_type
-from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv
+from magrl.checks import check_finite, check_number, check_numbers, check_type
+from magrl.envs import GeomagneticNavEnv
 from magrl.files import DamagedFileError, load_tensors, save_tensors
 from magrl.transforms import ObservationView
+from magrl.transforms.track_view import TrackView
 
 POLICY_FORMAT = 2
+VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}
+"""What policies observe, by the kind that their files name."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class PolicyConfig:
     """All that is needed to rebuild a policy, except its weights.
 
     Args:
-        view: what the policy observes, and its scaling.
+        view: what the policy observes, and its scaling: values scaled to a region, or estimates of its own track.
         num_cells: width of each hidden layer.
         layer_norm: whether hidden layers are normalized.
         memory_size: width of the LSTM; 0 for a policy without memory.
@@ -46,13 +50,13 @@ class PolicyConfig:
         0
     """
 
-    view: ObservationView
+    view: ObservationView | TrackView
     num_cells: tuple[int, ...]
     layer_norm: bool = True
     memory_size: int = 0
 
     def __post_init__(self) -> None:
-        check_type(ObservationView, view=self.view)
+        check_type((ObservationView, TrackView), view=self.view)
         check_type(bool, layer_norm=self.layer_norm)
         check_number(0, 65536, whole=True, memory_size=self.memory_size)
         if not self.num_cells or not all(isinstance(n, int) and 1 <= n <= 65536 for n in self.num_cells):
@@ -61,6 +65,8 @@ class PolicyConfig:
     def make_actor(self, device: Device = None) -> TensorDictSequential:
         """Return an actor of this shape, with new weights."""
         if self.memory_size:
+            if not isinstance(self.view, ObservationView):
+                raise TypeError(f"an agent with a memory needs an ObservationView, got {self.view}")
             shape = (self.view, self.num_cells, self.memory_size)
             return make_recurrent_actor(*shape, layer_norm=self.layer_norm, device=device)
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
@@ -69,8 +75,9 @@ class PolicyConfig:
 class FieldPolicy(TensorDictModuleBase):
     """A trained agent as a navigator of the plain environment, in physical units.
 
-    A recurrent policy keeps its own state for each vehicle from the start of an episode (``step_count`` 0) on: call it
-    once per step.
+    A recurrent policy, and one that reads its own track (:class:`~magrl.transforms.TrackView`), keeps its own state for
+    each vehicle from the start of an episode (``step_count`` 0) on: call it once per step. The latter reads the
+    standard deviations of the sensors from ``sensor_std``, or from its attribute ``noise_std`` without this key.
 
     Args:
         config: what the policy observes, and the shape of its network.
@@ -92,23 +99,46 @@ class FieldPolicy(TensorDictModuleBase):
         super().__init__()
         check_type(PolicyConfig, config=config)
         self.config = config
-        heading = ["heading"] if config.view.observe_heading else []
-        self.in_keys = [key for key in PUBLIC_KEYS if key != "heading"] + heading
-        self.in_keys += ["step_count"] if config.memory_size else []
+        self.in_keys = [*config.view.in_keys, *(["step_count"] if config.memory_size else [])]
         self.observe = Compose(*config.view.observation_transforms())
         self.act = config.view.action_transform()
         self.actor = config.make_actor() if actor is None else actor
         self.state: TensorDictBase | None = None
+        self.noise_std = (0.0, 0.0, 0.0)
+
+    @property
+    def noise_std(self) -> tuple[float, ...]:
+        """Standard deviations of the noise on D [deg], I [deg], B_H [nT], of readings without ``sensor_std``."""
+        return self._noise_std
+
+    @noise_std.setter
+    def noise_std(self, values: Sequence[float]) -> None:
+        check_numbers(3, noise_std=values)
+        check_number(0, noise_std=min(values))
+        self._noise_std = tuple(values)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""
-        observed = self.observe(tensordict.select(*self.in_keys))
+        seen = tensordict.select(*self.in_keys)
+        observed = self._track(seen, tensordict) if isinstance(self.config.view, TrackView) else self.observe(seen)
         if self.config.memory_size:
             self._recall(observed)
         action = self.actor(observed)["action"]
         if self.config.memory_size:
             self.state = observed["next"].select(*STATE_KEYS).detach()
         return tensordict.set("action", self.act.denormalize("action", action))
+
+    def _track(self, seen: TensorDictBase, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the observation after the last move, and keep the state of the track for the next."""
+        noise = seen["field"].new_tensor(self.noise_std).expand_as(seen["field"])
+        seen["sensor_std"] = tensordict.get("sensor_std", noise)
+        observed, starts = self.observe(seen.copy()), seen["step_count"].squeeze(-1) == 0
+        state = self.state
+        if state is not None and state.shape == seen.shape and state.device == seen.device and not starts.all():
+            moved = self.observe(state.copy().set("next", seen))["next"]
+            observed = torch.where(starts, observed, moved)
+        self.state = observed.select(*self.config.view.state_keys)
+        return observed
 
     def _recall(self, observed: TensorDictBase) -> None:
         """Add the recurrent state and the mask of the vehicles whose episode starts."""
@@ -125,7 +155,10 @@ class FieldPolicy(TensorDictModuleBase):
             ValueError: naming the element and both ranges.
         """
         check_type(GeomagneticNavEnv, env=env)
-        self.config.view.check_covers(env.field, env.region.grid(81).to(env.device))
+        if isinstance(self.config.view, ObservationView):  # an agent that reads its own track is of no region
+            if env.many:
+                raise ValueError(f"the policy was trained in one region, and cannot fly in {len(env.region)} regions")
+            self.config.view.check_covers(env.field, env.region.grid(81).to(env.device))
 
 
 def save_policy(path: Path | str, policy: FieldPolicy) -> None:
@@ -142,7 +175,9 @@ def save_policy(path: Path | str, policy: FieldPolicy) -> None:
     """
     check_type(FieldPolicy, policy=policy)
     weights = {key: value.cpu() for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
-    save_tensors({"format": POLICY_FORMAT, "config": asdict(policy.config), "weights": weights}, Path(path))
+    kind = next(name for name, view in VIEWS.items() if isinstance(policy.config.view, view))
+    config = asdict(policy.config) | {"kind": kind}
+    save_tensors({"format": POLICY_FORMAT, "config": config, "weights": weights}, Path(path))
 
 
 def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy:
@@ -187,9 +222,11 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
 
 def _rebuild(config: Any, weights: Any, name: str) -> FieldPolicy:
     names = {field.name for field in fields(PolicyConfig)}
-    if not isinstance(config, dict) or set(config) != names or not isinstance(weights, dict):
-        raise ValueError(f"the configuration of a policy must hold exactly {sorted(names)}")
-    rebuilt = PolicyConfig(**{**config, "view": ObservationView(**config["view"])})
+    config = {"kind": "region", **config} if isinstance(config, dict) else {}
+    kind = config.pop("kind", None)
+    if set(config) != names or kind not in VIEWS or not isinstance(weights, dict):
+        raise ValueError(f"the configuration of a policy must hold exactly {sorted(names)} and a kind of {list(VIEWS)}")
+    rebuilt = PolicyConfig(**{**config, "view": VIEWS[kind](**config["view"])})
     check_finite(weights.items(), name)
     # Before anything is allocated: a few bytes may ask for any number of cells.
     shapes = {key: tuple(value.shape) for key, value in rebuilt.make_actor("meta").state_dict().items()}

@@ -1,0 +1,33 @@
+"""Trained policies that come with the library; beside each file is a card with its training, figures and limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from magrl.agents.policy import FieldPolicy, load_policy
+from magrl.checks import check_type
+
+_FOLDER = Path(__file__).parent
+
+
+def load_pretrained(name: str, device: torch.device | str = "cpu") -> FieldPolicy:
+    """Return a trained policy that comes with the library.
+
+    Args:
+        name: ``"anywhere"``, which navigates without a map (``recipes/td3_anywhere.py``).
+        device: device on which the policy acts.
+
+    Raises:
+        ValueError: for an unknown name, with those that there are.
+
+    Example:
+        >>> load_pretrained("anywhere").config.num_cells
+        (128, 128, 128)
+    """
+    check_type(str, name=name)
+    names = sorted(path.stem for path in _FOLDER.glob("*.pt"))
+    if name not in names:
+        raise ValueError(f"there is no pretrained policy {name!r}: choose from {', '.join(names)}")
+    return load_policy(_FOLDER / f"{name}.pt", device)
