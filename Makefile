@@ -8,21 +8,20 @@ export GOMP_SPINCOUNT ?= 3000
 SEEDS := 0 1 2 3 4
 TEN := $(SEEDS) 5 6 7 8 9
 TWENTY := $(TEN) $(TEN:%=1%)
-GUIDED := $(TWENTY:%=runs/td3_gradient_guided-fast-seed%)
+GUIDED := $(SEEDS:%=runs/td3_gradient_guided-fast-seed%)
 ONE_THREAD := $(TWENTY:%=runs/td3_gradient_guided-fast-one-thread-seed%)
-PLAIN := $(TEN:%=runs/td3-fast-seed%)
+PLAIN := $(SEEDS:%=runs/td3-fast-seed%)
 NOISY := $(SEEDS:%=runs/td3_gradient_guided-fast-noise-0.05-0.05-5-seed%)
 AZORES := $(SEEDS:%=runs/td3_gradient_guided-fast-azores-seed%)
 MEMORY := $(foreach s,0 1 2,runs/td3_recurrent-seed$(s))
-STRICT := $(SEEDS:%=runs/td3_gradient_guided-zeta0.001-seed%)
-AGENTS := $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(MEMORY:%=recurrent=%)
-FAIR := secant kalman run_and_tumble
+AGENTS := $(ONE_THREAD:%=gg_td3=%) $(PLAIN:%=td3=%)
+FAIR := anywhere secant kalman run_and_tumble
 ORACLES := mean_jacobian parallel geodesic
 SWARMS := ga pso afsa ga:flown pso:flown afsa:flown
 NOISE_LEVELS := 0 0.02 0.05 0.1
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere test test-slow check format clean paper trade bench docs replay mutate help
+.PHONY: train fly anywhere test test-slow check format clean earth paper trade bench docs replay mutate help
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -30,8 +29,8 @@ train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two c
 fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; seconds
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" $(ARGS)
 
-anywhere: $(VENV)/.installed  ## train the agent without a map
-	$(RECIPE)/td3_anywhere.py --preset far $(ARGS)
+anywhere: $(VENV)/.installed  ## train the agent without a map; about 20 minutes on one core
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_anywhere.py --preset far $(ARGS)
 
 test: $(VENV)/.installed-dev  ## run the fast tests, one process per core with one thread each
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
@@ -63,36 +62,48 @@ bench: $(VENV)/.installed-dev  ## run the benchmarks; about nine minutes on two 
 replay: runs/td3_gradient_guided-fast-seed0/eval.json  ## write a replay page, replay.html in the run folder
 	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 $(ARGS)
 
-# Ablations of the discount factor, the alignment offset and the state: ten trainings, seven of which take one minute each.
-trade: runs/td3_gradient_guided-fast-seed0/eval.json $(MEMORY:%=%/eval.json)  ## run the ablations
-	for gamma in 0.97 0.995; do test -e runs/trade-gamma$$gamma || \
-	  $(RECIPE)/td3_gradient_guided.py --gamma $$gamma --out runs/trade-gamma$$gamma || exit; done
+# Ablations of the discount factor, the alignment offset and the state, without a cost of distance: eleven trainings, eight
+# of which take one minute each.
+trade: $(MEMORY:%=%/eval.json)  ## run the ablations
+	test -e runs/trade-gamma0.9 || $(RECIPE)/td3_gradient_guided.py --distance-cost 0 --out runs/trade-gamma0.9
+	for gamma in 0.97 0.995; do test -e runs/trade-gamma$$gamma || $(RECIPE)/td3_gradient_guided.py \
+	  --distance-cost 0 --gamma $$gamma --out runs/trade-gamma$$gamma || exit; done
 	for gamma in 0.9 0.97 0.995; do test -e runs/trade-gamma$$gamma-offset0 || $(RECIPE)/td3_gradient_guided.py \
-	  --gamma $$gamma --alignment-offset 0 --out runs/trade-gamma$$gamma-offset0 || exit; done
-	test -e runs/no-difference || $(RECIPE)/td3_gradient_guided.py --no-observe-difference --out runs/no-difference
-	test -e runs/literal-state || $(RECIPE)/td3_gradient_guided.py --no-observe-difference --no-observe-heading \
-	  --out runs/literal-state
+	  --distance-cost 0 --gamma $$gamma --alignment-offset 0 --out runs/trade-gamma$$gamma-offset0 || exit; done
+	test -e runs/no-difference || $(RECIPE)/td3_gradient_guided.py --distance-cost 0 --no-observe-difference \
+	  --out runs/no-difference
+	test -e runs/literal-state || $(RECIPE)/td3_gradient_guided.py --distance-cost 0 --no-observe-difference \
+	  --no-observe-heading --out runs/literal-state
 	mkdir -p docs/results
-	$(RECIPE)/tables/results_table.py "γ 0.9, offset π/4=runs/td3_gradient_guided-fast-seed0" \
-	  $(foreach g,0.97 0.995,"γ $(g), offset π/4=runs/trade-gamma$(g)") \
+	$(RECIPE)/tables/results_table.py $(foreach g,0.9 0.97 0.995,"γ $(g), offset π/4=runs/trade-gamma$(g)") \
 	  $(foreach g,0.9 0.97 0.995,"γ $(g), offset 0=runs/trade-gamma$(g)-offset0") > docs/results/trade.md
-	$(RECIPE)/tables/results_table.py "as published=runs/td3_gradient_guided-fast-seed0" \
+	$(RECIPE)/tables/results_table.py "heading and difference=runs/trade-gamma0.9" \
 	  "without the difference=runs/no-difference" "the paper's eight numbers=runs/literal-state" \
 	  $(foreach s,0 1 2,"the eight numbers with a memory (seed $(s))=runs/td3_recurrent-seed$(s)") > docs/results/state.md
 
-# Section 4 of the paper. Existing runs are reused. All trainings take an hour and a half on two cores (make -j2), everything
+# Tables of docs/anywhere.md, from the pretrained policy.
+earth: $(VENV)/.installed  ## fly the pretrained agent and other navigators all over the Earth; about ten minutes
+	mkdir -p docs/results
+	$(RECIPE)/tables/earth_table.py anywhere kalman secant parallel geodesic > docs/results/earth.md
+	$(RECIPE)/tables/earth_table.py anywhere kalman secant geodesic --distance-km 700 1000 --max-steps 120 --tasks 2000 \
+	  > docs/results/earth-700.md
+	$(RECIPE)/tables/earth_table.py anywhere kalman secant geodesic --distance-km 1200 1800 --max-steps 120 --tasks 2000 \
+	  > docs/results/earth-1200.md
+	$(RECIPE)/tables/publish.py docs/anywhere.md
+
+# Section 4 of the paper. Existing runs are reused. All trainings take forty minutes on two cores (make -j2), everything
 # else a few minutes.
-paper: $(foreach run,$(GUIDED) $(ONE_THREAD) $(PLAIN) $(STRICT) $(MEMORY) $(NOISY) $(AZORES),$(run)/eval.json)  ## make all tables and figures of the paper's Section 4
+paper: $(foreach run,$(GUIDED) $(ONE_THREAD) $(PLAIN) $(NOISY) $(AZORES),$(run)/eval.json)  ## make all tables and figures of the paper's Section 4
 	rm -rf runs/comparison runs/comparison-paper-100 runs/comparison-zeta0.001 runs/azores runs/azores-tasks $(NOISE_LEVELS:%=runs/noise-%)
 	$(RECIPE)/evaluate.py $(AGENTS) $(SWARMS) $(FAIR) $(ORACLES) --out runs/comparison
 	$(RECIPE)/evaluate.py $(AGENTS) $(SWARMS) $(FAIR) $(ORACLES) --tasks paper-100 --out runs/comparison-paper-100
-	$(RECIPE)/evaluate.py $(STRICT:%=gg_td3=%) $(FAIR) $(ORACLES) --zeta 0.001 --out runs/comparison-zeta0.001
-	for noise in "0 0 0" "0.02 0.02 2" "0.05 0.05 5" "0.1 0.1 10"; do $(RECIPE)/evaluate.py $(GUIDED:%=gg_td3=%) \
+	$(RECIPE)/evaluate.py $(FAIR) $(ORACLES) --zeta 0.001 --out runs/comparison-zeta0.001
+	for noise in "0 0 0" "0.02 0.02 2" "0.05 0.05 5" "0.1 0.1 10"; do $(RECIPE)/evaluate.py $(ONE_THREAD:%=gg_td3=%) \
 	  $(NOISY:%=gg_td3_noise=%) $(FAIR) $(ORACLES) --noise $$noise --out runs/noise-$${noise%% *} || exit; done
 	$(RECIPE)/evaluate.py $(AZORES:%=gg_td3=%) $(FAIR) $(ORACLES) --scenario docs/examples/azores.toml --tasks test-1000 \
 	  --out runs/azores
 	$(RECIPE)/evaluate.py $(AZORES:%=gg_td3=%) $(FAIR) $(ORACLES) --out runs/azores-tasks
-	$(RECIPE)/tables/figures.py --results runs/comparison --gg-td3 $(GUIDED) --td3 $(PLAIN) --out docs/figures
+	$(RECIPE)/tables/figures.py --results runs/comparison --gg-td3 $(ONE_THREAD) --td3 $(PLAIN) --out docs/figures
 	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 --gif docs/figures/replay.gif
 	mkdir -p docs/results
 	for name in comparison comparison-paper-100 comparison-zeta0.001; do cp runs/$$name/table.md docs/results/$$name.md; done
@@ -100,10 +111,10 @@ paper: $(foreach run,$(GUIDED) $(ONE_THREAD) $(PLAIN) $(STRICT) $(MEMORY) $(NOIS
 	cp runs/azores/short.md docs/results/own-world.md
 	cp runs/azores-tasks/short.md docs/results/own-world-tasks.md
 	$(RECIPE)/tables/noise_table.py $(NOISE_LEVELS:%=runs/noise-%) --table docs/results/noise.md --figure docs/figures/noise.png
-	$(RECIPE)/tables/learning_table.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) > docs/results/learning.md
-	$(RECIPE)/tables/results_table.py $(GUIDED:%="two threads=%") $(ONE_THREAD:%="one thread=%") --pooled > docs/results/seeds.md
+	$(RECIPE)/tables/learning_table.py $(ONE_THREAD:%=gg_td3=%) $(PLAIN:%=td3=%) > docs/results/learning.md
+	$(RECIPE)/tables/results_table.py $(ONE_THREAD:%="one thread=%") $(GUIDED:%="two threads=%") --pooled > docs/results/seeds.md
 	$(RECIPE)/tables/results_table.py $(AZORES) --each > docs/results/azores.md
-	$(RECIPE)/tables/path_loss.py $(GUIDED:%=gg_td3=%) $(PLAIN:%=td3=%) $(FAIR) $(ORACLES) > docs/results/path_loss.md
+	$(RECIPE)/tables/path_loss.py $(ONE_THREAD:%=gg_td3=%) $(PLAIN:%=td3=%) $(FAIR) $(ORACLES) > docs/results/path_loss.md
 	$(RECIPE)/tables/probe_sweep.py > docs/results/probe_sweep.md
 	$(RECIPE)/tables/random_boxes.py > docs/results/random_boxes.md
 	$(RECIPE)/tables/publish.py README.md docs/reproduction.md docs/own_data.md
@@ -125,9 +136,6 @@ runs/td3-fast-seed%/eval.json: | $(VENV)/.installed
 
 runs/td3_recurrent-seed%/eval.json: | $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(RECIPE)/td3_recurrent.py --seed $*
-
-runs/td3_gradient_guided-zeta0.001-seed%/eval.json: | $(VENV)/.installed
-	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --zeta 0.001 --total-frames 409600 --seed $* --out $(@D)
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## /  \1\t/p' $(MAKEFILE_LIST) | expand -t 14

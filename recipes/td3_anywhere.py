@@ -45,7 +45,7 @@ class Config(RunConfig):
 
     preset: Literal["fast", "far"] = "fast"
     """Source of the defaults: destinations 300-500 km away, or 150-1800 km."""
-    total_frames: Count = 4_096_000
+    total_frames: Count = 2_048_000
     """Steps of all vehicles together."""
     eval_every: Count = 200
     """Collected batches between evaluations on the validation tasks."""

@@ -421,6 +421,11 @@ TRANSFORMS: Rows = {
             )["true_way"]
         ),
     ],
+    "transforms.DistanceCost": [
+        *bad_numbers(transforms.DistanceCost, cost=(-0.1, NAN, INF, "a")),
+        refused(lambda: transforms.DistanceCost(0.1, in_keys=PAIR), ValueError, "1 in_keys", str(PAIR)),
+        refused(lambda: transforms.DistanceCost(0.1)(TensorDict(move=zeros(2))), KeyError, "next"),
+    ],
     "transforms.DetourReward": [
         *bad_numbers(
             transforms.DetourReward,

@@ -17,7 +17,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.field.regional import RegionalField
 from magrl.geodesy import geodesic, move
 from magrl.navigators import Secant
-from magrl.transforms import DetourReward, TrueWay
+from magrl.transforms import DetourReward, DistanceCost, TrueWay
 from magrl.transforms.way import detour_reward
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
@@ -161,3 +161,19 @@ def test_what_is_missing_is_named() -> None:
         TrueWay()(td.exclude("position", "next"))
     with pytest.raises(KeyError, match=r"DetourReward reads .*true_way"):
         _ = TransformedEnv(nav(), DetourReward()).specs
+
+
+def long_move(td: TensorDict) -> TensorDict:
+    return td.set("action", torch.tensor([30.0, 0.1]).expand(*td.shape, 2))
+
+
+def test_distance_cost_is_paid_for_each_kilometer() -> None:
+    base = GeomagneticNavEnv(num_envs=4, seed=0)
+    env = TransformedEnv(base, DistanceCost(0.05))
+    check_env_specs(env)
+    env.set_seed(0)
+    costly = env.rollout(5, long_move)
+    reward, move = costly["next", "reward"], costly["next", "move"]
+    terms = costly["next", "reward_destination"] + costly["next", "reward_proximity"]
+    torch.testing.assert_close(reward, terms - 0.05 * move[..., :1])
+    assert (move[..., 0] == 30).all()

@@ -270,6 +270,8 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
 def noise_figure(levels: Mapping[str, Summaries], mode: str = "look-ahead") -> Figure:
     """Return SPL over the noise level: a line for each navigator, and the range of its runs where it has several.
 
+    The axis leaves out navigators that are below 50 % at every level beside better ones; the legend says so.
+
     Args:
         levels: by noise level, lowest first, the summaries of the runs of each navigator. A level that a navigator did
             not fly, or flew without an SPL, leaves a gap.
@@ -287,17 +289,22 @@ def noise_figure(levels: Mapping[str, Summaries], mode: str = "look-ahead") -> F
     if not names:
         raise ValueError(f"levels must hold the summaries of at least one navigator, got {dict(levels)}")
     figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.subplots()
+    axes, shown = figure.subplots(), list[float]()
     for name in names:
         text = navigator_label(name, mode).partition(" (")[0]
         color, line = NAVIGATOR_COLORS[name.partition(":")[0]], "--" if text.endswith("flown") else "-"
         runs = [known_values(run.get("spl") for run in summaries.get(name, ())) for summaries in levels.values()]
         middle = [interquartile_mean(torch.tensor(values)).item() if values else np.nan for values in runs]
         low, high = ([end(values, default=np.nan) for values in runs] for end in (min, max))
+        good = np.nanmax([*middle, -np.inf]) >= 50
+        shown += low if good else []
+        text += "" if good else " (below 50 %)"
         axes.plot(middle, marker="o", ms=4, lw=1.5, ls=line, color=color, label=text)
         axes.fill_between(range(len(runs)), low, high, color=color, alpha=0.2, lw=0)
     axes.set_xticks(range(len(levels)), list(levels))
     axes.set(xlabel="standard deviations of the readings of D, I, $B_H$", ylabel="SPL [%]")
+    if shown:
+        axes.set_ylim(np.nanmin(shown) - 3, 101)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

@@ -127,8 +127,10 @@ class Kalman(QuasiNewton):
         slope = now.mean[..., 1:]
         square = slope.unsqueeze(-1) * slope.unsqueeze(-2) + now.covariance[..., 1:, 1:] - after[..., 1:, 1:]
         normal = (square / variance[..., None, None]).sum(-3)
-        ridge = (DISTANCE_SCALE_KM / self.range_km) ** 2 * torch.eye(2, dtype=normal.dtype, device=normal.device)
-        return torch.linalg.inv(normal + ridge) * DISTANCE_SCALE_KM**2
+        unknown = torch.eye(2, dtype=normal.dtype, device=normal.device) * (self.range_km / DISTANCE_SCALE_KM) ** 2
+        inverse, info = torch.linalg.inv_ex(normal + torch.diag(1 / unknown.diagonal()))
+        # Where rounding leaves a singular matrix, the way is as unknown as before.
+        return torch.where((info == 0)[..., None, None], inverse, unknown) * DISTANCE_SCALE_KM**2
 
 
 def trade_off(noise: Sequence[float]) -> tuple[float, float]:

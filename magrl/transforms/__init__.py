@@ -12,12 +12,13 @@ from magrl.transforms.sensors import RandomSensorNoise, SensorNoise, sensor_leve
 from magrl.transforms.track import TrackGradient
 from magrl.transforms.track_view import TrackObservation, TrackView
 from magrl.transforms.view import ObservationView
-from magrl.transforms.way import DetourReward, TrueWay
+from magrl.transforms.way import DetourReward, DistanceCost, TrueWay
 
 __all__ = [
     "AlignmentReward",
     "AngleVector",
     "DetourReward",
+    "DistanceCost",
     "FieldGradient",
     "GradientHeading",
     "MinMaxNorm",

@@ -1,4 +1,4 @@
-"""The true way to the destination and a reward for a short path: privileged, for critics and rewards only."""
+"""Rewards for short paths, and the true way to the destination, which is privileged: for critics and rewards only."""
 
 from __future__ import annotations
 
@@ -186,3 +186,57 @@ class DetourReward(ObservationTransform):
     def _observed_way(self) -> TensorSpec:
         parent = self.parent
         return self._leaf(Composite() if parent is None else parent.full_observation_spec, self.in_keys[0])
+
+
+class DistanceCost(ObservationTransform):
+    """Subtract a cost of the distance of each move from a reward.
+
+    Without it, a move that brings the vehicle no nearer costs no more than waiting.
+
+    Args:
+        cost: cost of a move [1/km].
+        in_keys: one move ``(..., K)``, with the distance [km] first.
+        out_keys: one reward ``(..., 1)``, from which the cost is subtracted.
+
+    Raises:
+        ValueError: for a negative cost, or another number of keys.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> step = TensorDict(next=TensorDict(move=torch.tensor([40.0, 0.1]), reward=torch.tensor([3.0])))
+        >>> DistanceCost(0.05)(step)["next", "reward"]
+        tensor([1.])
+    """
+
+    def __init__(
+        self, cost: float, in_keys: NestedKey | Keys = ("move",), out_keys: NestedKey | Keys = ("reward",)
+    ) -> None:
+        super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
+        expect_keys(self, 1, 1)
+        check_number(0, cost=cost)
+        self.cost = float(cost)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        return tensordict_reset  # a reset has no reward
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
+        if values is None:
+            return next_tensordict
+        reward = next_tensordict[self.out_keys[0]]
+        return next_tensordict.set(self.out_keys[0], reward - self.cost * values[0][..., :1])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Subtract the cost from the reward of transitions."""
+        if tensordict.get("next", None) is None:
+            raise KeyError(
+                f"DistanceCost needs transitions, with move and reward under 'next', got {sorted_keys(tensordict)}"
+            )
+        self._call(tensordict["next"])
+        return tensordict
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """Remove the bounds of the reward."""
+        leaf = reward_spec[self.out_keys[0]]
+        reward_spec[self.out_keys[0]] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
+        return reward_spec
