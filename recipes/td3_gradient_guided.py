@@ -58,8 +58,8 @@ class Config(RunConfig):
     """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
     alignment_offset: float = math.pi / 4
     """Heading deviation at which the alignment reward changes sign [rad]."""
-    distance_cost: NonNegative = 0.1
-    """Cost of a move [1/km]; the paper has none."""
+    distance_cost: NonNegative = 0.0
+    """Cost of a move [1/km]; 0.1 in preset fast, none in the paper."""
     observe_heading: bool = True
     """Observe cosine and sine of the heading."""
     observe_difference: bool = True
@@ -122,7 +122,6 @@ PAPER = Config(
     num_envs=1,
     total_frames=1_000_000,
     layer_norm=False,
-    distance_cost=0.0,
     observe_difference=False,
     updates_per_batch=1,
     init_random_frames=256,
@@ -130,8 +129,9 @@ PAPER = Config(
     saturation_weight=0.0,
     eval_every=2000,
 )
-PRESETS = {"fast": Config(), "paper": PAPER}
-PRESETS |= {f"td3-{name}": preset.replace(preset=f"td3-{name}", guided=False) for name, preset in PRESETS.items()}
+PRESETS = {"fast": Config(distance_cost=0.1), "paper": PAPER}
+PRESETS["td3-fast"] = Config(preset="td3-fast", guided=False)
+PRESETS["td3-paper"] = PAPER.replace(preset="td3-paper", guided=False)
 
 
 def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> TransformedEnv:
