@@ -144,7 +144,7 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
     ]
     sensors = [SensorNoise(config.noise, seed=base.seed)] if any(config.noise) else []
     scaling = [*view.observation_transforms(), view.action_transform()]
-    rewards = [DistanceCost(config.distance_cost), RewardSum(), RewardScaling(loc=0.0, scale=config.reward_scale)]
+    rewards = [RewardSum(), DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
     return TransformedEnv(base, Compose(*(guidance if config.guided else []), *sensors, *scaling, *rewards))
 
 

@@ -122,7 +122,10 @@ def test_noise_figure_shows_average_and_range_of_runs() -> None:
     axes = plots.noise_figure(levels, "flown").axes[0]
     assert [line.get_ydata().tolist() for line in axes.lines] == [[91, 70], pytest.approx([5, math.nan], nan_ok=True)]
     assert [line.get_linestyle() for line in axes.lines] == ["-", "--"]
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["Gradient-Guided TD3", "GA, flown (below 50 %)"]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        "Gradient-Guided TD3",
+        "GA, flown (below 50 %)",
+    ]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["none", "high"]
     edge = axes.collections[0].get_paths()[0].vertices
     assert {tuple(point) for point in edge} == {(0, 80), (0, 99), (1, 70)}
