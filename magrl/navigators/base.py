@@ -2,7 +2,7 @@
 
 A navigator reads keys of the plain :class:`magrl.envs.GeomagneticNavEnv` in physical units and writes ``action``
 ``(N, 2)``: distance [km] and turn [rad]. A navigator that reads privileged keys, or the field at places where the
-vehicle has not been, has ``oracle = True``; ``needs`` says in words what it knows beside its own readings.
+vehicle has not been, has ``oracle = True``; ``needs`` states what it knows beside its own readings.
 """
 
 from __future__ import annotations

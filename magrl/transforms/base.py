@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
@@ -66,6 +66,35 @@ class ObservationTransform(Transform):
         if key not in spec.keys(True, True):
             raise KeyError(f"{type(self).__name__} reads {key!r}, which is not among {sorted_keys(spec)}")
         return spec[key]
+
+
+def observed_spec(transform: Transform) -> Composite:
+    """Return the observations that come before a transform; none without an environment.
+
+    Example:
+        >>> from torchrl.envs import CatTensors
+        >>> len(observed_spec(CatTensors(["field"], "observation")).keys())
+        0
+    """
+    parent = transform.parent
+    return Composite() if parent is None else parent.full_observation_spec
+
+
+def with_state(input_spec: Composite, state: Mapping[NestedKey, TensorSpec]) -> Composite:
+    """Return an input spec whose state has further keys: batched and parallel environments pass them to a step.
+
+    Example:
+        >>> from torchrl.data import Unbounded
+        >>> empty = Composite(full_state_spec=None, full_action_spec=None)
+        >>> sorted(with_state(empty, {"way": Unbounded(2)})["full_state_spec"].keys())
+        ['way']
+    """
+    input_spec = input_spec.clone()
+    if input_spec["full_state_spec"] is None:
+        input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
+    for key, spec in state.items():
+        input_spec["full_state_spec"][key] = spec.clone()
+    return input_spec
 
 
 def sorted_keys(container: TensorDictBase | Composite) -> list[str]:

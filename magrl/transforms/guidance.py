@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.func import jacfwd, vmap
-from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from magrl import guidance
@@ -19,7 +19,16 @@ from magrl.checks import check_number, check_tensor
 from magrl.field.elements import element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import wrap_angle
-from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list, several_keys, sorted_keys
+from magrl.transforms.base import (
+    Keys,
+    ObservationTransform,
+    expect_keys,
+    key_list,
+    observed_spec,
+    several_keys,
+    sorted_keys,
+    with_state,
+)
 
 
 class FieldGradient(ObservationTransform):
@@ -261,22 +270,16 @@ class AlignmentReward(Transform):
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
         """Remove the bounds of the reward; rewards that the environment lacks get the shape of the angle."""
         for key in self.out_keys:
-            leaf = reward_spec[key] if key in reward_spec.keys(True, True) else self._observed(self.in_keys[0])
+            leaf = reward_spec[key] if key in reward_spec.keys(True, True) else self._observation(self.in_keys[0])
             reward_spec[key] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
         return reward_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make the reference part of the state, so that batched and parallel environments pass it to the next step."""
-        input_spec = input_spec.clone()
-        if input_spec["full_state_spec"] is None:
-            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
-        for key in self.in_keys[1:]:
-            input_spec["full_state_spec"][key] = self._observed(key).clone()
-        return input_spec
+        return with_state(input_spec, {key: self._observation(key) for key in self.in_keys[1:]})
 
-    def _observed(self, key: NestedKey) -> TensorSpec:
-        parent = self.parent
-        spec = Composite() if parent is None else parent.full_observation_spec
+    def _observation(self, key: NestedKey) -> TensorSpec:
+        spec = observed_spec(self)
         if key not in spec.keys(True, True):
             raise KeyError(f"AlignmentReward reads {key!r}, which is not among the observations {sorted_keys(spec)}")
         return spec[key]

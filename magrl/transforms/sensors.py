@@ -15,11 +15,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list
+from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list, observed_spec, with_state
 from magrl.transforms.counters import advanced, counter_stream, split, stream_uniform
 
 _SENSORS = 1  # second counter: it separates these numbers from others of the same seed
@@ -157,15 +157,11 @@ class SensorNoise(ObservationTransform):
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make what a step reads part of the state, so that environments in other processes pass it to the step."""
-        input_spec = super().transform_input_spec(input_spec).clone()
-        if input_spec["full_state_spec"] is None:
-            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
-        parent = self.parent
-        if parent is not None:
-            observed = self.transform_observation_spec(parent.full_observation_spec.clone())
-            for key in (self.stream_key, self.std_key):
-                input_spec["full_state_spec"][key] = observed[key]
-        return input_spec
+        input_spec = super().transform_input_spec(input_spec)
+        if self.parent is None:
+            return with_state(input_spec, {})
+        observed = self.transform_observation_spec(observed_spec(self).clone())
+        return with_state(input_spec, {key: observed[key] for key in (self.stream_key, self.std_key)})
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
         saved = state_dict.get(f"{prefix}streams")

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 
 from magrl import tracking
 from magrl.checks import check_number, check_numbers
 from magrl.tracking import FieldTrack, GradientPrior
-from magrl.transforms.base import Keys, ObservationTransform, several_keys, sorted_keys
+from magrl.transforms.base import Keys, ObservationTransform, observed_spec, several_keys, sorted_keys, with_state
 
 FRAMES = ("world", "vehicle")
 OUT_KEYS = ("track_mean", "track_covariance", "estimated_field", "estimated_gradient", "way", "way_covariance")
@@ -195,15 +195,12 @@ class TrackGradient(ObservationTransform):
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make the filter part of the state, so that batched and parallel environments pass it to the next step."""
-        input_spec = super().transform_input_spec(input_spec).clone()
-        if input_spec["full_state_spec"] is None:
-            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
-        parent = self.parent
-        reading = self._leaf(Composite() if parent is None else parent.full_observation_spec, self.in_keys[0])
-        for key, last in zip(self.out_keys[:2], self._sizes(len(self.scales)), strict=False):
-            shape = (*reading.shape[:-1], *last)
-            input_spec["full_state_spec"][key] = Unbounded(shape, device=reading.device, dtype=reading.dtype)
-        return input_spec
+        input_spec = super().transform_input_spec(input_spec)
+        reading = self._leaf(observed_spec(self), self.in_keys[0])
+        sizes = zip(self.out_keys[:2], self._sizes(len(self.scales)), strict=False)
+        shapes = {key: (*reading.shape[:-1], *last) for key, last in sizes}
+        state = {key: Unbounded(shape, device=reading.device, dtype=reading.dtype) for key, shape in shapes.items()}
+        return with_state(input_spec, state)
 
 
 def _turned(vectors: Tensor, heading: Tensor) -> Tensor:

@@ -9,12 +9,20 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from magrl import guidance
 from magrl.checks import check_number, check_tensor
-from magrl.transforms.base import Keys, ObservationTransform, expect_keys, several_keys, sorted_keys
+from magrl.transforms.base import (
+    Keys,
+    ObservationTransform,
+    expect_keys,
+    observed_spec,
+    several_keys,
+    sorted_keys,
+    with_state,
+)
 from magrl.transforms.scaling import MinMaxNorm
 from magrl.transforms.track import OUT_KEYS, TrackGradient
 
@@ -181,14 +189,9 @@ class TrackObservation(ObservationTransform):
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make the first reading part of the state, so that batched and parallel environments pass it on."""
-        input_spec = super().transform_input_spec(input_spec).clone()
-        if input_spec["full_state_spec"] is None:
-            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
-        parent = self.parent
-        leaf = self._leaf(Composite() if parent is None else parent.full_observation_spec, self.in_keys[0])
+        leaf = self._leaf(observed_spec(self), self.in_keys[0])
         first = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
-        input_spec["full_state_spec"][self.out_keys[1]] = first
-        return input_spec
+        return with_state(super().transform_input_spec(input_spec), {self.out_keys[1]: first})
 
 
 @dataclass(frozen=True, kw_only=True)

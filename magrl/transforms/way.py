@@ -6,11 +6,20 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 
 from magrl.checks import check_number, check_tensor
 from magrl.geodesy import geodesic
-from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list, several_keys, sorted_keys
+from magrl.transforms.base import (
+    Keys,
+    ObservationTransform,
+    expect_keys,
+    key_list,
+    observed_spec,
+    several_keys,
+    sorted_keys,
+    with_state,
+)
 
 
 class TrueWay(ObservationTransform):
@@ -177,15 +186,10 @@ class DetourReward(ObservationTransform):
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make the true way part of the state, so that batched and parallel environments pass it to the next step."""
-        input_spec = super().transform_input_spec(input_spec).clone()
-        if input_spec["full_state_spec"] is None:
-            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
-        input_spec["full_state_spec"][self.in_keys[0]] = self._observed_way().clone()
-        return input_spec
+        return with_state(super().transform_input_spec(input_spec), {self.in_keys[0]: self._observed_way()})
 
     def _observed_way(self) -> TensorSpec:
-        parent = self.parent
-        return self._leaf(Composite() if parent is None else parent.full_observation_spec, self.in_keys[0])
+        return self._leaf(observed_spec(self), self.in_keys[0])
 
 
 class DistanceCost(ObservationTransform):
