@@ -109,7 +109,8 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
         held = {Path(name) for name in archive.namelist()}
     library = {path.relative_to(ROOT) for path in (ROOT / "magrl").rglob("*") if path.suffix == ".py"}
     data = {Path("magrl/py.typed"), Path("magrl/evaluation/templates/replay.html")}
-    data |= {Path("magrl/evaluation/coastlines.npz")}
+    data |= {Path("magrl/evaluation/coastlines.npz"), Path("magrl/field/wmmhr2025.cof.gz")}
+    data |= {Path("magrl/field/weather.npz")}
     data |= {Path(f"magrl/agents/pretrained/anywhere.{kind}") for kind in ("pt", "md")}
     assert {path for path in held if path.parts[0] == "magrl"} == library | data
     others = {path.parts[0] for path in held} - {"magrl"}

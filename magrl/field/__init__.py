@@ -1,23 +1,34 @@
-"""Models of the geomagnetic field: IGRF, spherical harmonic expansions, and fast regional expansions of either."""
+"""Models of the geomagnetic field: IGRF, spherical harmonics, the crust, and fast regional expansions of each."""
 
 from magrl.field.bank import FieldBank
+from magrl.field.crust import CrustedField, RandomCrust, crustal_spectrum
 from magrl.field.igrf import IGRF, Date, igrf_coefficients, parse_date
 from magrl.field.model import FieldModel, elements_at, elements_gradient_at, elements_range
 from magrl.field.planets import random_planets
 from magrl.field.regional import RegionalField
 from magrl.field.spherical import SphericalHarmonicField
+from magrl.field.weather import WEATHER, WeatherRecord, weather_record
+from magrl.field.wmmhr import WMMHR, wmmhr_coefficients
 
 __all__ = [
     "IGRF",
+    "WEATHER",
+    "WMMHR",
+    "CrustedField",
     "Date",
     "FieldBank",
     "FieldModel",
+    "RandomCrust",
     "RegionalField",
     "SphericalHarmonicField",
+    "WeatherRecord",
+    "crustal_spectrum",
     "elements_at",
     "elements_gradient_at",
     "elements_range",
     "igrf_coefficients",
     "parse_date",
     "random_planets",
+    "weather_record",
+    "wmmhr_coefficients",
 ]

@@ -314,7 +314,7 @@ def _surface_weights(gauss: Tensor) -> Tensor:
     angles, _ = chebyshev_nodes(degree + 12)
     axis, _, z = to_ecef(90 - torch.rad2deg(angles), torch.zeros_like(angles)).unbind(-1)
     parts = []
-    for some in gauss.split(_BOXES):
+    for some in gauss.split(max(1, _BOXES * 14**3 // degree**3)):  # temporary memory grows with the cube of the degree
         tables = torch.cat([harmonics.field_table(table) for table in some])
         parts.append(harmonics.on_surface(harmonics.separate(tables, degree), axis, z).unflatten(0, (-1, 3)))
     return torch.cat(parts)
