@@ -21,10 +21,10 @@ from torchrl.envs import EnvBase
 from magrl import guidance
 from magrl.checks import check_number, check_type
 from magrl.envs import specs
-from magrl.envs.measures import check_zeta
+from magrl.envs.arrival import Arrival
 from magrl.envs.region import Region
 from magrl.envs.regions import Regions
-from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
+from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array, track_recorder
 from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import RegionTasks, Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
@@ -58,8 +58,12 @@ class GeomagneticNavEnv(EnvBase):
         num_envs: number of vehicles in the batch.
         max_steps: moves after which an episode is truncated.
         max_move_km: longest move [km].
+        drift_km: how much farther errors of motion may carry a vehicle [km]; see :class:`~magrl.transforms.MotionError`.
         max_turn_rad: largest turn to either side before a move [rad].
         zeta: arrival threshold on the objective, below 3, its largest value at the start.
+        arrival: ``"objective"`` for the paper's rule, or ``"declared"``: the action has a third number, in [-1, 1], and
+            above 0 the vehicle declares that it has arrived with this move, which ends the episode.
+        arrival_radius_km: distance from the destination within which a declared arrival is a success [km].
         start_heading: ``"north"``, or ``"random"`` for a uniform heading.
         destination_weight: reward at arrival, zeta_1.
         proximity_weight: reward per unit of the objective, zeta_2.
@@ -96,8 +100,11 @@ class GeomagneticNavEnv(EnvBase):
         num_envs: int = 1,
         max_steps: int = 50,
         max_move_km: float = 50.0,
+        drift_km: float = 0.0,
         max_turn_rad: float = math.pi / 2,
         zeta: float = 0.01,
+        arrival: str = "objective",
+        arrival_radius_km: float = 25.0,
         start_heading: str = "north",
         destination_weight: float = 200.0,
         proximity_weight: float = 10.0,
@@ -111,28 +118,22 @@ class GeomagneticNavEnv(EnvBase):
         check_number(0, 2**64 - 1, whole=True, seed=0 if seed is None else seed)
         check_number(0, 1000, above=True, max_move_km=max_move_km)  # a move is one short leg
         check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
-        check_zeta(zeta)
-        check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight)
+        rule = Arrival(arrival, zeta, arrival_radius_km)
+        check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
         if start_heading not in ("north", "random"):
             raise ValueError(f"start_heading must be 'north' or 'random', got {start_heading!r}")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        if render_mode and isinstance(scenario.region, Regions):
-            raise ValueError(
-                f"render_mode {render_mode!r} draws one region, the scenario has {len(scenario.region)}: take None"
-            )
+        tracks = track_recorder(render_mode, scenario.region, max_steps + 1)
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
-        self.num_envs, self.max_steps, self.zeta = num_envs, max_steps, float(zeta)
-        self.max_move_km, self.max_turn_rad = float(max_move_km), float(max_turn_rad)
-        self.start_heading, self.render_mode = start_heading, render_mode
+        self.num_envs, self.max_steps, self.arrival, self.zeta = num_envs, max_steps, rule, float(zeta)
+        self.max_move_km, self.max_turn_rad, self.drift_km = float(max_move_km), float(max_turn_rad), float(drift_km)
+        self.start_heading, self.render_mode, self._tracks = start_heading, render_mode, tracks
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
-        self._tracks = TrackRecorder(max_steps + 1) if render_mode else None
         self._place(scenario)
-        self.register_buffer("action_low", self._float64((0.0, -self.max_turn_rad)))
-        self.register_buffer("action_high", self._float64((self.max_move_km, self.max_turn_rad)))
+        self.register_buffer("action_low", self._float64((0.0, -self.max_turn_rad, *self.arrival.low)))
+        self.register_buffer("action_high", self._float64((self.max_move_km, self.max_turn_rad, *self.arrival.high)))
         self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
-        self._make_specs(self.edge.reachable(max_move_km))
+        self._make_specs(self.edge.reachable(max_move_km + drift_km))
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
     def _place(self, scenario: Scenario) -> None:
@@ -142,7 +143,7 @@ class GeomagneticNavEnv(EnvBase):
         if self.many:  # tensors, which move to the device; those of the scenario stay where they are
             self.region, self.edge = (copy.deepcopy(boxes).to(self.device) for boxes in (self.region, self.edge))
         self.tasks = None if tasks is None else type(tasks)(*(values.to(self.device) for values in tasks))
-        field = scenario.build_field(self.max_move_km)
+        field = scenario.build_field(self.max_move_km + self.drift_km)
         self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
         self.field = field.to(self.device) if isinstance(field, torch.nn.Module) else field
 
@@ -183,7 +184,8 @@ class GeomagneticNavEnv(EnvBase):
     def _make_specs(self, box: Region | Regions) -> None:
         bounds = specs.field_bounds(self.field, box, self.device)
         many = len(self.region) if self.many else None
-        observation = specs.observation_spec(self.num_envs, bounds, self.max_move_km, self.max_turn_rad, many)
+        limits = self.max_move_km + self.drift_km, self.max_turn_rad
+        observation = specs.observation_spec(self.num_envs, bounds, *limits, many, self.arrival.declared)
         self.observation_spec = observation.to(self.device)
         self.state_spec = specs.state_spec(self.observation_spec)
         self.action_spec = specs.bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
@@ -241,6 +243,7 @@ class GeomagneticNavEnv(EnvBase):
                 "success": flags["done"].clone(),
                 **flags,
                 **({specs.REGION: index[0].unsqueeze(-1)} if index else {}),
+                **({specs.DECLARED: flags["done"].clone()} if self.arrival.declared else {}),
             },
             batch_size=vehicle.shape,
             device=self.device,
@@ -261,13 +264,12 @@ class GeomagneticNavEnv(EnvBase):
     # Step
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = specs.checked_action(tensordict["action"], self.action_low, self.action_high)
-        distance, turn = action.unbind(-1)
+        action = specs.checked_action(tensordict["action"], self.action_low, self.action_high, self.drift_km)
+        distance, turn = action[:, :2].unbind(-1)
         before = tensordict["position"]
         heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
-        latitude, longitude = before.unbind(-1)
         index = (tensordict[specs.REGION].squeeze(-1),) if self.many else ()
-        moved = torch.stack(move(latitude, longitude, heading, distance), -1)
+        moved = torch.stack(move(before[:, 0], before[:, 1], heading, distance), -1)
         was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), *index).unbind(0)
         position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
         lost = ~(was_inside & is_inside)
@@ -275,9 +277,10 @@ class GeomagneticNavEnv(EnvBase):
         field = elements_at(self.field, position, *index).float().double()
         weights = tensordict["objective_weights"].double()
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
-        arrived = (objective < self.zeta) & ~lost
+        ended, right = self.arrival(action, objective, position, tensordict["target_position"])
+        arrived = right & ended & ~lost
         step = tensordict["step_count"] + 1
-        terminated = arrived | lost
+        terminated = ended | lost
         truncated = (step >= self.max_steps) & ~terminated
         proximity = guidance.proximity_reward(tensordict["objective"].double(), objective, self.proximity_weight)
         proximity = guidance.late_decay(proximity, step, self.max_steps)
@@ -286,7 +289,7 @@ class GeomagneticNavEnv(EnvBase):
             {
                 "field": field.float(),
                 "target_field": tensordict["target_field"],
-                "move": action.float(),
+                "move": action[:, :2].float(),
                 "heading": heading.float().unsqueeze(-1),
                 "step_count": step,
                 "position": position,
@@ -302,6 +305,7 @@ class GeomagneticNavEnv(EnvBase):
                 "terminated": terminated,
                 "truncated": truncated,
                 **({specs.REGION: tensordict[specs.REGION]} if index else {}),
+                **({specs.DECLARED: ended} if self.arrival.declared else {}),
             },
             batch_size=tensordict.batch_size,
             device=self.device,
@@ -332,8 +336,7 @@ class GeomagneticNavEnv(EnvBase):
             ``(size_px, size_px, 3)`` uint8 RGB.
 
         Raises:
-            RuntimeError: without ``render_mode="rgb_array"``, or before the first reset.
-            IndexError: for a vehicle that is not in the batch.
+            RuntimeError, IndexError: as :meth:`track`.
         """
         chosen = range(min(self.num_envs, 16)) if vehicles is None else vehicles
         paths = [self.track(vehicle).cpu() for vehicle in chosen]

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.envs.region import Region
+from magrl.envs.regions import Regions
 from magrl.field.elements import NAMES, UNITS
 from magrl.field.model import FieldModel, elements_at
 
@@ -149,6 +150,28 @@ def draw_tracks(axes: Axes, field: FieldModel, region: Region, paths: Sequence[T
 def _device(field: FieldModel) -> torch.device:
     buffers = field.buffers() if isinstance(field, torch.nn.Module) else iter(())
     return next((b.device for b in buffers), torch.device("cpu"))
+
+
+def track_recorder(render_mode: str | None, region: Region | Regions, length: int) -> TrackRecorder | None:
+    """Return what keeps the tracks for rendering, or None without a render mode.
+
+    Args:
+        render_mode: ``"rgb_array"`` or None.
+        region: region of the scenario.
+        length: states kept.
+
+    Raises:
+        ValueError: for another render mode, or many regions, which are no one map.
+
+    Example:
+        >>> track_recorder(None, Region((-10, 0), (160, 170)), 51) is None
+        True
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+    if render_mode and isinstance(region, Regions):
+        raise ValueError(f"render_mode {render_mode!r} draws one region, the scenario has {len(region)}: take None")
+    return TrackRecorder(length) if render_mode else None
 
 
 class TrackRecorder:

@@ -16,6 +16,8 @@ REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Terms whose sum is ``reward``."""
 REGION = "region"
 """Index of the region of each vehicle, where there are many."""
+DECLARED = "declared"
+"""Flag that the vehicle has declared its arrival, where it must."""
 STATE_KEYS = (
     "target_field",
     "heading",
@@ -101,6 +103,7 @@ def observation_spec(
     max_move_km: float,
     max_turn_rad: float,
     num_regions: int | None = None,
+    declared: bool = False,
 ) -> Composite:
     """Return the spec of what a step observes, privileged keys included.
 
@@ -110,6 +113,7 @@ def observation_spec(
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
         num_regions: number of regions, of which ``region`` is the index; None without that key.
+        declared: whether there is the flag ``declared``.
 
     Example:
         >>> observation_spec(4, (torch.zeros(3), torch.ones(3)), 50.0, 1.5)["field"].shape
@@ -117,7 +121,8 @@ def observation_spec(
     """
     low, high = (bound.cpu() for bound in field_bounds)
     highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
-    many = {} if num_regions is None else {"region": Bounded(0, num_regions - 1, (num_envs, 1), dtype=torch.int64)}
+    more = {} if num_regions is None else {REGION: Bounded(0, num_regions - 1, (num_envs, 1), dtype=torch.int64)}
+    more |= {DECLARED: _flag(num_envs)} if declared else {}
     return Composite(
         field=bounded(num_envs, low, high),
         target_field=bounded(num_envs, low, high),
@@ -130,18 +135,19 @@ def observation_spec(
         objective=Unbounded((num_envs, 1)),
         objective_weights=Unbounded((num_envs, 3)),
         success=_flag(num_envs),
-        **many,
+        **more,
         shape=(num_envs,),
     )
 
 
-def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def checked_action(action: Tensor, low: Tensor, high: Tensor, drift_km: float = 0.0) -> Tensor:
     """Return actions in float64, rounded into their bounds.
 
     Args:
-        action: ``(N, 2)`` distance [km], turn [rad].
-        low: ``(2,)`` lowest.
-        high: ``(2,)`` highest.
+        action: ``(N, 2)`` distance [km], turn [rad]; ``(N, 3)`` where an arrival is declared.
+        low: ``(2,)`` or ``(3,)`` lowest.
+        high: ``(2,)`` or ``(3,)`` highest.
+        drift_km: how much farther than the highest distance errors of motion may carry a vehicle [km].
 
     Raises:
         ValueError: naming the vehicles whose action is not finite or beyond the bounds by more than rounding.
@@ -151,6 +157,8 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
         tensor([[50.,  0.]], dtype=torch.float64)
     """
     action = action.double()
+    if drift_km:
+        high = torch.cat((high[:1] + drift_km, high[1:]))
     slack = 1e-5 * (high - low)
     sound = (action >= low - slack) & (action <= high + slack)
     if torch.compiler.is_compiling() or action.is_cuda:
@@ -160,7 +168,7 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
         raise ValueError(
             f"GeomagneticNavEnv: actions of vehicles {bad[:8].tolist()} are not finite or out of bounds: "
             f"{action[bad[:8]].tolist()}; distance [km] must be in [0, {float(high[0])}] and turn [rad] in "
-            f"[-{float(high[1]):.4f}, {float(high[1]):.4f}]"
+            f"[-{float(high[1]):.4f}, {float(high[1]):.4f}]{', declare in [-1, 1]' * (len(high) > 2)}"
         )
     return action.clamp(low, high)
 

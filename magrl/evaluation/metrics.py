@@ -60,7 +60,8 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
         angle at way-points (180 is straight, NaN without way-points); ``heading_mae_deg`` and ``heading_rmse_deg``,
         deviations from the bearing to the destination over the moves of nonzero length (NaN without any); with ``env``
         also ``spl_to_arrival``, the SPL whose shortest path leads to the nearest place where a vehicle has arrived
-        (:func:`magrl.envs.measures.distance_to_arrival`) instead of to the destination.
+        (:func:`magrl.envs.measures.distance_to_arrival`) instead of to the destination. Where vehicles declare their
+        arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success.
 
     Raises:
         TypeError: for an ``env`` that is no environment.
@@ -94,13 +95,24 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
         "heading_mae_deg": deviation.nanmean(1),
         "heading_rmse_deg": (deviation**2).nanmean(1).sqrt(),
     }
+    if "declared" in rollout["next"].keys():  # noqa: SIM118 - a TensorDict is no mapping
+        declared = rollout["next", "declared"].squeeze(-1).gather(1, last).squeeze(-1)
+        measures["false_arrival"] = declared & ~success
     if env is not None:
         check_type(EnvBase, env=env)
-        weights, region = rollout["objective_weights"][:, 0], rollout.get("region", None)
-        region = None if region is None else region[:, 0, 0]
-        near_km = distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region)
+        near_km = _nearest_arrival(rollout, env, measures["shortest_km"])
         measures["spl_to_arrival"] = spl(success, near_km, length_km)
     return measures
+
+
+def _nearest_arrival(rollout: TensorDictBase, env: GeomagneticNavEnv, shortest_km: Tensor) -> Tensor:
+    """Return the distance from each start to the nearest place where a vehicle has arrived, ``(M,)`` [km]."""
+    if env.arrival.declared:
+        return (shortest_km - env.arrival.radius_km).clamp_min(0)
+    start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
+    weights, region = rollout["objective_weights"][:, 0], rollout.get("region", None)
+    region = None if region is None else region[:, 0, 0]
+    return distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region)
 
 
 def _moving(rollout: TensorDictBase, valid: Tensor) -> Tensor:
@@ -139,7 +151,9 @@ def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
         ``spl_low`` and ``spl_high``, likewise ``path_efficiency`` over the episodes that moved, and ``spl_to_arrival``
         where it was measured; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper, and with
         the suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
-        ``heading_rmse_deg`` over successes; ``num_tasks``. Means over no episode are NaN.
+        ``heading_rmse_deg`` over successes; ``num_tasks``. Means over no episode are NaN. Where vehicles declare their
+        arrival, also ``false_arrival_rate`` [%] with its Wilson 95 % interval, and ``navigation_error_km_declared``,
+        the mean over all episodes that ended with a declaration.
 
     Raises:
         ValueError: for no episode, or ``success`` that is not bool.
@@ -173,7 +187,18 @@ def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
     summary["steps_all"] = episodes["steps"].double().mean().item()
     for name in ("navigation_error_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"):
         summary[name] = episodes[name][success].nanmean().item()
+    if "false_arrival" in episodes:
+        summary |= _declarations(success, episodes["false_arrival"], error)
     return summary | {"num_tasks": count}
+
+
+def _declarations(success: Tensor, false: Tensor, error_km: Tensor) -> dict[str, float]:
+    """Return the measures of declared arrivals, of which each is a success or a false arrival."""
+    rate = false.double().mean().item()
+    low, high = wilson_interval(rate, len(false))
+    rates = {"rate": rate, "rate_low": low, "rate_high": high}
+    measures = {f"false_arrival_{name}": 100 * value for name, value in rates.items()}
+    return measures | {"navigation_error_km_declared": error_km[success | false].mean().item()}
 
 
 def _percent(name: str, values: Tensor) -> dict[str, float]:
