@@ -13,7 +13,14 @@ from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 from benchmarks.profile_training import shares_of, table
 from benchmarks.timing import Row, alternate
 from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
+from magrl.transforms import (
+    AlignmentReward,
+    FieldGradient,
+    GradientHeading,
+    SensorErrors,
+    VectorErrors,
+    north_reference,
+)
 
 VEHICLES = 1024
 REGIONS = 2048
@@ -79,6 +86,22 @@ class Collecting:
         next(self.batches)
 
 
+def with_every_sensor_error(env: GeomagneticNavEnv) -> TransformedEnv:
+    """Return an environment with all errors of its sensors and of its north reference."""
+    vector = VectorErrors((20.0,) * 3, ((1e-3,) * 3,) * 3, (0.1, 0.1))
+    sensors = SensorErrors(
+        (0.05, 0.05, 5.0),
+        bias=(0.05, 0.05, 5.0),
+        scale=(0.0, 0.0, 1e-3),
+        drift=(0.05, 0.05, 5.0),
+        drift_length=200.0,
+        resolution=(0.01, 0.01, 1.0),
+        outage_rate=0.02,
+        vector=vector,
+    )
+    return TransformedEnv(env, Compose(sensors, north_reference("marine", speed_km_h=20.0)))
+
+
 def rows(repeats: int = 15) -> list[Row]:
     """Return what the field and the framework cost, as the speed of less beside the speed of all."""
     env = GeomagneticNavEnv(num_envs=VEHICLES, seed=0)
@@ -90,11 +113,16 @@ def rows(repeats: int = 15) -> list[Row]:
         Running(GeomagneticNavEnv(scenario, num_envs=VEHICLES, start_heading="random", seed=0))
         for scenario in (bank, Scenario())
     )
+    disturbed, plain = (
+        Running(make(GeomagneticNavEnv(num_envs=VEHICLES, seed=0)))
+        for make in (with_every_sensor_error, TransformedEnv)
+    )
     options = {"repeats": repeats, "inner": 50}
     return [
         alternate("env step: the same without a field", step, free_step, goal="≥ 0.40", **options),
         alternate("guided env in a Collector: raw env step", Collecting(VEHICLES), step, goal="≥ 0.25", **options),
         alternate(f"env over {REGIONS} regions: over one", over_bank, over_one, goal="≥ 0.50", **options),
+        alternate("env with all sensor errors: without", disturbed, plain, goal="≥ 0.67", **options),
     ]
 
 

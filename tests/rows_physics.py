@@ -217,6 +217,11 @@ def bank() -> field.FieldBank:
     return field.FieldBank(zeros(2, 3, 4, 4), *(torch.tensor([[-10.0, 0.0], [0.0, 10.0]]),) * 2)
 
 
+@cache
+def crust() -> field.RandomCrust:
+    return field.RandomCrust((0.0, 10.0), (0.0, 10.0), 0, waves=4)
+
+
 def bad_places(model: Callable[..., object]) -> list[Refused | Nan]:
     return [
         refused(lambda: model(t(-95.0), t(0.0)), ValueError, "latitude -95.0"),
@@ -303,6 +308,61 @@ FIELDS: Rows = {
             spread=(1.0, (2.0, 0.5), (1.0,), (0.5, INF)),
         ),
     ],
+    "field.wmmhr_coefficients": [
+        refused(lambda: field.wmmhr_coefficients("2024-12-31"), ValueError, "2024-12-31", "2025-01-01", "2030-01-01"),
+        refused(lambda: field.wmmhr_coefficients(2030.5), ValueError, "2030-07-02", "2030-01-01"),
+        refused(lambda: field.wmmhr_coefficients("May"), ValueError, "'May'"),
+    ],
+    "field.WMMHR": [
+        refused(lambda: field.WMMHR("2024-12-31"), ValueError, "2024-12-31", "2025-01-01"),
+        refused(lambda: field.WMMHR(2026.0, altitude_km=-2.0), ValueError, "altitude_km", "-2.0"),
+        refused(lambda: field.WMMHR(2026.0, chunk=0), ValueError, "chunk", "0"),
+    ],
+    "field.crustal_spectrum": [
+        refused(lambda: field.crustal_spectrum(134), TypeError, "degree", "134"),
+        refused(lambda: field.crustal_spectrum(t(134.0, 0.0)), ValueError, "degree 0.0"),
+        refused(lambda: field.crustal_spectrum(t(NAN)), ValueError, "degree nan"),
+    ],
+    "field.RandomCrust": [
+        *bad_numbers(
+            lambda seed=0, **options: field.RandomCrust((0, 10), (0, 10), seed, **options),
+            seed=(-1, 0.5, NAN, None, 2**63),
+            degrees=(134, (400, 134), (0, 100), (134, NAN)),
+            strength=(-1.0, NAN, "a"),
+            waves=(0, 1.5, NAN),
+            altitude_km=(-1.0, INF, "a"),
+        ),
+        refused(lambda: field.RandomCrust((0, -1), (0, 1), 0), ValueError, "(0, -1)"),
+        refused(lambda: field.RandomCrust((0, 40), (0, 10), 0), ValueError, "(0, 40)", "20.6 degrees", "smaller"),
+        refused(lambda: crust()(t(1j), t(0.0)), TypeError, "complex64"),
+        Nan(lambda: crust()(t(11.0, NAN, 5.0), t(5.0, 5.0, INF))),
+    ],
+    "field.RandomCrust.value_and_gradient": [
+        Nan(lambda: crust().value_and_gradient(t(11.0, NAN, 5.0), t(5.0, 5.0, -1.0))),
+    ],
+    "field.CrustedField": [
+        refused(lambda: field.CrustedField(igrf(), 5), TypeError, "crust", "5"),
+        refused(lambda: field.CrustedField(zeros(3), crust()), TypeError, "field"),
+        Nan(lambda: field.CrustedField(igrf(), crust())(t(11.0), t(5.0))),
+    ],
+    "field.CrustedField.value_and_gradient": [
+        Nan(lambda: field.CrustedField(igrf(), crust()).value_and_gradient(t(11.0), t(5.0))),
+    ],
+    "field.weather_record": [
+        refused(lambda n=name: field.weather_record(n), ValueError, repr(name), "quiet, disturbed")
+        for name in ("storm", 5, None)
+    ],
+    "field.WeatherRecord": [
+        *bad_tensors(field.WeatherRecord, "variation"),
+        refused(lambda: field.WeatherRecord(zeros(5, 2)), ValueError, "variation", "(5, 2)"),
+        refused(lambda: field.WeatherRecord(zeros(0, 3)), ValueError, "T >= 1", "(0, 3)"),
+        *bad_numbers(lambda **options: field.WeatherRecord(zeros(5, 3), **options), first=(-1, 5, 0.5), last=(5, "a")),
+        refused(lambda: field.WeatherRecord(zeros(5, 3), name=5), TypeError, "name", "5"),  # type: ignore[arg-type]
+    ],
+    "field.WeatherRecord.starts": [
+        *bad_numbers(field.WeatherRecord(zeros(5, 3)).starts, span_h=(-1, NAN, "a")),
+        refused(lambda: field.WeatherRecord(zeros(61, 3)).starts(1.1), ValueError, "1.1 h", "at most 1 h"),
+    ],
     "field.FieldBank": [
         *bad_tensors(lambda a, b: bank()(a, b, int64(1)), "latitude", "longitude"),
         refused(lambda: field.FieldBank(5, zeros(1, 2), zeros(1, 2)), TypeError, "expansion", "5"),
@@ -374,6 +434,97 @@ TRANSFORMS: Rows = {
                 TensorDict(field=t(NAN, 0.0, 1.0), target_field=zeros(3), move=zeros(2), heading=zeros(1))
             )["way"]
         ),
+    ],
+    "transforms.SensorErrors": [
+        *bad_numbers(
+            transforms.SensorErrors,
+            bias=((0.1, 0.1), (0.1, 0.1, -1.0), (0.1, 0.1, NAN), 5),
+            scale=((0.1, 0.1, -1.0),),
+            drift=((0.1, 0.1, -1.0),),
+            resolution=((0.1,), (0.1, 0.1, INF)),
+            outage_rate=(-0.1, 1, NAN, "a"),
+        ),
+        refused(lambda: transforms.SensorErrors(drift=(0.0, 0.0, 1.0)), ValueError, "drift_length", "None"),
+        refused(lambda: transforms.SensorErrors(vector=5), TypeError, "vector", "5"),
+        refused(lambda: transforms.SensorErrors()(TensorDict(field=zeros(3))), NotImplementedError, "TransformedEnv"),
+    ],
+    "transforms.VectorErrors": [
+        *bad_numbers(
+            transforms.VectorErrors,
+            hard_iron_nt=((1.0,), (1.0, 1.0, -1.0), (1.0, 1.0, NAN), 5),
+            attitude_deg=((1.0,), (1.0, -1.0), (1.0, INF)),
+        ),
+        refused(lambda: transforms.VectorErrors(soft_iron=((1.0,),)), ValueError, "soft_iron", "((1.0,),)"),
+        refused(lambda: transforms.VectorErrors(soft_iron=((0.1, 0.1),) * 3), ValueError, "soft_iron", "(0.1, 0.1)"),
+    ],
+    "transforms.VectorErrors.constants": bad_vectors(transforms.VectorErrors().constants, "normal", 14),
+    "transforms.VectorErrors.disturb": bad_vectors(
+        lambda x: transforms.VectorErrors().disturb(x, zeros(1), zeros(12)), "elements", 3
+    ),
+    "transforms.VectorErrors.variance": bad_vectors(transforms.VectorErrors().variance, "elements", 3),
+    "transforms.NorthReferenceError": [
+        *bad_numbers(
+            transforms.NorthReferenceError,
+            constant_deg=(-1.0, NAN, "a"),
+            drift_deg=(-1.0, INF),
+            random_deg=(-1.0, "a"),
+            seed=(0.5,),
+        ),
+        refused(lambda: transforms.NorthReferenceError(0.0, 1.0), ValueError, "drift_length_km", "None"),
+        refused(
+            lambda: transforms.NorthReferenceError(in_keys=PAIR), ValueError, "3 or 4 in_keys", "['here', 'there']"
+        ),
+    ],
+    "transforms.north_reference": [
+        refused(lambda: transforms.north_reference("sextant", speed_km_h=1.0), ValueError, "'sextant'", "marine"),
+        *bad_numbers(lambda **x: transforms.north_reference("marine", **x), speed_km_h=(0.0, -1.0, NAN, "a")),
+    ],
+    "transforms.MotionError": [
+        *bad_numbers(
+            transforms.MotionError,
+            log_scale=(-0.1, NAN, 0.25),
+            log_noise=(-0.1, "a", 0.25),
+            compass_deg=(-1.0, INF),
+            heading_noise_deg=(-1.0, NAN),
+            current_km_h=(-1.0, NAN),
+            eddies_km_h=(-1.0, "a"),
+            eddy_km=(0.0, -1.0),
+            seed=(0.5,),
+        ),
+        refused(lambda: transforms.MotionError(current_km_h=1.0), ValueError, "speed_km_h", "None"),
+        refused(lambda: transforms.MotionError(eddies_km_h=1.0, speed_km_h=0.0), ValueError, "speed_km_h", "0.0"),
+        refused(lambda: transforms.MotionError(in_keys=PAIR), ValueError, "3 in_keys", "['here', 'there']"),
+    ],
+    "transforms.MotionError.farthest_km": bad_numbers(
+        lambda **x: transforms.MotionError().farthest_km(**x), max_move_km=(0.0, -1.0, NAN, "a")
+    ),
+    "transforms.MagneticWeather": [
+        *bad_numbers(
+            lambda speed_km_h=5.0, **options: transforms.MagneticWeather(speed_km_h=speed_km_h, **options),
+            speed_km_h=(0, -5.0, NAN, "a"),
+            reading_s=(-1, INF),
+            span_h=(-1, "a"),
+            seed=(0.5,),
+        ),
+        refused(lambda: transforms.MagneticWeather("storm", speed_km_h=5), ValueError, "'storm'", "quiet, disturbed"),
+        refused(lambda: transforms.MagneticWeather(5, speed_km_h=5), TypeError, "record", "5"),
+        refused(lambda: transforms.MagneticWeather(speed_km_h=5, in_keys=["a"]), ValueError, "2 in_keys", "['a']"),
+        refused(
+            lambda: transforms.MagneticWeather(speed_km_h=5)(TensorDict(field=zeros(3), move=zeros(2))),
+            KeyError,
+            "'weather_clock'",
+        ),
+        Nan(
+            lambda: transforms.MagneticWeather(speed_km_h=5)(
+                TensorDict(field=t(NAN, NAN, NAN), move=zeros(2), weather_clock=zeros(2).double())
+            )["field"]
+        ),
+    ],
+    "transforms.DeclareArrival": [
+        *bad_numbers(transforms.DeclareArrival, within_km=(0, -1.0, NAN, "a")),
+        refused(lambda: transforms.DeclareArrival(5.0, way_keys="way"), TypeError, "'way'"),
+        refused(lambda: transforms.DeclareArrival(5.0, way_keys=["way"]), ValueError, "['way']"),
+        refused(lambda: transforms.DeclareArrival(5.0).inv(TensorDict(action=zeros(2))), KeyError, "'way'"),
     ],
     "transforms.SensorNoise": [
         *bad_numbers(transforms.SensorNoise, std=(5, (), "ab", (0.1, -0.1), (0.1, NAN), (0.1, INF))),

@@ -5,31 +5,48 @@ transform takes ``in_keys`` and ``out_keys`` (nested ones too), works in ``Compo
 module where that makes sense.
 """
 
+from magrl.transforms.arrival import DeclareArrival
+from magrl.transforms.errors import TRUE_KEYS
 from magrl.transforms.guidance import AlignmentReward, FieldGradient, GradientHeading
+from magrl.transforms.motion import MotionError
+from magrl.transforms.north import NORTH_REFERENCES, NorthReferenceError, north_reference
 from magrl.transforms.observation import AngleVector, TargetDifference
 from magrl.transforms.scaling import MinMaxNorm
+from magrl.transforms.sensor_errors import SensorErrors
 from magrl.transforms.sensors import RandomSensorNoise, SensorNoise, sensor_levels, with_sensor_noise
 from magrl.transforms.track import TrackGradient
 from magrl.transforms.track_view import TrackObservation, TrackView
+from magrl.transforms.vector_errors import VectorErrors
 from magrl.transforms.view import ObservationView
 from magrl.transforms.way import DetourReward, DistanceCost, TrueWay
+from magrl.transforms.weather import SPEEDS_KM_H, MagneticWeather
 
 __all__ = [
+    "NORTH_REFERENCES",
+    "SPEEDS_KM_H",
+    "TRUE_KEYS",
     "AlignmentReward",
     "AngleVector",
+    "DeclareArrival",
     "DetourReward",
     "DistanceCost",
     "FieldGradient",
     "GradientHeading",
+    "MagneticWeather",
     "MinMaxNorm",
+    "MotionError",
+    "NorthReferenceError",
     "ObservationView",
     "RandomSensorNoise",
+    "SensorErrors",
     "SensorNoise",
     "TargetDifference",
     "TrackGradient",
     "TrackObservation",
     "TrackView",
     "TrueWay",
+    "VectorErrors",
+    "north_reference",
     "sensor_levels",
     "with_sensor_noise",
 ]

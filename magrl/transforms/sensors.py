@@ -1,14 +1,9 @@
-"""Errors of sensors: what is measured is written over what is true, and the true value is kept under a key of its own.
-
-The random numbers of an error are a pure function of (seed, vehicle, episode, reading). Each episode has a stream of
-them, whose state is in the TensorDict, so that a step depends on its input alone. The transform itself only holds the
-streams from which the next episodes split off.
-"""
+"""White noise of sensors: what is measured is written over what is true, which is kept under a key of its own."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -19,13 +14,12 @@ from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.transforms.base import Keys, ObservationTransform, expect_keys, key_list, observed_spec, with_state
-from magrl.transforms.counters import advanced, counter_stream, split, stream_uniform
+from magrl.transforms.base import Keys, expect_keys, key_list, observed_spec, with_state
+from magrl.transforms.counters import advanced, stream_uniform
+from magrl.transforms.errors import EpisodeErrors
 
-_SENSORS = 1  # second counter: it separates these numbers from others of the same seed
 
-
-class SensorNoise(ObservationTransform):
+class SensorNoise(EpisodeErrors):
     """Add white noise to a reading, independent for each element, at reset and at each step.
 
     The reading is ``value + std * z`` with a standard normal ``z``. Beside it, the transform writes the true value, the
@@ -36,7 +30,8 @@ class SensorNoise(ObservationTransform):
         std: standard deviation of each element in its unit, E numbers. If all are 0, the reading is the value.
         in_keys: one value ``(..., E)``.
         out_keys: its reading ``(..., E)``, in place by default.
-        true_key: key of the true value, or None to leave it out. Privileged: a policy must not read it.
+        true_key: key of the true value, or None to leave it out. Privileged: a policy must not read it. Where a
+            transform before this one has written it, it stays.
         std_key: key of the standard deviations ``(..., E)``.
         stream_key: key of the state of the random numbers ``(..., 1)``, int64.
         seed: seed of the noise. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
@@ -55,7 +50,7 @@ class SensorNoise(ObservationTransform):
         [0.05, 0.05, 4.98]
     """
 
-    streams: Tensor | None
+    channel = 1
     draws = 0
     """Random numbers that an episode takes before its first reading."""
 
@@ -70,16 +65,10 @@ class SensorNoise(ObservationTransform):
         stream_key: NestedKey = "sensor_stream",
         seed: int = 0,
     ) -> None:
-        super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
+        super().__init__(key_list(in_keys), key_list(out_keys), stream_key=stream_key, seed=seed)
         expect_keys(self, 1, 1)
-        check_number(whole=True, seed=seed)
-        self.std, self.seed = check_std(std), int(seed)
-        self.true_key, self.std_key, self.stream_key = true_key, std_key, stream_key
-        self.register_buffer("streams", None)
-
-    def restart(self) -> None:
-        """Begin with the first episode of each vehicle again, so that the episodes repeat their noise."""
-        self.streams = None
+        self.std = check_std(std)
+        self.true_key, self.std_key = true_key, std_key
 
     # Data
 
@@ -90,17 +79,6 @@ class SensorNoise(ObservationTransform):
             tensordict_reset.set(self.std_key, self._levels(stream).to(values[0].dtype))
             tensordict_reset.set(self.stream_key, advanced(stream, self.draws).unsqueeze(-1))
         return self._call(tensordict_reset)
-
-    def _next_episode(self, tensordict: TensorDictBase, batch: torch.Size, device: torch.device) -> Tensor:
-        """Return the streams of new episodes; the rows of vehicles that are not reset are placeholders."""
-        if self.streams is None or self.streams.shape != batch:
-            vehicle = torch.arange(batch.numel(), device=device).reshape(batch)
-            self.streams = counter_stream(self.seed, torch.stack((vehicle, torch.full_like(vehicle, _SENSORS)), -1))
-        stream = split(self.streams)
-        mask = tensordict.get("_reset", None)
-        # Advanced out of place: a checkpoint may hold the old tensor.
-        self.streams = advanced(self.streams, 1 if mask is None else mask.reshape(batch).long())
-        return stream
 
     def _levels(self, stream: Tensor) -> Tensor:
         """Return the standard deviations of an episode, ``(..., E)``."""
@@ -118,8 +96,7 @@ class SensorNoise(ObservationTransform):
         if values is None:
             return next_tensordict
         stream, std = (self._written(next_tensordict, key) for key in (self.stream_key, self.std_key))
-        if self.true_key is not None:
-            next_tensordict.set(self.true_key, values[0])
+        self._keep(next_tensordict, self.true_key, values[0])
         return next_tensordict.set(self.out_keys[0], self._reading(values[0], std, stream))
 
     def _reading(self, value: Tensor, std: Tensor, stream: Tensor) -> Tensor:
@@ -130,12 +107,9 @@ class SensorNoise(ObservationTransform):
         normal = math.sqrt(2) * torch.erfinv(2 * uniform - 1 + 2.0**-53)  # the shift keeps it finite and centered
         return value + std * normal.to(value.dtype)
 
-    def _written(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            known = "which its reset writes: step from what reset() or step_mdp() returned"
-            raise KeyError(f"{type(self).__name__} reads {key!r}, {known}")
-        return value
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Measure the value of a TensorDict that holds the state of the random numbers."""
+        return self._call(tensordict)
 
     # Specs
 
@@ -147,7 +121,7 @@ class SensorNoise(ObservationTransform):
                 f"{type(self).__name__} has {len(self.std)} standard deviations, one for each element; "
                 f"{self.in_keys[0]!r} is {tuple(leaf.shape)}"
             )
-        if self.true_key is not None:
+        if self.true_key is not None and not self._comes_before(self.true_key):
             observation_spec[self.true_key] = leaf.clone()
         for key in (self.out_keys[0], self.std_key):
             observation_spec[key] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
@@ -162,11 +136,6 @@ class SensorNoise(ObservationTransform):
             return with_state(input_spec, {})
         observed = self.transform_observation_spec(observed_spec(self).clone())
         return with_state(input_spec, {key: observed[key] for key in (self.stream_key, self.std_key)})
-
-    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        saved = state_dict.get(f"{prefix}streams")
-        self.streams = None if saved is None else torch.empty_like(saved)
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
 
 class RandomSensorNoise(SensorNoise):
