@@ -11,7 +11,7 @@ from torchrl.data import TensorSpec, Unbounded
 
 from magrl import tracking
 from magrl.checks import check_number, check_numbers
-from magrl.tracking import FieldTrack, GradientPrior
+from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, curl_relation, dipole_prior, field_curvature
 from magrl.transforms.base import Keys, ObservationTransform, observed_spec, several_keys, sorted_keys, with_state
 
 FRAMES = ("world", "vehicle")
@@ -36,10 +36,12 @@ class TrackGradient(ObservationTransform):
         noise_std: standard deviation of the readings' noise, E numbers, where it is not among the ``in_keys``; by
             default 0. The filter has a floor, :data:`~magrl.tracking.VARIANCE_FLOOR`.
         prior: function from a first reading ``(..., E)`` to a :class:`~magrl.tracking.GradientPrior`; for other
-            elements than D, I, B_H, give one, and also ``scales``, ``curvature`` and ``angles``.
+            elements than D, I, B_H, give one, and also ``relation``, ``scales``, ``curvature`` and ``angles``.
+        relation: function from the estimated field ``(..., E)`` to a :class:`~magrl.tracking.GradientRelation` that the
+            gradients obey; None for none.
         scales: units of the elements in the state, E numbers; see :func:`magrl.tracking.start`.
-        curvature: standard deviation of the change of a gradient along the way, E numbers; see
-            :func:`magrl.tracking.predict`.
+        curvature: standard deviation of the change of a gradient along the way, E numbers or a function from the
+            estimated field ``(..., E)`` to them; see :func:`magrl.tracking.predict`.
         angles: elements that are angles in degrees, by index: their differences are wrapped, and their estimate is
             continued beyond 180 degrees.
         range_km: prior standard deviation of the way along each axis [km].
@@ -58,9 +60,9 @@ class TrackGradient(ObservationTransform):
     """
 
     scales: Tensor
-    curvature: Tensor
     noise_std: Tensor
     period: Tensor
+    constant_curvature: Tensor
 
     def __init__(
         self,
@@ -68,9 +70,10 @@ class TrackGradient(ObservationTransform):
         out_keys: Keys = OUT_KEYS,
         *,
         noise_std: Sequence[float] | None = None,
-        prior: Callable[[Tensor], GradientPrior] = tracking.dipole_prior,
+        prior: Callable[[Tensor], GradientPrior] = dipole_prior,
+        relation: Callable[[Tensor], GradientRelation] | None = curl_relation,
         scales: Sequence[float] = tracking.ELEMENT_SCALES,
-        curvature: Sequence[float] = tracking.CURVATURE,
+        curvature: Sequence[float] | Callable[[Tensor], Tensor] = field_curvature,
         angles: Sequence[int] = (0,),
         range_km: float = 300.0,
         frame: str = "world",
@@ -86,13 +89,15 @@ class TrackGradient(ObservationTransform):
         check_number(0, above=True, range_km=range_km)
         if frame not in FRAMES or not callable(prior):
             raise ValueError(f"frame must be one of {FRAMES} and prior a function, got {frame!r} and {prior!r}")
-        self.prior, self.range_km, self.frame = prior, float(range_km), frame
+        if relation is not None and not callable(relation):
+            raise ValueError(f"relation must be a function or None, got {relation!r}")
+        self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
         self._register(scales, curvature, noise_std, angles)
 
     def _register(
         self,
         scales: Sequence[float],
-        curvature: Sequence[float],
+        curvature: Sequence[float] | Callable[[Tensor], Tensor],
         noise_std: Sequence[float] | None,
         angles: Sequence[int],
     ) -> None:
@@ -100,7 +105,10 @@ class TrackGradient(ObservationTransform):
         count = len(scales) if isinstance(scales, (tuple, list)) else 0
         if not count or not isinstance(angles, (tuple, list)) or not set(angles) <= set(range(count)):
             raise ValueError(f"scales must be numbers and angles among their indices, got {scales!r} and {angles!r}")
-        numbers = {"curvature": curvature, "noise_std": (0.0,) * count if noise_std is None else noise_std}
+        numbers = {"noise_std": (0.0,) * count if noise_std is None else noise_std}
+        self.curvature = curvature if callable(curvature) else None
+        if not callable(curvature):
+            numbers["constant_curvature"] = curvature
         for name, values in ({"scales": scales} | numbers).items():
             check_numbers(count, **{name: values})
             if min(values) < 0 or (name == "scales" and min(values) == 0):
@@ -131,7 +139,8 @@ class TrackGradient(ObservationTransform):
             return next_tensordict
         reading, target, move, heading, *std = values
         displacement = move[..., :1] * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
-        track = tracking.predict(self._state(tensordict), displacement, self.curvature, self.scales)
+        track = self._state(tensordict)
+        track = tracking.predict(track, displacement, self._curvature_at(track), self.scales)
         noise = std[0] if std else self.noise_std
         track = tracking.update(track, self._continued(reading, track), noise, self.scales)
         return self._write(next_tensordict, track, target, heading)
@@ -145,6 +154,11 @@ class TrackGradient(ObservationTransform):
             )
         return FieldTrack(*(tensordict.get(key) for key in self.out_keys[:2]))
 
+    def _curvature_at(self, track: FieldTrack) -> Tensor:
+        if self.curvature is None:
+            return self.constant_curvature
+        return self.curvature(track.mean[..., 0] * self.scales.to(track.mean.dtype))
+
     def _continued(self, values: Tensor, track: FieldTrack) -> Tensor:
         """Return values whose angles are within half a turn of the estimate."""
         near, period = track.mean[..., 0] * self.scales.to(values.dtype), self.period.to(values.dtype)
@@ -152,9 +166,12 @@ class TrackGradient(ObservationTransform):
 
     def _write(self, tensordict: TensorDictBase, track: FieldTrack, target: Tensor, heading: Tensor) -> TensorDictBase:
         """Write the state and the estimates."""
-        value = track.mean[..., 0] * self.scales.to(target.dtype)
-        gradient = tracking.estimated_gradient(track, self.scales)
-        way, covariance = tracking.way_to(track, self._continued(target, track), self.range_km, self.scales)
+        scales = self.scales.to(target.dtype)
+        known, shared = track, None
+        if self.relation is not None:
+            known, shared = tracking.relate(track, self.relation(track.mean[..., 0] * scales), scales)
+        value, gradient = known.mean[..., 0] * scales, tracking.estimated_gradient(known, scales)
+        way, covariance = tracking.way_to(known, self._continued(target, known), self.range_km, scales, shared)
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)
