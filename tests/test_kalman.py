@@ -129,7 +129,7 @@ def test_more_noise_means_less_caution_and_dearer_steps() -> None:
     cautions, prices = zip(*levels, strict=True)
     assert list(cautions) == sorted(cautions, reverse=True)
     assert list(prices) == sorted(prices)
-    assert levels[1] == pytest.approx((4.5, 1.0))  # 0.02 deg of I is 4/3 km
+    assert levels[1] == pytest.approx((2.25, 2 / 3))  # 0.02 deg of I is 4/3 km
 
 
 def test_by_name_it_takes_bounds_noise_and_step_limit_from_the_environment() -> None:

@@ -32,7 +32,8 @@ class Kalman(QuasiNewton):
     For each it predicts the covariance of the filter after the reading at its end, which does not depend on what will
     be read, and chooses the least sum of three costs [km]:
 
-    - the path: the length of the move and the distance that then remains;
+    - the path: the length of the move minus the progress, that is, what it takes off the estimated way times the
+      cosine of the typical error of its direction;
     - ``caution`` times the detour that the remaining uncertainty of the way may cost;
     - the price of the remaining steps, which rises as fewer of them are left.
 
@@ -169,14 +170,14 @@ def trade_off(noise: Sequence[float]) -> tuple[float, float]:
 
     Example:
         >>> trade_off((0, 0, 0))
-        (10.0, 0.1)
+        (5.0, 0.1)
         >>> [round(value, 2) for value in trade_off((0.1, 0.1, 10))]
-        [0.9, 5.0]
+        [0.45, 3.33]
     """
     check_numbers(3, noise=noise)
     check_number(0, noise=min(noise))
     noise_km = sorted(std / slope for std, slope in zip(noise, SLOPES, strict=True))[1]
-    return min(10.0, 6.0 / max(noise_km, 0.1)), max(0.1, 0.75 * noise_km)
+    return min(5.0, 3.0 / max(noise_km, 0.1)), max(0.1, 0.5 * noise_km)
 
 
 def _certainty(way: Tensor, covariance: Tensor) -> Tensor:
