@@ -88,6 +88,19 @@ def test_the_estimates_are_those_of_the_pure_functions() -> None:
         torch.testing.assert_close((step["way"], step["way_covariance"]), tuple(way), rtol=1e-4, atol=1e-3)
 
 
+def test_a_constant_error_is_a_key() -> None:
+    keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
+    first = first_reading()
+    first["sensor_std"] = torch.tensor(NOISE, dtype=first["field"].dtype).expand_as(first["field"])
+    first["bias_std"] = 10 * first["sensor_std"]
+    biased, plain = TrackGradient(keys)(first.clone()), TrackGradient(keys[:5])(first.clone())
+    for key in (*STATE, "estimated_gradient"):
+        assert torch.equal(biased[key], plain[key])
+    known, shared = tracking.relate(FieldTrack(*(plain[key] for key in STATE)), tracking.curl_relation(first["field"]))
+    way = tracking.way_to(known, first["target_field"], 300.0, shared=shared, bias_std=first["bias_std"])
+    torch.testing.assert_close((biased["way"], biased["way_covariance"]), tuple(way))
+
+
 def test_the_first_estimate_is_the_reading_and_the_prior() -> None:
     first = TrackGradient(relation=None)(first_reading())
     torch.testing.assert_close(first["estimated_field"], first["field"])

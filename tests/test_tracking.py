@@ -303,6 +303,17 @@ def test_way_satisfies_its_normal_equations():
         np.testing.assert_allclose(found.covariance[n].numpy(), 1e4 * np.linalg.inv(normal), rtol=1e-9)
 
 
+def test_a_constant_error_widens_the_way_and_nothing_else():
+    """It is as if the value were less certain, but not its relation to the gradients."""
+    track, target = random_track(20, 3), SCALES * randn(20, 3, seed=7)
+    bias = f64(0.5, 0.1, 20.0)
+    covariance = track.covariance.clone()
+    covariance[..., 0, 0] += (bias / SCALES).square()
+    expected = way_to(FieldTrack(track.mean, covariance), target, 300.0)
+    found = way_to(track, target, 300.0, bias_std=bias)
+    torch.testing.assert_close((found.displacement, found.covariance), tuple(expected))
+
+
 def test_way_is_accurate_in_float32_where_gradients_are_nearly_parallel():
     """At 1e-3 rad between them, a c - b^2 would have no correct digit left."""
     gradients = f64((1.0, 0.0), (2.0, 2e-3), (3.0, 0.0))

@@ -42,6 +42,7 @@ def way_to(
     range_km: float,
     scales: PerElement = ELEMENT_SCALES,
     shared: Tensor | None = None,
+    bias_std: PerElement | None = None,
 ) -> Way:
     """Return the displacement to the place where the field has given values, and its uncertainty.
 
@@ -55,9 +56,11 @@ def way_to(
         range_km: prior standard deviation of the way along each axis [km].
         scales: those of :func:`start`.
         shared: ``(..., E, 3)`` from :func:`relate`; without it, the elements are independent.
+        bias_std: standard deviation of a constant error of the readings, ``(..., E)`` or E numbers. It is not in the
+            state: gradients do not depend on it, but all remaining differences do.
 
     Raises:
-        ValueError: for shapes that do not match, or a range that is not above 0.
+        ValueError: for shapes that do not match, a range that is not above 0, or a negative number in ``bias_std``.
 
     Example:
         >>> gradient = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 2.0]])  # the first element grows northward
@@ -68,9 +71,12 @@ def way_to(
     count = check_track(track)
     check_tensor(count, target=target)
     check_number(0, above=True, range_km=range_km)
-    target = target.to(track.mean.dtype) / positive("scales", scales, count, track.mean)
-    shape = common(track.mean.shape[:-1], target.shape)
+    unit = positive("scales", scales, count, track.mean)
+    target = target.to(track.mean.dtype) / unit
+    bias = positive("bias_std", (0.0,) * count if bias_std is None else bias_std, count, track.mean) / unit
+    shape = common(track.mean.shape[:-1], target.shape, bias.shape)
     (value, north, east), (p00, p01, p02, p11, p12, p22) = parts(track, shape)
+    p00 = p00 + first(bias, shape).square()
     ridge = (DISTANCE_SCALE_KM / range_km) ** 2
     terms = torch.stack((first(target, shape) - value, north, east))
     expected, twice1, twice2, twice12 = p00 + (p11 + p22) / ridge, 2 * p01, 2 * p02, 2 * p12

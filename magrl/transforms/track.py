@@ -28,7 +28,8 @@ class TrackGradient(ObservationTransform):
     Args:
         in_keys: readings ``(..., E)``, values at the target ``(..., E)``, the last move ``(..., K)`` (its first number
             is the distance [km]), the heading after the move ``(..., 1)`` [rad], and optionally the standard deviation
-            of the readings' noise ``(..., E)``.
+            of the readings' noise ``(..., E)`` and that of their constant error ``(..., E)``, which only widens the
+            covariance of the way.
         out_keys: the state, in the scaled units of :class:`~magrl.tracking.FieldTrack`: mean ``(..., E, 3)`` and
             covariance ``(..., E, 3, 3)``, always northward and eastward; then the estimates: the field ``(..., E)``,
             its gradient ``(..., E, 2)`` [element unit / km], the way to the target ``(..., 2)`` [km] and its covariance
@@ -79,12 +80,13 @@ class TrackGradient(ObservationTransform):
         frame: str = "world",
     ) -> None:
         super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        if len(self.in_keys) not in (4, 5) or len(self.out_keys) != 6:
+        if len(self.in_keys) not in (4, 5, 6) or len(self.out_keys) != 6:
             raise ValueError(
-                "TrackGradient takes 4 or 5 in_keys (reading, target, move, heading, standard deviation of the noise) "
-                f"and 6 out_keys (such as {OUT_KEYS}), got {self.in_keys} and {self.out_keys}"
+                "TrackGradient takes 4 to 6 in_keys (reading, target, move, heading, standard deviations of the noise "
+                f"and of the constant error) and 6 out_keys (such as {OUT_KEYS}), got {self.in_keys} and "
+                f"{self.out_keys}"
             )
-        if noise_std is not None and len(self.in_keys) == 5:
+        if noise_std is not None and len(self.in_keys) > 4:
             raise ValueError(f"give noise_std or its key {self.in_keys[4]!r}, not both: got noise_std {noise_std}")
         check_number(0, above=True, range_km=range_km)
         if frame not in FRAMES or not callable(prior):
@@ -131,7 +133,7 @@ class TrackGradient(ObservationTransform):
         prior = self.prior(reading)
         noise = std[0] if std else self.noise_std
         track = tracking.start(reading, prior.gradient, prior.std, noise, prior.azimuth, self.scales)
-        return self._write(first, track, target, heading)
+        return self._write(first, track, target, heading, *std[1:])
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         values = self._read(next_tensordict)
@@ -143,7 +145,7 @@ class TrackGradient(ObservationTransform):
         track = tracking.predict(track, displacement, self._curvature_at(track), self.scales)
         noise = std[0] if std else self.noise_std
         track = tracking.update(track, self._continued(reading, track), noise, self.scales)
-        return self._write(next_tensordict, track, target, heading)
+        return self._write(next_tensordict, track, target, heading, *std[1:])
 
     def _state(self, tensordict: TensorDictBase) -> FieldTrack:
         missing = [key for key in self.out_keys[:2] if tensordict.get(key, None) is None]
@@ -164,14 +166,22 @@ class TrackGradient(ObservationTransform):
         near, period = track.mean[..., 0] * self.scales.to(values.dtype), self.period.to(values.dtype)
         return values - period * torch.round((values - near) / 360)
 
-    def _write(self, tensordict: TensorDictBase, track: FieldTrack, target: Tensor, heading: Tensor) -> TensorDictBase:
+    def _write(
+        self,
+        tensordict: TensorDictBase,
+        track: FieldTrack,
+        target: Tensor,
+        heading: Tensor,
+        bias_std: Tensor | None = None,
+    ) -> TensorDictBase:
         """Write the state and the estimates."""
         scales = self.scales.to(target.dtype)
         known, shared = track, None
         if self.relation is not None:
             known, shared = tracking.relate(track, self.relation(track.mean[..., 0] * scales), scales)
         value, gradient = known.mean[..., 0] * scales, tracking.estimated_gradient(known, scales)
-        way, covariance = tracking.way_to(known, self._continued(target, known), self.range_km, scales, shared)
+        target = self._continued(target, known)
+        way, covariance = tracking.way_to(known, target, self.range_km, scales, shared, bias_std)
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)
