@@ -21,7 +21,7 @@ SWARMS := ga pso afsa ga:flown pso:flown afsa:flown
 NOISE_LEVELS := 0 0.02 0.05 0.1
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere test test-slow check format clean earth paper trade bench docs replay mutate help
+.PHONY: train fly anywhere test test-slow check format clean earth globe paper trade bench docs replay mutate help
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -89,6 +89,16 @@ earth: $(VENV)/.installed  ## fly the pretrained agent and other navigators all 
 	  > docs/results/earth-700.md
 	$(RECIPE)/tables/earth_table.py anywhere kalman secant geodesic --distance-km 1200 1800 --max-steps 120 --tasks 2000 \
 	  > docs/results/earth-1200.md
+	$(RECIPE)/tables/publish.py docs/anywhere.md
+
+# The map of the whole Earth, the table of epochs, and the pictures of the flight, from the pretrained policy.
+globe: $(VENV)/.installed  ## map where the pretrained agent fails, fly it at five epochs and draw a flight; two minutes
+	$(RECIPE)/tables/globe.py
+	$(RECIPE)/tables/earth_table.py anywhere --date 1900-01-01 1950-01-01 2000-01-01 2025-01-01 2030-01-01 \
+	  > docs/results/epochs.md
+	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --out runs/flight
+	cp runs/flight/flight.png docs/figures/flight.png
+	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --noise 0.05 0.05 5 --out runs/flight --animate docs/figures/flight.gif
 	$(RECIPE)/tables/publish.py docs/anywhere.md
 
 # Section 4 of the paper. Existing runs are reused. All trainings take forty minutes on two cores (make -j2), everything

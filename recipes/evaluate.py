@@ -41,7 +41,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import arrival_threshold, check_distinct, make_navigator
+from magrl.evaluation.navigators import arrival_threshold, check_distinct, check_map_date, make_navigator
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import NO_NOISE, Noise, agreed, common_scenario, trained_runs
 from magrl.evaluation.tables import comparison_table, short_table
@@ -64,8 +64,8 @@ class Config:
     """Settings of an evaluation."""
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
-    """Navigators: anywhere, kalman, secant, run_and_tumble, mean_jacobian, parallel, geodesic, ga, pso, afsa; with a
-    run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, recurrent=RUN, anywhere=RUN."""
+    """Navigators: anywhere, kalman, secant, run_and_tumble, mean_jacobian, map_matching, parallel, geodesic, ga, pso,
+    afsa; with a run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, recurrent=RUN, anywhere=RUN."""
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
     tasks_seed: int | None = None
@@ -81,6 +81,8 @@ class Config:
     """Arrival threshold on the objective (Eq. 2-7); that of the runs by default, 0.01 without runs."""
     noise: Noise | None = None
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]; by default those of the runs, or 0."""
+    map_date: str | None = None
+    """Date of the map of map_matching, as 2015-01-01 (IGRF); by default its map is the field itself."""
     start_heading: Literal["north", "random"] | None = None
     """Heading at the start of an episode; by default that of the runs, or north."""
     seed: int = 0
@@ -188,13 +190,9 @@ def settle(config: Config) -> tuple[Config, float, list[str]]:
         check_number(0, noise=level)
     runs = trained_runs(config.navigators)
     zeta, warnings = arrival_threshold(config.navigators, config.zeta)
+    own = config.start_heading
     heading, others = agreed(
-        runs,
-        lambda run: run.start_heading,
-        config.start_heading,
-        "north",
-        name="start heading",
-        option="--start-heading",
+        runs, lambda run: run.start_heading, own, "north", name="start heading", option="--start-heading"
     )
     noise, noisy = agreed(runs, lambda run: run.noise, config.noise, NO_NOISE, name="sensor noise", option="--noise")
     scenario, places = config.scenario, list[str]()
@@ -228,13 +226,14 @@ def prepare(config: Config) -> Prepared:
         if config.export:
             export.check_suffix(config.export)
         check_distinct(config.navigators, config.mode)
+        check_map_date(config.navigators, config.map_date)
         config, zeta, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed)
         example = first_tasks(scenario, 1) if config.scenario else Scenario().with_tasks(named_tasks("figure-4-1"))
         bases = [make_env(place, zeta, config.seed, config.start_heading) for place in (scenario, example)]
         envs = [with_sensor_noise(base, config.noise, config.seed) for base in bases]
         navigators = [
-            tuple(make_navigator(text, base, config.mode, config.seed, config.noise) for base in bases)
+            tuple(make_navigator(text, base, config.mode, config.seed, config.noise, config.map_date) for base in bases)
             for text in config.navigators
         ]
         if config.export:
@@ -290,6 +289,7 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
         "scenario": config.scenario and config.scenario.name,
         "zeta": env.zeta,
         "noise": config.noise,
+        "map_date": config.map_date,
         "start_heading": config.start_heading,
         "mode": config.mode,
         "seed": config.seed,
@@ -306,6 +306,8 @@ def write(config: Config, env: EnvBase, results: Results) -> None:
     if any(config.noise or ()):
         levels = "{:g} deg, {:g} deg, {:g} nT".format(*config.noise)
         notes = f"\nStandard deviations of the noise on D, I and B_H: {levels}.\n{notes}"
+    if config.map_date:
+        notes = f"\nDate of the map of map matching: {config.map_date}.\n{notes}"
     (config.out / "table.md").write_text(comparison_table(results.summaries, config.mode) + notes)
     (config.out / "short.md").write_text(short_table(results.summaries, config.mode) + notes)
     if config.export:

@@ -34,6 +34,7 @@ from tqdm import tqdm
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation import episode_measures, export
+from magrl.evaluation.animation import write_flight_gif
 from magrl.evaluation.flight import flight_figure
 from magrl.evaluation.navigators import make_navigator, needs
 from magrl.evaluation.places import (
@@ -82,6 +83,8 @@ class Config:
     """Folder of flight.png and flight.json, which are replaced."""
     export: Path | None = None
     """File for the track: .geojson, .gpx or .kml."""
+    animate: Path | None = None
+    """File for an animation of the flight: .gif."""
 
 
 class Watched(TensorDictModuleBase):
@@ -149,7 +152,10 @@ def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
         navigator = make_navigator(config.navigator, base, seed=config.seed, noise=config.noise)
         if config.export:
             export.check_suffix(config.export)
-        for file in (config.out / "flight.png", config.out / "flight.json", *filter(None, [config.export])):
+        if config.animate and config.animate.suffix != ".gif":
+            raise ValueError(f"an animation must end in .gif, got {config.animate}")
+        own = filter(None, (config.export, config.animate))
+        for file in (config.out / "flight.png", config.out / "flight.json", *own):
             check_writable(file)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
@@ -180,7 +186,7 @@ def fly(config: Config) -> dict[str, Any]:
     outcome = "arrived" if last["success"].item() else failure
     name = config.navigator.partition("=")[0]
     result = {
-        **{key: value for key, value in asdict(config).items() if key not in ("out", "export")},
+        **{key: value for key, value in asdict(config).items() if key not in ("out", "export", "animate")},
         "navigator": name,
         "needs": needs(name),
         "zeta": base.zeta,
@@ -194,6 +200,8 @@ def fly(config: Config) -> dict[str, Any]:
     flight_figure(steps, base.field, base.region, title).savefig(config.out / "flight.png", dpi=120)
     if config.export:
         export.write_tracks(config.export, export.tracks(steps, [title], navigator=name))
+    if config.animate:
+        write_flight_gif(config.animate, steps, base.field, base.region, title)
     return result
 
 

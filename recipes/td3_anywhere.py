@@ -45,7 +45,7 @@ class Config(RunConfig):
 
     preset: Literal["fast", "far"] = "fast"
     """Source of the defaults: destinations 300-500 km away, or 150-1800 km."""
-    total_frames: Count = 2_048_000
+    total_frames: Count = 1_228_800
     """Steps of all vehicles together."""
     eval_every: Count = 200
     """Collected batches between evaluations on the validation tasks."""
@@ -61,7 +61,7 @@ class Config(RunConfig):
     """Moves after which an episode is truncated."""
     range_km: Positive = 300.0
     """Prior standard deviation of the way to the destination along each axis [km]."""
-    step_cost: NonNegative = 0.08
+    step_cost: NonNegative = 0.02
     """Penalty for each move; arriving is worth 10, and a detour as long as the task costs 10."""
 
     # Networks
@@ -77,7 +77,7 @@ class Config(RunConfig):
     """Capacity of the replay buffer [transitions]."""
     init_random_frames: Annotated[int, Field(ge=0)] = 4096
     """Steps with random actions before the policy acts."""
-    gamma: Discount = 0.98
+    gamma: Discount = 0.99
     """Discount factor."""
     tau: PositiveShare = 0.01
     """Polyak averaging factor of the target networks."""
@@ -119,7 +119,7 @@ class Config(RunConfig):
 
 
 FAST = Config()
-FAR = Config(preset="far", distance_range_km=(150.0, 1800.0), max_steps=120, range_km=1000.0, gamma=0.985)
+FAR = Config(preset="far", total_frames=2_048_000, distance_range_km=(150.0, 1800.0), max_steps=120, range_km=1000.0)
 PRESETS = {"fast": FAST, "far": FAR}
 
 
@@ -215,6 +215,7 @@ def train(config: Config) -> dict[str, float]:
         )
         stats = run.statistics
         for batch in run.batches():
+            batch["next", "terminated"] = batch["next", "done"]  # time is observed: its limit ends an episode for good
             buffer.extend(batch.reshape(-1).select(*TRANSITION))
             noise.step()
             rate = config.linear("learning_rate", run.remaining)

@@ -48,6 +48,7 @@ from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.navigators import (
     Geodesic,
     Kalman,
+    MapMatching,
     MeanJacobian,
     Navigator,
     ParallelApproach,
@@ -288,6 +289,20 @@ NAVIGATORS: Rows = {
         step_km=(0.0,),
         range_km=(0.0,),
     ),
+    "navigators.MapMatching": [
+        *bad_numbers(
+            lambda **options: MapMatching(**({"field": igrf(), "region": PAPER_REGION} | options)),
+            **BOUNDS,
+            noise=(5, (1.0, 2.0), (1.0, 2.0, NAN)),
+            map_error=(5, (1.0,), (1.0, 2.0, NAN)),
+            hypotheses=(0, 1.5, 2000),
+            field=("IGRF", None),
+        ),
+        refused(lambda: MapMatching(igrf(), "box"), TypeError, "region", "'box'"),
+        refused(lambda: MapMatching(igrf(), PAPER_REGION, map_error=(1.0, -2.0, 3.0)), ValueError, "map_error", "-2.0"),
+        refused(lambda: MapMatching(nav().field, Region((0, 20), (160, 170))), ValueError, "not defined", "larger box"),
+        refused(lambda: MapMatching(igrf(), Regions.of([PAPER_REGION] * 2)), ValueError, "1 maps", "2 boxes"),
+    ],
     "navigators.MeanJacobian": [
         *bad_numbers(lambda **options: MeanJacobian(igrf(), zeros(4, 2), **options), **BOUNDS, noise=(5, (1.0, NAN))),
         *bad_numbers(lambda field: MeanJacobian(field, zeros(4, 2)), field=("IGRF", None)),

@@ -426,7 +426,7 @@ TRANSFORMS: Rows = {
         ),
         *bad_numbers(transforms.TrackGradient, angles=(5, (3,), (-1,), (0.5,))),
         refused(lambda: transforms.TrackGradient("field"), TypeError, "'field'"),
-        refused(lambda: transforms.TrackGradient(["field"]), ValueError, "4 or 5 in_keys", "['field']"),
+        refused(lambda: transforms.TrackGradient(["field"]), ValueError, "4 to 6 in_keys", "['field']"),
         refused(lambda: transforms.TrackGradient(list("abcde"), noise_std=(0.0,) * 3), ValueError, "'e'", "not both"),
         refused(lambda: transforms.TrackGradient()(TensorDict(field=zeros(3))), KeyError, "target_field"),
         Nan(

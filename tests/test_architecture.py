@@ -59,10 +59,10 @@ def top(module: str) -> str:
 MODULES = [name for name in sources() if name != "magrl"]
 
 
-def test_seven_packages_and_few_modules() -> None:
+def test_eight_packages_and_few_modules() -> None:
     packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
     modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
-    assert len(packages) == 7
+    assert len(packages) == 8
     assert len(modules) <= 6
     assert packages | modules == set(FLOOR)
 

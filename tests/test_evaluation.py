@@ -265,6 +265,10 @@ def test_only_bad_usage_is_shown_in_one_line(evaluate, tmp_path: Path, monkeypat
 def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, capsys) -> None:
     cases = {
         "earth_table": ([], "name at least one navigator"),
+        "globe": (
+            ["--tasks", "0", "--table", str(tmp_path / "a"), "--figure", str(tmp_path / "b")],
+            "num_tasks must be",
+        ),
         "figures": (["--results", str(tmp_path), "--out", str(tmp_path)], "there is no"),
         "learning_table": (["runs/A"], "a run must be given as NAME=RUN, such as gg_td3=runs/A, got 'runs/A'"),
         "path_loss": (["dowsing"], "unknown navigator 'dowsing'"),
@@ -376,3 +380,15 @@ def test_earth_table_flies_each_navigator_at_each_level() -> None:
     assert earth.cell([(90.0, 80.0, 10.0), (100.0, 90.0, 12.0)]) == "95.0 / 85.0 [80.0] / 11.0"
     with pytest.raises(UsageError, match="unknown navigator 'dowsing'"):
         earth.table(earth.Config(("dowsing",), tasks=2, regions=1))
+
+
+def test_earth_table_has_a_row_for_each_date() -> None:
+    earth = load("tables/earth_table")
+    lines = earth.table(earth.Config(("secant",), tasks=4, regions=2, date=("1900-01-01", "2030-01-01"))).splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert cells[0][:3] == ["date", "navigator", "needs"]
+    assert [row[0] for row in cells[2:]] == ["1900-01-01", "2030-01-01"]
+    assert cells[2][4:] != cells[3][4:]  # another field
+    for dates, message in ((("2031-01-01",), "outside IGRF-14"), ((), "at least one date")):
+        with pytest.raises(UsageError, match=message):
+            earth.table(earth.Config(("secant",), tasks=2, regions=1, date=dates))

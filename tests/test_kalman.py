@@ -14,7 +14,7 @@ from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import NAVIGATORS, Kalman
-from magrl.navigators.kalman import ANGLES_DEG, LENGTHS, _detour, trade_off
+from magrl.navigators.kalman import ANGLES_DEG, LENGTHS, _certainty, _detour, trade_off
 from magrl.tracking import FieldTrack
 from magrl.transforms import SensorNoise
 
@@ -101,6 +101,13 @@ def test_the_detour_by_hand() -> None:
     torch.testing.assert_close(_detour(way * 30 / 400, along), torch.tensor(20.0, dtype=F64))  # half of it: 50 - 30
 
 
+def test_the_certainty_by_hand() -> None:
+    """The direction is off by 400 km in 300 km: 0.6 is the cosine."""
+    way = torch.tensor([[0.0, 300.0], [300.0, 0.0]], dtype=F64)
+    covariance = torch.diag(torch.tensor([400.0**2, 0.0], dtype=F64)).expand(2, 2, 2)
+    torch.testing.assert_close(_certainty(way, covariance), torch.tensor([[0.6], [1.0]], dtype=F64))
+
+
 def test_the_moves_that_are_compared() -> None:
     way = torch.tensor([[0.0, 20.0]], dtype=F64)
     moves = Kalman()._moves(way)
@@ -122,7 +129,7 @@ def test_more_noise_means_less_caution_and_dearer_steps() -> None:
     cautions, prices = zip(*levels, strict=True)
     assert list(cautions) == sorted(cautions, reverse=True)
     assert list(prices) == sorted(prices)
-    assert levels[1] == pytest.approx((4.5, 1.0))  # 0.02 deg of I is 4/3 km
+    assert levels[1] == pytest.approx((2.25, 2 / 3))  # 0.02 deg of I is 4/3 km
 
 
 def test_by_name_it_takes_bounds_noise_and_step_limit_from_the_environment() -> None:

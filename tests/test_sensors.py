@@ -286,14 +286,14 @@ def test_levels_by_hand() -> None:
     uniform = torch.tensor(
         [
             [0.1499, 0.0, 0.5, 0.5, 0.5, 0.0, 0.5],  # perfect sensors
-            [0.15, 0.5, 0.5, 0.5, 0.5, 0.3, 0.5],  # a tenth of the largest
+            [0.15, 0.5 ** (2 / 3), 0.5, 0.5, 0.5, 0.3, 0.5],  # a tenth of the largest
             [0.99, 1.0, 0.0, 1.0, 0.5, 0.9, 0.5],  # a hundredth, with factors 0.398, 2.512, 1
             [0.99, 0.0, 0.5, 0.5, 0.5, 0.29, 0.5],  # a poor north reference: 1 + 6 / 2
         ],
         dtype=torch.float64,
     )
     factor = 10**0.4
-    expected = [[0, 0, 0], [0.015, 0.015, 1.5], [0.0015 / factor, 0.0015 * factor, 0.15], [0.6, 0.15, 15]]
+    expected = [[0, 0, 0], [0.02, 0.02, 2.0], [0.002 / factor, 0.002 * factor, 0.2], [0.8, 0.2, 20]]
     torch.testing.assert_close(sensor_levels(uniform), torch.tensor(expected, dtype=torch.float64))
 
 

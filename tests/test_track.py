@@ -28,6 +28,7 @@ sys.path.append(str(Path(__file__).parent.parent / "docs" / "examples"))
 plume_env = importlib.import_module("plume_env")
 
 STATE = ("track_mean", "track_covariance")
+SCALES = torch.tensor(tracking.ELEMENT_SCALES)
 ESTIMATES = ("estimated_field", "estimated_gradient", "way", "way_covariance")
 NOISE = (0.02, 0.05, 3.0)
 
@@ -77,18 +78,43 @@ def test_the_estimates_are_those_of_the_pure_functions() -> None:
     for step in rollout["next"].unbind(1):
         heading = step["heading"]
         d = step["move"][:, :1] * torch.cat((heading.cos(), heading.sin()), -1)
-        track = tracking.update(tracking.predict(track, d), step["field"], NOISE)
-        way = tracking.way_to(track, step["target_field"], 300.0)
+        curvature = tracking.field_curvature(track.mean[..., 0] * SCALES)
+        track = tracking.update(tracking.predict(track, d, curvature), step["field"], NOISE)
+        known, shared = tracking.relate(track, tracking.curl_relation(track.mean[..., 0] * SCALES))
+        way = tracking.way_to(known, step["target_field"], 300.0, shared=shared)
         torch.testing.assert_close(FieldTrack(*(step[key] for key in STATE)), track)
-        torch.testing.assert_close(step["estimated_field"], track.mean[..., 0] * torch.tensor(tracking.ELEMENT_SCALES))
-        torch.testing.assert_close(step["estimated_gradient"], tracking.estimated_gradient(track))
-        torch.testing.assert_close((step["way"], step["way_covariance"]), tuple(way))
+        torch.testing.assert_close(step["estimated_field"], known.mean[..., 0] * SCALES)
+        torch.testing.assert_close(step["estimated_gradient"], tracking.estimated_gradient(known))
+        torch.testing.assert_close((step["way"], step["way_covariance"]), tuple(way), rtol=1e-4, atol=1e-3)
+
+
+def test_a_constant_error_is_a_key() -> None:
+    keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
+    first = first_reading()
+    first["sensor_std"] = torch.tensor(NOISE, dtype=first["field"].dtype).expand_as(first["field"])
+    first["bias_std"] = 10 * first["sensor_std"]
+    biased, plain = TrackGradient(keys)(first.clone()), TrackGradient(keys[:5])(first.clone())
+    for key in (*STATE, "estimated_gradient"):
+        assert torch.equal(biased[key], plain[key])
+    known, shared = tracking.relate(FieldTrack(*(plain[key] for key in STATE)), tracking.curl_relation(first["field"]))
+    way = tracking.way_to(known, first["target_field"], 300.0, shared=shared, bias_std=first["bias_std"])
+    torch.testing.assert_close((biased["way"], biased["way_covariance"]), tuple(way))
 
 
 def test_the_first_estimate_is_the_reading_and_the_prior() -> None:
-    first = TrackGradient()(first_reading())
+    first = TrackGradient(relation=None)(first_reading())
     torch.testing.assert_close(first["estimated_field"], first["field"])
     torch.testing.assert_close(first["estimated_gradient"], tracking.dipole_prior(first["field"]).gradient)
+
+
+def test_the_estimated_gradient_obeys_the_relation() -> None:
+    """The curl is less than that of the prior, and a relation changes the estimates, not the state."""
+    first, free = (TrackGradient(**options)(first_reading()) for options in ({}, {"relation": None}))
+    weights, value, _ = tracking.curl_relation(first["field"])
+    curl, curl_free = (((weights * td["estimated_gradient"]).sum((-2, -1)) - value).abs() for td in (first, free))
+    assert (curl < 0.9 * curl_free).all()
+    for key in STATE:
+        assert torch.equal(first[key], free[key])
 
 
 def test_without_noise_it_finds_gradient_and_target() -> None:
@@ -96,7 +122,7 @@ def test_without_noise_it_finds_gradient_and_target() -> None:
     start = flown(env, 12)[:, -1]
     after = start["next"]
     true = elements_gradient_at(field(), after["position"]).float()
-    scale = torch.tensor(tracking.ELEMENT_SCALES).unsqueeze(-1) / tracking.DISTANCE_SCALE_KM
+    scale = SCALES.unsqueeze(-1) / tracking.DISTANCE_SCALE_KM
     assert ((after["estimated_gradient"] - true) / scale).norm(dim=(-2, -1)).median() < 0.1
     way_km, bearing = geodesic(*after["position"].T, *after["target_position"].T)
     true_way = (way_km * torch.stack((bearing.cos(), bearing.sin()))).T.float()
@@ -171,10 +197,9 @@ def test_a_declination_that_crosses_180_degrees_is_continued(turn: float) -> Non
 
     first = first_reading(64)
     after = moved(first, 40.0, 0.3, torch.tensor((-0.8, 0.5, 60.0), dtype=torch.float64))
-    steps = TensorDict(TrackGradient()(first.clone()), batch_size=64).set("next", after)
-    shifted_steps = TrackGradient(prior=turned_back)(shifted(first)).set("next", shifted(after))
-    plain = TrackGradient()(steps)["next"]
-    other = TrackGradient(prior=turned_back)(shifted_steps)["next"]
+    one, two = TrackGradient(relation=None), TrackGradient(relation=None, prior=turned_back)
+    steps = TensorDict(one(first.clone()), batch_size=64).set("next", after)
+    plain, other = one(steps)["next"], two(two(shifted(first)).set("next", shifted(after)))["next"]
     for key in ("estimated_gradient", "way", "way_covariance"):
         torch.testing.assert_close(other[key], plain[key], rtol=1e-8, atol=1e-8, msg=key)
     torch.testing.assert_close(
@@ -252,7 +277,9 @@ def tracer_prior(reading: Tensor) -> GradientPrior:
 def test_the_estimated_gradient_of_tracers_leads_to_the_target() -> None:
     """The figures of docs/transforms.md: nothing here is magnetic, and nothing reads the true gradient."""
     options = {"scales": (1.0, 1.0), "curvature": (2000.0, 2000.0), "angles": (), "range_km": 5.0}
-    track = TrackGradient(["tracers", "target_tracers", "move", "heading"], prior=tracer_prior, **options)
+    track = TrackGradient(
+        ["tracers", "target_tracers", "move", "heading"], prior=tracer_prior, relation=None, **options
+    )
     keys = ["estimated_field", "target_tracers", "estimated_gradient"]
     heading = GradientHeading(keys, ["way_heading", "way_valid"], pair=(0, 1))
     env = TransformedEnv(plume_env.PlumeEnv(200), Compose(StepCounter(30), track, heading))

@@ -6,20 +6,25 @@ import numpy as np
 import pytest
 import torch
 
-from magrl.field import IGRF, SphericalHarmonicField, elements_at, elements_gradient_at
+from magrl.field import IGRF, SphericalHarmonicField, elements_at, elements_gradient_at, random_planets
 from magrl.field.elements import measured_elements
-from magrl.geodesy import local_frame, move, to_ecef
+from magrl.geodesy import curvature_radii, local_frame, move, to_ecef
 from magrl.tracking import (
     CURVATURE,
-    DIPOLE_STD,
+    CURVATURE_NT,
+    DIPOLE_STD_NT,
     DISTANCE_SCALE_KM,
     EARTH_RADIUS_KM,
     ELEMENT_SCALES,
     VARIANCE_FLOOR,
     FieldTrack,
+    GradientRelation,
+    curl_relation,
     dipole_prior,
     estimated_gradient,
+    field_curvature,
     predict,
+    relate,
     start,
     update,
     way_to,
@@ -250,7 +255,7 @@ def test_gradient_converges_to_the_exact_one_of_igrf(igrf):
 
 def test_a_straight_track_says_nothing_across_it():
     """Without drift, the gradient along the track converges; the one across it keeps its prior and its variance."""
-    gradient, std = torch.zeros(3, 2, dtype=F64), f64(*DIPOLE_STD) / 100
+    gradient, std = torch.zeros(3, 2, dtype=F64), f64((0.4, 0.5), (0.3, 0.2), (190.0, 135.0)) / 100
     heading = 0.6
     along, across = f64(math.cos(heading), math.sin(heading)), f64(-math.sin(heading), math.cos(heading))
     track, slope = start(f64(0.0, 0.0, 0.0), gradient, std, NOISE, torch.tensor(heading, dtype=F64)), 0.01 * SCALES
@@ -298,6 +303,17 @@ def test_way_satisfies_its_normal_equations():
         np.testing.assert_allclose(found.covariance[n].numpy(), 1e4 * np.linalg.inv(normal), rtol=1e-9)
 
 
+def test_a_constant_error_widens_the_way_and_nothing_else():
+    """It is as if the value were less certain, but not its relation to the gradients."""
+    track, target = random_track(20, 3), SCALES * randn(20, 3, seed=7)
+    bias = f64(0.5, 0.1, 20.0)
+    covariance = track.covariance.clone()
+    covariance[..., 0, 0] += (bias / SCALES).square()
+    expected = way_to(FieldTrack(track.mean, covariance), target, 300.0)
+    found = way_to(track, target, 300.0, bias_std=bias)
+    torch.testing.assert_close((found.displacement, found.covariance), tuple(expected))
+
+
 def test_way_is_accurate_in_float32_where_gradients_are_nearly_parallel():
     """At 1e-3 rad between them, a c - b^2 would have no correct digit left."""
     gradients = f64((1.0, 0.0), (2.0, 2e-3), (3.0, 0.0))
@@ -330,6 +346,89 @@ def test_way_stays_in_range_without_information():
     way = way_to(FieldTrack(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3)), torch.ones(3), 250.0)
     torch.testing.assert_close(way.displacement, torch.zeros(2), rtol=0, atol=0)
     torch.testing.assert_close(way.covariance, 250.0**2 * torch.eye(2))
+
+
+# --- relations between the gradients ----------------------------------------------------------------------------------
+
+
+def related(count, elements, seed=0):
+    """States, and a relation of their gradients in units of 1 / km."""
+    track = random_track(count, elements, seed=seed)
+    weights, value = 100 * randn(count, elements, 2, seed=seed + 5), randn(count, seed=seed + 6)
+    return track, GradientRelation(weights, value, randn(count, seed=seed + 7).abs() + 0.1)
+
+
+def joint(track, n):
+    """Mean ``(3 E,)`` and covariance ``(3 E, 3 E)`` of all elements of one vehicle, in NumPy."""
+    return track.mean[n].flatten().numpy(), torch.block_diag(*track.covariance[n]).numpy()
+
+
+def test_a_relation_conditions_the_joint_normal_distribution():
+    track, relation = related(20, 3)
+    found, shared = relate(track, relation, scales=(1.0,) * 3)
+    assert torch.equal(found.covariance, track.covariance)
+    for n in range(20):
+        mean, covariance = joint(track, n)
+        row = np.concatenate([[0.0, *w] for w in relation.weights[n].numpy()]) / 100
+        gain = covariance @ row / (row @ covariance @ row + float(relation.std[n]) ** 2)
+        expected = mean + gain * (float(relation.value[n]) - row @ mean)
+        np.testing.assert_allclose(found.mean[n].flatten().numpy(), expected, rtol=1e-9, atol=1e-12)
+        u = shared[n].flatten().numpy()
+        np.testing.assert_allclose(np.outer(u, u), np.outer(gain, row @ covariance), rtol=1e-9, atol=1e-12)
+
+
+def test_way_given_a_relation_satisfies_its_normal_equations():
+    """As above, with the full covariance of the remaining differences from the second solve on."""
+    (track, shared), target, reach = relate(*related(20, 3), scales=(1.0,) * 3), randn(20, 3, seed=7), 2.5
+    found = way_to(track, target, 100 * reach, (1.0,) * 3, shared)
+    for n in range(20):
+        mean, blocks, u = track.mean[n].numpy(), track.covariance[n].numpy(), shared[n].numpy()
+        spread = np.diag(blocks[:, 0, 0] + reach**2 * (blocks[:, 1, 1] + blocks[:, 2, 2]))
+        for _ in range(3):
+            weight = np.linalg.inv(spread)
+            normal = mean[:, 1:].T @ weight @ mean[:, 1:] + np.eye(2) / reach**2
+            way = np.linalg.solve(normal, mean[:, 1:].T @ weight @ (target[n].numpy() - mean[:, 0]))
+            lever = np.array([1.0, *way])
+            spread = np.diag([lever @ p @ lever for p in blocks]) - np.outer(u @ lever, u @ lever)
+        np.testing.assert_allclose(found.displacement[n].numpy(), 100 * way, rtol=1e-7)
+        np.testing.assert_allclose(found.covariance[n].numpy(), 1e4 * np.linalg.inv(normal), rtol=1e-7)
+
+
+def test_the_field_has_no_vertical_curl():
+    """On planets, B_H dD/dm - dB_H/dc is what the relation says with the true latitude, and mostly in its spread."""
+    generator = torch.Generator().manual_seed(0)
+    latitude = 140 * torch.rand(400, generator=generator, dtype=F64) - 70
+    longitude = 360 * torch.rand(400, generator=generator, dtype=F64) - 180
+    position, ratios = torch.stack((latitude, longitude), -1), []
+    for gauss in random_planets(8, seed=3):
+        planet = SphericalHarmonicField(gauss)
+        elements, gradient = elements_at(planet, position), elements_gradient_at(planet, position)
+        good = elements[:, 2] > 4000
+        relation = curl_relation(elements)
+        found = (relation.weights * gradient).sum((-2, -1))
+        convergence = elements[:, 2] * torch.sin(torch.deg2rad(elements[:, 0])) / curvature_radii(latitude)[1]
+        exact = convergence * torch.tan(torch.deg2rad(latitude))
+        torch.testing.assert_close(found[good], exact[good], rtol=0, atol=1e-6)
+        ratios.append(((found - relation.value) / relation.std)[good])
+    ratio = torch.cat(ratios)
+    assert 0.4 < float(ratio.square().mean().sqrt()) < 1.2
+    assert (ratio.abs() < 2).double().mean() > 0.9
+
+
+def test_a_straight_track_tells_the_gradient_across_it_by_the_curl():
+    """Towards magnetic north, the change of D tells how B_H changes across."""
+    dipole = SphericalHarmonicField(random_planets(1, seed=1)[0])
+    place = f64(10.0, 20.0)
+    first = elements_at(dipole, place)
+    heading = torch.deg2rad(first[0])
+    leg = 40 * torch.stack((torch.cos(heading), torch.sin(heading)))
+    track = update(predict(started(first, (0.0,) * 3), leg), elements_at(dipole, place + leg / 111.2), (0.0,) * 3)
+    exact = elements_gradient_at(dipole, place + leg / 111.2)[2]
+    across = torch.stack((-torch.sin(heading), torch.cos(heading)))
+    known, shared = relate(track, curl_relation(track.mean[:, 0] * SCALES))
+    before, after = (abs(float((estimated_gradient(x)[2] - exact) @ across)) for x in (track, known))
+    assert after < 0.5 * before
+    assert shared[2].norm() > shared[1].norm() == 0
 
 
 # --- the dipole -------------------------------------------------------------------------------------------------------
@@ -388,7 +487,43 @@ def test_dipole_prior_points_at_magnetic_north():
     assert prior.gradient[1, 1] > 0
     assert prior.gradient[2, 1] < 0
     assert float(prior.azimuth) == pytest.approx(math.pi / 2)
-    torch.testing.assert_close(prior.std * 100, f64(*DIPOLE_STD))
+
+
+def test_prior_and_drift_are_those_of_disturbances_of_the_components():
+    """At B_H = 30 000 nT and I = 60 deg, F is 60 000 nT: 30 nT turn D by 1 / 1000 rad and I by 1 / 2000 rad."""
+    elements = f64(10.0, 60.0, 30000.0)
+    unit = f64(math.degrees(1) / 30000, math.degrees(1) / 60000, 1.0)
+    torch.testing.assert_close(dipole_prior(elements).std * 100, unit[:, None] * f64(*DIPOLE_STD_NT))
+    torch.testing.assert_close(field_curvature(elements), unit * f64(*CURVATURE_NT))
+
+
+def test_planets_deviate_from_the_dipole_and_curve_as_assumed():
+    """Root mean squares over planets, within 20 %."""
+    generator = torch.Generator().manual_seed(0)
+    place = torch.stack(
+        (
+            120 * torch.rand(600, generator=generator, dtype=F64) - 60,
+            360 * torch.rand(600, generator=generator, dtype=F64),
+        ),
+        -1,
+    )
+    heading = 2 * math.pi * torch.rand(600, generator=generator, dtype=F64)
+    later = torch.stack(move(*place.unbind(-1), heading, torch.full_like(heading, 100.0)), -1)
+    deviations, changes = [], []
+    for gauss in random_planets(12, seed=5):
+        planet = SphericalHarmonicField(gauss)
+        elements, gradient = elements_at(planet, place), elements_gradient_at(planet, place)
+        prior = dipole_prior(elements)
+        cos, sin = torch.cos(prior.azimuth)[:, None], torch.sin(prior.azimuth)[:, None]
+        north, east = (gradient - prior.gradient).unbind(-1)
+        turned = torch.stack((cos * north + sin * east, cos * east - sin * north), -1)
+        change = elements_gradient_at(planet, later) - gradient
+        good = elements[:, 2] > 10000
+        deviations.append((turned / prior.std)[good])
+        changes.append((100 * change / field_curvature(elements).unsqueeze(-1))[good])
+    for ratios, least, most in ((torch.cat(deviations), 0.75, 1.4), (torch.cat(changes), 0.75, 1.4)):
+        rms = ratios.square().mean(0).sqrt()
+        assert ((rms > least) & (rms < most)).all(), rms
 
 
 def test_prior_is_narrow_along_the_azimuth():
@@ -409,7 +544,8 @@ def fly(reading, moved, after, target, noise):
     prior = dipole_prior(reading)
     track = start(reading, prior.gradient, prior.std, noise, prior.azimuth)
     track = update(predict(track, moved), after, NOISE)
-    return (*track, *way_to(track, target, 300.0), estimated_gradient(track))
+    known, shared = relate(track, curl_relation(after))
+    return (*track, *way_to(known, target, 300.0, shared=shared), estimated_gradient(known))
 
 
 def flight(dtype=F64):

@@ -254,7 +254,9 @@ def alignment_twice() -> Transform:
 def track_plane() -> Transform:
     keys = [nested(name) for name in ("scent", "scent_there", "place", "angle")]
     outs = [nested(f"track_{k}") for k in range(6)]
-    return TrackGradient(keys, outs, prior=flat_prior, scales=(1.0, 1.0), curvature=(1.0, 1.0), angles=())
+    return TrackGradient(
+        keys, outs, prior=flat_prior, relation=None, scales=(1.0, 1.0), curvature=(1.0, 1.0), angles=()
+    )
 
 
 def flat_prior(reading: Tensor) -> GradientPrior:
@@ -530,7 +532,9 @@ DATA_CASES = {
     ),
 }
 DATA_CASES["TrackGradient"] = DataCase(
-    lambda key: TrackGradient([key(x) for x in ("x", "y", "move", "angle")], [key(f"o{k}") for k in range(6)]),
+    lambda key: TrackGradient(
+        [key(x) for x in ("x", "y", "move", "angle")], [key(f"o{k}") for k in range(6)], relation=None
+    ),
     lambda rand: {"x": 90 * rand(3), "y": 90 * rand(3), "move": rand(2), "angle": rand(1)},
     lambda td: {"o2": td["x"], "o3": dipole_prior(td["x"]).gradient},  # the first reading and the prior
 )

@@ -24,7 +24,9 @@ from magrl.envs.rendering import PATH, START, TARGET, draw_contours
 from magrl.field import FieldModel
 from magrl.geodesy import geodesic, move
 
-_LAND, _ESTIMATE = "#8c6d46", "#56B4E9"
+_LAND = "#8c6d46"
+ESTIMATE = "#56B4E9"
+"""Color of estimates of the destination."""
 
 
 @cache
@@ -109,36 +111,92 @@ def flight_figure(rollout: TensorDictBase, field: FieldModel, region: Region, ti
         >>> flight_figure(env.rollout(3), env.field, env.region).axes[0].get_ylabel()
         'latitude [° N]'
     """
+    figure, path = flight_map(rollout, field, region, title)
+    axes, states = figure.axes[0], rollout[0, 1:]
+    if "way" in states.keys():  # noqa: SIM118 - a TensorDict is no mapping
+        guesses = region.unwrapped(estimates(states, 5000.0))
+        axes.plot(guesses[:, 1], guesses[:, 0], ".", color=ESTIMATE, ms=4, label="destination, estimated")
+    axes.plot(path[:, 1], path[:, 0], "-", color=PATH, lw=2, marker=".", ms=4, label="track")
+    draw_legend(figure)
+    return figure
+
+
+def flight_map(
+    rollout: TensorDictBase, field: FieldModel, region: Region, title: str = "", shown: Tensor | None = None
+) -> tuple[Figure, Tensor]:
+    """Return the map of an episode without its track: contours, coastlines, shortest path, start and destination.
+
+    Args:
+        rollout: as in :func:`flight_figure`.
+        field: any model of :mod:`magrl.field`.
+        region: region of the episode.
+        title: title of the figure.
+        shown: ``(P, 2)`` positions that the map must hold beside the track and the shortest path [deg].
+
+    Returns:
+        The figure, and the positions of the vehicle ``(T + 1, 2)`` latitude, longitude [deg], unwrapped.
+
+    Raises:
+        ValueError: for more than one vehicle.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=1, seed=0)
+        >>> flight_map(env.rollout(3), env.field, env.region)[1].shape
+        torch.Size([4, 2])
+    """
     check_type(TensorDictBase, rollout=rollout)
     if rollout.ndim != 2 or len(rollout) != 1:
         raise ValueError(f"a rollout must be of one vehicle, (1, T), got {tuple(rollout.shape)}")
-    states, start = rollout[0, 1:], rollout["start_position"][0, 0]
-    target, last = rollout["target_position"][0, 0], rollout["next", "position"][0, -1:]
-    path = region.unwrapped(torch.cat((start[None], states["position"], last)))
+    start, target = rollout["start_position"][0, 0], rollout["target_position"][0, 0]
+    path = region.unwrapped(torch.cat((start[None], rollout["next", "position"][0])))
     way, ends = region.unwrapped(shortest_path(start, target)), region.unwrapped(torch.stack((start, target)))
-    box = frame(torch.cat((path, way)))
+    box = frame(torch.cat((path, way, way[:0] if shown is None else region.unwrapped(shown))))
     width = (box.longitude[1] - box.longitude[0]) * math.cos(math.radians(sum(box.latitude) / 2))
     figure = Figure(figsize=(9, 1.6 + 8 * min((box.latitude[1] - box.latitude[0]) / width, 1.3)), layout="constrained")
     axes = figure.subplots()
     draw_contours(axes, field, box)
     for turn in (-360, 0, 360):
         axes.plot(coastlines()[:, 1] + turn, coastlines()[:, 0], color=_LAND, lw=1)
-    if "way" in states.keys():  # noqa: SIM118 - a TensorDict is no mapping
-        guesses = region.unwrapped(_estimates(states))
-        axes.plot(guesses[:, 1], guesses[:, 0], ".", color=_ESTIMATE, ms=4, label="destination, estimated")
     axes.plot(way[:, 1], way[:, 0], "--", color=PATH, lw=1, label="shortest path")
-    axes.plot(path[:, 1], path[:, 0], "-", color=PATH, lw=2, marker=".", ms=4, label="track")
-    axes.plot(ends[0, 1], ends[0, 0], "s", color=START, ms=8, label="start")
-    axes.plot(ends[1, 1], ends[1, 0], "^", color=TARGET, ms=9, label="destination")
+    axes.plot(ends[0, 1], ends[0, 0], "s", color=START, ms=8, zorder=3, label="start")
+    axes.plot(ends[1, 1], ends[1, 0], "^", color=TARGET, ms=9, zorder=3, label="destination")
     axes.set(xlim=box.longitude, ylim=box.latitude, title=title)
     axes.xaxis.set_major_formatter(lambda degrees, _: f"{math.remainder(degrees, 360):g}")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return figure
+    return figure, path
 
 
-def _estimates(states: TensorDictBase) -> Tensor:
-    """Return where the destination was estimated to be, ``(T, 2)`` [deg]; estimates farther than 5000 km left out."""
+def draw_legend(figure: Figure) -> None:
+    """Draw the legend of a map below it.
+
+    Example:
+        >>> figure = Figure(layout="constrained")
+        >>> draw_legend(figure.subplots().plot([0, 1], label="track")[0].figure)
+        >>> len(figure.legends)
+        1
+    """
+    labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+
+
+def estimates(states: TensorDictBase, farthest_km: float) -> Tensor:
+    """Return where a vehicle estimated its destination to be.
+
+    Args:
+        states: ``(T,)`` of one vehicle, with ``position`` and ``way``.
+        farthest_km: distance from the vehicle beyond which an estimate is left out [km].
+
+    Returns:
+        ``(P, 2)`` latitude, longitude [deg], P at most T.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> ways = torch.tensor([[111.2, 0.0], [9000.0, 0.0]])
+        >>> states = TensorDict(position=torch.zeros(2, 2), way=ways, batch_size=[2])
+        >>> estimates(states, 5000.0).round(decimals=1)
+        tensor([[1., 0.]], dtype=torch.float64)
+    """
     (north, east), (latitude, longitude) = (states[key].double().unbind(-1) for key in ("way", "position"))
     distance = torch.hypot(north, east)
     places = torch.stack(move(latitude, longitude, torch.atan2(east, north), distance), -1)
-    return places[distance < 5000]
+    return places[distance < farthest_km]

@@ -13,6 +13,7 @@ from magrl.agents import FieldPolicy, load_policy
 from magrl.agents.pretrained import load_pretrained
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
+from magrl.field import Date
 from magrl.navigators import METAHEURISTICS, NAVIGATOR_CLASSES, NAVIGATORS, Navigator
 from magrl.transforms import TrackView
 
@@ -38,6 +39,7 @@ NAVIGATOR_NAMES = {
     "mean_jacobian": "mean Jacobian",
     "geodesic": "geodesic",
     "run_and_tumble": "run and tumble",
+    "map_matching": "map matching",
 }
 """Label of each navigator in figures."""
 
@@ -48,6 +50,7 @@ _DETAILED_NAMES = NAVIGATOR_NAMES | {
     "parallel": "parallel (true gradient, an oracle)",
     "kalman": "Kalman (dual control)",
     "mean_jacobian": "mean Jacobian (quasi-Newton)",
+    "map_matching": "map matching (Kalman filter)",
     "geodesic": "geodesic (both positions, an oracle)",
 }
 """Label of each navigator in tables."""
@@ -59,6 +62,7 @@ def make_navigator(
     mode: str = "look-ahead",
     seed: int = 0,
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    map_date: Date | None = None,
 ) -> TensorDictModuleBase:
     """Return the navigator that a text such as ``secant``, ``pso:flown`` or ``gg_td3=RUN`` names.
 
@@ -68,6 +72,7 @@ def make_navigator(
         mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
         noise: standard deviations of the sensors, D [deg], I [deg], B_H [nT], for navigators that weigh their readings.
+        map_date: date of the map of ``map_matching``, from IGRF; None for the environment's own field.
 
     Raises:
         ValueError: for an unknown name, a trained agent without a run or trained in another field, a run or a mode for
@@ -97,7 +102,8 @@ def make_navigator(
     if name in METAHEURISTICS and not run:
         return METAHEURISTICS[name](env, own_mode or mode, seed)
     if name in NAVIGATORS and not run and not own_mode:
-        return NAVIGATORS[name](env, mode, seed, noise)
+        options = {"map_date": map_date} if name == "map_matching" else {}
+        return NAVIGATORS[name](env, mode, seed, noise, **options)
     known = ", ".join([*PRETRAINED, *(f"{trained}=RUN" for trained in TRAINED), *NAVIGATORS, *METAHEURISTICS])
     raise ValueError(f"unknown navigator {text!r}: choose from {known}")
 
@@ -174,6 +180,28 @@ def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> No
         if key in seen:
             raise ValueError(f"{text} is given twice: the same episodes again are no spread over runs")
         seen.add(key)
+
+
+def check_map_date(texts: Sequence[str], map_date: Date | None) -> None:
+    """Raise if the date of a map is given without the navigator that has a map.
+
+    Args:
+        texts: navigators, as :func:`make_navigator` takes them.
+        map_date: date of the map, or None.
+
+    Raises:
+        ValueError: with the date.
+
+    Example:
+        >>> check_map_date(["secant", "map_matching"], "2015-01-01")
+        >>> check_map_date(["secant"], "2015-01-01")
+        Traceback (most recent call last):
+        ValueError: --map-date 2015-01-01 is the date of the map of map_matching: add that navigator, or omit the date
+    """
+    if map_date is not None and "map_matching" not in texts:
+        raise ValueError(
+            f"--map-date {map_date} is the date of the map of map_matching: add that navigator, or omit the date"
+        )
 
 
 def arrival_threshold(texts: Sequence[str], zeta: float | None = None) -> tuple[float, list[str]]:

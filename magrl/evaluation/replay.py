@@ -6,7 +6,7 @@ The page is ``templates/replay.html`` with the data embedded as JSON, escaped so
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -237,11 +237,36 @@ def write_gif(
     """
     check_type((Path, str), path=path)
     check_number(1, whole=True, frames_per_step=frames_per_step, size_px=size_px)
-    frames = list(_frames(rollout, field, region, frames_per_step, size_px))
+    save_gif(path, list(_frames(rollout, field, region, frames_per_step, size_px)), STEP_MS // frames_per_step)
+
+
+def save_gif(path: Path | str, frames: Sequence[Image.Image], frame_ms: int, colors: int = GIF_COLORS) -> None:
+    """Write frames as an animated GIF that loops and shows its last frame for longer.
+
+    Args:
+        path: path of the image; an existing file is replaced.
+        frames: RGB images of one size.
+        frame_ms: time that each frame is shown [ms].
+        colors: number of colors, at most 256.
+
+    Raises:
+        ValueError: for no frame, a time below 1 ms, or another number of colors.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "colors.gif"
+        >>> save_gif(path, [Image.new("RGB", (8, 8), color) for color in ("red", "blue")], frame_ms=100)
+        >>> Image.open(path).n_frames
+        2
+    """
+    check_number(1, whole=True, frame_ms=frame_ms)
+    check_number(1, 256, whole=True, colors=colors)
+    if not frames:
+        raise ValueError("frames must hold at least one image, got none")
     sample = np.hstack([np.asarray(frame) for frame in (frames[0], frames[len(frames) // 2], frames[-1])])
-    palette = Image.fromarray(sample).quantize(GIF_COLORS)  # one for all frames, so that unchanged pixels compress well
+    palette = Image.fromarray(sample).quantize(colors)  # one for all frames, so that unchanged pixels compress well
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    durations = [STEP_MS // frames_per_step] * len(others) + [4 * STEP_MS]
+    durations = [frame_ms] * len(others) + [4 * STEP_MS]
     first.save(Path(path), "GIF", save_all=True, append_images=others, duration=durations, loop=0)
 
 

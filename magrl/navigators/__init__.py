@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from magrl.envs import GeomagneticNavEnv
+from magrl.field import Date
 from magrl.navigators.base import Navigator
 from magrl.navigators.geodesic import Geodesic
 from magrl.navigators.kalman import Kalman
+from magrl.navigators.map_matching import MapMatching, aged_error, dated_map
 from magrl.navigators.mean_jacobian import MeanJacobian
 from magrl.navigators.metaheuristics import METAHEURISTICS
 from magrl.navigators.parallel import ParallelApproach
@@ -47,6 +49,20 @@ def _kalman(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFEC
     return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps)
 
 
+def _map_matching(
+    env: GeomagneticNavEnv,
+    mode: str,  # noqa: ARG001
+    seed: int,  # noqa: ARG001
+    noise: Noise = _PERFECT,
+    map_date: Date | None = None,
+) -> MapMatching:
+    if map_date is None:
+        return MapMatching(env.field, env.edge, env.max_move_km, env.max_turn_rad, noise)
+    field = dated_map(env.scenario, map_date, env.max_move_km).to(env.device)
+    error = aged_error(env.scenario, map_date)
+    return MapMatching(field, env.edge, env.max_move_km, env.max_turn_rad, noise, error)
+
+
 NAVIGATORS: dict[str, Callable[..., Navigator]] = {
     "parallel": _parallel,
     "secant": _secant,
@@ -54,9 +70,10 @@ NAVIGATORS: dict[str, Callable[..., Navigator]] = {
     "geodesic": _geodesic,
     "run_and_tumble": _run_and_tumble,
     "kalman": _kalman,
+    "map_matching": _map_matching,
 }
 """Factories by name, called with an environment, a mode and a seed, which these ignore, and perhaps the standard
-deviations of the sensors: D [deg], I [deg], B_H [nT]."""
+deviations of the sensors: D [deg], I [deg], B_H [nT]; ``map_matching`` also with the date of its map."""
 
 NAVIGATOR_CLASSES: dict[str, type[Navigator]] = {
     "parallel": ParallelApproach,
@@ -65,6 +82,7 @@ NAVIGATOR_CLASSES: dict[str, type[Navigator]] = {
     "geodesic": Geodesic,
     "run_and_tumble": RunAndTumble,
     "kalman": Kalman,
+    "map_matching": MapMatching,
 }
 """Classes by name, for what they say of themselves (:attr:`Navigator.needs`)."""
 
@@ -74,6 +92,7 @@ __all__ = [
     "NAVIGATOR_CLASSES",
     "Geodesic",
     "Kalman",
+    "MapMatching",
     "MeanJacobian",
     "Navigator",
     "ParallelApproach",

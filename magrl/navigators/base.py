@@ -141,6 +141,7 @@ class Navigator(TensorDictModuleBase):
     """Whether the navigator reads privileged keys, or the field where the vehicle has not been."""
     needs: str = "nothing"
     """What it needs beside its readings and the sensors' data sheet: ``"nothing"``, ``"a map of the region"``,
+    ``"a map and the region"``,
     ``"the gradient"``, ``"the position"`` or ``"the field at other places"``."""
 
     def __init__(self, max_move_km: float, max_turn_rad: float) -> None:

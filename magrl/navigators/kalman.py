@@ -32,7 +32,8 @@ class Kalman(QuasiNewton):
     For each it predicts the covariance of the filter after the reading at its end, which does not depend on what will
     be read, and chooses the least sum of three costs [km]:
 
-    - the path: the length of the move and the distance that then remains;
+    - the path: the length of the move minus the progress, that is, what it takes off the estimated way times the
+      cosine of the typical error of its direction;
     - ``caution`` times the detour that the remaining uncertainty of the way may cost;
     - the price of the remaining steps, which rises as fewer of them are left.
 
@@ -83,13 +84,20 @@ class Kalman(QuasiNewton):
     def prior(self, reading: Tensor) -> GradientPrior:
         return tracking.dipole_prior(reading)
 
+    def _drift(self, seen: TensorDictBase) -> Tensor:
+        return tracking.field_curvature(seen["field"].double())
+
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         super().decide(seen, memory)  # the filter reads
         track = FieldTrack(memory["mean"], memory["covariance"])
-        way = tracking.way_to(track, seen["target_field"].double(), self.range_km, self.scales).displacement
+        target = seen["target_field"].double()
+        known, shared = self._related(track)
+        way, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared)
         moves = self._moves(way)
         left = way.unsqueeze(1) - moves
-        cost = moves.norm(dim=-1) + left.norm(dim=-1) * (1 + self._price(way, seen["step_count"]) / self.max_move_km)
+        progress = (way.norm(dim=-1, keepdim=True) - left.norm(dim=-1)) * _certainty(way, covariance)
+        cost = moves.norm(dim=-1) - progress
+        cost = cost + left.norm(dim=-1) * self._price(way, seen["step_count"]) / self.max_move_km
         cost = cost + self.caution * _detour(left, self._covariance_after(track, moves, left))
         best = moves[torch.arange(len(moves), device=moves.device), cost.argmin(-1)]
         distance = best.norm(dim=-1)
@@ -111,26 +119,40 @@ class Kalman(QuasiNewton):
         spare = self.max_steps - step.double() - 1.5 * way.norm(dim=-1, keepdim=True) / self.max_move_km
         return self.step_km * (self.max_steps / spare.clamp_min(1.0)).square()
 
+    def _related(self, track: FieldTrack) -> tuple[FieldTrack, Tensor]:
+        """Return the state given that the field has no curl, see :func:`~magrl.tracking.relate`."""
+        elements = track.mean[..., 0] * track.mean.new_tensor(self.scales)
+        return tracking.relate(track, tracking.curl_relation(elements), self.scales)
+
     def _covariance_after(self, track: FieldTrack, moves: Tensor, left: Tensor) -> Tensor:
         """Return the expected covariance ``(N, M, 2, 2)`` [km^2] of the way after moves and readings at their ends.
 
         The gradients that a reading will teach are unknown, but not their mean square: that of the present estimate
-        plus what the variance decreases. The drift of the gradients is left out, as it does not depend on the choice.
+        plus what the covariance decreases. The drift of the gradients is left out, as it does not depend on the choice.
         """
-        now = FieldTrack(track.mean.unsqueeze(1), track.covariance.unsqueeze(1))
-        moved = tracking.predict(now, moves, [0.0] * len(self.scales), self.scales)
+        now, shared = self._related(FieldTrack(track.mean.unsqueeze(1), track.covariance.unsqueeze(1)))
+        moved = tracking.predict(FieldTrack(track.mean.unsqueeze(1), now.covariance), moves, [0.0] * 3, self.scales)
         expected = moved.mean[..., 0] * moves.new_tensor(self.scales)
-        after = tracking.update(moved, expected, self.noise, self.scales).covariance
-        d = (left / DISTANCE_SCALE_KM).unsqueeze(-2)
-        cross = 2 * after[..., 0, 1:] + (after[..., 1:, 1:] * d.unsqueeze(-2)).sum(-1)
-        variance = after[..., 0, 0] + (cross * d).sum(-1)
-        slope = now.mean[..., 1:]
-        square = slope.unsqueeze(-1) * slope.unsqueeze(-2) + now.covariance[..., 1:, 1:] - after[..., 1:, 1:]
-        normal = (square / variance[..., None, None]).sum(-3)
+        after, shared_after = self._related(tracking.update(moved, expected, self.noise, self.scales))
+        weights = _weights(after.covariance, shared_after, left / DISTANCE_SCALE_KM)
+        learned = (now.covariance - after.covariance)[..., 1:, 1:]
+        normal = (weights.diagonal(dim1=-2, dim2=-1)[..., None, None] * learned).sum(-3)
+        for rows, sign in ((now.mean, 1), (shared, -1), (shared_after, 1)):
+            normal = normal + sign * rows[..., 1:].mT @ weights @ rows[..., 1:]
         unknown = torch.eye(2, dtype=normal.dtype, device=normal.device) * (self.range_km / DISTANCE_SCALE_KM) ** 2
         inverse, info = torch.linalg.inv_ex(normal + torch.diag(1 / unknown.diagonal()))
         # Where rounding leaves a singular matrix, the way is as unknown as before.
         return torch.where((info == 0)[..., None, None], inverse, unknown) * DISTANCE_SCALE_KM**2
+
+
+def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:
+    """Return the inverse covariance ``(..., 3, 3)`` of the elements at the end of a way ``(..., 2)`` [100 km]."""
+    d = way.unsqueeze(-2)
+    cross = 2 * covariance[..., 0, 1:] + (covariance[..., 1:, 1:] * d.unsqueeze(-2)).sum(-1)
+    weight = (covariance[..., 0, 0] + (cross * d).sum(-1)).reciprocal()
+    row = weight * (shared[..., 0] + (shared[..., 1:] * d).sum(-1))
+    rest = 1 - (row.square() / weight).sum(-1)
+    return torch.diag_embed(weight) + row.unsqueeze(-1) * row.unsqueeze(-2) / rest[..., None, None]
 
 
 def trade_off(noise: Sequence[float]) -> tuple[float, float]:
@@ -148,14 +170,23 @@ def trade_off(noise: Sequence[float]) -> tuple[float, float]:
 
     Example:
         >>> trade_off((0, 0, 0))
-        (10.0, 0.1)
+        (5.0, 0.1)
         >>> [round(value, 2) for value in trade_off((0.1, 0.1, 10))]
-        [0.9, 5.0]
+        [0.45, 3.33]
     """
     check_numbers(3, noise=noise)
     check_number(0, noise=min(noise))
     noise_km = sorted(std / slope for std, slope in zip(noise, SLOPES, strict=True))[1]
-    return min(10.0, 6.0 / max(noise_km, 0.1)), max(0.1, 0.75 * noise_km)
+    return min(5.0, 3.0 / max(noise_km, 0.1)), max(0.1, 0.5 * noise_km)
+
+
+def _certainty(way: Tensor, covariance: Tensor) -> Tensor:
+    """Return the share ``(N, 1)`` of a move along a way that is progress: the cosine of its typical error."""
+    distance = way.norm(dim=-1).clamp_min(1e-9)
+    unit = way / distance.unsqueeze(-1)
+    across = torch.stack((-unit[..., 1], unit[..., 0]), -1)
+    variance = ((covariance * across.unsqueeze(-2)).sum(-1) * across).sum(-1)
+    return (distance / (distance.square() + variance).sqrt()).unsqueeze(-1)
 
 
 def _detour(left: Tensor, covariance: Tensor) -> Tensor:

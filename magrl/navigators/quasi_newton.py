@@ -71,6 +71,10 @@ class QuasiNewton(Navigator):
         """
         raise NotImplementedError(f"{type(self).__name__} must return a GradientPrior in prior(reading)")
 
+    def _drift(self, seen: TensorDictBase) -> Tensor | list[float]:  # noqa: ARG002
+        """Return the standard deviation of the change of the Jacobian, see :func:`magrl.tracking.predict`."""
+        return self.curvature
+
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         reading = seen["field"].double()[:, self.elements]
         gradient, std, azimuth = self.prior(reading)
@@ -82,7 +86,7 @@ class QuasiNewton(Navigator):
         heading = seen["heading"].squeeze(-1).double()
         leg = seen["move"][:, :1].double() * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
         track = tracking.FieldTrack(memory["mean"], memory["covariance"])
-        moved = tracking.predict(track, leg, self.curvature, self.scales)
+        moved = tracking.predict(track, leg, self._drift(seen), self.scales)
         moved = tracking.update(moved, seen["field"].double()[:, self.elements], self.noise, self.scales)
         began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
         mean = torch.where(began, track.mean, moved.mean)

@@ -11,7 +11,7 @@ from torchrl.data import TensorSpec, Unbounded
 
 from magrl import tracking
 from magrl.checks import check_number, check_numbers
-from magrl.tracking import FieldTrack, GradientPrior
+from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, curl_relation, dipole_prior, field_curvature
 from magrl.transforms.base import Keys, ObservationTransform, observed_spec, several_keys, sorted_keys, with_state
 
 FRAMES = ("world", "vehicle")
@@ -28,7 +28,8 @@ class TrackGradient(ObservationTransform):
     Args:
         in_keys: readings ``(..., E)``, values at the target ``(..., E)``, the last move ``(..., K)`` (its first number
             is the distance [km]), the heading after the move ``(..., 1)`` [rad], and optionally the standard deviation
-            of the readings' noise ``(..., E)``.
+            of the readings' noise ``(..., E)`` and that of their constant error ``(..., E)``, which only widens the
+            covariance of the way.
         out_keys: the state, in the scaled units of :class:`~magrl.tracking.FieldTrack`: mean ``(..., E, 3)`` and
             covariance ``(..., E, 3, 3)``, always northward and eastward; then the estimates: the field ``(..., E)``,
             its gradient ``(..., E, 2)`` [element unit / km], the way to the target ``(..., 2)`` [km] and its covariance
@@ -36,10 +37,12 @@ class TrackGradient(ObservationTransform):
         noise_std: standard deviation of the readings' noise, E numbers, where it is not among the ``in_keys``; by
             default 0. The filter has a floor, :data:`~magrl.tracking.VARIANCE_FLOOR`.
         prior: function from a first reading ``(..., E)`` to a :class:`~magrl.tracking.GradientPrior`; for other
-            elements than D, I, B_H, give one, and also ``scales``, ``curvature`` and ``angles``.
+            elements than D, I, B_H, give one, and also ``relation``, ``scales``, ``curvature`` and ``angles``.
+        relation: function from the estimated field ``(..., E)`` to a :class:`~magrl.tracking.GradientRelation` that the
+            gradients obey; None for none.
         scales: units of the elements in the state, E numbers; see :func:`magrl.tracking.start`.
-        curvature: standard deviation of the change of a gradient along the way, E numbers; see
-            :func:`magrl.tracking.predict`.
+        curvature: standard deviation of the change of a gradient along the way, E numbers or a function from the
+            estimated field ``(..., E)`` to them; see :func:`magrl.tracking.predict`.
         angles: elements that are angles in degrees, by index: their differences are wrapped, and their estimate is
             continued beyond 180 degrees.
         range_km: prior standard deviation of the way along each axis [km].
@@ -58,9 +61,9 @@ class TrackGradient(ObservationTransform):
     """
 
     scales: Tensor
-    curvature: Tensor
     noise_std: Tensor
     period: Tensor
+    constant_curvature: Tensor
 
     def __init__(
         self,
@@ -68,31 +71,35 @@ class TrackGradient(ObservationTransform):
         out_keys: Keys = OUT_KEYS,
         *,
         noise_std: Sequence[float] | None = None,
-        prior: Callable[[Tensor], GradientPrior] = tracking.dipole_prior,
+        prior: Callable[[Tensor], GradientPrior] = dipole_prior,
+        relation: Callable[[Tensor], GradientRelation] | None = curl_relation,
         scales: Sequence[float] = tracking.ELEMENT_SCALES,
-        curvature: Sequence[float] = tracking.CURVATURE,
+        curvature: Sequence[float] | Callable[[Tensor], Tensor] = field_curvature,
         angles: Sequence[int] = (0,),
         range_km: float = 300.0,
         frame: str = "world",
     ) -> None:
         super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        if len(self.in_keys) not in (4, 5) or len(self.out_keys) != 6:
+        if len(self.in_keys) not in (4, 5, 6) or len(self.out_keys) != 6:
             raise ValueError(
-                "TrackGradient takes 4 or 5 in_keys (reading, target, move, heading, standard deviation of the noise) "
-                f"and 6 out_keys (such as {OUT_KEYS}), got {self.in_keys} and {self.out_keys}"
+                "TrackGradient takes 4 to 6 in_keys (reading, target, move, heading, standard deviations of the noise "
+                f"and of the constant error) and 6 out_keys (such as {OUT_KEYS}), got {self.in_keys} and "
+                f"{self.out_keys}"
             )
-        if noise_std is not None and len(self.in_keys) == 5:
+        if noise_std is not None and len(self.in_keys) > 4:
             raise ValueError(f"give noise_std or its key {self.in_keys[4]!r}, not both: got noise_std {noise_std}")
         check_number(0, above=True, range_km=range_km)
         if frame not in FRAMES or not callable(prior):
             raise ValueError(f"frame must be one of {FRAMES} and prior a function, got {frame!r} and {prior!r}")
-        self.prior, self.range_km, self.frame = prior, float(range_km), frame
+        if relation is not None and not callable(relation):
+            raise ValueError(f"relation must be a function or None, got {relation!r}")
+        self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
         self._register(scales, curvature, noise_std, angles)
 
     def _register(
         self,
         scales: Sequence[float],
-        curvature: Sequence[float],
+        curvature: Sequence[float] | Callable[[Tensor], Tensor],
         noise_std: Sequence[float] | None,
         angles: Sequence[int],
     ) -> None:
@@ -100,7 +107,10 @@ class TrackGradient(ObservationTransform):
         count = len(scales) if isinstance(scales, (tuple, list)) else 0
         if not count or not isinstance(angles, (tuple, list)) or not set(angles) <= set(range(count)):
             raise ValueError(f"scales must be numbers and angles among their indices, got {scales!r} and {angles!r}")
-        numbers = {"curvature": curvature, "noise_std": (0.0,) * count if noise_std is None else noise_std}
+        numbers = {"noise_std": (0.0,) * count if noise_std is None else noise_std}
+        self.curvature = curvature if callable(curvature) else None
+        if not callable(curvature):
+            numbers["constant_curvature"] = curvature
         for name, values in ({"scales": scales} | numbers).items():
             check_numbers(count, **{name: values})
             if min(values) < 0 or (name == "scales" and min(values) == 0):
@@ -123,7 +133,7 @@ class TrackGradient(ObservationTransform):
         prior = self.prior(reading)
         noise = std[0] if std else self.noise_std
         track = tracking.start(reading, prior.gradient, prior.std, noise, prior.azimuth, self.scales)
-        return self._write(first, track, target, heading)
+        return self._write(first, track, target, heading, *std[1:])
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         values = self._read(next_tensordict)
@@ -131,10 +141,11 @@ class TrackGradient(ObservationTransform):
             return next_tensordict
         reading, target, move, heading, *std = values
         displacement = move[..., :1] * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
-        track = tracking.predict(self._state(tensordict), displacement, self.curvature, self.scales)
+        track = self._state(tensordict)
+        track = tracking.predict(track, displacement, self._curvature_at(track), self.scales)
         noise = std[0] if std else self.noise_std
         track = tracking.update(track, self._continued(reading, track), noise, self.scales)
-        return self._write(next_tensordict, track, target, heading)
+        return self._write(next_tensordict, track, target, heading, *std[1:])
 
     def _state(self, tensordict: TensorDictBase) -> FieldTrack:
         missing = [key for key in self.out_keys[:2] if tensordict.get(key, None) is None]
@@ -145,16 +156,32 @@ class TrackGradient(ObservationTransform):
             )
         return FieldTrack(*(tensordict.get(key) for key in self.out_keys[:2]))
 
+    def _curvature_at(self, track: FieldTrack) -> Tensor:
+        if self.curvature is None:
+            return self.constant_curvature
+        return self.curvature(track.mean[..., 0] * self.scales.to(track.mean.dtype))
+
     def _continued(self, values: Tensor, track: FieldTrack) -> Tensor:
         """Return values whose angles are within half a turn of the estimate."""
         near, period = track.mean[..., 0] * self.scales.to(values.dtype), self.period.to(values.dtype)
         return values - period * torch.round((values - near) / 360)
 
-    def _write(self, tensordict: TensorDictBase, track: FieldTrack, target: Tensor, heading: Tensor) -> TensorDictBase:
+    def _write(
+        self,
+        tensordict: TensorDictBase,
+        track: FieldTrack,
+        target: Tensor,
+        heading: Tensor,
+        bias_std: Tensor | None = None,
+    ) -> TensorDictBase:
         """Write the state and the estimates."""
-        value = track.mean[..., 0] * self.scales.to(target.dtype)
-        gradient = tracking.estimated_gradient(track, self.scales)
-        way, covariance = tracking.way_to(track, self._continued(target, track), self.range_km, self.scales)
+        scales = self.scales.to(target.dtype)
+        known, shared = track, None
+        if self.relation is not None:
+            known, shared = tracking.relate(track, self.relation(track.mean[..., 0] * scales), scales)
+        value, gradient = known.mean[..., 0] * scales, tracking.estimated_gradient(known, scales)
+        target = self._continued(target, known)
+        way, covariance = tracking.way_to(known, target, self.range_km, scales, shared, bias_std)
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)

@@ -2,9 +2,11 @@
 
     python recipes/tables/earth_table.py anywhere kalman secant parallel > docs/results/earth.md
     python recipes/tables/earth_table.py anywhere=runs/A anywhere=runs/B --distance-km 700 1000 --max-steps 120
+    python recipes/tables/earth_table.py map_matching --map-date 2015-01-01
+    python recipes/tables/earth_table.py anywhere --date 1900-01-01 1950-01-01 2000-01-01 > docs/results/epochs.md
 
 The regions are those of `magrl.envs.earth_scenario`: seeded, with latitudes of their middles up to 60 degrees and a
-horizontal intensity of at least 8000 nT (IGRF-14 at 2025-01-01). Episodes start at random headings. Navigators without
+horizontal intensity of at least 8000 nT (IGRF-14). Episodes start at random headings. Navigators without
 training are told the noise of the sensors. Prints a Markdown table: success rate (SR) and success weighted by path
 length (SPL) in percent, and steps over successes; means over several runs of one name, with the lowest SPL in brackets.
 """
@@ -25,13 +27,14 @@ from tqdm import tqdm
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
-from magrl.evaluation.navigators import check_distinct, label, make_navigator, needs
+from magrl.evaluation.navigators import check_distinct, check_map_date, label, make_navigator, needs
 from magrl.evaluation.tables import markdown_table
 from magrl.training import UsageError, command
 from magrl.transforms import with_sensor_noise
 
 RECIPE = "earth_table.py"
 Noise = tuple[float, float, float]
+Result = tuple[float, float, float]  # SR [%], SPL [%] and steps
 LEVELS: tuple[Noise, ...] = (
     (0.0, 0.0, 0.0),
     (0.02, 0.02, 2.0),
@@ -60,21 +63,26 @@ class Config:
     """Arrival threshold on the objective (Eq. 2-7)."""
     seed: int = 0
     """Random seed of regions, tasks, start headings and noise; no training uses it."""
+    date: tuple[str, ...] = ("2025-01-01",)
+    """Dates of the field, 1900 to 2030 (IGRF-14); of several, the first column of the table has the date."""
+    map_date: str | None = None
+    """Date of the map of map_matching, as 2015-01-01; by default its map is the field itself."""
 
 
-def earth(config: Config) -> Scenario:
-    """Return frozen tasks in random regions of the Earth, large enough for the longest distance."""
+def earth(config: Config, date: str) -> Scenario:
+    """Return frozen tasks in random regions of the Earth at a date, large enough for the longest distance."""
     far = config.distance_km[1] > 500
     size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"half_size_deg": 10, "max_latitude": 70}
     seed = 3 * paper.FIRST_RESERVED_SEED + config.seed  # beyond those of trainings and of frozen sets
-    scenario = earth_scenario(config.regions, seed=seed, distance_range_km=config.distance_km, **size)
+    scenario = earth_scenario(config.regions, seed, date, distance_range_km=config.distance_km, **size)
     return scenario.with_tasks(scenario.random_tasks(config.tasks, seed))
 
 
-def measure(text: str, base: GeomagneticNavEnv, noise: Noise) -> tuple[float, float, float]:
+def measure(text: str, base: GeomagneticNavEnv, noise: Noise, map_date: str | None = None) -> Result:
     """Return SR [%], SPL [%] and steps of a navigator at a level of noise."""
     env = with_sensor_noise(base, noise, base.seed)
-    summary = summarize(episode_measures(evaluation_rollout(env, make_navigator(text, base, noise=noise))))
+    navigator = make_navigator(text, base, noise=noise, map_date=map_date)
+    summary = summarize(episode_measures(evaluation_rollout(env, navigator)))
     return summary["success_rate"], summary["spl"], summary["steps"]
 
 
@@ -86,24 +94,49 @@ def table(config: Config) -> str:
     """
     if not config.navigators:
         raise UsageError("name at least one navigator, for example: anywhere")
+    if not config.date:
+        raise UsageError("--date must name at least one date, for example: 2025-01-01")
     try:
         check_distinct(config.navigators)
-        options = {"max_steps": config.max_steps, "zeta": config.zeta, "start_heading": "random", "seed": config.seed}
-        base = GeomagneticNavEnv(earth(config), num_envs=config.tasks, **options)
-        results: dict[str, list[list[tuple[float, float, float]]]] = {}
-        for text in tqdm(config.navigators, unit="navigator"):
-            results.setdefault(text.partition("=")[0], []).append([measure(text, base, noise) for noise in LEVELS])
+        check_map_date(config.navigators, config.map_date)
+        with tqdm(total=len(config.date) * len(config.navigators), unit="navigator") as bar:
+            measured = {date: measure_all(config, date, bar) for date in config.date}
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
+    several, own_map = len(config.date) > 1, config.map_date
     heads = [", ".join(f"{level:g}" for level in noise) for noise in LEVELS]
     rows = [
-        [label(name), needs(name), len(runs), *(cell([run[k] for run in runs]) for k in range(len(LEVELS)))]
+        [*[date] * several, row_label(name, own_map), needs(name), len(runs), *map(cell, zip(*runs, strict=True))]
+        for date, results in measured.items()
         for name, runs in results.items()
     ]
-    return markdown_table(["navigator", "needs", "runs", *heads], rows)
+    return markdown_table([*["date"] * several, "navigator", "needs", "runs", *heads], rows)
 
 
-def cell(runs: Sequence[tuple[float, float, float]]) -> str:
+def row_label(name: str, map_date: str | None) -> str:
+    """Return the label of a navigator, for map matching with the date of an own map."""
+    return f"{label(name)}, map of {map_date}" if map_date and name == "map_matching" else label(name)
+
+
+def measure_all(config: Config, date: str, bar: tqdm) -> dict[str, list[list[Result]]]:
+    """Return the results of each navigator at a date: of each of its runs, at each level of noise."""
+    base = GeomagneticNavEnv(
+        earth(config, date),
+        num_envs=config.tasks,
+        max_steps=config.max_steps,
+        zeta=config.zeta,
+        start_heading="random",
+        seed=config.seed,
+    )
+    results: dict[str, list[list[Result]]] = {}
+    for text in config.navigators:
+        measured = [measure(text, base, noise, config.map_date) for noise in LEVELS]
+        results.setdefault(text.partition("=")[0], []).append(measured)
+        bar.update()
+    return results
+
+
+def cell(runs: Sequence[Result]) -> str:
     """Return the mean SR, SPL and steps of runs, and the lowest SPL of several."""
     rate, spl, steps = (fmean(values) for values in zip(*runs, strict=True))
     lowest = f" [{min(run[1] for run in runs):.1f}]" if len(runs) > 1 else ""

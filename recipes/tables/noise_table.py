@@ -26,6 +26,9 @@ RECIPE = "noise_table.py"
 Noise = tuple[float, ...]
 """Standard deviations of D [deg], I [deg], B_H [nT]."""
 
+SAME = ("tasks", "tasks_seed", "scenario", "zeta", "start_heading", "mode", "map_date")
+"""Settings that all evaluations must have in common."""
+
 
 @dataclass(frozen=True)
 class Config:
@@ -69,7 +72,7 @@ def by_level(folders: Sequence[Path]) -> tuple[str, dict[Noise, Summaries]]:
         noise = tuple(float(value) for value in settings["noise"] or (0, 0, 0))
         if noise in levels:
             raise UsageError(f"{folder} has the noise {list(noise)}, as a folder before it: one folder for each level")
-        same = {key: settings.get(key) for key in ("tasks", "tasks_seed", "scenario", "zeta", "start_heading", "mode")}
+        same = {key: settings.get(key) for key in SAME}
         if differing := [key for key, value in same.items() if common.setdefault(key, value) != value]:
             key = differing[0]
             raise UsageError(f"{folder} has {key} {same[key]!r}, the folders before it {common[key]!r}")

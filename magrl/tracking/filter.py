@@ -35,14 +35,7 @@ CURVATURE = (0.015, 0.018, 8.0)
 VARIANCE_FLOOR = 1e-4
 """Smallest variance of a reading, in squared scaled units: a standard deviation of 0.003°, 0.015°, 1 nT."""
 
-DIPOLE_STD = ((0.39, 0.54), (0.27, 0.24), (190.0, 135.0))
-"""Deviation of the gradients of D, I [deg], B_H [nT] from a dipole, along and across magnetic north: rms per 100 km."""
-
-EARTH_RADIUS_KM = 6371.2  # reference radius of the geomagnetic field
-
 PerElement = Tensor | Sequence[float]  # a value of each element: (..., E), or E numbers
-
-_LEAST_VARIANCE = 1e-8  # of a remaining difference: keeps the squares of the weights inside float32
 
 
 class FieldTrack(NamedTuple):
@@ -72,45 +65,18 @@ class GradientPrior(NamedTuple):
     azimuth: Tensor
 
 
-class Way(NamedTuple):
-    """Displacement ``(..., 2)`` northward and eastward [km] and its covariance ``(..., 2, 2)`` [km^2].
+class GradientRelation(NamedTuple):
+    """Linear relation of the gradients at a place: the sum of ``weights (..., E, 2)`` times the gradients northward and
+    eastward [element unit / km] is ``value (...)``, with a standard deviation ``std (...)``.
 
     Example:
-        >>> Way(torch.zeros(2), torch.eye(2)).displacement
-        tensor([0., 0.])
+        >>> GradientRelation(torch.tensor([[1.0, 0.0], [0.0, -1.0]]), torch.tensor(0.0), torch.tensor(0.1)).value
+        tensor(0.)
     """
 
-    displacement: Tensor
-    covariance: Tensor
-
-
-def dipole_prior(reading: Tensor) -> GradientPrior:
-    """Return the gradient of a dipole field through a reading of D, I, B_H, and how far fields deviate from it.
-
-    With the magnetic latitude phi of tan(phi) = tan(I) / 2, towards magnetic north (azimuth D) dI/ds =
-    2 / ((1 + 3 sin^2 phi) R) and dB_H/ds = -B_H tan(phi) / R; D is constant.
-
-    Args:
-        reading: ``(..., 3)``: D [deg], I [deg], B_H [nT].
-
-    Returns:
-        Gradient ``(..., 3, 2)`` and standard deviations ``(3, 2)`` along and across magnetic north, in deg/km, deg/km,
-        nT/km, and the azimuth of magnetic north ``(...)`` [rad].
-
-    Example:
-        >>> prior = dipole_prior(torch.tensor([0.0, 0.0, 30000.0]))  # at the magnetic equator
-        >>> prior.gradient[1]  # I increases northward by 1.8 degrees per 100 km
-        tensor([0.0180, 0.0000])
-    """
-    check_tensor(3, reading=reading)
-    azimuth, inclination = torch.deg2rad(reading[..., :2]).unbind(-1)
-    latitude = torch.atan2(torch.sin(inclination), 2 * torch.cos(inclination))
-    dip_slope = torch.rad2deg(2 / (1 + 3 * torch.sin(latitude).square())) / EARTH_RADIUS_KM
-    strength_slope = -reading[..., 2] * torch.tan(latitude) / EARTH_RADIUS_KM
-    slopes = torch.stack((torch.zeros_like(dip_slope), dip_slope, strength_slope), -1)
-    northward = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
-    std = torch.tensor(DIPOLE_STD, dtype=slopes.dtype, device=slopes.device) / 100
-    return GradientPrior(slopes.unsqueeze(-1) * northward.unsqueeze(-2), std, azimuth)
+    weights: Tensor
+    value: Tensor
+    std: Tensor
 
 
 def start(
@@ -136,6 +102,7 @@ def start(
 
     Example:
         >>> reading, noise = torch.tensor([8.0, -16.0, 35000.0]), (0.05, 0.05, 5.0)
+        >>> from magrl.tracking import dipole_prior
         >>> prior = dipole_prior(reading)
         >>> track = start(reading, prior.gradient, prior.std, noise, prior.azimuth)
         >>> track.mean.shape, track.covariance.shape
@@ -144,7 +111,7 @@ def start(
     check_tensor(reading=reading)
     count = reading.shape[-1] if reading.ndim else 0
     check_tensor(count, 2, prior_gradient=prior_gradient, prior_std=prior_std)
-    unit = _positive("scales", scales, count, reading)
+    unit = positive("scales", scales, count, reading)
     azimuth = torch.zeros_like(reading[..., 0]) if azimuth is None else azimuth
     check_tensor(azimuth=azimuth)
     per_unit = (DISTANCE_SCALE_KM / unit).unsqueeze(-1)
@@ -179,13 +146,13 @@ def predict(
         >>> predict(track, torch.tensor([50.0, 0.0]), curvature=(1.0,), scales=(1.0,)).mean
         tensor([[0.5000, 1.0000, 0.0000]])
     """
-    count = _check_track(track)
+    count = check_track(track)
     check_tensor(2, displacement=displacement)
-    drift = _positive("curvature", curvature, count, track.mean) / _positive("scales", scales, count, track.mean)
-    shape = _common(track.mean.shape[:-1], (*displacement.shape[:-1], count), drift.shape)
-    (value, north, east), (p00, p01, p02, p11, p12, p22) = _parts(track, shape)
+    drift = positive("curvature", curvature, count, track.mean) / positive("scales", scales, count, track.mean)
+    shape = common(track.mean.shape[:-1], (*displacement.shape[:-1], count), drift.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = parts(track, shape)
     dn, de = (displacement.to(value.dtype) / DISTANCE_SCALE_KM).unbind(-1)  # the same for all elements
-    growth = _first(drift, shape).square() * (length2 := dn * dn + de * de)
+    growth = first(drift, shape).square() * (length2 := dn * dn + de * de)
     moved1, moved2 = p01 + p11 * dn + p12 * de, p02 + p12 * dn + p22 * de
     top = p00 + (p01 + moved1) * dn + (p02 + moved2) * de + growth * (length2 / 4)
     cross = moved1 + growth * (dn / 2), moved2 + growth * (de / 2)
@@ -214,19 +181,55 @@ def update(
         >>> update(track, torch.tensor([2.0]), noise_std=(1.0,), scales=(1.0,)).mean[0, 0]
         tensor(1.)
     """
-    count = _check_track(track)
+    count = check_track(track)
     check_tensor(count, reading=reading)
-    unit = _positive("scales", scales, count, track.mean)
+    unit = positive("scales", scales, count, track.mean)
     reading, noise = reading.to(track.mean.dtype) / unit, _variance(noise_std, count, unit)
-    shape = _common(track.mean.shape[:-1], reading.shape, noise.shape)
-    (value, north, east), (p00, p01, p02, p11, p12, p22) = _parts(track, shape)
-    noise, surprise = _first(noise, shape), _first(reading, shape) - value
+    shape = common(track.mean.shape[:-1], reading.shape, noise.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = parts(track, shape)
+    noise, surprise = first(noise, shape), first(reading, shape) - value
     total = p00 + noise
     kept, k0, k1, k2 = noise / total, p00 / total, p01 / total, p02 / total  # 1 - k0; the gain
     spread, rest1, rest2 = k0 * noise, p01 - total * k1, p02 - total * k2  # the rests are 0 but for rounding
     top = kept * kept * p00 + k0 * spread, kept * (p01 - k1 * p00) + k1 * spread, kept * (p02 - k2 * p00) + k2 * spread
     block = p11 - k1 * (p01 + rest1), p12 - k1 * p02 - k2 * rest1, p22 - k2 * (p02 + rest2)
     return _track((value + k0 * surprise, north + k1 * surprise, east + k2 * surprise), (*top, *block))
+
+
+def relate(
+    track: FieldTrack, relation: GradientRelation, scales: PerElement = ELEMENT_SCALES
+) -> tuple[FieldTrack, Tensor]:
+    """Return the state given a relation of its gradients, and what the elements then share.
+
+    The relation couples the elements: their joint covariance becomes that of the blocks ``covariance`` minus
+    ``u u^T``, with ``u`` the second result. Go on with the state from before: the relation holds at every place anew.
+
+    Args:
+        track: state.
+        relation: of the gradients at the present place.
+        scales: those of :func:`start`.
+
+    Returns:
+        The state with its mean updated and its covariance as before, and ``(..., E, 3)``.
+
+    Raises:
+        ValueError: for shapes that do not match.
+
+    Example:
+        >>> track = FieldTrack(torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]), torch.eye(3).expand(2, 3, 3))
+        >>> same = GradientRelation(torch.tensor([[1.0, 0.0], [-1.0, 0.0]]), torch.tensor(0.0), torch.tensor(0.0))
+        >>> relate(track, same, scales=(1.0, 1.0))[0].mean[:, 1]  # two gradients that must be the same
+        tensor([0.5000, 0.5000])
+    """
+    count = check_track(track)
+    check_tensor(count, 2, weights=relation.weights)
+    unit = positive("scales", scales, count, track.mean)
+    rows = relation.weights.to(track.mean.dtype) * (unit / DISTANCE_SCALE_KM).unsqueeze(-1)
+    gain = (track.covariance[..., 1:] * rows.unsqueeze(-2)).sum(-1)
+    total = (rows * gain[..., 1:]).sum((-2, -1)) + relation.std.to(rows).square()
+    surprise = relation.value.to(rows) - (rows * track.mean[..., 1:]).sum((-2, -1))
+    mean = track.mean + gain * (surprise / total)[..., None, None]
+    return FieldTrack(mean, track.covariance), gain * total.rsqrt()[..., None, None]
 
 
 def estimated_gradient(track: FieldTrack, scales: PerElement = ELEMENT_SCALES) -> Tensor:
@@ -237,66 +240,11 @@ def estimated_gradient(track: FieldTrack, scales: PerElement = ELEMENT_SCALES) -
         >>> estimated_gradient(track, scales=(100.0,))
         tensor([[1., 2.]])
     """
-    count = _check_track(track)
-    return track.mean[..., 1:] * (_positive("scales", scales, count, track.mean) / DISTANCE_SCALE_KM).unsqueeze(-1)
+    count = check_track(track)
+    return track.mean[..., 1:] * (positive("scales", scales, count, track.mean) / DISTANCE_SCALE_KM).unsqueeze(-1)
 
 
-def way_to(track: FieldTrack, target: Tensor, range_km: float, scales: PerElement = ELEMENT_SCALES) -> Way:
-    """Return the displacement to the place where the field has given values, and its uncertainty.
-
-    It minimizes the sum over the elements of ``(r - g·d)^2 / var(d)``, plus ``|d|^2 / range^2``, with the remaining
-    difference r and the filter's variance of r - g·d. It takes three solves, each with the variances at the solution
-    before it; the first has their mean over ways of the range. The covariance is the inverse of the normal matrix.
-
-    Args:
-        track: state.
-        target: ``(..., E)`` values at the destination, in the element's unit.
-        range_km: prior standard deviation of the way along each axis [km].
-        scales: those of :func:`start`.
-
-    Raises:
-        ValueError: for shapes that do not match, or a range that is not above 0.
-
-    Example:
-        >>> gradient = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 2.0]])  # the first element grows northward
-        >>> track = FieldTrack(gradient, 1e-6 * torch.eye(3).expand(2, 3, 3))
-        >>> way_to(track, torch.tensor([3.0, 4.0]), 1000.0, scales=(1.0, 1.0)).displacement.round()
-        tensor([300., 200.])
-    """
-    count = _check_track(track)
-    check_tensor(count, target=target)
-    check_number(0, above=True, range_km=range_km)
-    target = target.to(track.mean.dtype) / _positive("scales", scales, count, track.mean)
-    shape = _common(track.mean.shape[:-1], target.shape)
-    (value, north, east), (p00, p01, p02, p11, p12, p22) = _parts(track, shape)
-    ridge = (DISTANCE_SCALE_KM / range_km) ** 2
-    singles, pairs, (i, j) = _solution_terms(_first(target, shape) - value, north, east, ridge)
-    expected, twice1, twice2, twice12 = p00 + (p11 + p22) / ridge, 2 * p01, 2 * p02, 2 * p12
-    for _ in range(3):
-        weight = expected.clamp_min(_LEAST_VARIANCE).reciprocal()
-        determinant, dn, de = (weight * singles).sum(1) + (weight[i] * weight[j] * pairs).sum(1)
-        determinant = determinant + ridge**2
-        dn, de = dn / determinant, de / determinant
-        expected = p00 + dn * (twice1 + p11 * dn + twice12 * de) + de * (twice2 + p22 * de)
-    nn, ne, ee = (weight * torch.stack((north * north, north * east, east * east))).sum(1)
-    inverse = torch.stack((ee + ridge, -ne, -ne, nn + ridge), -1) * (DISTANCE_SCALE_KM**2 / determinant).unsqueeze(-1)
-    return Way(torch.stack((dn, de), -1) * DISTANCE_SCALE_KM, inverse.unflatten(-1, (2, 2)))
-
-
-def _solution_terms(remaining: Tensor, north: Tensor, east: Tensor, ridge: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the terms, without weights, of the determinant of the normal matrix and of the solution times it.
-
-    They are of elements ``(3, E, ...)`` and of pairs ``(3, P, ...)`` of elements ``(2, P)`` (Cauchy-Binet): unlike
-    a c - b^2 such sums do not cancel in float32 where gradients are nearly parallel.
-    """
-    i, j = index = torch.triu_indices(len(north), len(north), 1, device=north.device)
-    (ri, rj), (ni, nj), (ei, ej) = ((x[i], x[j]) for x in (remaining, north, east))
-    crossing = ni * ej - ei * nj
-    singles = torch.stack((north * north + east * east, remaining * north, remaining * east))
-    return ridge * singles, crossing * torch.stack((crossing, ri * ej - rj * ei, rj * ni - ri * nj)), index
-
-
-def _parts(track: FieldTrack, shape: torch.Size) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+def parts(track: FieldTrack, shape: torch.Size) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
     """Return e, g_N, g_E and the six entries of their covariance by rows, ``(E, ...)`` of a shape ``(..., E)``.
 
     By parts, as 3 x 3 matrix products are slower, and may round to TF32 or, under autocast, to bfloat16.
@@ -307,23 +255,23 @@ def _parts(track: FieldTrack, shape: torch.Size) -> tuple[Sequence[Tensor], Sequ
 
 
 def _track(mean: Sequence[Tensor], covariance: Sequence[Tensor]) -> FieldTrack:
-    """Return the state of the parts of :func:`_parts`."""
+    """Return the state of the parts of :func:`parts`."""
     p00, p01, p02, p11, p12, p22 = covariance
     matrix = torch.stack((p00, p01, p02, p01, p11, p12, p02, p12, p22)).unflatten(0, (3, 3))
     return FieldTrack(torch.stack(tuple(mean)).movedim((0, 1), (-1, -2)), matrix.movedim((0, 1, 2), (-2, -1, -3)))
 
 
-def _first(values: Tensor, shape: torch.Size) -> Tensor:
+def first(values: Tensor, shape: torch.Size) -> Tensor:
     """Return a value of each element ``(..., E)`` as ``(E, ...)``, expanded to a shape ``(..., E)``."""
     return values.expand(shape).movedim(-1, 0).contiguous()
 
 
-def _common(shape: torch.Size, *others: tuple[int, ...]) -> torch.Size:
+def common(shape: torch.Size, *others: tuple[int, ...]) -> torch.Size:
     """Return the shape ``(..., E)`` of all; torch.broadcast_shapes takes longer than ten sums of 1024 vehicles."""
     return shape if all(x in (shape, shape[-1:]) for x in others) else torch.broadcast_shapes(shape, *others)
 
 
-def _check_track(track: FieldTrack) -> int:
+def check_track(track: FieldTrack) -> int:
     """Return the number of elements of a state; raise for anything else than a state."""
     check_type(FieldTrack, track=track)
     check_tensor(3, mean=track.mean)
@@ -336,10 +284,10 @@ def _check_track(track: FieldTrack) -> int:
 
 def _variance(noise_std: PerElement, count: int, unit: Tensor) -> Tensor:
     """Return the variance of a reading ``(..., E)`` in squared scaled units, not below the floor."""
-    return (_positive("noise_std", noise_std, count, unit) / unit).square().clamp_min(VARIANCE_FLOOR)
+    return (positive("noise_std", noise_std, count, unit) / unit).square().clamp_min(VARIANCE_FLOOR)
 
 
-def _positive(name: str, values: PerElement, count: int, like: Tensor) -> Tensor:
+def positive(name: str, values: PerElement, count: int, like: Tensor) -> Tensor:
     """Return a value of each element, ``(..., E)``, of another tensor's dtype."""
     if isinstance(values, Tensor):
         check_tensor(count, **{name: values})

@@ -1,0 +1,304 @@
+"""Map matching: a navigator with a map of the field, on which it finds itself and the destination."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.nn.functional import max_pool2d
+
+from magrl import geodesy
+from magrl.checks import check_number, check_numbers, check_type
+from magrl.envs import Region, Regions, Scenario
+from magrl.field import Date, FieldBank, FieldModel, RegionalField, elements_at, igrf_coefficients, parse_date
+from magrl.field.elements import elements_gradient, measured_elements
+from magrl.navigators.base import Navigator, displacement_to, steer
+from magrl.navigators.secant import SLOPES
+
+FLOOR = (1e-3, 1e-3, 0.1)
+"""Standard deviation of D, I [deg], B_H [nT] that every reading has at least: its rounding, and that of the map."""
+SECULAR_VARIATION = (0.1, 0.1, 39.0)
+"""Root mean square change per year of D, I [deg], B_H [nT] in regions of the Earth, 2015 to 2025 (IGRF-14)."""
+GRID_POINTS = 41
+"""Points of the grid along each side of the region, on which the inversion of the map starts."""
+NEWTON_STEPS = 25
+LONGEST_STEP_KM = 200.0
+PRIOR_KM = 1000.0
+"""Prior standard deviation of a position along each axis [km]."""
+FORGET_KM = 30.0
+"""Distance along which the error of a map changes the position as much as it moves it in all [km]; from a scan."""
+_DEGREE_KM = 111.2
+
+
+class MapMatching(Navigator):
+    """Map matching: an extended Kalman filter of the vehicle's position, by readings that are compared with a map.
+
+    The first reading is inverted on the map: from the lowest points of its error on a grid of the region, Gauss-Newton
+    steps lead to a few hypotheses of the position. Each is then tracked by its own filter: moves are dead-reckoned, and
+    each reading corrects the position and adds its normalized squared residual to the misfit of the hypothesis. The
+    destination is found on the same map by its elements. Each move follows the geodesic to it from the hypothesis of
+    the least misfit.
+
+    An error of the map, for example its age, moves both positions nearly alike, so that much of it cancels. With
+    ``map_error``, the filter also forgets: the older a reading, the less it tells of the error at the present place.
+
+    It is told the region, and over many regions in which of them it is (``region``).
+
+    Args:
+        field: the map, a field model or a bank of them; ``env.field`` is a perfect one.
+        region: where vehicle and destination may be, usually ``env.edge``; the map must hold all of it.
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+        noise: standard deviations of the sensors, their data sheet: D [deg], I [deg], B_H [nT].
+        map_error: standard deviations of the map.
+        hypotheses: number of positions that are tracked.
+
+    Raises:
+        TypeError: for a region of another type.
+        ValueError: for an option out of its range, a bank with another number of expansions than regions, or a map that
+            is not defined on all of the region.
+
+    Source:
+        L. D. Hostetler and R. D. Andreas, Nonlinear Kalman filtering techniques for terrain-aided navigation, IEEE
+        Trans. Automatic Control 28 (1983): parallel filters over a map, and the least residual chooses among them.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> env.rollout(50, MapMatching(env.field, env.edge))["next", "success"].any(1).flatten()
+        tensor([True, True])
+    """
+
+    needs = "a map and the region"
+
+    grid: Tensor
+    grid_elements: Tensor
+    box: Tensor
+
+    def __init__(
+        self,
+        field: FieldModel | FieldBank,
+        region: Region | Regions,
+        max_move_km: float = 50.0,
+        max_turn_rad: float = math.pi / 2,
+        noise: Sequence[float] = (0.0, 0.0, 0.0),
+        map_error: Sequence[float] = (0.0, 0.0, 0.0),
+        hypotheses: int = 4,
+    ) -> None:
+        super().__init__(max_move_km, max_turn_rad)
+        if not hasattr(field, "value_and_gradient"):
+            raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
+        check_type((Region, Regions), region=region)
+        check_numbers(3, noise=noise, map_error=map_error)
+        check_number(0, noise=min(noise), map_error=min(map_error))
+        check_number(1, GRID_POINTS**2, whole=True, hypotheses=hypotheses)
+        self.many, self.hypotheses = isinstance(region, Regions), int(hypotheses)
+        self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if self.many else [])]
+        self.map = field
+        self._place(region if isinstance(region, Regions) else Regions.of([region]).to(_device(field)))
+        squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, noise))
+        floor, error, sensors = (x.to(self.grid.device) for x in squares)
+        self.register_buffer("target_std", (floor + error).sqrt())
+        self.register_buffer("std", (floor + error + sensors).sqrt())
+        # Two elements give a position, so that the second smallest of the three counts.
+        self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
+
+    def _place(self, region: Regions) -> None:
+        """Keep the region, and the elements on a grid of it."""
+        expansions = len(self.map) if isinstance(self.map, FieldBank) else 1
+        if isinstance(self.map, FieldBank) != self.many or expansions != len(region):
+            raise ValueError(
+                f"field holds {expansions} maps and region {len(region)} boxes: give many regions a FieldBank with one "
+                "expansion for each, and a single Region a field model"
+            )
+        grid = region.grid(GRID_POINTS)
+        index = torch.arange(len(region), device=grid.device).reshape(-1, 1, 1)
+        elements = elements_at(self.map, grid, index if self.many else None)
+        missing = ~elements.isfinite().flatten(1).all(1)
+        if missing.any():
+            box = region[int(missing.nonzero()[0])]
+            raise ValueError(f"the map is not defined on all of {box}: take a map of a larger box, or a smaller region")
+        self.register_buffer("grid", grid.flatten(1, 2))
+        self.register_buffer("grid_elements", elements)
+        self.register_buffer("box", torch.stack((region.latitude, region.longitude), -1))
+
+    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
+        positions = self.grid.new_zeros(len(seen["heading"]), self.hypotheses, 2)
+        covariance, misfit = torch.diag_embed(positions), positions[..., 0].clone()
+        known = torch.zeros(len(positions), dtype=torch.bool, device=positions.device)
+        hypotheses = {"position": positions, "covariance": covariance, "misfit": misfit}
+        return {**hypotheses, "target": positions[:, 0].clone(), "known": known}
+
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+        known = memory["known"].clone()
+        for rows, read in ((~known, self._begin), (known, self._track)):
+            if rows.any():
+                memory[rows] = read(seen[rows], memory[rows])
+        here, there = best(memory["position"], memory["misfit"]), memory["target"]
+        distance, bearing = geodesy.geodesic(*here.unbind(-1), *there.unbind(-1))
+        return steer(seen["heading"].squeeze(-1).double(), bearing, distance, self.max_move_km, self.max_turn_rad)
+
+    def _begin(self, seen: TensorDictBase, memory: TensorDictBase) -> TensorDictBase:
+        """Find the vehicle by its first reading, and the destination by its elements."""
+        region = self._region(seen)
+        target, _, misfit = self._located(seen["target_field"].double(), self.target_std, region)
+        memory["target"] = best(target, misfit)
+        found = self._located(seen["field"].double(), self.std, region)
+        memory["known"] = torch.ones_like(memory["known"])
+        return memory.update(dict(zip(("position", "covariance", "misfit"), found, strict=True)))
+
+    def _track(self, seen: TensorDictBase, memory: TensorDictBase) -> TensorDictBase:
+        """Dead-reckon the last move of each hypothesis, and correct it by the reading at its end."""
+        region, length = self._region(seen), seen["move"][:, :1].double()
+        position = self._moved(memory["position"], seen["heading"].double(), length, region)
+        growth = self.map_error_km**2 * length / FORGET_KM
+        covariance = memory["covariance"] + torch.diag_embed(growth.unsqueeze(-1).expand_as(position))
+        position, covariance, more = self._corrected(position, covariance, seen["field"].double(), self.std, region)
+        found = {"position": position, "covariance": covariance, "misfit": memory["misfit"] + more}
+        return memory.update(found)
+
+    def _located(self, elements: Tensor, std: Tensor, region: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Invert the map: positions ``(P, H, 2)`` for elements ``(P, 3)``, their covariances and misfits."""
+        position = self._lowest(elements, std, region)
+        for _ in range(NEWTON_STEPS):
+            residual, jacobian = self._residual(position, elements, std, region)
+            north, east = displacement_to(residual, jacobian).unbind(-1)
+            length = torch.hypot(north, east).clamp_max(LONGEST_STEP_KM)
+            position = self._moved(position, torch.atan2(east, north), length, region)
+        prior = torch.diag_embed(torch.full_like(position, PRIOR_KM**2))
+        return self._corrected(position, prior, elements, std, region)
+
+    def _lowest(self, elements: Tensor, std: Tensor, region: Tensor) -> Tensor:
+        """Return the points of the grid ``(P, H, 2)`` where the error is lower than at their neighbors, lowest first.
+
+        The error is divided by its standard deviation, and by the change of the elements from point to point.
+        """
+        side = (self.box[region, 1, 0] - self.box[region, 0, 0]) * _DEGREE_KM / (GRID_POINTS - 1)
+        spread = torch.hypot(std, side.unsqueeze(-1) * std.new_tensor(SLOPES))[:, None, None]
+        away = difference(elements[:, None, None], self.grid_elements[region]) / spread
+        height = away.square().sum(-1)
+        lower = -max_pool2d(-height.unsqueeze(1), 3, 1, 1).squeeze(1)
+        height = torch.where(height > lower, torch.inf, height).flatten(1)
+        rows = height.topk(self.hypotheses, largest=False).indices
+        return self.grid[region].gather(1, rows.unsqueeze(-1).expand(-1, -1, 2))
+
+    def _corrected(
+        self, position: Tensor, covariance: Tensor, elements: Tensor, std: Tensor, region: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return positions, covariances and misfits after a reading ``(P, 3)`` of each vehicle."""
+        residual, jacobian = self._residual(position, elements, std, region)
+        displacement, covariance, misfit = update(covariance, jacobian, residual)
+        north, east = displacement.unbind(-1)
+        heading, length = torch.atan2(east, north), torch.hypot(north, east)
+        return self._moved(position, heading, length, region), covariance, misfit
+
+    def _residual(self, position: Tensor, elements: Tensor, std: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:
+        """Return elements minus those of the map ``(P, H, 3)`` and its gradient ``(P, H, 3, 2)``, both over ``std``."""
+        index = (region.unsqueeze(-1).expand(position.shape[:-1]),) if self.many else ()
+        value, gradient = self.map.value_and_gradient(*position.unbind(-1), *index)
+        residual = difference(elements.unsqueeze(1), measured_elements(value))
+        return residual / std, elements_gradient(value, gradient) / std.unsqueeze(-1)
+
+    def _moved(self, position: Tensor, heading: Tensor, distance_km: Tensor, region: Tensor) -> Tensor:
+        """Return positions ``(P, H, 2)`` after moves, held within the region, where the map is defined."""
+        latitude, longitude = geodesy.move(position[..., 0], position[..., 1], heading, distance_km)
+        low, high = self.box[region].unsqueeze(1).unbind(-2)
+        middle = (low[..., 1] + high[..., 1]) / 2
+        longitude = middle + geodesy.wrap_longitude(longitude - middle)
+        return torch.stack((latitude, longitude), -1).clamp(low, high)
+
+    def _region(self, seen: TensorDictBase) -> Tensor:
+        """Return the number of the region of each vehicle ``(P,)``."""
+        return seen["region"].squeeze(-1) if self.many else torch.zeros_like(seen["step_count"].squeeze(-1))
+
+
+def _device(field: FieldModel | FieldBank) -> torch.device:
+    buffers = field.buffers() if isinstance(field, nn.Module) else ()
+    return next((values.device for values in buffers), torch.device("cpu"))
+
+
+def update(covariance: Tensor, jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Correct positions by readings: the update of an extended Kalman filter, in Joseph's form.
+
+    Args:
+        covariance: ``(..., 2, 2)`` of a position [km^2].
+        jacobian: ``(..., E, 2)`` gradients of the elements, over their standard deviations [1/km].
+        residual: ``(..., E)`` readings minus the elements at the position, over their standard deviations.
+
+    Returns:
+        Displacement ``(..., 2)`` [km], covariance ``(..., 2, 2)`` after the reading, and misfit ``(...)``, the square
+        of the residual over its covariance.
+
+    Example:
+        >>> way, covariance, misfit = update(torch.eye(2), torch.eye(2), torch.tensor([2.0, 0.0]))
+        >>> way, covariance.diagonal(), misfit
+        (tensor([1., 0.]), tensor([0.5000, 0.5000]), tensor(2.))
+    """
+    gradient, sides = jacobian @ covariance, residual.unsqueeze(-1)
+    innovation = gradient @ jacobian.mT + torch.eye(residual.shape[-1], dtype=residual.dtype, device=residual.device)
+    solved, _ = torch.linalg.solve_ex(innovation, torch.cat((gradient, sides), -1))
+    gain = solved[..., :2].mT
+    kept = torch.eye(2, dtype=gain.dtype, device=gain.device) - gain @ jacobian
+    misfit = (residual * solved[..., 2]).sum(-1)
+    return (gain @ sides).squeeze(-1), kept @ covariance @ kept.mT + gain @ gain.mT, misfit
+
+
+def difference(elements: Tensor, others: Tensor) -> Tensor:
+    """Return D, I, B_H ``(..., 3)`` minus others, that of D the shorter way around.
+
+    Example:
+        >>> difference(torch.tensor([179.0, 10.0, 30000.0]), torch.tensor([-179.0, 9.0, 29000.0]))
+        tensor([  -2.,    1., 1000.])
+    """
+    declination, rest = (elements - others).split((1, 2), -1)
+    return torch.cat((geodesy.wrap_longitude(declination), rest), -1)
+
+
+def best(position: Tensor, misfit: Tensor) -> Tensor:
+    """Return the hypothesis of the least misfit: ``(P, 2)`` of ``(P, H, 2)``.
+
+    Example:
+        >>> best(torch.tensor([[[0.0, 1.0], [2.0, 3.0]]]), torch.tensor([[5.0, 1.0]]))
+        tensor([[2., 3.]])
+    """
+    return position[torch.arange(len(position), device=position.device), misfit.argmin(-1)]
+
+
+def dated_map(scenario: Scenario, date: Date, max_move_km: float = 50.0) -> RegionalField | FieldBank:
+    """Return IGRF at another date, over every place that a vehicle can reach in a scenario.
+
+    Args:
+        scenario: region or regions, generation of IGRF, and altitude.
+        date: date of the map.
+        max_move_km: longest move [km].
+
+    Raises:
+        ValueError: for a date outside the field model, or a region where the field of that date has no smooth elements.
+
+    Example:
+        >>> dated_map(Scenario(), "2015-01-01").latitude
+        (-15.5, 5.5)
+    """
+    if isinstance(scenario.region, Region):
+        dated = scenario.replace(date=date, field=None, tasks=None, names=()).build_field(max_move_km)
+        assert isinstance(dated, RegionalField)
+        return dated
+    box, gauss = scenario.reachable(max_move_km), igrf_coefficients(date, scenario.generation).unsqueeze(0)
+    assert isinstance(box, Regions)
+    planet = torch.zeros(len(box), dtype=torch.int64)
+    return FieldBank.build(gauss, planet, box.latitude, box.longitude, degree=scenario.field.degree, tolerance_nt=0.1)
+
+
+def aged_error(scenario: Scenario, date: Date) -> tuple[float, float, float]:
+    """Return the standard deviations of D, I [deg], B_H [nT] that a map of another date has in a scenario.
+
+    Example:
+        >>> [round(std, 2) for std in aged_error(Scenario(date="2025-01-01", generation=14), "2015-01-01")]
+        [1.0, 1.0, 390.11]
+    """
+    years = abs((parse_date(scenario.date) - parse_date(date)).days) / 365.25
+    d, i, b_h = SECULAR_VARIATION
+    return years * d, years * i, years * b_h

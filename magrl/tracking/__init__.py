@@ -1,0 +1,48 @@
+"""Estimation of a field and its gradient along a dead-reckoned track."""
+
+from magrl.tracking.filter import (
+    CURVATURE,
+    DISTANCE_SCALE_KM,
+    ELEMENT_SCALES,
+    VARIANCE_FLOOR,
+    FieldTrack,
+    GradientPrior,
+    GradientRelation,
+    estimated_gradient,
+    predict,
+    relate,
+    start,
+    update,
+)
+from magrl.tracking.priors import (
+    CURVATURE_NT,
+    DIPOLE_STD_NT,
+    EARTH_RADIUS_KM,
+    curl_relation,
+    dipole_prior,
+    field_curvature,
+)
+from magrl.tracking.way import Way, way_to
+
+__all__ = [
+    "CURVATURE",
+    "CURVATURE_NT",
+    "DIPOLE_STD_NT",
+    "DISTANCE_SCALE_KM",
+    "EARTH_RADIUS_KM",
+    "ELEMENT_SCALES",
+    "VARIANCE_FLOOR",
+    "FieldTrack",
+    "GradientPrior",
+    "GradientRelation",
+    "Way",
+    "curl_relation",
+    "dipole_prior",
+    "estimated_gradient",
+    "field_curvature",
+    "predict",
+    "relate",
+    "start",
+    "update",
+    "way_to",
+]
