@@ -106,7 +106,7 @@ class _Batch:
             self._state = None if state["next", "done"].all() else self.env.step_mdp(state)
         after = state["next"]
         done = after["done"].squeeze(-1)
-        self._length_km = self._length_km + after["move"][:, 0].double()
+        self._length_km = self._length_km + after.get("true_move", after["move"])[:, 0].double()
         measures = _measures(after[done], self._length_km[done]) if done.any() else {}
         self._length_km = self._length_km.masked_fill(done, 0.0)
         return after, measures

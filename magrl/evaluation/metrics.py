@@ -85,7 +85,7 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
     success = rollout["next", "success"].squeeze(-1).gather(1, last).squeeze(-1)
     start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
     end = rollout["next", "position"].gather(1, last.unsqueeze(-1).expand(-1, 1, 2)).squeeze(1)
-    length_km = (rollout["next", "move"][..., 0].double() * valid).sum(1)
+    length_km = (moved(rollout["next"])[0] * valid).sum(1)
     deviation = _heading_deviation(rollout, valid)
     measures = {
         "success": success,
@@ -105,6 +105,27 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
     return measures
 
 
+def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Return distance [km] and direction [rad] of moves over the ground, ``(...)`` each, in float64.
+
+    They are what the policy commanded (``move``, ``heading``), unless errors of motion or of the north reference keep
+    what is true.
+
+    Args:
+        steps: what follows the moves, usually ``rollout["next"]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> move, heading = torch.tensor([[30.0, 0.1]]), torch.tensor([[0.1]])
+        >>> moved(TensorDict(move=move, heading=heading, true_move=1.5 * move))[0]
+        tensor([45.], dtype=torch.float64)
+    """
+    check_type(TensorDictBase, steps=steps)
+    move = steps.get("true_move", steps["move"])
+    course = steps.get("true_course", steps.get("true_heading", steps["heading"]))
+    return move[..., 0].double(), course.squeeze(-1).double()
+
+
 def _nearest_arrival(rollout: TensorDictBase, env: GeomagneticNavEnv, shortest_km: Tensor) -> Tensor:
     """Return the distance from each start to the nearest place where a vehicle has arrived, ``(M,)`` [km]."""
     if env.arrival.declared:
@@ -117,19 +138,19 @@ def _nearest_arrival(rollout: TensorDictBase, env: GeomagneticNavEnv, shortest_k
 
 def _moving(rollout: TensorDictBase, valid: Tensor) -> Tensor:
     """Return the mask of the moves that have a direction, ``(M, T)``."""
-    return valid & (rollout["next", "move"][..., 0] > 1e-6)
+    return valid & (moved(rollout["next"])[0] > 1e-6)
 
 
 def _heading_deviation(rollout: TensorDictBase, valid: Tensor) -> Tensor:
     """Return the angle between each move and the bearing to the destination at its start, ``(M, T)`` [deg] or NaN."""
     _, bearing = geodesic(*rollout["position"].unbind(-1), *rollout["target_position"].unbind(-1))
-    angle = wrap_angle(rollout["next", "heading"].squeeze(-1).double() - bearing).abs()
+    angle = wrap_angle(moved(rollout["next"])[1] - bearing).abs()
     return torch.where(_moving(rollout, valid), torch.rad2deg(angle), math.nan)
 
 
 def _turns(rollout: TensorDictBase, valid: Tensor) -> Tensor:
     """Return the turn between each move and the last move of nonzero length before it, ``(M, T)`` [deg] or NaN."""
-    heading = rollout["next", "heading"].squeeze(-1).double()
+    _, heading = moved(rollout["next"])
     moving = _moving(rollout, valid)
     index = torch.arange(heading.shape[1], device=heading.device).expand_as(heading)
     latest = torch.where(moving, index, -1).cummax(1).values

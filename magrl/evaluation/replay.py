@@ -22,7 +22,7 @@ from torch import Tensor
 from magrl.checks import check_number, check_type
 from magrl.envs.region import Region
 from magrl.envs.rendering import PATH, START, TARGET, contour_lines, draw_contours
-from magrl.evaluation.metrics import episode_measures
+from magrl.evaluation.metrics import episode_measures, moved
 from magrl.field.model import FieldModel
 from magrl.geodesy import geodesic, move
 
@@ -115,7 +115,7 @@ def episode_tracks(rollout: TensorDictBase, region: Region) -> list[Tensor]:
     steps = episode_measures(rollout)["steps"].tolist()
     latitude, longitude = rollout["position"].unsqueeze(-2).unbind(-1)
     share = torch.arange(PIECES, dtype=torch.float64) / PIECES
-    heading, distance = rollout["next", "heading"].double(), rollout["next", "move"][..., :1].double()
+    distance, heading = (part.unsqueeze(-1) for part in moved(rollout["next"]))
     legs = torch.stack(move(latitude, longitude, heading, distance * share), -1)
     legs[..., 0, :] = rollout["position"]
     rows = zip(legs, rollout["next", "position"], steps, strict=True)

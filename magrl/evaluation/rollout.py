@@ -9,7 +9,7 @@ from torchrl.envs import EnvBase
 
 from magrl.checks import check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
-from magrl.transforms import SensorNoise
+from magrl.transforms.errors import EpisodeErrors
 
 
 def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
@@ -61,7 +61,7 @@ def restart(env: EnvBase) -> None:
     check_type(GeomagneticNavEnv, env=base)
     base.set_seed(base.seed)
     for part in env.modules():
-        if isinstance(part, SensorNoise):
+        if isinstance(part, EpisodeErrors):
             part.restart()
 
 
@@ -70,6 +70,7 @@ def with_true_field(rollout: TensorDictBase) -> TensorDictBase:
 
     Example:
         >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.transforms import SensorNoise
         >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), SensorNoise((0.05, 0.05, 5.0)))
         >>> rollout = env.rollout(2)
         >>> bool((with_true_field(rollout)["next", "field"] == rollout["next", "true_field"]).all())
