@@ -21,7 +21,7 @@ SWARMS := ga pso afsa ga:flown pso:flown afsa:flown
 NOISE_LEVELS := 0 0.02 0.05 0.1
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere test test-slow check format clean earth globe paper trade bench docs replay mutate help
+.PHONY: train fly anywhere test test-slow check format clean earth globe conditions paper trade bench docs replay mutate help
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -90,6 +90,18 @@ earth: $(VENV)/.installed  ## fly the pretrained agent and other navigators all 
 	$(RECIPE)/tables/earth_table.py anywhere kalman secant geodesic --distance-km 1200 1800 --max-steps 120 --tasks 2000 \
 	  > docs/results/earth-1200.md
 	$(RECIPE)/tables/publish.py docs/anywhere.md
+
+# Table and figure of docs/conditions.md, from the pretrained policy; make -j2 makes both at once.
+conditions: docs/results/conditions.md docs/figures/conditions.png  ## fly navigators under the errors of real vehicles; about fifteen minutes
+	$(RECIPE)/tables/publish.py docs/conditions.md
+
+.PHONY: docs/results/conditions.md docs/figures/conditions.png
+docs/results/conditions.md: $(VENV)/.installed
+	mkdir -p docs/results
+	OMP_NUM_THREADS=1 $(RECIPE)/tables/conditions_table.py > $@
+
+docs/figures/conditions.png: $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/tables/conditions_table.py --tasks 300 --figure $@
 
 # The map of the whole Earth, the table of epochs, and the pictures of the flight, from the pretrained policy.
 globe: $(VENV)/.installed  ## map where the pretrained agent fails, fly it at five epochs and draw a flight; two minutes

@@ -4,6 +4,7 @@
     python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso:flown --out runs/comparison
     python recipes/evaluate.py secant --scenario my.toml --export tracks.kml    # own tasks, tracks for a map
     python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --noise 0.05 0.05 5
+    python recipes/evaluate.py kalman parallel --conditions ship                # errors of a real vehicle
 
 Trained agents are given with their run folders. They are flown as they were trained: in their scenario, with their
 arrival threshold, start heading and sensor noise. Runs that differ in one of these need the option that chooses it. An
@@ -49,7 +50,7 @@ from magrl.files import check_writable, write_json
 from magrl.training import UsageError, command
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
 from magrl.training.run_folder import create_run_folder
-from magrl.transforms import with_sensor_noise
+from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
 
 RECIPE = "evaluate.py"
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
@@ -81,6 +82,8 @@ class Config:
     """Arrival threshold on the objective (Eq. 2-7); that of the runs by default, 0.01 without runs."""
     noise: Noise | None = None
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]; by default those of the runs, or 0."""
+    conditions: str | None = None
+    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater or low-cost."""
     map_date: str | None = None
     """Date of the map of map_matching, as 2015-01-01 (IGRF); by default its map is the field itself."""
     start_heading: Literal["north", "random"] | None = None
@@ -147,11 +150,10 @@ def first_tasks(scenario: Scenario, num_tasks: int) -> Scenario:
     return scenario.replace(tasks=tasks, names=scenario.names[:num_tasks])
 
 
-def make_env(scenario: Scenario, zeta: float, seed: int, start_heading: str = "north") -> GeomagneticNavEnv:
+def make_env(scenario: Scenario, zeta: float, seed: int, **options: Any) -> GeomagneticNavEnv:
     """Return an environment with one vehicle for each frozen task."""
     assert scenario.tasks is not None
-    count = len(scenario.tasks.start)
-    return GeomagneticNavEnv(scenario, num_envs=count, zeta=zeta, seed=seed, start_heading=start_heading)
+    return GeomagneticNavEnv(scenario, num_envs=len(scenario.tasks.start), zeta=zeta, seed=seed, **options)
 
 
 def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]]:
@@ -183,18 +185,24 @@ def settle(config: Config) -> tuple[Config, float, list[str]]:
     """Return the settings with those of the runs where none were chosen, the threshold, and warnings.
 
     Raises:
-        ValueError: for runs that differ in a setting that was not chosen.
+        ValueError: for runs that differ in a setting that was not chosen, or conditions with noise.
         FileNotFoundError: for a run without its scenario file.
     """
     for level in config.noise or ():
         check_number(0, noise=level)
+    if config.conditions and config.noise:
+        raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
     runs = trained_runs(config.navigators)
     zeta, warnings = arrival_threshold(config.navigators, config.zeta)
     own = config.start_heading
     heading, others = agreed(
         runs, lambda run: run.start_heading, own, "north", name="start heading", option="--start-heading"
     )
-    noise, noisy = agreed(runs, lambda run: run.noise, config.noise, NO_NOISE, name="sensor noise", option="--noise")
+    noise, noisy = NO_NOISE, list[str]()
+    if not config.conditions:
+        noise, noisy = agreed(
+            runs, lambda run: run.noise, config.noise, NO_NOISE, name="sensor noise", option="--noise"
+        )
     scenario, places = config.scenario, list[str]()
     if config.tasks != "figure-4-1":  # which lies in the paper's region
         scenario, places = common_scenario(runs, config.scenario)
@@ -230,10 +238,16 @@ def prepare(config: Config) -> Prepared:
         config, zeta, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed)
         example = first_tasks(scenario, 1) if config.scenario else Scenario().with_tasks(named_tasks("figure-4-1"))
-        bases = [make_env(place, zeta, config.seed, config.start_heading) for place in (scenario, example)]
-        envs = [with_sensor_noise(base, config.noise, config.seed) for base in bases]
+        flown = conditions_named(config.conditions or "laboratory")
+        options = {"start_heading": config.start_heading, "drift_km": flown.drift_km(50.0)}
+        bases = [make_env(place, zeta, config.seed, **options) for place in (scenario, example)]
+        if config.conditions:
+            envs = [with_conditions(base, flown, config.seed) for base in bases]
+        else:
+            envs = [with_sensor_noise(base, config.noise, config.seed) for base in bases]
+        told = flown.sensor_std if config.conditions else config.noise, config.map_date, flown.bias_std
         navigators = [
-            tuple(make_navigator(text, base, config.mode, config.seed, config.noise, config.map_date) for base in bases)
+            tuple(make_navigator(text, base, config.mode, config.seed, *told) for base in bases)
             for text in config.navigators
         ]
         if config.export:
@@ -289,6 +303,7 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
         "scenario": config.scenario and config.scenario.name,
         "zeta": env.zeta,
         "noise": config.noise,
+        "conditions": config.conditions,
         "map_date": config.map_date,
         "start_heading": config.start_heading,
         "mode": config.mode,
@@ -306,6 +321,8 @@ def write(config: Config, env: EnvBase, results: Results) -> None:
     if any(config.noise or ()):
         levels = "{:g} deg, {:g} deg, {:g} nT".format(*config.noise)
         notes = f"\nStandard deviations of the noise on D, I and B_H: {levels}.\n{notes}"
+    if config.conditions:
+        notes = f"\nConditions: {config.conditions}.\n{notes}"
     if config.map_date:
         notes = f"\nDate of the map of map matching: {config.map_date}.\n{notes}"
     (config.out / "table.md").write_text(comparison_table(results.summaries, config.mode) + notes)

@@ -3,6 +3,7 @@
     python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W"                     # Bergen to Reykjavik
     python recipes/fly.py "60.4N 5.3E" "D=-11.1 I=75.2 BH=13000"         # a destination by its magnetic elements
     python recipes/fly.py "38.7, -9.1" "40.7, -74.0" --noise 0.05 0.05 5 --navigator secant --export track.geojson
+    python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W" --conditions underwater     # with the errors of a real vehicle
 
 The agent measures declination D, inclination I and horizontal intensity B_H, and knows their values at the destination.
 It never observes a position: coordinates serve the simulation, the score and the picture only.
@@ -49,7 +50,8 @@ from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
 from magrl.training import UsageError, command
-from magrl.transforms import SensorNoise, TrackGradient
+from magrl.transforms import SensorNoise, TrackGradient, conditions_named
+from magrl.transforms.track_view import DATA_SHEET
 
 RECIPE = "fly.py"
 ARRIVAL_KM = 400.0
@@ -69,6 +71,8 @@ class Config:
     recipes/evaluate.py."""
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
+    conditions: str | None = None
+    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater or low-cost."""
     date: str = "2025-01-01"
     """Date of the field, 1900 to 2030 (IGRF-14)."""
     zeta: float | None = None
@@ -134,22 +138,31 @@ def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
     try:
         for level in config.noise:
             check_number(0, noise=level)
+        if config.conditions and any(config.noise):
+            raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
+        conditions = conditions_named(config.conditions or "laboratory")
+        drift_km = conditions.drift_km(50.0)
         field = IGRF(config.date)
         start, target, distance_km = places(config, field)
-        region = region_around(start, target, field)
+        region = region_around(start, target, field, 50.0 + drift_km)
         scenario = Scenario(region=region, margin_deg=0, field=field, tasks=Tasks(start[None], target[None]))
         base = GeomagneticNavEnv(
             scenario,
             max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
             zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
             start_heading="random",
+            drift_km=drift_km,
             seed=config.seed,
         )
         if config.start_heading != "random":
             check_number(-360, 360, start_heading=config.start_heading)
-        track = TrackGradient(("field", "target_field", "move", "heading", "sensor_std"), range_km=1000.0)
-        env = TransformedEnv(base, Compose(SensorNoise(config.noise, seed=config.seed), track))
-        navigator = make_navigator(config.navigator, base, seed=config.seed, noise=config.noise)
+        track = TrackGradient(("field", "target_field", "move", "heading", *DATA_SHEET), range_km=1000.0)
+        noise, errors = config.noise, [SensorNoise(config.noise, seed=config.seed)]
+        if config.conditions:
+            noise, errors = conditions.sensor_std, conditions.transforms(config.seed)
+        env = TransformedEnv(base, Compose(*errors, track))
+        told = {"noise": noise, "bias": conditions.bias_std}
+        navigator = make_navigator(config.navigator, base, seed=config.seed, **told)
         if config.export:
             export.check_suffix(config.export)
         if config.animate and config.animate.suffix != ".gif":
@@ -166,7 +179,11 @@ def rollout(env: TransformedEnv, navigator: Watched, start_heading: float | Lite
     """Return the steps of the flight, ``(1, T)``."""
     state = env.reset()
     if start_heading != "random":
-        state["heading"] = torch.full_like(state["heading"], math.radians(math.remainder(start_heading, 360)))
+        wanted = torch.full_like(state["heading"], math.radians(math.remainder(start_heading, 360)))
+        if state.get("true_heading", None) is not None:  # the measured one keeps its error
+            state["heading"], state["true_heading"] = state["heading"] + wanted - state["true_heading"], wanted
+        else:
+            state["heading"] = wanted
     with torch.no_grad(), navigator.bar:
         return env.rollout(env.max_steps, navigator, auto_reset=False, tensordict=state)
 
@@ -208,6 +225,7 @@ def fly(config: Config) -> dict[str, Any]:
 def summary(result: dict[str, Any]) -> str:
     """Return the result of a flight as text."""
     noise = "{:g} deg, {:g} deg, {:g} nT".format(*result["noise"]) if any(result["noise"]) else "none"
+    noise = f"conditions {result['conditions']}" if result["conditions"] else noise
     ends = ["{:.2f}, {:.2f}".format(*result[key]) for key in ("start_position", "target_position")]
     rows = {
         "outcome": result["outcome"],

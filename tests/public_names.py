@@ -28,7 +28,7 @@ def homes() -> Iterator[ModuleType]:
 
 
 def is_code(member: object) -> bool:
-    return inspect.isfunction(member) or inspect.isclass(member)
+    return inspect.isfunction(inspect.unwrap(member)) or inspect.isclass(member)  # cached functions, too
 
 
 def own_names(module: ModuleType) -> Iterator[str]:

@@ -147,6 +147,8 @@ ENVS: Rows = {
         *bad_numbers(lambda date: earth_scenario(2, 0, date), date=("May",)),
         refused(lambda: earth_scenario(2, 0, "2055-01-01"), ValueError, "2055-01-01"),
         refused(lambda: earth_scenario(2, 0, generation=12), ValueError, "12"),
+        refused(lambda: earth_scenario(2, 0, crust=1), TypeError, "crust"),
+        refused(lambda: earth_scenario(2, 0, "2020-01-01", crust=True), ValueError, "2020"),
     ],
     "envs.task_set": [
         *bad_numbers(lambda num_tasks: task_set(num_tasks, 0), num_tasks=(0, 1.5, "a", True)),
@@ -284,6 +286,7 @@ NAVIGATORS: Rows = {
         Kalman,
         **BOUNDS,
         noise=(5, (1.0,)),
+        bias=(5, (1.0,)),
         max_steps=(0, 1.5),
         caution=(-1.0, NAN),
         step_km=(0.0,),

@@ -542,6 +542,33 @@ TRANSFORMS: Rows = {
         refused(lambda: transforms.RandomSensorNoise(5), TypeError, "levels", "5"),
         refused(lambda: transforms.RandomSensorNoise(draws=3), ValueError, "uniform", "(3,)"),
     ],
+    "transforms.Conditions": [
+        refused(lambda: transforms.Conditions(5), TypeError, "name", "5"),
+        refused(lambda: transforms.Conditions("own", north="sextant"), ValueError, "'sextant'", "marine"),
+        refused(lambda: transforms.Conditions("own", sensors={"bias": (1.0,)}), ValueError, "bias", "(1.0,)"),
+        refused(lambda: transforms.Conditions("own", weather={"record": "hail"}), ValueError, "'hail'", "quiet"),
+        refused(lambda: transforms.Conditions("own", 0.0, motion={"current_km_h": 1.0}), ValueError, "speed_km_h"),
+    ],
+    "transforms.Conditions.transforms": bad_numbers(
+        lambda **x: transforms.Conditions("own").transforms(**x), seed=(0.5, "a")
+    ),
+    "transforms.Conditions.drift_km": bad_numbers(
+        lambda **x: transforms.Conditions("own").drift_km(**x), max_move_km=(0.0, -1.0, NAN, "a")
+    ),
+    "transforms.SensorErrors.variances": bad_vectors(transforms.SensorErrors().variances, "field", 3),
+    "transforms.NorthReferenceError.variances": bad_tensors(transforms.NorthReferenceError().variances, "field"),
+    "transforms.MagneticWeather.variances": bad_vectors(
+        transforms.MagneticWeather(speed_km_h=5.0).variances, "field", 3
+    ),
+    "transforms.conditions_named": [
+        refused(lambda: transforms.conditions_named("sledge"), ValueError, "'sledge'", "laboratory, aircraft, ship"),
+        refused(lambda: transforms.conditions_named(5), ValueError, "5", "low-cost"),
+    ],
+    "transforms.with_conditions": [
+        refused(lambda: transforms.with_conditions(5, "ship"), TypeError, "env", "5"),
+        refused(lambda: transforms.with_conditions(5, "sledge"), ValueError, "'sledge'", "ship"),
+        refused(lambda: transforms.with_conditions(5, 5), TypeError, "conditions", "5"),
+    ],
     "transforms.sensor_levels": bad_vectors(transforms.sensor_levels, "uniform", 7),
     "transforms.with_sensor_noise": [
         refused(lambda: transforms.with_sensor_noise(5, (0.1, -1.0)), ValueError, "std", "(0.1, -1.0)"),

@@ -408,7 +408,7 @@ def test_table_of_keys_in_the_documentation() -> None:
     rows = table_rows(ENVIRONMENT, "`SensorNoise`](", "key")
     assert set(rows) == set(specs.keys()) - set(nav(7).observation_spec.keys())
     check_rows(rows, specs)
-    assert [key for key, row in rows.items() if row[-1] == "all policies"] == ["sensor_std"]
+    assert [key for key, row in rows.items() if row[-1] == "all policies"] == ["sensor_std", "bias_std"]
 
 
 # Policies and evaluations

@@ -77,7 +77,8 @@ class FieldPolicy(TensorDictModuleBase):
 
     A recurrent policy, and one that reads its own track (:class:`~magrl.transforms.TrackView`), keeps its own state for
     each vehicle from the start of an episode (``step_count`` 0) on: call it once per step. The latter reads the
-    standard deviations of the sensors from ``sensor_std``, or from its attribute ``noise_std`` without this key.
+    standard deviations of the sensors from ``sensor_std``, or from its attribute ``noise_std`` without this key, and
+    those of their constant and slow errors from ``bias_std``, or takes 0.
 
     Args:
         config: what the policy observes, and the shape of its network.
@@ -132,6 +133,7 @@ class FieldPolicy(TensorDictModuleBase):
         """Return the observation after the last move, and keep the state of the track for the next."""
         noise = seen["field"].new_tensor(self.noise_std).expand_as(seen["field"])
         seen["sensor_std"] = tensordict.get("sensor_std", noise)
+        seen["bias_std"] = tensordict.get("bias_std", torch.zeros_like(noise))
         observed, starts = self.observe(seen.copy()), seen["step_count"].squeeze(-1) == 0
         state = self.state
         if state is not None and state.shape == seen.shape and state.device == seen.device and not starts.all():

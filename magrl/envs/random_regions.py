@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from magrl import paper
-from magrl.checks import check_number
+from magrl.checks import check_number, check_type
 from magrl.envs.regions import Regions
 from magrl.envs.scenario import Scenario
 from magrl.envs.specs import region_elements
-from magrl.field import Date, FieldBank, igrf_coefficients, parse_date, random_planets
+from magrl.field import Date, FieldBank, igrf_coefficients, parse_date, random_planets, wmmhr_coefficients
 from magrl.transforms.counters import counter_uniform
 
 REGIONS_PER_PLANET = 2
@@ -45,14 +45,18 @@ def planet_scenario(count: int, seed: int, **options: Any) -> Scenario:
     return region_scenario(planets, torch.arange(count) // REGIONS_PER_PLANET, seed, **options)
 
 
-def earth_scenario(count: int, seed: int, date: Date = "2025-01-01", generation: int = 14, **options: Any) -> Scenario:
-    """Return a scenario over random regions of the Earth (IGRF).
+def earth_scenario(
+    count: int, seed: int, date: Date = "2025-01-01", generation: int = 14, *, crust: bool = False, **options: Any
+) -> Scenario:
+    """Return a scenario over random regions of the Earth.
 
     Args:
         count: number of regions.
         seed: random seed; the result is a pure function of the arguments.
         date: date of the field, as in :class:`Scenario`.
         generation: generation of IGRF, 13 or 14.
+        crust: whether the field is that of :class:`~magrl.field.WMMHR` (degree 133, 2025 to 2030) in place of IGRF. Its
+            expansions have degree 52 by default, and take 0.5 s a region to build.
         **options: of :func:`region_scenario`.
 
     Raises:
@@ -67,7 +71,10 @@ def earth_scenario(count: int, seed: int, date: Date = "2025-01-01", generation:
     """
     check_number(1, whole=True, count=count)
     check_number(0, 2**63 - 1, whole=True, seed=seed)
-    earth = igrf_coefficients(date, generation).unsqueeze(0)
+    check_type(bool, crust=crust)
+    if crust:
+        options = {"degree": 52, **options}
+    earth = (wmmhr_coefficients(date) if crust else igrf_coefficients(date, generation)).unsqueeze(0)
     scenario = region_scenario(earth, torch.zeros(count, dtype=torch.int64), seed, **options)
     return scenario.replace(date=parse_date(date), generation=generation)
 

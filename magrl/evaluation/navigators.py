@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -63,6 +64,7 @@ def make_navigator(
     seed: int = 0,
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
     map_date: Date | None = None,
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> TensorDictModuleBase:
     """Return the navigator that a text such as ``secant``, ``pso:flown`` or ``gg_td3=RUN`` names.
 
@@ -73,6 +75,8 @@ def make_navigator(
         seed: random seed of a metaheuristic.
         noise: standard deviations of the sensors, D [deg], I [deg], B_H [nT], for navigators that weigh their readings.
         map_date: date of the map of ``map_matching``, from IGRF; None for the environment's own field.
+        bias: standard deviations of constant and slow errors of the sensors, for navigators that tell them from noise.
+            Agents read both from the TensorDict, and all others are told the root of the sum of the squares as noise.
 
     Raises:
         ValueError: for an unknown name, a trained agent without a run or trained in another field, a run or a mode for
@@ -102,8 +106,10 @@ def make_navigator(
     if name in METAHEURISTICS and not run:
         return METAHEURISTICS[name](env, own_mode or mode, seed)
     if name in NAVIGATORS and not run and not own_mode:
+        if name == "kalman":
+            return NAVIGATORS[name](env, mode, seed, noise, bias=bias)
         options = {"map_date": map_date} if name == "map_matching" else {}
-        return NAVIGATORS[name](env, mode, seed, noise, **options)
+        return NAVIGATORS[name](env, mode, seed, tuple(map(math.hypot, noise, bias)), **options)
     known = ", ".join([*PRETRAINED, *(f"{trained}=RUN" for trained in TRAINED), *NAVIGATORS, *METAHEURISTICS])
     raise ValueError(f"unknown navigator {text!r}: choose from {known}")
 

@@ -96,6 +96,18 @@ class WeatherRecord:
             )
         return found
 
+    def mean_squares(self) -> tuple[float, ...]:
+        """Return the mean squares of the variation northward, eastward and downward [nT^2], without gaps.
+
+        Those of the minutes at which an episode may start.
+
+        Example:
+            >>> [round(square**0.5) for square in weather_record("disturbed").mean_squares()]
+            [40, 29, 11]
+        """
+        last = None if self.last is None else self.last + 1
+        return tuple(self.variation[self.first : last].double().square().nanmean(0).tolist())
+
 
 WEATHER = {
     "quiet": ("boulder-2016-01", 18, 18),

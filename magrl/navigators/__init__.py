@@ -45,8 +45,14 @@ def _run_and_tumble(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise =
     return RunAndTumble(env.max_move_km, env.max_turn_rad, objective_floors=floors)
 
 
-def _kalman(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> Kalman:  # noqa: ARG001
-    return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps)
+def _kalman(
+    env: GeomagneticNavEnv,
+    mode: str,  # noqa: ARG001
+    seed: int,  # noqa: ARG001
+    noise: Noise = _PERFECT,
+    bias: Noise = _PERFECT,
+) -> Kalman:
+    return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps, bias=bias)
 
 
 def _map_matching(
@@ -73,7 +79,8 @@ NAVIGATORS: dict[str, Callable[..., Navigator]] = {
     "map_matching": _map_matching,
 }
 """Factories by name, called with an environment, a mode and a seed, which these ignore, and perhaps the standard
-deviations of the sensors: D [deg], I [deg], B_H [nT]; ``map_matching`` also with the date of its map."""
+deviations of the sensors: D [deg], I [deg], B_H [nT]; ``kalman`` also with those of constant and slow errors, and
+``map_matching`` with the date of its map."""
 
 NAVIGATOR_CLASSES: dict[str, type[Navigator]] = {
     "parallel": ParallelApproach,

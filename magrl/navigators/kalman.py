@@ -45,6 +45,7 @@ class Kalman(QuasiNewton):
         caution: weight of the uncertainty; for None that of :func:`trade_off`.
         step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
+        bias: standard deviations of constant and slow errors of the readings, like ``noise``.
 
     Raises:
         ValueError: for an option out of its range, or a negative standard deviation.
@@ -70,16 +71,19 @@ class Kalman(QuasiNewton):
         caution: float | None = None,
         step_km: float | None = None,
         range_km: float = 300.0,
+        bias: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         super().__init__(max_move_km, max_turn_rad, noise=noise)
         check_number(1, whole=True, max_steps=max_steps)
+        check_numbers(3, bias=bias)
+        check_number(0, bias=min(bias))
         usual_caution, usual_step_km = trade_off(noise)
         caution = usual_caution if caution is None else caution
         step_km = usual_step_km if step_km is None else step_km
         check_number(0, caution=caution)
         check_number(0, above=True, step_km=step_km, range_km=range_km)
         self.max_steps, self.range_km = int(max_steps), float(range_km)
-        self.caution, self.step_km = float(caution), float(step_km)
+        self.caution, self.step_km, self.bias = float(caution), float(step_km), tuple(bias)
 
     def prior(self, reading: Tensor) -> GradientPrior:
         return tracking.dipole_prior(reading)
@@ -92,7 +96,7 @@ class Kalman(QuasiNewton):
         track = FieldTrack(memory["mean"], memory["covariance"])
         target = seen["target_field"].double()
         known, shared = self._related(track)
-        way, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared)
+        way, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared, self.bias)
         moves = self._moves(way)
         left = way.unsqueeze(1) - moves
         progress = (way.norm(dim=-1, keepdim=True) - left.norm(dim=-1)) * _certainty(way, covariance)
@@ -134,7 +138,8 @@ class Kalman(QuasiNewton):
         moved = tracking.predict(FieldTrack(track.mean.unsqueeze(1), now.covariance), moves, [0.0] * 3, self.scales)
         expected = moved.mean[..., 0] * moves.new_tensor(self.scales)
         after, shared_after = self._related(tracking.update(moved, expected, self.noise, self.scales))
-        weights = _weights(after.covariance, shared_after, left / DISTANCE_SCALE_KM)
+        biased = (moves.new_tensor(self.bias) / moves.new_tensor(self.scales)).square()
+        weights = _weights(after.covariance, shared_after, left / DISTANCE_SCALE_KM, biased)
         learned = (now.covariance - after.covariance)[..., 1:, 1:]
         normal = (weights.diagonal(dim1=-2, dim2=-1)[..., None, None] * learned).sum(-3)
         for rows, sign in ((now.mean, 1), (shared, -1), (shared_after, 1)):
@@ -145,11 +150,14 @@ class Kalman(QuasiNewton):
         return torch.where((info == 0)[..., None, None], inverse, unknown) * DISTANCE_SCALE_KM**2
 
 
-def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:
-    """Return the inverse covariance ``(..., 3, 3)`` of the elements at the end of a way ``(..., 2)`` [100 km]."""
+def _weights(covariance: Tensor, shared: Tensor, way: Tensor, biased: Tensor) -> Tensor:
+    """Return the inverse covariance ``(..., 3, 3)`` of the elements at the end of a way ``(..., 2)`` [100 km].
+
+    Constant errors of the readings add their variances ``(3,)``.
+    """
     d = way.unsqueeze(-2)
     cross = 2 * covariance[..., 0, 1:] + (covariance[..., 1:, 1:] * d.unsqueeze(-2)).sum(-1)
-    weight = (covariance[..., 0, 0] + (cross * d).sum(-1)).reciprocal()
+    weight = (covariance[..., 0, 0] + biased + (cross * d).sum(-1)).reciprocal()
     row = weight * (shared[..., 0] + (shared[..., 1:] * d).sum(-1))
     rest = 1 - (row.square() / weight).sum(-1)
     return torch.diag_embed(weight) + row.unsqueeze(-1) * row.unsqueeze(-2) / rest[..., None, None]

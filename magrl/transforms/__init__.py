@@ -6,6 +6,7 @@ module where that makes sense.
 """
 
 from magrl.transforms.arrival import DeclareArrival
+from magrl.transforms.conditions import CONDITIONS, Conditions, conditions_named, with_conditions
 from magrl.transforms.errors import TRUE_KEYS
 from magrl.transforms.guidance import AlignmentReward, FieldGradient, GradientHeading
 from magrl.transforms.motion import MotionError
@@ -22,11 +23,13 @@ from magrl.transforms.way import DetourReward, DistanceCost, TrueWay
 from magrl.transforms.weather import SPEEDS_KM_H, MagneticWeather
 
 __all__ = [
+    "CONDITIONS",
     "NORTH_REFERENCES",
     "SPEEDS_KM_H",
     "TRUE_KEYS",
     "AlignmentReward",
     "AngleVector",
+    "Conditions",
     "DeclareArrival",
     "DetourReward",
     "DistanceCost",
@@ -46,7 +49,9 @@ __all__ = [
     "TrackView",
     "TrueWay",
     "VectorErrors",
+    "conditions_named",
     "north_reference",
     "sensor_levels",
+    "with_conditions",
     "with_sensor_noise",
 ]

@@ -31,6 +31,7 @@ TRUE_KEYS = (
     "sensor_stream",
     "north_stream",
     "motion_stream",
+    "weather_clock",
 )
 """Keys of the errors that a policy may not read: what is true, the errors, and the states of their random numbers."""
 
@@ -111,6 +112,12 @@ class EpisodeErrors(ObservationTransform):
         """Write a true value, unless a transform before this one has written it: the first error keeps it."""
         if key is not None and not self._comes_before(key):
             tensordict.set(key, value)
+
+    def _tell(self, tensordict: TensorDictBase, key: NestedKey, variance: Tensor) -> None:
+        """Write a standard deviation that the vehicle is told; the variance is added to that of transforms before."""
+        if self._comes_before(key):
+            variance = variance + tensordict[key].square()
+        tensordict.set(key, variance.sqrt())
 
     def _written(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         value = tensordict.get(key, None)

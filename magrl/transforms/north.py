@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from magrl.checks import check_number
+from magrl.checks import check_number, check_tensor
 from magrl.geodesy import wrap_angle, wrap_longitude
 from magrl.transforms.base import Keys, observed_spec, several_keys, with_state
 from magrl.transforms.counters import advanced, stream_normal
@@ -45,8 +45,8 @@ class NorthReferenceError(EpisodeErrors):
 
     b has a constant part, a drift (first-order Gauss-Markov) and a part that is new at each reading, each normal, cut
     at four standard deviations. The measured ``heading`` takes the place of the true one, which is kept in
-    ``true_heading`` and given back to the environment for its step. ``sensor_std`` of D grows by the standard deviation
-    of b (without the factor of the latitude, which the vehicle does not know).
+    ``true_heading`` and given back to the environment for its step. What the vehicle is told of D grows: ``sensor_std``
+    by the random part, ``bias_std`` by the others (without the factor of the latitude, which it does not know).
 
     It stands after the transforms of the field's errors, and after those that read the true heading.
 
@@ -62,7 +62,8 @@ class NorthReferenceError(EpisodeErrors):
         true_heading_key: key of the true heading ``(..., 1)``. Privileged.
         true_key: key of the true elements, if no transform before this one has written it. Privileged.
         std_key: key of the standard deviations of the elements ``(..., E)``.
-        rated_key: key of those that a transform before this one wrote; for its next step.
+        bias_key: key of those of their constant and slow errors ``(..., E)``.
+        rated_key: key of the former that a transform before this one wrote; for its next step.
         error_key: key of constant part, drift and b itself ``(..., 3)`` [deg]. Privileged.
         stream_key: key of the state of the random numbers ``(..., 1)``, int64.
         seed: seed of the errors.
@@ -94,6 +95,7 @@ class NorthReferenceError(EpisodeErrors):
         true_heading_key: NestedKey = "true_heading",
         true_key: NestedKey = "true_field",
         std_key: NestedKey = "sensor_std",
+        bias_key: NestedKey = "bias_std",
         rated_key: NestedKey = "rated_std",
         error_key: NestedKey = "north_error",
         stream_key: NestedKey = "north_stream",
@@ -112,7 +114,7 @@ class NorthReferenceError(EpisodeErrors):
             check_number(0, above=True, drift_length_km=drift_length_km)
         self.sizes, self.drift_length_km, self.fixed = (constant_deg, drift_deg, random_deg), drift_length_km, fixed
         self.true_heading_key, self.true_key, self.std_key = true_heading_key, true_key, std_key
-        self.rated_key, self.error_key = rated_key, error_key
+        self.bias_key, self.rated_key, self.error_key = bias_key, rated_key, error_key
 
     # Data
 
@@ -162,16 +164,30 @@ class NorthReferenceError(EpisodeErrors):
         tensordict.set(self.error_key, error)
         for key, value in zip(self.out_keys, seen, strict=True):
             tensordict.set(key, value)
-        return self._grow(tensordict, field)
-
-    def _grow(self, tensordict: TensorDictBase, field: Tensor) -> TensorDictBase:
-        """Add the variance of the error to that of D."""
-        rated = torch.zeros_like(field)
         if self._comes_before(self.std_key):
-            rated = tensordict[self.std_key]
-            tensordict.set(self.rated_key, rated)
-        declination = (rated[..., :1].square() + sum(size * size for size in self.sizes)).sqrt()
-        return tensordict.set(self.std_key, torch.cat((declination, rated[..., 1:]), -1))
+            tensordict.set(self.rated_key, tensordict[self.std_key])
+        for told, variance in zip((self.std_key, self.bias_key), self.variances(field), strict=True):
+            self._tell(tensordict, told, variance)
+        return tensordict
+
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the variances that the vehicle is told of a reading: of new errors, and of constant and slow ones.
+
+        Args:
+            field: ``(..., E)`` reading.
+
+        Returns:
+            Both ``(..., E)``.
+
+        Example:
+            >>> NorthReferenceError(2.0, random_deg=1.0).variances(torch.zeros(3))
+            (tensor([1., 0., 0.]), tensor([4., 0., 0.]))
+        """
+        check_tensor(field=field)
+        declination = torch.zeros_like(field)
+        declination[..., 0] = 1
+        constant, drift, random = (size * size for size in self.sizes)
+        return random * declination, (constant + drift) * declination
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Give the true heading to the environment, and their standard deviations to the transforms before this one."""
@@ -195,7 +211,7 @@ class NorthReferenceError(EpisodeErrors):
         if self._comes_before(self.std_key):
             observation_spec[self.rated_key] = observation_spec[self.std_key].clone()
         observation_spec[self.true_heading_key] = heading.clone()
-        for key in (self.out_keys[1], self.std_key):
+        for key in (self.out_keys[1], self.std_key, self.bias_key):
             observation_spec[key] = Unbounded(field.shape, device=field.device, dtype=field.dtype)
         of_error = (*heading.shape[:-1], 3)
         observation_spec[self.error_key] = Unbounded(of_error, device=heading.device, dtype=heading.dtype)

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
-from magrl.checks import check_number, check_type
+from magrl.checks import check_number, check_tensor, check_type
 from magrl.transforms.base import observed_spec, with_state
 from magrl.transforms.counters import advanced, normal_of, stream_normal, stream_uniform
 from magrl.transforms.errors import check_sizes, gauss_markov
@@ -30,9 +30,9 @@ class SensorErrors(SensorNoise):
     Gauss-Markov process along the way. Sizes are standard deviations of normal errors (cut at four of them), E numbers
     in the unit of each element; those that are not given are 0.
 
-    ``sensor_std`` is the accuracy that the data sheets give for a single reading: the root of the sum of all variances,
-    constant errors included, so that a filter gives less weight to an element with a large one. During an outage it is
-    :data:`OUTAGE_STD`.
+    The vehicle is told the data sheets: ``sensor_std`` is that of the errors which are new at each reading (noise and
+    rounding), during an outage :data:`OUTAGE_STD`; ``bias_std`` that of the constant and the slow ones. Both are roots
+    of sums of variances.
 
     Args:
         std: white noise.
@@ -59,8 +59,8 @@ class SensorErrors(SensorNoise):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> errors = SensorErrors((0.05, 0.05, 5.0), bias=(0.1, 0.1, 20.0), drift=(0.0, 0.0, 10.0), drift_length=200.0)
         >>> state = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), errors).reset()
-        >>> state["sensor_std"][0]
-        tensor([ 0.1118,  0.1118, 22.9129])
+        >>> state["sensor_std"][0], state["bias_std"][0]
+        (tensor([0.0500, 0.0500, 5.0000]), tensor([ 0.1000,  0.1000, 22.3607]))
     """
 
     channel = 2
@@ -102,8 +102,6 @@ class SensorErrors(SensorNoise):
         self.drift_length, self.outage_rate, self.vector = drift_length, float(outage_rate), vector
         self.fixed, self.heading_key, self.move_key, self.error_key = fixed, heading_key, move_key, error_key
         self.register_buffer("_noise", torch.tensor(self.std), persistent=False)
-        squares = (self._noise, self._bias, self._drift, self._resolution / 12**0.5)
-        self.register_buffer("_variance", sum(x.square() for x in squares), persistent=False)
         self.draws = 2 * count + (vector.draws if vector else 0)
 
     # Data
@@ -150,13 +148,15 @@ class SensorErrors(SensorNoise):
         if self.rounded:
             step = self._resolution.to(dtype)
             reading = torch.where(step > 0, torch.round(reading / step) * step, reading)
-        std = self._accuracy(reading)
+        white, slow = self.variances(reading)
+        std = white.sqrt()
         if self.outage_rate and not first:
             missing = uniform[..., -1:] < self.outage_rate
             reading, std = torch.where(missing, last, reading), torch.where(missing, OUTAGE_STD, std)
         self._keep(tensordict, self.true_key, value)
         tensordict.set(self.out_keys[0], reading)
         tensordict.set(self.std_key, std)
+        self._tell(tensordict, self.bias_key, slow)
         return tensordict.set(self.error_key, torch.cat((bias, scale, drift, reading, vector), -1))
 
     def _drifted(self, tensordict: TensorDictBase, drift: Tensor, normal: Tensor, first: bool) -> Tensor:
@@ -166,12 +166,28 @@ class SensorErrors(SensorNoise):
         distance = 1.0 if self.move_key is None else tensordict[self.move_key][..., :1]
         return gauss_markov(drift, std, distance, float(self.drift_length or 0), normal)
 
-    def _accuracy(self, reading: Tensor) -> Tensor:
-        """Return the standard deviation of a reading ``(..., E)``, all errors together."""
-        variance = self._variance.to(reading.dtype) + (self._scale.to(reading.dtype) * reading).square()
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the variances that the vehicle is told of a reading: of new errors, and of constant and slow ones.
+
+        Args:
+            field: ``(..., E)`` reading.
+
+        Returns:
+            Both ``(..., E)``.
+
+        Example:
+            >>> SensorErrors((1.0, 1.0), bias=(2.0, 0.0)).variances(torch.zeros(2))
+            (tensor([1., 1.]), tensor([4., 0.]))
+        """
+        check_tensor(len(self.std), field=field)
+        noise, bias, scale, drift, resolution = (
+            getattr(self, f"_{part}").to(field.dtype).square()
+            for part in ("noise", "bias", "scale", "drift", "resolution")
+        )
+        slow = bias + drift + scale * field.square()
         if self.vector is not None:
-            variance = variance + self.vector.variance(reading)
-        return variance.sqrt()
+            slow = slow + self.vector.variance(field)
+        return (noise + resolution / 12).expand_as(field), slow
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Raise an error: the errors of an episode begin with its reset."""

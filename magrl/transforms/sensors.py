@@ -23,7 +23,8 @@ class SensorNoise(EpisodeErrors):
     """Add white noise to a reading, independent for each element, at reset and at each step.
 
     The reading is ``value + std * z`` with a standard normal ``z``. Beside it, the transform writes the true value, the
-    standard deviations (the data sheet of the sensors, which a policy may read) and the state of the random numbers.
+    data sheet of the sensors, which a policy may read (the standard deviations, and those of constant errors, which are
+    0), and the state of the random numbers.
     In ``Compose``, a transform that reads the true value stands before this one, such as ``GradientHeading``.
 
     Args:
@@ -33,6 +34,7 @@ class SensorNoise(EpisodeErrors):
         true_key: key of the true value, or None to leave it out. Privileged: a policy must not read it. Where a
             transform before this one has written it, it stays.
         std_key: key of the standard deviations ``(..., E)``.
+        bias_key: key of those of constant errors ``(..., E)``: 0, or what a transform before this one has written.
         stream_key: key of the state of the random numbers ``(..., 1)``, int64.
         seed: seed of the noise. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
 
@@ -62,13 +64,14 @@ class SensorNoise(EpisodeErrors):
         out_keys: NestedKey | Keys = ("field",),
         true_key: NestedKey | None = "true_field",
         std_key: NestedKey = "sensor_std",
+        bias_key: NestedKey = "bias_std",
         stream_key: NestedKey = "sensor_stream",
         seed: int = 0,
     ) -> None:
         super().__init__(key_list(in_keys), key_list(out_keys), stream_key=stream_key, seed=seed)
         expect_keys(self, 1, 1)
         self.std = check_std(std)
-        self.true_key, self.std_key = true_key, std_key
+        self.true_key, self.std_key, self.bias_key = true_key, std_key, bias_key
 
     # Data
 
@@ -97,6 +100,7 @@ class SensorNoise(EpisodeErrors):
             return next_tensordict
         stream, std = (self._written(next_tensordict, key) for key in (self.stream_key, self.std_key))
         self._keep(next_tensordict, self.true_key, values[0])
+        self._tell(next_tensordict, self.bias_key, torch.zeros_like(values[0]))
         return next_tensordict.set(self.out_keys[0], self._reading(values[0], std, stream))
 
     def _reading(self, value: Tensor, std: Tensor, stream: Tensor) -> Tensor:
@@ -123,7 +127,7 @@ class SensorNoise(EpisodeErrors):
             )
         if self.true_key is not None and not self._comes_before(self.true_key):
             observation_spec[self.true_key] = leaf.clone()
-        for key in (self.out_keys[0], self.std_key):
+        for key in (self.out_keys[0], self.std_key, self.bias_key):
             observation_spec[key] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
         shape = (*observation_spec.shape, 1)
         observation_spec[self.stream_key] = Unbounded(shape, device=leaf.device, dtype=torch.int64)

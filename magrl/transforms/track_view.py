@@ -27,6 +27,8 @@ from magrl.transforms.scaling import MinMaxNorm
 from magrl.transforms.track import OUT_KEYS, TrackGradient
 
 OBSERVATION_SIZE = 15
+DATA_SHEET = ("sensor_std", "bias_std")
+"""What a vehicle is told of its readings: the standard deviations of their new errors, and of constant or slow ones."""
 _STD_UNITS = (1.0, 1.0, 100.0)
 _LEAST_STD = 0.002
 
@@ -229,8 +231,8 @@ class TrackView:
         check_number(0, math.pi, above=True, max_turn_rad=self.max_turn_rad)
 
     def observation_transforms(self) -> list[Transform]:
-        """Return the transforms from the public keys and ``sensor_std`` to ``observation`` ``(..., 15)``."""
-        keys = ("field", "target_field", "move", "heading", "sensor_std")
+        """Return the transforms from the public keys and :data:`DATA_SHEET` to ``observation`` ``(..., 15)``."""
+        keys = ("field", "target_field", "move", "heading", *DATA_SHEET)
         track = TrackGradient(keys, range_km=self.range_km, frame="vehicle")
         return [track, TrackObservation(zeta=self.zeta, max_steps=self.max_steps)]
 

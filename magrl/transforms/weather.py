@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from numbers import Real
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from magrl.checks import check_number, check_type
+from magrl.checks import check_number, check_tensor, check_type
 from magrl.field.elements import field_vector, measured_elements
 from magrl.field.weather import WeatherRecord, weather_record
 from magrl.transforms.base import (
@@ -40,7 +41,7 @@ class MagneticWeather(EpisodeErrors):
     Each episode starts at a minute of the record that is a pure function of (seed, vehicle, episode). A step takes
     ``distance / speed + reading_s``. The variation of the minute in which the step ends is added to the field vector;
     between the minutes of the record nothing is interpolated. All vehicles of a batch are in the weather of the record,
-    wherever they are.
+    wherever they are. The vehicle is told its size: ``bias_std`` grows by the root mean square of the variation.
 
     ``field`` becomes what is measured, and ``true_field`` what it was: arrival, objective and reward belong to the
     environment and know no weather. In ``Compose``, the weather stands before the errors of the sensors.
@@ -57,6 +58,7 @@ class MagneticWeather(EpisodeErrors):
         out_keys: the measured elements ``(..., 3)``, in place by default.
         true_key: key of the elements without weather, if no transform before this one has written it. Privileged: a
             policy must not read it.
+        bias_key: key of the standard deviations of the elements' constant and slow errors ``(..., 3)``.
         clock_key: key of the state ``(..., 2)``, float64: the minute of the record in which the episode started, and
             the minutes since then. Privileged.
         seed: seed of the starts. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
@@ -89,6 +91,7 @@ class MagneticWeather(EpisodeErrors):
         in_keys: Keys = ("field", "move"),
         out_keys: NestedKey | Keys = ("field",),
         true_key: NestedKey = "true_field",
+        bias_key: NestedKey = "bias_std",
         clock_key: NestedKey = "weather_clock",
         seed: int = 0,
     ) -> None:
@@ -99,9 +102,10 @@ class MagneticWeather(EpisodeErrors):
         check_number(0, above=True, speed_km_h=speed_km_h)
         check_number(0, reading_s=reading_s)
         self.speed_km_h, self.reading_s, self.span_h = float(speed_km_h), float(reading_s), span_h
-        self.true_key, self.clock_key = true_key, clock_key
+        self.true_key, self.bias_key, self.clock_key = true_key, bias_key, clock_key
         self._known = None if span_h is None else (self.record.starts(span_h), float(span_h))
         self.register_buffer("variation", self.record.variation, persistent=False)
+        self.mean_squares = self.record.mean_squares()
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Attach to an environment, from which the longest time of an episode follows where it is not given."""
@@ -152,7 +156,32 @@ class MagneticWeather(EpisodeErrors):
         field, minute = values[0], self._written(next_tensordict, self.clock_key).sum(-1).long()
         vector = field_vector(field.double()) + self.variation[minute]
         self._keep(next_tensordict, self.true_key, field)
+        self._tell(next_tensordict, self.bias_key, self.variances(field)[1])
         return next_tensordict.set(self.out_keys[0], measured_elements(vector).to(field.dtype))
+
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the variances that the vehicle is told of a reading: of new errors, and of constant and slow ones.
+
+        Args:
+            field: ``(..., E)`` reading.
+
+        Returns:
+            Both ``(..., E)``.
+
+        Example:
+            >>> weather = MagneticWeather("disturbed", speed_km_h=24.0)
+            >>> weather.variances(torch.tensor([0.0, 60.0, 24000.0]))[1].sqrt()
+            tensor([ 0.0694,  0.0421, 40.1754])
+        """
+        check_tensor(3, field=field)
+        horizontal, declination = field[..., 2], torch.deg2rad(field[..., 0])
+        dip, (north, east, down) = torch.deg2rad(field[..., 1]), self.mean_squares
+        cos, sin = torch.cos(declination).square(), torch.sin(declination).square()
+        along, across = north * cos + east * sin, east * cos + north * sin  # of the horizontal field
+        turned = along * torch.sin(dip).square() + down * torch.cos(dip).square()
+        per_radian = math.degrees(1) / horizontal
+        angles = across * per_radian.square(), turned * (per_radian * torch.cos(dip)).square()
+        return torch.zeros_like(field), torch.stack((*angles, along.expand_as(horizontal)), -1)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Measure the elements of a TensorDict that holds the clock."""
@@ -171,7 +200,8 @@ class MagneticWeather(EpisodeErrors):
         self._limits()  # an error before the first episode
         if not self._comes_before(self.true_key):
             observation_spec[self.true_key] = leaf.clone()
-        observation_spec[self.out_keys[0]] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
+        for key in (self.out_keys[0], self.bias_key):
+            observation_spec[key] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
         clock = Unbounded((*leaf.shape[:-1], 2), device=leaf.device, dtype=torch.float64)
         observation_spec[self.clock_key] = clock
         return observation_spec

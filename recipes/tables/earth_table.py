@@ -65,6 +65,8 @@ class Config:
     """Random seed of regions, tasks, start headings and noise; no training uses it."""
     date: tuple[str, ...] = ("2025-01-01",)
     """Dates of the field, 1900 to 2030 (IGRF-14); of several, the first column of the table has the date."""
+    crust: bool = False
+    """Whether the field is that of WMMHR-2025 (degree 133), with the crust, in place of IGRF; up to 500 km."""
     map_date: str | None = None
     """Date of the map of map_matching, as 2015-01-01; by default its map is the field itself."""
 
@@ -73,8 +75,11 @@ def earth(config: Config, date: str) -> Scenario:
     """Return frozen tasks in random regions of the Earth at a date, large enough for the longest distance."""
     far = config.distance_km[1] > 500
     size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"half_size_deg": 10, "max_latitude": 70}
+    if config.crust and far:
+        raise UsageError(f"with the crust, distances reach up to 500 km, got {config.distance_km[1]:g}")
     seed = 3 * paper.FIRST_RESERVED_SEED + config.seed  # beyond those of trainings and of frozen sets
-    scenario = earth_scenario(config.regions, seed, date, distance_range_km=config.distance_km, **size)
+    options = {"distance_range_km": config.distance_km, "crust": config.crust, **size}
+    scenario = earth_scenario(config.regions, seed, date, **options)
     return scenario.with_tasks(scenario.random_tasks(config.tasks, seed))
 
 
