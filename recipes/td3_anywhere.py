@@ -215,7 +215,6 @@ def train(config: Config) -> dict[str, float]:
         )
         stats = run.statistics
         for batch in run.batches():
-            batch["next", "terminated"] = batch["next", "done"]  # time is observed: its limit ends an episode for good
             buffer.extend(batch.reshape(-1).select(*TRANSITION))
             noise.step()
             rate = config.linear("learning_rate", run.remaining)
