@@ -30,7 +30,7 @@ train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two c
 fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; seconds
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" $(ARGS)
 
-anywhere: $(VENV)/.installed  ## train the agent without a map; about 20 minutes on one core
+anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; 15 minutes on one core
 	OMP_NUM_THREADS=1 $(RECIPE)/td3_anywhere.py --preset far $(ARGS)
 
 test: $(VENV)/.installed-dev  ## run the fast tests, one process per core with one thread each
