@@ -16,6 +16,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each ot
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
@@ -33,7 +34,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scena
 from magrl.training import Run, RunConfig, command, parse_config
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, Discount, NonNegative, Positive, PositiveShare, Widths
-from magrl.transforms import DetourReward, RandomSensorNoise, SensorNoise, TrackView, TrueWay
+from magrl.transforms import DetourReward, RandomSensorNoise, SensorNoise, TrackView, TrueWay, sensor_levels
 
 RECIPE = "td3_anywhere.py"
 OBSERVED = ("observation", "true_way_scaled")
@@ -63,6 +64,9 @@ class Config(RunConfig):
     """Prior standard deviation of the way to the destination along each axis [km]."""
     step_cost: NonNegative = 0.02
     """Penalty for each move; arriving is worth 10, and a detour as long as the task costs 10."""
+
+    noise_exponent: Positive = 1.5
+    """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
 
     # Networks
     num_cells: Widths = (128, 128, 128)
@@ -119,13 +123,15 @@ class Config(RunConfig):
 
 
 FAST = Config()
-FAR = Config(preset="far", total_frames=2_048_000, distance_range_km=(150.0, 1800.0), max_steps=120, range_km=1000.0)
+_LONG: dict[str, Any] = {"distance_range_km": (150.0, 1800.0), "range_km": 1000.0, "max_steps": 120}
+FAR = Config(preset="far", **_LONG, total_frames=2_048_000, step_cost=0.08, noise_exponent=1.0, gamma=0.985)
 PRESETS = {"fast": FAST, "far": FAR}
 
 
 def sensors(config: Config, seed: int) -> SensorNoise:
     """Return the noise of the sensors: that of the settings, or by default levels drawn for each episode."""
-    return SensorNoise(config.noise, seed=seed) if any(config.noise) else RandomSensorNoise(seed=seed)
+    levels = partial(sensor_levels, exponent=config.noise_exponent)
+    return SensorNoise(config.noise, seed=seed) if any(config.noise) else RandomSensorNoise(levels, seed=seed)
 
 
 def make_view(base: GeomagneticNavEnv, range_km: float) -> TrackView:
@@ -215,7 +221,6 @@ def train(config: Config) -> dict[str, float]:
         )
         stats = run.statistics
         for batch in run.batches():
-            batch["next", "terminated"] = batch["next", "done"]  # time is observed: its limit ends an episode for good
             buffer.extend(batch.reshape(-1).select(*TRANSITION))
             noise.step()
             rate = config.linear("learning_rate", run.remaining)

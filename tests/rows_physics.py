@@ -569,7 +569,10 @@ TRANSFORMS: Rows = {
         refused(lambda: transforms.with_conditions(5, "sledge"), ValueError, "'sledge'", "ship"),
         refused(lambda: transforms.with_conditions(5, 5), TypeError, "conditions", "5"),
     ],
-    "transforms.sensor_levels": bad_vectors(transforms.sensor_levels, "uniform", 7),
+    "transforms.sensor_levels": [
+        *bad_vectors(transforms.sensor_levels, "uniform", 7),
+        *bad_numbers(lambda exponent: transforms.sensor_levels(zeros(7), exponent), exponent=(0.0, -1.0, NAN, "a")),
+    ],
     "transforms.with_sensor_noise": [
         refused(lambda: transforms.with_sensor_noise(5, (0.1, -1.0)), ValueError, "std", "(0.1, -1.0)"),
         refused(lambda: transforms.with_sensor_noise(5, (0.1,)), TypeError, "env", "5"),

@@ -295,6 +295,8 @@ def test_levels_by_hand() -> None:
     factor = 10**0.4
     expected = [[0, 0, 0], [0.02, 0.02, 2.0], [0.002 / factor, 0.002 * factor, 0.2], [0.8, 0.2, 20]]
     torch.testing.assert_close(sensor_levels(uniform), torch.tensor(expected, dtype=torch.float64))
+    uniform[1, 1] = 0.5
+    torch.testing.assert_close(sensor_levels(uniform, 1.0), torch.tensor(expected, dtype=torch.float64))
 
 
 def test_random_noise_has_the_level_of_its_episode() -> None:

@@ -176,29 +176,32 @@ class RandomSensorNoise(SensorNoise):
         return self.levels(stream_uniform(stream, self.draws))
 
 
-def sensor_levels(uniform: Tensor) -> Tensor:
+def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
     """Return standard deviations of D [deg], I [deg] and B_H [nT] from perfect sensors to poor ones.
 
     In 15 % of cases there is no noise. Otherwise a common factor spans two decades up to 0.2 deg, 0.2 deg and 20 nT,
-    with as many cases above 0.04 deg as below. Each element has a factor of its own, log-uniform from 0.4 to 2.5,
+    half of them above 0.04 deg. Each element has a factor of its own, log-uniform from 0.4 to 2.5,
     and in 30 % of cases that of D is multiplied by a number from 1 to 7, as where the north reference is poor.
 
     Args:
         uniform: ``(..., 7)`` uniform numbers in [0, 1).
+        exponent: of the uniform number in the logarithm of the common factor: with 1 it is log-uniform, with half of
+            the cases above 0.02 deg; the larger, the more noise.
 
     Returns:
         ``(..., 3)``.
 
     Raises:
-        ValueError: for another number of uniform numbers.
+        ValueError: for another number of uniform numbers, or an exponent that is not above 0.
 
     Example:
         >>> sensor_levels(torch.tensor([0.5, 0.0, 0.5, 0.5, 0.5, 0.5, 0.5]))
         tensor([ 0.2000,  0.2000, 20.0000])
     """
     check_tensor(7, uniform=uniform)
+    check_number(0, above=True, exponent=exponent)
     none, common, poor, factor = (uniform[..., k : k + 1] for k in (0, 1, 5, 6))
-    level = 10 ** (-2 * common**1.5) * 10 ** (0.8 * uniform[..., 2:5] - 0.4) * uniform.new_tensor((0.2, 0.2, 20.0))
+    level = 10 ** (-2 * common**exponent) * 10 ** (0.8 * uniform[..., 2:5] - 0.4) * uniform.new_tensor((0.2, 0.2, 20.0))
     declination = torch.where(poor < 0.3, 1 + 6 * factor, 1.0)
     level = level * torch.cat((declination, torch.ones_like(uniform[..., :2])), -1)
     return torch.where(none < 0.15, 0.0, level)
