@@ -58,7 +58,7 @@ class GeomagneticNavEnv(EnvBase):
         num_envs: number of vehicles in the batch.
         max_steps: moves after which an episode is truncated.
         max_move_km: longest move [km].
-        drift_km: how much farther errors of motion may carry a vehicle [km]; see :class:`~magrl.transforms.MotionError`.
+        drift_km: how much farther a :class:`~magrl.transforms.MotionError` may carry a vehicle [km].
         max_turn_rad: largest turn to either side before a move [rad].
         zeta: arrival threshold on the objective, below 3, its largest value at the start.
         arrival: ``"objective"`` for the paper's rule, or ``"declared"``: the action has a third number, in [-1, 1], and
