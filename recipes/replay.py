@@ -91,7 +91,7 @@ def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], s
         available = len(scenario.tasks.start)
         count = min(DEFAULT_TASKS, available) if config.num_tasks is None else config.num_tasks
         zeta = run_config(config.run).get("zeta", DEFAULT_ZETA) if config.zeta is None else config.zeta
-        base = make_env(first_tasks(scenario, count), zeta, config.seed, run.start_heading)
+        base = make_env(first_tasks(scenario, count), zeta, config.seed, start_heading=run.start_heading)
         env = with_sensor_noise(base, run.noise, config.seed)
         texts = (f"{run.kind or 'gg_td3'}={config.run}", *config.navigators)
         made = {text: make_navigator(text, base, seed=config.seed, noise=run.noise) for text in texts}

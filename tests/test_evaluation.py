@@ -264,6 +264,7 @@ def test_only_bad_usage_is_shown_in_one_line(evaluate, tmp_path: Path, monkeypat
 
 def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, capsys) -> None:
     cases = {
+        "conditions_table": (["dowsing"], "unknown navigator 'dowsing'"),
         "earth_table": ([], "name at least one navigator"),
         "globe": (
             ["--tasks", "0", "--table", str(tmp_path / "a"), "--figure", str(tmp_path / "b")],

@@ -118,6 +118,7 @@ def test_settings_say_what_was_flown(tmp_path: Path) -> None:
         "start_heading": "north",
         "mode": "look-ahead",
         "map_date": None,
+        "conditions": None,
         "seed": 2,
     }
     lines = (tmp_path / "noisy" / "table.md").read_text().splitlines()

@@ -130,7 +130,7 @@ def test_weights_are_those_of_the_first_reading_of_each_row() -> None:
     td = env.rollout(3, break_when_any_done=False)[:, -1]["next"]
     chosen = torch.tensor([True, False, False, True])
     after = env.reset(td.clone().set("_reset", chosen.unsqueeze(-1)))
-    first = observe(after.select(*VIEW.in_keys, "sensor_std"))
+    first = observe(after.select(*VIEW.in_keys, "sensor_std", "bias_std"))
     for key in ("observation", "first_field"):
         assert torch.equal(after[key][~chosen], td[key][~chosen]), key
         torch.testing.assert_close(after[key][chosen], first[key][chosen], rtol=1e-5, atol=1e-4, msg=key)
