@@ -68,7 +68,8 @@ class MapMatching(Navigator):
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> env.rollout(50, MapMatching(env.field, env.edge))["next", "success"].any(1).flatten()
+        >>> rollout = env.rollout(50, MapMatching(env.field, env.edge), break_when_any_done=False)
+        >>> rollout["next", "success"].any(1).flatten()
         tensor([True, True])
     """
 
@@ -296,8 +297,8 @@ def aged_error(scenario: Scenario, date: Date) -> tuple[float, float, float]:
     """Return the standard deviations of D, I [deg], B_H [nT] that a map of another date has in a scenario.
 
     Example:
-        >>> [round(std, 2) for std in aged_error(Scenario(date="2025-01-01", generation=14), "2015-01-01")]
-        [1.0, 1.0, 390.11]
+        >>> [round(std) for std in aged_error(Scenario(date="2025-01-01", generation=14), "2015-01-01")]
+        [1, 1, 390]
     """
     years = abs((parse_date(scenario.date) - parse_date(date)).days) / 365.25
     d, i, b_h = SECULAR_VARIATION

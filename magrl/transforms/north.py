@@ -77,7 +77,7 @@ class NorthReferenceError(EpisodeErrors):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> error = NorthReferenceError(2.0, fixed=True)
         >>> state = TransformedEnv(GeomagneticNavEnv(num_envs=1, seed=0), error).reset()
-        >>> state["heading"].rad2deg().round(), (state["field"] - state["true_field"])[0, 0]
+        >>> state["heading"].rad2deg().round(), (state["field"] - state["true_field"])[0, 0].round()
         (tensor([[-2.]]), tensor(-2.))
     """
 
