@@ -1,7 +1,8 @@
 """The paper's equations as pure functions of tensors: objective, rewards and the parallel approach.
 
 Shapes broadcast over leading dimensions; angles are in radians clockwise from true north unless a name says
-otherwise; the last dimension of a ``field`` is the element (D [deg], I [deg], B_H [nT]).
+otherwise; the last dimension of a ``field`` is the element (D [deg], I [deg], B_H [nT]), and differences in D, the
+first, are taken the shorter way around.
 
 Types and shapes are checked. Values are not, because the functions run in every step: NaN in gives NaN out, except in
 :func:`parallel_approach`, whose mask is False there.
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from magrl.checks import check_tensor
+from magrl.field.elements import element_difference
 from magrl.geodesy import wrap_angle
 
 OBJECTIVE_FLOORS = (0.05, 0.4, 15.0)
@@ -40,7 +42,7 @@ def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Te
         tensor([0.2500, 4.0000])
     """
     _check_elements(field=field, target_field=target_field, floors=floors)
-    return (target_field - field).abs().maximum(floors).square().reciprocal()
+    return element_difference(target_field, field).abs().maximum(floors).square().reciprocal()
 
 
 def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
@@ -62,7 +64,7 @@ def objective(field: Tensor, target_field: Tensor, weights: Tensor) -> Tensor:
         tensor([0.2500])
     """
     _check_elements(field=field, target_field=target_field, weights=weights)
-    return (weights * (target_field - field).square()).sum(-1, keepdim=True)
+    return (weights * element_difference(target_field, field).square()).sum(-1, keepdim=True)
 
 
 def destination_reward(arrived: Tensor, weight: float) -> Tensor:

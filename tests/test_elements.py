@@ -10,6 +10,7 @@ from magrl.field.elements import (
     NAMES,
     UNITS,
     Elements,
+    element_difference,
     element_index,
     elements_gradient,
     elements_jacobian,
@@ -88,6 +89,14 @@ def test_paper_example_has_a_negative_inclination():
 def test_field_vector_worked_by_hand():
     found = field_vector(f64(30.0, -45.0, 20000.0))
     torch.testing.assert_close(found, f64(10000 * math.sqrt(3), 10000.0, -20000.0), rtol=1e-14, atol=0)
+
+
+def test_differences_in_declination_are_wrapped_and_others_are_not_rounded():
+    here, there = torch.rand(2, 1000, 3, generator=torch.Generator().manual_seed(0)) * 180 - 90
+    assert torch.equal(element_difference(here, there), here - there)
+    turned = element_difference(here.double() + f64(360.0, 0, 0), there.double())
+    torch.testing.assert_close(turned, here.double() - there.double())
+    assert element_difference(f64(350.0, 200.0, 200.0), f64(0.0, 0.0, 0.0)).tolist() == [-10.0, 200.0, 200.0]
 
 
 def test_round_trip():

@@ -61,6 +61,13 @@ def test_objective_at_both_ends():
     assert float(objective(target, target, weights)) == 0.0
 
 
+def test_the_objective_takes_the_shorter_way_around_of_the_declination():
+    start, target = f64(178.0, -16.0, 35000.0), f64(-178.0, -16.0, 35000.0)
+    weights = objective_weights(start, target, FLOORS)
+    assert float(weights[0]) == pytest.approx(1 / 16)
+    assert float(objective(f64(-179.0, -16.0, 35000.0), target, weights)) == pytest.approx(1 / 16)
+
+
 def test_small_differences_are_floored():
     """A difference of half the floor counts as the floor, one of twice the floor as itself; none is infinite."""
     start = f64(8.0, -16.0, 35000.0)

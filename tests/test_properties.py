@@ -288,10 +288,11 @@ def test_the_units_of_an_element_do_not_matter(approach: tuple[Tensor, Tensor], 
     units = f64(one, two)
     difference = heading_of(error, gradient) - heading_of(error * units, gradient * units.unsqueeze(-1))
     assert abs(math.remainder(difference, 2 * math.pi)) < 1e-9
-    here, there, floors = torch.zeros(2, dtype=torch.float64), error, f64(0.01, 0.01)
+    there = torch.cat((f64(0.0), error))  # D, the first, is in degrees always
+    here, floors = torch.zeros_like(there), torch.full_like(there, 0.01)
     plain, scaled = (
         objective(0.3 * there * unit, there * unit, objective_weights(here, there * unit, floors * unit))
-        for unit in (f64(1, 1), units)
+        for unit in (f64(1, 1, 1), f64(1, one, two))
     )
     torch.testing.assert_close(scaled, plain)
 

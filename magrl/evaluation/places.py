@@ -12,6 +12,7 @@ from magrl.checks import check_tensor, check_type
 from magrl.envs import Region
 from magrl.envs.specs import field_bounds
 from magrl.field import FieldModel, elements_at, elements_gradient_at
+from magrl.field.elements import element_difference
 from magrl.geodesy import geodesic, move, wrap_longitude
 from magrl.navigators.base import displacement_to
 
@@ -194,5 +195,4 @@ def said(elements: Tensor) -> str:
 
 def _difference(field: FieldModel, elements: Tensor, place: Tensor) -> Tensor:
     """Return elements minus those at places, with D by the shorter way around."""
-    difference = elements.double() - elements_at(field, place)
-    return torch.cat((wrap_longitude(difference[..., :1]), difference[..., 1:]), -1)
+    return element_difference(elements.double(), elements_at(field, place))

@@ -101,6 +101,27 @@ def measured_elements(b_ned: Tensor) -> Tensor:
     return torch.cat((angles, horizontal.unsqueeze(-1)), -1)
 
 
+def element_difference(elements: Tensor, others: Tensor) -> Tensor:
+    """Return D, I, B_H minus others, that of D by the shorter way around.
+
+    Args:
+        elements: ``(..., E)`` with D [deg] first.
+        others: ``(..., E)``.
+
+    Returns:
+        ``(..., E)``: D in [-180, 180]; what is there already is not rounded.
+
+    Example:
+        >>> element_difference(torch.tensor([179.0, 10.0, 30000.0]), torch.tensor([-179.0, 9.0, 29000.0]))
+        tensor([  -2.,    1., 1000.])
+    """
+    check_tensor(elements=elements, others=others)
+    difference = elements - others
+    declination = difference[..., 0]
+    declination -= 360 * torch.round(declination / 360)  # a view: the difference changes with it
+    return difference
+
+
 def field_vector(elements: Tensor) -> Tensor:
     """Return the field vector of D, I, B_H: the inverse of :func:`measured_elements`.
 

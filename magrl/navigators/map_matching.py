@@ -8,13 +8,12 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torch.nn.functional import max_pool2d
 
 from magrl import geodesy
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs import Region, Regions, Scenario
 from magrl.field import Date, FieldBank, FieldModel, RegionalField, elements_at, igrf_coefficients, parse_date
-from magrl.field.elements import elements_gradient, measured_elements
+from magrl.field.elements import element_difference, elements_gradient, measured_elements
 from magrl.navigators.base import Navigator, displacement_to, steer
 from magrl.navigators.secant import SLOPES
 
@@ -24,7 +23,7 @@ SECULAR_VARIATION = (0.1, 0.1, 39.0)
 """Root mean square change per year of D, I [deg], B_H [nT] in regions of the Earth, 2015 to 2025 (IGRF-14)."""
 GRID_POINTS = 41
 """Points of the grid along each side of the region, on which the inversion of the map starts."""
-NEWTON_STEPS = 25
+NEWTON_STEPS = 8
 LONGEST_STEP_KM = 200.0
 PRIOR_KM = 1000.0
 """Prior standard deviation of a position along each axis [km]."""
@@ -173,16 +172,14 @@ class MapMatching(Navigator):
         return self._corrected(position, prior, elements, std, region)
 
     def _lowest(self, elements: Tensor, std: Tensor, region: Tensor) -> Tensor:
-        """Return the points of the grid ``(P, H, 2)`` where the error is lower than at their neighbors, lowest first.
+        """Return the points of the grid ``(P, H, 2)`` where the error is lowest, lowest first.
 
         The error is divided by its standard deviation, and by the change of the elements from point to point.
         """
         side = (self.box[region, 1, 0] - self.box[region, 0, 0]) * _DEGREE_KM / (GRID_POINTS - 1)
         spread = torch.hypot(std, side.unsqueeze(-1) * std.new_tensor(SLOPES))[:, None, None]
-        away = difference(elements[:, None, None], self.grid_elements[region]) / spread
-        height = away.square().sum(-1)
-        lower = -max_pool2d(-height.unsqueeze(1), 3, 1, 1).squeeze(1)
-        height = torch.where(height > lower, torch.inf, height).flatten(1)
+        away = element_difference(elements[:, None, None], self.grid_elements[region]) / spread
+        height = away.square().sum(-1).flatten(1)
         rows = height.topk(self.hypotheses, largest=False).indices
         return self.grid[region].gather(1, rows.unsqueeze(-1).expand(-1, -1, 2))
 
@@ -200,7 +197,7 @@ class MapMatching(Navigator):
         """Return elements minus those of the map ``(P, H, 3)`` and its gradient ``(P, H, 3, 2)``, both over ``std``."""
         index = (region.unsqueeze(-1).expand(position.shape[:-1]),) if self.many else ()
         value, gradient = self.map.value_and_gradient(*position.unbind(-1), *index)
-        residual = difference(elements.unsqueeze(1), measured_elements(value))
+        residual = element_difference(elements.unsqueeze(1), measured_elements(value))
         return residual / std, elements_gradient(value, gradient) / std.unsqueeze(-1)
 
     def _moved(self, position: Tensor, heading: Tensor, distance_km: Tensor, region: Tensor) -> Tensor:
@@ -245,17 +242,6 @@ def update(covariance: Tensor, jacobian: Tensor, residual: Tensor) -> tuple[Tens
     kept = torch.eye(2, dtype=gain.dtype, device=gain.device) - gain @ jacobian
     misfit = (residual * solved[..., 2]).sum(-1)
     return (gain @ sides).squeeze(-1), kept @ covariance @ kept.mT + gain @ gain.mT, misfit
-
-
-def difference(elements: Tensor, others: Tensor) -> Tensor:
-    """Return D, I, B_H ``(..., 3)`` minus others, that of D the shorter way around.
-
-    Example:
-        >>> difference(torch.tensor([179.0, 10.0, 30000.0]), torch.tensor([-179.0, 9.0, 29000.0]))
-        tensor([  -2.,    1., 1000.])
-    """
-    declination, rest = (elements - others).split((1, 2), -1)
-    return torch.cat((geodesy.wrap_longitude(declination), rest), -1)
 
 
 def best(position: Tensor, misfit: Tensor) -> Tensor:
