@@ -8,6 +8,7 @@ import evaluate
 import fly
 import pytest
 import torch
+from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
@@ -16,6 +17,7 @@ from magrl.agents.pretrained import load_pretrained
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
+from magrl.field.elements import field_vector
 from magrl.navigators import Kalman
 from magrl.training import UsageError
 from magrl.transforms import (
@@ -29,6 +31,8 @@ from magrl.transforms import (
     VectorErrors,
     with_conditions,
 )
+from magrl.transforms.errors import TYPICAL_FIELD
+from magrl.transforms.sensor_errors import OUTAGE_STD
 
 ERRORS = [name for name in CONDITIONS if name != "laboratory"]
 
@@ -62,12 +66,42 @@ def test_an_environment_that_is_too_small_is_refused() -> None:
         with_conditions(nav(2), "ship")
 
 
+class TypicalField(nn.Module):
+    """The field that data sheets are stated for, everywhere."""
+
+    def forward(self, latitude: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        return field_vector(torch.tensor(TYPICAL_FIELD, dtype=torch.float64)).expand(*latitude.shape, 3)
+
+
 @pytest.mark.parametrize("name", ERRORS)
 def test_what_is_told_is_the_size_of_the_errors(name: str) -> None:
-    state = under(name, 4000).reset()
+    env = under(name, 4000)
+    env.base_env.field = TypicalField()
+    state = env.reset()
     error = state["field"] - state["true_field"]
     told = (state["sensor_std"].square() + state["bias_std"].square()).sqrt()
-    torch.testing.assert_close((error / told).square().mean(0).sqrt(), torch.ones(3), rtol=0.12, atol=0)
+    # The components of the weather are taken as independent, which those of the record are not.
+    torch.testing.assert_close((error / told).square().mean(0).sqrt(), torch.ones(3), rtol=0.2, atol=0)
+
+
+EVERY_ERROR = Conditions(
+    "own",
+    sensors={"scale": (0.01,) * 3, "outage_rate": 0.3, "vector": VectorErrors((10.0,) * 3, attitude_deg=(0.1, 0.1))},
+    north="marine",
+    weather={"record": "disturbed"},
+)
+
+
+@pytest.mark.parametrize("conditions", [*(CONDITIONS[name] for name in ERRORS), EVERY_ERROR], ids=lambda one: one.name)
+def test_what_is_told_is_the_same_everywhere(conditions: Conditions) -> None:
+    """If it depended on the true field, a policy could compute that field from it."""
+    rollout = with_conditions(nav(20, conditions.drift_km(50.0)), conditions).rollout(3)
+    white, slow = (rollout[key].flatten(0, 1) for key in ("sensor_std", "bias_std"))
+    read = white[:, 1] < OUTAGE_STD
+    assert 20 <= read.sum() < (55 if conditions is EVERY_ERROR else 61)
+    for told, expected in ((white[read], conditions.sensor_std), (slow, conditions.bias_std)):
+        torch.testing.assert_close(told, torch.tensor(expected).expand_as(told))
+        assert len(told.unique(dim=0)) == 1
 
 
 def test_the_variances_of_all_errors_add_up() -> None:

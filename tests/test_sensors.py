@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import copy
 import math
-import pickle
 from collections.abc import Callable
 from functools import cache, partial
 
 import pytest
 import torch
+from conformance import Conformance
 from scipy import stats
 from tensordict import TensorDict, TensorDictBase
 from test_docs import ENVIRONMENT, check_rows, table_rows
 from test_transforms import PlaneEnv, nested, parallel
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, EnvBase, SerialEnv, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from magrl.agents import FieldPolicy
@@ -75,30 +74,8 @@ cases = pytest.mark.parametrize(("base", "make"), CASES.values(), ids=CASES.keys
 
 
 @cases
-class TestConformance:
-    def test_single_trans_env_check(self, base, make) -> None:
-        check_env_specs(TransformedEnv(base(), make()), break_when_any_done="both")
-
-    def test_serial_trans_env_check(self, base, make) -> None:
-        check_env_specs(SerialEnv(2, lambda: TransformedEnv(base(), make())))
-
-    def test_trans_serial_env_check(self, base, make) -> None:
-        check_env_specs(TransformedEnv(SerialEnv(2, base), make()))
-
-    def test_copies(self, base, make) -> None:
-        env = TransformedEnv(base(), make())
-        env.rollout(2)
-        check_env_specs(copy.deepcopy(env))
-        check_env_specs(TransformedEnv(base(), env.transform.clone()))
-        check_env_specs(TransformedEnv(base(), pickle.loads(pickle.dumps(make()))))
-
-    def test_parent_specs_are_not_mutated(self, base, make) -> None:
-        plain = base()
-        before = plain.specs.clone()
-        env = TransformedEnv(plain, make())
-        env.rollout(2)
-        assert env.specs != before
-        assert plain.specs == before
+class TestConformance(Conformance):
+    """Of each case."""
 
 
 @pytest.mark.parametrize("inside", [True, False])

@@ -12,15 +12,12 @@ import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_type
-from magrl.transforms.errors import EpisodeErrors
+from magrl.transforms.errors import TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.motion import MotionError
 from magrl.transforms.north import NorthReferenceError, north_reference
 from magrl.transforms.sensor_errors import SensorErrors
 from magrl.transforms.vector_errors import VectorErrors
 from magrl.transforms.weather import SPEEDS_KM_H, MagneticWeather
-
-TYPICAL_FIELD = (0.0, 60.0, 24000.0)
-"""D [deg], I [deg], B_H [nT] at middle latitudes, for data sheets that depend on the field."""
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 
 from magrl.checks import check_number, check_numbers
-from magrl.transforms.base import Keys, ObservationTransform, observed_spec
+from magrl.transforms.base import Keys, ObservationTransform, observed_spec, with_state
 from magrl.transforms.counters import advanced, counter_stream, split
 
 TRUE_KEYS = (
@@ -34,6 +35,13 @@ TRUE_KEYS = (
     "weather_clock",
 )
 """Keys of the errors that a policy may not read: what is true, the errors, and the states of their random numbers."""
+
+TYPICAL_FIELD = (10.0, 60.0, 24000.0)
+"""D [deg], I [deg], B_H [nT] at middle latitudes, for which data sheets state the errors that depend on the field.
+
+What a vehicle is told is the same everywhere. Stated for the true field, or for a reading to which an error is still
+added, it would give that field or that reading away.
+"""
 
 
 class EpisodeErrors(ObservationTransform):
@@ -113,11 +121,11 @@ class EpisodeErrors(ObservationTransform):
         if key is not None and not self._comes_before(key):
             tensordict.set(key, value)
 
-    def _tell(self, tensordict: TensorDictBase, key: NestedKey, variance: Tensor) -> None:
-        """Write a standard deviation that the vehicle is told; the variance is added to that of transforms before."""
-        if self._comes_before(key):
-            variance = variance + tensordict[key].square()
-        tensordict.set(key, variance.sqrt())
+    def _tell(self, tensordict: TensorDictBase, key: NestedKey, std: Tensor, reading: Tensor) -> None:
+        """Write standard deviations ``(E,)`` that the vehicle is told; their squares add to those written before."""
+        std = std.to(reading.dtype)
+        told = torch.hypot(tensordict[key], std) if self._comes_before(key) else std.expand_as(reading).clone()
+        tensordict.set(key, told)
 
     def _written(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         value = tensordict.get(key, None)
@@ -129,6 +137,19 @@ class EpisodeErrors(ObservationTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Raise an error: the errors of an episode begin with its reset."""
         raise NotImplementedError(f"{type(self).__name__} needs an environment: append it to a TransformedEnv")
+
+    @property
+    def _state_keys(self) -> list[NestedKey]:
+        """Keys of this transform's observations that its next step reads."""
+        return [self.stream_key]
+
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Make what a step reads part of the state, so that environments in other processes pass it to the step."""
+        input_spec = super().transform_input_spec(input_spec)
+        if self.parent is None:
+            return input_spec
+        observed = self.transform_observation_spec(observed_spec(self).clone())
+        return with_state(input_spec, {key: observed[key] for key in self._state_keys})
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
         saved = state_dict.get(f"{prefix}streams")

@@ -6,12 +6,13 @@ import math
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, TensorSpec, Unbounded
 
 from magrl.checks import check_number
 from magrl.geodesy import local_frame, wrap_angle
-from magrl.transforms.base import Keys, observed_spec, several_keys, with_state
+from magrl.transforms.base import Keys, observed_spec, several_keys
 from magrl.transforms.counters import NORMAL_LIMIT, advanced, counter_stream, normal_of, stream_normal, stream_uniform
 from magrl.transforms.errors import EpisodeErrors, check_sizes
 
@@ -222,6 +223,10 @@ class MotionError(EpisodeErrors):
         observation_spec[self.stream_key] = Unbounded(heading.shape, device=heading.device, dtype=torch.int64)
         return observation_spec
 
+    @property
+    def _state_keys(self) -> list[NestedKey]:
+        return [*super()._state_keys, self.error_key]
+
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make what a step reads part of the state, and check that the environment allows the farthest move.
 
@@ -231,8 +236,7 @@ class MotionError(EpisodeErrors):
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
-        observed = self.transform_observation_spec(observed_spec(self).clone())
-        action, move = input_spec["full_action_spec"][self.action_key], observed[self.in_keys[0]]
+        action, move = input_spec["full_action_spec"][self.action_key], observed_spec(self)[self.in_keys[0]]
         if isinstance(action, Bounded) and isinstance(move, Bounded):
             commanded, allowed = (float(spec.space.high[..., 0].max()) for spec in (action, move))
             farthest = self.farthest_km(commanded)
@@ -241,8 +245,7 @@ class MotionError(EpisodeErrors):
                     f"MotionError moves a vehicle by up to {farthest:.6g} km, the environment allows {allowed:.6g} km: "
                     f"create it with drift_km={math.ceil(100 * (farthest - commanded)) / 100}"
                 )
-        state = Composite({key: observed[key] for key in (self.error_key, self.stream_key)})
-        return with_state(input_spec, state)
+        return input_spec
 
 
 def eddy_waves(seed: int, wavelength_km: float) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,11 +10,12 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torch.nn.functional import pad
+from torchrl.data import TensorSpec, Unbounded
 
 from magrl.checks import check_number, check_tensor
 from magrl.geodesy import wrap_angle, wrap_longitude
-from magrl.transforms.base import Keys, observed_spec, several_keys, with_state
+from magrl.transforms.base import Keys, several_keys
 from magrl.transforms.counters import advanced, stream_normal
 from magrl.transforms.errors import EpisodeErrors, check_sizes, gauss_markov
 
@@ -113,6 +115,8 @@ class NorthReferenceError(EpisodeErrors):
         if drift_deg:
             check_number(0, above=True, drift_length_km=drift_length_km)
         self.sizes, self.drift_length_km, self.fixed = (constant_deg, drift_deg, random_deg), drift_length_km, fixed
+        told = torch.tensor([[random_deg], [math.hypot(constant_deg, drift_deg)]])
+        self.register_buffer("_told", told, persistent=False)
         self.true_heading_key, self.true_key, self.std_key = true_heading_key, true_key, std_key
         self.bias_key, self.rated_key, self.error_key = bias_key, rated_key, error_key
 
@@ -166,12 +170,13 @@ class NorthReferenceError(EpisodeErrors):
             tensordict.set(key, value)
         if self._comes_before(self.std_key):
             tensordict.set(self.rated_key, tensordict[self.std_key])
-        for told, variance in zip((self.std_key, self.bias_key), self.variances(field), strict=True):
-            self._tell(tensordict, told, variance)
+        of_elements = pad(self._told, (0, field.shape[-1] - 1))  # 0 but for D
+        for told, std in zip((self.std_key, self.bias_key), of_elements, strict=True):
+            self._tell(tensordict, told, std, field)
         return tensordict
 
     def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances that the vehicle is told of a reading: of new errors, and of constant and slow ones.
+        """Return the variances of the errors of a reading: of new errors, and of constant and slow ones.
 
         Args:
             field: ``(..., E)`` reading.
@@ -184,10 +189,8 @@ class NorthReferenceError(EpisodeErrors):
             (tensor([1., 0., 0.]), tensor([4., 0., 0.]))
         """
         check_tensor(field=field)
-        declination = torch.zeros_like(field)
-        declination[..., 0] = 1
-        constant, drift, random = (size * size for size in self.sizes)
-        return random * declination, (constant + drift) * declination
+        white, slow = pad(self._told.square(), (0, field.shape[-1] - 1)).to(field.dtype)
+        return white.expand_as(field), slow.expand_as(field)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Give the true heading to the environment, and their standard deviations to the transforms before this one."""
@@ -218,15 +221,10 @@ class NorthReferenceError(EpisodeErrors):
         observation_spec[self.stream_key] = Unbounded(heading.shape, device=heading.device, dtype=torch.int64)
         return observation_spec
 
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make what a step reads part of the state, so that environments in other processes pass it to the step."""
-        input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
-            return input_spec
-        observed = self.transform_observation_spec(observed_spec(self).clone())
-        state = [self.true_heading_key, self.error_key, self.stream_key]
-        state += [self.rated_key] if self._comes_before(self.std_key) else []
-        return with_state(input_spec, Composite({key: observed[key] for key in state}))
+    @property
+    def _state_keys(self) -> list[NestedKey]:
+        rated = [self.rated_key] if self._comes_before(self.std_key) else []
+        return [*super()._state_keys, self.true_heading_key, self.error_key, *rated]
 
 
 def _less(field: Tensor, error_deg: Tensor) -> Tensor:

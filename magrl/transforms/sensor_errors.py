@@ -12,9 +12,8 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.transforms.base import observed_spec, with_state
 from magrl.transforms.counters import advanced, normal_of, stream_normal, stream_uniform
-from magrl.transforms.errors import check_sizes, gauss_markov
+from magrl.transforms.errors import TYPICAL_FIELD, check_sizes, gauss_markov
 from magrl.transforms.sensors import SensorNoise
 from magrl.transforms.vector_errors import VectorErrors
 
@@ -32,12 +31,12 @@ class SensorErrors(SensorNoise):
 
     The vehicle is told the data sheets: ``sensor_std`` is that of the errors which are new at each reading (noise and
     rounding), during an outage :data:`OUTAGE_STD`; ``bias_std`` that of the constant and the slow ones. Both are roots
-    of sums of variances.
+    of sums of variances, at :data:`~magrl.transforms.errors.TYPICAL_FIELD`.
 
     Args:
         std: white noise.
         bias: constant error.
-        scale: error of the scale, as a share of the value.
+        scale: error of the scale, as a share of the value, where the elements are D, I, B_H.
         drift: slow drift.
         drift_length: its correlation length [unit of the distance in ``move_key``, or steps]; with ``drift`` alone.
         resolution: the reading is rounded to multiples of this; 0 for no rounding.
@@ -52,7 +51,7 @@ class SensorErrors(SensorNoise):
 
     Raises:
         ValueError: for sizes that are negative or of another number than ``std``, a rate outside [0, 1), a drift
-            without its length, or ``vector`` with other than three elements.
+            without its length, or ``scale`` or ``vector`` with other than three elements.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -97,12 +96,16 @@ class SensorErrors(SensorNoise):
             check_number(0, above=True, drift_length=drift_length)
         if vector is not None:
             check_type(VectorErrors, vector=vector)
-            if count != 3:
-                raise ValueError(f"vector acts on D, I and B_H, got {count} elements in std")
+        for name, given_errors in (("scale", any(sizes["scale"])), ("vector", vector is not None)):
+            if given_errors and count != 3:
+                raise ValueError(f"{name} acts on D, I and B_H, got {count} elements in std")
         self.drift_length, self.outage_rate, self.vector = drift_length, float(outage_rate), vector
         self.fixed, self.heading_key, self.move_key, self.error_key = fixed, heading_key, move_key, error_key
         self.register_buffer("_noise", torch.tensor(self.std), persistent=False)
         self.draws = 2 * count + (vector.draws if vector else 0)
+        field = torch.tensor(TYPICAL_FIELD if count == 3 else (0.0,) * count, dtype=torch.float64)
+        for name, variance in zip(("_white_std", "_slow_std"), self.variances(field), strict=True):
+            self.register_buffer(name, variance.sqrt().to(self._bias.dtype), persistent=False)
 
     # Data
 
@@ -148,15 +151,14 @@ class SensorErrors(SensorNoise):
         if self.rounded:
             step = self._resolution.to(dtype)
             reading = torch.where(step > 0, torch.round(reading / step) * step, reading)
-        white, slow = self.variances(reading)
-        std = white.sqrt()
+        std = self._white_std.to(dtype).expand_as(reading).clone()
         if self.outage_rate and not first:
             missing = uniform[..., -1:] < self.outage_rate
             reading, std = torch.where(missing, last, reading), torch.where(missing, OUTAGE_STD, std)
         self._keep(tensordict, self.true_key, value)
         tensordict.set(self.out_keys[0], reading)
         tensordict.set(self.std_key, std)
-        self._tell(tensordict, self.bias_key, slow)
+        self._tell(tensordict, self.bias_key, self._slow_std, reading)
         return tensordict.set(self.error_key, torch.cat((bias, scale, drift, reading, vector), -1))
 
     def _drifted(self, tensordict: TensorDictBase, drift: Tensor, normal: Tensor, first: bool) -> Tensor:
@@ -167,7 +169,7 @@ class SensorErrors(SensorNoise):
         return gauss_markov(drift, std, distance, float(self.drift_length or 0), normal)
 
     def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances that the vehicle is told of a reading: of new errors, and of constant and slow ones.
+        """Return the variances of the errors of a reading: of new errors, and of constant and slow ones.
 
         Args:
             field: ``(..., E)`` reading.
@@ -208,10 +210,6 @@ class SensorErrors(SensorNoise):
         observation_spec[self.error_key] = Unbounded(shape, device=reading.device, dtype=reading.dtype)
         return observation_spec
 
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make what a step reads part of the state, so that environments in other processes pass it to the step."""
-        input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
-            return input_spec
-        observed = self.transform_observation_spec(observed_spec(self).clone())
-        return with_state(input_spec, {self.error_key: observed[self.error_key]})
+    @property
+    def _state_keys(self) -> list[NestedKey]:
+        return [*super()._state_keys, self.error_key]

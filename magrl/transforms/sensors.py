@@ -14,7 +14,7 @@ from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.transforms.base import Keys, expect_keys, key_list, observed_spec, with_state
+from magrl.transforms.base import Keys, expect_keys, key_list
 from magrl.transforms.counters import advanced, stream_uniform
 from magrl.transforms.errors import EpisodeErrors
 
@@ -100,7 +100,8 @@ class SensorNoise(EpisodeErrors):
             return next_tensordict
         stream, std = (self._written(next_tensordict, key) for key in (self.stream_key, self.std_key))
         self._keep(next_tensordict, self.true_key, values[0])
-        self._tell(next_tensordict, self.bias_key, torch.zeros_like(values[0]))
+        if not self._comes_before(self.bias_key):
+            next_tensordict.set(self.bias_key, torch.zeros_like(values[0]))
         return next_tensordict.set(self.out_keys[0], self._reading(values[0], std, stream))
 
     def _reading(self, value: Tensor, std: Tensor, stream: Tensor) -> Tensor:
@@ -133,13 +134,9 @@ class SensorNoise(EpisodeErrors):
         observation_spec[self.stream_key] = Unbounded(shape, device=leaf.device, dtype=torch.int64)
         return observation_spec
 
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make what a step reads part of the state, so that environments in other processes pass it to the step."""
-        input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
-            return with_state(input_spec, {})
-        observed = self.transform_observation_spec(observed_spec(self).clone())
-        return with_state(input_spec, {key: observed[key] for key in (self.stream_key, self.std_key)})
+    @property
+    def _state_keys(self) -> list[NestedKey]:
+        return [*super()._state_keys, self.std_key]
 
 
 class RandomSensorNoise(SensorNoise):

@@ -97,17 +97,16 @@ class VectorErrors:
             ``(..., 3)``.
         """
         check_tensor(3, elements=elements)
-        angles = torch.deg2rad(elements[..., :2])
-        bearing = angles[..., :1] - heading  # of magnetic north from the bow
-        horizontal = elements[..., 2:]
-        level = torch.cat((torch.cos(bearing), torch.sin(bearing), torch.tan(angles[..., 1:])), -1) * horizontal
+        declination, inclination, horizontal = elements.unbind(-1)
+        bearing = torch.deg2rad(declination) - heading.squeeze(-1)  # of magnetic north from the bow
+        cos, sin, tan = torch.cos(bearing), torch.sin(bearing), torch.tan(torch.deg2rad(inclination))
+        level = torch.stack((cos, sin, tan), -1) * horizontal.unsqueeze(-1)
         matrix, offset = constants[..., :9].unflatten(-1, (3, 3)), constants[..., 9:]
-        forward, right, down = (level + (matrix * level.unsqueeze(-2)).sum(-1) + offset).unbind(-1)
-        cos, sin = torch.cos(bearing.squeeze(-1)), torch.sin(bearing.squeeze(-1))
+        forward, right, down = (level + offset + (matrix @ level.unsqueeze(-1)).squeeze(-1)).unbind(-1)
         along, across = forward * cos + right * sin, right * cos - forward * sin  # of the true magnetic north
         measured = torch.hypot(forward, right)
-        turned = torch.rad2deg(torch.atan2(torch.stack((across, down), -1), torch.stack((along, measured), -1)))
-        return torch.stack((elements[..., 0] + turned[..., 0], turned[..., 1], measured), -1)
+        turned, dip = torch.atan2(across, along), torch.atan2(down, measured)
+        return torch.stack((declination + torch.rad2deg(turned), torch.rad2deg(dip), measured), -1)
 
     def variance(self, elements: Tensor) -> Tensor:
         """Return the variance of the elements to first order, as a mean over the headings.

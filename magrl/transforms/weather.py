@@ -15,16 +15,9 @@ from torchrl.envs import EnvBase, Transform
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.field.elements import field_vector, measured_elements
 from magrl.field.weather import WeatherRecord, weather_record
-from magrl.transforms.base import (
-    Keys,
-    expect_keys,
-    key_list,
-    observed_spec,
-    several_keys,
-    with_state,
-)
+from magrl.transforms.base import Keys, expect_keys, key_list, several_keys
 from magrl.transforms.counters import stream_uniform
-from magrl.transforms.errors import EpisodeErrors
+from magrl.transforms.errors import TYPICAL_FIELD, EpisodeErrors
 
 SPEEDS_KM_H = {"aircraft": 341.0, "ship": 24.0, "underwater": 6.1}
 """Speeds of vehicles [km/h], with which 400 km take 1.2 h, 17 h and 66 h.
@@ -41,7 +34,8 @@ class MagneticWeather(EpisodeErrors):
     Each episode starts at a minute of the record that is a pure function of (seed, vehicle, episode). A step takes
     ``distance / speed + reading_s``. The variation of the minute in which the step ends is added to the field vector;
     between the minutes of the record nothing is interpolated. All vehicles of a batch are in the weather of the record,
-    wherever they are. The vehicle is told its size: ``bias_std`` grows by the root mean square of the variation.
+    wherever they are. The vehicle is told its size: ``bias_std`` grows by the root mean square of the variation, at
+    :data:`~magrl.transforms.errors.TYPICAL_FIELD`.
 
     ``field`` becomes what is measured, and ``true_field`` what it was: arrival, objective and reward belong to the
     environment and know no weather. In ``Compose``, the weather stands before the errors of the sensors.
@@ -106,6 +100,8 @@ class MagneticWeather(EpisodeErrors):
         self._known = None if span_h is None else (self.record.starts(span_h), float(span_h))
         self.register_buffer("variation", self.record.variation, persistent=False)
         self.mean_squares = self.record.mean_squares()
+        slow = self.variances(torch.tensor(TYPICAL_FIELD, dtype=torch.float64))[1]
+        self.register_buffer("_std", slow.sqrt().to(torch.get_default_dtype()), persistent=False)
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Attach to an environment, from which the longest time of an episode follows where it is not given."""
@@ -156,11 +152,11 @@ class MagneticWeather(EpisodeErrors):
         field, minute = values[0], self._written(next_tensordict, self.clock_key).sum(-1).long()
         vector = field_vector(field.double()) + self.variation[minute]
         self._keep(next_tensordict, self.true_key, field)
-        self._tell(next_tensordict, self.bias_key, self.variances(field)[1])
+        self._tell(next_tensordict, self.bias_key, self._std, field)
         return next_tensordict.set(self.out_keys[0], measured_elements(vector).to(field.dtype))
 
     def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances that the vehicle is told of a reading: of new errors, and of constant and slow ones.
+        """Return the variances of the errors of a reading: of new errors, and of constant and slow ones.
 
         Args:
             field: ``(..., E)`` reading.
@@ -205,11 +201,3 @@ class MagneticWeather(EpisodeErrors):
         clock = Unbounded((*leaf.shape[:-1], 2), device=leaf.device, dtype=torch.float64)
         observation_spec[self.clock_key] = clock
         return observation_spec
-
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make the clock part of the state, so that environments in other processes pass it to the step."""
-        input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
-            return with_state(input_spec, {})
-        observed = self.transform_observation_spec(observed_spec(self).clone())
-        return with_state(input_spec, {self.clock_key: observed[self.clock_key]})
