@@ -446,6 +446,7 @@ TRANSFORMS: Rows = {
         ),
         refused(lambda: transforms.SensorErrors(drift=(0.0, 0.0, 1.0)), ValueError, "drift_length", "None"),
         refused(lambda: transforms.SensorErrors(vector=5), TypeError, "vector", "5"),
+        refused(lambda: transforms.SensorErrors((1.0,), scale=(0.1,)), ValueError, "scale", "1 elements"),
         refused(lambda: transforms.SensorErrors()(TensorDict(field=zeros(3))), NotImplementedError, "TransformedEnv"),
     ],
     "transforms.VectorErrors": [
@@ -577,6 +578,15 @@ TRANSFORMS: Rows = {
         refused(lambda: transforms.with_sensor_noise(5, (0.1, -1.0)), ValueError, "std", "(0.1, -1.0)"),
         refused(lambda: transforms.with_sensor_noise(5, (0.1,)), TypeError, "env", "5"),
     ],
+    "transforms.SearchAim": [
+        *bad_numbers(
+            lambda **options: transforms.SearchAim(**({"zeta": 0.01} | options)),
+            zeta=(0.0, -1.0, NAN, "a"),
+            frame=("vessel", None),
+        ),
+        refused(lambda: transforms.SearchAim(PAIR, zeta=0.01), ValueError, "8 in_keys", str(PAIR)),
+        refused(lambda: transforms.SearchAim(zeta=0.01)(TensorDict(field=zeros(3))), KeyError, "'target_field'"),
+    ],
     "transforms.TrackObservation": [
         *bad_numbers(
             lambda **options: transforms.TrackObservation(**({"zeta": 0.01, "max_steps": 50} | options)),
@@ -664,6 +674,12 @@ def sound_view(**options: Any) -> transforms.ObservationView:
     return transforms.ObservationView(**(sound | options))
 
 
+def track_view(**options: Any) -> transforms.TrackView:
+    """A sound view but for some options."""
+    sound: dict[str, Any] = {"zeta": 0.01, "max_steps": 50, "max_move_km": 50.0, "max_turn_rad": 1.5}
+    return transforms.TrackView(**(sound | options))
+
+
 NARROW = sound_view(field_high=(10.0, -40.0, 4e4))
 
 VIEWS: Rows = {
@@ -679,16 +695,17 @@ VIEWS: Rows = {
     "transforms.ObservationView.check_covers": [
         refused(lambda: NARROW.check_covers(igrf(), t(-5.0, 165.0)), ValueError, "I is", "-50.0 to -40.0°")
     ],
-    "transforms.TrackView": bad_numbers(
-        lambda **options: transforms.TrackView(
-            **({"zeta": 0.01, "max_steps": 50, "max_move_km": 50.0, "max_turn_rad": 1.5} | options)
+    "transforms.TrackView": [
+        *bad_numbers(
+            track_view,
+            zeta=(0.0, NAN, "a"),
+            max_steps=(0, 2.5, None),
+            max_move_km=(0.0, -50.0, "a"),
+            max_turn_rad=(0.0, 4.0, "a"),
+            range_km=(0.0, INF, "a"),
         ),
-        zeta=(0.0, NAN, "a"),
-        max_steps=(0, 2.5, None),
-        max_move_km=(0.0, -50.0, "a"),
-        max_turn_rad=(0.0, 4.0, "a"),
-        range_km=(0.0, INF, "a"),
-    ),
+        refused(lambda: track_view(search="yes"), TypeError, "search", "'yes'"),
+    ],
 }
 
 ROWS = FOUNDATIONS | GUIDANCE | FIELDS | TRANSFORMS | VIEWS

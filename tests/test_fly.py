@@ -205,8 +205,8 @@ def test_files_that_cannot_be_written_and_agents_of_one_region(tmp_path: Path) -
 
 def test_a_policy_may_fly_longer_than_it_was_trained_for() -> None:
     """The share of the step limit that it observes ends at 1."""
-    view = TrackView(zeta=0.01, max_steps=2, max_move_km=50.0, max_turn_rad=math.pi / 2).observation_transforms()[1]
-    keys = {"field": 3, "target_field": 3, "estimated_field": 3, "way": 2, "sensor_std": 3}
+    view = TrackView(zeta=0.01, max_steps=2, max_move_km=50.0, max_turn_rad=math.pi / 2).observation_transforms()[-1]
+    keys = {"field": 3, "target_field": 3, "estimated_field": 3, "aim": 2, "sensor_std": 3}
     state = TensorDict({key: torch.ones(3, size) for key, size in keys.items()}, batch_size=[3])
     state["estimated_gradient"], state["way_covariance"] = torch.ones(3, 3, 2), torch.eye(2).expand(3, 2, 2)
     state["step_count"] = torch.tensor([[1], [2], [5]])

@@ -20,7 +20,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.field.regional import RegionalField
 from magrl.files import save_tensors
-from magrl.transforms import SensorNoise, TrackGradient, TrackObservation, TrackView
+from magrl.transforms import SensorNoise, TrackGradient, TrackView
 from magrl.transforms.track_view import track_observation
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
@@ -97,7 +97,7 @@ def observed_flight(turn: float) -> Tensor:
     """
     keys = ("field", "target_field", "move", "heading", "sensor_std")
     track = TrackGradient(keys, relation=None, range_km=VIEW.range_km, frame="vehicle")
-    observe = Compose(track, TrackObservation(zeta=VIEW.zeta, max_steps=VIEW.max_steps))
+    observe = Compose(track, *VIEW.observation_transforms()[1:])
     state, seen, observations = None, first_reading(), []
     seen["heading"] += turn
     seen["target_field"][:, 0] += math.degrees(turn)
@@ -189,12 +189,13 @@ def test_a_step_without_its_state_is_refused() -> None:
         observe(td.exclude("first_field"))
 
 
-def test_a_step_is_compiled_whole() -> None:
+@pytest.mark.parametrize(("place", "key"), [(1, "aim"), (2, "observation")])
+def test_a_step_is_compiled_whole(place: int, key: str) -> None:
     rollout = observing().rollout(2)[:, 0]
-    expected = observe(rollout.clone())["next", "observation"]
+    expected = observe(rollout.clone())["next", key]
     torch.compiler.reset()
-    compiled = torch.compile(TrackObservation(zeta=0.01, max_steps=50), fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(rollout)["next", "observation"], expected, rtol=1e-4, atol=1e-4)
+    compiled = torch.compile(VIEW.observation_transforms()[place], fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(rollout)["next", key], expected, rtol=1e-4, atol=1e-4)
 
 
 # The policy

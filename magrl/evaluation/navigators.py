@@ -96,7 +96,8 @@ def make_navigator(
             raise ValueError(f"{name} needs the folder of a finished run: {name}=RUN")
         policy = load_policy(Path(run) / "policy.pt", env.device) if run else load_pretrained(name, env.device)
         if isinstance(view := policy.config.view, TrackView):  # it is told what counts as arrived
-            policy = FieldPolicy(replace(policy.config, view=replace(view, zeta=env.zeta)), policy.actor)
+            view = replace(view, zeta=env.zeta, search=not env.arrival.declared)
+            policy = FieldPolicy(replace(policy.config, view=view), policy.actor)
             policy.noise_std = noise
         try:
             policy.check_fits(env)

@@ -52,7 +52,8 @@ def _kalman(
     noise: Noise = _PERFECT,
     bias: Noise = _PERFECT,
 ) -> Kalman:
-    return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps, bias=bias)
+    search = not env.arrival.declared
+    return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps, bias=bias, zeta=env.zeta, search=search)
 
 
 def _map_matching(

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl import tracking
-from magrl.checks import check_number, check_numbers
+from magrl import guidance, tracking
+from magrl.checks import check_number, check_numbers, check_type
 from magrl.navigators.base import steer
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.navigators.secant import SLOPES
@@ -37,6 +37,10 @@ class Kalman(QuasiNewton):
     - ``caution`` times the detour that the remaining uncertainty of the way may cost;
     - the price of the remaining steps, which rises as fewer of them are left.
 
+    The way is that to the most probable destination, given that the episode has not ended at the places where the
+    vehicle has been (:func:`~magrl.tracking.unvisited`). Constant errors of the readings (``bias``) widen the search,
+    but no move reduces them, so that they count in none of the costs.
+
     Args:
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
@@ -46,9 +50,13 @@ class Kalman(QuasiNewton):
         step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
         bias: standard deviations of constant and slow errors of the readings, like ``noise``.
+        zeta: arrival threshold on the objective.
+        search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
+            it, the way is the estimated one.
 
     Raises:
         ValueError: for an option out of its range, or a negative standard deviation.
+        TypeError: for ``search`` other than a bool.
 
     Source:
         A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
@@ -72,6 +80,8 @@ class Kalman(QuasiNewton):
         step_km: float | None = None,
         range_km: float = 300.0,
         bias: Sequence[float] = (0.0, 0.0, 0.0),
+        zeta: float = 0.01,
+        search: bool = True,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad, noise=noise)
         check_number(1, whole=True, max_steps=max_steps)
@@ -81,9 +91,10 @@ class Kalman(QuasiNewton):
         caution = usual_caution if caution is None else caution
         step_km = usual_step_km if step_km is None else step_km
         check_number(0, caution=caution)
-        check_number(0, above=True, step_km=step_km, range_km=range_km)
-        self.max_steps, self.range_km = int(max_steps), float(range_km)
-        self.caution, self.step_km, self.bias = float(caution), float(step_km), tuple(bias)
+        check_number(0, above=True, step_km=step_km, range_km=range_km, zeta=zeta)
+        check_type(bool, search=search)
+        self.max_steps, self.range_km, self.search = int(max_steps), float(range_km), search
+        self.caution, self.step_km, self.bias, self.zeta = float(caution), float(step_km), tuple(bias), float(zeta)
 
     def prior(self, reading: Tensor) -> GradientPrior:
         return tracking.dipole_prior(reading)
@@ -91,12 +102,19 @@ class Kalman(QuasiNewton):
     def _drift(self, seen: TensorDictBase) -> Tensor:
         return tracking.field_curvature(seen["field"].double())
 
+    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
+        field = seen["field"].double()
+        floors = field.new_tensor(guidance.OBJECTIVE_FLOORS)
+        weights = guidance.objective_weights(field, seen["target_field"].double(), floors) / self.zeta
+        return super().first_memory(seen) | {"visited": tracking.unvisited_yet(field), "weights": weights}
+
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         super().decide(seen, memory)  # the filter reads
         track = FieldTrack(memory["mean"], memory["covariance"])
         target = seen["target_field"].double()
         known, shared = self._related(track)
-        way, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared, self.bias)
+        way = self._searched(known, target, shared, seen, memory)
+        _, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared)
         moves = self._moves(way)
         left = way.unsqueeze(1) - moves
         progress = (way.norm(dim=-1, keepdim=True) - left.norm(dim=-1)) * _certainty(way, covariance)
@@ -108,6 +126,21 @@ class Kalman(QuasiNewton):
         north, east = torch.where((distance > 0).unsqueeze(-1), best, way).unbind(-1)  # standing still, face the way
         heading = seen["heading"].squeeze(-1).double()
         return steer(heading, torch.atan2(east, north), distance, self.max_move_km, self.max_turn_rad)
+
+    def _searched(
+        self, known: FieldTrack, target: Tensor, shared: Tensor, seen: TensorDictBase, memory: TensorDictBase
+    ) -> Tensor:
+        """Return the way ``(N, 2)`` [km] to the most probable destination; remember the end of the last move."""
+        heading = seen["heading"].squeeze(-1).double()
+        leg = seen["move"][:, :1].double() * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
+        moved = tracking.visit(memory["visited"], leg)
+        first = (memory["decisions"] == 1)[:, None, None]
+        memory["visited"] = torch.where(first, memory["visited"], moved)
+        way = tracking.way_to(known, target, self.range_km, self.scales, shared, self.bias)
+        if not self.search:
+            return way.displacement
+        ellipse = tracking.arrival_ellipse(known, memory["weights"], self.scales)
+        return tracking.unvisited(way, memory["visited"], ellipse)
 
     def _moves(self, way: Tensor) -> Tensor:
         """Return the displacements ``(N, M, 2)`` [km] that are compared, given the way ``(N, 2)``."""
@@ -138,8 +171,7 @@ class Kalman(QuasiNewton):
         moved = tracking.predict(FieldTrack(track.mean.unsqueeze(1), now.covariance), moves, [0.0] * 3, self.scales)
         expected = moved.mean[..., 0] * moves.new_tensor(self.scales)
         after, shared_after = self._related(tracking.update(moved, expected, self.noise, self.scales))
-        biased = (moves.new_tensor(self.bias) / moves.new_tensor(self.scales)).square()
-        weights = _weights(after.covariance, shared_after, left / DISTANCE_SCALE_KM, biased)
+        weights = _weights(after.covariance, shared_after, left / DISTANCE_SCALE_KM)
         learned = (now.covariance - after.covariance)[..., 1:, 1:]
         normal = (weights.diagonal(dim1=-2, dim2=-1)[..., None, None] * learned).sum(-3)
         for rows, sign in ((now.mean, 1), (shared, -1), (shared_after, 1)):
@@ -150,14 +182,11 @@ class Kalman(QuasiNewton):
         return torch.where((info == 0)[..., None, None], inverse, unknown) * DISTANCE_SCALE_KM**2
 
 
-def _weights(covariance: Tensor, shared: Tensor, way: Tensor, biased: Tensor) -> Tensor:
-    """Return the inverse covariance ``(..., 3, 3)`` of the elements at the end of a way ``(..., 2)`` [100 km].
-
-    Constant errors of the readings add their variances ``(3,)``.
-    """
+def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:
+    """Return the inverse covariance ``(..., 3, 3)`` of the elements at the end of a way ``(..., 2)`` [100 km]."""
     d = way.unsqueeze(-2)
     cross = 2 * covariance[..., 0, 1:] + (covariance[..., 1:, 1:] * d.unsqueeze(-2)).sum(-1)
-    weight = (covariance[..., 0, 0] + biased + (cross * d).sum(-1)).reciprocal()
+    weight = (covariance[..., 0, 0] + (cross * d).sum(-1)).reciprocal()
     row = weight * (shared[..., 0] + (shared[..., 1:] * d).sum(-1))
     rest = 1 - (row.square() / weight).sum(-1)
     return torch.diag_embed(weight) + row.unsqueeze(-1) * row.unsqueeze(-2) / rest[..., None, None]

@@ -22,6 +22,7 @@ from magrl.tracking.priors import (
     dipole_prior,
     field_curvature,
 )
+from magrl.tracking.search import SEARCH_KM, VISITED, arrival_ellipse, unvisited, unvisited_yet, visit
 from magrl.tracking.way import Way, way_to
 
 __all__ = [
@@ -31,11 +32,14 @@ __all__ = [
     "DISTANCE_SCALE_KM",
     "EARTH_RADIUS_KM",
     "ELEMENT_SCALES",
+    "SEARCH_KM",
     "VARIANCE_FLOOR",
+    "VISITED",
     "FieldTrack",
     "GradientPrior",
     "GradientRelation",
     "Way",
+    "arrival_ellipse",
     "curl_relation",
     "dipole_prior",
     "estimated_gradient",
@@ -43,6 +47,9 @@ __all__ = [
     "predict",
     "relate",
     "start",
+    "unvisited",
+    "unvisited_yet",
     "update",
+    "visit",
     "way_to",
 ]

@@ -13,6 +13,7 @@ from magrl.transforms.motion import MotionError
 from magrl.transforms.north import NORTH_REFERENCES, NorthReferenceError, north_reference
 from magrl.transforms.observation import AngleVector, TargetDifference
 from magrl.transforms.scaling import MinMaxNorm
+from magrl.transforms.search import SearchAim
 from magrl.transforms.sensor_errors import SensorErrors
 from magrl.transforms.sensors import RandomSensorNoise, SensorNoise, sensor_levels, with_sensor_noise
 from magrl.transforms.track import TrackGradient
@@ -41,6 +42,7 @@ __all__ = [
     "NorthReferenceError",
     "ObservationView",
     "RandomSensorNoise",
+    "SearchAim",
     "SensorErrors",
     "SensorNoise",
     "TargetDifference",

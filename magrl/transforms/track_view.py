@@ -13,7 +13,8 @@ from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from magrl import guidance
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number, check_tensor, check_type
+from magrl.field.elements import element_difference
 from magrl.transforms.base import (
     Keys,
     ObservationTransform,
@@ -24,11 +25,13 @@ from magrl.transforms.base import (
     with_state,
 )
 from magrl.transforms.scaling import MinMaxNorm
+from magrl.transforms.search import SearchAim
 from magrl.transforms.track import OUT_KEYS, TrackGradient
 
 OBSERVATION_SIZE = 15
 DATA_SHEET = ("sensor_std", "bias_std")
 """What a vehicle is told of its readings: the standard deviations of their new errors, and of constant or slow ones."""
+OBSERVED_KEYS = ("field", "target_field", *OUT_KEYS[2:4], "aim", OUT_KEYS[5], "sensor_std", "step_count")
 _STD_UNITS = (1.0, 1.0, 100.0)
 _LEAST_STD = 0.002
 
@@ -48,8 +51,8 @@ def track_observation(
     seen through logarithms, because the right move depends on their ratios.
 
     Args:
-        way: ``(..., 2)`` estimated way to the target, forward and to the right [km].
-        way_covariance: ``(..., 2, 2)`` its covariance [km^2].
+        way: ``(..., 2)`` way to aim at, forward and to the right [km].
+        way_covariance: ``(..., 2, 2)`` covariance of the estimated way to the target [km^2].
         gradient: ``(..., E, 2)`` estimated gradient, forward and to the right [element unit / km].
         remaining: ``(..., E)`` target elements minus estimated elements.
         weights: ``(..., E)`` weights of the objective F (Eq. 2-6), divided by the arrival threshold.
@@ -99,22 +102,17 @@ def _axes(matrix: Tensor, least: float) -> tuple[Tensor, Tensor]:
     return roots, (matrix[..., 0, 1] / roots.prod(-1)).unsqueeze(-1)
 
 
-def _difference(target: Tensor, elements: Tensor) -> Tensor:
-    """Return target elements minus elements ``(..., 3)``, D the short way around."""
-    declination, others = (target - elements).split((1, 2), -1)
-    return torch.cat((torch.remainder(declination + 180, 360) - 180, others), -1)
-
-
 class TrackObservation(ObservationTransform):
     """Write the observation of an agent that navigates by its own track, see :func:`track_observation`.
 
-    It stands after :class:`~magrl.transforms.TrackGradient` in the vehicle's frame. The weights of the objective follow
-    from the first reading, which is kept as state in the TensorDict.
+    It stands after :class:`~magrl.transforms.TrackGradient` and :class:`~magrl.transforms.SearchAim` in the vehicle's
+    frame; without the latter, its fifth key is that of the estimated way. The weights of the objective follow from the
+    first reading, which is kept as state in the TensorDict.
 
     Args:
-        in_keys: reading and target ``(..., 3)``, estimated field ``(..., 3)``, its gradient ``(..., 3, 2)``, way
-            ``(..., 2)`` and its covariance ``(..., 2, 2)``, standard deviation of the noise ``(..., 3)``, and the
-            number of the step ``(..., 1)``.
+        in_keys: reading and target ``(..., 3)``, estimated field ``(..., 3)``, its gradient ``(..., 3, 2)``, way to aim
+            at ``(..., 2)``, covariance of the estimated way ``(..., 2, 2)``, standard deviation of the noise
+            ``(..., 3)``, and the number of the step ``(..., 1)``.
         out_keys: observation ``(..., 15)`` and the first reading ``(..., 3)``.
         zeta: arrival threshold on the objective.
         max_steps: step limit.
@@ -126,15 +124,15 @@ class TrackObservation(ObservationTransform):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.transforms import SensorNoise
         >>> from torchrl.envs import Compose, TransformedEnv
-        >>> track = TrackGradient(("field", "target_field", "move", "heading", "sensor_std"), frame="vehicle")
-        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), track, TrackObservation(zeta=0.01, max_steps=50))
+        >>> view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=1.5)
+        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), *view.observation_transforms())
         >>> TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), steps).rollout(3)["observation"].shape
         torch.Size([2, 3, 15])
     """
 
     def __init__(
         self,
-        in_keys: Keys = ("field", "target_field", *OUT_KEYS[2:], "sensor_std", "step_count"),
+        in_keys: Keys = OBSERVED_KEYS,
         out_keys: Keys = ("observation", "first_field"),
         *,
         zeta: float,
@@ -168,7 +166,7 @@ class TrackObservation(ObservationTransform):
     def _write(self, tensordict: TensorDictBase, first: Tensor, values: list[Tensor]) -> TensorDictBase:
         _, target, estimate, gradient, way, covariance, noise_std, step = values
         floors = first.new_tensor(guidance.OBJECTIVE_FLOORS)
-        at_first, remaining = _difference(target, first), _difference(target, estimate)
+        at_first, remaining = element_difference(target, first), element_difference(target, estimate)
         weights = guidance.objective_weights(torch.zeros_like(at_first), at_first, floors) / self.zeta
         time = (step.to(way.dtype) / self.max_steps).clamp(max=1)  # a policy may fly longer than it was trained for
         observed = track_observation(way, covariance, gradient, remaining, weights, noise_std, time)
@@ -206,9 +204,12 @@ class TrackView:
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
         range_km: prior standard deviation of the way along each axis [km].
+        search: whether it observes the way to where the vehicle has not been (:class:`~magrl.transforms.SearchAim`), as
+            suits environments that end the episode at arrival.
 
     Raises:
         ValueError: for a number out of its range.
+        TypeError: for ``search`` other than a bool.
 
     Example:
         >>> TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=1.5).size
@@ -220,21 +221,29 @@ class TrackView:
     max_move_km: float
     max_turn_rad: float
     range_km: float = 300.0
+    search: bool = True
 
     size: ClassVar[int] = OBSERVATION_SIZE
     in_keys: ClassVar[tuple[str, ...]] = ("field", "target_field", "move", "heading", "step_count")
-    state_keys: ClassVar[tuple[str, ...]] = (*OUT_KEYS[:2], "first_field")
 
     def __post_init__(self) -> None:
         check_number(0, above=True, zeta=self.zeta, max_move_km=self.max_move_km, range_km=self.range_km)
         check_number(1, whole=True, max_steps=self.max_steps)
         check_number(0, math.pi, above=True, max_turn_rad=self.max_turn_rad)
+        check_type(bool, search=self.search)
+
+    @property
+    def state_keys(self) -> tuple[str, ...]:
+        """Keys of the state that a step reads from the one before."""
+        return *OUT_KEYS[:2], "first_field", *(("visited", "arrival_weights") if self.search else ())
 
     def observation_transforms(self) -> list[Transform]:
         """Return the transforms from the public keys and :data:`DATA_SHEET` to ``observation`` ``(..., 15)``."""
         keys = ("field", "target_field", "move", "heading", *DATA_SHEET)
         track = TrackGradient(keys, range_km=self.range_km, frame="vehicle")
-        return [track, TrackObservation(zeta=self.zeta, max_steps=self.max_steps)]
+        search = [SearchAim(zeta=self.zeta, frame="vehicle")] if self.search else []
+        observed = [key if key != "aim" or self.search else "way" for key in OBSERVED_KEYS]
+        return [track, *search, TrackObservation(observed, zeta=self.zeta, max_steps=self.max_steps)]
 
     def action_transform(self) -> MinMaxNorm:
         """Return the transform from actions in [-1, 1] to distance [km] and turn [rad]."""

@@ -1,0 +1,137 @@
+"""The search for a destination: it is not where the vehicle has been without arriving."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_number, check_tensor
+from magrl.tracking.filter import DISTANCE_SCALE_KM, ELEMENT_SCALES, FieldTrack, PerElement, check_track, positive
+from magrl.tracking.way import Way
+
+VISITED = 24
+"""Number of past places that a search remembers."""
+SEARCH_KM = 500.0
+"""Difference of distance that outweighs a factor e of probability [km]."""
+_SOBOL = torch.quasirandom.SobolEngine(2).fast_forward(1)  # its first point is a corner, the second the center
+_SAMPLES = math.sqrt(2) * torch.erfinv(2 * _SOBOL.draw(32, dtype=torch.float64) - 1)  # standard normal, the mean first
+_UNNOTICED = 0.02  # probability of having been at the destination: visited places stay possible
+_STAYED_KM = 1.0  # longest move after which the vehicle is where it was
+_FAR_KM = 1e5  # of places that are not there yet
+_LEAST_KM2 = 1e-12
+
+
+def unvisited(way: Way, visited: Tensor, ellipse: Tensor, search_km: float = SEARCH_KM) -> Tensor:
+    """Return the displacement to the most probable destination, given where the vehicle did not arrive.
+
+    The density of the destination is that of the estimated way, times the probability of not arriving at the nearest
+    visited place: near 0 at that place, half on the border of the arrival ellipse around it, 1 far from it. The
+    displacement is the best of 32 quasi-random samples of the estimate, one of which is its mean: the largest
+    logarithm of the density minus the distance over ``search_km``. Without visited places near it, it is the mean.
+
+    Args:
+        way: estimated way and its covariance.
+        visited: ``(..., K, 2)`` displacements to the visited places, northward and eastward [km].
+        ellipse: ``(..., 2, 2)`` arrival ellipse, where ``d^T E d = 1`` for displacements d [km].
+        search_km: difference of distance that outweighs a factor e of probability [km].
+
+    Returns:
+        ``(..., 2)`` [km].
+
+    Raises:
+        ValueError: for shapes that do not match, or a distance that is not above 0.
+
+    Source:
+        L. D. Stone, Theory of Optimal Search, Academic Press (1975): the posterior of a target after unsuccessful
+        search.
+
+    Example:
+        >>> way = Way(torch.zeros(2), torch.diag(torch.tensor([1.0, 2500.0])))  # known northward, but not eastward
+        >>> ellipse = torch.eye(2) / 400  # 20 km around
+        >>> unvisited(way, torch.full((1, 2), 1e5), ellipse)
+        tensor([0., 0.])
+        >>> bool(unvisited(way, torch.zeros(1, 2), ellipse)[1].abs() > 20)
+        True
+    """
+    check_tensor(2, displacement=way.displacement, visited=visited)
+    check_tensor(2, 2, covariance=way.covariance, ellipse=ellipse)
+    check_number(0, above=True, search_km=search_km)
+    samples = _SAMPLES.to(way.displacement)
+    ways = way.displacement.unsqueeze(-2) + samples @ _root(way.covariance).mT
+    north, east = (ways.unsqueeze(-2) - visited.unsqueeze(-3)).unbind(-1)  # (..., S, K)
+    nn, ne, ee = (ellipse[..., i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    nearest = (nn * north * north + 2 * ne * north * east + ee * east * east).amin(-1)
+    missed = torch.log1p((_UNNOTICED - 1) * torch.exp2(-nearest))
+    score = missed - samples.square().sum(-1) / 2 - ways.norm(dim=-1) / search_km
+    best = torch.where(nearest[..., 0] < 1, score.argmax(-1), 0)[..., None, None]
+    return ways.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
+
+
+def unvisited_yet(like: Tensor) -> Tensor:
+    """Return the visited places ``(..., K, 2)`` at the start of an episode, for vehicles ``(..., E)``: none.
+
+    Example:
+        >>> unvisited_yet(torch.zeros(5, 3)).shape
+        torch.Size([5, 24, 2])
+    """
+    return like.new_full((*like.shape[:-1], VISITED, 2), _FAR_KM)
+
+
+def visit(visited: Tensor, displacement: Tensor) -> Tensor:
+    """Return the visited places after a move: all displacements change by the move, and its end is the latest place.
+
+    After a move below 1 km, the end takes the place of the one before.
+
+    Args:
+        visited: ``(..., K, 2)`` displacements to the visited places before the move [km].
+        displacement: ``(..., 2)`` move [km].
+
+    Raises:
+        ValueError: for shapes that do not match.
+
+    Example:
+        >>> visit(torch.tensor([[1.0, 0.0], [2.0, 0.0]]), torch.tensor([0.0, 3.0]))
+        tensor([[ 0.,  0.],
+                [ 1., -3.]])
+    """
+    check_tensor(2, visited=visited, displacement=displacement)
+    stayed = (displacement.norm(dim=-1) < _STAYED_KM)[..., None, None]
+    before = torch.where(stayed, visited[..., 1:, :], visited[..., :-1, :]) - displacement.unsqueeze(-2)
+    return torch.cat((torch.zeros_like(displacement).unsqueeze(-2), before), -2)
+
+
+def arrival_ellipse(track: FieldTrack, weights: Tensor, scales: PerElement = ELEMENT_SCALES) -> Tensor:
+    """Return the matrix ``(..., 2, 2)`` [1/km^2] of the ellipse in which the objective F is below its threshold.
+
+    It is the expected one: the less is known of the gradient, the smaller the ellipse.
+
+    Args:
+        track: state of the filter.
+        weights: ``(..., E)`` weights of the objective (Eq. 2-6), divided by the arrival threshold.
+        scales: those of :func:`~magrl.tracking.start`.
+
+    Raises:
+        ValueError: for shapes that do not match.
+
+    Example:
+        >>> track = FieldTrack(torch.tensor([[0.0, 2.0, 0.0]]), torch.zeros(1, 3, 3))
+        >>> arrival_ellipse(track, torch.tensor([100.0]), scales=(1.0,))
+        tensor([[0.0400, 0.0000],
+                [0.0000, 0.0000]])
+    """
+    count = check_track(track)
+    check_tensor(count, weights=weights)
+    per_km = weights * (positive("scales", scales, count, track.mean) / DISTANCE_SCALE_KM).square()
+    gradient = track.mean[..., 1:]
+    squares = gradient.unsqueeze(-1) * gradient.unsqueeze(-2) + track.covariance[..., 1:, 1:]
+    return (per_km[..., None, None] * squares).sum(-3)
+
+
+def _root(covariance: Tensor) -> Tensor:
+    """Return the Cholesky factor of covariances ``(..., 2, 2)``, which may be singular by rounding."""
+    first = covariance[..., 0, 0].clamp_min(_LEAST_KM2).sqrt()
+    below = covariance[..., 0, 1] / first
+    second = (covariance[..., 1, 1] - below * below).clamp_min(_LEAST_KM2).sqrt()
+    return torch.stack((first, torch.zeros_like(first), below, second), -1).unflatten(-1, (2, 2))

@@ -1,0 +1,96 @@
+"""The search for a destination where the vehicle has not been."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from magrl.envs import GeomagneticNavEnv
+from magrl.tracking import VISITED, FieldTrack, Way, arrival_ellipse, unvisited, unvisited_yet, visit
+from magrl.transforms import SearchAim, SensorErrors, TrackGradient
+
+LONG = torch.tensor([[36.0, 200.0], [200.0, 2500.0]])  # [km^2]: 6 km northward, 50 km eastward, correlated
+ELLIPSE = torch.diag(torch.tensor([1 / 20.0**2, 1 / 12.0**2]))
+
+
+def searched(destinations: torch.Tensor, moves: int) -> torch.Tensor:
+    """Which of some destinations are found, by vehicles that start at the mean of what is known and go where told."""
+    count = len(destinations)
+    here, visited = torch.zeros(count, 2), visit(unvisited_yet(torch.zeros(count, 3)), torch.zeros(count, 2))
+    found = torch.zeros(count, dtype=torch.bool)
+    for _ in range(moves):
+        left = destinations - here
+        found |= (left.unsqueeze(-2) @ ELLIPSE @ left.unsqueeze(-1)).flatten() <= 1
+        step = unvisited(Way(-here, LONG.expand(count, 2, 2)), visited, ELLIPSE.expand(count, 2, 2))
+        here, visited = here + step, visit(visited, step)
+    return found
+
+
+def test_a_search_finds_nearly_all_that_the_estimate_allows() -> None:
+    normal = torch.randn(2000, 2, generator=torch.Generator().manual_seed(0))
+    destinations = normal @ torch.linalg.cholesky(LONG).mT
+    found = searched(destinations, 1).float().mean(), searched(destinations, 16).float().mean()
+    assert found[0] < 0.3
+    assert found[1] > 0.9  # the samples reach to two standard deviations
+
+
+def test_the_mean_is_the_way_until_the_vehicle_has_been_there() -> None:
+    mean = torch.tensor([100.0, -80.0])
+    for nearest, expected in ((19.9, False), (20.1, True)):
+        visited = unvisited_yet(torch.zeros(3))
+        visited[5] = mean + torch.tensor([nearest, 0.0])
+        assert torch.equal(unvisited(Way(mean, LONG), visited, ELLIPSE), mean) == expected
+
+
+def test_short_moves_do_not_fill_the_memory() -> None:
+    visited = visit(unvisited_yet(torch.zeros(3)), torch.tensor([30.0, 0.0]))
+    for _ in range(2 * VISITED):
+        visited = visit(visited, torch.tensor([0.0, 0.5]))
+    assert (visited.norm(dim=-1) < 1e3).sum() == 1
+    visited = visit(visited, torch.tensor([0.0, 40.0]))
+    assert visited[:2].tolist() == [[0.0, 0.0], [0.0, -40.0]]
+
+
+def test_the_ellipse_shrinks_with_the_uncertainty_of_the_gradient() -> None:
+    """The expected square of g·d is that of the mean plus the variance: here 1 + 3 along the first axis."""
+    covariance = torch.diag(torch.tensor([0.0, 3.0, 5.0])).unsqueeze(0)
+    track = FieldTrack(torch.tensor([[7.0, 1.0, 2.0]]), covariance)
+    expected = torch.tensor([[4.0, 2.0], [2.0, 9.0]]) * 4 / 100**2
+    torch.testing.assert_close(arrival_ellipse(track, torch.tensor([4.0]), (1.0,)), expected)
+
+
+def make_env(frame: str) -> TransformedEnv:
+    base = GeomagneticNavEnv(num_envs=64, seed=3, start_heading="random")
+    keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
+    errors = SensorErrors((0.02, 0.02, 2.0), bias=(0.3, 0.0, 0.0), seed=1)
+    return TransformedEnv(base, Compose(errors, TrackGradient(keys, frame=frame), SearchAim(zeta=0.01, frame=frame)))
+
+
+def test_specs() -> None:
+    check_env_specs(make_env("vehicle"), check_dtype=True)
+
+
+def test_both_frames_give_the_same_way() -> None:
+    torch.manual_seed(0)
+    actions = [make_env("world").rand_action()["action"] for _ in range(4)]
+    ways = {}
+    for frame in ("world", "vehicle"):
+        env = make_env(frame)
+        state = env.reset()
+        for action in actions:
+            state = env.step_mdp(env.step(state.set("action", action)))
+        ways[frame], heading = state["aim"], state["heading"].squeeze(-1)
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    (north, east), turned = ways["world"].unbind(-1), ways["vehicle"]
+    expected = torch.stack((cos * north + sin * east, cos * east - sin * north), -1)
+    torch.testing.assert_close(turned, expected, rtol=1e-3, atol=0.1)
+
+
+@pytest.mark.parametrize("zeta", [0.0, -1.0, math.nan])
+def test_a_threshold_must_be_positive(zeta: float) -> None:
+    with pytest.raises(ValueError, match="zeta"):
+        SearchAim(zeta=zeta)
