@@ -72,7 +72,7 @@ def north(size: float) -> Conditions:
 
 PANELS: Mapping[str, tuple[Callable[[float], Conditions], tuple[float, ...]]] = {
     "bias of D [°]": (lambda size: readings(bias=(size, 0.0, 0.0)), (0.1, 0.3, 1.0, 3.0)),
-    "north reference, constant b [°]": (north, (0.1, 0.3, 1.0, 3.0)),
+    "north reference, constant b [°]": (north, (0.1, 0.5, 1.0, 3.0)),
     "bias of I [°]": (lambda size: readings(bias=(0.0, size, 0.0)), (0.05, 0.1, 0.2, 0.5)),
     "hard iron [nT]": (lambda size: readings(vector=VectorErrors((size,) * 3)), (10.0, 30.0, 60.0, 100.0)),
     "roll and pitch [°]": (
