@@ -14,6 +14,8 @@ PLAIN := $(SEEDS:%=runs/td3-fast-seed%)
 NOISY := $(SEEDS:%=runs/td3_gradient_guided-fast-noise-0.05-0.05-5-seed%)
 AZORES := $(SEEDS:%=runs/td3_gradient_guided-fast-azores-seed%)
 ANYWHERE := $(SEEDS:%=runs/td3_anywhere-fast-seed%)
+SAC := $(SEEDS:%=runs/sac-seed%)
+PPO := $(SEEDS:%=runs/ppo-seed%)
 MEMORY := $(foreach s,0 1 2,runs/td3_recurrent-seed$(s))
 AGENTS := $(ONE_THREAD:%=gg_td3=%) $(PLAIN:%=td3=%)
 FAIR := anywhere secant kalman run_and_tumble
@@ -22,7 +24,7 @@ SWARMS := ga pso afsa ga:flown pso:flown afsa:flown
 NOISE_LEVELS := 0 0.02 0.05 0.1
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere test test-slow check format clean earth globe conditions paper trade bench docs replay mutate help
+.PHONY: train fly anywhere algorithms test test-slow check format clean earth globe conditions paper trade bench docs replay mutate help
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -106,6 +108,13 @@ docs/results/conditions.md: $(VENV)/.installed
 docs/figures/conditions.png: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(RECIPE)/tables/conditions_table.py --tasks 300 --figure $@
 
+# Table of docs/algorithms.md: five seeds of each algorithm, with one thread.
+algorithms: $(foreach run,$(SEEDS:%=runs/td3_gradient_guided-fast-one-thread-seed%) $(SAC) $(PPO),$(run)/eval.json)  ## train TD3, SAC and PPO with five seeds each; half an hour on one core
+	mkdir -p docs/results
+	$(RECIPE)/tables/results_table.py $(SEEDS:%="TD3=runs/td3_gradient_guided-fast-one-thread-seed%") $(SAC:%=SAC=%) \
+	  $(PPO:%=PPO=%) > docs/results/algorithms.md
+	$(RECIPE)/tables/publish.py docs/algorithms.md
+
 # The map of the whole Earth, the table of epochs, and the pictures of the flight, from the pretrained policy.
 globe: $(VENV)/.installed  ## map where the pretrained agent fails, fly it at five epochs and draw a flight; two minutes
 	$(RECIPE)/tables/globe.py
@@ -146,6 +155,12 @@ paper: $(foreach run,$(GUIDED) $(ONE_THREAD) $(PLAIN) $(NOISY) $(AZORES),$(run)/
 
 runs/td3_gradient_guided-fast-seed%/eval.json: | $(VENV)/.installed
 	OMP_NUM_THREADS=2 $(RECIPE)/td3_gradient_guided.py --seed $*
+
+runs/sac-seed%/eval.json: | $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/sac.py --seed $*
+
+runs/ppo-seed%/eval.json: | $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/ppo.py --seed $*
 
 runs/td3_gradient_guided-fast-one-thread-seed%/eval.json: | $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --seed $* --out $(@D)

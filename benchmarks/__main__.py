@@ -32,6 +32,7 @@ COMPARISONS = {
     "fields": ("fields", "rows"),
     "env": ("env", "rows"),
     "imports": ("imports", "rows"),
+    "onboard": ("onboard", "rows"),
     "update": ("update", "rows"),
     "training": ("training", "whole_training"),
     "first-attempt": ("training", "first_attempt"),

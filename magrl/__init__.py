@@ -23,14 +23,15 @@ _PACKAGES = {
         "TargetDifference",
     ),
     "envs": ("GeomagneticNavEnv", "Region", "Scenario", "Tasks", "load_scenario", "task_set"),
-    "agents": ("FieldPolicy", "load_policy", "load_pretrained", "save_policy"),
-    "evaluation": ("episode_measures", "evaluation_rollout", "summarize"),
+    "agents": ("FieldPolicy", "export_policy", "load_policy", "load_pretrained", "save_policy"),
+    "evaluation": ("episode_measures", "evaluate", "evaluation_rollout", "summarize"),
 }
 _HOMES = {name: package for package, names in _PACKAGES.items() for name in names}
 __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:  # the same names for type checkers and editors
     from magrl.agents import FieldPolicy as FieldPolicy
+    from magrl.agents import export_policy as export_policy
     from magrl.agents import load_policy as load_policy
     from magrl.agents import load_pretrained as load_pretrained
     from magrl.agents import save_policy as save_policy
@@ -41,6 +42,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from magrl.envs import load_scenario as load_scenario
     from magrl.envs import task_set as task_set
     from magrl.evaluation import episode_measures as episode_measures
+    from magrl.evaluation import evaluate as evaluate
     from magrl.evaluation import evaluation_rollout as evaluation_rollout
     from magrl.evaluation import summarize as summarize
     from magrl.field import IGRF as IGRF

@@ -5,6 +5,8 @@
     python recipes/evaluate.py secant --scenario my.toml --export tracks.kml    # own tasks, tracks for a map
     python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --noise 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --conditions ship                # errors of a real vehicle
+    python recipes/evaluate.py secant kalman --arrival distance --arrival-radius-km 25 --max-steps 80 --altitude-km -3
+    python recipes/evaluate.py policy:SAC=sac.pt secant                         # a policy of another algorithm
 
 Trained agents are given with their run folders. They are flown as they were trained: in their scenario, with their
 arrival threshold, start heading and sensor noise. Runs that differ in one of these need the option that chooses it. An
@@ -12,7 +14,8 @@ agent that was trained otherwise, or is not finished, is marked by a warning bel
 Metaheuristics evaluate candidate moves in one of two modes, `--mode` or a suffix such as `ga:flown`: `look-ahead` reads
 the field at the end of every candidate for free (an oracle), `flown` makes every candidate a move.
 
-Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, settings.json, table.md and short.md.
+Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, settings.json, table.md, short.md and
+trajectories.png (the first tasks of each navigator).
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import os
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
 import csv
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,15 +40,15 @@ from torchrl import torchrl_logger
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from magrl import paper
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
-from magrl.envs.tasks import RANDOM_SETS
 from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize
+from magrl.evaluation.maps import flights_figure
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import arrival_threshold, check_distinct, check_map_date, make_navigator
+from magrl.evaluation.navigators import arrival_threshold, check_distinct, check_map_date, label, make_navigator
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import NO_NOISE, Noise, agreed, common_scenario, trained_runs
+from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names, with_declaration
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
 from magrl.training import UsageError, command
@@ -53,20 +57,20 @@ from magrl.training.run_folder import create_run_folder
 from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
 
 RECIPE = "evaluate.py"
-TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
-FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
-"""Seed of random tasks with --tasks-seed 0: beyond those of trainings and of frozen sets."""
+SHOWN = 24
+"""Number of tasks in trajectories.png."""
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
 MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency", "spl_to_arrival")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(ScenarioOptions):
     """Settings of an evaluation."""
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
     """Navigators: anywhere, kalman, secant, run_and_tumble, mean_jacobian, map_matching, parallel, geodesic, ga, pso,
-    afsa; with a run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, recurrent=RUN, anywhere=RUN."""
+    afsa; with a run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, recurrent=RUN, anywhere=RUN; a policy of any algorithm
+    policy=FILE or policy:LABEL=FILE."""
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
     tasks_seed: int | None = None
@@ -78,16 +82,14 @@ class Config:
     """File for the tracks of all episodes: .geojson, .gpx or .kml."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
     """How metaheuristics evaluate a candidate move."""
-    zeta: float | None = None
-    """Arrival threshold on the objective (Eq. 2-7); that of the runs by default, 0.01 without runs."""
     noise: Noise | None = None
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]; by default those of the runs, or 0."""
     conditions: str | None = None
     """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater or low-cost."""
     map_date: str | None = None
     """Date of the map of map_matching, as 2015-01-01 (IGRF); by default its map is the field itself."""
-    start_heading: Literal["north", "random"] | None = None
-    """Heading at the start of an episode; by default that of the runs, or north."""
+    kilometers: bool = False
+    """Whether the tables lead with distances, as they do where arrival is not by the objective."""
     seed: int = 0
     """Random seed of metaheuristics, sensor noise and random start headings."""
     out: Path = Path("runs/evaluation")
@@ -105,55 +107,8 @@ class Results:
     episodes: list[dict[str, Any]] = field(default_factory=list)
     paths: list[dict[str, Any]] = field(default_factory=list)
     tracks: list[export.Track] = field(default_factory=list)
+    rollouts: dict[str, TensorDictBase] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
-
-
-def choose_tasks(path: Path | None, tasks: str | int | None, tasks_seed: int | None = None) -> Scenario:
-    """Return a scenario with frozen tasks.
-
-    Args:
-        path: scenario file; the paper's scenario by default.
-        tasks: task set, or number of random tasks; by default the scenario's own tasks, or ``test-1000`` where it has
-            none.
-        tasks_seed: seed of random tasks; 0 by default.
-
-    Raises:
-        ValueError: for a file that is not a scenario, the paper's example task in another scenario, or a seed for tasks
-            that are not random.
-        FileNotFoundError: for a missing file.
-    """
-    if isinstance(tasks, int):
-        check_number(0, 2**62, whole=True, tasks_seed=0 if tasks_seed is None else tasks_seed)
-        scenario = Scenario() if path is None else load_scenario(path)
-        return scenario.with_tasks(scenario.random_tasks(tasks, FIRST_TASKS_SEED + (tasks_seed or 0)))
-    if tasks_seed is not None:
-        raise ValueError(f"--tasks-seed {tasks_seed} needs a number of random tasks, such as --tasks 300")
-    if path is None:
-        return Scenario().with_tasks(named_tasks(tasks or "test-1000"))
-    if tasks == "figure-4-1":
-        raise ValueError("--tasks figure-4-1 lies in the paper's region: omit it, or --scenario")
-    scenario = load_scenario(path)
-    if scenario.tasks is not None and tasks is None:
-        return scenario
-    return scenario.with_tasks(scenario.random_tasks(*RANDOM_SETS[tasks or "test-1000"]))
-
-
-def first_tasks(scenario: Scenario, num_tasks: int) -> Scenario:
-    """Return a scenario with its first tasks only.
-
-    Raises:
-        ValueError: for fewer than one task, or more than it has.
-    """
-    assert scenario.tasks is not None
-    check_number(1, len(scenario.tasks.start), whole=True, num_tasks=num_tasks)
-    tasks = type(scenario.tasks)(*(values[:num_tasks] for values in scenario.tasks))
-    return scenario.replace(tasks=tasks, names=scenario.names[:num_tasks])
-
-
-def make_env(scenario: Scenario, zeta: float, seed: int, **options: Any) -> GeomagneticNavEnv:
-    """Return an environment with one vehicle for each frozen task."""
-    assert scenario.tasks is not None
-    return GeomagneticNavEnv(scenario, num_envs=len(scenario.tasks.start), zeta=zeta, seed=seed, **options)
 
 
 def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]]:
@@ -181,8 +136,8 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def settle(config: Config) -> tuple[Config, float, list[str]]:
-    """Return the settings with those of the runs where none were chosen, the threshold, and warnings.
+def settle(config: Config) -> tuple[Config, list[str]]:
+    """Return the settings with those of the scenario, or of the runs, where none were chosen, and warnings.
 
     Raises:
         ValueError: for runs that differ in a setting that was not chosen, or conditions with noise.
@@ -193,21 +148,21 @@ def settle(config: Config) -> tuple[Config, float, list[str]]:
     if config.conditions and config.noise:
         raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
     runs = trained_runs(config.navigators)
-    zeta, warnings = arrival_threshold(config.navigators, config.zeta)
-    own = config.start_heading
+    path, places = config.scenario, list[str]()
+    if config.tasks != "figure-4-1":  # which lies in the paper's region
+        path, places = common_scenario(runs, config.scenario)
+    own = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
+    zeta, warnings = arrival_threshold(config.navigators, own.zeta)
     heading, others = agreed(
-        runs, lambda run: run.start_heading, own, "north", name="start heading", option="--start-heading"
+        runs, lambda run: run.start_heading, own.start_heading, "north", name="start heading", option="--start-heading"
     )
     noise, noisy = NO_NOISE, list[str]()
     if not config.conditions:
         noise, noisy = agreed(
             runs, lambda run: run.noise, config.noise, NO_NOISE, name="sensor noise", option="--noise"
         )
-    scenario, places = config.scenario, list[str]()
-    if config.tasks != "figure-4-1":  # which lies in the paper's region
-        scenario, places = common_scenario(runs, config.scenario)
-    settled = replace(config, scenario=scenario, start_heading=heading, noise=noise)
-    return settled, zeta, [*warnings, *others, *noisy, *places]
+    settled = replace(config, scenario=path, zeta=zeta, start_heading=heading, noise=noise)
+    return settled, [*warnings, *others, *noisy, *places]
 
 
 @dataclass
@@ -235,16 +190,20 @@ def prepare(config: Config) -> Prepared:
             export.check_suffix(config.export)
         check_distinct(config.navigators, config.mode)
         check_map_date(config.navigators, config.map_date)
-        config, zeta, warnings = settle(config)
-        scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed)
-        example = first_tasks(scenario, 1) if config.scenario else Scenario().with_tasks(named_tasks("figure-4-1"))
+        config, warnings = settle(config)
+        scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
+        example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
         flown = conditions_named(config.conditions or "laboratory")
-        options = {"start_heading": config.start_heading, "drift_km": flown.drift_km(50.0)}
-        bases = [make_env(place, zeta, config.seed, **options) for place in (scenario, example)]
+        drift_km = flown.drift_km(scenario.max_move_km or 50.0)
+        bases = [
+            GeomagneticNavEnv(place, num_envs=len(task_names(place)), drift_km=drift_km, seed=config.seed)
+            for place in (scenario, example)
+        ]
         if config.conditions:
             envs = [with_conditions(base, flown, config.seed) for base in bases]
         else:
             envs = [with_sensor_noise(base, config.noise, config.seed) for base in bases]
+        envs = [with_declaration(env) for env in envs]
         told = flown.sensor_std if config.conditions else config.noise, config.map_date, flown.bias_std
         navigators = [
             tuple(make_navigator(text, base, config.mode, config.seed, *told) for base in bases)
@@ -267,7 +226,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
     torchrl_logger.setLevel("WARNING")
     prepared = prepare(config)
     config, env = prepared.config, prepared.env
-    names = env.scenario.names or tuple(f"task {number}" for number in range(env.num_envs))
+    names = task_names(env.scenario)
     results = Results(warnings=prepared.warnings)
     for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), prepared.navigators, strict=True):
         name, _, run = text.partition("=")
@@ -279,14 +238,15 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         number = len(results.summaries.setdefault(name, []))
         results.summaries[name].append(summary)
         results.runs.append({"navigator": name, "run": number, "source": Path(run).name, **summary})
-        columns = {key: measured[key].tolist() for key in MEASURES}
+        columns = {key: measured[key].tolist() for key in (*MEASURES, "false_arrival") if key in measured}
         results.episodes += [
-            {"navigator": name, "run": number, "task": task, **{key: columns[key][task] for key in MEASURES}}
+            {"navigator": name, "run": number, "task": task, **{key: column[task] for key, column in columns.items()}}
             for task in range(env.num_envs)
         ]
         if config.export:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
+            results.rollouts[label(name, config.mode)] = rollout[:SHOWN].clone()
             results.paths += path_rows(name, evaluation_rollout(prepared.example_env, example))
     write(config, env, results)
     return results.summaries
@@ -302,10 +262,17 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
         "zeta": env.zeta,
+        "arrival": env.arrival.rule,
+        "arrival_radius_km": env.arrival.radius_km,
+        "max_steps": env.max_steps,
+        "max_move_km": env.max_move_km,
+        "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
+        "altitude_km": env.scenario.altitude_km,
+        "margin_deg": env.scenario.margin_deg,
         "noise": config.noise,
         "conditions": config.conditions,
         "map_date": config.map_date,
-        "start_heading": config.start_heading,
+        "start_heading": env.start_heading,
         "mode": config.mode,
         "seed": config.seed,
     }
@@ -325,8 +292,14 @@ def write(config: Config, env: EnvBase, results: Results) -> None:
         notes = f"\nConditions: {config.conditions}.\n{notes}"
     if config.map_date:
         notes = f"\nDate of the map of map matching: {config.map_date}.\n{notes}"
-    (config.out / "table.md").write_text(comparison_table(results.summaries, config.mode) + notes)
-    (config.out / "short.md").write_text(short_table(results.summaries, config.mode) + notes)
+    if env.arrival.rule != "objective":
+        notes = f"\nArrival: {env.arrival.rule}, within {env.arrival.radius_km:g} km.\n{notes}"
+    ahead = config.kilometers or env.arrival.rule != "objective"
+    whole = comparison_table(results.summaries, config.mode, published=not config.scenario, kilometers=ahead)
+    (config.out / "table.md").write_text(whole + notes)
+    (config.out / "short.md").write_text(short_table(results.summaries, config.mode, kilometers=ahead) + notes)
+    figure = flights_figure(results.rollouts, env.field, env.region, env.scenario.names)
+    figure.savefig(config.out / "trajectories.png", dpi=120)
     if config.export:
         export.write_tracks(config.export, results.tracks)
     run = WandbRun(config.out, config.wandb_mode, settings(config, env), "evaluation", list(results.summaries))

@@ -18,16 +18,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from evaluate import TaskSet, choose_tasks, first_tasks, make_env
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from torchrl.envs import EnvBase
 
+from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.navigators import DEFAULT_ZETA, label, make_navigator
 from magrl.evaluation.replay import replay_data, write_gif, write_replay
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import read_run, run_config
+from magrl.evaluation.scenarios import TaskSet, choose_tasks, first_tasks
 from magrl.files import check_writable
 from magrl.training import UsageError, command
 from magrl.transforms import with_sensor_noise
@@ -86,12 +87,12 @@ def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], s
     try:
         run = read_run(config.run)
         path = config.scenario or run.scenario
-        scenario = choose_tasks(path, config.tasks)
+        zeta = run_config(config.run).get("zeta", DEFAULT_ZETA) if config.zeta is None else config.zeta
+        scenario = choose_tasks(path, config.tasks, zeta=zeta, start_heading=run.start_heading)
         assert scenario.tasks is not None
         available = len(scenario.tasks.start)
         count = min(DEFAULT_TASKS, available) if config.num_tasks is None else config.num_tasks
-        zeta = run_config(config.run).get("zeta", DEFAULT_ZETA) if config.zeta is None else config.zeta
-        base = make_env(first_tasks(scenario, count), zeta, config.seed, start_heading=run.start_heading)
+        base = GeomagneticNavEnv(first_tasks(scenario, count), num_envs=count, seed=config.seed)
         env = with_sensor_noise(base, run.noise, config.seed)
         texts = (f"{run.kind or 'gg_td3'}={config.run}", *config.navigators)
         made = {text: make_navigator(text, base, seed=config.seed, noise=run.noise) for text in texts}
@@ -114,7 +115,8 @@ def replay(config: Config) -> Path:
     torchrl_logger.setLevel("WARNING")
     env, navigators, title, out = prepare(config)
     rollouts = {name: with_true_field(evaluation_rollout(env, flown)) for name, flown in navigators.items()}
-    write_replay(out, replay_data(rollouts, env.field, env.region, zeta=env.zeta, title=title))
+    data = replay_data(rollouts, env.field, env.region, zeta=env.zeta, title=title, names=env.scenario.names)
+    write_replay(out, data)
     if config.gif:
         write_gif(config.gif, next(iter(rollouts.values())), env.field, env.region)
     return out

@@ -18,7 +18,7 @@ PACKAGES = (
     "training",
 )
 """Packages whose ``__all__`` is public."""
-MODULES = ("checks", "files", "geodesy", "guidance", "envs.gymnasium")
+MODULES = ("checks", "files", "geodesy", "guidance", "onboard", "envs.gymnasium")
 """Modules whose functions and classes are public."""
 
 

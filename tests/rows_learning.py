@@ -28,7 +28,8 @@ from rows_physics import NARROW, igrf
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from magrl import agents, training, transforms
+from magrl import agents, onboard, training, transforms
+from magrl.agents.program import TensorProgram
 from magrl.envs import (
     PAPER_REGION,
     GeomagneticNavEnv,
@@ -44,7 +45,7 @@ from magrl.envs import (
     task_set,
 )
 from magrl.envs.gymnasium import GeomagneticNavGymEnv, GeomagneticNavVectorEnv
-from magrl.evaluation import episode_measures, evaluation_rollout, summarize
+from magrl.evaluation import episode_measures, evaluate, evaluation_rollout, summarize
 from magrl.navigators import (
     Geodesic,
     Kalman,
@@ -71,6 +72,12 @@ def flight() -> TensorDictBase:
 
 def stepped(action: Tensor) -> object:
     return nav().step(nav().reset().set("action", action))
+
+
+def aboard() -> onboard.Onboard:
+    vehicle = onboard.Onboard("secant")
+    vehicle.start((-11.6, 75.4, 13240.0))
+    return vehicle
 
 
 def begun() -> GeomagneticNavEnv:
@@ -169,7 +176,7 @@ ENVS: Rows = {
             region=(5, ((0, 1), (0, 1))),
             distance_range_km=((5.0, 4.0), (0.0, NAN), (5000.0, 6000.0)),
             generation=(12, "13"),
-            altitude_km=(-1.0, NAN, 601.0, "a"),
+            altitude_km=(-16.0, NAN, 601.0, "a"),
             margin_deg=(-1.0, NAN, "a"),
             objective_floors=(5, "abc"),
             field=("IGRF",),
@@ -203,11 +210,11 @@ ENVS: Rows = {
             GeomagneticNavEnv,
             num_envs=(0, 1.5, "a"),
             max_steps=(0, "a"),
-            max_move_km=("a", None, 0.0, 1001.0),
+            max_move_km=("a", 0.0, 1001.0),
             max_turn_rad=(INF, "a", 4.0),
-            zeta=("a", None, t(0.01), 0.0),
-            arrival=("said", None, []),
-            arrival_radius_km=("a", None, 0.0, INF),
+            zeta=("a", t(0.01), 0.0),
+            arrival=("said", []),
+            arrival_radius_km=("a", 0.0, INF),
             start_heading=([], "south"),
             destination_weight=("a", -1.0),
             proximity_weight=("a", NAN),
@@ -215,6 +222,12 @@ ENVS: Rows = {
             seed=(1.5, -1, "a", NAN, True, 2**64),
         ),
         refused(lambda: GeomagneticNavEnv(5), TypeError, "scenario", "5"),
+        refused(
+            lambda: GeomagneticNavEnv(Scenario(zeta=0.02), zeta=0.01),
+            ValueError,
+            "zeta is 0.02 in the scenario",
+            "0.01",
+        ),
         refused(lambda: GeomagneticNavEnv(Scenario(field=lambda lat, _: lat)), ValueError, "(81, 81)"),
         refused(lambda: nav().set_seed(None), ValueError, "seed", "None"),
         refused(lambda: stepped(torch.tensor([[1.0, 0.0], [NAN, 0.0]])), ValueError, "vehicles [1]", "nan"),
@@ -366,6 +379,10 @@ def view() -> transforms.ObservationView:
     return nav().observation_view()
 
 
+def halves() -> TensorProgram:
+    return TensorProgram(1, [["mul.Tensor", [{"value": 0}, 0.5], {}]], [], [1])
+
+
 def policy_config(**options: Any) -> agents.PolicyConfig:
     return agents.PolicyConfig(**({"view": view(), "num_cells": (8,)} | options))
 
@@ -410,7 +427,56 @@ AGENTS: Rows = {
         refused(lambda: agents.FieldPolicy(policy_config()).check_fits(5), TypeError, "env", "5"),
         refused(lambda: agents.FieldPolicy(policy_config(view=NARROW)).check_fits(nav()), ValueError, "I is", "-40.0°"),
     ],
-    "agents.save_policy": [refused(lambda: agents.save_policy(folder() / "policy.pt", 5), TypeError, "policy", "5")],
+    "agents.VehicleStep": [
+        refused(lambda: agents.VehicleStep(5), TypeError, "policy", "5"),
+        refused(
+            lambda: agents.VehicleStep(agents.FieldPolicy(policy_config())), ValueError, "TrackView", "ObservationView"
+        ),
+    ],
+    "agents.write_step": [
+        refused(lambda: agents.write_step("a.onnx", agents.FieldPolicy(policy_config())), ValueError, ".pt2", "a.onnx"),
+    ],
+    "onboard.Onboard": [
+        *bad_numbers(onboard.Onboard, zeta=(0.0, NAN, 3.5), arrival_km=(0.0, "a"), confidence=(0.0, 1.5)),
+        refused(lambda: onboard.Onboard("dowsing"), ValueError, "dowsing", "kalman"),
+        refused(lambda: onboard.Onboard(5), TypeError, "navigator", "5"),
+    ],
+    "onboard.Onboard.start": [refused(lambda: aboard().start((1.0, NAN, 2.0)), ValueError, "target", "nan")],
+    "onboard.Onboard.step": [
+        refused(lambda: onboard.Onboard("secant").step(3.5, 73.0, 15000.0, 0.0), RuntimeError, "start(target)"),
+        *bad_numbers(lambda **given: aboard().step(3.5, 73.0, 15000.0, **given), heading=(NAN, "a", 400.0)),
+    ],
+    "onboard.Onboard.save": [refused(lambda: onboard.Onboard("secant").save("a"), RuntimeError, "start(target)")],
+    "onboard.Onboard.restore": [
+        refused(lambda: aboard().restore(written({"a": 1})), ValueError, "not the state of a vehicle"),
+        refused(lambda: aboard().restore(text_file("a.pt", "b")), ValueError, "a.pt", "damaged"),
+    ],
+    "agents.save_policy": [
+        refused(lambda: agents.save_policy(folder() / "policy.pt", 5), TypeError, "policy", "5"),
+        refused(lambda: agents.save_policy("a.pt", agents.make_actor(13, (8,))), TypeError, "TensorDictSequential"),
+    ],
+    "agents.export_policy": [
+        refused(lambda: agents.export_policy(5, nav()), TypeError, "actor", "5"),
+        refused(lambda: agents.export_policy(agents.make_actor(13, (8,)), 5), TypeError, "env", "5"),
+        refused(lambda: agents.export_policy(agents.make_actor(13, (8,)), nav()), ValueError, "'observation'"),
+    ],
+    "agents.ExportedPolicy": [
+        refused(lambda: agents.ExportedPolicy(["move"], 5), TypeError, "program", "5"),
+        refused(lambda: agents.ExportedPolicy("move", halves()), TypeError, "in_keys", "'move'"),
+        refused(lambda: agents.ExportedPolicy(["position"], halves()), ValueError, "in_keys", "position"),
+        refused(lambda: agents.ExportedPolicy([], halves()), ValueError, "in_keys", "[]"),
+        refused(lambda: agents.ExportedPolicy(["move", "field"], halves()), ValueError, "2 keys", "1 inputs"),
+        refused(lambda: agents.ExportedPolicy(["move"], halves(), 5), TypeError, "view", "5"),
+    ],
+    "agents.ExportedPolicy.check_fits": [
+        refused(lambda: agents.ExportedPolicy(["move"], halves()).check_fits(5), TypeError, "env", "5"),
+        refused(
+            lambda: agents.ExportedPolicy(["move"], halves(), NARROW).check_fits(nav()), ValueError, "I is", "-40.0°"
+        ),
+    ],
+    "agents.ExportedPolicy.write_torch": [
+        refused(lambda: agents.ExportedPolicy(["move"], halves()).write_torch("a.pt"), ValueError, ".pt2", "'a.pt'")
+    ],
     "agents.load_policy": [
         refused(lambda: agents.load_policy("nowhere.pt"), FileNotFoundError, "nowhere.pt"),
         refused(lambda: agents.load_policy(written([1])), ValueError, "content.pt"),
@@ -464,6 +530,20 @@ TRAINING: Rows = {
         refused(lambda: summarize({"success": zeros(2)}), ValueError, "tensor([0., 0.])"),
         refused(lambda: summarize({}), KeyError, "success"),
         refused(lambda: summarize(without("spl")), KeyError, "spl"),
+    ],
+    "evaluation.evaluate": [
+        *bad_numbers(lambda **options: evaluate("secant", "paper-100", **options), num_envs=(0, 1.5, "a"), seed=(-1,)),
+        refused(lambda: evaluate(5, "figure-4-1"), TypeError, "policy", "5"),
+        refused(lambda: evaluate("dowsing", "figure-4-1"), ValueError, "'dowsing'"),
+        refused(lambda: evaluate("secant", 5), TypeError, "tasks", "5"),
+        refused(lambda: evaluate("secant", "figure-9"), ValueError, "'figure-9'"),
+        refused(lambda: evaluate("secant", Scenario()), ValueError, "no tasks"),
+        refused(lambda: evaluate("secant", "figure-4-1", noise=(0.1, -1.0, 5.0)), ValueError, "-1.0"),
+        refused(lambda: evaluate("secant", "figure-4-1", conditions="storm"), ValueError, "'storm'"),
+        refused(lambda: evaluate("secant", "figure-4-1", conditions="ship", noise=(1, 1, 1)), ValueError, "(1, 1, 1)"),
+        refused(
+            lambda: evaluate(agents.FieldPolicy(policy_config(view=NARROW)), "figure-4-1"), ValueError, "I is", "-40.0°"
+        ),
     ],
     "evaluation.evaluation_rollout": [
         refused(lambda: evaluation_rollout(5, None), TypeError, "env", "5"),

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from magrl import checks, field, files, geodesy, guidance, transforms
 
+READING: dict[str, Any] = {"declination": 3.5, "inclination": 73.0, "horizontal_intensity": 15000.0}
 FOUNDATIONS: Rows = {
     "geodesy.wrap_angle": [*bad_tensors(geodesy.wrap_angle, "angle"), Nan(lambda: geodesy.wrap_angle(t(NAN, INF)))],
     "geodesy.wrap_longitude": [
@@ -266,6 +267,8 @@ FIELDS: Rows = {
         refused(lambda: field.IGRF(2022.0, 12), ValueError, "12", "[13, 14]"),
         refused(lambda: field.IGRF(2022.0, altitude_km=INF), ValueError, "altitude_km", "inf"),
         refused(lambda: field.IGRF(2022.0, "13"), ValueError, "'13'", "[13, 14]"),
+        refused(lambda: field.IGRF([2022.0, "May"]), ValueError, "'May'"),
+        refused(lambda: field.IGRF(2022.0, altitude_km=5000), ValueError, "altitude_km 5000", "600 km", "meters?"),
         *bad_places(lambda *place: igrf()(*place)),
     ],
     "field.elements_at": [
@@ -347,6 +350,16 @@ FIELDS: Rows = {
     ],
     "field.CrustedField.value_and_gradient": [
         Nan(lambda: field.CrustedField(igrf(), crust()).value_and_gradient(t(11.0), t(5.0))),
+    ],
+    "field.check_earth_reading": [
+        *bad_numbers(lambda **given: field.check_earth_reading(**(READING | given)), inclination=(NAN, 91.0, "a")),
+        refused(lambda: field.check_earth_reading(3.5, 73.0, 15.0), ValueError, "15 ", "microtesla"),
+        refused(lambda: field.check_earth_reading(0.06, 1.27, 15000.0), ValueError, "1.27", "radians"),
+    ],
+    "field.check_earth_jump": [
+        refused(lambda: field.check_earth_jump((1.0, 2.0), (1.0, 2.0, 3.0), 1.0), ValueError, "before", "(1.0, 2.0)"),
+        refused(lambda: field.check_earth_jump((0, 60, 2e4), (0, 60, 3e4), 50.0), ValueError, "B_H", "30000", "50 km"),
+        refused(lambda: field.check_earth_jump((0, 60, 2e4), (0, 60, 2e4), -1.0), ValueError, "distance_km", "-1.0"),
     ],
     "field.weather_record": [
         refused(lambda n=name: field.weather_record(n), ValueError, repr(name), "quiet, disturbed")
@@ -683,6 +696,9 @@ def track_view(**options: Any) -> transforms.TrackView:
 NARROW = sound_view(field_high=(10.0, -40.0, 4e4))
 
 VIEWS: Rows = {
+    "transforms.ObservationView.action_transform": [
+        refused(lambda: sound_view().action_transform(declared=1), TypeError, "declared", "1")
+    ],
     "transforms.ObservationView": bad_numbers(
         sound_view,
         observe_heading=(None,),

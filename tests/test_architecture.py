@@ -19,7 +19,7 @@ FLOORS = (
     {"transforms"},
     {"envs"},
     {"navigators", "agents"},
-    {"evaluation"},
+    {"evaluation", "onboard"},
     {"training"},
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}

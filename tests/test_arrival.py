@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
-from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Scenario, Tasks
+from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region, Scenario, Tasks
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import FieldModel
 from magrl.geodesy import move
@@ -41,13 +41,13 @@ def declaring(num_envs: int = 2, within_km: float = 20.0, **options: object) -> 
     return TransformedEnv(declared(num_envs, **options), Compose(TrackGradient(), DeclareArrival(within_km)))
 
 
-def near(*distances_km: float) -> GeomagneticNavEnv:
+def near(*distances_km: float, rule: str = "declared") -> GeomagneticNavEnv:
     """Vehicles whose targets are some distances northward; a radius of 10 km."""
     start = torch.tensor([[-5.0, 165.0]], dtype=torch.float64).expand(len(distances_km), 2)
     reach = torch.tensor(distances_km, dtype=torch.float64)
     target = torch.stack(move(*start.unbind(-1), torch.zeros_like(reach), reach), -1)
     scenario = Scenario(field=field(), tasks=Tasks(start, target))
-    return GeomagneticNavEnv(scenario, num_envs=len(reach), arrival="declared", arrival_radius_km=10.0, seed=0)
+    return GeomagneticNavEnv(scenario, num_envs=len(reach), arrival=rule, arrival_radius_km=10.0, seed=0)
 
 
 # The environment
@@ -94,6 +94,35 @@ def test_the_objective_ends_no_episode() -> None:
     assert right["success"].all()
     assert right["terminated"].all()
     assert not right["truncated"].any()
+
+
+def test_an_arrival_by_distance_ends_the_episode_within_the_radius() -> None:
+    """Moves of 20 km northward to targets 9.9, 10.1, 29.9 and 30.1 km away: 10.1, 9.9, 9.9 and 10.1 km are left."""
+    env = near(9.9, 10.1, 29.9, 30.1, rule="distance")
+    assert env.action_spec.shape == (4, 2)
+    after = env.step(env.reset().set("action", torch.tensor([[20.0, 0.0]]).expand(4, 2)))["next"]
+    for key in ("success", "terminated", "done"):
+        assert after[key].squeeze(-1).tolist() == [False, True, True, False]
+    assert after["reward_destination"].squeeze(-1).tolist() == [0, 200, 200, 0]
+    assert "declared" not in after.keys()  # noqa: SIM118 - a TensorDict is no mapping
+    check_env_specs(near(20.0, 30.0, rule="distance"))
+
+
+def test_on_a_long_way_the_distance_tells_what_the_objective_hides() -> None:
+    """At 1000 to 1800 km, F < 0.01 holds up to 100 km from the destination: SR is 100 %, and few end within 25 km."""
+    region = Region((30.0, 50.0), (-45.0, -20.0))
+    scenario = Scenario(region=region, date="2025-01-01", generation=14, distance_range_km=(1000.0, 1800.0))
+    frozen = scenario.replace(max_steps=120).with_tasks(scenario.random_tasks(30, seed=1))
+    by_objective, by_distance = (
+        summarize(episode_measures(evaluation_rollout(env, Secant()), env))
+        for env in (GeomagneticNavEnv(frozen, num_envs=30, arrival=rule, seed=0) for rule in ("objective", "distance"))
+    )
+    assert by_objective["success_rate"] == by_distance["success_rate"] == 100
+    assert by_objective["success_rate_within_25km"] < 30
+    assert by_objective["final_distance_km_median"] > 35
+    assert by_distance["success_rate_within_25km"] == 100
+    assert by_distance["final_distance_km_median"] < 25
+    assert by_distance["spl_to_arrival"] < by_distance["spl"]
 
 
 def test_a_lost_vehicle_arrives_nowhere() -> None:
@@ -225,7 +254,7 @@ def test_measures_by_hand() -> None:
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: nav(arrival="said"), "arrival must be one of 'objective', 'declared', got 'said'"),
+        (lambda: nav(arrival="said"), "arrival must be one of 'objective', 'distance', 'declared', got 'said'"),
         (lambda: declared(radius_km=0.0), r"arrival_radius_km .*0\.0"),
         (lambda: declared(radius_km=math.nan), "arrival_radius_km .*nan"),
         (lambda: DeclareArrival(0), "within_km .*0"),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from benchmarks import __main__ as bench
-from benchmarks import env, imports, profile_training, update
+from benchmarks import env, imports, onboard, profile_training, update
 from benchmarks.__main__ import cost_figure, seconds_table, table
 from benchmarks.timing import Row, alternate
 
@@ -90,6 +90,12 @@ def test_imports_are_timed_with_and_without_magrl(monkeypatch) -> None:
         "import torchrl",
         "import " + ", ".join(f"torchrl.{x}" for x in imports.PARTS),
     }
+
+
+def test_steps_on_board_are_timed() -> None:
+    found = onboard.row("secant", repeats=5)
+    assert found.what.startswith("step on board, secant")
+    assert found.magrl_ms > 0
 
 
 def test_shares_add_up() -> None:

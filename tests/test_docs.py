@@ -16,6 +16,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
+from magrl.envs.episodes import DEFAULTS
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
 ROOT = Path(__file__).parent.parent
@@ -25,6 +26,8 @@ EXAMPLES = [
     for page in PAGES
     for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
 ]
+BUDGET = {"total_frames = 60_000": "total_frames = 512", "= 512, 1024, 8": "= 64, 64, 1"}
+"""Settings of trainings in examples, and those of their tests."""
 THEORY, ENVIRONMENT, OWN_DATA, RELIABILITY = (
     (ROOT / "docs" / f"{name}.md").read_text() for name in ("theory", "environment", "own_data", "reliability")
 )
@@ -114,9 +117,17 @@ def run_folder(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(("page", "block"), EXAMPLES, ids=lambda value: getattr(value, "name", None))
 def test_python_examples_run(page: Path, block: str, run_folder: Path, monkeypatch) -> None:
     monkeypatch.chdir(run_folder)
+    for setting, small in BUDGET.items():
+        block = block.replace(setting, small)
     names: dict[str, object] = {}
     exec(compile(block, str(page), "exec"), names)
     assert len(names) > 1, "an example should leave something behind"
+
+
+def test_a_training_of_another_algorithm_is_short() -> None:
+    block = next(block for page, block in EXAMPLES if page.name == "training_your_own.md")
+    assert len(block.splitlines()) <= 80
+    assert all(setting in block for setting in BUDGET)
 
 
 # Tables of options
@@ -139,7 +150,9 @@ def test_options_of_the_environment_are_documented() -> None:
     rows = table_rows(ENVIRONMENT, "## Options", "option")
     assert list(rows) == list(options)
     for name in rows.keys() - {"scenario", "device"}:
-        assert documented_default(rows[name][0]) == pytest.approx(options[name].default), name
+        default = DEFAULTS.get(name, options[name].default)
+        assert documented_default(rows[name][0]) == pytest.approx(default), name
+        assert (options[name].default is None) == (name in DEFAULTS or default is None), name
     assert documented_default(rows["scenario"][0]) == Scenario()
 
 

@@ -12,11 +12,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from test_metrics import episode, point
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from magrl.agents import FieldPolicy, save_policy
+from magrl.agents import ExportedPolicy, FieldPolicy, save_policy
 from magrl.agents.policy import PolicyConfig
-from magrl.envs import GeomagneticNavEnv, named_tasks
+from magrl.agents.program import TensorProgram
+from magrl.envs import GeomagneticNavEnv, Scenario, named_tasks
+from magrl.evaluation import evaluate as evaluate_policy
+from magrl.evaluation import evaluation_rollout, summarize
 from magrl.evaluation.navigators import (
     NAVIGATOR_NAMES,
     PRETRAINED,
@@ -146,6 +152,33 @@ def test_every_navigator_has_a_label_and_can_be_made(run: Path) -> None:
         label("dowsing")
 
 
+@pytest.fixture(scope="module")
+def halves(tmp_path_factory) -> Path:
+    """The file of a policy that is not of the library's networks: it moves by 25 km, straight on."""
+    path = tmp_path_factory.mktemp("own") / "halves.pt"
+    steps = [["mul.Tensor", [{"value": 0}, 0.0], {}], ["add.Tensor", [{"value": 2}, {"value": 1}], {}]]
+    save_policy(path, ExportedPolicy(["move"], TensorProgram(1, steps, [torch.tensor([25.0, 0.0])], [3])))
+    return path
+
+
+def test_a_policy_of_any_algorithm_is_in_the_table(evaluate, halves: Path, tmp_path: Path) -> None:
+    """Beside the others, by its label; two files are two runs of one navigator."""
+    copy, third = (shutil.copy(halves, tmp_path / name) for name in ("copy.pt", "third.pt"))
+    names = (f"policy:SAC={halves}", f"policy:SAC={copy}", f"policy={third}", "secant")
+    out = tmp_path / "out"
+    evaluate.evaluate(evaluate.Config(names, tasks=3, out=out, wandb_mode="disabled"))
+    cells = [[cell.strip() for cell in line.split("|")[1:4]] for line in (out / "table.md").read_text().splitlines()]
+    assert cells[2:4] == [["SAC", "training", "2"], ["own policy", "training", "1"]]
+    assert "Warning" not in (out / "table.md").read_text()
+    lengths = {row["length_km"] for row in rows(out / "episodes.csv") if row["navigator"] == "policy:SAC"}
+    assert {round(float(length)) for length in lengths} <= {25 * steps for steps in range(51)}
+    env = GeomagneticNavEnv(seed=0)
+    with pytest.raises(ValueError, match="policy needs the folder of a finished run or the file of a policy"):
+        make_navigator("policy:SAC", env)
+    with pytest.raises(FileNotFoundError, match=r"there is no policy file at .*nowhere\.pt"):
+        make_navigator("policy=nowhere.pt", env)
+
+
 def test_a_mode_behind_the_name_overrides_the_default() -> None:
     env = GeomagneticNavEnv(num_envs=1, seed=0)
     oracles = [
@@ -272,12 +305,14 @@ def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, caps
         ),
         "figures": (["--results", str(tmp_path), "--out", str(tmp_path)], "there is no"),
         "learning_table": (["runs/A"], "a run must be given as NAME=RUN, such as gg_td3=runs/A, got 'runs/A'"),
+        "onboard_table": (["dowsing"], "unknown navigator 'dowsing'"),
         "path_loss": (["dowsing"], "unknown navigator 'dowsing'"),
         "probe_sweep": (["--zeta", "5"], "zeta must be below 3, got 5"),
         "publish": ([str(tmp_path / "missing.md")], "there is no document"),
         "noise_table": ([str(tmp_path)], "there is no"),
         "random_boxes": (["--boxes", "0"], "count must be a whole number from 1 on, got 0"),
         "results_table": ([str(tmp_path)], "no eval.json"),
+        "sweep_table": ([str(tmp_path)], f"there is no run at {tmp_path}: a run folder holds config.json"),
         "sweep_metaheuristics": (["--tasks", "0"], "num_tasks must be a whole number from 1 on, got 0"),
     }
     assert cases.keys() == {path.stem for path in (RECIPES / "tables").glob("*.py")}
@@ -393,3 +428,60 @@ def test_earth_table_has_a_row_for_each_date() -> None:
     for dates, message in ((("2031-01-01",), "outside IGRF-14"), ((), "at least one date")):
         with pytest.raises(UsageError, match=message):
             earth.table(earth.Config(("secant",), tasks=2, regions=1, date=dates))
+
+
+# magrl.evaluation.evaluate
+
+
+def test_every_task_is_flown_once_however_many_vehicles_fly() -> None:
+    tasks = named_tasks("paper-100")
+    together, batches = (evaluate_policy("secant", tasks, num_envs=number) for number in (None, 30))
+    assert together.shape == batches.shape == (100,)
+    for key in ("shortest_km", "length_km", "spl"):
+        torch.testing.assert_close(together[key], batches[key])
+    assert torch.equal(together["steps"], batches["steps"])
+    assert together["shortest_km"].unique().numel() == 100
+    recipe = summarize(together)
+    assert recipe["num_tasks"] == 100
+    assert recipe["success_rate"] > 98
+
+
+def test_batches_have_errors_of_their_own_that_repeat() -> None:
+    """The same task in three batches has other noise and another start heading; the same call has the same."""
+    tasks = named_tasks("figure-4-1")
+    thrice = Scenario().with_tasks(type(tasks)(*(values.repeat(3, 1) for values in tasks)))
+    for errors in ({"noise": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
+        one, again = (evaluate_policy("secant", thrice, num_envs=1, **errors)["smoothness_deg"] for _ in range(2))
+        assert torch.equal(one, again)
+        assert one.unique().numel() == 3
+    perfect = evaluate_policy("secant", thrice, num_envs=1)
+    torch.testing.assert_close(perfect["length_km"], perfect["length_km"][:1].expand(3))
+    ship = evaluate_policy("secant", thrice, conditions="ship", max_steps=5)
+    assert (ship["steps"] <= 5).all()
+
+
+def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:
+    """Twice with the same actions, those of the mode of its distribution."""
+    network = TensorDictModule(lambda move: (0 * move, 0 * move + 2.0), ["move"], ["loc", "scale"])
+    policy = ProbabilisticActor(
+        network,
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        default_interaction_type=ExplorationType.RANDOM,
+        distribution_kwargs={"low": torch.tensor([0.0, -1.0]), "high": torch.tensor([50.0, 1.0])},
+    )
+    env = GeomagneticNavEnv(num_envs=3, seed=0, max_steps=4)
+    assert env.rollout(4, policy)["action"].unique().numel() > 4
+    actions = evaluation_rollout(env, policy)["action"]
+    assert torch.equal(actions, torch.tensor([25.0, 0.0]).expand_as(actions))
+    episodes = [evaluate_policy(policy, "figure-4-1", max_steps=4)["length_km"] for _ in range(2)]
+    assert torch.equal(*episodes)
+
+
+def test_episodes_are_a_data_frame() -> None:
+    pandas = pytest.importorskip("pandas")
+    episodes = evaluate_policy("geodesic", "figure-4-1")
+    frame = pandas.DataFrame(episodes.to_dict(convert_tensors="numpy"))
+    assert len(frame) == 1
+    assert frame["success"].dtype == bool
+    assert set(frame) == set(episodes.keys()) > {"spl", "spl_to_arrival", "navigation_error_km"}

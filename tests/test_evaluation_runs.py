@@ -15,8 +15,9 @@ from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, named_tasks
 from magrl.envs.tasks import task_set
 from magrl.evaluation.runs import TrainedRun, agreed, common_scenario, read_run, run_config, trained_runs
+from magrl.evaluation.scenarios import FIRST_TASKS_SEED
 from magrl.files import write_json
-from magrl.training import UsageError
+from magrl.training import RunConfig, UsageError
 from magrl.training.collectors import worker_seed
 
 NOISE = (0.05, 0.05, 5.0)
@@ -79,7 +80,7 @@ def test_random_tasks_are_not_those_of_a_training_or_a_frozen_set() -> None:
     seeds = [7, worker_seed(7, 0), paper.TEST_SEED, paper.VALIDATION_SEED, paper.SWEEP_SEED, paper.PAPER_SEED]
     for seed in seeds:
         assert not torch.equal(task_set(3, seed).start, evaluate.choose_tasks(None, 3, 7).tasks.start)
-    assert max(*seeds, paper.FIRST_RESERVED_SEED) < evaluate.FIRST_TASKS_SEED
+    assert max(*seeds, paper.FIRST_RESERVED_SEED) < FIRST_TASKS_SEED
     assert torch.equal(evaluate.choose_tasks(None, "test-1000").tasks.start, named_tasks("test-1000").start)
 
 
@@ -92,6 +93,8 @@ def test_random_tasks_are_not_those_of_a_training_or_a_frozen_set() -> None:
         ({"tasks": "paper-100", "tasks_seed": 0}, "--tasks-seed 0 needs a number of random tasks"),
         ({"noise": (0.05, -1.0, 5.0)}, "noise must be a finite number from 0 on, got -1.0"),
         ({"noise": (0.05, math.nan, 5.0)}, "noise .*nan"),
+        ({"max_steps": 0}, "max_steps must be greater than or equal to 1, got 0"),
+        ({"altitude_km": 5000.0}, "altitude_km must be from -15 to 600 km, negative for a depth, got 5000"),
         ({"start_heading": "south"}, "start_heading must be 'north' or 'random', got 'south'"),
     ],
     ids=str,
@@ -114,6 +117,13 @@ def test_settings_say_what_was_flown(tmp_path: Path) -> None:
         "tasks_seed": 7,
         "scenario": None,
         "zeta": 0.01,
+        "arrival": "objective",
+        "arrival_radius_km": 25,
+        "max_steps": 50,
+        "max_move_km": 50,
+        "max_turn_deg": 90,
+        "altitude_km": 0,
+        "margin_deg": 5,
         "noise": list(NOISE),
         "start_heading": "north",
         "mode": "look-ahead",
@@ -260,3 +270,65 @@ def test_first_of_equal_runs_is_named() -> None:
         agreed(runs, lambda run: run.start_heading, None, "north", **options)
     assert agreed(runs[:1], lambda run: run.start_heading, None, "random", **options) == ("north", [])
     assert agreed([], lambda run: run.start_heading, None, "random", **options) == ("random", [])
+
+
+# Options of a scenario
+
+
+OWN = """date = 2026-07-01
+zeta = 0.02
+max_steps = 70
+arrival = "distance"
+region = {latitude = [36, 46], longitude = [-32, -22]}
+tasks = [{name = "far off", start = [37.74, -25.67], target = [53.5, -31.13]}]
+"""
+
+
+def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Path) -> None:
+    """Its destination, seven degrees north of the region, needs a wider margin than the five of the default."""
+    (tmp_path / "own.toml").write_text(OWN)
+    with pytest.raises(
+        UsageError, match=r"own\.toml: tasks: .* lies outside .*: raise margin_deg from 5 to at least 7\.5$"
+    ):
+        flown(tmp_path / "out", "secant", tasks=None, scenario=tmp_path / "own.toml")
+    options = {
+        "margin_deg": 8.0,
+        "max_steps": 90,
+        "max_turn_deg": 120.0,
+        "altitude_km": -2.0,
+        "start_heading": "random",
+    }
+    said = flown(tmp_path / "out", "secant", "parallel", tasks=None, scenario=tmp_path / "own.toml", **options)
+    assert said.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 1}).items()
+    for episode in rows(tmp_path / "out", "episodes"):
+        assert episode["success"] == "True"
+        assert float(episode["navigation_error_km"]) <= 25
+    assert (tmp_path / "out" / "trajectories.png").stat().st_size > 10_000
+
+
+def test_tables_lead_with_kilometers_where_arrival_is_a_distance_and_have_no_row_of_the_paper(tmp_path: Path) -> None:
+    heads = []
+    for name, options in (("a", {}), ("b", {"kilometers": True}), ("c", {"arrival": "declared"})):
+        flown(tmp_path / name, "secant", "ga", **options)
+        table, short = ((tmp_path / name / f"{kind}.md").read_text() for kind in ("table", "short"))
+        assert "GA, paper" in table
+        heads.append(short.splitlines()[0].split(" | ")[2:5])
+    assert heads[0] == ["SR %", "SPL %", "worst run, SPL %"]
+    assert heads[1] == ["within 25 km %", "final distance, median km", "SR %"]
+    assert heads[2] == ["within 25 km %", "final distance, median km", "false arrivals %"]
+    assert "Arrival: declared, within 25 km." in short
+    assert {episode["false_arrival"] for episode in rows(tmp_path / "c", "episodes")} <= {"True", "False"}
+    (tmp_path / "own.toml").write_text(AZORES)
+    flown(tmp_path / "d", "ga", scenario=tmp_path / "own.toml")
+    assert "paper" not in (tmp_path / "d" / "table.md").read_text()
+
+
+def test_a_training_contradicts_no_scenario(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(OWN.replace("53.5", "40.5"))
+    with pytest.raises(ValueError, match=r"the scenario says zeta = 0\.02, the training 0\.01: add --zeta 0\.02"):
+        RunConfig(scenario=path)
+    assert RunConfig(scenario=path, zeta=0.02).load_scenario().max_steps == 70
+    path.write_text(OWN.replace("53.5", "40.5").replace("distance", "declared"))
+    with pytest.raises(ValueError, match="the recipes train no agent that declares"):
+        RunConfig(scenario=path, zeta=0.02)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
+from magrl.evaluation.colors import NAVIGATOR_COLORS
 from magrl.evaluation.export import Track, check_suffix, cut, to_geojson, to_gpx, to_kml, tracks, write_tracks
 
 GPX, KML = "{http://www.topografix.com/GPX/1/1}", "{http://www.opengis.net/kml/2.2}"
@@ -53,6 +54,7 @@ def test_tracks_are_those_of_the_rollout() -> None:
     assert one.positions[0] == tuple(rollout["position"][0, 0].tolist())
     assert one.positions[-1] == tuple(rollout["next", "position"][0, 3].tolist())
     assert len(one.positions) == 5
+    assert one.target == tuple(rollout["target_position"][0, 0].tolist())
     assert (one.properties["navigator"], one.properties["steps"], one.properties["success"]) == ("chance", 4, False)
     assert {"spl", "length_km", "shortest_km", "navigation_error_km"} <= one.properties.keys()
     with pytest.raises(ValueError, match="each of 2 episodes, got 1"):
@@ -105,6 +107,36 @@ def test_kml_holds_the_places_and_is_cut() -> None:
     assert across[0][-1][1] == 180
     assert across[1][0][1] == -180
     assert ElementTree.fromstring(text).find(f".//{KML}name").text.startswith("a <b> &")
+
+
+def test_kml_has_a_folder_and_a_color_for_each_navigator_and_the_ends_once() -> None:
+    """Two runs of one navigator and one of another on two tasks; in KML, all styles stand before the first folder."""
+    ends = {"home": ((10.0, 20.0), (11.0, 21.0)), "port": ((12.0, 22.0), (13.0, 179.0))}
+    flown = [
+        Track(name, [start, (start[0], start[1] + 1)], {"navigator": navigator, "run": run}, target)
+        for navigator, run in (("td3", 0), ("td3", 1), ("secant", 0))
+        for name, (start, target) in ends.items()
+    ]
+    document = ElementTree.fromstring(to_kml(flown)).find(f"{KML}Document")
+    assert [part.tag for part in document] == [f"{KML}Style"] * 5 + [f"{KML}Folder"] * 4
+    *navigators, last = document.findall(f"{KML}Folder")
+    assert [folder.find(f"{KML}name").text for folder in navigators] == ["td3, run 0", "td3, run 1", "secant"]
+    colors = {f"#{style.get('id')}": style.find(f"*/{KML}color").text for style in document.findall(f"{KML}Style")}
+    drawn = []
+    for folder in navigators:
+        placemarks = folder.findall(f"{KML}Placemark")
+        assert [place.find(f"{KML}name").text for place in placemarks] == ["home", "port"]
+        drawn += {colors[place.find(f"{KML}styleUrl").text] for place in placemarks}
+    expected = (NAVIGATOR_COLORS[name] for name in ("td3", "td3", "secant"))
+    assert drawn == [f"ff{color[5:]}{color[3:5]}{color[1:3]}".lower() for color in expected]
+    places = [[part.text for part in (*place.iter(f"{KML}name"), *place.iter(f"{KML}coordinates"))] for place in last]
+    assert places[1:] == [
+        ["home: start", "20.000000000,10.000000000,0"],
+        ["home: destination", "21.000000000,11.000000000,0"],
+        ["port: start", "22.000000000,12.000000000,0"],
+        ["port: destination", "179.000000000,13.000000000,0"],
+    ]
+    assert {"#start", "#destination"} <= colors.keys()
 
 
 @pytest.mark.parametrize(

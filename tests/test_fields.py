@@ -8,6 +8,7 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
+import pandas
 import ppigrf
 import pytest
 import torch
@@ -146,6 +147,9 @@ def test_another_model_gives_its_published_values():
         "2022-07-02T22:00:00+10:00",
         2022.5,
         np.float64(2022.5),
+        np.float32(2022.5),
+        np.datetime64("2022-07-02T12:00"),
+        pandas.Timestamp("2022-07-02T12:00"),
     ],
     ids=str,
 )
@@ -184,9 +188,72 @@ def test_a_day_outside_the_model_is_refused_with_its_span(generation, side):
 
 @pytest.mark.parametrize("read", [parse_date, IGRF])
 def test_bad_dates_are_refused(read):
-    for date in (math.nan, math.inf, -1.0, 0.5, 1e5, "yesterday", "", "2022-13-01", True, None, [2022]):
+    for date in (
+        math.nan,
+        math.inf,
+        -1.0,
+        0.5,
+        1e5,
+        "yesterday",
+        "",
+        "2022-13-01",
+        True,
+        None,
+        [],
+        np.datetime64("NaT"),
+        pandas.NaT,
+    ):
         with pytest.raises(ValueError, match="date"):
             read(date)
+
+
+def test_many_dates_are_each_that_of_its_place():
+    """Against one model for each date, in every form of dates, with gradients; and on an epoch, first and last day."""
+    dates = ["1900-01-01", 1957.25, calendar_date(2019, 3, 4), np.datetime64("2020-01-01"), "2029-12-31", "2030-01-01"]
+    latitude, longitude = globe(len(dates), 11)
+    altitude_km = torch.linspace(-10, 500, len(dates), dtype=torch.float64)
+    many = IGRF(dates)
+    values, gradients = many.value_and_gradient(latitude, longitude, altitude_km)
+    for k, date in enumerate(dates):
+        value, gradient = IGRF(date).value_and_gradient(latitude[k], longitude[k], altitude_km[k])
+        torch.testing.assert_close(values[k], value, rtol=0, atol=ROUNDING_NT)
+        torch.testing.assert_close(gradients[k], gradient, rtol=0, atol=ROUNDING_NT)
+    torch.testing.assert_close(many(latitude, longitude, altitude_km), values, rtol=0, atol=ROUNDING_NT)
+    for form in (many.date, many.date.astype("M8[ns]"), pandas.Series(many.date), pandas.DatetimeIndex(many.date)):
+        torch.testing.assert_close(IGRF(form)(latitude, longitude, altitude_km), values, rtol=0, atol=ROUNDING_NT)
+
+
+def test_dates_broadcast_with_positions():
+    latitude, longitude = globe(3, 12)
+    series = IGRF(np.array([[2000.0], [2021.0]]), altitude_km=100.0)
+    expected = torch.stack([IGRF(year, altitude_km=100.0)(latitude, longitude) for year in (2000.0, 2021.0)])
+    torch.testing.assert_close(series(latitude, longitude), expected, rtol=0, atol=ROUNDING_NT)
+    assert series.value_and_gradient(latitude, longitude)[1].shape == (2, 3, 3, 2)
+    assert IGRF([2020.0])(f64(1.0), f64(2.0)).shape == (1, 3)
+
+
+def test_bad_dates_among_many_are_refused():
+    for dates, message in (
+        ([], r"at least one date, got \[\]"),
+        ([2020.0, "May"], "date 'May' is not an ISO date"),
+        ([2020.0, "1850-01-01"], "date 1850-01-01T00:00:00 is outside IGRF-14"),
+        (np.array(["2020-01-01", "NaT"], dtype="M8[D]"), "date .*NaT.* is missing"),
+        (pandas.Series([None], dtype="M8[ns]"), "date .*NaT.* is missing"),
+        ([np.datetime64(20000, "Y")], "is not in a year between"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            IGRF(dates)
+    with pytest.raises(ValueError, match=re.escape("shape (3,) do not broadcast with dates of shape (2,)")):
+        IGRF([2020.0, 2021.0])(*globe(3, 0))
+
+
+@pytest.mark.parametrize("date", [2020.0, [2020.0, 2021.0]])
+def test_an_altitude_in_meters_is_questioned(date):
+    for altitude_km in (5000.0, 601.0, -16.0):
+        with pytest.raises(ValueError, match=rf"altitude_km {altitude_km} is not from -15 to 600 km .* in meters\?"):
+            IGRF(date, altitude_km=altitude_km)
+        with pytest.raises(ValueError, match=rf"altitude_km {altitude_km} is not from -15 to 600 km .* in meters\?"):
+            IGRF(date)(*globe(2, 0), altitude_km)
 
 
 def test_a_calendar_date_is_its_midnight():
@@ -228,7 +295,7 @@ def test_the_model_s_altitude_and_the_same_given_agree(altitude_km):
     """One is a short series made for that altitude, the other the whole expansion: over the globe and at its poles."""
     latitude, longitude = globe(500, 6)
     latitude[:2] = f64(90.0, -90.0)
-    model = IGRF(PAPER_DATE, 13, altitude_km=altitude_km)
+    model = SphericalHarmonicField(igrf_coefficients(PAPER_DATE, 13), altitude_km=altitude_km)
     given = model.value_and_gradient(latitude, longitude, altitude_km)
     torch.testing.assert_close(model(latitude, longitude), given[0], rtol=0, atol=ROUNDING_NT)
     found = model.value_and_gradient(latitude[2:], longitude[2:])
@@ -437,7 +504,7 @@ def test_bad_tables_and_options_are_refused():
         with pytest.raises(ValueError, match=f"{chunk}"):
             IGRF(PAPER_DATE, chunk=chunk)
     for altitude_km in (math.nan, math.inf, -101.0):
-        with pytest.raises(ValueError, match=f"altitude_km .* got {altitude_km}"):
+        with pytest.raises(ValueError, match=f"altitude_km .*{altitude_km}"):
             IGRF(PAPER_DATE, altitude_km=altitude_km)
 
 

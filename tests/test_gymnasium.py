@@ -22,7 +22,7 @@ from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
 from magrl.envs.gymnasium import ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation import episode_measures
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorNoise, TrackGradient
 
 ROOT = Path(__file__).parent.parent
 PAPER = Scenario(field=Scenario().build_field())
@@ -508,3 +508,55 @@ def test_adapter_refuses_another_autoreset() -> None:
     envs = gymnasium.make_vec(ENV_ID, num_envs=1, vectorization_mode="sync", **SHORT)
     with pytest.raises(ValueError, match="NEXT_STEP"):
         adapter.BatchedVecEnv(envs)
+
+
+# Own transforms, declared arrival, errors in the units of the caller
+
+
+def test_own_transforms_stand_behind_the_environment_and_their_keys_can_be_observed() -> None:
+    parts = [SensorNoise((0.05, 0.05, 5.0), seed=3), TrackGradient()]
+    envs = [gymnasium.make(ENV_ID, transforms=parts, observation=("field", "way")) for _ in range(2)]  # cloned
+    first, second = (env.reset(seed=0)[0] for env in envs)
+    assert set(first) == set(envs[0].observation_space.spaces) == {"field", "way"}
+    assert envs[0].observation_space.contains(first)
+    np.testing.assert_array_equal(first["field"], second["field"])
+    clean, _ = gymnasium.make(ENV_ID, observation="dict").reset(seed=0)
+    assert 0 < abs(first["field"] - clean["field"])[2] < 30
+    noisy = gymnasium.make(ENV_ID, transforms=parts)
+    assert not np.array_equal(noisy.reset(seed=0)[0], gymnasium.make(ENV_ID).reset(seed=0)[0])
+    for options, error, message in (
+        ({"transforms": [5]}, TypeError, r"transforms\[0\] must be a Transform, got 5"),
+        ({"observation": ("field", "wings")}, ValueError, "observation names 'wings', which is not among the keys"),
+        (
+            {"wings": 2},
+            TypeError,
+            "'wings'; the options are .*'observation', .*'scale_actions', .*'transforms', 'zeta'",
+        ),
+    ):
+        with pytest.raises(error, match=message):
+            gymnasium.make(ENV_ID, **options)
+
+
+@pytest.mark.parametrize("scaled", [True, False])
+def test_an_arrival_is_declared_with_the_third_number(scaled: bool) -> None:
+    env = gymnasium.make(ENV_ID, arrival="declared", scale_actions=scaled)
+    env.reset(seed=0)
+    high = [1.0, 1.0, 1.0] if scaled else [50.0, math.pi / 2, 1.0]
+    np.testing.assert_allclose(env.action_space.high, high, rtol=1e-6)
+    stay = -1.0 if scaled else 0.0
+    assert not env.step(np.array([stay, 0.0, -0.5], dtype=np.float32))[2]
+    *_, terminated, _, info = env.step(np.array([stay, 0.0, 0.5], dtype=np.float32))
+    assert terminated
+    assert (info["success"], info["false_arrival"]) == (False, True)
+
+
+def test_errors_of_actions_are_in_the_units_of_the_caller() -> None:
+    for options, action, message in (
+        ({}, (1.5, 0.0), r"action \[1.5, 0.0\] of vehicle 0 is not finite or out of bounds, \[-1, 1\], \[-1, 1\]$"),
+        ({}, (0.0, float("nan")), r"out of bounds, \[-1, 1\], \[-1, 1\]$"),
+        ({"scale_actions": False}, (51.0, 0.0), r"out of bounds, \[0, 50\], \[-1.5708, 1.5708\]$"),
+    ):
+        env = gymnasium.make(ENV_ID, disable_env_checker=True, **options)
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=message):
+            env.step(np.array(action, dtype=np.float32))

@@ -37,6 +37,8 @@ EXEMPT = {
     "navigators.metaheuristics.Metaheuristic.first_state": "called by first_memory and decide",
     "agents.PolicyConfig.make_actor": "takes a device, which torch checks",
     "agents.SoftUpdate": "TorchRL's, which checks its arguments",
+    "agents.first_state": "takes no arguments",
+    "onboard.Command": "holds what a step returns",
     "agents.optimize": "takes a loss and optimizers of torch",
     "agents.recurrent_transforms": "takes a view and an actor, which are checked where they are made",
     "training.UsageError": "an error",

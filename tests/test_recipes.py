@@ -1,4 +1,4 @@
-"""The feedforward recipe as its users run it: small, but complete."""
+"""The recipes without memory as their users run them: small, but complete."""
 
 import csv
 import json
@@ -7,11 +7,14 @@ import re
 import signal
 from pathlib import Path
 
+import ppo
 import pytest
+import sac
 import td3_gradient_guided as recipe
 import td3_recurrent
 import torch
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from magrl import paper
 from magrl.agents import PolicyConfig, load_policy
@@ -190,14 +193,14 @@ def test_training_with_noise_resumes_exactly(tmp_path: Path, signalled, same_out
 def first_state(module, noise: tuple[float, ...], seed: int = 5) -> TensorDict:
     """Return the first observation of a recipe's training environment."""
     config, base = module.Config(noise=noise), GeomagneticNavEnv(num_envs=4, seed=seed)
-    if module is recipe:
-        return recipe.make_env(base, base.observation_view(), config).reset()
+    if module is not td3_recurrent:
+        return module.make_env(base, base.observation_view(), config).reset()
     view = base.observation_view(observe_heading=False)
     actor = PolicyConfig(view, (8,), memory_size=4).make_actor()
     return td3_recurrent.make_env(base, view, actor, config).reset()
 
 
-@pytest.mark.parametrize("module", [recipe, td3_recurrent], ids=lambda module: module.__name__)
+@pytest.mark.parametrize("module", [recipe, td3_recurrent, sac, ppo], ids=lambda module: module.__name__)
 def test_noise_is_observed_and_the_guidance_is_by_the_truth(module) -> None:
     perfect, noisy = first_state(module, (0.0, 0.0, 0.0)), first_state(module, NOISE)
     assert "true_field" not in perfect.keys()  # noqa: SIM118
@@ -230,6 +233,50 @@ def test_run_is_named_after_its_noise() -> None:
     ):
         run = Run(recipe.Config(seed=2, **options), recipe=recipe.RECIPE, name="mine")
         assert (run.name, run.folder) == (name, Path("runs") / f"{name}-seed2")
+
+
+# Other algorithms
+
+
+def small(module, out: Path):
+    """Return the settings of five batches of 32 transitions."""
+    own = {"steps_per_batch": 2, "epochs": 2} if module is ppo else {"num_envs": 32}
+    shared = {key: value for key, value in SMALL.items() if key in module.Config.model_fields}
+    return module.Config(out=out, **shared | {"total_frames": 160} | own)
+
+
+@pytest.mark.usefixtures("without_figures")
+@pytest.mark.parametrize("module", [sac, ppo], ids=lambda module: module.__name__)
+def test_other_algorithms_resume_exactly(module, tmp_path: Path, signalled, same_outcome, outcome) -> None:
+    """With networks, optimizers and running episodes; the losses have their columns, and the policy is loaded."""
+    result = module.train(small(module, tmp_path / "whole"))
+    with signalled(3, signal.SIGINT), pytest.raises(SystemExit):
+        module.train(small(module, tmp_path / "run"))
+    module.main(["--resume", str(tmp_path / "run")])
+    assert same_outcome(tmp_path / "run", tmp_path / "whole")
+    rows, weights = outcome(tmp_path / "whole")
+    assert result["updates"] == int(rows[-1]["updates"]) > 0
+    assert all(math.isfinite(float(rows[-1][key])) for key in module.LOSSES)
+    torch.manual_seed(0)
+    env = GeomagneticNavEnv(num_envs=3, seed=0)
+    start = dict(PolicyConfig(env.observation_view(), SMALL["num_cells"]).make_actor().named_parameters())
+    assert not any(torch.equal(weights[key], start[key]) for key in start)
+    policy = load_policy(tmp_path / "run" / "policy.pt")
+    assert env.rollout(2, policy)["action"].isfinite().all()
+
+
+@pytest.mark.parametrize("module", [sac, ppo], ids=lambda module: module.__name__)
+def test_saved_actor_is_the_stochastic_one_without_noise(module) -> None:
+    config, base = module.Config(), GeomagneticNavEnv(num_envs=4, seed=0)
+    view = base.observation_view()
+    env = module.make_env(base, view, config)
+    actor = PolicyConfig(view, (16,)).make_actor()
+    options = (actor, env, view, config) if module is sac else (actor, env, config)
+    stochastic, seen = module.make_stochastic_actor(*options), env.reset()
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.testing.assert_close(stochastic(seen.copy())["action"], actor(seen.copy())["action"])
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        assert not torch.equal(stochastic(seen.copy())["action"], actor(seen.copy())["action"])
 
 
 # Settings and command line
@@ -291,6 +338,9 @@ def test_bad_settings_are_refused_by_name(tmp_path: Path, bad: dict) -> None:
         (td3_recurrent, "--noise 0.05 0.05", "Missing value for argument '--noise'. Expected 3 values"),
         (recipe, "--num-envs 8 --collectors 3", "num_envs 8 cannot be divided evenly among 3 collectors"),
         (td3_recurrent, "--num-envs 1", "num_envs must be at least 2, got 1"),
+        (sac, "--total-frames 512", "batch_size 1024 must not exceed total_frames: no gradient step is possible"),
+        (sac, "--buffer-size 1000", "buffer_size 1000 does not hold one batch of 1024"),
+        (ppo, "--num-envs 8", "batch_size 1024 must not exceed num_envs * steps_per_batch, 128"),
         (td3_recurrent, "--shortest-task-km 600", "shortest_task_km must be below 500, got 600.0"),
     ],
 )
@@ -387,7 +437,7 @@ def test_evaluation_seeds_are_out_of_reach() -> None:
             recipe.Config(seed=seed)
 
 
-@pytest.mark.parametrize("module", [recipe, td3_recurrent], ids=lambda module: module.__name__)
+@pytest.mark.parametrize("module", [recipe, td3_recurrent, sac, ppo], ids=lambda module: module.__name__)
 def test_help_lists_the_flags(module, capsys, monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     with pytest.raises(SystemExit) as stop:

@@ -130,6 +130,12 @@ def test_no_track_breaks_at_the_antimeridian() -> None:
     assert longitude[-1] == pytest.approx(182, abs=0.2)
     assert np.abs(np.diff(longitude)).max() < 0.5
     assert data["tasks"][0]["target"] == [-5.0, 182.0]
+    assert [task["name"] for task in data["tasks"]] == [str(k + 1) for k in range(len(data["tasks"]))]
+    names = [f"task <{k}>" for k in range(len(data["tasks"]))]
+    named = replay_data({"parallel": rollout}, env.field, region, zeta=env.zeta, names=names)
+    assert [task["name"] for task in named["tasks"]] == names
+    with pytest.raises(ValueError, match=rf"one name for each of {len(names)} tasks, got \['a', 'b', 'c', 'd', 'e'\]"):
+        replay_data({"parallel": rollout}, env.field, region, zeta=env.zeta, names="abcde")
     assert data["region"]["longitude"] == (175, 185)
 
 

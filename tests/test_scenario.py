@@ -140,8 +140,12 @@ def test_replace_checks_anew_and_changes_nothing_else() -> None:
     assert torch.equal(framed.tasks.start, tasks.start)
     assert framed.with_tasks(None) == scenario
     assert framed.replace(altitude_km=5).altitude_km == 5
-    with pytest.raises(ValueError, match="altitude_km must be greater than or equal to 0, got -1"):
-        scenario.replace(altitude_km=-1)
+    assert scenario.replace(altitude_km=-11).altitude_km == -11
+    for altitude_km in (-16, 5000):
+        with pytest.raises(
+            ValueError, match=f"from -15 to 600 km, negative for a depth, got {altitude_km}.* is it in met"
+        ):
+            scenario.replace(altitude_km=altitude_km)
     with pytest.raises(ValueError, match="lies outside"):
         Scenario().with_tasks(tasks)
     with pytest.raises(ValueError, match="frozen"):
@@ -228,7 +232,7 @@ def test_an_own_field_may_cover_a_pole() -> None:
 
 INSIDE = places((-5.0, 165.0))
 BAD_VALUES: list[tuple[str, object, str]] = [
-    ("zeta", 0.01, "unknown key 'zeta': choose from region, distance_range_km, distance_law, date"),
+    ("wings", 0.01, "unknown key 'wings': choose from region, distance_range_km, distance_law, date"),
     ("region", ((0, 1), (0, 1)), "region must be a Region, or a table of latitude and longitude"),
     ("region", None, "region must be a Region, or a table of latitude and longitude"),
     ("distance_range_km", (500.0, 300.0), "distance_range_km (500.0, 300.0) must be two rising numbers from 0 on"),
@@ -253,8 +257,8 @@ BAD_VALUES: list[tuple[str, object, str]] = [
     ("date", 2026.0, "2026-01-01T00:00:00 is outside IGRF-13, which is valid from 1900-01-01 to 2025-01-01"),
     ("generation", 12, "generation must be 13 or 14, got 12"),
     ("generation", "13", "generation must be 13 or 14, got '13'"),
-    ("altitude_km", -1.0, "altitude_km must be greater than or equal to 0, got -1.0"),
-    ("altitude_km", 601.0, "altitude_km must be less than or equal to 600, got 601.0"),
+    ("altitude_km", -16.0, "altitude_km must be from -15 to 600 km, negative for a depth, got -16.0"),
+    ("altitude_km", 601.0, "altitude_km must be from -15 to 600 km, negative for a depth, got 601.0"),
     ("altitude_km", NAN, "altitude_km must be a finite number, got nan"),
     ("altitude_km", "high", "altitude_km must be a valid number, got 'high'"),
     ("altitude_km", True, "altitude_km must be a valid number, got True"),
@@ -293,6 +297,13 @@ BAD_VALUES: list[tuple[str, object, str]] = [
     ("tasks", Tasks(torch.zeros(4, 3), torch.zeros(4, 3)), "tasks must be two (M, 2) tensors with M >= 1, got (4, 3)"),
     ("tasks", Tasks(torch.zeros(2, 2), torch.zeros(3, 2)), "with M >= 1, got (2, 2) and (3, 2)"),
     ("names", ("a",), "names must hold one name for each of 0 tasks, got ('a',)"),
+    ("max_steps", 0, "max_steps must be greater than or equal to 1, got 0"),
+    ("max_move_km", 5000.0, "max_move_km must be less than or equal to 1000, got 5000"),
+    ("max_turn_deg", 0.0, "max_turn_deg must be greater than 0, got 0"),
+    ("zeta", 3.0, "zeta must be below 3, got 3"),
+    ("arrival", "said", "arrival must be 'objective', 'distance' or 'declared', got 'said'"),
+    ("arrival_radius_km", 0.0, "arrival_radius_km must be greater than 0, got 0"),
+    ("start_heading", "south", "start_heading must be 'north' or 'random', got 'south'"),
 ]
 
 
@@ -303,15 +314,15 @@ def test_bad_values_are_refused_with_field_value_and_remedy() -> None:
         assert says in str(error.value), name
         assert "\n" not in str(error.value)
         assert len(str(error.value)) < 300
-    assert {name for name, *_ in BAD_VALUES} == {"zeta", *Scenario.model_fields}
+    assert {name for name, *_ in BAD_VALUES} == {"wings", *Scenario.model_fields}
     for names in (("a", "b"), ("a", 5)):
         with pytest.raises(ValueError, match="names"):
             Scenario(tasks=Tasks(INSIDE, places((-6.0, 165.0))), names=names)
 
 
 def test_every_bad_value_of_a_scenario_is_named() -> None:
-    with pytest.raises(ValueError, match=r"altitude_km must .*, got -1; margin_deg must .*, got -2"):
-        Scenario(altitude_km=-1, margin_deg=-2)
+    with pytest.raises(ValueError, match=r"altitude_km must .*, got -16.*; margin_deg must .*, got -2"):
+        Scenario(altitude_km=-16, margin_deg=-2)
 
 
 def test_an_own_field_needs_no_date_of_igrf() -> None:
@@ -394,7 +405,8 @@ BAD_CONTENT: list[tuple[str, object, str]] = [
     ("generation", 12, "generation must be 13 or 14, got 12"),
     ("generation", 13.5, "generation must be 13 or 14, got 13.5"),
     ("generation", True, "generation must be 13 or 14, got True"),
-    ("altitude_km", -1, "altitude_km must be greater than or equal to 0, got -1"),
+    ("altitude_km", 5000, "altitude_km must be from -15 to 600 km, negative for a depth, got 5000.0: is it in meters?"),
+    ("max_steps", 2.5, "max_steps must be a valid integer, got 2.5"),
     ("altitude_km", "high", "altitude_km must be a valid number, got 'high'"),
     ("distance_range_km", [500, 300], "distance_range_km (500.0, 300.0) must be two rising numbers"),
     ("distance_range_km", [3000, 5000], "are more than 1391 km apart"),
@@ -586,3 +598,50 @@ def test_a_region_too_large_for_a_field_leaves_no_run_folder(tmp_path: Path) -> 
     with pytest.raises(ValueError, match=r"big\.json: region.*misses the model by .* nT.*: choose a smaller region"):
         recipe.train(recipe.Config(scenario=path, out=tmp_path / "run", wandb_mode="disabled"))
     assert not (tmp_path / "run").exists()
+
+
+# --- options of episodes ----------------------------------------------------------------------------------------------
+
+
+def test_a_scenario_holds_the_options_of_its_episodes(tmp_path) -> None:
+    path = tmp_path / "long.toml"
+    path.write_text(
+        """date = 2022-01-01
+altitude_km = -3
+max_steps = 80
+max_move_km = 20
+max_turn_deg = 45
+zeta = 0.02
+arrival = "distance"
+arrival_radius_km = 30
+start_heading = "random"
+region = {latitude = [-10, 0], longitude = [160, 170]}
+"""
+    )
+    env = GeomagneticNavEnv(load_scenario(path), num_envs=3, seed=0)
+    assert (env.max_steps, env.max_move_km, env.zeta, env.start_heading) == (80, 20.0, 0.02, "random")
+    assert (env.max_turn_rad, env.arrival.rule, env.arrival.radius_km) == (math.pi / 4, "distance", 30.0)
+    assert env.action_spec.space.high[0].tolist() == pytest.approx([20.0, math.pi / 4])
+    assert env.reset()["heading"].abs().min() > 0
+    deep = IGRF("2022-01-01")(torch.tensor(-5.0), torch.tensor(165.0), -3.0)
+    torch.testing.assert_close(env.field(torch.tensor(-5.0), torch.tensor(165.0)), deep, rtol=0, atol=1e-4)
+
+
+def test_options_are_those_given_then_of_the_scenario_then_the_default() -> None:
+    scenario = Scenario(max_steps=80, max_turn_deg=90)
+    assert GeomagneticNavEnv(scenario, seed=0).max_steps == 80
+    assert GeomagneticNavEnv(scenario, zeta=0.5, seed=0).zeta == 0.5
+    assert GeomagneticNavEnv(scenario, max_steps=80, max_turn_rad=math.pi / 2, seed=0).max_move_km == 50
+    with pytest.raises(ValueError, match=r"max_steps is 80 in the scenario, and 50 was given.*scenario\.replace"):
+        GeomagneticNavEnv(scenario, max_steps=50)
+
+
+def test_a_destination_outside_needs_a_margin_that_the_error_gives() -> None:
+    """Twelve degrees south of the region, and seven beyond the antimeridian from it."""
+    tasks = Tasks(places((-5.0, 165.0), (-5.0, 165.0)), places((-21.7, 165.0), (-5.0, -179.0)))
+    with pytest.raises(ValueError, match=r"lies outside .*: raise margin_deg from 5 to at least 12$"):
+        Scenario(tasks=tasks)
+    env = GeomagneticNavEnv(Scenario(tasks=tasks, margin_deg=12), num_envs=2, seed=0)
+    assert env.edge.contains(env.reset()["target_position"]).all()
+    with pytest.raises(ValueError, match=r"to at least 11$"):
+        Scenario(tasks=Tasks(tasks.start[1:], tasks.target[1:]))

@@ -118,6 +118,16 @@ def test_results_table_groups_runs(tmp_path: Path) -> None:
     assert [cells(line)[0] for line in unnamed[-2:]] == ["seed 11", "all runs"]
 
 
+def test_results_table_of_another_scenario_has_no_row_of_the_paper(tmp_path: Path) -> None:
+    results = load("tables/results_table")
+    for name, scenario in (("paper", None), ("own", "scenario.toml")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "eval.json").write_text('{"seed": 0, "spl": 99.0}')
+        (tmp_path / name / "config.json").write_text(json.dumps({"scenario": scenario}))
+    assert "| paper |" in results.table(results.grouped([str(tmp_path / "paper")]))
+    assert "| paper |" not in results.table(results.grouped([str(tmp_path / "own")]))
+
+
 def test_results_table_says_what_is_wrong(tmp_path: Path) -> None:
     results = load("tables/results_table")
     run = finished(tmp_path / "run", 0)
@@ -185,3 +195,63 @@ def test_noise_table_refuses_evaluations_that_cannot_be_compared(tmp_path: Path)
     with pytest.raises(UsageError, match=r"cannot write .*t\.md"):
         noise.make(noise.Config((clean,), tmp_path / "file" / "t.md", tmp_path / "f.png"))
     assert not (tmp_path / "t.md").exists()
+
+
+def swept(folder: Path, result: bool = True, **settings) -> Path:
+    """Return the folder of a run of a sweep: SPL is 90 and the seed."""
+    folder.mkdir(parents=True)
+    defaults = {"recipe": "sac.py", "seed": 0, "gamma": 0.9, "num_cells": [8, 8], "out": folder.name}
+    (folder / "config.json").write_text(json.dumps(defaults | settings))
+    if result:
+        values = {"success_rate": 100.0, "spl": 90.0 + settings.get("seed", 0), "training_seconds": 60.0}
+        (folder / "eval.json").write_text(json.dumps(values))
+    return folder
+
+
+def test_sweep_table_groups_runs_by_setting_and_seed(tmp_path: Path, capsys) -> None:
+    """Settings in natural order, an interval from ten seeds on, and a warning for a run without results."""
+    sweep = load("tables/sweep_table")
+    for seed in range(10):
+        swept(tmp_path / f"a{seed}", seed=seed, gamma=0.5, wandb_mode="offline", logger="csv")
+    for seed in (2, 0):
+        swept(tmp_path / f"b{seed}", seed=seed, num_cells=[16], gamma=0.10)
+    swept(tmp_path / "unfinished", False, seed=3, gamma=0.99)
+    (tmp_path / "notes").mkdir()
+    runs = sweep.finished(sweep.run_folders([f"{tmp_path}/*", f"{tmp_path}/a1"]))
+    said = capsys.readouterr().err
+    assert said == f"Warning: {tmp_path}/unfinished is left out: it holds no eval.json, the run is not complete\n"
+    head, _, few, many = sweep.table(runs).splitlines()
+    assert cells(head)[:5] == ["gamma", "num_cells", "seeds", "SR %", "SPL %"]
+    assert cells(few) == ["0.1", "16", "2", "100.0 [100.0–100.0]", "91.00 [90.00–92.00]", "—", "—", "60"]
+    assert cells(many)[:3] == ["0.5", "8 8", "10"]
+    middle, low, high = interval(cells(many)[4])
+    assert 90 < low < middle == 94.5 < high < 99
+
+
+def test_sweep_table_tells_scenarios_apart(tmp_path: Path) -> None:
+    """By the content of the files, which have one name."""
+    sweep = load("tables/sweep_table")
+    for name, text in (("a", "date = 2020-01-01"), ("b", "date = 2025-01-01"), ("c", "date = 2020-01-01")):
+        folder = swept(tmp_path / name, seed=ord(name), scenario="scenario.toml")
+        (folder / "scenario.toml").write_text(text)
+    lines = sweep.table(sweep.finished(sweep.run_folders([f"{tmp_path}/?"]))).splitlines()[2:]
+    assert [cells(line)[:2] for line in lines] == [[f"{tmp_path}/{name}/scenario.toml", n] for name, n in ("a2", "b1")]
+
+
+def test_sweep_table_says_what_is_wrong(tmp_path: Path) -> None:
+    sweep = load("tables/sweep_table")
+    swept(tmp_path / "sac")
+    swept(tmp_path / "again", out="elsewhere")
+    swept(tmp_path / "ppo", seed=1, recipe="ppo.py")
+    swept(tmp_path / "unfinished", False)
+    (swept(tmp_path / "damaged") / "eval.json").write_text("{")
+    for names, message in (
+        ([], "name at least one run or a pattern"),
+        (["no*"], r"there is no run at .*no\*: a run folder holds config\.json"),
+        (["unfinished"], "none of 1 runs is complete"),
+        (["damaged"], "damaged cannot be read"),
+        (["sac", "again"], "sac and .*again have the same settings and seed 0: name one"),
+        (["sac", "ppo"], r"several recipes, ppo\.py, sac\.py: compare them with results_table\.py"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            sweep.table(sweep.finished(sweep.run_folders([str(tmp_path / name) for name in names])))

@@ -1,4 +1,4 @@
-"""Trained policies as navigators, and their files: one format for every kind.
+"""Trained policies as navigators, and the files of policies of any kind.
 
 A policy reads public keys of the plain environment and writes an action, both in physical units, so that it needs no
 transforms and is used like every other navigator.
@@ -15,8 +15,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.envs import Compose
+from torchrl.envs import Compose, EnvBase
 
+from magrl.agents.exported import ExportedPolicy, check_fits, export_policy, rebuild
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
 from magrl.checks import check_finite, check_number, check_numbers, check_type
@@ -156,18 +157,25 @@ class FieldPolicy(TensorDictModuleBase):
         Raises:
             ValueError: naming the element and both ranges.
         """
-        check_type(GeomagneticNavEnv, env=env)
-        if isinstance(self.config.view, ObservationView):  # an agent that reads its own track is of no region
-            if env.many:
-                raise ValueError(f"the policy was trained in one region, and cannot fly in {len(env.region)} regions")
-            self.config.view.check_covers(env.field, env.region.grid(81).to(env.device))
+        # an agent that reads its own track is of no region
+        check_fits(self.config.view if isinstance(self.config.view, ObservationView) else None, env)
 
 
-def save_policy(path: Path | str, policy: FieldPolicy) -> None:
-    """Write a policy: its configuration and its weights, as numbers and tensors.
+def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | None = None) -> None:
+    """Write a policy as numbers, text and tensors, for :func:`load_policy`.
+
+    A policy of another class is exported first, with the transforms that it needs, and compared with its export in
+    flight (:func:`export_policy`).
+
+    Args:
+        path: path of the file; an existing file is replaced.
+        policy: policy of any algorithm; a stochastic one is saved with its deterministic sample.
+        env: environment of the training, with its transforms; not needed for a :class:`FieldPolicy` or an
+            :class:`ExportedPolicy`.
 
     Raises:
-        TypeError: for another type of policy.
+        TypeError: for a policy that is no TensorDict module, or of another class without an environment.
+        ValueError: for a policy that cannot be exported, with the reason.
         OSError: if the file cannot be written.
 
     Example:
@@ -175,18 +183,28 @@ def save_policy(path: Path | str, policy: FieldPolicy) -> None:
         >>> policy = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
         >>> save_policy(Path(tempfile.mkdtemp()) / "policy.pt", policy)
     """
-    check_type(FieldPolicy, policy=policy)
+    check_type(TensorDictModuleBase, policy=policy)
+    if not isinstance(policy, (FieldPolicy, ExportedPolicy)):
+        if env is None:
+            raise TypeError(
+                f"a {type(policy).__name__} is saved with the transforms of its environment: "
+                "save_policy(path, policy, env)"
+            )
+        policy = export_policy(policy, env)
+    if isinstance(policy, ExportedPolicy):
+        save_tensors({"format": POLICY_FORMAT, "exported": policy.content()}, Path(path))
+        return
     weights = {key: value.cpu() for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
     kind = next(name for name, view in VIEWS.items() if isinstance(policy.config.view, view))
     config = asdict(policy.config) | {"kind": kind}
     save_tensors({"format": POLICY_FORMAT, "config": config, "weights": weights}, Path(path))
 
 
-def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy:
-    """Read a policy that :func:`save_policy` wrote.
+def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy | ExportedPolicy:
+    """Read a policy that :func:`save_policy` wrote. Reading a file runs no code from it.
 
     Args:
-        path: ``policy.pt`` of a run.
+        path: ``policy.pt`` of a run, or another file of :func:`save_policy`.
         device: device on which the policy acts.
 
     Raises:
@@ -206,20 +224,20 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
         content = load_tensors(path)
     except DamagedFileError as error:
         raise ValueError(f"{path} is not a policy file: {error}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} is not a policy file: it must hold format, config and weights")
+    content = content if isinstance(content, dict) else {}
     version = content.get("format", content.get("recurrent_format"))
     if version is not None and version != POLICY_FORMAT:
         raise ValueError(
             f"{path} is a policy of format {version!r}; this version reads format {POLICY_FORMAT}: train it again"
         )
-    if set(content) != {"format", "config", "weights"}:
-        raise ValueError(f"{path} is not a policy file: it must hold format, config and weights")
     try:
-        policy = _rebuild(content["config"], content["weights"], str(path))
+        if set(content) == {"format", "exported"}:
+            return rebuild(content["exported"]).to(device).eval()
+        if set(content) != {"format", "config", "weights"}:
+            raise ValueError("it must hold format, config and weights, or format and exported")
+        return _rebuild(content["config"], content["weights"], str(path)).to(device).eval()
     except (TypeError, RuntimeError, ValueError, AttributeError, FloatingPointError) as error:
         raise ValueError(f"{path} does not hold a valid policy: {error}") from error
-    return policy.to(device).eval()
 
 
 def _rebuild(config: Any, weights: Any, name: str) -> FieldPolicy:

@@ -1,4 +1,4 @@
-"""Rules of arrival: by the objective at the vehicle's place, as in the paper, or by what the vehicle declares."""
+"""Rules of arrival: by the objective, as in the paper, by the distance, or by what the vehicle declares."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from magrl.checks import check_number
 from magrl.envs.measures import check_zeta
 from magrl.geodesy import geodesic
 
-ARRIVALS = ("objective", "declared")
+ARRIVALS = ("objective", "distance", "declared")
 """Rules by name."""
 
 
@@ -18,14 +18,15 @@ ARRIVALS = ("objective", "declared")
 class Arrival:
     """When an episode ends at a destination, and whether that is a success.
 
-    By ``"objective"``, an episode ends where the objective F is below ``zeta``, which is a success. By ``"declared"``,
-    the action has a third number, and an episode ends with a move of which it is above 0: the vehicle declares that it
-    has arrived. That is a success within ``radius_km`` of the destination, and a false arrival elsewhere.
+    By ``"objective"``, an episode ends where the objective F is below ``zeta``, which is a success. By ``"distance"``,
+    it ends within ``radius_km`` of the destination, which is a success. By ``"declared"``, the action has a third
+    number, and an episode ends with a move of which it is above 0: the vehicle declares that it has arrived. That is a
+    success within ``radius_km`` of the destination, and a false arrival elsewhere.
 
     Args:
-        rule: ``"objective"`` or ``"declared"``.
+        rule: ``"objective"``, ``"distance"`` or ``"declared"``.
         zeta: arrival threshold on the objective.
-        radius_km: largest distance from the destination at which a declared arrival is a success [km].
+        radius_km: largest distance from the destination of an arrival, or of a right declaration [km].
 
     Raises:
         ValueError: for another rule, or a number out of its range.
@@ -72,8 +73,9 @@ class Arrival:
         Returns:
             ``(N, 1)`` bool each.
         """
-        if not self.declared:
-            ended = objective < self.zeta
-            return ended, ended
-        distance_km, _ = geodesic(*place.unbind(-1), *target.unbind(-1))
-        return action[:, 2:] > 0, distance_km.unsqueeze(-1) <= self.radius_km
+        if self.rule == "objective":
+            arrived = objective < self.zeta
+        else:
+            distance_km, _ = geodesic(*place.unbind(-1), *target.unbind(-1))
+            arrived = distance_km.unsqueeze(-1) <= self.radius_km
+        return (action[:, 2:] > 0 if self.declared else arrived), arrived

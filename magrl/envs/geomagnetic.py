@@ -8,7 +8,6 @@ and the number of the episode that each vehicle is in.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,7 +20,7 @@ from torchrl.envs import EnvBase
 from magrl import guidance
 from magrl.checks import check_number, check_type
 from magrl.envs import specs
-from magrl.envs.arrival import Arrival
+from magrl.envs.episodes import episode_options
 from magrl.envs.region import Region
 from magrl.envs.regions import Regions
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array, track_recorder
@@ -56,15 +55,16 @@ class GeomagneticNavEnv(EnvBase):
         scenario: region, field, distances and frozen tasks; by default the paper's. Where it has tasks, vehicle i flies
             task ``i + k * num_envs`` in episode k, counted around the set.
         num_envs: number of vehicles in the batch.
-        max_steps: moves after which an episode is truncated.
-        max_move_km: longest move [km].
+        max_steps: moves after which an episode is truncated; by default that of the scenario, or 50.
+        max_move_km: longest move [km]; by default that of the scenario, or 50. Likewise the options with a value below:
         drift_km: how much farther a :class:`~magrl.transforms.MotionError` may carry a vehicle [km].
-        max_turn_rad: largest turn to either side before a move [rad].
-        zeta: arrival threshold on the objective, below 3, its largest value at the start.
-        arrival: ``"objective"`` for the paper's rule, or ``"declared"``: the action has a third number, in [-1, 1], and
-            above 0 the vehicle declares that it has arrived with this move, which ends the episode.
-        arrival_radius_km: distance from the destination within which a declared arrival is a success [km].
-        start_heading: ``"north"``, or ``"random"`` for a uniform heading.
+        max_turn_rad: largest turn to either side before a move [rad], pi / 2.
+        zeta: arrival threshold on the objective, below 3, its largest value at the start; 0.01.
+        arrival: ``"objective"`` for the paper's rule; ``"distance"`` for arrival within ``arrival_radius_km``; or
+            ``"declared"``: the action has a third number, in [-1, 1], and above 0 the vehicle declares that it has
+            arrived with this move, which ends the episode.
+        arrival_radius_km: distance from the destination of an arrival, or of a right declaration [km], 25.
+        start_heading: ``"north"``, the default, or ``"random"`` for a uniform heading.
         destination_weight: reward at arrival, zeta_1.
         proximity_weight: reward per unit of the objective, zeta_2.
         render_mode: ``"rgb_array"`` to keep the tracks that :meth:`render` draws, or None.
@@ -98,14 +98,14 @@ class GeomagneticNavEnv(EnvBase):
         scenario: Scenario | None = None,
         *,
         num_envs: int = 1,
-        max_steps: int = 50,
-        max_move_km: float = 50.0,
+        max_steps: int | None = None,
+        max_move_km: float | None = None,
         drift_km: float = 0.0,
-        max_turn_rad: float = math.pi / 2,
-        zeta: float = 0.01,
-        arrival: str = "objective",
-        arrival_radius_km: float = 25.0,
-        start_heading: str = "north",
+        max_turn_rad: float | None = None,
+        zeta: float | None = None,
+        arrival: str | None = None,
+        arrival_radius_km: float | None = None,
+        start_heading: str | None = None,
         destination_weight: float = 200.0,
         proximity_weight: float = 10.0,
         render_mode: str | None = None,
@@ -114,26 +114,25 @@ class GeomagneticNavEnv(EnvBase):
     ) -> None:
         scenario = Scenario() if scenario is None else scenario
         check_type(Scenario, scenario=scenario)
-        check_number(1, whole=True, num_envs=num_envs, max_steps=max_steps)
+        check_number(1, whole=True, num_envs=num_envs)
         check_number(0, 2**64 - 1, whole=True, seed=0 if seed is None else seed)
-        check_number(0, 1000, above=True, max_move_km=max_move_km)  # a move is one short leg
-        check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
-        rule = Arrival(arrival, zeta, arrival_radius_km)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
-        if start_heading not in ("north", "random"):
-            raise ValueError(f"start_heading must be 'north' or 'random', got {start_heading!r}")
-        tracks = track_recorder(render_mode, scenario.region, max_steps + 1)
+        given = {"max_steps": max_steps, "max_move_km": max_move_km, "max_turn_rad": max_turn_rad, "zeta": zeta}
+        rules = {"arrival": arrival, "arrival_radius_km": arrival_radius_km, "start_heading": start_heading}
+        options = episode_options(scenario, **given, **rules)
+        tracks = track_recorder(render_mode, scenario.region, options.max_steps + 1)
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
-        self.num_envs, self.max_steps, self.arrival, self.zeta = num_envs, max_steps, rule, float(zeta)
-        self.max_move_km, self.max_turn_rad, self.drift_km = float(max_move_km), float(max_turn_rad), float(drift_km)
-        self.start_heading, self.render_mode, self._tracks = start_heading, render_mode, tracks
+        self.num_envs, self.max_steps, self.drift_km = num_envs, options.max_steps, float(drift_km)
+        self.max_move_km, self.max_turn_rad = options.max_move_km, options.max_turn_rad
+        self.arrival, self.zeta = options.arrival, float(options.arrival.zeta)
+        self.start_heading, self.render_mode, self._tracks = options.start_heading, render_mode, tracks
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
         self._place(scenario)
         self.register_buffer("action_low", self._float64((0.0, -self.max_turn_rad, *self.arrival.low)))
         self.register_buffer("action_high", self._float64((self.max_move_km, self.max_turn_rad, *self.arrival.high)))
         self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
-        self._make_specs(self.edge.reachable(max_move_km + drift_km))
+        self._make_specs(self.edge.reachable(self.max_move_km + self.drift_km))
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
     def _place(self, scenario: Scenario) -> None:

@@ -7,6 +7,7 @@ give the same bits.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium
@@ -18,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import CatTensors, TransformedEnv
 
 from magrl.envs.geomagnetic import PUBLIC_KEYS
@@ -29,18 +30,24 @@ ENV_ID = "magrl/GeomagneticNavigation-v0"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
 
-def _box(*specs: Bounded) -> spaces.Space[Any]:
+def _box(*specs: TensorSpec) -> spaces.Space[Any]:
     """Return the space of one vehicle, from the specs that are concatenated in an array."""
-    low, high = (
-        torch.cat([getattr(spec.space, end)[0] for spec in specs]).cpu().numpy().astype(np.float32)
-        for end in ("low", "high")
-    )
+    low, high = (torch.cat([_bound(spec, end) for spec in specs]).cpu().numpy() for end in ("low", "high"))
     return spaces.Box(low, high, dtype=np.float32)
+
+
+def _bound(spec: TensorSpec, end: str) -> Tensor:
+    """Return the lowest or highest values of one vehicle; infinite where the spec has none."""
+    if isinstance(spec, Bounded):
+        return getattr(spec.space, end)[0].float()
+    return torch.full(spec.shape[1:], -math.inf if end == "low" else math.inf)
 
 
 def _observation_space(env: TransformedEnv, keys: tuple[str, ...]) -> spaces.Space[Any]:
     """Return the space of one vehicle's observation; its bounds are those of the specs."""
     spec = env.observation_spec
+    if missing := [key for key in keys if key not in spec.keys()]:  # noqa: SIM118 - a Composite is no mapping
+        raise ValueError(f"observation names {missing[0]!r}, which is not among the keys {sorted(spec.keys())}")
     if keys != ("observation",):
         return spaces.Dict({key: _box(spec[key]) for key in keys})
     # CatTensors drops the bounds of what it joins.
@@ -69,7 +76,9 @@ class _Batch:
         if "num_envs" in options:
             raise TypeError(f"one vehicle has no num_envs, got {options['num_envs']}: use gymnasium.make_vec")
         self.env = navigation_env(num_envs, render_mode=render_mode, **options)
-        self.keys = ("observation",) if options.get("observation", "flat") == "flat" else PUBLIC_KEYS
+        observation = options.get("observation", "flat")
+        named = {"flat": ("observation",), "dict": PUBLIC_KEYS}
+        self.keys = named[observation] if isinstance(observation, str) else tuple(observation)
         self.observation_space = _observation_space(self.env, self.keys)
         self.action_space = _box(self.env.action_spec)
         self._state: TensorDictBase | None = None
@@ -87,8 +96,8 @@ class _Batch:
 
     def observe(self, state: TensorDictBase) -> Observation:
         """Return the observations of all vehicles, ``(N, ...)``."""
-        arrays = {key: _array(state[key]) for key in self.keys}
-        return arrays if len(arrays) > 1 else arrays["observation"]
+        arrays = {key: _array(state[key]).astype(np.float32, copy=False) for key in self.keys}
+        return arrays["observation"] if self.keys == ("observation",) else arrays
 
     def step(self, actions: Any, *, autoreset: bool) -> tuple[TensorDictBase, dict[str, NDArray[Any]]]:
         """Move every vehicle.
@@ -115,7 +124,17 @@ class _Batch:
         array = np.array(actions, dtype=np.float32)
         shape = tuple(self.env.action_spec.shape)
         if array.shape != shape:
-            raise ValueError(f"actions must have shape {shape}, distance and turn, got shape {array.shape}")
+            kinds = "distance, turn and declaration" if shape[-1] == 3 else "distance and turn"
+            raise ValueError(f"actions must have shape {shape}, {kinds}, got shape {array.shape}")
+        space = self.action_space
+        assert isinstance(space, spaces.Box)
+        slack = 1e-5 * (space.high - space.low)
+        if (bad := ~((array >= space.low - slack) & (array <= space.high + slack)).all(-1)).any():
+            first = int(bad.argmax())
+            limits = ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(space.low, space.high, strict=True))
+            raise ValueError(
+                f"action {array[first].tolist()} of vehicle {first} is not finite or out of bounds, {limits}"
+            )
         return torch.from_numpy(array).to(self.env.device)
 
     def current(self) -> Observation:
@@ -138,6 +157,7 @@ def _measures(end: TensorDictBase, length_km: Tensor) -> dict[str, NDArray[Any]]
         "success": success,
         "is_success": success,  # the name that stable-baselines3 and Gymnasium-Robotics read
         "steps": end["step_count"].squeeze(-1),
+        **({"false_arrival": end["declared"].squeeze(-1) & ~success} if "declared" in end.keys() else {}),  # noqa: SIM118
         **path_measures(success, end["start_position"], end["position"], end["target_position"], length_km),
     }
     return {name: _array(value) for name, value in measures.items()}

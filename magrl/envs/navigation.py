@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from magrl.checks import check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
+from magrl.transforms import AlignmentReward, DeclareArrival, FieldGradient, GradientHeading
 
 OBSERVATIONS = ("flat", "dict")
 REWARDS = ("guided", "base")
@@ -19,8 +20,9 @@ REWARDS = ("guided", "base")
 def navigation_env(
     num_envs: int = 1,
     *,
-    observation: str = "flat",
+    observation: str | Sequence[str] = "flat",
     reward: str = "guided",
+    transforms: Sequence[Transform] = (),
     scale_actions: bool = True,
     alignment_weight: float = 3.0,
     alignment_offset: float = math.pi / 4,
@@ -31,7 +33,9 @@ def navigation_env(
     Args:
         num_envs: vehicles in the batch.
         observation: ``"flat"`` adds ``observation``, ``(N, 13)``, the input of the recipes' networks; ``"dict"`` leaves
-            the public keys in physical units.
+            the public keys in physical units, and so does a list of keys, which the Gymnasium interface observes.
+        transforms: own transforms, directly behind the environment: errors of sensors, estimates, rewards. They are
+            cloned.
         reward: ``"guided"`` adds the alignment term to the paper's base reward; ``"base"`` is that reward alone.
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
         alignment_weight: zeta_3 of Eq. 3-6 [1/rad], of the guided reward.
@@ -39,31 +43,35 @@ def navigation_env(
         **options: of :class:`magrl.envs.GeomagneticNavEnv`.
 
     Raises:
-        TypeError: for an unknown option, or ``scale_actions`` that is not a bool.
+        TypeError: for an unknown option, ``scale_actions`` that is not a bool, or a transform that is none.
         ValueError: for any option out of its range, naming it and its value.
 
     Example:
         >>> navigation_env(4, seed=0).reset()["observation"].shape
         torch.Size([4, 13])
     """
-    check_choice("observation", observation, OBSERVATIONS)
+    if isinstance(observation, str):
+        check_choice("observation", observation, OBSERVATIONS)
     check_choice("reward", reward, REWARDS)
     check_type(bool, scale_actions=scale_actions)
     known = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "num_envs"}
     if unknown := sorted(options.keys() - known):
+        every = known | (inspect.signature(navigation_env).parameters.keys() - {"num_envs", "options"})
         # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
-        raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the environment has {sorted(known)}")
+        raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {sorted(every)}")
+    check_type(Transform, **{f"transforms[{number}]": each for number, each in enumerate(transforms)})
     base = GeomagneticNavEnv(num_envs=num_envs, **options)
     view = base.observation_view()
-    transforms: list[Transform] = []
+    steps = [each.clone() for each in transforms]
     if reward == "guided":
         alignment = AlignmentReward(weight=alignment_weight, offset=alignment_offset)
-        transforms += [FieldGradient(base.field), GradientHeading(), alignment]
+        steps += [FieldGradient(base.field), GradientHeading(), alignment]
     if observation == "flat":
-        transforms += view.observation_transforms()
+        steps += view.observation_transforms()
     if scale_actions:
-        transforms.append(view.action_transform())
-    return TransformedEnv(base, Compose(*transforms))
+        declared = base.arrival.declared and not any(isinstance(each, DeclareArrival) for each in steps)
+        steps.append(view.action_transform(declared=declared))
+    return TransformedEnv(base, Compose(*steps))
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

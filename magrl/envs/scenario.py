@@ -6,12 +6,13 @@ import math
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from torch import Tensor
 from typing_extensions import Self
 
 from magrl import guidance, paper
 from magrl.checks import CheckedModel, short
+from magrl.envs.measures import check_zeta
 from magrl.envs.region import PAPER_REGION, Region
 from magrl.envs.regions import Regions
 from magrl.envs.specs import field_bounds
@@ -28,8 +29,6 @@ from magrl.field import (
     parse_date,
 )
 
-MAX_ALTITUDE_KM = 600.0
-"""Highest altitude of a scenario: IGRF is in use up to there, and distances are those over the ground."""
 FLOOR_KM = 25.0
 """Distance of travel whose mean change of each element is the default floor of Eq. 2-6 away from the paper's box."""
 
@@ -80,12 +79,24 @@ def _field(value: object) -> object:
     return value
 
 
+def _altitude(value: float) -> float:
+    lowest, highest = IGRF.altitude_range_km
+    if not lowest <= value <= highest:
+        raise ValueError(
+            f"altitude_km must be from {lowest:g} to {highest:g} km, negative for a depth, got {value}: is it in "
+            "meters?"
+        )
+    return value
+
+
 _DISTANCES = numbers_validator("distance_range_km", 2, "shortest and longest in km")
 _FLOORS = numbers_validator("objective_floors", 3, "of D [deg], I [deg] and B_H [nT]")
 
 
 class Scenario(CheckedModel):
     """Where tasks lie, the field there, and how far apart their ends are; by default those of the paper.
+
+    The last fields are options of the environment, each None for the environment's own default.
 
     Raises:
         ValueError: naming the value: for distances that the region cannot hold, a date outside the field model, an
@@ -108,8 +119,9 @@ class Scenario(CheckedModel):
     """Date of the field: ``datetime``, ``date``, ISO text or decimal year; kept as a ``datetime``."""
     generation: Literal[13, 14] = paper.GENERATION  # type: ignore[assignment]
     """Generation of IGRF."""
-    altitude_km: Annotated[float, Field(ge=0, le=MAX_ALTITUDE_KM)] = 0.0
-    """Altitude over the ellipsoid at which the field is measured [km]; distances are those over the ground."""
+    altitude_km: Annotated[float, AfterValidator(_altitude)] = 0.0
+    """Altitude over the ellipsoid at which the field is measured, negative for a depth [km]; distances are those over
+    the ground."""
     margin_deg: Annotated[float, Field(ge=0)] = 5.0
     """How far beyond the region a vehicle may stray before it is lost [deg]."""
     objective_floors: Annotated[tuple[float, float, float] | None, BeforeValidator(_floors)] = guidance.OBJECTIVE_FLOORS
@@ -122,6 +134,20 @@ class Scenario(CheckedModel):
     """Frozen tasks to fly in place of random ones; over many regions with the region of each."""
     names: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
     """Names of the frozen tasks, or none."""
+    max_steps: Annotated[int, Field(ge=1)] | None = None
+    """Moves after which an episode is truncated."""
+    max_move_km: Annotated[float, Field(gt=0, le=1000)] | None = None
+    """Longest move [km]."""
+    max_turn_deg: Annotated[float, Field(gt=0, le=180)] | None = None
+    """Largest turn to either side before a move [deg]."""
+    zeta: Annotated[float, AfterValidator(check_zeta)] | None = None
+    """Arrival threshold on the objective."""
+    arrival: Literal["objective", "distance", "declared"] | None = None
+    """Rule of arrival: F below ``zeta``, the distance to the destination, or what the vehicle declares."""
+    arrival_radius_km: Annotated[float, Field(gt=0)] | None = None
+    """Distance from the destination of an arrival by distance, or of a right declaration [km]."""
+    start_heading: Literal["north", "random"] | None = None
+    """Heading at the start of an episode."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -151,7 +177,18 @@ class Scenario(CheckedModel):
         try:
             return check_tasks(tasks, self.edge)
         except ValueError as error:
-            raise ValueError(str(error) if str(error).startswith("tasks") else f"tasks: {error}") from error
+            text = str(error) if str(error).startswith("tasks") else f"tasks: {error}"
+            if "lies outside" in text and isinstance(self.region, Region):
+                text += f": raise margin_deg from {self.margin_deg:g} to at least {self._margin_to(tasks):g}"
+            raise ValueError(text) from error
+
+    def _margin_to(self, tasks: Tasks | RegionTasks) -> float:
+        """Return the margin that would hold all tasks, rounded up to half a degree."""
+        assert isinstance(self.region, Region)
+        ends = torch.cat([torch.as_tensor(end, dtype=torch.float64) for end in tasks[:2]])
+        (low, high) = torch.tensor((self.region.latitude, self.region.longitude), dtype=torch.float64).T
+        beyond = (self.region.unwrapped(ends) - (low + high) / 2).abs() - (high - low) / 2
+        return math.ceil(2 * beyond.max().item()) / 2
 
     @property
     def edge(self) -> Region | Regions:
@@ -170,11 +207,11 @@ class Scenario(CheckedModel):
         """
         return self.edge.reachable(max_move_km)
 
-    def build_field(self, max_move_km: float = 50.0) -> FieldModel:
+    def build_field(self, max_move_km: float | None = None) -> FieldModel:
         """Return the own field model or bank, or IGRF expanded over every place that a vehicle can reach.
 
         Args:
-            max_move_km: longest move [km].
+            max_move_km: longest move [km]; by default that of the scenario, or 50.
 
         Raises:
             ValueError: for a region too large for the expansion, or too near to a pole of the Earth or of the field;
@@ -182,6 +219,7 @@ class Scenario(CheckedModel):
         """
         if self.field is not None:
             return self.field
+        max_move_km = (self.max_move_km or 50.0) if max_move_km is None else max_move_km
         try:
             return self._expanded_igrf(max_move_km)
         except ValueError as error:

@@ -52,7 +52,7 @@ class TaskEntry(CheckedModel):
             raise ValueError(f"tasks, entry {number}: {error}") from error
 
 
-def load_scenario(path: Path | str) -> Scenario:
+def load_scenario(path: Path | str, **changes: Any) -> Scenario:
     """Read a scenario from a TOML or JSON file, whose keys are the fields of :class:`Scenario`.
 
     ``region`` and ``date`` are required. ``generation`` is 14 and ``objective_floors`` follow the region unless given.
@@ -60,6 +60,7 @@ def load_scenario(path: Path | str) -> Scenario:
 
     Args:
         path: file that ends in ``.toml`` or ``.json``.
+        **changes: fields of :class:`Scenario` that replace those of the file.
 
     Raises:
         FileNotFoundError: if it does not exist.
@@ -76,7 +77,7 @@ def load_scenario(path: Path | str) -> Scenario:
     check_type((Path, str), path=path)
     path = Path(path)
     try:
-        scenario = _scenario(_content(path))
+        scenario = _scenario(_content(path), changes)
         scenario.build_field()
         return scenario
     except FileNotFoundError:
@@ -85,7 +86,7 @@ def load_scenario(path: Path | str) -> Scenario:
         raise ValueError(f"{path}: {error or type(error).__name__}") from error
 
 
-def _scenario(content: Any) -> Scenario:
+def _scenario(content: Any, changes: dict[str, Any]) -> Scenario:
     if not isinstance(content, dict):
         raise ValueError(f"a scenario file must hold a table, got {short(content)}")
     if "journeys" in content or "field" in content:
@@ -102,7 +103,7 @@ def _scenario(content: Any) -> Scenario:
     values: dict[str, Any] = {"generation": 14, "objective_floors": None} | content
     if "tasks" in content:
         values["names"], values["tasks"] = _listed_tasks(content["tasks"])
-    return Scenario(**values)
+    return Scenario(**(values | changes))
 
 
 def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:

@@ -18,6 +18,8 @@ from xml.etree import ElementTree
 from tensordict import TensorDictBase
 
 from magrl.checks import check_numbers, check_type
+from magrl.envs.rendering import START, TARGET
+from magrl.evaluation.colors import NAVIGATOR_COLORS
 from magrl.evaluation.metrics import episode_measures
 from magrl.files import json_ready
 
@@ -35,6 +37,7 @@ class Track(NamedTuple):
         name: name of the episode.
         positions: latitude, longitude [deg] of each way-point, start first.
         properties: further properties by name, numbers and texts.
+        target: latitude, longitude [deg] of the destination, or None.
 
     Example:
         >>> Track("home", [(-2.0, 162.0), (-2.4, 162.1)], {"steps": 1}).positions[-1]
@@ -44,6 +47,7 @@ class Track(NamedTuple):
     name: str
     positions: Sequence[Position]
     properties: dict[str, Any]
+    target: Position | None = None
 
 
 def tracks(rollout: TensorDictBase, names: Sequence[str], **properties: Any) -> list[Track]:
@@ -66,12 +70,14 @@ def tracks(rollout: TensorDictBase, names: Sequence[str], **properties: Any) -> 
     measures = {key: value.tolist() for key, value in episode_measures(rollout).items() if key in MEASURES}
     if len(names) != len(rollout):
         raise ValueError(f"names must hold one name for each of {len(rollout)} episodes, got {len(names)}")
-    starts, paths = rollout["start_position"][:, 0].tolist(), rollout["next", "position"].tolist()
+    starts, targets = (rollout[f"{end}_position"][:, 0].tolist() for end in ("start", "target"))
+    paths = rollout["next", "position"].tolist()
     return [
         Track(
             name,
             [tuple(position) for position in (start, *path[: measures["steps"][row]])],
             {**properties, **{key: values[row] for key, values in measures.items()}},
+            (targets[row][0], targets[row][1]),
         )
         for row, (name, start, path) in enumerate(zip(names, starts, paths, strict=True))
     ]
@@ -125,7 +131,10 @@ def to_gpx(tracks: Sequence[Track]) -> str:
 
 
 def to_kml(tracks: Sequence[Track]) -> str:
-    """Return a KML 2.2 document with one placemark for each track, clamped to the ground.
+    """Return a KML 2.2 document: a folder for each navigator, and a placemark for each track, clamped to the ground.
+
+    Tracks of one navigator (their properties ``navigator`` and ``run``) have its color. A last folder holds a placemark
+    at the start of each task and, where a track has a target, at its destination.
 
     Raises:
         ValueError: for a track of fewer than two positions, or a position out of range.
@@ -137,16 +146,76 @@ def to_kml(tracks: Sequence[Track]) -> str:
     """
     root = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
     document = ElementTree.SubElement(root, "Document")
-    for track in tracks:
-        placemark = ElementTree.SubElement(document, "Placemark")
-        _add_text(placemark, "name", track.name)
-        _add_text(placemark, "description", _description(track))
-        shape = ElementTree.SubElement(placemark, "MultiGeometry")
-        for line in cut(track.positions):
-            drawn = ElementTree.SubElement(shape, "LineString")
-            _add_text(drawn, "tessellate", "1")
-            _add_text(drawn, "coordinates", " ".join(f"{_number(lon)},{_number(lat)},0" for lat, lon in line))
+    groups = _by_navigator(tracks)
+    for name, color in _ENDS.items():
+        _add_style(document, name, "IconStyle", color)
+    for number, group in enumerate(groups.values()):  # all styles stand before the first folder
+        navigator = str(group[0].properties.get("navigator", "")).partition(":")[0]
+        _add_style(document, f"track{number}", "LineStyle", NAVIGATOR_COLORS.get(navigator, "#000000"))
+    for number, (navigator, group) in enumerate(groups.items()):
+        folder = _add_folder(document, navigator) if navigator else document
+        for track in group:
+            _add_track(folder, track, f"#track{number}")
+    _add_ends(document, tracks)
     return _xml(root)
+
+
+_ENDS = {"start": START, "destination": TARGET}
+"""Colors of the ends of tasks."""
+
+
+def _by_navigator(tracks: Sequence[Track]) -> dict[str, list[Track]]:
+    """Return tracks by their navigator, with its run where it has several."""
+    runs = {(track.properties.get("navigator"), track.properties.get("run", 0)) for track in tracks}
+    groups: dict[str, list[Track]] = {}
+    for track in tracks:
+        name, run = track.properties.get("navigator", ""), track.properties.get("run", 0)
+        several = sum(other == name for other, _ in runs) > 1
+        groups.setdefault(f"{name}, run {run}" if several else str(name), []).append(track)
+    return groups
+
+
+def _add_style(document: ElementTree.Element, name: str, kind: str, color: str) -> None:
+    """Add a style; KML writes colors as opacity, blue, green, red."""
+    style = ElementTree.SubElement(ElementTree.SubElement(document, "Style", id=name), kind)
+    _add_text(style, "color", f"ff{color[5:7]}{color[3:5]}{color[1:3]}".lower())
+    if kind == "LineStyle":
+        _add_text(style, "width", "2")
+
+
+def _add_folder(document: ElementTree.Element, name: str) -> ElementTree.Element:
+    folder = ElementTree.SubElement(document, "Folder")
+    _add_text(folder, "name", name)
+    return folder
+
+
+def _add_track(parent: ElementTree.Element, track: Track, style: str) -> None:
+    placemark = ElementTree.SubElement(parent, "Placemark")
+    _add_text(placemark, "name", track.name)
+    _add_text(placemark, "description", _description(track))
+    _add_text(placemark, "styleUrl", style)
+    shape = ElementTree.SubElement(placemark, "MultiGeometry")
+    for line in cut(track.positions):
+        drawn = ElementTree.SubElement(shape, "LineString")
+        _add_text(drawn, "tessellate", "1")
+        _add_text(drawn, "coordinates", " ".join(f"{_number(lon)},{_number(lat)},0" for lat, lon in line))
+
+
+def _add_ends(document: ElementTree.Element, tracks: Sequence[Track]) -> None:
+    """Add a folder with the start and the destination of each task, once for all navigators."""
+    tasks = {(track.name, track.positions[0], track.target) for track in tracks if track.target is not None}
+    if not tasks:
+        return
+    folder = _add_folder(document, "starts and destinations")
+    order = {track.name: number for number, track in enumerate(tracks)}
+    for name, *places in sorted(tasks, key=lambda task: order[task[0]]):
+        for end, place in zip(_ENDS, places, strict=True):
+            (latitude, longitude), _ = _checked([place, place])
+            placemark = ElementTree.SubElement(folder, "Placemark")
+            _add_text(placemark, "name", f"{name}: {end}")
+            _add_text(placemark, "styleUrl", f"#{end}")
+            point = ElementTree.SubElement(placemark, "Point")
+            _add_text(point, "coordinates", f"{_number(longitude)},{_number(latitude)},0")
 
 
 WRITERS: dict[str, Callable[[Sequence[Track]], str]] = {".geojson": to_geojson, ".gpx": to_gpx, ".kml": to_kml}

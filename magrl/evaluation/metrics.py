@@ -128,7 +128,7 @@ def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
 
 def _nearest_arrival(rollout: TensorDictBase, env: GeomagneticNavEnv, shortest_km: Tensor) -> Tensor:
     """Return the distance from each start to the nearest place where a vehicle has arrived, ``(M,)`` [km]."""
-    if env.arrival.declared:
+    if env.arrival.rule != "objective":
         return (shortest_km - env.arrival.radius_km).clamp_min(0)
     start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
     weights, region = rollout["objective_weights"][:, 0], rollout.get("region", None)
@@ -159,16 +159,17 @@ def _turns(rollout: TensorDictBase, valid: Tensor) -> Tensor:
     return torch.where(moving & (previous >= 0), torch.rad2deg(turn), math.nan)
 
 
-def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
+def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
     """Return the summary of a set of episodes, in the paper's units.
 
     Args:
-        episodes: from :func:`episode_measures`.
+        episodes: from :func:`episode_measures` or :func:`magrl.evaluation.evaluate`.
 
     Returns:
         ``success_rate`` [%] with its Wilson 95 % interval ``success_rate_low`` and ``success_rate_high``;
         ``success_rate_within_10km`` and ``success_rate_within_25km`` [%], the share of episodes that end within that
-        distance of the destination, whatever the field there; ``spl`` [%] with its bootstrap 95 % interval
+        distance of the destination, whatever the field there, and ``final_distance_km_median``, the median over all
+        episodes of the distance left at the end; ``spl`` [%] with its bootstrap 95 % interval
         ``spl_low`` and ``spl_high``, likewise ``path_efficiency`` over the episodes that moved, and ``spl_to_arrival``
         where it was measured; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper, and with
         the suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
@@ -189,6 +190,7 @@ def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
         >>> summary["success_rate"], summary["trajectory_length_m"], summary["steps"]
         (50.0, 500000.0, 10.0)
     """
+    episodes = dict(episodes.items())
     success = episodes["success"]
     if success.dtype != torch.bool or success.ndim != 1 or not len(success):
         raise ValueError(f"success must be bool of shape (M,) with M >= 1, got {success!r}")
@@ -198,6 +200,7 @@ def summarize(episodes: dict[str, Tensor]) -> dict[str, float]:
     error = episodes["navigation_error_km"]
     summary = {"success_rate": 100 * rate, "success_rate_low": 100 * low, "success_rate_high": 100 * high}
     summary |= {f"success_rate_within_{d}km": 100 * (error <= d).double().mean().item() for d in WITHIN_KM}
+    summary["final_distance_km_median"] = error.median().item()
     efficiency = episodes["path_efficiency"]
     summary |= _percent("spl", episodes["spl"]) | _percent("path_efficiency", efficiency[~efficiency.isnan()])
     if "spl_to_arrival" in episodes:

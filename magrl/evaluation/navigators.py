@@ -18,8 +18,10 @@ from magrl.field import Date
 from magrl.navigators import METAHEURISTICS, NAVIGATOR_CLASSES, NAVIGATORS, Navigator
 from magrl.transforms import TrackView
 
-TRAINED = ("gg_td3", "gg_td3_noise", "td3", "recurrent", "anywhere")
+TRAINED = ("gg_td3", "gg_td3_noise", "td3", "recurrent", "anywhere", "policy")
 """Names of trained agents, which take a run folder; ``anywhere`` without one is the pretrained policy."""
+OWN = "policy"
+"""Name of a policy of any algorithm, which takes its file or a folder with ``policy.pt``, and after ``:`` a label."""
 PRETRAINED = ("anywhere",)
 """Names of trained agents that come with the library."""
 DEFAULT_ZETA = 0.01
@@ -31,6 +33,7 @@ NAVIGATOR_NAMES = {
     "td3": "TD3",
     "recurrent": "recurrent TD3",
     "anywhere": "anywhere",
+    "policy": "own policy",
     "ga": "GA",
     "pso": "PSO",
     "afsa": "AFSA",
@@ -69,7 +72,8 @@ def make_navigator(
     """Return the navigator that a text such as ``secant``, ``pso:flown`` or ``gg_td3=RUN`` names.
 
     Args:
-        text: name; after ``=`` the run folder of a trained agent; after ``:`` the mode of a metaheuristic.
+        text: name; after ``=`` the run folder of a trained agent, or the file of a policy; after ``:`` the mode of a
+            metaheuristic, or the label of a policy, as in ``policy:SAC=sac.pt``.
         env: environment that it navigates in.
         mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
@@ -91,12 +95,15 @@ def make_navigator(
     check_type(str, text=text)
     name, _, run = text.partition("=")
     name, _, own_mode = name.partition(":")
-    if name in TRAINED and not own_mode:
+    if name in TRAINED and (not own_mode or name == OWN):
         if not run and name not in PRETRAINED:
-            raise ValueError(f"{name} needs the folder of a finished run: {name}=RUN")
-        policy = load_policy(Path(run) / "policy.pt", env.device) if run else load_pretrained(name, env.device)
-        if isinstance(view := policy.config.view, TrackView):  # it is told what counts as arrived
-            view = replace(view, zeta=env.zeta, search=not env.arrival.declared)
+            file = " or the file of a policy" if name == OWN else ""
+            raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
+        path = Path(run) if name == OWN and not Path(run).is_dir() else Path(run) / "policy.pt"
+        policy = load_policy(path, env.device) if run else load_pretrained(name, env.device)
+        # one that reads its own track is told what counts as arrived
+        if isinstance(policy, FieldPolicy) and isinstance(view := policy.config.view, TrackView):
+            view = replace(view, zeta=env.zeta, search=env.arrival.rule == "objective")
             policy = FieldPolicy(replace(policy.config, view=view), policy.actor)
             policy.noise_std = noise
         try:
@@ -128,13 +135,15 @@ def needs(name: str, default_mode: str = "look-ahead") -> str:
     Example:
         >>> needs("secant"), needs("mean_jacobian"), needs("td3")
         ('nothing', 'a map of the region', 'training in the region')
-        >>> needs("pso"), needs("pso:flown")
-        ('the field at other places', 'nothing')
+        >>> needs("pso"), needs("pso:flown"), needs("policy:SAC")
+        ('the field at other places', 'nothing', 'training')
     """
     base, _, mode = name.partition(":")
     label(base)  # raises for an unknown name
     if base in METAHEURISTICS:
         return "the field at other places" if (mode or default_mode) == "look-ahead" else Navigator.needs
+    if base == OWN:
+        return "training"
     if base in PRETRAINED:  # trained on planets that share only the spectrum of the field
         return Navigator.needs
     return "training in the region" if base in TRAINED else NAVIGATOR_CLASSES[base].needs
@@ -144,21 +153,21 @@ def label(name: str, default_mode: str = "look-ahead") -> str:
     """Return the label of a navigator in tables, which says how a metaheuristic reads the field.
 
     Args:
-        name: name without a run, for example ``pso`` or ``pso:flown``.
+        name: name without a run, for example ``pso``, ``pso:flown`` or ``policy:SAC``.
         default_mode: mode of a metaheuristic without one in ``name``.
 
     Raises:
         ValueError: for an unknown name.
 
     Example:
-        >>> label("pso"), label("ga:flown")
-        ('PSO, look-ahead (an oracle)', 'GA, flown')
+        >>> label("pso"), label("ga:flown"), label("policy:SAC")
+        ('PSO, look-ahead (an oracle)', 'GA, flown', 'SAC')
     """
     base, _, mode = name.partition(":")
     if base not in _DETAILED_NAMES:
         raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(_DETAILED_NAMES)}")
     if base not in METAHEURISTICS:
-        return _DETAILED_NAMES[base]
+        return mode if base == OWN and mode else _DETAILED_NAMES[base]
     look_ahead = (mode or default_mode) == "look-ahead"
     return _DETAILED_NAMES[base] + (", look-ahead (an oracle)" if look_ahead else ", flown")
 
@@ -229,7 +238,8 @@ def arrival_threshold(texts: Sequence[str], zeta: float | None = None) -> tuple[
         (0.01, ['runs/nowhere is not a finished training: it holds no eval.json'])
     """
     named = (text.partition("=") for text in texts)
-    runs = [Path(run) for name, _, run in named if name in TRAINED and run]
+    runs = [Path(run) for name, _, run in named if name.partition(":")[0] in TRAINED and run]
+    runs = [run for run in runs if not run.is_file()]  # the file of a policy belongs to no run
     trained = {run: known for run in runs if (known := _trained_zeta(run)) is not None}
     if zeta is None:
         examples = {known: run for run, known in trained.items()}

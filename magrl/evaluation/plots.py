@@ -16,22 +16,16 @@ from tensordict import TensorDictBase
 
 from magrl.checks import check_number, check_type
 from magrl.envs.region import Region
-from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours, draw_tracks
+from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
 from magrl.envs.tasks import Tasks
+from magrl.evaluation.colors import NAVIGATOR_COLORS
 from magrl.evaluation.intervals import interquartile_mean
-from magrl.evaluation.metrics import first_episode_mask
+from magrl.evaluation.maps import draw_episodes
 from magrl.evaluation.navigators import NAVIGATOR_NAMES
 from magrl.evaluation.navigators import label as navigator_label
 from magrl.evaluation.tables import Summaries, known_values
 from magrl.field.elements import NAMES, UNITS
 from magrl.field.model import FieldModel, elements_at
-from magrl.navigators import NAVIGATORS
-
-_COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
-_COLORS += ["#882255", "#332288", "#44AA99", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
-
-NAVIGATOR_COLORS = dict(zip(dict.fromkeys((*NAVIGATOR_NAMES, *NAVIGATORS)), _COLORS, strict=False))
-"""Color of each navigator in every figure."""
 
 LINES = ("#0072B2", "#D55E00", "#009E73")
 
@@ -81,7 +75,9 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
     return figure
 
 
-def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Region, episodes: int = 24) -> Figure:
+def trajectories_figure(
+    rollout: TensorDictBase, field: FieldModel, region: Region, episodes: int = 24, names: Sequence[str] = ()
+) -> Figure:
     """Return a map of the first episodes of a rollout over the field's contours.
 
     Args:
@@ -89,6 +85,7 @@ def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Regi
         field: any model of :mod:`magrl.field`.
         region: region of the tasks.
         episodes: number of episodes to show.
+        names: names of the tasks, which are written at their destinations.
 
     Example:
         >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
@@ -97,16 +94,9 @@ def trajectories_figure(rollout: TensorDictBase, field: FieldModel, region: Regi
         >>> figure.axes[0].get_ylabel()
         'latitude [° N]'
     """
-    check_type(TensorDictBase, rollout=rollout)
     check_number(1, whole=True, episodes=episodes)
-    shown = rollout[:episodes].cpu()
-    steps = first_episode_mask(shown["next", "done"]).sum(1)
-    paths = [
-        torch.cat((row["position"][:1], row["next", "position"][:count]))
-        for row, count in zip(shown, steps.tolist(), strict=True)
-    ]
     figure = Figure(figsize=(8, 8.4), layout="constrained")
-    draw_tracks(figure.subplots(), field, region, paths, shown["target_position"][:, 0])
+    draw_episodes(figure.subplots(), rollout, field, region, episodes, names)
     return figure
 
 

@@ -35,7 +35,13 @@ GIF_COLORS, STEP_MS = 96, 320
 
 
 def replay_data(
-    rollouts: Mapping[str, TensorDictBase], field: FieldModel, region: Region, *, zeta: float, title: str = ""
+    rollouts: Mapping[str, TensorDictBase],
+    field: FieldModel,
+    region: Region,
+    *,
+    zeta: float,
+    title: str = "",
+    names: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return the data of the page, as lists and numbers.
 
@@ -45,6 +51,7 @@ def replay_data(
         region: region of the tasks; the map is extended to hold all tracks.
         zeta: arrival threshold on the objective.
         title: title of the page.
+        names: names of the tasks; numbers without any.
 
     Returns:
         ``title``, ``zeta``, ``pieces``, ``region``, ``contours`` of each element, ``tasks`` and ``navigators``. Each
@@ -52,7 +59,8 @@ def replay_data(
         unwrapped longitudes and all angles in degrees, lengths in km, intensities in nT.
 
     Raises:
-        ValueError: for no rollout, a rollout of other tasks than the first, or a threshold out of its range.
+        ValueError: for no rollout, a rollout of other tasks than the first, another number of names than of tasks, or a
+            threshold out of its range.
 
     Example:
         >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
@@ -69,6 +77,9 @@ def replay_data(
     if not rollouts:
         raise ValueError("rollouts must hold at least one rollout, got {}")
     first = next(iter(rollouts.values()))
+    names = [*names] or [str(number) for number in range(1, len(first) + 1)]
+    if len(names) != len(first):
+        raise ValueError(f"names must hold one name for each of {len(first)} tasks, got {names}")
     for name, rollout in rollouts.items():
         if any(not torch.equal(rollout[key][:, 0], first[key][:, 0]) for key in ("start_position", "target_position")):
             raise ValueError(f"the rollout {name!r} is of other tasks than {next(iter(rollouts))!r}")
@@ -81,7 +92,7 @@ def replay_data(
         "pieces": PIECES,
         "region": {"latitude": shown.latitude, "longitude": shown.longitude},
         "contours": _contours(field, shown),
-        "tasks": _tasks(first, region),
+        "tasks": [{"name": name, **task} for name, task in zip(names, _tasks(first, region), strict=True)],
         "navigators": [
             {"label": name, "episodes": _episodes(rollout, tracks[name])} for name, rollout in rollouts.items()
         ],

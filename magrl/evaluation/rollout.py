@@ -1,21 +1,115 @@
-"""Evaluation rollouts: exactly one episode of each vehicle, without exploration."""
+"""Evaluation rollouts: exactly one episode of each vehicle or of each task, without exploration."""
 
 from __future__ import annotations
+
+import math
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from magrl.checks import check_type
-from magrl.envs.geomagnetic import GeomagneticNavEnv
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
+from magrl.evaluation.metrics import episode_measures
+from magrl.evaluation.navigators import make_navigator
+from magrl.evaluation.runs import NO_NOISE, Noise
+from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
 from magrl.transforms.errors import EpisodeErrors
+
+
+def evaluate(
+    policy: TensorDictModuleBase | str,
+    tasks: Scenario | Tasks | str,
+    *,
+    num_envs: int | None = None,
+    noise: Noise = NO_NOISE,
+    conditions: str | None = None,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    **options: Any,
+) -> TensorDict:
+    """Fly each task exactly once, without exploration, and return the measures of the episodes.
+
+    Args:
+        policy: policy or navigator of the plain environment, or the text that names one, as
+            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.pt"``.
+        tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
+            region.
+        num_envs: number of vehicles that fly at a time, each several tasks where there are more; by default one for
+            each task. Sensor noise, other errors and random start headings depend on it, the tasks do not.
+        noise: standard deviations of the noise on D [deg], I [deg], B_H [nT].
+        conditions: errors of a real vehicle instead of noise, a name of :data:`magrl.transforms.CONDITIONS`.
+        seed: random seed of the errors, random start headings and metaheuristics.
+        device: device of the environment.
+        options: further options of :class:`~magrl.envs.GeomagneticNavEnv`, such as ``max_steps`` or ``zeta``.
+
+    Returns:
+        ``(M,)``, one row for each task in its order, with the measures of
+        :func:`magrl.evaluation.episode_measures`. :func:`magrl.evaluation.summarize` takes it, and
+        ``pandas.DataFrame(episodes.to_dict(convert_tensors="numpy"))`` is its data frame.
+
+    Raises:
+        TypeError: for a policy that is not callable, or tasks of another type.
+        ValueError: for a scenario without tasks, noise with conditions, a policy of another field, or another value
+            out of its range.
+
+    Example:
+        >>> episodes = evaluate("secant", "paper-100", num_envs=30)
+        >>> episodes.shape, episodes["success"].double().mean()
+        (torch.Size([100]), tensor(1., dtype=torch.float64))
+    """
+    scenario = _with_tasks(tasks)
+    count = len(scenario.tasks.start)  # type: ignore[union-attr]
+    num_envs = count if num_envs is None else num_envs
+    if conditions is not None and any(noise):
+        raise ValueError(f"conditions {conditions!r} hold the noise of the sensors: omit the noise {noise}")
+    flown = conditions_named(conditions or "laboratory")
+    drift = {"drift_km": flown.drift_km(options.get("max_move_km") or scenario.max_move_km or 50.0)}
+    base = GeomagneticNavEnv(scenario, num_envs=num_envs, seed=seed, device=device, **(drift | options))
+    if isinstance(policy, str):
+        told = tuple(noise) if conditions is None else flown.sensor_std
+        policy = make_navigator(policy, base, seed=seed, noise=told, bias=flown.bias_std)  # type: ignore[arg-type]
+    elif hasattr(policy, "check_fits"):
+        policy.check_fits(base)
+    env = with_sensor_noise(base, noise, seed) if conditions is None else with_conditions(base, flown, seed)
+    restart(env)
+    episodes = [_next_episodes(env, policy) for _ in range(math.ceil(count / num_envs))]
+    return torch.cat(episodes)[:count]  # a last batch that is not full has flown the first tasks again
+
+
+def _with_tasks(tasks: Scenario | Tasks | str) -> Scenario:
+    """Return a scenario with tasks; raise if it has none."""
+    if isinstance(tasks, str):
+        tasks = named_tasks(tasks)
+    if isinstance(tasks, Tasks):
+        return Scenario().with_tasks(tasks)
+    check_type(Scenario, tasks=tasks)
+    if tasks.tasks is None:
+        raise ValueError("the scenario has no tasks to fly: scenario.with_tasks(scenario.random_tasks(300, seed=0))")
+    return tasks
+
+
+def _next_episodes(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
+    """Return the measures of the next episode of each vehicle, ``(num_envs,)``, and count exactly this episode."""
+    base = getattr(env, "base_env", env)
+    errors = [part for part in env.modules() if isinstance(part, EpisodeErrors)]
+    before = base.episode, [part.streams for part in errors]
+    measures = episode_measures(_rollout(env, policy), env)
+    base.episode = before[0]
+    for part, streams in zip(errors, before[1], strict=True):
+        part.streams = streams
+    env.reset()
+    return TensorDict(measures, [env.num_envs])
 
 
 def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
     """Return a rollout of exactly one episode of each vehicle, without exploration or gradients.
 
-    It is the first episode of each vehicle: tasks, start headings and sensor noise are the same in every call.
+    A stochastic policy acts by its deterministic sample. It is the first episode of each vehicle: tasks, start headings
+    and sensor noise are the same in every call.
 
     Args:
         env: navigation environment, with transforms or without.
@@ -34,10 +128,15 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
         torch.Size([2, 3])
     """
     check_type(EnvBase, env=env)
+    restart(env)
+    return _rollout(env, policy)
+
+
+def _rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
+    """Return the next episode of each vehicle, without exploration or gradients."""
     if not callable(policy):
         raise TypeError(f"policy must be callable with a TensorDict, got {policy!r}")
-    restart(env)
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         return env.rollout(env.max_steps, policy, break_when_any_done=False, break_when_all_done=True)
 
 

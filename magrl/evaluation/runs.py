@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from magrl.checks import check_type
-from magrl.evaluation.navigators import TRAINED
+from magrl.evaluation.navigators import OWN, TRAINED
 
 Value = TypeVar("Value")
 Noise = tuple[float, float, float]
@@ -102,9 +102,10 @@ def trained_runs(texts: Sequence[str]) -> list[TrainedRun]:
     runs = []
     for text in texts:
         name, _, folder = text.partition("=")
+        name = name.partition(":")[0]
         if name in TRAINED and (Path(folder) / "config.json").is_file():
             run = read_run(Path(folder))
-            if run.kind in TRAINED and run.kind != name.removesuffix("_noise"):
+            if name != OWN and run.kind in TRAINED and run.kind != name.removesuffix("_noise"):
                 raise ValueError(f"{folder} was trained as {run.kind}, not {name}: write {run.kind}={folder}")
             runs.append(run)
     return runs

@@ -50,6 +50,14 @@ SHORT_COLUMNS = {
 }
 """The same of :func:`short_table`."""
 
+KILOMETERS = {
+    "within 25 km %": ("success_rate_within_25km", ".1f"),
+    "final distance, median km": ("final_distance_km_median", ".1f"),
+    "false arrivals %": ("false_arrival_rate", ".1f"),
+}
+"""The first columns of tables that lead with kilometers: on long ways, the objective hides how far off an end is. False
+arrivals are shown where vehicles declare their arrival."""
+
 INTERVALS = ("success_rate", "spl", "spl_to_arrival", "path_efficiency", "steps")
 """Measures that are shown with an interval."""
 
@@ -118,12 +126,16 @@ def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> 
     return "\n".join([row(*head), "|---" * len(head) + "|", *(row(*cells) for cells in rows)])
 
 
-def comparison_table(summaries: Summaries, mode: str = "look-ahead") -> str:
+def comparison_table(
+    summaries: Summaries, mode: str = "look-ahead", *, published: bool = True, kilometers: bool = False
+) -> str:
     """Return the paper's Table 2 and further measures for navigators, below the paper's own rows.
 
     Args:
         summaries: by navigator, one summary for each run, with ``field_readings``.
         mode: mode of metaheuristics without one in their name.
+        published: whether the paper's rows are shown; they are of its own region.
+        kilometers: whether the columns of :data:`KILOMETERS` come first.
 
     Raises:
         ValueError: for an unknown navigator.
@@ -134,19 +146,30 @@ def comparison_table(summaries: Summaries, mode: str = "look-ahead") -> str:
         | TD3, paper | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — |
     """
     rows: list[list[object]] = []
-    published = set()
+    shown = set[str]()
+    columns = _kilometers(summaries, kilometers) | COLUMNS
     for name, results in summaries.items():
         base = name.partition(":")[0]
-        if base in paper.TABLE_2 and base not in published:
-            published.add(base)
-            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", 1, *_published(base)])
-        rows.append([label(name, mode), needs(name, mode), len(results), *_cells(results, COLUMNS)])
-    return markdown_table(["navigator", "needs", "runs", *COLUMNS], rows) + "\n"
+        if published and base in paper.TABLE_2 and base not in shown:
+            shown.add(base)
+            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", 1, *_published(base, columns)])
+        rows.append([label(name, mode), needs(name, mode), len(results), *_cells(results, columns)])
+    return markdown_table(["navigator", "needs", "runs", *columns], rows) + "\n"
 
 
-def _published(name: str) -> list[str]:
+def _kilometers(summaries: Summaries, wanted: bool) -> dict[str, tuple[str, str]]:
+    """Return the columns of :data:`KILOMETERS`, as far as they are wanted and known."""
+    declared = any("false_arrival_rate" in run for runs in summaries.values() for run in runs)
+    return {
+        head: column
+        for head, column in KILOMETERS.items()
+        if wanted and (declared or column[0] != "false_arrival_rate")
+    }
+
+
+def _published(name: str, columns: Mapping[str, tuple[str, str]]) -> list[str]:
     values = paper.TABLE_2[name]._asdict()
-    return [format(values[key], form) if key in values else "—" for key, form in COLUMNS.values()]
+    return [format(values[key], form) if key in values else "—" for key, form in columns.values()]
 
 
 def _cells(results: Sequence[Summary], columns: Mapping[str, tuple[str, str]]) -> list[str]:
@@ -181,12 +204,13 @@ def worst(results: Sequence[Summary], form: str) -> str:
     return format(min(values), form) if len(values) > 1 else "—"
 
 
-def short_table(summaries: Summaries, mode: str = "look-ahead") -> str:
+def short_table(summaries: Summaries, mode: str = "look-ahead", *, kilometers: bool = False) -> str:
     """Return the main measures of navigators, without the paper's rows.
 
     Args:
         summaries: by navigator, one summary for each run.
         mode: mode of metaheuristics without one in their name.
+        kilometers: whether the columns of :data:`KILOMETERS` come first.
 
     Raises:
         ValueError: for an unknown navigator.
@@ -196,7 +220,6 @@ def short_table(summaries: Summaries, mode: str = "look-ahead") -> str:
         >>> print(short_table({"secant": [measures]}).splitlines()[2].partition(" | 1.0")[2])
         | 1.0 | — | 1.0 | 1.0 |
     """
-    rows = [
-        [label(name, mode), needs(name, mode), *_cells(results, SHORT_COLUMNS)] for name, results in summaries.items()
-    ]
-    return markdown_table(["navigator", "needs", *SHORT_COLUMNS], rows) + "\n"
+    columns = _kilometers(summaries, kilometers) | SHORT_COLUMNS
+    rows = [[label(name, mode), needs(name, mode), *_cells(results, columns)] for name, results in summaries.items()]
+    return markdown_table(["navigator", "needs", *columns], rows) + "\n"

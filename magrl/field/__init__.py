@@ -3,6 +3,7 @@
 from magrl.field.bank import FieldBank
 from magrl.field.crust import CrustedField, RandomCrust, crustal_spectrum
 from magrl.field.igrf import IGRF, Date, igrf_coefficients, parse_date
+from magrl.field.limits import check_earth_jump, check_earth_reading
 from magrl.field.model import FieldModel, elements_at, elements_gradient_at, elements_range
 from magrl.field.planets import random_planets
 from magrl.field.regional import RegionalField
@@ -22,6 +23,8 @@ __all__ = [
     "RegionalField",
     "SphericalHarmonicField",
     "WeatherRecord",
+    "check_earth_jump",
+    "check_earth_reading",
     "crustal_spectrum",
     "elements_at",
     "elements_gradient_at",

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Callable, Sequence
 from functools import cache
+from numbers import Real
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from magrl.checks import short
 from magrl.field.spherical import SphericalHarmonicField
 
-Date = datetime.datetime | datetime.date | str | float
-"""A ``datetime`` or ``date``, ISO text such as ``"2022-01-01"``, or a decimal year such as ``2022.0``."""
+Date = datetime.datetime | datetime.date | np.datetime64 | str | float
+"""A ``datetime``, ``date`` or ``numpy.datetime64``, ISO text such as ``"2022-01-01"``, or a decimal year such as
+``2022.0``."""
 
 
 def parse_date(date: Date) -> datetime.datetime:
     """Return a date in any of the accepted forms as a naive UTC ``datetime``.
 
     Args:
-        date: ``datetime`` (aware ones are converted to UTC), ``date`` (its midnight), ISO 8601 text, or decimal year.
+        date: ``datetime`` (aware ones are converted to UTC), ``date`` (its midnight), ``numpy.datetime64``, ISO 8601
+            text, or decimal year.
 
     Raises:
-        ValueError: for text that is not an ISO date, a number that is not a year between 1 and 9999, or another type.
+        ValueError: for text that is not an ISO date, a number that is not a year between 1 and 9999, a missing date
+            (NaT), or another type.
 
     Example:
         >>> parse_date(2022.5)
@@ -34,17 +41,50 @@ def parse_date(date: Date) -> datetime.datetime:
             date = datetime.datetime.fromisoformat(date)
         except ValueError as error:
             raise ValueError(f"date {date!r} is not an ISO date such as '2022-01-01'") from error
+    if isinstance(date, (np.datetime64, datetime.date)) and date != date:
+        raise ValueError(f"date {date!r} is missing: give a date for each place")
+    if isinstance(date, np.datetime64):
+        moment = date.astype("M8[us]").item()
+        if not isinstance(moment, datetime.datetime):
+            raise ValueError(f"date {date!r} is not in a year between 1 and 9999")
+        return moment
     if isinstance(date, datetime.datetime):
         return date.astimezone(datetime.timezone.utc).replace(tzinfo=None) if date.tzinfo else date
     if isinstance(date, datetime.date):
         return datetime.datetime(date.year, date.month, date.day)
-    if isinstance(date, bool) or not isinstance(date, (int, float)):
+    if isinstance(date, bool) or not isinstance(date, Real):
         raise ValueError(f"date {date!r} is neither a datetime, nor ISO text, nor a decimal year")
     if not 1 <= date < 9999:
         raise ValueError(f"date {short(date)} is not a year between 1 and 9999")
     year = int(date)
     start, end = datetime.datetime(year, 1, 1), datetime.datetime(year + 1, 1, 1)
-    return start + datetime.timedelta(seconds=(date - year) * (end - start).total_seconds())
+    return start + datetime.timedelta(seconds=float(date - year) * (end - start).total_seconds())
+
+
+def parse_dates(dates: Sequence[Date] | NDArray[Any]) -> NDArray[np.datetime64]:
+    """Return an array of dates in any of the accepted forms as naive UTC ``datetime64[us]``.
+
+    Args:
+        dates: list, array or pandas column ``(...)`` of dates as :func:`parse_date` takes them.
+
+    Returns:
+        ``(...)``.
+
+    Raises:
+        ValueError: for no date, or as :func:`parse_date`.
+
+    Example:
+        >>> parse_dates([2022.5, "2023-01-01"])
+        array(['2022-07-02T12:00:00.000000', '2023-01-01T00:00:00.000000'], dtype='datetime64[us]')
+    """
+    array = np.asarray(dates, dtype=object if isinstance(dates, (list, tuple)) else None)
+    if not array.size:
+        raise ValueError(f"dates must hold at least one date, got {dates!r}")
+    if array.dtype.kind == "M" and not np.isnat(array).any():
+        return array.astype("M8[us]")
+    rows = list(array.flat) if array.dtype.kind == "M" else array.ravel().tolist()
+    known = {date: parse_date(date) for date in dict.fromkeys(rows)}
+    return np.array([known[date] for date in rows], dtype="M8[us]").reshape(array.shape)
 
 
 @cache
@@ -84,27 +124,64 @@ def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
     """
     epochs, table = _igrf_tables(generation)
     when = parse_date(date)
-    if not epochs[0] <= when <= epochs[-1]:
-        raise ValueError(
-            f"date {when.isoformat()} is outside IGRF-{generation}, which is valid from {epochs[0].date()} "
-            f"to {epochs[-1].date()}"
-        )
+    _check_span(when, when, generation)
     right = next(k for k in range(1, len(epochs)) if when <= epochs[k])
     weight = (when - epochs[right - 1]) / (epochs[right] - epochs[right - 1])
     return torch.from_numpy((1 - weight) * table[right - 1] + weight * table[right])
 
 
+def _check_span(first: datetime.datetime, last: datetime.datetime, generation: int) -> None:
+    epochs, _ = _igrf_tables(generation)
+    for when in (first, last):
+        if not epochs[0] <= when <= epochs[-1]:
+            raise ValueError(
+                f"date {when.isoformat()} is outside IGRF-{generation}, which is valid from {epochs[0].date()} "
+                f"to {epochs[-1].date()}"
+            )
+
+
+def _shares(dates: NDArray[np.datetime64], generation: int) -> tuple[Tensor, Tensor]:
+    """Return Gauss tables of the epochs around some dates, and the share of each epoch in the field of each date.
+
+    Returns:
+        Complex ``(E, 14, 14)`` and ``(E, ...)`` float64; the shares of a date are those of linear interpolation.
+    """
+    _check_span(dates.min().item(), dates.max().item(), generation)
+    epochs, table = _igrf_tables(generation)
+    nodes = np.array(epochs, dtype="M8[us]")
+    right = np.searchsorted(nodes, dates.ravel()).clip(1)
+    weight = (dates.ravel() - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
+    share, column = np.zeros((len(nodes), dates.size)), np.arange(dates.size)
+    share[right - 1, column], share[right, column] = 1 - weight, weight
+    used = share.any(1)
+    return torch.from_numpy(table[used]), torch.from_numpy(share[used].reshape(-1, *dates.shape))
+
+
+def _expansions(date: Any, generation: int) -> tuple[Tensor, Tensor | None, datetime.datetime | NDArray[np.datetime64]]:
+    """Return tables ``(E, 14, 14)``, the shares of many dates ``(E, ...)``, and the parsed date or dates."""
+    if np.ndim(date) == 0:
+        return igrf_coefficients(date, generation).unsqueeze(0), None, parse_date(date)
+    dates = parse_dates(date)
+    return *_shares(dates, generation), dates
+
+
 class IGRF(SphericalHarmonicField):
-    """The International Geomagnetic Reference Field at one date.
+    """The International Geomagnetic Reference Field at one date, or at a date for each place.
+
+    With an array of dates, latitudes and longitudes broadcast with it: ``IGRF(dates)(latitude, longitude)`` of three
+    arrays ``(P,)`` is the field at P places, each at its date; dates ``(T, 1)`` give T fields at each place.
+    A field of many dates is for tables of positions; environments and expansions take one date.
 
     Args:
-        date: ``datetime``, ISO text or decimal year, from 1900.0 to the end of the generation.
+        date: ``datetime``, ``date``, ``numpy.datetime64``, ISO text or decimal year, from 1900.0 to the end of the
+            generation; or a list, an array or a pandas column of them.
         generation: 13 (to 2025) or 14 (to 2030). The paper's figures are those of 13 at 2022-01-01.
-        altitude_km: default height above the ellipsoid [km].
+        altitude_km: default height above the ellipsoid [km], from -15 (15 km deep) to 600.
         chunk: points evaluated at a time.
 
     Raises:
-        ValueError: for an unknown generation, or a date outside the model, with the valid span.
+        ValueError: for an unknown generation, a date outside the model, with the valid span, or an altitude beyond
+            its range, which is probably not in kilometers.
 
     Source:
         Alken et al., International Geomagnetic Reference Field: the thirteenth generation, EPS 73 (2021);
@@ -116,11 +193,70 @@ class IGRF(SphericalHarmonicField):
         tensor([ 35120.,   4947., -10270.], dtype=torch.float64)
     """
 
-    def __init__(self, date: Date, generation: int = 14, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
-        super().__init__(igrf_coefficients(date, generation), altitude_km=altitude_km, chunk=chunk)
-        self.date = parse_date(date)
+    altitude_range_km: ClassVar[tuple[float, float]] = (-15.0, 600.0)
+    """Range of altitudes: from below the deepest trench to the height of satellites that measure the field [km]."""
+    share: Tensor | None
+
+    def __init__(
+        self,
+        date: Date | Sequence[Date] | NDArray[Any],
+        generation: int = 14,
+        *,
+        altitude_km: float = 0.0,
+        chunk: int = 16384,
+    ) -> None:
+        gauss, share, self.date = _expansions(date, generation)
+        super().__init__(gauss[0], altitude_km=altitude_km, chunk=chunk)
         self.generation = generation
+        # Of many dates, this is the field of their first epoch; those of the others follow it.
+        others = (SphericalHarmonicField(table, altitude_km=altitude_km, chunk=chunk) for table in gauss[1:])
+        self.others = nn.ModuleList(others)
+        self.register_buffer("share", share, persistent=False)
+
+    def forward(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None) -> Tensor:
+        """Return the field vector ``(..., 3)`` [nT], as in the parent class; ``...`` is also that of the dates."""
+        if self.share is None:
+            return super().forward(latitude, longitude, altitude_km)
+        return self._mixed(SphericalHarmonicField.forward, (3,), latitude, longitude, altitude_km)
+
+    def value_and_gradient(
+        self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the vector and its gradient, as in the parent class; ``...`` is also that of the dates."""
+        if self.share is None:
+            return super().value_and_gradient(latitude, longitude, altitude_km)
+
+        def both(field: SphericalHarmonicField, *place: Tensor) -> Tensor:
+            value, gradient = SphericalHarmonicField.value_and_gradient(field, *place)
+            return torch.cat((value.unsqueeze(-1), gradient), -1)
+
+        found = self._mixed(both, (3, 3), latitude, longitude, altitude_km)
+        return found[..., 0], found[..., 1:]
+
+    def _mixed(
+        self, evaluate: Callable[..., Tensor], size: tuple[int, ...], latitude: Tensor, longitude: Tensor, altitude: Any
+    ) -> Tensor:
+        """Return the sum over epochs of what each gives, times its share, at the places where it has any."""
+        assert self.share is not None
+        shape, points = self._points(latitude, longitude, altitude)
+        try:
+            whole = torch.broadcast_shapes(shape, self.share.shape[1:])
+        except RuntimeError:
+            raise ValueError(
+                f"positions of shape {tuple(shape)} do not broadcast with dates of shape "
+                f"{tuple(self.share.shape[1:])}: give a date for each position"
+            ) from None
+        points = [x.reshape(shape).expand(whole).flatten() for x in points[: 2 if altitude is None else 3]]
+        found = points[0].new_zeros(points[0].numel(), *size)
+        for field, share in zip((self, *self.others), self.share, strict=True):
+            share = share.expand(whole).flatten()
+            rows = share.nonzero().squeeze(-1)
+            part = evaluate(field, *(x[rows] for x in points))
+            found[rows] += share[rows].reshape(-1, *(1 for _ in size)) * part
+        return found.reshape(*whole, *size)
 
     def extra_repr(self) -> str:
         """Return the date, the generation and the default height as text."""
-        return f"date={self.date.isoformat()}, generation={self.generation}, altitude_km={self.altitude_km}"
+        date = self.date
+        dates = f"date={date.isoformat()}" if isinstance(date, datetime.datetime) else f"dates={date.shape}"
+        return f"{dates}, generation={self.generation}, altitude_km={self.altitude_km}"

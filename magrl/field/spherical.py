@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -13,9 +13,6 @@ from magrl.checks import check_number, check_tensor, check_type, require
 from magrl.field import harmonics
 from magrl.field.model import Float64Module, in_chunks
 from magrl.geodesy import WGS84_A_KM, WGS84_E2, check_positions
-
-LEAST_ALTITUDE_KM = -100.0
-"""Lowest altitude: below it there are sources, and the expansion does not hold."""
 
 
 class SphericalHarmonicField(Float64Module):
@@ -39,6 +36,8 @@ class SphericalHarmonicField(Float64Module):
                 [    0.,     0., 60410.]], dtype=torch.float64)
     """
 
+    altitude_range_km: ClassVar[tuple[float, float]] = (-100.0, math.inf)
+    """Range of altitudes [km]: below it there are sources, and the expansion does not hold."""
     value_weights: Tensor
     gradient_weights: Tensor
     level_value_weights: Tensor
@@ -53,7 +52,7 @@ class SphericalHarmonicField(Float64Module):
         if not torch.isfinite(torch.view_as_real(gauss.to(torch.complex128))).all():
             raise ValueError("gauss holds non-finite coefficients")
         self.degree = gauss.shape[0] - 1
-        self.altitude_km = _checked_altitude(altitude_km)
+        self.altitude_km = self._checked_altitude(altitude_km)
         self.chunk = int(chunk)
         gauss = gauss.to(torch.complex128)
         value, gradient = harmonics.field_table(gauss), harmonics.gradient_table(gauss)
@@ -110,6 +109,21 @@ class SphericalHarmonicField(Float64Module):
         rows = in_chunks(partial(self._value_and_gradient, altitude_km is None), points, 9, self.chunk)
         return rows[:3].reshape(3, *shape).movedim(0, -1), rows[3:].reshape(3, 2, *shape).movedim((0, 1), (-2, -1))
 
+    @property
+    def _altitudes(self) -> str:
+        """Altitudes that are valid, as text."""
+        lowest, highest = self.altitude_range_km
+        if highest == math.inf:
+            return f"a finite number from {lowest:g} km on"
+        return f"from {lowest:g} to {highest:g} km (a depth is negative): is it in meters? Divide by 1000"
+
+    def _checked_altitude(self, altitude_km: float) -> float:
+        check_number(altitude_km=altitude_km)
+        lowest, highest = self.altitude_range_km
+        if not lowest <= altitude_km <= highest:
+            raise ValueError(f"altitude_km {altitude_km} is not {self._altitudes}")
+        return float(altitude_km)
+
     def _points(
         self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None
     ) -> tuple[torch.Size, list[Tensor]]:
@@ -117,8 +131,9 @@ class SphericalHarmonicField(Float64Module):
         check_tensor(**{f"input {i}": x for i, x in enumerate(inputs) if isinstance(x, Tensor)})
         tensors = [torch.as_tensor(x, dtype=torch.float64, device=self.value_weights.device) for x in inputs]
         check_positions(tensors[0], tensors[1])
-        sound = (tensors[2] >= LEAST_ALTITUDE_KM) & (tensors[2] < math.inf)
-        require(sound, tensors[2], f"altitude_km {{}} is not a finite number from {LEAST_ALTITUDE_KM} km on")
+        lowest, highest = self.altitude_range_km
+        sound = (tensors[2] >= lowest) & (tensors[2] <= highest) & (tensors[2] < math.inf)
+        require(sound, tensors[2], f"altitude_km {{}} is not {self._altitudes}")
         tensors = list(torch.broadcast_tensors(*tensors))
         return tensors[0].shape, [x.reshape(-1) for x in tensors]
 
@@ -219,8 +234,3 @@ def _frame_turning(b_ned: Tensor, place: _Place) -> Tensor:
             -east / across,
         )
     )
-
-
-def _checked_altitude(altitude_km: float) -> float:
-    check_number(LEAST_ALTITUDE_KM, altitude_km=altitude_km)
-    return float(altitude_km)

@@ -13,12 +13,12 @@ import datetime
 import gzip
 from functools import cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number
 from magrl.field.igrf import Date, parse_date
 from magrl.field.spherical import SphericalHarmonicField
 
@@ -26,8 +26,6 @@ WMMHR_SHA256 = "8851d40e57a1d948cb56d49b837612844890a941f93a73846a122b6c1182d504
 """Checksum of the uncompressed file of coefficients."""
 EPOCH, END = datetime.datetime(2025, 1, 1), datetime.datetime(2030, 1, 1)
 """First and last date of WMMHR-2025."""
-LEAST_ALTITUDE_KM = -1.0
-"""Lowest altitude of WMMHR-2025: the sources of the field of the crust are not far below."""
 
 
 @cache
@@ -82,7 +80,8 @@ class WMMHR(SphericalHarmonicField):
 
     Args:
         date: ``datetime``, ISO text or decimal year, from 2025.0 to 2030.0.
-        altitude_km: height above the ellipsoid [km], from -1. Another altitude in a call takes about 15 times as long.
+        altitude_km: height above the ellipsoid [km], from -1 to 600. Another altitude in a call takes about 15 times as
+            long.
         chunk: points evaluated at a time.
 
     Raises:
@@ -98,8 +97,10 @@ class WMMHR(SphericalHarmonicField):
         tensor([32140.,  1112., -8271.], dtype=torch.float64)
     """
 
+    altitude_range_km: ClassVar[tuple[float, float]] = (-1.0, 600.0)
+    """Range of altitudes [km]: the sources of the field of the crust are not far below."""
+
     def __init__(self, date: Date, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
-        check_number(LEAST_ALTITUDE_KM, altitude_km=altitude_km)
         super().__init__(wmmhr_coefficients(date), altitude_km=altitude_km, chunk=chunk)
         self.date = parse_date(date)
 

@@ -52,7 +52,7 @@ def _kalman(
     noise: Noise = _PERFECT,
     bias: Noise = _PERFECT,
 ) -> Kalman:
-    search = not env.arrival.declared
+    search = env.arrival.rule == "objective"
     return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps, bias=bias, zeta=env.zeta, search=search)
 
 

@@ -1,5 +1,6 @@
 """Estimation of a field and its gradient along a dead-reckoned track."""
 
+from magrl.tracking.belief import probability_below, probability_within, steepest, surprise
 from magrl.tracking.filter import (
     CURVATURE,
     DISTANCE_SCALE_KM,
@@ -45,8 +46,12 @@ __all__ = [
     "estimated_gradient",
     "field_curvature",
     "predict",
+    "probability_below",
+    "probability_within",
     "relate",
     "start",
+    "steepest",
+    "surprise",
     "unvisited",
     "unvisited_yet",
     "update",

@@ -98,9 +98,16 @@ class RunConfig(CheckedModel):
                 f"device {self.device!r} cannot be used here ({reason}): choose another, such as cpu"
             ) from None
         try:
-            self.load_scenario()
+            scenario = self.load_scenario()
         except OSError as error:
             raise ValueError(str(error)) from None
+        for name in ("zeta", "start_heading", "max_steps"):
+            said, own = getattr(scenario, name), getattr(self, name, None)
+            if None not in (said, own) and said != own:
+                option = f"--{name.replace('_', '-')}"
+                raise ValueError(f"the scenario says {name} = {said!r}, the training {own!r}: add {option} {said}")
+        if scenario.arrival == "declared":
+            raise ValueError('the scenario says arrival = "declared": the recipes train no agent that declares')
         return self
 
     def load_scenario(self) -> Scenario:

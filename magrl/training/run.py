@@ -23,9 +23,10 @@ from typing_extensions import Self
 from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import check_finite
-from magrl.envs import GeomagneticNavEnv, Region
+from magrl.envs import GeomagneticNavEnv, Region, Scenario
 from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
+from magrl.evaluation.scenarios import task_names
 from magrl.files import write_json
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful
 from magrl.training.config import RunConfig, UsageError
@@ -69,6 +70,7 @@ class Run:
         self.statistics, self.best, self.stop = TrainingStatistics(), BestPolicy(), StopRequest()
         self.folder = config.out or Path("runs") / f"{self.name}-seed{config.seed}"
         self._exits = contextlib.ExitStack()
+        self._own: EnvBase | None = None  # of the tasks in the scenario file
 
     # Folder
 
@@ -116,13 +118,17 @@ class Run:
         Args:
             options: options of :class:`magrl.envs.GeomagneticNavEnv`.
         """
+        if self.scenario.tasks is not None:
+            self._own = self._evaluation_env(self.scenario, paper.TEST_SEED, options)
         sets = ((self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED))
-        first, second = (self._evaluation_env(count, seed, options) for count, seed in sets)
+        scenarios = (self.scenario.with_tasks(self.scenario.random_tasks(*each)) for each in sets)
+        first, second = (
+            self._evaluation_env(scenario, seed, options) for scenario, (_, seed) in zip(scenarios, sets, strict=True)
+        )
         return first, second
 
-    def _evaluation_env(self, num_tasks: int, seed: int, options: dict[str, Any]) -> EnvBase:
-        scenario = self.scenario.with_tasks(self.scenario.random_tasks(num_tasks, seed))
-        base = GeomagneticNavEnv(scenario, num_envs=num_tasks, seed=seed, **options)
+    def _evaluation_env(self, scenario: Scenario, seed: int, options: dict[str, Any]) -> EnvBase:
+        base = GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), seed=seed, **options)
         return with_sensor_noise(base, self.config.noise, seed)
 
     # Parts
@@ -261,7 +267,9 @@ class Run:
         reached = next((row["seconds"] for row in self.log.rows if passes_paper(row)), math.nan)
         result |= {"training_seconds": seconds, "seconds_to_97_sr_88_spl": reached}
         if isinstance(test.region, Region):
-            self.log.figure("trajectories", plots.trajectories_figure(rollout, test.field, test.region))
+            shown = rollout if self._own is None else evaluation_rollout(self._own, self.policy)
+            figure = plots.trajectories_figure(shown, test.field, test.region, names=self.scenario.names)
+            self.log.figure("trajectories", figure)
         self.log.result(result, navigator=self.name)
         self.checkpoints.clear()
         self._report(result)

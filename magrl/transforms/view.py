@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import CatTensors, Transform
 
-from magrl.checks import check_number, check_numbers
+from magrl.checks import check_number, check_numbers, check_type
 from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.transforms.observation import AngleVector, TargetDifference
 from magrl.transforms.scaling import MinMaxNorm
@@ -87,9 +87,20 @@ class ObservationView:
             steps.append(AngleVector("heading", "heading_vector"))
         return [*steps, CatTensors(scaled, "observation", del_keys=False, sort=False)]
 
-    def action_transform(self) -> MinMaxNorm:
-        """Return the transform from actions in [-1, 1] to distance [km] and turn [rad]."""
-        return MinMaxNorm(in_keys_inv=["action"], bounds={"action": self._action_bounds()})
+    def action_transform(self, *, declared: bool = False) -> MinMaxNorm:
+        """Return the transform from actions in [-1, 1] to distance [km] and turn [rad].
+
+        Args:
+            declared: whether actions have a third number, which declares the arrival and is in [-1, 1] anyway.
+
+        Raises:
+            TypeError: for ``declared`` that is not a bool.
+        """
+        check_type(bool, declared=declared)
+        low, high = self._action_bounds()
+        if declared:
+            low, high = torch.cat((low, torch.tensor([-1.0]))), torch.cat((high, torch.tensor([1.0])))
+        return MinMaxNorm(in_keys_inv=["action"], bounds={"action": (low, high)})
 
     def _action_bounds(self) -> tuple[Tensor, Tensor]:
         high = torch.tensor((self.max_move_km, self.max_turn_rad))

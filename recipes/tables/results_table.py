@@ -15,6 +15,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -79,8 +80,15 @@ def grouped(texts: Sequence[str]) -> dict[str, list[Summary]]:
             if folder.resolve() in seen:
                 raise UsageError(f"{folder} is given twice: the same run again is no spread over runs")
             seen.add(folder.resolve())
-            groups.setdefault(name, []).append(json.loads((folder / "eval.json").read_text()))
+            groups.setdefault(name, []).append(json.loads((folder / "eval.json").read_text()) | _place(folder))
     return groups
+
+
+def _place(folder: Path) -> dict[str, Any]:
+    """Return the scenario file of a run, if it had one."""
+    path = folder / "config.json"
+    scenario = json.loads(path.read_text()).get("scenario") if path.is_file() else None
+    return {"scenario": scenario} if scenario else {}
 
 
 def cells(*strata: Sequence[Summary]) -> list[str]:
@@ -97,8 +105,9 @@ def _cell(strata: Sequence[Sequence[Summary]], key: str, form: str) -> str:
 
 
 def table(groups: Groups, each: bool = False, pooled: bool = False) -> str:
-    """Return the table of groups of runs."""
-    rows = [["paper", *cells([paper.TABLE_2["gg_td3"]._asdict()])]]
+    """Return the table of groups of runs, below the paper's row unless a run was in another scenario."""
+    elsewhere = any("scenario" in run for runs in groups.values() for run in runs)
+    rows = [] if elsewhere else [["paper", *cells([paper.TABLE_2["gg_td3"]._asdict()])]]
     for name, runs in groups.items():
         if each and len(runs) > 1:
             rows += [[f"{name}, seed {run['seed']}" if name else f"seed {run['seed']}", *cells([run])] for run in runs]

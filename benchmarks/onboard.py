@@ -1,0 +1,76 @@
+"""Cost of a step on board of one vehicle: `python -m benchmarks.onboard`, seconds on one core."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+
+from benchmarks.timing import HEADER, Row, alternate
+from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation.navigators import make_navigator
+from magrl.onboard import Onboard
+
+NAVIGATORS = ("anywhere", "secant", "kalman")
+
+
+class Simulated:
+    """A navigator in the environment with one vehicle, one episode after the other; it keeps what it flew."""
+
+    def __init__(self, name: str) -> None:
+        self.env = GeomagneticNavEnv(num_envs=1, seed=0)
+        self.policy = make_navigator(name, self.env)
+        self.state = self.env.reset()
+        self.flown: list[TensorDictBase] = []
+
+    def __call__(self) -> None:
+        with torch.no_grad():
+            step, following = self.env.step_and_maybe_reset(self.policy(self.state))
+        self.flown.append(step)
+        self.state = following
+
+
+class Aboard:
+    """The same navigator on board, on the readings of a simulated flight."""
+
+    def __init__(self, name: str, flown: list[TensorDictBase]) -> None:
+        self.vehicle, self.number = Onboard(name, max_steps=50, confidence=1.0), 0
+        self.readings = [
+            (*step["field"][0].tolist(), math.degrees(step["heading"].item()), step["move"][0, 0].item())
+            for step in flown
+        ]
+        self.target = flown[0]["target_field"][0].tolist()
+
+    def __call__(self) -> None:
+        if self.number % len(self.readings) == 0:
+            self.vehicle.start(self.target)
+        self.vehicle.step(*self.readings[self.number % len(self.readings)])
+        self.number += 1
+
+
+def rows(repeats: int = 60) -> list[Row]:
+    """Return the times of a step on one thread: on board, and of the environment with the same navigator.
+
+    Args:
+        repeats: pairs of times for each row.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return [row(name, repeats) for name in NAVIGATORS]
+    finally:
+        torch.set_num_threads(threads)
+
+
+def row(name: str, repeats: int) -> Row:
+    """Return the times of a navigator."""
+    simulated = Simulated(name)
+    while not simulated.flown or not simulated.flown[-1]["next", "done"].item():
+        simulated()
+    aboard = Aboard(name, list(simulated.flown))
+    return alternate(f"step on board, {name}: environment and policy", aboard, simulated, repeats=repeats)
+
+
+if __name__ == "__main__":
+    print(HEADER + "\n".join(map(str, rows())))

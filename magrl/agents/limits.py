@@ -1,0 +1,139 @@
+"""What a policy was made for: the longest move, the largest turn, and the range of the field."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+
+from magrl.checks import check_number, check_numbers, check_type
+from magrl.field.elements import NAMES, UNITS
+from magrl.transforms import ObservationView, TrackView
+
+LEAST_NT = 2000.0
+"""Least B_H for an agent without a map: below, it fails more often (docs/anywhere.md, the whole globe) [nT]."""
+
+_LONGER = 1.1  # than the longest move
+
+View = ObservationView | TrackView | None
+
+
+def view_of(policy: TensorDictModuleBase) -> View:
+    """Return what a trained policy observes; None for a navigator, or a policy of no region.
+
+    Example:
+        >>> from magrl.agents import load_pretrained
+        >>> view_of(load_pretrained("anywhere")).max_steps
+        120
+    """
+    view = getattr(getattr(policy, "config", policy), "view", None)
+    return view if isinstance(view, (ObservationView, TrackView)) else None
+
+
+def move_limits(
+    policy: TensorDictModuleBase | None, max_move_km: float | None = None, max_turn_deg: float | None = None
+) -> tuple[float, float]:
+    """Return the longest move [km] and the largest turn [deg] of a vehicle that follows a policy.
+
+    Args:
+        policy: policy or navigator; None for one that is made for the vehicle.
+        max_move_km: longest move of the vehicle; by default that of the policy, or 50 km.
+        max_turn_deg: its largest turn to either side; by default that of the policy, or 90 degrees.
+
+    Raises:
+        ValueError: for a vehicle that cannot do what the policy commands, or numbers out of their range.
+
+    Example:
+        >>> move_limits(None, max_move_km=20.0)
+        (20.0, 90.0)
+    """
+    own = policy if policy is None else view_of(policy) or policy
+    moves, turns = getattr(own, "max_move_km", None), getattr(own, "max_turn_rad", None)
+    turns = None if turns is None else math.degrees(turns)
+    limits = []
+    for name, vehicle, commanded, usual, most in (
+        ("max_move_km", max_move_km, moves, 50.0, 1000.0),
+        ("max_turn_deg", max_turn_deg, turns, 90.0, 180.0),
+    ):
+        value = (usual if commanded is None else commanded) if vehicle is None else vehicle
+        given: dict[str, Any] = {name: value}
+        check_number(0, most, above=True, **given)
+        if commanded is not None and value < commanded * (1 - 1e-6):
+            raise ValueError(f"{name} must be at least {commanded:g}, which the policy commands, got {value!r}")
+        limits.append(float(value))
+    return limits[0], limits[1]
+
+
+def out_of_range(view: View, elements: Sequence[float]) -> str:
+    """Return which element is beyond the range that a policy was trained or tested in, as text; empty if none is.
+
+    For a policy of a region, as :meth:`~magrl.transforms.ObservationView.check_covers`: the range of the region and a
+    quarter of it beyond. For one that reads its own track, B_H of at least :data:`LEAST_NT`.
+
+    Args:
+        view: from :func:`view_of`.
+        elements: D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> from magrl.agents import load_pretrained
+        >>> out_of_range(view_of(load_pretrained("anywhere")), (0.0, 88.0, 1500.0))
+        'B_H 1500 nT is out of the range of the policy, 2000 to inf nT'
+    """
+    check_type((ObservationView, TrackView, type(None)), view=view)
+    check_numbers(3, elements=elements)
+    low: Sequence[float] = (-180.0, -90.0, 0.0)
+    high: Sequence[float] = (180.0, 90.0, math.inf)
+    if isinstance(view, TrackView):
+        low = (-180.0, -90.0, LEAST_NT)
+    elif view is not None:
+        ends = list(zip(view.field_low, view.field_high, strict=True))
+        low, high = [b - 1.25 * (b - a) for a, b in ends], [a + 1.25 * (b - a) for a, b in ends]
+    for name, unit, value, least, most in zip(NAMES, UNITS, elements, low, high, strict=True):
+        if not least <= value <= most:
+            return f"{name} {value:g} {unit} is out of the range of the policy, {least:g} to {most:g} {unit}"
+    return ""
+
+
+def check_move(heading_deg: float, distance_km: float, steer_deg: float | None, max_move_km: float) -> None:
+    """Raise unless a vehicle can have made a move.
+
+    A heading in radians is a small one in degrees. It is recognized where it is, in radians, what the vehicle was to
+    steer.
+
+    Args:
+        heading_deg: heading of the move, -360 to 360.
+        distance_km: its length.
+        steer_deg: heading that the vehicle was told to steer; None for none.
+        max_move_km: longest move; a vehicle may drift a tenth farther.
+
+    Raises:
+        ValueError: naming the value and what would be right.
+
+    Example:
+        >>> check_move(60.0, 30.0, 60.0, max_move_km=50.0)
+        >>> check_move(1.0472, 30.0, 60.0, max_move_km=50.0)
+        Traceback (most recent call last):
+        ValueError: heading 1.0472 looks like radians: the vehicle was to steer 60.0 deg; degrees are expected
+    """
+    named: tuple[dict[str, Any], dict[str, Any]] = {"heading [deg]": heading_deg}, {"distance [km]": distance_km}
+    check_number(-360, 360, **named[0])
+    check_number(0, **named[1])
+    if distance_km > _LONGER * max_move_km:
+        raise ValueError(
+            f"distance {distance_km:g} km is longer than the longest move of this vehicle, {max_move_km:g} km: it must "
+            "be in kilometers, and since the last step"
+        )
+    if steer_deg is None or abs(heading_deg) > 2 * math.pi or _apart(heading_deg, steer_deg) < 10:
+        return
+    if _apart(math.degrees(heading_deg), steer_deg) < 0.5:
+        raise ValueError(
+            f"heading {heading_deg!r} looks like radians: the vehicle was to steer {steer_deg:.1f} deg; degrees are "
+            "expected"
+        )
+
+
+def _apart(one: float, other: float) -> float:
+    """Return the angle between two headings [deg]."""
+    return abs(math.remainder(one - other, 360))

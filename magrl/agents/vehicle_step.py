@@ -1,0 +1,141 @@
+"""The step of an agent without a map as one function of tensors, for vehicles without TorchRL."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from magrl.agents.policy import FieldPolicy
+from magrl.checks import check_type
+from magrl.transforms import TrackView
+
+
+class StepState(NamedTuple):
+    """What an agent keeps between its steps; :func:`first_state` is that before the first one.
+
+    Example:
+        >>> StepState._fields
+        ('step', 'mean', 'covariance', 'first_field')
+    """
+
+    step: Tensor
+    mean: Tensor
+    covariance: Tensor
+    first_field: Tensor
+
+
+def first_state() -> StepState:
+    """Return the state before the first step.
+
+    Example:
+        >>> first_state().covariance.shape
+        torch.Size([3, 3, 3])
+    """
+    return StepState(torch.tensor(0), torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3).clone(), torch.zeros(3))
+
+
+class VehicleStep(nn.Module):
+    """One step of an agent that reads its own track, from plain tensors to plain tensors, without a batch.
+
+    It does not search (:class:`~magrl.transforms.SearchAim`): nobody tells the vehicle that it has not arrived.
+
+    Args:
+        policy: trained policy with a :class:`~magrl.transforms.TrackView`.
+
+    Raises:
+        ValueError: for a policy that observes something else.
+
+    Example:
+        >>> from magrl.agents import load_pretrained
+        >>> act = VehicleStep(load_pretrained("anywhere"))
+        >>> here, there, sheet = torch.tensor([3.5, 73, 15000]), torch.tensor([-11.6, 75.4, 13240]), torch.zeros(2, 3)
+        >>> action, way, covariance, *state = act(here, there, torch.zeros(2), sheet, *first_state())
+        >>> action.shape, state[0]
+        (torch.Size([2]), tensor(1))
+    """
+
+    def __init__(self, policy: FieldPolicy) -> None:
+        super().__init__()
+        check_type(FieldPolicy, policy=policy)
+        view = policy.config.view
+        if not isinstance(view, TrackView):
+            raise ValueError(f"the policy must read its own track (TrackView), got {view}")
+        alone = FieldPolicy(replace(policy.config, view=replace(view, search=False)), policy.actor)
+        self.observe, self.act, self.actor = alone.observe, alone.act, alone.actor
+
+    def forward(
+        self,
+        field: Tensor,
+        target_field: Tensor,
+        course: Tensor,
+        data_sheet: Tensor,
+        step: Tensor,
+        mean: Tensor,
+        covariance: Tensor,
+        first_field: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """Return what to do after a move, the estimates, and the next state.
+
+        Args:
+            field: ``(3,)`` reading of D [deg], I [deg], B_H [nT] after the move.
+            target_field: ``(3,)`` the same at the destination.
+            course: ``(2,)`` distance [km] and heading [rad] of the move; in the first step 0 and the heading.
+            data_sheet: ``(2, 3)`` standard deviations of noise and of constant errors, in the units of the reading.
+            step: ``()`` int64, and with the next three the :class:`StepState`.
+            mean: ``(3, 3)`` mean of the filter.
+            covariance: ``(3, 3, 3)`` covariance of the filter.
+            first_field: ``(3,)`` first reading.
+
+        Returns:
+            Distance [km] and turn [rad] ``(2,)``, the way to the destination forward and to the right ``(2,)`` [km],
+            its covariance ``(2, 2)`` [km^2], and the parts of the next state.
+        """
+        distance, heading = course.split(1)
+        keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
+        values = (field, target_field, torch.cat((distance, torch.zeros_like(distance))), heading, *data_sheet.unbind())
+        rows = {key: value.unsqueeze(0) for key, value in zip(keys, values, strict=True)}
+        seen = TensorDict({**rows, "step_count": step.reshape(1, 1)}, [1])
+        state = {"track_mean": mean, "track_covariance": covariance, "first_field": first_field}
+        before = TensorDict({key: value.unsqueeze(0) for key, value in state.items()}, [1])
+        started, moved = self.observe(seen.copy()), self.observe(before.set("next", seen.copy()))["next"]
+        kept = ("observation", "way", "way_covariance", *state)
+        now = {key: torch.where(step == 0, started[key], moved[key]) for key in kept}
+        action = self.actor(TensorDict({"observation": now["observation"]}, [1]))["action"]
+        action = self.act.denormalize("action", action)
+        return action[0], *(now[key][0] for key in ("way", "way_covariance")), step + 1, *(now[key][0] for key in state)
+
+
+def write_step(path: Path | str, policy: FieldPolicy) -> None:
+    """Write the step of an agent that reads its own track as a file that runs without magrl and TorchRL.
+
+    :func:`torch.export.load` reads the file; its module takes and returns the tensors of :class:`VehicleStep`. PyTorch
+    reads such a file with pickle: load it only from a source that you trust.
+
+    Args:
+        path: path of the file, ``.pt2``.
+        policy: trained policy, such as ``load_pretrained("anywhere")``.
+
+    Raises:
+        ValueError: for another suffix, or a policy that does not read its own track.
+        OSError: if the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from magrl.agents import load_pretrained
+        >>> write_step(Path(tempfile.mkdtemp()) / "anywhere.pt2", load_pretrained("anywhere"))
+    """
+    if Path(path).suffix != ".pt2":
+        raise ValueError(f"a file for torch.export.load must end with .pt2, got {str(path)!r}")
+    module = VehicleStep(policy).eval()
+    examples = torch.zeros(3), torch.ones(3), torch.zeros(2), torch.zeros(2, 3)
+    with torch.no_grad():
+        exported = torch.export.export(module, (*examples, *first_state()), strict=False)
+    file = io.BytesIO()
+    torch.export.save(exported, file)
+    Path(path).write_bytes(file.getvalue())

@@ -1,0 +1,140 @@
+"""What an evaluation flies: a scenario with frozen tasks, and the keys of it that a command line can change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from magrl import paper
+from magrl.checks import check_number
+from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
+from magrl.envs.tasks import RANDOM_SETS
+from magrl.transforms import DeclareArrival, TrackGradient
+from magrl.transforms.track_view import DATA_SHEET
+
+TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
+FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
+"""Seed of random tasks with --tasks-seed 0: beyond those of trainings and of frozen sets."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioOptions:
+    """Keys of a scenario that a command line can change; None for those of the file, or the defaults.
+
+    Example:
+        >>> ScenarioOptions(max_steps=80).changes()
+        {'max_steps': 80}
+    """
+
+    zeta: float | None = None
+    """Arrival threshold on the objective (Eq. 2-7); that of the runs by default, 0.01 without runs."""
+    start_heading: Literal["north", "random"] | None = None
+    """Heading at the start of an episode; by default that of the runs, or north."""
+    arrival: Literal["objective", "distance", "declared"] | None = None
+    """Rule of arrival: F below --zeta, the distance below --arrival-radius-km, or a declaration by the navigator's own
+    estimate; objective by default."""
+    arrival_radius_km: float | None = None
+    """Distance from the destination of an arrival by distance, or of a right declaration [km]; 25 by default."""
+    max_steps: int | None = None
+    """Moves after which an episode ends; 50 by default."""
+    max_move_km: float | None = None
+    """Longest move [km]; 50 by default."""
+    max_turn_deg: float | None = None
+    """Largest turn to either side before a move [deg]; 90 by default."""
+    altitude_km: float | None = None
+    """Altitude above the ellipsoid, negative for a depth [km]; 0 by default."""
+    margin_deg: float | None = None
+    """How far beyond the region destinations may lie and vehicles may stray [deg]; 5 by default."""
+
+    def changes(self) -> dict[str, Any]:
+        """Return the keys that are given."""
+        given = {field.name: getattr(self, field.name) for field in fields(ScenarioOptions)}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+def choose_tasks(path: Path | None, tasks: str | int | None, tasks_seed: int | None = None, **changes: Any) -> Scenario:
+    """Return a scenario with frozen tasks.
+
+    Args:
+        path: scenario file; the paper's scenario by default.
+        tasks: task set, or number of random tasks; by default the scenario's own tasks, or ``test-1000`` where it has
+            none.
+        tasks_seed: seed of random tasks; 0 by default.
+        **changes: keys of the scenario that replace its own.
+
+    Raises:
+        ValueError: for a file that is not a scenario, the paper's example task in another scenario, or a seed for tasks
+            that are not random.
+        FileNotFoundError: for a missing file.
+
+    Example:
+        >>> choose_tasks(None, 30, 7).tasks.start.shape
+        torch.Size([30, 2])
+    """
+    scenario = Scenario(**changes) if path is None else load_scenario(path, **changes)
+    if isinstance(tasks, int):
+        check_number(0, 2**62, whole=True, tasks_seed=0 if tasks_seed is None else tasks_seed)
+        return scenario.with_tasks(scenario.random_tasks(tasks, FIRST_TASKS_SEED + (tasks_seed or 0)))
+    if tasks_seed is not None:
+        raise ValueError(f"--tasks-seed {tasks_seed} needs a number of random tasks, such as --tasks 300")
+    if path is None:
+        return scenario.with_tasks(named_tasks(tasks or "test-1000"))
+    if tasks == "figure-4-1":
+        raise ValueError("--tasks figure-4-1 lies in the paper's region: omit it, or --scenario")
+    if scenario.tasks is not None and tasks is None:
+        return scenario
+    return scenario.with_tasks(scenario.random_tasks(*RANDOM_SETS[tasks or "test-1000"]))
+
+
+def first_tasks(scenario: Scenario, num_tasks: int) -> Scenario:
+    """Return a scenario with its first tasks only.
+
+    Raises:
+        ValueError: for fewer than one task, or more than it has.
+
+    Example:
+        >>> first_tasks(choose_tasks(None, "paper-100"), 3).tasks.start.shape
+        torch.Size([3, 2])
+    """
+    assert scenario.tasks is not None
+    check_number(1, len(scenario.tasks.start), whole=True, num_tasks=num_tasks)
+    tasks = type(scenario.tasks)(*(values[:num_tasks] for values in scenario.tasks))
+    return scenario.replace(tasks=tasks, names=scenario.names[:num_tasks])
+
+
+def task_names(scenario: Scenario, first: int = 0) -> tuple[str, ...]:
+    """Return the names of frozen tasks: their own, or numbers from ``first`` on.
+
+    Example:
+        >>> task_names(first_tasks(choose_tasks(None, "paper-100"), 2))
+        ('task 0', 'task 1')
+    """
+    assert scenario.tasks is not None
+    return scenario.names or tuple(f"task {number}" for number in range(first, first + len(scenario.tasks.start)))
+
+
+def with_declaration(env: EnvBase) -> EnvBase:
+    """Return an environment in which navigators of two numbers declare their arrival, where it must be declared.
+
+    They declare where the root mean square of the distance that a filter of their own track estimates is within the
+    radius of arrival (:class:`~magrl.transforms.DeclareArrival`).
+
+    Args:
+        env: navigation environment with all errors of the sensors.
+
+    Example:
+        >>> env = with_declaration(GeomagneticNavEnv(num_envs=2, arrival="declared", seed=0))
+        >>> env.action_spec.shape
+        torch.Size([2, 2])
+    """
+    base: GeomagneticNavEnv = getattr(env, "base_env", env)
+    if not base.arrival.declared:
+        return env
+    told = DATA_SHEET if DATA_SHEET[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
+    furthest = torch.tensor(base.scenario.distance_range_km).max().item()
+    track = TrackGradient(("field", "target_field", "move", "heading", *told), range_km=furthest)
+    return TransformedEnv(env, Compose(track, DeclareArrival(base.arrival.radius_km)))

@@ -1,0 +1,239 @@
+"""Evaluate the field at the points of a table: D, I, B_H, the vector, the total intensity and the gradients.
+
+    python -m magrl.field points.csv                                        # writes points_field.csv
+    python -m magrl.field points.csv --altitude height --unit m --date 2026-07-01 --out field.parquet
+
+The table has a row for each point. Its columns are latitude and longitude [deg], altitude or depth [km], and date (ISO
+text or decimal year). Other names are given by options; an option that is not a column is the value of all points. All
+columns of the table are kept, and these are added:
+
+    D_deg, I_deg, B_H_nT       declination, inclination, horizontal intensity
+    X_nT, Y_nT, Z_nT, F_nT     north, east and down components, total intensity
+    dD_north_deg_per_km, ...   horizontal gradients of D, I and B_H, northward and eastward
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from magrl.checks import short
+from magrl.field.elements import NAMES, elements_gradient, seven_elements
+from magrl.field.igrf import IGRF, parse_date
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+UNITS_KM = {"km": 1.0, "m": 0.001}
+SUFFIXES = (".csv", ".parquet")
+NO_PARQUET = "pandas reads and writes Parquet with the package pyarrow: pip install pyarrow, or use .csv"
+_DIGITS = {"deg": 6, "nT": 4, "km": 9}
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(
+        prog="python -m magrl.field", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    made.add_argument("points", type=Path, help="table of the points: .csv or .parquet")
+    made.add_argument("--out", type=Path, help="result: .csv or .parquet; by default beside the points, with _field")
+    for name, meaning in (("latitude", "geodetic latitude [deg]"), ("longitude", "longitude [deg]")):
+        made.add_argument(f"--{name}", default=name, help=f"column of the {meaning}, or a number; default {name}")
+    height = made.add_mutually_exclusive_group()
+    height.add_argument("--altitude", help="column of the altitude above the ellipsoid, or a number; default altitude")
+    height.add_argument("--depth", help="column of the depth below the ellipsoid, or a number; default depth")
+    made.add_argument("--unit", choices=UNITS_KM, default="km", help="unit of altitude or depth; default km")
+    made.add_argument("--date", default="date", help="column of the date, or a date; default date")
+    made.add_argument("--generation", type=int, choices=(13, 14), default=14, help="generation of IGRF; default 14")
+    return made
+
+
+def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
+    """Return a table with the field at each of its points.
+
+    Args:
+        table: columns of text or numbers.
+        options: of :func:`parser`.
+
+    Raises:
+        ValueError: naming the column, the row and the value, or the columns that there are.
+
+    Example:
+        >>> import pandas
+        >>> place = pandas.DataFrame({"latitude": [-2.0], "longitude": [162.0], "depth": [1.0], "date": ["2022-01-01"]})
+        >>> field_of_points(place, parser().parse_args(["points.csv"]))[["D_deg", "B_H_nT"]].round(1).values.tolist()
+        [[8.0, 35480.8]]
+    """
+    if not len(table):
+        raise ValueError("the table has no row")
+    latitude, longitude = (_numbers(table, getattr(options, name), name) for name in ("latitude", "longitude"))
+    altitude_km = _altitude_km(table, options)
+    for name, values, low, high in (("latitude", latitude, -90.0, 90.0), ("longitude", longitude, -360.0, 360.0)):
+        _check_rows(getattr(options, name), values, low, high, "degrees")
+    dates = _column(table, options.date, "date", _date)
+    field = IGRF(dates, options.generation)
+    place = (torch.from_numpy(values) for values in (latitude, longitude, altitude_km))
+    found = _columns(*field.value_and_gradient(*place))
+    if taken := sorted(found.keys() & set(table.columns)):
+        raise ValueError(f"the table has columns {', '.join(taken)} already: rename them, or remove them")
+    return table.assign(**found)
+
+
+def _columns(value: torch.Tensor, gradient: torch.Tensor) -> dict[str, NDArray[np.float64]]:
+    """Return the columns of the result, from vectors ``(P, 3)`` and their gradients ``(P, 3, 2)``."""
+    elements = seven_elements(value)
+    names = {"D": "deg", "I": "deg", "B_H": "nT"}
+    found = {f"{name}_{unit}": getattr(elements, name) for name, unit in names.items()}
+    found |= {"X_nT": elements.B_x, "Y_nT": elements.B_y, "Z_nT": elements.B_z, "F_nT": elements.B_F}
+    slopes = elements_gradient(value, gradient)
+    for row, name in enumerate(NAMES):
+        for column, way in enumerate(("north", "east")):
+            found[f"d{name}_{way}_{names[name]}_per_km"] = slopes[:, row, column]
+    return {name: values.numpy().round(_DIGITS[name.rpartition("_")[2]]) for name, values in found.items()}
+
+
+def _altitude_km(table: DataFrame, options: argparse.Namespace) -> NDArray[np.float64]:
+    """Return altitudes above the ellipsoid [km] ``(P,)``."""
+    given = [name for name in _HEIGHTS if getattr(options, name) is not None]
+    names = given or [name for name in _HEIGHTS if name in table.columns]
+    if len(names) != 1:
+        which = "both columns altitude and depth" if names else f"neither altitude nor depth among {_listed(table)}"
+        raise ValueError(f"the table has {which}: choose with --altitude or --depth, such as --altitude 0")
+    (name,) = names
+    values = _numbers(table, getattr(options, name) or name, name) * UNITS_KM[options.unit]
+    sign = -1.0 if name == "depth" else 1.0
+    low, high = sorted(sign * limit for limit in IGRF.altitude_range_km)
+    hint = "km: is it in meters? Then add --unit m" if options.unit == "km" else "km"
+    _check_rows(getattr(options, name) or name, values, low, high, f"{hint}; {name} is {_HEIGHTS[name]}")
+    return sign * values
+
+
+_HEIGHTS = {
+    "altitude": "above the ellipsoid, and negative below it",
+    "depth": "below the ellipsoid, and negative above it",
+}
+
+
+def _column(table: DataFrame, text: str, name: str, read: Callable[[Any], Any]) -> NDArray[Any]:
+    """Return what is read of a column ``(P,)``, or of a text that is none, for all rows."""
+    if text not in table.columns:
+        try:
+            return np.full(len(table), read(text))
+        except ValueError:
+            raise ValueError(
+                f"{text!r} is no column of the table and no {name}: choose among {_listed(table)} with --{name}"
+            ) from None
+    values = table[text].tolist()
+    known: dict[Any, Any] = {}
+    try:
+        for row, value in enumerate(values, start=1):  # noqa: B007 - for the message
+            if value not in known:
+                known[value] = read(value)
+    except ValueError as error:
+        raise ValueError(f"row {row}, {text}: {error}") from None
+    return np.array([known[value] for value in values])
+
+
+def _numbers(table: DataFrame, text: str, name: str) -> NDArray[np.float64]:
+    return _column(table, text, name, _number).astype(np.float64)
+
+
+def _number(value: object) -> float:
+    """Return a finite number."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{short(value)} is not a finite number")
+    return number
+
+
+def _date(value: Any) -> np.datetime64:
+    """Return a date, from a text that is perhaps a decimal year."""
+    with contextlib.suppress(TypeError, ValueError):
+        value = float(value)
+    return np.datetime64(parse_date(value), "us")
+
+
+def _check_rows(text: str, values: NDArray[np.float64], low: float, high: float, unit: str) -> None:
+    outside = (values < low) | (values > high)
+    if outside.any():
+        row = int(outside.argmax())
+        raise ValueError(f"row {row + 1}, {text}: {values[row]:g} is not from {low:g} to {high:g} {unit}")
+
+
+def _listed(table: DataFrame) -> str:
+    return ", ".join(map(str, table.columns))
+
+
+def read_points(path: Path) -> DataFrame:
+    """Return a table from a file; columns of a CSV file stay text, so that they are written as they were.
+
+    Raises:
+        ValueError: for a file that is no table, or another suffix.
+    """
+    import pandas
+
+    check_suffix(path)
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}")
+    try:
+        if path.suffix == ".parquet":
+            return pandas.read_parquet(path)
+        return pandas.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
+    except ImportError as error:
+        raise ValueError(NO_PARQUET) from error
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path} is not a table: {error}") from error
+
+
+def write_points(path: Path, table: DataFrame) -> None:
+    """Write a table, in the format of the suffix."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        if path.suffix == ".parquet":
+            table.to_parquet(path, index=False)
+        else:
+            table.to_csv(path, index=False)
+    except ImportError as error:
+        raise ValueError(NO_PARQUET) from error
+
+
+def check_suffix(path: Path) -> None:
+    """Raise unless a file ends in one of :data:`SUFFIXES`.
+
+    Example:
+        >>> check_suffix(Path("points.csv"))
+    """
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"a table must end in {' or '.join(SUFFIXES)}, got {str(path)!r}")
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line, evaluate the field and write the table."""
+    options = parser().parse_args(args)
+    out = options.out or options.points.with_stem(f"{options.points.stem}_field")
+    try:
+        check_suffix(out)
+        if out.resolve() == options.points.resolve():
+            raise ValueError(f"--out {out} would replace the points: choose another name")
+        table = field_of_points(read_points(options.points), options)
+        write_points(out, table)
+    except (ValueError, OSError) as error:
+        print(f"python -m magrl.field: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    print(f"The field at {len(table)} points is in {out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""What the Earth's field can be: checks of readings of D, I and B_H as plain numbers.
+
+The limits are those of IGRF-14 at sea level, 1900 to 2030, on a grid of 1 by 2 degrees: a total intensity of 21 900 to
+69 400 nT, a horizontal intensity up to 41 900 nT, and a change of the vector of up to 16 nT/km between 75° S and 75° N
+and 63 nT/km up to 88°, where north turns along the way. Where the inclination is within 1.6 degrees, the horizontal
+intensity is at least 24 100 nT and the gradient of the inclination at least 1.5 degrees per 100 km. The checks leave
+room for the crust, magnetic storms, altitude and errors of sensors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from magrl.checks import check_number, check_numbers
+
+TOTAL_NT = (20000.0, 76000.0)
+"""Least and greatest total intensity: 10 % beyond those of IGRF [nT]."""
+MOST_HORIZONTAL_NT = 46000.0
+"""Greatest horizontal intensity: 10 % beyond that of IGRF [nT]."""
+EQUATOR_NT = 22000.0
+"""Least horizontal intensity where the inclination is within pi/2 degrees: 10 % below that of IGRF [nT]."""
+EQUATOR_SLOPE_DEG = 0.5
+"""Least gradient of the inclination where it is within pi/2 degrees: a third of that of IGRF [deg per 100 km]."""
+SLOPE_NT_KM = 60.0
+"""Greatest change of the field vector along a way, up to 88 degrees of latitude [nT/km]."""
+DISTURBANCE_NT = 2000.0
+"""Change of the field vector between two readings by the crust and a severe magnetic storm; chosen [nT]."""
+_SLACK_DEG = 1.0  # of an inclination
+_SIGMAS = 8.0  # of the noise of a difference
+_UNITS = {"microtesla": 1e3, "gauss": 1e5, "millitesla": 1e6, "tesla": 1e9}
+
+
+def check_earth_reading(
+    declination: float, inclination: float, horizontal_intensity: float, what: str = "the reading"
+) -> None:
+    """Raise unless three elements are possible on the Earth.
+
+    An inclination in radians is a small one in degrees. On the Earth, an inclination of at most pi/2 degrees comes with
+    a strong horizontal field, so that most readings in radians are recognized, but not all: at 0.5 and 30000 nT both
+    units are possible.
+
+    Args:
+        declination: D [deg], -180 to 180.
+        inclination: I [deg], -90 to 90.
+        horizontal_intensity: B_H [nT].
+        what: context, at the start of the message.
+
+    Raises:
+        ValueError: naming the value, what is possible, and the unit that it probably has.
+
+    Example:
+        >>> check_earth_reading(3.5, 73.0, 15000.0)
+        >>> check_earth_reading(3.5, 73.0, 15.0)
+        Traceback (most recent call last):
+        ValueError: the reading: horizontal_intensity 15 at an inclination of 73 deg is not possible on the Earth, \
+where it is 5513 to 23485 nT there: it looks like microtesla, and nanotesla are expected
+    """
+    for name, value, least, most in (
+        ("declination [deg]", declination, -180.0, 180.0),
+        ("inclination [deg]", inclination, -90.0, 90.0),
+        ("horizontal_intensity [nT]", horizontal_intensity, 0.0, math.inf),
+    ):
+        given: dict[str, Any] = {f"{what}: {name}": value}
+        check_number(least, most, **given)
+    low, high = _horizontal_limits(abs(inclination))
+    if low <= horizontal_intensity <= high:
+        return
+    units = [unit for unit, factor in _UNITS.items() if low <= factor * horizontal_intensity <= high]
+    in_radians = abs(inclination) <= math.pi / 2 and abs(declination) <= math.pi
+    least, most = _horizontal_limits(math.degrees(abs(inclination))) if in_radians else (math.inf, 0.0)
+    guess = f": it looks like {units[0]}, and nanotesla are expected" if units else ""
+    if least <= horizontal_intensity <= most:
+        guess = ": the inclination looks like radians, and degrees are expected"
+    raise ValueError(
+        f"{what}: horizontal_intensity {horizontal_intensity:g} at an inclination of {inclination:g} deg is not "
+        f"possible on the Earth, where it is {low:.0f} to {high:.0f} nT there{guess}"
+    )
+
+
+def _horizontal_limits(inclination: float) -> tuple[float, float]:
+    """Return the least and the greatest horizontal intensity [nT] at the size of an inclination [deg]."""
+    steep, flat = min(inclination + _SLACK_DEG, 90.0), max(inclination - _SLACK_DEG, 0.0)
+    low = EQUATOR_NT if inclination <= math.pi / 2 else TOTAL_NT[0] * math.cos(math.radians(steep))
+    return low, min(MOST_HORIZONTAL_NT, TOTAL_NT[1] * math.cos(math.radians(flat)))
+
+
+def check_earth_jump(
+    before: Sequence[float], after: Sequence[float], distance_km: float, sensor_std: Sequence[float] = (0.0, 0.0, 0.0)
+) -> None:
+    """Raise unless a move can explain the change between two readings, up to 88 degrees of latitude.
+
+    The change of each element is a change of the field vector of at least so many nanotesla. A move changes the vector
+    by at most :data:`SLOPE_NT_KM`, anything else by :data:`DISTURBANCE_NT`.
+
+    Args:
+        before: D [deg], I [deg], B_H [nT] before the move.
+        after: the same after it.
+        distance_km: length of the move [km].
+        sensor_std: standard deviations of the noise of a reading, in the same units.
+
+    Raises:
+        ValueError: naming the element, both values, and what a move of this length can explain.
+
+    Example:
+        >>> check_earth_jump((3.5, 73.0, 15000.0), (4.0, 72.5, 15400.0), 50.0)
+        >>> check_earth_jump((3.5, 40.0, 25000.0), (3.5, -40.0, 25000.0), 50.0)
+        Traceback (most recent call last):
+        ValueError: inclination changed from 40 to -40 deg over 50 km, by 41955 nT of the field vector; a move of this \
+length explains at most 5000 nT: the reading is wrong, or the distance is
+    """
+    check_numbers(3, before=before, after=after, sensor_std=sensor_std)
+    check_number(0, distance_km=distance_km, sensor_std=min(sensor_std))
+    horizontal = min(before[2], after[2])
+    total = min(TOTAL_NT[1], *(b / max(math.cos(math.radians(i)), 1e-6) for _, i, b in (before, after)))
+    radius = 2 * horizontal, 2 * total, 1.0
+    noise = math.radians(sensor_std[0]) * horizontal, math.radians(sensor_std[1]) * total, sensor_std[2]
+    for index, (name, unit) in enumerate((("declination", "deg"), ("inclination", "deg"), ("B_H", "nT"))):
+        change = abs(after[index] - before[index])
+        change = change if index == 2 else abs(math.sin(math.radians(change / 2)))
+        most = DISTURBANCE_NT + SLOPE_NT_KM * distance_km + _SIGMAS * math.sqrt(2) * noise[index]
+        if radius[index] * change > most:
+            raise ValueError(
+                f"{name} changed from {before[index]:g} to {after[index]:g} {unit} over {distance_km:g} km, by "
+                f"{radius[index] * change:.0f} nT of the field vector; a move of this length explains at most "
+                f"{most:.0f} nT: the reading is wrong, or the distance is"
+            )

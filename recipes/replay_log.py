@@ -1,0 +1,314 @@
+"""Replay the log of a vehicle: what a navigator would have commanded at each point, and what it estimated.
+
+    python recipes/replay_log.py docs/examples/log.csv --noise 0.02 0.02 2
+    python recipes/replay_log.py track.csv --target -11.6 75.4 13240 --navigator kalman
+    python recipes/replay_log.py track.csv --declination dec_deg --horizontal H_nT --every-km 20
+
+Each row of the log holds a reading of D [deg], I [deg], B_H [nT], and the heading [deg] and the length [km] of the move
+since the row before; in the first row, the length is 0. The destination is that of the last row, unless --target gives
+its elements. Where the log has positions, the estimates are compared with them; the navigator does not read them.
+Writes log.csv, log.md and log.png.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import torch
+import tyro
+from matplotlib.patches import Ellipse
+
+from magrl.agents import load_policy
+from magrl.checks import check_number
+from magrl.evaluation.tables import markdown_table
+from magrl.files import check_writable
+from magrl.geodesy import check_positions, geodesic
+from magrl.onboard import NAMED, Onboard
+from magrl.training import UsageError, command
+
+RECIPE = "replay_log.py"
+FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}"}
+"""Formats of columns of log.md, where not one decimal."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Log, names of its columns, navigator and destination."""
+
+    log: tyro.conf.Positional[Path]
+    """Log of the vehicle: a CSV file with a header."""
+    navigator: str = "anywhere"
+    """Navigator: anywhere (the pretrained agent), secant, kalman, run_and_tumble, or a policy file (.pt)."""
+    target: tuple[float, float, float] | None = None
+    """Elements at the destination, D [deg], I [deg], B_H [nT]; by default those of the last row."""
+    target_position: tuple[float, float] | None = None
+    """Its latitude and longitude [deg], for the comparison only; by default that of the last row, without --target."""
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Standard deviations of the noise on D [deg], I [deg], B_H [nT]: the data sheet of the sensors."""
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Standard deviations of constant and slow errors of the same."""
+    zeta: float = 0.01
+    """Arrival threshold on the objective F (Eq. 2-6)."""
+    arrival_km: float | None = None
+    """Distance that counts as arrived, in place of the threshold [km]."""
+    every_km: float = 0.0
+    """Least length of a move: shorter ones are joined [km]."""
+    time: str = "time"
+    """Column of the time, which is copied; it may be missing."""
+    declination: str = "D"
+    """Column of the declination [deg]."""
+    inclination: str = "I"
+    """Column of the inclination [deg]."""
+    horizontal: str = "B_H"
+    """Column of the horizontal intensity [nT]."""
+    heading: str = "heading"
+    """Column of the heading of the move since the row before [deg]."""
+    distance: str = "distance"
+    """Column of its length [km]."""
+    latitude: str = "latitude"
+    """Column of the true latitude [deg]; it may be missing, with that of the longitude."""
+    longitude: str = "longitude"
+    """Column of the true longitude [deg]."""
+    out: Path = Path("runs/replay_log")
+    """Folder of log.csv, log.md and log.png, which are replaced."""
+
+
+def read_log(config: Config) -> pd.DataFrame:
+    """Return the columns of the log by the names of the options, and the number of each row in the file.
+
+    Raises:
+        UsageError: for a file that cannot be read, a missing column, or a value that is not a number.
+    """
+    try:
+        raw = pd.read_csv(config.log, dtype=str, skipinitialspace=True)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot read {config.log}: {error}") from error
+    log = pd.DataFrame({"row": np.arange(len(raw)) + 2})  # row 1 of the file is the header
+    if config.time in raw:
+        log["time"] = raw[config.time]
+    wanted = ["declination", "inclination", "horizontal", "heading", "distance"]
+    if config.latitude in raw or config.longitude in raw:
+        wanted += ["latitude", "longitude"]
+    for option in wanted:
+        name = getattr(config, option)
+        if name not in raw:
+            known = ", ".join(map(repr, raw.columns))
+            raise UsageError(f"{config.log} has no column {name!r} but {known}: name it by --{option}")
+        log[option] = pd.to_numeric(raw[name], errors="coerce")
+        bad = ~np.isfinite(log[option])
+        if bad.any():
+            row = int(bad.idxmax())
+            raise UsageError(f"row {row + 2} of {config.log}: {name} is {raw[name][row]!r}, which is not a number")
+    if len(log) < 2:
+        raise UsageError(f"{config.log} must hold at least two rows, got {len(log)}")
+    return log
+
+
+def joined(log: pd.DataFrame, every_km: float) -> pd.DataFrame:
+    """Return the rows at the ends of moves of at least some length; shorter moves are added as vectors.
+
+    The last row always stays.
+    """
+    rows, way = [], np.zeros(2)
+    for index, row in log.iterrows():
+        heading = math.radians(row["heading"])
+        way = way + row["distance"] * np.array((math.cos(heading), math.sin(heading)))
+        length = float(np.hypot(*way))
+        if index == 0 or length >= every_km or index == len(log) - 1:
+            course = math.degrees(math.atan2(way[1], way[0])) % 360 if length and every_km else row["heading"]
+            rows.append({**row, "heading": course, "distance": length if every_km else row["distance"]})
+            way = np.zeros(2)
+    return pd.DataFrame(rows)
+
+
+def vehicle(config: Config, steps: int) -> Onboard:
+    """Return the vehicle on board of which the log is replayed."""
+    named = config.navigator in NAMED or not config.navigator.endswith(".pt")
+    return Onboard(
+        config.navigator if named else load_policy(config.navigator),
+        sensor_std=config.noise,
+        bias_std=config.bias,
+        max_steps=steps,
+        zeta=config.zeta,
+        arrival_km=config.arrival_km,
+    )
+
+
+def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
+    """Return what the navigator would have commanded and estimated after each row, beside the row itself.
+
+    Raises:
+        UsageError: for a row that no vehicle can have recorded, with its number.
+    """
+    elements = ["declination", "inclination", "horizontal"]
+    board = vehicle(config, len(log))
+    board.start(log[elements].iloc[-1].tolist() if config.target is None else config.target)
+    found = []
+    for _, row in log.iterrows():
+        try:
+            told = board.step(*row[elements], row["heading"], row["distance"])
+        except ValueError as error:
+            raise UsageError(f"row {row['row']} of {config.log}: {error}") from error
+        found.append(
+            {
+                "move_km": told.distance_km,
+                "turn_deg": told.turn_deg,
+                "steer_deg": told.heading_deg,
+                "north_km": told.way_km[0],
+                "east_km": told.way_km[1],
+                "error_km": told.error_km,
+                "confidence": told.confidence,
+                "stop": told.stop or "",
+                "covariance": told.way_covariance_km2,
+            }
+        )
+    return pd.concat((log.reset_index(drop=True), pd.DataFrame(found)), axis=1)
+
+
+def with_truth(config: Config, table: pd.DataFrame) -> pd.DataFrame:
+    """Return the table with the true way to the destination and the error of the estimate, where both are known."""
+    if "latitude" not in table or (config.target is not None and config.target_position is None):
+        return table
+    place = torch.tensor(table[["latitude", "longitude"]].to_numpy(dtype=float))
+    target = place[-1] if config.target_position is None else torch.tensor(config.target_position, dtype=torch.float64)
+    check_positions(*place.unbind(-1))
+    check_positions(*target)
+    distance, bearing = geodesic(*place.unbind(-1), *target.expand_as(place).unbind(-1))
+    north, east = (distance * torch.cos(bearing)).numpy(), (distance * torch.sin(bearing)).numpy()
+    miss = np.hypot(table["north_km"] - north, table["east_km"] - east)
+    return table.assign(true_north_km=north, true_east_km=east, miss_km=miss)
+
+
+def places(table: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions from the start ``(T, 2)``, northward and eastward [km], and the turn of north ``(T,)`` [rad].
+
+    From true positions, where the log has them, else by dead reckoning, without the turn of north along the way.
+    """
+    if "latitude" in table:
+        place = torch.tensor(table[["latitude", "longitude"]].to_numpy(dtype=float))
+        distance, bearing = geodesic(*place[:1].expand_as(place).unbind(-1), *place.unbind(-1))
+        around = torch.remainder(place[:, 1] - place[0, 1] + 180, 360) - 180
+        turn = torch.deg2rad(around) * torch.sin(torch.deg2rad((place[:, 0] + place[0, 0]) / 2))
+        return torch.stack((distance * torch.cos(bearing), distance * torch.sin(bearing)), -1).numpy(), -turn.numpy()
+    heading = np.radians(table["heading"].to_numpy(dtype=float))
+    moves = table["distance"].to_numpy(dtype=float)[:, None] * np.stack((np.cos(heading), np.sin(heading)), -1)
+    return np.cumsum(moves, 0), np.zeros(len(table))
+
+
+def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return vectors ``(T, 2)`` northward and eastward, turned to the right by angles ``(T,)`` [rad]."""
+    (north, east), cos, sin = vectors.T, np.cos(angle), np.sin(angle)
+    return np.stack((cos * north - sin * east, sin * north + cos * east), -1)
+
+
+def figure(table: pd.DataFrame, title: str) -> plt.Figure:
+    """Return a figure of the track with the estimates of the destination, and of the distance that is left."""
+    drawn, (plan, left) = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
+    (place, turn), way = places(table), table[["north_km", "east_km"]].to_numpy(dtype=float)
+    travelled, number = table["distance"].cumsum(), np.arange(len(table))
+    steer = np.radians(table["steer_deg"].to_numpy(dtype=float)) + turn
+    plan.plot(place[:, 1], place[:, 0], "-", color="0.4", label="track")
+    arrows = {"angles": "xy", "width": 0.004, "color": "#0072B2", "label": "commanded heading"}
+    plan.quiver(place[:, 1], place[:, 0], np.sin(steer), np.cos(steer), **arrows)
+    guess = place + turned(way, turn)
+    dots = plan.scatter(guess[:, 1], guess[:, 0], c=number, cmap="viridis", s=18, zorder=3, label="estimated target")
+    drawn.colorbar(dots, ax=plan, label="row of the table", shrink=0.8)
+    values, axes = np.linalg.eigh(np.array(table["covariance"].iloc[-1]))
+    size = 4 * np.sqrt(np.maximum(values, 0))
+    angle = math.degrees(math.atan2(axes[0, 1], axes[1, 1]))
+    plan.add_patch(Ellipse(guess[-1, ::-1], size[1], size[0], angle=angle, fill=False, color="#D55E00"))
+    extent = np.concatenate((place, guess[len(guess) // 4 :]))
+    plan.set(xlabel="east of the start [km]", ylabel="north of the start [km]", aspect="equal", title=title)
+    plan.set(xlim=_limits(extent[:, 1]), ylim=_limits(extent[:, 0]))
+    distance, error = np.hypot(*way.T), table["error_km"].to_numpy(dtype=float)
+    left.plot(travelled, distance, "o-", color="#0072B2", markersize=3, label="estimated")
+    left.fill_between(travelled, np.maximum(distance - error, 0), distance + error, alpha=0.2, label="± error")
+    if "miss_km" in table:
+        true = table[["true_north_km", "true_east_km"]].to_numpy(dtype=float)
+        target = place[0] + true[0]
+        plan.plot(target[1], target[0], "*", color="#D55E00", markersize=14, zorder=2, label="true target")
+        left.plot(travelled, np.hypot(*true.T), "k--", label="true")
+        left.plot(travelled, table["miss_km"], color="#D55E00", label="error of the estimate")
+    left.set(xlabel="distance moved [km]", ylabel="way to the destination [km]", ylim=(0, 1.3 * distance.max()))
+    for axis in (plan, left):
+        axis.grid(alpha=0.3)
+        axis.legend(frameon=False, fontsize=8)
+    return drawn
+
+
+def _limits(values: np.ndarray) -> tuple[float, float]:
+    slack = 0.1 * (values.max() - values.min()) + 10
+    return values.min() - slack, values.max() + slack
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """Return the table with rounded numbers."""
+    hidden = ["declination", "inclination", "horizontal", "latitude", "longitude", "covariance"]
+    shown = table.drop(columns=[name for name in hidden if name in table])
+
+    def cell(name: str, value: object) -> object:
+        return FORMATS.get(name, "{:.1f}").format(value) if isinstance(value, (int, float)) else value
+
+    rows = [[cell(name, row[name]) for name in shown] for _, row in shown.iterrows()]
+    return markdown_table(list(shown), rows)
+
+
+def notes(table: pd.DataFrame) -> list[str]:
+    """Return what a reader of the table must know."""
+    found = []
+    heading = table["heading"]
+    if heading.abs().max() <= 2 * math.pi and heading.max() - heading.min() > 0.5:
+        span = f"{heading.min():g} to {heading.max():g}"
+        found.append(f"Warning: all headings are {span} deg. If these are radians, convert them to degrees.")
+    stops = table[table["stop"] != ""]
+    if len(stops):
+        found.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")
+    if "miss_km" in table:
+        last = table.iloc[-1]
+        found.append(
+            f"Error of the estimated way at the end: {last['miss_km']:.1f} km; stated {last['error_km']:.1f} km."
+        )
+    return found
+
+
+def run(config: Config) -> pd.DataFrame:
+    """Replay the log, write the files and return the table.
+
+    Raises:
+        UsageError: for a log or a setting that is wrong.
+    """
+    log = read_log(config)
+    try:
+        check_number(0, every_km=config.every_km)
+        for name in ("log.csv", "log.md", "log.png"):
+            check_writable(config.out / name)
+        table = with_truth(config, replay(config, joined(log, config.every_km)))
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from error
+    table.drop(columns="covariance").to_csv(config.out / "log.csv", index=False)
+    (config.out / "log.md").write_text("\n".join([markdown(table), "", *notes(table), ""]))
+    figure(table, f"{config.log.name}: {config.navigator}").savefig(config.out / "log.png", dpi=110)
+    plt.close("all")
+    return table
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line, replay the log and print the table."""
+    config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
+    run(config)
+    print((config.out / "log.md").read_text())
+    print(f"The picture is {config.out / 'log.png'}")
+
+
+if __name__ == "__main__":
+    command(RECIPE, main)

@@ -1,0 +1,133 @@
+"""The command ``python -m magrl.field``: a table of points in, the field at each of them out."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+import torch
+
+from magrl.field import IGRF, elements_at, elements_gradient_at
+from magrl.field.__main__ import main
+
+POINTS = """id,latitude,longitude,altitude,date
+007,-2.0,162.0,0.5,2022-01-01
+008,60.4,5.3,-3,1999.5
+009,78.0,-30,400,2026-07-01T12:00:00
+"""
+
+
+@pytest.fixture
+def points(tmp_path: Path) -> Path:
+    path = tmp_path / "points.csv"
+    path.write_text(POINTS)
+    return path
+
+
+def test_the_field_of_each_row_is_that_of_its_date_and_altitude(points) -> None:
+    main([str(points)])
+    table = pandas.read_csv(points.with_name("points_field.csv"), dtype={"id": str, "date": str, "altitude": str})
+    given = pandas.read_csv(points, dtype=str)
+    assert [table[name].tolist() for name in ("id", "date", "altitude")] == [
+        given[name].tolist() for name in ("id", "date", "altitude")
+    ]
+    dates = ("2022-01-01", 1999.5, "2026-07-01T12:00:00")
+    for (_, row), date in zip(table.iterrows(), dates, strict=True):
+        field = IGRF(date, altitude_km=float(row["altitude"]))
+        place = torch.tensor([row["latitude"], row["longitude"]], dtype=torch.float64)
+        vector = field(*place)
+        np.testing.assert_allclose([row[f"{name}_nT"] for name in "XYZ"], vector, rtol=0, atol=1e-3)
+        assert row["F_nT"] == pytest.approx(vector.norm().item(), abs=1e-3)
+        found = [row[name] for name in ("D_deg", "I_deg", "B_H_nT")]
+        np.testing.assert_allclose(found, elements_at(field, place), rtol=0, atol=1e-3)
+        names = [f"d{x}_{way}_{unit}_per_km" for x, unit in (("D", "deg"), ("I", "deg"), ("B_H", "nT"))
+                 for way in ("north", "east")]  # fmt: skip
+        np.testing.assert_allclose(row[names].tolist(), elements_gradient_at(field, place).flatten(), rtol=0, atol=1e-8)
+
+
+def test_columns_have_any_name_a_value_of_all_rows_and_meters(points, tmp_path) -> None:
+    points.write_text("lat,lon,down\n-2,162,500\n60,5,11000\n")
+    out = tmp_path / "new" / "out.csv"
+    options = [
+        "--latitude",
+        "lat",
+        "--longitude",
+        "lon",
+        "--depth",
+        "down",
+        "--unit",
+        "m",
+        "--date",
+        "2022-01-01",
+        "--generation",
+        "13",
+    ]
+    main([str(points), *options, "--out", str(out)])
+    found = pandas.read_csv(out)[["X_nT", "Y_nT", "Z_nT"]].to_numpy()
+    place = torch.tensor([[-2.0, 60.0], [162.0, 5.0]], dtype=torch.float64)
+    expected = IGRF("2022-01-01", 13)(*place, torch.tensor([-0.5, -11.0]))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "options", "message"),
+    [
+        ("0.5", "5000", "", "row 1, altitude: 5000 is not from -15 to 600 km: is it in meters? Then add --unit m"),
+        ("0.5", "-20", "", "row 1, altitude: -20 is not from -15 to 600 km"),
+        ("60.4", "north", "", "row 2, latitude: 'north' is not a finite number"),
+        ("60.4", "", "", "row 2, latitude: '' is not a finite number"),
+        ("60.4", "91", "", "row 2, latitude: 91 is not from -90 to 90 degrees"),
+        ("162.0", "1620", "", "row 1, longitude: 1620 is not from -360 to 360 degrees"),
+        ("1999.5", "May", "", "row 2, date: date 'May' is not an ISO date"),
+        ("1999.5", "20220101", "", "row 2, date: date 20220101.0 is not a year"),
+        ("1999.5", "1850-01-01", "", "1850-01-01T00:00:00 is outside IGRF-14, which is valid from 1900-01-01"),
+        ("altitude", "height", "", "neither altitude nor depth among id, latitude, longitude, height, date"),
+        ("id", "depth", "", "both columns altitude and depth: choose with --altitude or --depth"),
+        (
+            "latitude",
+            "lat",
+            "",
+            "'latitude' is no column of the table and no latitude: choose among id, lat, longitude",
+        ),
+        ("id", "D_deg", "", "the table has columns D_deg already"),
+        (POINTS.partition("\n")[2], "", "", "the table has no row"),
+        ("", "", "--altitude 5000", "5000 is not from -15 to 600 km"),
+        ("", "", "--out points.xlsx", "a table must end in .csv or .parquet, got 'points.xlsx'"),
+        ("", "", "--out points.csv", "would replace the points"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_row(points, monkeypatch, capsys, old, new, options, message) -> None:
+    monkeypatch.chdir(points.parent)
+    points.write_text(POINTS.replace(old, new, 1) if old else POINTS)
+    with pytest.raises(SystemExit) as exit_:
+        main(["points.csv", *options.split()])
+    assert exit_.value.code == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert not points.with_name("points_field.csv").exists()
+
+
+def test_a_missing_file_and_a_missing_engine_are_said(points, monkeypatch, capsys) -> None:
+    def without_engine(*_, **__):
+        raise ImportError("no engine")
+
+    monkeypatch.setattr(pandas.DataFrame, "to_parquet", without_engine)
+    for arguments, message in (
+        (["nowhere.csv"], "there is no file nowhere.csv"),
+        ([str(points), "--out", str(points.with_suffix(".parquet"))], "pip install pyarrow"),
+    ):
+        with pytest.raises(SystemExit):
+            main(arguments)
+        assert message in capsys.readouterr().err
+
+
+def test_it_runs_as_a_command(points) -> None:
+    command = [sys.executable, "-W", "ignore", "-m", "magrl.field", str(points)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert re.fullmatch(r"The field at 3 points is in .*points_field\.csv\n", done.stdout)
