@@ -20,7 +20,7 @@ from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.rollout import restart
 from magrl.field import IGRF, check_earth_jump, check_earth_reading, elements_at
 from magrl.geodesy import geodesic
-from magrl.navigators import Geodesic, Secant
+from magrl.navigators import Geodesic, Kalman, Secant
 from magrl.onboard import LOST_SURPRISE, Onboard
 from magrl.tracking import probability_below, probability_within
 from magrl.transforms import with_sensor_noise
