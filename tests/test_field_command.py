@@ -77,8 +77,8 @@ def test_columns_have_any_name_a_value_of_all_rows_and_meters(points, tmp_path) 
 @pytest.mark.parametrize(
     ("old", "new", "options", "message"),
     [
-        ("0.5", "5000", "", "row 1, altitude: 5000 is not from -15 to 600 km: is it in meters? Then add --unit m"),
-        ("0.5", "-20", "", "row 1, altitude: -20 is not from -15 to 600 km"),
+        ("0.5", "5000", "", "row 1, altitude: 5000 is not from -15 to 1000 km: is it in meters? Then add --unit m"),
+        ("0.5", "-20", "", "row 1, altitude: -20 is not from -15 to 1000 km"),
         ("60.4", "north", "", "row 2, latitude: 'north' is not a finite number"),
         ("60.4", "", "", "row 2, latitude: '' is not a finite number"),
         ("60.4", "91", "", "row 2, latitude: 91 is not from -90 to 90 degrees"),
@@ -96,7 +96,7 @@ def test_columns_have_any_name_a_value_of_all_rows_and_meters(points, tmp_path) 
         ),
         ("id", "D_deg", "", "the table has columns D_deg already"),
         (POINTS.partition("\n")[2], "", "", "the table has no row"),
-        ("", "", "--altitude 5000", "5000 is not from -15 to 600 km"),
+        ("", "", "--altitude 5000", "5000 is not from -15 to 1000 km"),
         ("", "", "--out points.xlsx", "a table must end in .csv or .parquet, got 'points.xlsx'"),
         ("", "", "--out points.csv", "would replace the points"),
     ],

@@ -176,7 +176,7 @@ class IGRF(SphericalHarmonicField):
         date: ``datetime``, ``date``, ``numpy.datetime64``, ISO text or decimal year, from 1900.0 to the end of the
             generation; or a list, an array or a pandas column of them.
         generation: 13 (to 2025) or 14 (to 2030). The paper's figures are those of 13 at 2022-01-01.
-        altitude_km: default height above the ellipsoid [km], from -15 (15 km deep) to 600.
+        altitude_km: default height above the ellipsoid [km], from -15 (15 km deep) to 1000.
         chunk: points evaluated at a time.
 
     Raises:
@@ -193,7 +193,7 @@ class IGRF(SphericalHarmonicField):
         tensor([ 35120.,   4947., -10270.], dtype=torch.float64)
     """
 
-    altitude_range_km: ClassVar[tuple[float, float]] = (-15.0, 600.0)
+    altitude_range_km: ClassVar[tuple[float, float]] = (-15.0, 1000.0)
     """Range of altitudes: from below the deepest trench to the height of satellites that measure the field [km]."""
     share: Tensor | None
 

@@ -124,8 +124,9 @@ class TrackObservation(ObservationTransform):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.transforms import SensorNoise
         >>> from torchrl.envs import Compose, TransformedEnv
-        >>> view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=1.5)
-        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), *view.observation_transforms())
+        >>> track = TrackGradient(("field", "target_field", "move", "heading", "sensor_std"), frame="vehicle")
+        >>> aim, observation = SearchAim(zeta=0.01, frame="vehicle"), TrackObservation(zeta=0.01, max_steps=50)
+        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), track, aim, observation)
         >>> TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), steps).rollout(3)["observation"].shape
         torch.Size([2, 3, 15])
     """
