@@ -98,7 +98,8 @@ def test_commands_can_be_given(page: Path, monkeypatch) -> None:
 def test_flags_in_the_text_exist(monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     scripts = [str(path.relative_to(ROOT)) for path in (*ROOT.glob("recipes/*.py"), *ROOT.glob("recipes/tables/*.py"))]
-    known = "".join(help_text(script) for script in [*scripts, "-m benchmarks", "-m benchmarks.fields", "-m magrl.field"])
+    modules = ["-m benchmarks", "-m benchmarks.fields", "-m magrl.field"]
+    known = "".join(help_text(script) for script in [*scripts, *modules])
     for page in PAGES:
         for flag in re.findall(r"`(--[\w-]+)[^`]*`", page.read_text()):
             assert re.search(rf"(?<![\w-]){flag}(?![\w-])", known), f"{page.name} mentions {flag}, which no script has"
