@@ -98,7 +98,7 @@ earth: $(ANYWHERE:%=%/eval.json)  ## fly agents without a map and other navigato
 	$(RECIPE)/tables/publish.py docs/anywhere.md
 
 # Table and figure of docs/conditions.md, from the pretrained policy; make -j2 makes both at once.
-conditions: docs/results/conditions.md docs/figures/conditions.png  ## fly navigators under the errors of real vehicles; about fifteen minutes
+conditions: docs/results/conditions.md docs/figures/conditions.png  ## fly navigators under the errors of real vehicles; about seven minutes
 	$(RECIPE)/tables/publish.py docs/conditions.md
 
 .PHONY: docs/results/conditions.md docs/figures/conditions.png
@@ -107,7 +107,7 @@ docs/results/conditions.md: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(RECIPE)/tables/conditions_table.py > $@
 
 docs/figures/conditions.png: $(VENV)/.installed
-	OMP_NUM_THREADS=1 $(RECIPE)/tables/conditions_table.py --tasks 300 --figure $@
+	OMP_NUM_THREADS=1 $(RECIPE)/tables/conditions_table.py --tasks 200 --figure $@
 
 # Table of docs/algorithms.md: five seeds of each algorithm, with one thread.
 algorithms: $(foreach run,$(SEEDS:%=runs/td3_gradient_guided-fast-one-thread-seed%) $(SAC) $(PPO),$(run)/eval.json)  ## train TD3, SAC and PPO with five seeds each; half an hour on one core

@@ -2,7 +2,7 @@
 
     python recipes/tables/conditions_table.py > docs/results/conditions.md
     python recipes/tables/conditions_table.py anywhere=runs/A kalman --conditions ship low-cost --tasks 300
-    python recipes/tables/conditions_table.py --tasks 300 --figure docs/figures/conditions.png
+    python recipes/tables/conditions_table.py --tasks 200 --figure docs/figures/conditions.png
 
 Regions and tasks are the same under all conditions: those of `magrl.envs.earth_scenario`, with starts at random
 headings. Navigators are told the data sheets of the conditions (`Conditions.sensor_std`, `Conditions.bias_std`). Prints
