@@ -143,7 +143,7 @@ def test_replace_checks_anew_and_changes_nothing_else() -> None:
     assert scenario.replace(altitude_km=-11).altitude_km == -11
     for altitude_km in (-16, 5000):
         with pytest.raises(
-            ValueError, match=f"from -15 to 600 km, negative for a depth, got {altitude_km}.* is it in met"
+            ValueError, match=f"from -15 to 1000 km, negative for a depth, got {altitude_km}.* is it in met"
         ):
             scenario.replace(altitude_km=altitude_km)
     with pytest.raises(ValueError, match="lies outside"):
@@ -257,8 +257,8 @@ BAD_VALUES: list[tuple[str, object, str]] = [
     ("date", 2026.0, "2026-01-01T00:00:00 is outside IGRF-13, which is valid from 1900-01-01 to 2025-01-01"),
     ("generation", 12, "generation must be 13 or 14, got 12"),
     ("generation", "13", "generation must be 13 or 14, got '13'"),
-    ("altitude_km", -16.0, "altitude_km must be from -15 to 600 km, negative for a depth, got -16.0"),
-    ("altitude_km", 601.0, "altitude_km must be from -15 to 600 km, negative for a depth, got 601.0"),
+    ("altitude_km", -16.0, "altitude_km must be from -15 to 1000 km, negative for a depth, got -16.0"),
+    ("altitude_km", 1001.0, "altitude_km must be from -15 to 1000 km, negative for a depth, got 1001.0"),
     ("altitude_km", NAN, "altitude_km must be a finite number, got nan"),
     ("altitude_km", "high", "altitude_km must be a valid number, got 'high'"),
     ("altitude_km", True, "altitude_km must be a valid number, got True"),
@@ -405,7 +405,7 @@ BAD_CONTENT: list[tuple[str, object, str]] = [
     ("generation", 12, "generation must be 13 or 14, got 12"),
     ("generation", 13.5, "generation must be 13 or 14, got 13.5"),
     ("generation", True, "generation must be 13 or 14, got True"),
-    ("altitude_km", 5000, "altitude_km must be from -15 to 600 km, negative for a depth, got 5000.0: is it in meters?"),
+    ("altitude_km", 5000, "altitude_km must be from -15 to 1000 km, negative for a depth, got 5000.0: is it in meters?"),
     ("max_steps", 2.5, "max_steps must be a valid integer, got 2.5"),
     ("altitude_km", "high", "altitude_km must be a valid number, got 'high'"),
     ("distance_range_km", [500, 300], "distance_range_km (500.0, 300.0) must be two rising numbers"),
