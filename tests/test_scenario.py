@@ -405,7 +405,7 @@ BAD_CONTENT: list[tuple[str, object, str]] = [
     ("generation", 12, "generation must be 13 or 14, got 12"),
     ("generation", 13.5, "generation must be 13 or 14, got 13.5"),
     ("generation", True, "generation must be 13 or 14, got True"),
-    ("altitude_km", 5000, "altitude_km must be from -15 to 1000 km, negative for a depth, got 5000.0: is it in meters?"),
+    ("altitude_km", 5000, "altitude_km must be from -15 to 1000 km, negative for a depth, got 5000.0: is it in met"),
     ("max_steps", 2.5, "max_steps must be a valid integer, got 2.5"),
     ("altitude_km", "high", "altitude_km must be a valid number, got 'high'"),
     ("distance_range_km", [500, 300], "distance_range_km (500.0, 300.0) must be two rising numbers"),
