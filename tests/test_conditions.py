@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import evaluate
@@ -18,6 +19,7 @@ from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
+from magrl.field.weather import weather_record
 from magrl.navigators import Kalman
 from magrl.training import UsageError
 from magrl.transforms import (
@@ -80,8 +82,7 @@ def test_what_is_told_is_the_size_of_the_errors(name: str) -> None:
     state = env.reset()
     error = state["field"] - state["true_field"]
     told = (state["sensor_std"].square() + state["bias_std"].square()).sqrt()
-    # The components of the weather are taken as independent, which those of the record are not.
-    torch.testing.assert_close((error / told).square().mean(0).sqrt(), torch.ones(3), rtol=0.2, atol=0)
+    torch.testing.assert_close((error / told).square().mean(0).sqrt(), torch.ones(3), rtol=0.12, atol=0)
 
 
 EVERY_ERROR = Conditions(
@@ -112,8 +113,9 @@ def test_the_variances_of_all_errors_add_up() -> None:
     reading = torch.tensor([0.0, 45.0, 20000.0], dtype=torch.float64)
     variances = zip(*(part.variances(reading) for part in conditions.transforms()), strict=True)
     white, slow = (sum(parts).sqrt() for parts in variances)
-    north2, east2, down2 = MagneticWeather("disturbed", speed_km_h=1.0).mean_squares
-    nanotesla = torch.tensor([east2 + 100, (north2 + down2) / 2 + 100, north2 + 125], dtype=torch.float64).sqrt()
+    moments = weather_record("disturbed").second_moments()
+    (north2, east2, down2), both = moments.diagonal(), moments[0, 2]
+    nanotesla = torch.stack((east2 + 100, (north2 + down2) / 2 - both + 100, north2 + 125)).sqrt()
     degrees = torch.tensor([20000.0, 20000 * 2**0.5, 1.0], dtype=torch.float64).reciprocal()
     degrees[:2] = torch.rad2deg(degrees[:2])
     expected = nanotesla * degrees
@@ -215,3 +217,21 @@ def test_fly_under_conditions(tmp_path: Path) -> None:
     torch.testing.assert_close(steps["true_heading"][0, 0], torch.tensor([torch.pi / 2]))
     torch.testing.assert_close(north, steps["north_error"][0, 0, 2:], atol=1e-4, rtol=0)
     assert north.abs() > 0.001
+
+
+@pytest.mark.parametrize("name", ["kalman", "secant", "map_matching"])
+def test_a_navigator_does_not_rely_on_the_reading_of_an_outage(name: str) -> None:
+    """It goes the same way whatever the reading is, within a percent of what the reading is worth otherwise."""
+    noise = (0.05, 0.05, 5.0)
+    env = with_conditions(GeomagneticNavEnv(num_envs=20, seed=0), Conditions("noise", sensors={"std": noise}), seed=0)
+    navigator = make_navigator(name, env.base_env, noise=noise)
+    state = env.rollout(4, navigator, break_when_any_done=False)[:, -1]["next"]
+
+    def turns(std: float, shift: float) -> torch.Tensor:
+        """Turns [rad] after a reading with ``std`` times the noise that is shifted by ``shift`` times the noise."""
+        field, told = state["field"] + shift * torch.tensor(noise), (std * torch.tensor(noise)).expand(20, 3)
+        return copy.deepcopy(navigator)(state.clone().update({"field": field, "sensor_std": told}))["action"][:, 1]
+
+    heeded, ignored = ((turns(std, 5.0) - turns(std, 0.0)).abs().mean() for std in (1.0, OUTAGE_STD))
+    assert heeded > 0.01
+    assert ignored < 0.01 * heeded

@@ -96,17 +96,18 @@ class WeatherRecord:
             )
         return found
 
-    def mean_squares(self) -> tuple[float, ...]:
-        """Return the mean squares of the variation northward, eastward and downward [nT^2], without gaps.
+    def second_moments(self) -> Tensor:
+        """Return the mean products of the variation northward, eastward and downward, ``(3, 3)`` [nT^2], without gaps.
 
         Those of the minutes at which an episode may start.
 
         Example:
-            >>> [round(square**0.5) for square in weather_record("disturbed").mean_squares()]
-            [40, 29, 11]
+            >>> weather_record("disturbed").second_moments().diagonal().sqrt().round()
+            tensor([40., 29., 11.], dtype=torch.float64)
         """
         last = None if self.last is None else self.last + 1
-        return tuple(self.variation[self.first : last].double().square().nanmean(0).tolist())
+        held = self.variation[self.first : last].double()
+        return (held.unsqueeze(-1) * held.unsqueeze(-2)).nanmean(0)
 
 
 WEATHER = {

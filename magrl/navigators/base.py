@@ -160,9 +160,23 @@ class Navigator(TensorDictModuleBase):
         """Return distance [km] and turn [rad], each ``(P,)``, of vehicles in a new state, and update their memory."""
         raise NotImplementedError
 
+    @staticmethod
+    def accuracy(seen: TensorDictBase, std: Tensor) -> Tensor:
+        """Return the standard deviations of the present reading, D, I, B_H.
+
+        Args:
+            seen: public keys of ``P`` vehicles, and ``sensor_std`` ``(P, 3)`` where readings come with it.
+            std: ``(3,)`` those of the data sheet.
+
+        Returns:
+            ``std``, or ``(P, 3)`` the larger of both: during an outage, a reading is worse than the data sheet.
+        """
+        told = seen.get("sensor_std", None)
+        return std if told is None else torch.maximum(std, told.to(std))
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]."""
-        seen = tensordict.select(*self.in_keys)
+        seen = tensordict.select(*self.in_keys).update(tensordict.select("sensor_std", strict=False))
         self.memory = memory = self._recall(seen)
         step = seen["step_count"].squeeze(-1)
         if "done" in self.in_keys:  # a rollout steps all vehicles until the last one is done

@@ -156,7 +156,8 @@ class MapMatching(Navigator):
         position = self._moved(memory["position"], seen["heading"].double(), length, region)
         growth = self.map_error_km**2 * length / FORGET_KM
         covariance = memory["covariance"] + torch.diag_embed(growth.unsqueeze(-1).expand_as(position))
-        position, covariance, more = self._corrected(position, covariance, seen["field"].double(), self.std, region)
+        std = self.accuracy(seen, self.std)
+        position, covariance, more = self._corrected(position, covariance, seen["field"].double(), std, region)
         found = {"position": position, "covariance": covariance, "misfit": memory["misfit"] + more}
         return memory.update(found)
 
@@ -198,6 +199,7 @@ class MapMatching(Navigator):
         index = (region.unsqueeze(-1).expand(position.shape[:-1]),) if self.many else ()
         value, gradient = self.map.value_and_gradient(*position.unbind(-1), *index)
         residual = element_difference(elements.unsqueeze(1), measured_elements(value))
+        std = std.expand(len(position), 3).unsqueeze(1)
         return residual / std, elements_gradient(value, gradient) / std.unsqueeze(-1)
 
     def _moved(self, position: Tensor, heading: Tensor, distance_km: Tensor, region: Tensor) -> Tensor:

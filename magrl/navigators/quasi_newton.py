@@ -61,6 +61,7 @@ class QuasiNewton(Navigator):
         self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
         self.elements = element_indices(elements, 2)
         self.noise, self.curvature = ([values[i] for i in self.elements] for values in (noise, CURVATURE))
+        self.register_buffer("data_sheet", torch.tensor(noise, dtype=torch.float64), persistent=False)
         self.scales = [tracking.ELEMENT_SCALES[i] * _FINE for i in self.elements]
 
     def prior(self, reading: Tensor) -> tracking.GradientPrior:
@@ -87,7 +88,8 @@ class QuasiNewton(Navigator):
         leg = seen["move"][:, :1].double() * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
         track = tracking.FieldTrack(memory["mean"], memory["covariance"])
         moved = tracking.predict(track, leg, self._drift(seen), self.scales)
-        moved = tracking.update(moved, seen["field"].double()[:, self.elements], self.noise, self.scales)
+        noise = self.accuracy(seen, self.data_sheet)[..., self.elements]
+        moved = tracking.update(moved, seen["field"].double()[:, self.elements], noise, self.scales)
         began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
         mean = torch.where(began, track.mean, moved.mean)
         covariance = torch.where(began.unsqueeze(-1), track.covariance, moved.covariance)
