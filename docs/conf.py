@@ -10,7 +10,7 @@ import magrl  # noqa: E402 - this tree, not an installed version
 
 project, author, version = "magrl", "The magrl developers", magrl.__version__
 project_copyright = author
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.apidoc", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.apidoc", "sphinx.ext.viewcode"]
 exclude_patterns = ["results", "api/modules.rst"]  # tables that are part of the pages, and a second list of modules
 
 html_theme = "furo"
@@ -18,6 +18,10 @@ html_title = f"magrl {version}"
 html_static_path, html_css_files = ["_static"], ["tables.css"]
 
 myst_heading_anchors = 3
+
+nb_execution_mode, nb_execution_timeout = "force", 600  # a cell [s]
+nb_execution_raise_on_error = nb_execution_in_temp = nb_merge_streams = True
+nb_output_stderr = "remove"  # warnings and logs of libraries
 
 apidoc_modules = [{"path": "../magrl", "destination": "api", "separate_modules": True, "max_depth": 1}]
 apidoc_options = ["members", "show-inheritance"]

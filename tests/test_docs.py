@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import inspect
+import json
 import math
 import re
 import sys
@@ -26,6 +27,9 @@ EXAMPLES = [
     for page in PAGES
     for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
 ]
+NOTEBOOK = ROOT / "docs" / "tutorial.ipynb"
+CELLS = ["".join(c["source"]) for c in json.loads(NOTEBOOK.read_text())["cells"] if c["cell_type"] == "code"]
+EXAMPLES += [(NOTEBOOK, "\n".join(CELLS))]
 BUDGET = {"total_frames = 60_000": "total_frames = 512", "= 512, 1024, 8": "= 64, 64, 1"}
 """Settings of trainings in examples, and those of their tests."""
 THEORY, ENVIRONMENT, OWN_DATA, RELIABILITY = (
@@ -87,7 +91,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def test_every_page_is_in_the_list_of_the_readme() -> None:
     readme = (ROOT / "README.md").read_text()
-    for page in ROOT.glob("docs/*.md"):
+    for page in [*ROOT.glob("docs/*.md"), NOTEBOOK]:
         assert page.name == "index.md" or f"(docs/{page.name})" in readme, page.name
 
 
@@ -122,6 +126,13 @@ def test_python_examples_run(page: Path, block: str, run_folder: Path, monkeypat
     names: dict[str, object] = {}
     exec(compile(block, str(page), "exec"), names)
     assert len(names) > 1, "an example should leave something behind"
+
+
+def test_the_notebook_is_kept_without_outputs() -> None:
+    """The build of the documentation executes it."""
+    cells = json.loads(NOTEBOOK.read_text())["cells"]
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
+    assert all(setting in EXAMPLES[-1][1] for setting in BUDGET)
 
 
 def test_a_training_of_another_algorithm_is_short() -> None:
