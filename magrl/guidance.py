@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from magrl.checks import check_tensor
+from magrl.checks import check_number, check_tensor
 from magrl.field.elements import element_difference
 from magrl.geodesy import wrap_angle
 
@@ -98,22 +98,35 @@ def _check_elements(**fields: Tensor) -> None:
         raise ValueError(f"the last dimensions must be the same elements, got {shapes}")
 
 
-def proximity_reward(objective_before: Tensor, objective_after: Tensor, weight: float) -> Tensor:
+def proximity_reward(
+    objective_before: Tensor, objective_after: Tensor, weight: float, limit: float | None = None
+) -> Tensor:
     """Return the reward of Eq. 3-5: ``weight`` times the decrease of the objective in a step.
+
+    F has no upper bound: far from the destination, the reward of one move exceeds that of the arrival many times.
 
     Args:
         objective_before: ``(...)`` F before the move.
         objective_after: ``(...)`` F after the move.
         weight: zeta_2.
+        limit: where F is greater, it counts as this; None for the paper's equation.
 
     Returns:
         ``(...)``: positive for an approach.
 
+    Raises:
+        ValueError: for a limit that is not positive.
+
     Example:
         >>> proximity_reward(torch.tensor(2.0), torch.tensor(1.5), 10.0)
         tensor(5.)
+        >>> proximity_reward(torch.tensor(200.0), torch.tensor(7.0), 10.0, limit=8.0)
+        tensor(10.)
     """
     check_tensor(objective_before=objective_before, objective_after=objective_after)
+    if limit is not None:
+        check_number(0, above=True, limit=limit)
+        objective_before, objective_after = objective_before.clamp(max=limit), objective_after.clamp(max=limit)
     return -weight * (objective_after - objective_before)
 
 

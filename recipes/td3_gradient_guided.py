@@ -2,7 +2,7 @@
 
     python recipes/td3_gradient_guided.py                     # preset fast, about a minute on two cores
     python recipes/td3_gradient_guided.py --preset td3-fast   # the baseline without guidance
-    python recipes/td3_gradient_guided.py --preset paper      # Table 1 as printed; many hours on a CPU
+    python recipes/td3_gradient_guided.py --preset paper      # Table 1 as printed; hours on a CPU
     python recipes/td3_gradient_guided.py --resume RUN        # resume an interrupted run exactly
 See docs/start.md.
 """
@@ -37,6 +37,7 @@ from magrl.transforms import AlignmentReward, DistanceCost, FieldGradient, Gradi
 
 RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
+ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 
 
 class Config(RunConfig):
@@ -60,6 +61,10 @@ class Config(RunConfig):
     """Heading deviation at which the alignment reward changes sign [rad]."""
     distance_cost: NonNegative = 0.0
     """Cost of a move [1/km]; 0.1 in preset fast, none in the paper."""
+    objective_limit: Positive | None = None
+    """Upper bound on the objective in the proximity reward; 10 in preset paper."""
+    time_limit_ends: bool = False
+    """Count the step limit as the end of the task, with no value after it; in preset paper."""
     observe_heading: bool = True
     """Observe cosine and sine of the heading."""
     observe_difference: bool = True
@@ -100,6 +105,8 @@ class Config(RunConfig):
     """Largest noise of target policy smoothing."""
     reward_scale: Positive = 0.05
     """Factor on rewards for the critics; reported rewards are unscaled."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Precision of the hidden layers in gradient steps; bfloat16 is faster where the processor has it."""
     saturation_weight: NonNegative = 0.05
     """Weight of the penalty on the actor's outputs before the tanh; falls linearly to 0."""
 
@@ -124,10 +131,10 @@ PAPER = Config(
     layer_norm=False,
     observe_difference=False,
     updates_per_batch=1,
-    init_random_frames=256,
-    reward_scale=1.0,
-    saturation_weight=0.0,
-    eval_every=2000,
+    init_random_frames=1000,
+    objective_limit=10.0,
+    time_limit_ends=True,
+    eval_every=1000,
 )
 PRESETS = {"fast": Config(distance_cost=0.1), "paper": PAPER}
 PRESETS["td3-fast"] = Config(preset="td3-fast", guided=False)
@@ -150,7 +157,7 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
 
 def worker_env(config: Config, view: ObservationView, index: int) -> TransformedEnv:
     """Make the environment of one of several collecting processes: its share of the vehicles, on tasks of its own."""
-    options = {"zeta": config.zeta, "start_heading": config.start_heading, "device": config.device}
+    options = config.model_dump(include=ENV_OPTIONS)
     seed, num_envs = worker_seed(config.seed, index), config.num_envs // config.collectors
     return make_env(GeomagneticNavEnv(config.load_scenario(), num_envs=num_envs, seed=seed, **options), view, config)
 
@@ -186,12 +193,10 @@ def train(config: Config) -> dict[str, float]:
     name = f"td3_gradient_guided-{config.preset}" if config.guided else f"td3-{config.preset.removeprefix('td3-')}"
     with Run(config, recipe=RECIPE, name=name) as run:
         # Environments
-        options = {"zeta": config.zeta, "start_heading": config.start_heading, "device": config.device}
+        options = config.model_dump(include=ENV_OPTIONS)
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
         validation, test = run.evaluation_envs(**options)
-        view = base.observation_view(
-            observe_heading=config.observe_heading, observe_difference=config.observe_difference
-        )
+        view = base.observation_view(**config.model_dump(include={"observe_heading", "observe_difference"}))
         env = make_env(base, view, config)
 
         # Networks
@@ -200,24 +205,17 @@ def train(config: Config) -> dict[str, float]:
         critic = make_critic(view.size, config.num_cells, layer_norm=config.layer_norm, device=env.device)
 
         # Loss, with clipped double Q and target policy smoothing
-        loss = TD3Loss(
-            actor, critic, gamma=config.gamma, policy_noise=config.policy_noise, noise_clip=config.noise_clip
-        )
+        loss = TD3Loss(actor, critic, **config.model_dump(include={"gamma", "policy_noise", "noise_clip", "precision"}))
+        loss.set_keys(terminated="done" if config.time_limit_ends else "terminated")
         target_update = SoftUpdate(loss, tau=config.tau)
         critic_optimizer = Adam(loss.critic_parameters(), lr=config.learning_rate, fused=True)
         actor_optimizer = Adam(loss.actor_parameters(), lr=config.learning_rate, fused=True)
 
         noise, collector, buffer = make_collection(env, actor, view, config)
+        policy = FieldPolicy(network, actor).to(env.device)
+        parts = {"critic_optimizer": critic_optimizer, "actor_optimizer": actor_optimizer, "noise": noise}
         run.start(
-            policy=FieldPolicy(network, actor).to(env.device),
-            validation=validation,
-            env=base,
-            collector=collector,
-            loss=loss,
-            critic_optimizer=critic_optimizer,
-            actor_optimizer=actor_optimizer,
-            noise=noise,
-            buffer=buffer,
+            policy=policy, validation=validation, env=base, collector=collector, loss=loss, buffer=buffer, **parts
         )
         stats = run.statistics
         for batch in run.batches():

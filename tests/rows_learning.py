@@ -218,6 +218,7 @@ ENVS: Rows = {
             start_heading=([], "south"),
             destination_weight=("a", -1.0),
             proximity_weight=("a", NAN),
+            objective_limit=("a", 0.0, NAN),
             render_mode=("human", 5),
             seed=(1.5, -1, "a", NAN, True, 2**64),
         ),
@@ -390,7 +391,7 @@ def policy_config(**options: Any) -> agents.PolicyConfig:
 SOUND = {"gamma": 0.99, "policy_noise": 0.2, "noise_clip": 0.5}
 
 
-def td3_loss(kind: type[agents.TD3Loss] = agents.TD3Loss, actor: Any = None, **options: float) -> agents.TD3Loss:
+def td3_loss(kind: type[agents.TD3Loss] = agents.TD3Loss, actor: Any = None, **options: Any) -> agents.TD3Loss:
     actor = agents.make_actor(13, (8,)) if actor is None else actor
     return kind(actor, agents.make_critic(13, (8,)), **(SOUND | options))
 
@@ -490,6 +491,7 @@ AGENTS: Rows = {
     "agents.TD3Loss": [
         *bad_numbers(td3_loss, **NOISES),
         refused(lambda: td3_loss(actor=5), TypeError, "actor", "5"),
+        refused(lambda: td3_loss(precision="half"), ValueError, "precision", "'half'", "bfloat16"),
         refused(lambda: agents.TD3Loss(agents.make_actor(13, (8,)), 5, **SOUND), TypeError, "critic", "5"),
     ],
     "agents.RecurrentTD3Loss": [

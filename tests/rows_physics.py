@@ -168,6 +168,10 @@ GUIDANCE: Rows = {
     "guidance.proximity_reward": [
         *bad_tensors(lambda a, b: guidance.proximity_reward(a, b, 1.0), "objective_before", "objective_after"),
         Nan(lambda: guidance.proximity_reward(t(0.0, NAN), t(NAN, 0.0), 1.0)),
+        Nan(lambda: guidance.proximity_reward(t(0.0, NAN), t(NAN, 0.0), 1.0, limit=5.0)),
+        *bad_numbers(
+            lambda **limit: guidance.proximity_reward(t(1.0), t(1.0), 1.0, **limit), limit=(0.0, -1.0, NAN, "a")
+        ),
     ],
     "guidance.late_decay": [
         *bad_tensors(lambda a, b: guidance.late_decay(a, b, 50), "proximity", "step"),

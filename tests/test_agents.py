@@ -23,6 +23,7 @@ from magrl.agents import (
     saturation_penalty,
     save_policy,
 )
+from magrl.agents.networks import make_mlp
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation.rollout import evaluation_rollout
 from magrl.files import save_tensors
@@ -271,6 +272,50 @@ def ours_and_stock() -> tuple[TD3Loss, StockTD3Loss]:
     SoftUpdate(stock, tau=0.1)
     stock.load_state_dict(ours.state_dict())
     return ours, stock
+
+
+def test_bfloat16_rounds_the_hidden_layers_alone() -> None:
+    """Losses agree to the three digits of the type. Both have gradients in float32, and the loss is not rounded."""
+    torch.manual_seed(0)
+    actor, critic, batch = make_actor(13, (64, 64)), make_critic(13, (64, 64)), transitions()
+    options = {"gamma": 0.9, "policy_noise": 0.0, "noise_clip": 0.5}
+    exact, rounded = (TD3Loss(actor, critic, **options, precision=kind) for kind in ("float32", "bfloat16"))
+    rounded.load_state_dict(exact.state_dict())
+    for name, weights in (("value_loss", "critic_parameters"), ("actor_loss", "actor_parameters")):
+        losses = [getattr(loss, name)(batch.clone())[0] for loss in (exact, rounded)]
+        assert losses[0].dtype == losses[1].dtype == torch.float32
+        assert losses[0] != losses[1]
+        torch.testing.assert_close(*losses, rtol=0.01, atol=0.01)
+        gradients = [
+            torch.autograd.grad(value, getattr(loss, weights)())
+            for value, loss in zip(losses, (exact, rounded), strict=True)
+        ]
+        for one, other in zip(*gradients, strict=True):
+            assert one.dtype == other.dtype == torch.float32
+            assert (one - other).norm() < 0.1 * one.norm()
+
+
+def test_first_and_last_layer_keep_float32() -> None:
+    """A difference of inputs that bfloat16 rounds off, and outputs between two of its numbers."""
+    network = make_mlp(1, 1, (1,), layer_norm=False)
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.copy_(torch.ones_like(weight))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        outputs = network(torch.tensor([[1.0], [1.0 + 2**-12]]))
+    assert outputs.dtype == torch.float32
+    assert (outputs[1] - outputs[0]).item() == pytest.approx(2**-12)
+
+
+def test_the_key_of_the_end_can_be_chosen() -> None:
+    """With ``done`` in its place, a step limit counts as the end: no value after it."""
+    torch.manual_seed(0)
+    loss, batch = make_loss(policy_noise=0.0), transitions()
+    batch["next", "terminated"] = torch.zeros(32, 1, dtype=torch.bool)
+    batch["next", "done"] = torch.ones(32, 1, dtype=torch.bool)
+    assert not torch.equal(loss.value_loss(batch)[1]["target_value"], batch["next", "reward"])
+    loss.set_keys(terminated="done")
+    assert torch.equal(loss.value_loss(batch)[1]["target_value"], batch["next", "reward"])
 
 
 def test_loss_is_that_of_torchrl() -> None:

@@ -724,6 +724,7 @@ BAD_OPTIONS = {
     "start_heading": ["south", "North", 0.0],
     "destination_weight": [-1.0, NAN, INF],
     "proximity_weight": [-1.0, NAN, INF],
+    "objective_limit": [0.0, -1.0, NAN, INF],
     "render_mode": ["human", "", True],
     "seed": [-1, 2**64, 0.5],
 }
@@ -780,6 +781,12 @@ def test_options_reach_the_data() -> None:
         fly(make(tasks=tasks, proximity_weight=w), (50.0, 1.0))[0]["next", "reward"].item() for w in (10.0, 30.0)
     )
     assert scaled == pytest.approx(3 * plain, rel=1e-5)
+    # Away from the destination F grows from 3 to more than 3.1: the limit takes the rest of the loss.
+    lost, limited = (
+        fly(make(tasks=tasks, objective_limit=limit), (50.0, 0.0))[0]["next", "reward"].item() for limit in (None, 3.1)
+    )
+    assert lost < -1.2
+    assert limited == pytest.approx(-1.0, abs=1e-4)
     north, east, _ = IGRF(1950.0, 13)(*places(START)[0]).tolist()
     td = make(tasks=tasks, field=IGRF(1950.0, 13)).reset()
     assert td["field"][0, 2].item() == pytest.approx(math.hypot(north, east), rel=1e-6)

@@ -306,6 +306,7 @@ def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, caps
         "figures": (["--results", str(tmp_path), "--out", str(tmp_path)], "there is no"),
         "learning_table": (["runs/A"], "a run must be given as NAME=RUN, such as gg_td3=runs/A, got 'runs/A'"),
         "onboard_table": (["dowsing"], "unknown navigator 'dowsing'"),
+        "paper_run": (["runs/A"], "a run must be given as LABEL=RUN, such as TD3=runs/A, got 'runs/A'"),
         "path_loss": (["dowsing"], "unknown navigator 'dowsing'"),
         "probe_sweep": (["--zeta", "5"], "zeta must be below 3, got 5"),
         "publish": ([str(tmp_path / "missing.md")], "there is no document"),
@@ -363,6 +364,20 @@ def test_path_loss_takes_every_navigator_once(monkeypatch) -> None:
     for texts, message in (([], "name at least one navigator"), (["secant", "secant"], "secant is given twice")):
         with pytest.raises(UsageError, match=message):
             loss.table(texts)
+
+
+def test_paper_run_shows_trainings_that_are_not_complete(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Means over the last five evaluations, the first with 90 %, and a figure."""
+    names = ("return", "success_rate", "seconds", "eval_spl", "eval_steps", "eval_success_rate")
+    rows = [",".join(("frames", "episodes", *names))]
+    rows += [f"{1000 * k},{20 * k},1,2,{30 * k},50,{'nan' if k < 3 else 20},{10 * k}" for k in range(1, 11)]
+    (tmp_path / "train.csv").write_text("\n".join(rows))
+    arguments = [f"ζ = 0.01={tmp_path}", "--figure", str(tmp_path / "curves.png")]
+    monkeypatch.setattr(sys, "argv", ["paper_run.py", *arguments])
+    load("tables/paper_run").main()
+    cells = [cell.strip() for cell in capsys.readouterr().out.splitlines()[2].strip("|").split("|")]
+    assert cells == ["ζ = 0.01", "10000", "200", "9000", "100.0", "80.0", "50.0", "20.0", "300"]
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_learning_table(run: Path) -> None:

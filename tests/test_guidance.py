@@ -111,6 +111,15 @@ def test_proximity_pays_what_the_objective_loses(dtype):
     assert found.tolist() == [5.0, -5.0, 0.0]
 
 
+@pytest.mark.parametrize("limit", [0.1, 2.0, 50.0])
+def test_a_limit_of_the_objective_leaves_no_gain_in_a_round_trip(limit):
+    """A bound on F, unlike one on the reward, pays nothing for going away and coming back."""
+    values = f64(3.0, 900.0, 40.0, 2.5, 3.0)
+    found = proximity_reward(values[:-1], values[1:], 10.0, limit)
+    assert found.abs().max() <= 10 * limit
+    assert float(found.sum()) == pytest.approx(0.0, abs=1e-9)
+
+
 def test_proximity_adds_up_along_a_path():
     values = f64(3.0, 1.7, 2.2, 0.4, 0.0)
     assert float(proximity_reward(values[:-1], values[1:], 10.0).sum()) == pytest.approx(30.0, rel=1e-12)

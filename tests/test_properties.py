@@ -357,6 +357,7 @@ OPTIONS = st.fixed_dictionaries(
         "start_heading": st.sampled_from(("north", "random")),
         "destination_weight": between(0, 1000),
         "proximity_weight": between(0, 100),
+        "objective_limit": st.sampled_from((None, 0.5, 10.0)),
         "seed": st.integers(0, 2**32),
     }
 )

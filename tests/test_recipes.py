@@ -93,6 +93,18 @@ def test_return_is_the_sum_of_its_terms(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_figures")
+def test_options_of_the_loss_and_the_reward_reach_the_training(tmp_path: Path, outcome) -> None:
+    """60 steps, so that episodes reach their limit of 50."""
+    options = {"none": {}, "limit": {"objective_limit": 0.5}, "end": {"time_limit_ends": True}}
+    options["precision"] = {"precision": "bfloat16"}
+    found = []
+    for name, changed in options.items():
+        recipe.train(settings(tmp_path / name, total_frames=960, eval_every=60, **changed))
+        found.append(torch.cat([weight.flatten() for weight in outcome(tmp_path / name)[1].values()]))
+    assert all(not torch.equal(found[0], other) for other in found[1:])
+
+
+@pytest.mark.usefixtures("without_figures")
 def test_training_without_guidance(tmp_path: Path) -> None:
     """The same recipe without the theoretical heading and its reward."""
     out = tmp_path / "run"
@@ -421,8 +433,8 @@ def test_paper_preset_is_table_1() -> None:
         "num_envs": 1,
         "updates_per_batch": 1,
         "seed": 4,
-        "reward_scale": 1.0,
-        "saturation_weight": 0.0,
+        "alignment_offset": math.pi / 4,
+        "distance_cost": 0.0,
         "observe_difference": False,
         "layer_norm": False,
     }

@@ -32,14 +32,7 @@ from magrl.transforms.view import ObservationView
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")
 """Keys that every policy may read, beside ``step_count``."""
-PRIVILEGED_KEYS = (
-    "position",
-    "target_position",
-    "start_position",
-    "objective",
-    "objective_weights",
-    "success",
-)
+PRIVILEGED_KEYS = ("position", "target_position", "start_position", "objective", "objective_weights", "success")
 """Keys that a policy may not read if it navigates by the field alone; nor ``region``, where there are many."""
 
 
@@ -67,6 +60,7 @@ class GeomagneticNavEnv(EnvBase):
         start_heading: ``"north"``, the default, or ``"random"`` for a uniform heading.
         destination_weight: reward at arrival, zeta_1.
         proximity_weight: reward per unit of the objective, zeta_2.
+        objective_limit: upper bound on the objective in that reward; None, as in the paper.
         render_mode: ``"rgb_array"`` to keep the tracks that :meth:`render` draws, or None.
         seed: seed of tasks and start headings; random if None.
         device: device of the batch.
@@ -108,6 +102,7 @@ class GeomagneticNavEnv(EnvBase):
         start_heading: str | None = None,
         destination_weight: float = 200.0,
         proximity_weight: float = 10.0,
+        objective_limit: float | None = None,
         render_mode: str | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
@@ -117,6 +112,7 @@ class GeomagneticNavEnv(EnvBase):
         check_number(1, whole=True, num_envs=num_envs)
         check_number(0, 2**64 - 1, whole=True, seed=0 if seed is None else seed)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
+        check_number(0, above=True, objective_limit=1.0 if objective_limit is None else objective_limit)
         given = {"max_steps": max_steps, "max_move_km": max_move_km, "max_turn_rad": max_turn_rad, "zeta": zeta}
         rules = {"arrival": arrival, "arrival_radius_km": arrival_radius_km, "start_heading": start_heading}
         options = episode_options(scenario, **given, **rules)
@@ -127,6 +123,7 @@ class GeomagneticNavEnv(EnvBase):
         self.arrival, self.zeta = options.arrival, float(options.arrival.zeta)
         self.start_heading, self.render_mode, self._tracks = options.start_heading, render_mode, tracks
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
+        self.objective_limit = objective_limit
         self._place(scenario)
         self.register_buffer("action_low", self._float64((0.0, -self.max_turn_rad, *self.arrival.low)))
         self.register_buffer("action_high", self._float64((self.max_move_km, self.max_turn_rad, *self.arrival.high)))
@@ -281,7 +278,8 @@ class GeomagneticNavEnv(EnvBase):
         step = tensordict["step_count"] + 1
         terminated = ended | lost
         truncated = (step >= self.max_steps) & ~terminated
-        proximity = guidance.proximity_reward(tensordict["objective"].double(), objective, self.proximity_weight)
+        objectives = tensordict["objective"].double(), objective
+        proximity = guidance.proximity_reward(*objectives, self.proximity_weight, self.objective_limit)
         proximity = guidance.late_decay(proximity, step, self.max_steps)
         destination = guidance.destination_reward(arrived, self.destination_weight)
         after = TensorDict(
