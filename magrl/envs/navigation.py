@@ -43,7 +43,8 @@ def navigation_env(
         **options: of :class:`magrl.envs.GeomagneticNavEnv`.
 
     Raises:
-        TypeError: for an unknown option, ``scale_actions`` that is not a bool, or a transform that is none.
+        TypeError: for an unknown option, ``scale_actions`` that is not a bool, or an object among the transforms
+            that is not a transform.
         ValueError: for any option out of its range, naming it and its value.
 
     Example:

@@ -124,7 +124,7 @@ _HEIGHTS = {
 
 
 def _column(table: DataFrame, text: str, name: str, read: Callable[[Any], Any]) -> NDArray[Any]:
-    """Return what is read of a column ``(P,)``, or of a text that is none, for all rows."""
+    """Return what is read of a column ``(P,)``, or of a text that names no column, for all rows."""
     if text not in table.columns:
         try:
             return np.full(len(table), read(text))
