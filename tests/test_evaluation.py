@@ -433,6 +433,17 @@ def test_earth_table_flies_each_navigator_at_each_level() -> None:
         earth.table(earth.Config(("dowsing",), tasks=2, regions=1))
 
 
+def test_the_table_of_long_ways_begins_with_kilometers() -> None:
+    """A vehicle that knows its position arrives in the ellipse, but seldom within 25 km when that is long."""
+    earth = load("tables/earth_table")
+    options = {"tasks": 20, "regions": 2, "max_steps": 120, "distance_km": (1200.0, 1800.0)}
+    lines = earth.table(earth.Config(("geodesic",), **options)).splitlines()
+    near, *rest = (float(value) for value in lines[2].split("|")[4].split("/"))
+    assert near < 90
+    assert rest[:2] == [100.0, 100.0]
+    assert earth.cell([(50.0, 90.0, 80.0, 10.0), (60.0, 100.0, 90.0, 12.0)]) == "55.0 / 95.0 / 85.0 [80.0] / 11.0"
+
+
 def test_earth_table_has_a_row_for_each_date() -> None:
     earth = load("tables/earth_table")
     lines = earth.table(earth.Config(("secant",), tasks=4, regions=2, date=("1900-01-01", "2030-01-01"))).splitlines()
