@@ -1,4 +1,4 @@
-"""Gradient step of the recipe beside one in plain PyTorch, and beside its matrix products alone."""
+"""Gradient step of the recipe beside one in plain PyTorch, its matrix products alone, and itself in bfloat16."""
 
 from __future__ import annotations
 
@@ -16,36 +16,37 @@ from benchmarks.timing import Row, alternate
 from magrl.agents import SoftUpdate, TD3Loss, make_actor, make_critic, optimize, saturation_penalty
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
-from td3_gradient_guided import Config
+from td3_gradient_guided import PAPER, Config
 
 CONFIG = Config()
 SATURATION = CONFIG.saturation_weight
 OBSERVATION_SIZE = 13
 
 
-def transitions(size: int) -> TensorDict:
+def transitions(size: int, batch: int) -> TensorDict:
     """Return a batch of transitions of the recipe's shape."""
 
     def seen() -> Tensor:
-        return torch.rand(CONFIG.batch_size, size) * 2 - 1
+        return torch.rand(batch, size) * 2 - 1
 
-    flag = torch.zeros(CONFIG.batch_size, 1, dtype=torch.bool)
-    after = {"observation": seen(), "reward": torch.randn(CONFIG.batch_size, 1), "done": flag, "terminated": flag}
-    action = torch.rand(CONFIG.batch_size, 2) * 2 - 1
-    return TensorDict({"observation": seen(), "action": action, "next": after}, batch_size=[CONFIG.batch_size])
+    flag = torch.zeros(batch, 1, dtype=torch.bool)
+    after = {"observation": seen(), "reward": torch.randn(batch, 1), "done": flag, "terminated": flag}
+    action = torch.rand(batch, 2) * 2 - 1
+    return TensorDict({"observation": seen(), "action": action, "next": after}, batch_size=[batch])
 
 
 class Recipe:
     """The body of the recipe's loop over batches, with the same parts."""
 
-    def __init__(self, size: int) -> None:
-        actor, critic = make_actor(size, CONFIG.num_cells), make_critic(size, CONFIG.num_cells)
-        self.loss = TD3Loss(
-            actor, critic, gamma=CONFIG.gamma, policy_noise=CONFIG.policy_noise, noise_clip=CONFIG.noise_clip
+    def __init__(self, size: int, config: Config = CONFIG, precision: str = "float32") -> None:
+        actor, critic = (
+            make(size, config.num_cells, layer_norm=config.layer_norm) for make in (make_actor, make_critic)
         )
-        self.target_update = SoftUpdate(self.loss, tau=CONFIG.tau)
-        self.critic_optimizer = torch.optim.Adam(self.loss.critic_parameters(), lr=CONFIG.learning_rate, fused=True)
-        self.actor_optimizer = torch.optim.Adam(self.loss.actor_parameters(), lr=CONFIG.learning_rate, fused=True)
+        noise = {"policy_noise": config.policy_noise, "noise_clip": config.noise_clip}
+        self.loss = TD3Loss(actor, critic, gamma=config.gamma, **noise, precision=precision)
+        self.target_update = SoftUpdate(self.loss, tau=config.tau)
+        self.critic_optimizer = torch.optim.Adam(self.loss.critic_parameters(), lr=config.learning_rate, fused=True)
+        self.actor_optimizer = torch.optim.Adam(self.loss.actor_parameters(), lr=config.learning_rate, fused=True)
         self.updates = 0
 
     def update(self, batch: TensorDict) -> None:
@@ -150,7 +151,7 @@ def rows(repeats: int = 15) -> list[Row]:
     """Return the two comparisons; a time is the mean of ten steps."""
     torch.manual_seed(0)
     recipe, plain, products = (kind(OBSERVATION_SIZE) for kind in (Recipe, Plain, Products))
-    batch = transitions(OBSERVATION_SIZE)
+    batch = transitions(OBSERVATION_SIZE, CONFIG.batch_size)
     after = batch["next"]
     tensors = (batch["observation"], batch["action"], after["reward"], after["observation"], after["terminated"])
 
@@ -161,7 +162,16 @@ def rows(repeats: int = 15) -> list[Row]:
     return [
         alternate("gradient step: plain PyTorch", ours, lambda: plain.update(*tensors), goal="≥ 0.95", **options),
         alternate("gradient step: its matrix products alone", ours, products.update, goal="≥ 0.56", **options),
+        of_the_paper(**options),
     ]
+
+
+def of_the_paper(**options: int) -> Row:
+    """Return the gradient step of preset paper in bfloat16, beside that in float32."""
+    batch = transitions(OBSERVATION_SIZE, PAPER.batch_size)
+    rounded, exact = (Recipe(OBSERVATION_SIZE, PAPER, precision) for precision in ("bfloat16", "float32"))
+    what = "gradient step of preset paper, bfloat16: float32"
+    return alternate(what, lambda: rounded.update(batch), lambda: exact.update(batch), goal="≥ 1.43", **options)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ def test_plain_step_is_the_step_of_the_recipe() -> None:
     plain.target_actor.load_state_dict(plain.actor.state_dict())
     for target, critic in zip(plain.target_critics, plain.critics, strict=True):
         target.load_state_dict(critic.state_dict())
-    batch = update.transitions(update.OBSERVATION_SIZE)
+    batch = update.transitions(update.OBSERVATION_SIZE, update.CONFIG.batch_size)
     after = batch["next"]
     for _ in range(2):
         torch.manual_seed(1)
