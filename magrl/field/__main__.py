@@ -31,7 +31,7 @@ from magrl.field.elements import NAMES, elements_gradient, seven_elements
 from magrl.field.igrf import IGRF, parse_date
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
 UNITS_KM = {"km": 1.0, "m": 0.001}
 SUFFIXES = (".csv", ".parquet")
@@ -198,15 +198,25 @@ def read_points(path: Path) -> DataFrame:
 
 
 def write_points(path: Path, table: DataFrame) -> None:
-    """Write a table, in the format of the suffix."""
+    """Write a table, in the format of the suffix; in Parquet, columns of numbers that were text become numbers."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         if path.suffix == ".parquet":
-            table.to_parquet(path, index=False)
+            table.apply(_as_numbers).to_parquet(path, index=False)
         else:
             table.to_csv(path, index=False)
     except ImportError as error:
         raise ValueError(NO_PARQUET) from error
+
+
+def _as_numbers(column: Series) -> Series:
+    """Return a column of texts as numbers if all of them are, else the column."""
+    import pandas
+
+    try:
+        return pandas.to_numeric(column)
+    except (ValueError, TypeError):
+        return column
 
 
 def check_suffix(path: Path) -> None:
