@@ -24,7 +24,7 @@ SWARMS := ga pso afsa ga:flown pso:flown afsa:flown
 NOISE_LEVELS := 0 0.02 0.05 0.1
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere algorithms test test-slow check format clean earth globe conditions paper trade bench docs replay mutate help
+.PHONY: train fly anywhere algorithms paper-run test test-slow check format clean earth globe conditions paper trade bench docs replay mutate help
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RUN)/python recipes/td3_gradient_guided.py $(ARGS)
@@ -153,6 +153,21 @@ paper: $(foreach run,$(GUIDED) $(ONE_THREAD) $(PLAIN) $(NOISY) $(AZORES),$(run)/
 	$(RECIPE)/tables/probe_sweep.py > docs/results/probe_sweep.md
 	$(RECIPE)/tables/random_boxes.py > docs/results/random_boxes.md
 	$(RECIPE)/tables/publish.py README.md docs/reproduction.md docs/own_data.md
+
+# The training of Table 1 (docs/paper_run.md): table, curves, and both agents on the tasks of the other tables.
+PAPER_RUNS := runs/td3_gradient_guided-paper-seed0 runs/td3-paper-seed0
+paper-run: $(PAPER_RUNS:%=%/eval.json)  ## train both agents of Table 1 whole; a day on two cores
+	$(RECIPE)/tables/paper_run.py "Gradient-Guided TD3=$(word 1,$(PAPER_RUNS))" "TD3=$(word 2,$(PAPER_RUNS))" \
+	  --figure docs/figures/paper-run.png > docs/results/paper-run.md
+	$(RECIPE)/evaluate.py gg_td3=$(word 1,$(PAPER_RUNS)) td3=$(word 2,$(PAPER_RUNS)) --out runs/paper-run
+	cp runs/paper-run/table.md docs/results/paper-run-1000.md
+	$(RECIPE)/tables/publish.py docs/paper_run.md
+
+runs/td3_gradient_guided-paper-seed%/eval.json: | $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --preset paper --precision bfloat16 --seed $*
+
+runs/td3-paper-seed%/eval.json: | $(VENV)/.installed
+	OMP_NUM_THREADS=1 $(RECIPE)/td3_gradient_guided.py --preset td3-paper --precision bfloat16 --seed $*
 
 runs/td3_gradient_guided-fast-seed%/eval.json: | $(VENV)/.installed
 	OMP_NUM_THREADS=2 $(RECIPE)/td3_gradient_guided.py --seed $*
