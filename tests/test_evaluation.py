@@ -378,6 +378,9 @@ def test_paper_run_shows_trainings_that_are_not_complete(tmp_path: Path, monkeyp
     cells = [cell.strip() for cell in capsys.readouterr().out.splitlines()[2].strip("|").split("|")]
     assert cells == ["ζ = 0.01", "10000", "200", "9000", "100.0", "80.0", "50.0", "20.0", "300"]
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+    monkeypatch.setattr(sys, "argv", ["paper_run.py", *arguments[:1], "--moves", "4500"])
+    load("tables/paper_run").main()
+    assert "| 4000 | 80 | never | 40.0 | 25.0 |" in capsys.readouterr().out
 
 
 def test_learning_table(run: Path) -> None:

@@ -39,12 +39,14 @@ class Config:
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """LABEL=RUN, in the order of the rows."""
+    moves: int | None = None
+    """Moves after which curves are cut, to compare trainings of different lengths."""
     figure: Path | None = None
     """File of the figure; none without it."""
 
 
-def read_curves(text: str) -> tuple[str, dict[str, np.ndarray]]:
-    """Return the label and the columns of ``train.csv`` of a text such as ``TD3=runs/A``.
+def read_curves(text: str, moves: float = math.inf) -> tuple[str, dict[str, np.ndarray]]:
+    """Return the label and the columns of ``train.csv``, up to some moves, of a text such as ``TD3=runs/A``.
 
     Raises:
         UsageError: for a text without a label, or a run without curves.
@@ -56,9 +58,9 @@ def read_curves(text: str) -> tuple[str, dict[str, np.ndarray]]:
     if not path.is_file():
         raise UsageError(f"there is no {path}: has the training begun?")
     with path.open() as file:
-        rows = list(csv.DictReader(file))
+        rows = [row for row in csv.DictReader(file) if float(row["frames"]) <= moves]
     if not rows:
-        raise UsageError(f"{path} has no rows: the training has not reached its first evaluation")
+        raise UsageError(f"{path} has no rows up to {moves:g} moves: the training did not reach its first evaluation")
     return label, {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
 
 
@@ -93,7 +95,7 @@ def main() -> None:
     config = tyro.cli(Config, prog=RECIPE, description=__doc__)
     if not config.runs:
         raise UsageError("name at least one run, such as TD3=runs/A")
-    runs = [read_curves(text) for text in config.runs]
+    runs = [read_curves(text, math.inf if config.moves is None else config.moves) for text in config.runs]
     print(markdown_table(HEAD, [table_row(*run) for run in runs]))
     if config.figure:
         curves_figure(runs).savefig(config.figure, dpi=110)
