@@ -118,7 +118,7 @@ algorithms: $(foreach run,$(SEEDS:%=runs/td3_gradient_guided-fast-one-thread-see
 
 # The map of the whole Earth, the table of epochs, and the pictures of the flight, from the pretrained policy.
 globe: $(VENV)/.installed  ## map where the pretrained agent fails, fly it at five epochs and draw a flight; two minutes
-	$(RECIPE)/tables/globe.py
+	$(RECIPE)/tables/globe.py --table docs/results/globe.md --figure docs/figures/globe.png
 	$(RECIPE)/tables/earth_table.py anywhere --date 1900-01-01 1950-01-01 2000-01-01 2025-01-01 2030-01-01 \
 	  > docs/results/epochs.md
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --out runs/flight

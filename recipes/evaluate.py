@@ -25,6 +25,7 @@ import os
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
 import csv
+import itertools
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -63,6 +64,13 @@ MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km
 MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency", "spl_to_arrival")
 
 
+def free_folder() -> Path:
+    """Return the first of runs/evaluation, runs/evaluation-2, ... that is not there."""
+    folder = Path("runs/evaluation")
+    others = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
+    return next(path for path in itertools.chain((folder,), others) if not path.exists())
+
+
 @dataclass(frozen=True)
 class Config(ScenarioOptions):
     """Settings of an evaluation."""
@@ -92,8 +100,8 @@ class Config(ScenarioOptions):
     """Whether the tables lead with distances, as they do where arrival is not by the objective."""
     seed: int = 0
     """Random seed of metaheuristics, sensor noise and random start headings."""
-    out: Path = Path("runs/evaluation")
-    """Folder of the results, new or empty."""
+    out: Path = field(default_factory=free_folder)
+    """Folder of the results, new or empty; by default runs/evaluation, or with the first free number behind it."""
     wandb_mode: WandbMode = "offline"
     """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
 

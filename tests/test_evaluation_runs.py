@@ -332,3 +332,11 @@ def test_a_training_contradicts_no_scenario(tmp_path: Path) -> None:
     path.write_text(OWN.replace("53.5", "40.5").replace("distance", "declared"))
     with pytest.raises(ValueError, match="the recipes train no agent that declares"):
         RunConfig(scenario=path, zeta=0.02)
+
+
+def test_results_go_to_the_first_folder_that_is_free(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert evaluate.Config(("secant",)).out == Path("runs/evaluation")
+    for name in ("evaluation", "evaluation-2"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+    assert evaluate.Config(("secant",)).out == Path("runs/evaluation-3")

@@ -200,7 +200,7 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
     error = episodes["navigation_error_km"]
     summary = {"success_rate": 100 * rate, "success_rate_low": 100 * low, "success_rate_high": 100 * high}
     summary |= {f"success_rate_within_{d}km": 100 * (error <= d).double().mean().item() for d in WITHIN_KM}
-    summary["final_distance_km_median"] = error.median().item()
+    summary["final_distance_km_median"] = error.double().quantile(0.5).item()
     efficiency = episodes["path_efficiency"]
     summary |= _percent("spl", episodes["spl"]) | _percent("path_efficiency", efficiency[~efficiency.isnan()])
     if "spl_to_arrival" in episodes:

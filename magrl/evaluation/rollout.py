@@ -86,7 +86,7 @@ def _with_tasks(tasks: Scenario | Tasks | str) -> Scenario:
         tasks = named_tasks(tasks)
     if isinstance(tasks, Tasks):
         return Scenario().with_tasks(tasks)
-    check_type(Scenario, tasks=tasks)
+    check_type((Scenario, Tasks, str), tasks=tasks)
     if tasks.tasks is None:
         raise ValueError("the scenario has no tasks to fly: scenario.with_tasks(scenario.random_tasks(300, seed=0))")
     return tasks

@@ -6,7 +6,7 @@
 Starts are uniform over the sphere, destinations uniform over the ring of 300-500 km about them, and start headings
 random. The field is IGRF-14 itself, without regions and their edges. Writes a Markdown table: success rate (SR) and
 success weighted by path length (SPL) in percent, and steps over successes, with perfect and with noisy sensors; and a
-map of the tasks with perfect sensors.
+map of the tasks with perfect sensors. Files of an earlier call are replaced.
 """
 
 from __future__ import annotations
@@ -95,9 +95,9 @@ class Config:
     """Moves after which an episode ends."""
     seed: int = 0
     """Random seed of tasks, start headings and noise; no training uses it."""
-    table: Path = Path("docs/results/globe.md")
+    table: Path = Path("runs/globe.md")
     """File of the table, which is replaced."""
-    figure: Path = Path("docs/figures/globe.png")
+    figure: Path = Path("runs/globe.png")
     """File of the map, which is replaced."""
 
 
