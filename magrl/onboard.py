@@ -222,7 +222,8 @@ class Onboard:
         """Raise unless a reading, a heading and a distance are possible, and possible together."""
         check_earth_reading(*reading)
         if not self._last:
-            check_number(0, 0, distance_of_the_first_step=distance)
+            if distance != 0:
+                raise ValueError(f"the first step takes the reading at the start: distance must be 0, got {distance!r}")
             check_move(heading, distance, None, self.max_move_km)
             if text := out_of_range(self._view, reading):
                 raise ValueError(f"the reading at the start: {text}")

@@ -4,6 +4,7 @@
     python recipes/td3_gradient_guided.py --preset td3-fast   # the baseline without guidance
     python recipes/td3_gradient_guided.py --preset paper      # Table 1 as printed; hours on a CPU
     python recipes/td3_gradient_guided.py --resume RUN        # resume an interrupted run exactly
+
 See docs/start.md.
 """
 

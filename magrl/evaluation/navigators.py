@@ -118,7 +118,8 @@ def make_navigator(
             return NAVIGATORS[name](env, mode, seed, noise, bias=bias)
         options = {"map_date": map_date} if name == "map_matching" else {}
         return NAVIGATORS[name](env, mode, seed, tuple(map(math.hypot, noise, bias)), **options)
-    known = ", ".join([*PRETRAINED, *(f"{trained}=RUN" for trained in TRAINED), *NAVIGATORS, *METAHEURISTICS])
+    trained_names = [f"{trained}=RUN" for trained in TRAINED if trained != OWN]
+    known = ", ".join([*PRETRAINED, *trained_names, "policy:NAME=FILE", *NAVIGATORS, *METAHEURISTICS])
     raise ValueError(f"unknown navigator {text!r}: choose from {known}")
 
 
