@@ -156,7 +156,7 @@ paper: $(foreach run,$(GUIDED) $(ONE_THREAD) $(PLAIN) $(NOISY) $(AZORES),$(run)/
 
 # The training of Table 1 (docs/paper_run.md): table, curves, and both agents on the tasks of the other tables.
 PAPER_RUNS := runs/td3_gradient_guided-paper-seed0 runs/td3-paper-seed0
-paper-run: $(PAPER_RUNS:%=%/eval.json)  ## train both agents of Table 1 whole; a day on two cores
+paper-run: $(PAPER_RUNS:%=%/eval.json)  ## train both agents of Table 1 whole; some six hours on two cores (make -j2)
 	$(RECIPE)/tables/paper_run.py "Gradient-Guided TD3=$(word 1,$(PAPER_RUNS))" "TD3=$(word 2,$(PAPER_RUNS))" \
 	  --figure docs/figures/paper-run.png > docs/results/paper-run.md
 	$(RECIPE)/evaluate.py gg_td3=$(word 1,$(PAPER_RUNS)) td3=$(word 2,$(PAPER_RUNS)) --out runs/paper-run
