@@ -158,8 +158,8 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
         try:
             told = board.step(*row[elements], row["heading"], row["distance"])
         except ValueError as error:
-            joined_km = f" (moves are joined by --every-km {config.every_km:g})" if config.every_km else ""
-            raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}{joined_km}") from error
+            joined_by = f" (moves are joined by --every-km {config.every_km:g})" if config.every_km else ""
+            raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}{joined_by}") from error
         found.append(
             {
                 "move_km": told.distance_km,
