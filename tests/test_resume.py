@@ -103,6 +103,26 @@ def test_run_that_ended_before_its_first_checkpoint_resumes(
     assert same_outcome(folder, whole)
 
 
+@pytest.mark.filterwarnings("ignore:.*trying the previous checkpoint")
+def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> None:
+    """The curves so far stay in their file."""
+    with signalled(5, signal.SIGTERM), pytest.raises(SystemExit):
+        recipe.train(parse(*SMALL, "--eval-every", "2", "--out", str(tmp_path)))
+    curves = (tmp_path / "train.csv").read_text()
+    config = tmp_path / "config.json"
+    settings = config.read_text()
+    config.write_text(settings.replace("16,\n    16", "24,\n    24"))
+    with pytest.raises(UsageError, match=r"cannot resume: .*checkpoint-\d+\.pt: loss does not fit this training"):
+        recipe.train(parse("--resume", str(tmp_path)))
+    config.write_text(settings)
+    for file in tmp_path.glob("checkpoints/*.pt"):
+        file.write_bytes(b"")
+    with pytest.raises(UsageError, match="cannot resume: there is no valid checkpoint in"):
+        recipe.train(parse("--resume", str(tmp_path)))
+    assert len(curves.splitlines()) == 3
+    assert (tmp_path / "train.csv").read_text() == curves
+
+
 # Run folders
 
 

@@ -150,6 +150,9 @@ class Run:
             env: environment inside the collector; with several collectors, each has its own.
             collector: source of batches.
             parts: everything else that checkpoints must hold, such as loss, optimizers and replay buffer.
+
+        Raises:
+            UsageError: if no checkpoint can be read, or it is of other settings.
         """
         self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
@@ -173,10 +176,13 @@ class Run:
             tags=[self.name],
             resumed=resumed,
         )
-        self._exits.callback(self.log.close)
         self.checkpoints.parts["run"] = self.log
         if resumed:
-            self.checkpoints.load()
+            try:
+                self.checkpoints.load()
+            except (ValueError, FileNotFoundError) as error:
+                raise UsageError(f"cannot resume: {error}") from error
+        self._exits.callback(self.log.close)
 
     @property
     def remaining(self) -> float:
