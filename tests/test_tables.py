@@ -128,6 +128,18 @@ def test_results_table_of_another_scenario_has_no_row_of_the_paper(tmp_path: Pat
     assert "| paper |" not in results.table(results.grouped([str(tmp_path / "own")]))
 
 
+def test_results_table_does_not_mix_settings_in_one_row(tmp_path: Path) -> None:
+    """Other seeds are welcome; a name for each group takes any."""
+    results = load("tables/results_table")
+    for name, seed, gamma in (("a", 0, 0.9), ("b", 1, 0.9), ("c", 0, 0.97)):
+        finished(tmp_path / name, seed)
+        (tmp_path / name / "config.json").write_text(json.dumps({"seed": seed, "gamma": gamma, "out": name}))
+    with pytest.raises(UsageError, match=r"gamma is 0\.9 and 0\.97; give each a name, as in NAME=.*/c$"):
+        results.grouped([f"{tmp_path}/*"])
+    groups = results.grouped([f"{tmp_path}/[ab]", f"low={tmp_path}/c"])
+    assert {name: len(runs) for name, runs in groups.items()} == {"": 2, "low": 1}
+
+
 def test_results_table_says_what_is_wrong(tmp_path: Path) -> None:
     results = load("tables/results_table")
     run = finished(tmp_path / "run", 0)

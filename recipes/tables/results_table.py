@@ -36,6 +36,8 @@ COLUMNS = {
     "training s": ("training_seconds", ".0f"),
     "to 97 / 88.4 s": ("seconds_to_97_sr_88_spl", ".0f"),
 }
+FREE = {"seed", "out", "device", "logger", "wandb_mode", "checkpoint_every", "collector_backend"}
+"""Settings in which the runs of one row may differ."""
 Groups = Mapping[str, Sequence[Summary]]
 
 
@@ -68,11 +70,12 @@ def grouped(texts: Sequence[str]) -> dict[str, list[Summary]]:
     """Return the results of runs by the name of their group; runs without a name are one group.
 
     Raises:
-        UsageError: for no run, one that is not complete, or one that is given twice.
+        UsageError: for no run, one that is not complete or given twice, or runs of different settings in one group.
     """
     if not texts:
         raise UsageError("name at least one run, for example: runs/td3_gradient_guided-fast-seed0")
     groups: dict[str, list[Summary]] = {}
+    members: dict[str, Path] = {}
     seen: set[Path] = set()
     for text in texts:
         name, _, pattern = text.rpartition("=")
@@ -80,14 +83,30 @@ def grouped(texts: Sequence[str]) -> dict[str, list[Summary]]:
             if folder.resolve() in seen:
                 raise UsageError(f"{folder} is given twice: the same run again is no spread over runs")
             seen.add(folder.resolve())
+            _check_same_settings(members.setdefault(name, folder), folder)
             groups.setdefault(name, []).append(json.loads((folder / "eval.json").read_text()) | _place(folder))
     return groups
 
 
+def _check_same_settings(folder: Path, other: Path) -> None:
+    first, second = _settings(folder), _settings(other)
+    differ = [key for key in first if key in second and key not in FREE and first[key] != second[key]]
+    if differ:
+        key = differ[0]
+        raise UsageError(
+            f"{folder} and {other} are no seeds of one training: {key} is {first[key]!r} and {second[key]!r}; "
+            f"give each a name, as in NAME={other}"
+        )
+
+
+def _settings(folder: Path) -> dict[str, Any]:
+    path = folder / "config.json"
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
 def _place(folder: Path) -> dict[str, Any]:
     """Return the scenario file of a run, if it had one."""
-    path = folder / "config.json"
-    scenario = json.loads(path.read_text()).get("scenario") if path.is_file() else None
+    scenario = _settings(folder).get("scenario")
     return {"scenario": scenario} if scenario else {}
 
 
