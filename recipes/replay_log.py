@@ -93,7 +93,7 @@ def read_log(config: Config) -> pd.DataFrame:
         raw = pd.read_csv(config.log, dtype=str, skipinitialspace=True)
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot read {config.log}: {error}") from error
-    log = pd.DataFrame({"row": np.arange(len(raw)) + 2})  # row 1 of the file is the header
+    log = pd.DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
     if config.time in raw:
         log["time"] = raw[config.time]
     wanted = ["declination", "inclination", "horizontal", "heading", "distance"]
@@ -108,7 +108,7 @@ def read_log(config: Config) -> pd.DataFrame:
         bad = ~np.isfinite(log[option])
         if bad.any():
             row = int(bad.idxmax())
-            raise UsageError(f"row {row + 2} of {config.log}: {name} is {raw[name][row]!r}, which is not a number")
+            raise UsageError(f"row {row + 1} of {config.log}: {name} is {raw[name][row]!r}, which is not a number")
     if len(log) < 2:
         raise UsageError(f"{config.log} must hold at least two rows, got {len(log)}")
     return log

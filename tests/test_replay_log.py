@@ -61,7 +61,7 @@ def test_short_moves_are_joined(recipe, tmp_path: Path) -> None:
     path.write_text("\n".join(["D,I,B_H,heading,distance", *rows]))
     log = recipe.read_log(recipe.Config(path))
     joined = recipe.joined(log, 5.0)
-    assert joined["row"].tolist() == [2, 4, 5]
+    assert joined["row"].tolist() == [1, 3, 4]
     assert joined["distance"].tolist() == pytest.approx([0, 5, 2])
     assert joined["heading"].tolist() == pytest.approx([0, 53.130102, 90])
     pd.testing.assert_frame_equal(recipe.joined(log, 0.0), log, check_dtype=False)
@@ -72,11 +72,11 @@ def test_short_moves_are_joined(recipe, tmp_path: Path) -> None:
     [
         (("B_H", "H"), (), "has no column 'B_H' but 'time', 'D', 'I', 'H'.*name it by --horizontal"),
         (("longitude", "lon"), (), "has no column 'longitude'.*name it by --longitude"),
-        (("1.310", "x"), (), r"row 3 of .*: D is 'x', which is not a number"),
-        (("1.310", ""), (), r"row 3 of .*: D is nan, which is not a number"),
-        (("14271.7", "14.27"), (), r"row 3 of .*microtesla"),
-        (("14271.7", "19000"), (), r"row 3 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
-        (("290.0,20.0", "290.0,20000.0"), (), r"row 3 of .*distance 20000 km is longer than the longest move"),
+        (("1.310", "x"), (), r"row 2 of .*: D is 'x', which is not a number"),
+        (("1.310", ""), (), r"row 2 of .*: D is nan, which is not a number"),
+        (("14271.7", "14.27"), (), r"row 2 of .*microtesla"),
+        (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
+        (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest move"),
         (("", ""), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
         (("", ""), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
         (("", ""), ("--every-km", "-1"), "every_km must be"),
