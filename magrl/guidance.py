@@ -20,7 +20,7 @@ from magrl.field.elements import element_difference
 from magrl.geodesy import wrap_angle
 
 OBJECTIVE_FLOORS = (0.05, 0.4, 15.0)
-"""Smallest ``|B_T - B_0|`` of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 25 km of travel each."""
+"""Smallest ``|B_T - B_0|`` of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by: about 18 to 25 km of travel."""
 
 
 def objective_weights(field: Tensor, target_field: Tensor, floors: Tensor) -> Tensor:

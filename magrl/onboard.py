@@ -47,7 +47,7 @@ _STATES = ("state", "memory")  # attributes in which policies and navigators kee
 
 @dataclass(frozen=True)
 class Command:
-    """What a vehicle is to do, and what is known of its destination.
+    """Hold the command of a step and the estimates of the destination.
 
     Args:
         distance_km: distance to move; 0 to stay and read again.
@@ -321,7 +321,7 @@ class Onboard:
         save_tensors({"format": _FORMAT, "options": self._options(), "state": state, "navigator": held}, Path(path))
 
     def restore(self, path: Path | str) -> None:
-        """Go on from a file of :meth:`save`: the same readings give the same commands, bit for bit.
+        """Resume from a file of :meth:`save`: the same readings give the same commands, bit for bit.
 
         Raises:
             ValueError: for a file that is damaged, of another format, or of a vehicle with other options.

@@ -4,8 +4,9 @@
     python recipes/td3_anywhere.py --preset far     # destinations 150-1800 km away
     python recipes/td3_anywhere.py --resume RUN     # resume an interrupted run exactly
 
-The regions are patches of planets whose magnetic fields share only the spectrum of the Earth's, and the noise of the
-sensors is drawn for each episode. The test tasks are on Earth, in regions that no training sees.
+The regions are patches of planets whose magnetic fields have the spectrum and the polarity of the Earth's and nothing
+else of it, and the noise of the sensors is drawn for each episode. The test tasks are on Earth, in regions that no
+training sees.
 """
 
 from __future__ import annotations

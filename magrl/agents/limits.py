@@ -1,4 +1,4 @@
-"""What a policy was made for: the longest move, the largest turn, and the range of the field."""
+"""Limits that a policy was made for: the longest move, the largest turn, and the range of the field."""
 
 from __future__ import annotations
 

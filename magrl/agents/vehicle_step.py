@@ -17,7 +17,7 @@ from magrl.transforms import TrackView
 
 
 class StepState(NamedTuple):
-    """What an agent keeps between its steps; :func:`first_state` is that before the first one.
+    """Hold the state of an agent between its steps; :func:`first_state` is that before the first one.
 
     Example:
         >>> StepState._fields
@@ -43,7 +43,7 @@ def first_state() -> StepState:
 class VehicleStep(nn.Module):
     """One step of an agent that reads its own track, from plain tensors to plain tensors, without a batch.
 
-    It does not search (:class:`~magrl.transforms.SearchAim`): nobody tells the vehicle that it has not arrived.
+    It does not search (:class:`~magrl.transforms.SearchAim`): the vehicle gets no signal that it has not arrived.
 
     Args:
         policy: trained policy with a :class:`~magrl.transforms.TrackView`.

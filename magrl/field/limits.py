@@ -1,4 +1,4 @@
-"""What the Earth's field can be: checks of readings of D, I and B_H as plain numbers.
+"""Limits of the Earth's field: checks of readings of D, I and B_H as plain numbers.
 
 The limits are those of IGRF-14 at sea level, 1900 to 2030, on a grid of 1 by 2 degrees: a total intensity of 21 900 to
 69 400 nT, a horizontal intensity up to 41 900 nT, and a change of the vector of up to 16 nT/km between 75° S and 75° N

@@ -1,4 +1,4 @@
-"""Random planets: magnetic fields with the spectrum of the Earth's, and nothing else of it.
+"""Random planets: magnetic fields with the spectrum and the polarity of the Earth's, and nothing else of it.
 
 An agent that learns on one planet learns its map. One that learns on many planets can only learn what their fields have
 in common, which is also true of a place that it never saw.

@@ -1,4 +1,4 @@
-"""Map matching: a navigator with a map of the field, on which it finds itself and the destination."""
+"""Map matching: a navigator with a map of the field, on which it estimates its position and that of the destination."""
 
 from __future__ import annotations
 

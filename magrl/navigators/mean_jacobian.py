@@ -1,4 +1,4 @@
-"""Quasi-Newton navigator that starts from the mean Jacobian of a region: what a map of twelve numbers is worth."""
+"""Quasi-Newton navigator that starts from the mean Jacobian of a region, a map of twelve numbers."""
 
 from __future__ import annotations
 

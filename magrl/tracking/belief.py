@@ -1,4 +1,4 @@
-"""What the estimates of the filter are worth: probabilities of arrival, and how well a reading fits the track.
+"""Reliability of the filter's estimates: probabilities of arrival, and how well a reading fits the track.
 
 Probabilities are means over a fixed set of 1024 quasi-random points of the normal distribution, so that equal estimates
 have equal probabilities.

@@ -197,7 +197,7 @@ class TrackObservation(ObservationTransform):
 
 @dataclass(frozen=True, kw_only=True)
 class TrackView:
-    """What an agent without a map observes: the estimates of a Kalman filter along its own track.
+    """Describe what an agent without a map observes: the estimates of a Kalman filter along its own track.
 
     Args:
         zeta: arrival threshold that the agent is trained for.

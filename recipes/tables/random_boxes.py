@@ -3,7 +3,8 @@
     python recipes/tables/random_boxes.py > docs/results/random_boxes.md      # one minute on one core
 
 The boxes are 10 degrees wide and high, with latitudes up to 60 degrees. Boxes that a scenario refuses (a weak
-horizontal field, a declination that jumps) are drawn again. The last row is the box five degrees east of the paper's.
+horizontal field, a declination that jumps) are drawn again. The last row is the box 10S-0,
+175E-185E, east of the paper's.
 Prints a Markdown table: success rate (SR) and success weighted by path length (SPL) in percent.
 """
 
