@@ -161,9 +161,11 @@ def test_interrupted_training_resumes_exactly(
 
 @pytest.mark.usefixtures("without_figures")
 def test_training_without_a_gradient_step_warns(trained, tmp_path: Path, capsys) -> None:
-    """The first episodes end before the replay buffer holds a batch."""
+    """The first episodes end before the replay buffer holds a batch; progress is shown in episodes."""
     result = recipe.train(settings(tmp_path / "run", total_episodes=1, batch_size=320, zeta=2.9))
     said = capsys.readouterr().err
+    assert "episode/s" in said
+    assert "frame/s" not in said
     assert result["updates"] == 0 < trained[1]["updates"]
     (line,) = [line for line in said.splitlines() if "no gradient step" in line]
     assert line.startswith(f"Warning: no gradient step was made in {result['frames']} frames")

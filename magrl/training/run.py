@@ -201,8 +201,9 @@ class Run:
             FloatingPointError: at a non-finite value in a batch, a loss or a weight, naming it.
         """
         saved = time.perf_counter()
-        bar = {"initial": self.statistics.frames, "desc": self.name, "mininterval": 0.5, "unit_scale": True}
-        with tqdm(total=self.config.total_frames, unit="frame", **bar) as progress:
+        counted = "episodes" if self.config.total_episodes else "frames"
+        bar = {"total": getattr(self.config, f"total_{counted}"), "initial": getattr(self.statistics, counted)}
+        with tqdm(**bar, unit=counted[:-1], desc=self.name, mininterval=0.5, unit_scale=True) as progress:
             for batch in self.collector:
                 check_finite(batch, f"after {self.statistics.frames} frames")
                 self.statistics.add(batch.reshape(-1))
@@ -210,7 +211,7 @@ class Run:
                 self._check_weights()
                 if self.complete or self.statistics.iterations % self.config.eval_every == 0:
                     progress.set_postfix_str(self._evaluate())
-                progress.update(batch.numel())
+                progress.update(getattr(self.statistics, counted) - progress.n)
                 if self.complete:
                     break
                 if self.stop.exit_code or time.perf_counter() - saved >= self.config.checkpoint_every:
