@@ -156,11 +156,19 @@ paper: $(foreach run,$(GUIDED) $(ONE_THREAD) $(PLAIN) $(NOISY) $(AZORES),$(run)/
 
 # The training of Table 1 (docs/paper_run.md): table, curves, and both agents on the tasks of the other tables.
 PAPER_RUNS := runs/td3_gradient_guided-paper-seed0 runs/td3-paper-seed0
-paper-run: $(PAPER_RUNS:%=%/eval.json)  ## train both agents of Table 1 whole; some six hours on two cores (make -j2)
+FAST_RUNS := runs/td3_gradient_guided-fast-one-thread-seed0 runs/td3-fast-seed0
+COMPARED := gg_td3=$(word 1,$(PAPER_RUNS)) td3=$(word 2,$(PAPER_RUNS)) \
+  "policy:Gradient-Guided TD3, preset fast=$(word 1,$(FAST_RUNS))/policy.pt" \
+  "policy:TD3, preset fast=$(word 2,$(FAST_RUNS))/policy.pt"
+paper-run: $(foreach run,$(PAPER_RUNS) $(FAST_RUNS),$(run)/eval.json)  ## train both agents of Table 1 whole; some six hours on two cores (make -j2)
 	$(RECIPE)/tables/paper_run.py "Gradient-Guided TD3=$(word 1,$(PAPER_RUNS))" "TD3=$(word 2,$(PAPER_RUNS))" \
+	  "Gradient-Guided TD3, preset fast=$(word 1,$(FAST_RUNS))" "TD3, preset fast=$(word 2,$(FAST_RUNS))" \
 	  --figure docs/figures/paper-run.png > docs/results/paper-run.md
-	$(RECIPE)/evaluate.py gg_td3=$(word 1,$(PAPER_RUNS)) td3=$(word 2,$(PAPER_RUNS)) --out runs/paper-run
+	rm -rf runs/paper-run runs/paper-run-100
+	$(RECIPE)/evaluate.py $(COMPARED) --out runs/paper-run
+	$(RECIPE)/evaluate.py $(COMPARED) --tasks paper-100 --out runs/paper-run-100
 	cp runs/paper-run/table.md docs/results/paper-run-1000.md
+	cp runs/paper-run-100/table.md docs/results/paper-run-100.md
 	$(RECIPE)/tables/publish.py docs/paper_run.md
 
 runs/td3_gradient_guided-paper-seed%/eval.json: | $(VENV)/.installed
