@@ -3,10 +3,9 @@
     python recipes/td3_recurrent.py                # about four minutes on one core
     python recipes/td3_recurrent.py --resume RUN   # resume an interrupted run exactly
 
-It also observes their difference to the target, a linear function of them. The state of Eq. 3-1 does not hold the
-heading from which turns are counted, so the memoryless agent of td3_gradient_guided.py does not learn from it. This
-agent has an LSTM that sums the turns (magrl/agents/recurrent.py).
-The critics read the true heading in training (asymmetric actor-critic). Expected: SR 95 to 100 %, SPL 87 to 97 %.
+It also observes their difference to the target. The state of Eq. 3-1 does not hold the heading from which turns are
+counted, so the memoryless agent of td3_gradient_guided.py does not learn from it. This agent has an LSTM that sums the
+turns. The critics read the true heading in training (asymmetric actor-critic). Expected: SR 95-100 %, SPL 87-97 %.
 """
 
 from __future__ import annotations
