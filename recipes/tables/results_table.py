@@ -36,8 +36,8 @@ COLUMNS = {
     "training s": ("training_seconds", ".0f"),
     "to 97 / 88.4 s": ("seconds_to_97_sr_88_spl", ".0f"),
 }
-FREE = {"seed", "out", "device", "logger", "wandb_mode", "checkpoint_every", "collector_backend"}
-"""Settings in which the runs of one row may differ."""
+MAY_DIFFER = {"seed", "out", "device", "logger", "wandb_mode", "checkpoint_every", "collector_backend"}
+"""Settings that may differ between the runs of one row."""
 Groups = Mapping[str, Sequence[Summary]]
 
 
@@ -90,11 +90,11 @@ def grouped(texts: Sequence[str]) -> dict[str, list[Summary]]:
 
 def _check_same_settings(folder: Path, other: Path) -> None:
     first, second = _settings(folder), _settings(other)
-    differ = [key for key in first if key in second and key not in FREE and first[key] != second[key]]
+    differ = [key for key in first if key in second and key not in MAY_DIFFER and first[key] != second[key]]
     if differ:
         key = differ[0]
         raise UsageError(
-            f"{folder} and {other} are no seeds of one training: {key} is {first[key]!r} and {second[key]!r}; "
+            f"{folder} and {other} are not seeds of one training: {key} is {first[key]!r} and {second[key]!r}; "
             f"give each a name, as in NAME={other}"
         )
 
