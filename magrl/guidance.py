@@ -2,7 +2,7 @@
 
 Shapes broadcast over leading dimensions; angles are in radians clockwise from true north unless a name says
 otherwise; the last dimension of a ``field`` is the element (D [deg], I [deg], B_H [nT]), and differences in D, the
-first, are taken the shorter way around.
+first, are taken the shorter way around, but in :func:`parallel_approach`, whose two elements may be any.
 
 Types and shapes are checked. Values are not, because the functions run in every step: NaN in gives NaN out, except in
 :func:`parallel_approach`, whose mask is False there.

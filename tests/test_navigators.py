@@ -266,6 +266,27 @@ def test_actions_stay_in_bounds_that_are_not_the_default(name: str) -> None:
     assert (action[..., 0] == (4.0 if name == "run_and_tumble" else 8.0)).any()
 
 
+@pytest.mark.parametrize("name", ["secant", "kalman", "mean_jacobian", "parallel"])
+def test_declination_continues_across_half_a_turn(env, name: str) -> None:
+    """D from -180 to 180 gives the moves of D without that jump."""
+
+    def rotated(navigator, wrapped: bool) -> Callable:
+        def act(state: TensorDict) -> TensorDict:
+            seen = state.clone()
+            for key in ("field", "target_field"):
+                seen[key] = state[key].double()
+                seen[key][:, 0] += 179.9 - state["target_field"][:, 0].double()
+                if wrapped:
+                    seen[key][:, 0] -= 360 * (seen[key][:, 0] > 180)
+            return state.set("action", navigator(seen)["action"])
+
+        return act
+
+    few = GeomagneticNavEnv(env.scenario, num_envs=20, seed=0)
+    moves = [flight(few, rotated(NAVIGATORS[name](few, "", 0), wrapped))["action"][:, :8] for wrapped in (False, True)]
+    torch.testing.assert_close(moves[0], moves[1], rtol=1e-3, atol=1e-3)
+
+
 @pytest.mark.parametrize("name", sorted(NAVIGATORS))
 def test_vehicles_do_not_know_of_each_other(env, name: str) -> None:
     together = flight(env, NAVIGATORS[name](env, "", 0))

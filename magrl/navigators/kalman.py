@@ -111,8 +111,8 @@ class Kalman(QuasiNewton):
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         super().decide(seen, memory)  # the filter reads
         track = FieldTrack(memory["mean"], memory["covariance"])
-        target = seen["target_field"].double()
         known, shared = self._related(track)
+        target = self._continued(seen["target_field"], known)
         way = self._searched(known, target, shared, seen, memory)
         _, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared)
         moves = self._moves(way)

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.field.bank import FieldBank
-from magrl.field.elements import NAMES
+from magrl.field.elements import NAMES, element_difference
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.guidance import parallel_approach
 from magrl.navigators.base import CURVATURE, Navigator, displacement_to, element_indices, steer
@@ -62,14 +62,15 @@ class ParallelApproach(Navigator):
         return {}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
-        here, there = (seen[key][:, self.elements].double() for key in ("field", "target_field"))
+        here, there = (seen[key].double() for key in ("field", "target_field"))
+        error = element_difference(there, here)[:, self.elements]
         index = seen["region"].squeeze(-1) if "region" in self.in_keys else None
         gradient = elements_gradient_at(self.field, seen["position"], index)[:, self.elements]
         scale = gradient.new_tensor(CURVATURE)[self.elements]
-        way = displacement_to((there - here) / scale, gradient / scale.unsqueeze(-1))
+        way = displacement_to(error / scale, gradient / scale.unsqueeze(-1))
         wanted = torch.atan2(way[:, 1], way[:, 0])
         if len(self.elements) == 2:  # where the two gradients are nearly parallel, least squares still give a heading
-            heading, valid = (x.squeeze(-1) for x in parallel_approach(here, there, gradient))
+            heading, valid = (x.squeeze(-1) for x in parallel_approach(torch.zeros_like(error), error, gradient))
             wanted = torch.where(valid, heading, wanted)
         now = seen["heading"].squeeze(-1).double()
         return steer(now, wanted, way.norm(dim=-1), self.max_move_km, self.max_turn_rad)

@@ -89,12 +89,20 @@ class QuasiNewton(Navigator):
         track = tracking.FieldTrack(memory["mean"], memory["covariance"])
         moved = tracking.predict(track, leg, self._drift(seen), self.scales)
         noise = self.accuracy(seen, self.data_sheet)[..., self.elements]
-        moved = tracking.update(moved, seen["field"].double()[:, self.elements], noise, self.scales)
+        moved = tracking.update(moved, self._continued(seen["field"], moved), noise, self.scales)
         began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
         mean = torch.where(began, track.mean, moved.mean)
         covariance = torch.where(began.unsqueeze(-1), track.covariance, moved.covariance)
         memory.update({"mean": mean, "covariance": covariance, "decisions": memory["decisions"] + 1})
-        target = seen["target_field"].double()[:, self.elements]
-        way = tracking.way_to(tracking.FieldTrack(mean, covariance), target, RANGE_KM, self.scales).displacement
+        track = tracking.FieldTrack(mean, covariance)
+        target = self._continued(seen["target_field"], track)
+        way = tracking.way_to(track, target, RANGE_KM, self.scales).displacement
         wanted = torch.atan2(way[:, 1], way[:, 0])
         return steer(heading, wanted, way.norm(dim=-1), self.max_move_km, self.max_turn_rad)
+
+    def _continued(self, values: Tensor, track: tracking.FieldTrack) -> Tensor:
+        """Return the elements ``(N, E)`` of readings, with D within half a turn of the estimate."""
+        values = values.double()[:, self.elements]
+        near = track.mean[..., 0] * values.new_tensor(self.scales)
+        period = values.new_tensor([360.0 * (index == 0) for index in self.elements])
+        return values - period * torch.round((values - near) / 360)
