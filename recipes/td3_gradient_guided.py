@@ -159,8 +159,8 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
 def worker_env(config: Config, view: ObservationView, index: int) -> TransformedEnv:
     """Make the environment of one of several collecting processes: its share of the vehicles, on tasks of its own."""
     options = config.model_dump(include=ENV_OPTIONS)
-    seed, num_envs = worker_seed(config.seed, index), config.num_envs // config.collectors
-    return make_env(GeomagneticNavEnv(config.load_scenario(), num_envs=num_envs, seed=seed, **options), view, config)
+    options |= {"seed": worker_seed(config.seed, index), "num_envs": config.num_envs // config.collectors}
+    return make_env(GeomagneticNavEnv(config.load_scenario().with_tasks(None), **options), view, config)
 
 
 def make_collection(

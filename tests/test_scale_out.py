@@ -75,6 +75,15 @@ def test_interrupted_training_of_several_processes_resumes(
     assert (stored["action"][-SMALL.num_envs :] > 0.3).all()  # 1, less the noise of exploration
 
 
+def test_workers_train_on_random_tasks_of_the_scenario() -> None:
+    """Not on those of its file, which the agent is evaluated on."""
+    config = SMALL.replace(scenario=Path(__file__).parent.parent / "docs" / "examples" / "azores.toml")
+    scenario = config.load_scenario()
+    assert scenario.tasks is not None
+    env = recipe.worker_env(config, recipe.GeomagneticNavEnv(scenario.with_tasks(None)).observation_view(), 0)
+    assert len(env.reset()["position"].unique(dim=0)) == SMALL.num_envs // 2
+
+
 def test_vehicles_that_cannot_be_divided_are_refused() -> None:
     with pytest.raises(ValueError, match="num_envs 8 cannot be divided evenly among 3 collectors"):
         SMALL.replace(collectors=3)
