@@ -16,13 +16,21 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, TransformedEnv
+from torchrl.envs import CatTensors, Compose, GymEnv, TransformedEnv
 
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks, task_set
 from magrl.envs.gymnasium import ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation import episode_measures
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorNoise, TrackGradient
+from magrl.transforms import (
+    AlignmentReward,
+    FieldGradient,
+    GradientHeading,
+    NorthReferenceError,
+    SensorNoise,
+    TrackGradient,
+    TrackView,
+)
 
 ROOT = Path(__file__).parent.parent
 PAPER = Scenario(field=Scenario().build_field())
@@ -560,3 +568,39 @@ def test_errors_of_actions_are_in_the_units_of_the_caller() -> None:
         env.reset(seed=0)
         with pytest.raises(ValueError, match=message):
             env.step(np.array(action, dtype=np.float32))
+
+
+def test_a_seed_determines_the_errors_of_the_sensors() -> None:
+    env = gymnasium.make(ENV_ID, transforms=[SensorNoise((0.05, 0.05, 5.0), seed=0)], observation="dict")
+    first, later, again = (env.reset(seed=seed)[0]["field"] for seed in (0, None, 0))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, later)
+
+
+def test_an_observation_of_own_transforms() -> None:
+    """Of a name that "flat" uses too, and beside what "flat" joins."""
+    view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
+    parts = [SensorNoise((0.05, 0.05, 5.0), seed=0), *view.observation_transforms()]
+    env = gymnasium.make(ENV_ID, transforms=parts, observation=["observation"])
+    seen, _ = env.reset(seed=0)
+    assert {key: value.shape for key, value in seen.items()} == {"observation": (view.size,)}
+    assert env.observation_space.contains(seen)
+    joined = CatTensors(["field", "move"], "both", del_keys=False)
+    assert gymnasium.make(ENV_ID, transforms=[joined]).reset(seed=0)[0].shape == (13,)
+
+
+def test_guidance_is_by_the_truth_and_a_compose_is_the_list_of_its_parts() -> None:
+    """Whatever the errors of the readings are."""
+    errors = [SensorNoise((0.2, 0.2, 20.0), seed=0), NorthReferenceError(2.0, fixed=True, seed=0)]
+    clean, listed, composed = (
+        navigation_env(20, transforms=transforms, seed=0, scale_actions=False)
+        for transforms in ((), errors, [Compose(*errors)])
+    )
+    action = torch.tensor([[30.0, 0.0]]).expand(20, 2)
+    true, erring, same = (env.step(env.reset().set("action", action))["next"] for env in (clean, listed, composed))
+    assert (true["field"] != erring["field"]).all()
+    assert (true["heading"] != erring["heading"]).all()
+    for key in ("field", "heading", "reward"):
+        torch.testing.assert_close(erring[key], same[key], rtol=0, atol=0)
+    for key in ("gradient_heading", "reward"):
+        torch.testing.assert_close(true[key], erring[key], rtol=0, atol=0)

@@ -25,6 +25,7 @@ from torchrl.envs import CatTensors, TransformedEnv
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.envs.measures import path_measures
 from magrl.envs.navigation import check_choice, navigation_env
+from magrl.transforms.errors import EpisodeErrors
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
@@ -43,16 +44,16 @@ def _bound(spec: TensorSpec, end: str) -> Tensor:
     return torch.full(spec.shape[1:], -math.inf if end == "low" else math.inf)
 
 
-def _observation_space(env: TransformedEnv, keys: tuple[str, ...]) -> spaces.Space[Any]:
+def _observation_space(env: TransformedEnv, keys: tuple[str, ...], *, flat: bool) -> spaces.Space[Any]:
     """Return the space of one vehicle's observation; its bounds are those of the specs."""
     spec = env.observation_spec
     if missing := [key for key in keys if key not in spec.keys()]:  # noqa: SIM118 - a Composite is no mapping
         raise ValueError(f"observation names {missing[0]!r}, which is not among the keys {sorted(spec.keys())}")
-    if keys != ("observation",):
+    if not flat:
         return spaces.Dict({key: _box(spec[key]) for key in keys})
     # CatTensors drops the bounds of what it joins.
-    (joined,) = (transform for transform in env.transform if isinstance(transform, CatTensors))
-    return _box(*(spec[key] for key in joined.in_keys))
+    joined = [step for step in env.transform if isinstance(step, CatTensors) and step.out_keys == ["observation"]]
+    return _box(*(spec[key] for key in joined[-1].in_keys))
 
 
 def _array(tensor: Tensor) -> NDArray[Any]:
@@ -79,7 +80,8 @@ class _Batch:
         observation = options.get("observation", "flat")
         named = {"flat": ("observation",), "dict": PUBLIC_KEYS}
         self.keys = named[observation] if isinstance(observation, str) else tuple(observation)
-        self.observation_space = _observation_space(self.env, self.keys)
+        self.flat = observation == "flat"
+        self.observation_space = _observation_space(self.env, self.keys, flat=self.flat)
         self.action_space = _box(self.env.action_spec)
         self._state: TensorDictBase | None = None
         self._length_km = torch.zeros(num_envs, dtype=torch.float64, device=self.env.device)
@@ -90,6 +92,9 @@ class _Batch:
             raise ValueError(f"reset() of {ENV_ID} takes no options, got {options}")
         if seed is not None:
             self.env.set_seed(seed)
+            for part in self.env.modules():
+                if isinstance(part, EpisodeErrors):
+                    part.restart()
         self._state = self.env.reset()
         self._length_km = torch.zeros_like(self._length_km)
         return self.observe(self._state)
@@ -97,7 +102,7 @@ class _Batch:
     def observe(self, state: TensorDictBase) -> Observation:
         """Return the observations of all vehicles, ``(N, ...)``."""
         arrays = {key: _array(state[key]).astype(np.float32, copy=False) for key in self.keys}
-        return arrays["observation"] if self.keys == ("observation",) else arrays
+        return arrays["observation"] if self.flat else arrays
 
     def step(self, actions: Any, *, autoreset: bool) -> tuple[TensorDictBase, dict[str, NDArray[Any]]]:
         """Move every vehicle.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from torchrl.envs import Compose, Transform, TransformedEnv
@@ -34,9 +34,9 @@ def navigation_env(
         num_envs: vehicles in the batch.
         observation: ``"flat"`` adds ``observation``, ``(N, 13)``, the input of the recipes' networks; ``"dict"`` leaves
             the public keys in physical units, and so does a list of keys, which the Gymnasium interface observes.
-        transforms: own transforms, directly behind the environment: errors of sensors, estimates, rewards. They are
-            cloned.
-        reward: ``"guided"`` adds the alignment term to the paper's base reward; ``"base"`` is that reward alone.
+        transforms: own transforms: errors of sensors, estimates, rewards. They are cloned, and act after the guidance.
+        reward: ``"guided"`` adds the alignment term to the paper's base reward, by the true field and heading;
+            ``"base"`` is that reward alone.
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
         alignment_weight: zeta_3 of Eq. 3-6 [1/rad], of the guided reward.
         alignment_offset: heading deviation at which the alignment term turns into a penalty [rad].
@@ -63,16 +63,23 @@ def navigation_env(
     check_type(Transform, **{f"transforms[{number}]": each for number, each in enumerate(transforms)})
     base = GeomagneticNavEnv(num_envs=num_envs, **options)
     view = base.observation_view()
-    steps = [each.clone() for each in transforms]
-    if reward == "guided":
+    steps: list[Transform] = []
+    if reward == "guided":  # before errors of the sensors
         alignment = AlignmentReward(weight=alignment_weight, offset=alignment_offset)
         steps += [FieldGradient(base.field), GradientHeading(), alignment]
+    steps += [each.clone() for each in _parts(transforms)]
     if observation == "flat":
         steps += view.observation_transforms()
     if scale_actions:
         declared = base.arrival.declared and not any(isinstance(each, DeclareArrival) for each in steps)
         steps.append(view.action_transform(declared=declared))
     return TransformedEnv(base, Compose(*steps))
+
+
+def _parts(transforms: Iterable[Transform]) -> Iterator[Transform]:
+    """Yield transforms, those of a ``Compose`` one by one."""
+    for each in transforms:
+        yield from _parts(each.transforms) if isinstance(each, Compose) else (each,)
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
