@@ -202,6 +202,14 @@ def test_first_observation_is_that_of_the_paper() -> None:
     assert not td["done"]
 
 
+def test_the_field_of_a_scenario_stays_on_its_device() -> None:
+    scenario = Scenario(field=RegionalField(IGRF("2022-01-01", 13), (-16.0, 6.0), (154.0, 176.0)))
+    env = GeomagneticNavEnv(scenario, seed=0)
+    with pytest.raises((RuntimeError, NotImplementedError)):  # a device without values
+        GeomagneticNavEnv(scenario, seed=0, device="meta")
+    assert env.field.coefficients.device.type == scenario.field.coefficients.device.type == "cpu"
+
+
 @pytest.mark.parametrize(
     ("turn", "end"),
     [  # 50 km on the ellipsoid, by GeographicLib 2.1

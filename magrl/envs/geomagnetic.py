@@ -141,7 +141,8 @@ class GeomagneticNavEnv(EnvBase):
         self.tasks = None if tasks is None else type(tasks)(*(values.to(self.device) for values in tasks))
         field = scenario.build_field(self.max_move_km + self.drift_km)
         self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
-        self.field = field.to(self.device) if isinstance(field, torch.nn.Module) else field
+        held = [*field.parameters(), *field.buffers()] if isinstance(field, torch.nn.Module) else []
+        self.field = copy.deepcopy(field).to(self.device) if any(x.device != self.device for x in held) else field
 
     def _float64(self, values: Sequence[float]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -250,7 +251,7 @@ class GeomagneticNavEnv(EnvBase):
             distances, law = self.scenario.distance_range_km, self.scenario.distance_law
             return sample_tasks(self.region, distances, self.seed, vehicle, episode, law)
         rows = (vehicle + episode * self.num_envs) % len(self.tasks.start)
-        return type(self.tasks)(*(values[rows] for values in self.tasks))
+        return type(self.tasks)(*(values.to(self.device)[rows] for values in self.tasks))  # the batch may have moved
 
     def _start_heading(self, vehicle: Tensor, episode: Tensor) -> Tensor:
         if self.start_heading == "north":
