@@ -190,6 +190,11 @@ POLAR: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
         "reduce margin_deg to 4, or move the region 1° toward the equator",
         {"region": Region((-84, -74), (0, 20))},
     ),
+    "with a law that allows no distance of zero": (
+        {"region": Region((75, 85), (0, 20)), "distance_law": "log"},
+        "reduce margin_deg to 4, or move the region 1° toward the equator",
+        {"margin_deg": 4.0},
+    ),
     "both kinds of poles, with whatever margin": (
         {"region": Region((75, 85), (120, 140))},
         "takes every value: move the region 6° toward the equator",

@@ -244,7 +244,8 @@ class Scenario(CheckedModel):
 
         def usable(**changes: Any) -> bool:
             try:
-                self.replace(tasks=None, names=(), distance_range_km=(0.0, 1.0), **changes)._expanded_igrf(max_move_km)
+                near = {"distance_range_km": (0.0, 1.0), "distance_law": "area"}
+                self.replace(tasks=None, names=(), **near, **changes)._expanded_igrf(max_move_km)
             except ValueError:
                 return False
             return True
