@@ -307,6 +307,9 @@ def test_own_levels() -> None:
     torch.testing.assert_close(std[:, 1] - std[:, 0], torch.ones(3))
     assert std[:, 2].eq(0).all()
     assert std[:, 0].unique().numel() == 3
+    table = torch.eye(3)
+    chosen = TransformedEnv(nav(9), RandomSensorNoise(lambda u: table[(3 * u[..., 0]).long()], draws=1))
+    assert (chosen.reset()["sensor_std"].sum(1) == 1).all()
 
 
 # Data without an env, and errors

@@ -264,7 +264,7 @@ def eddy_velocity(position: Tensor, waves: Tensor, phases: Tensor) -> Tensor:
     """Return the velocity of a field of eddies, whose mean square over places and phases is 1.
 
     The stream function is a sum of plane waves ``a / |k| sin(k·r + phase)`` in space, read on the unit sphere; the
-    velocity is the vertical times its gradient, ``v = r x grad psi``. It is smooth everywhere, and its divergence on
+    velocity is its gradient times the vertical, ``v = grad psi x r``. It is smooth everywhere, and its divergence on
     the sphere is 0. With M waves, a = sqrt(3 / M), and no speed exceeds sqrt(3 M).
 
     Args:
@@ -284,7 +284,7 @@ def eddy_velocity(position: Tensor, waves: Tensor, phases: Tensor) -> Tensor:
     unit = waves / waves.norm(dim=-1, keepdim=True)
     swing = torch.cos(-down @ waves.mT + phases) * math.sqrt(3 / len(waves))
     gradient = swing @ unit
-    # up x gradient: northward is -(gradient·east), eastward is gradient·north
+    # gradient x up: northward is -(gradient·east), eastward is gradient·north
     return torch.stack((-(gradient * east).sum(-1), (gradient * north).sum(-1)), -1)
 
 

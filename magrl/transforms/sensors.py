@@ -165,7 +165,7 @@ class RandomSensorNoise(SensorNoise):
         if not callable(levels):
             raise TypeError(f"levels must be a function of uniform numbers, got {levels!r}")
         check_number(1, whole=True, draws=draws)
-        elements = len(levels(torch.ones(draws)))
+        elements = len(levels(torch.full((draws,), 0.5)))
         super().__init__([1.0] * elements, **options)  # a placeholder: each episode has levels of its own
         self.levels, self.draws = levels, draws
 
