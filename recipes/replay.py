@@ -28,7 +28,7 @@ from magrl.evaluation.navigators import DEFAULT_ZETA, label, make_navigator
 from magrl.evaluation.replay import replay_data, write_gif, write_replay
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import read_run, run_config
-from magrl.evaluation.scenarios import TaskSet, choose_tasks, first_tasks
+from magrl.evaluation.scenarios import TaskSet, choose_tasks, first_tasks, with_declaration
 from magrl.files import check_writable
 from magrl.training import UsageError, command
 from magrl.transforms import with_sensor_noise
@@ -93,8 +93,8 @@ def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], s
         available = len(scenario.tasks.start)
         count = min(DEFAULT_TASKS, available) if config.num_tasks is None else config.num_tasks
         base = GeomagneticNavEnv(first_tasks(scenario, count), num_envs=count, seed=config.seed)
-        env = with_sensor_noise(base, run.noise, config.seed)
-        texts = (f"{run.kind or 'gg_td3'}={config.run}", *config.navigators)
+        env = with_declaration(with_sensor_noise(base, run.noise, config.seed))
+        texts = (f"{run.kind or f'policy:{config.run.name}'}={config.run}", *config.navigators)
         made = {text: make_navigator(text, base, seed=config.seed, noise=run.noise) for text in texts}
         navigators = {name: made[text] for name, text in labeled(texts).items()}
         out = config.out or config.run / "replay.html"

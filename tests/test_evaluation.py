@@ -316,9 +316,11 @@ def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, caps
         "sweep_table": ([str(tmp_path)], f"there is no run at {tmp_path}: a run folder holds config.json"),
         "sweep_metaheuristics": (["--tasks", "0"], "num_tasks must be a whole number from 1 on, got 0"),
     }
+    twice = ["anywhere", "anywhere=runs/A", "--figure", str(tmp_path / "figure.png")]
     assert cases.keys() == {path.stem for path in (RECIPES / "tables").glob("*.py")}
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(RECIPES)])
-    for name, (arguments, message) in cases.items():
+    commands = [*cases.items(), ("conditions_table", (twice, "anywhere is given twice: a figure has one line"))]
+    for name, (arguments, message) in commands:
         script = RECIPES / "tables" / f"{name}.py"
         monkeypatch.setattr(sys, "argv", [str(script), *arguments])
         with pytest.raises(SystemExit) as error:
@@ -487,6 +489,11 @@ def test_batches_have_errors_of_their_own_that_repeat() -> None:
     torch.testing.assert_close(perfect["length_km"], perfect["length_km"][:1].expand(3))
     ship = evaluate_policy("secant", thrice, conditions="ship", max_steps=5)
     assert (ship["steps"] <= 5).all()
+
+
+def test_navigators_declare_their_arrival_where_it_must_be_declared() -> None:
+    episodes = evaluate_policy("secant", "paper-100", arrival="declared", arrival_radius_km=40.0)
+    assert summarize(episodes)["success_rate"] > 80
 
 
 def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:

@@ -249,6 +249,22 @@ def test_the_recipe_flies_the_run_first(recipe: Any, run: Path, tmp_path: Path) 
     assert Image.open(tmp_path / "a.gif").n_frames > 1
 
 
+def test_a_policy_of_another_recipe_has_the_name_of_its_run(recipe: Any, run: Path) -> None:
+    (run / "config.json").write_text(json.dumps({"recipe": "sac.py", "zeta": 0.01}))
+    data = written(recipe.replay(recipe.Config(run, navigators=(), num_tasks=2)))
+    assert [navigator["label"] for navigator in data["navigators"]] == ["agent"]
+
+
+def test_a_declaration_elsewhere_is_a_false_arrival(recipe: Any, run: Path, tmp_path: Path) -> None:
+    box = {"latitude": [-10.0, 0.0], "longitude": [160.0, 170.0]}
+    content = {"region": box, "date": "2022-01-01", "generation": 13, "arrival": "declared", "arrival_radius_km": 0.001}
+    path = tmp_path / "declared.json"
+    path.write_text(json.dumps(content | {"tasks": [{"start": [-2.0, 162.0], "target": [-8.0, 164.0]}]}))
+    data = written(recipe.replay(recipe.Config(run, ("secant", "geodesic"), scenario=path, zeta=0.01)))
+    outcomes = {each["label"]: each["episodes"][0]["outcome"] for each in data["navigators"]}
+    assert set(outcomes.values()) <= {"arrived", "false arrival", "out of steps", "lost"}
+
+
 def test_two_agents_of_a_kind_are_told_apart(recipe: Any, run: Path, tmp_path: Path) -> None:
     out = tmp_path / "page.html"
     names = (f"gg_td3={run}", "pso:flown")

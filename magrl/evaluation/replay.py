@@ -171,7 +171,9 @@ def _episode(row: TensorDictBase, track: Tensor, measures: dict[str, Any]) -> di
     count = measures["steps"]
     seen = {key: torch.cat((row[key][:1], row["next", key][:count])) for key in _SEEN}
     left, _ = geodesic(*seen["position"].unbind(-1), *row["target_position"][0])
-    lost = bool(row["next", "terminated"][count - 1])
+    end = row["next"][count - 1]
+    declared = bool(end.get("declared", torch.tensor(False)))
+    failure = "false arrival" if declared else "lost" if end["terminated"] else "out of steps"
     return {
         "track": _rounded(track, 5),
         "field": _rounded(seen["field"], 4),
@@ -181,7 +183,7 @@ def _episode(row: TensorDictBase, track: Tensor, measures: dict[str, Any]) -> di
         "turn_deg": _rounded(seen["move"][:, 1].rad2deg(), 2),
         "path_km": _rounded(seen["move"][:, 0].double().cumsum(0), 4),
         "distance_km": _rounded(left, 4),
-        "outcome": "arrived" if measures["success"] else "lost" if lost else "out of steps",
+        "outcome": "arrived" if measures["success"] else failure,
         "steps": count,
         **{key: round(measures[key], 4) for key in ("shortest_km", "length_km", "navigation_error_km", "spl")},
     }

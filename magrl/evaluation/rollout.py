@@ -11,11 +11,14 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from magrl.agents import FieldPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.metrics import episode_measures
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.runs import NO_NOISE, Noise
+from magrl.evaluation.scenarios import with_declaration
+from magrl.navigators import Navigator
 from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
 from magrl.transforms.errors import EpisodeErrors
 
@@ -44,7 +47,9 @@ def evaluate(
         conditions: errors of a real vehicle instead of noise, a name of :data:`magrl.transforms.CONDITIONS`.
         seed: random seed of the errors, random start headings and metaheuristics.
         device: device of the environment.
-        options: further options of :class:`~magrl.envs.GeomagneticNavEnv`, such as ``max_steps`` or ``zeta``.
+        options: further options of :class:`~magrl.envs.GeomagneticNavEnv`, such as ``max_steps`` or ``zeta``. With
+            ``arrival="declared"``, navigators and trained agents declare by their own estimate
+            (:func:`magrl.evaluation.scenarios.with_declaration`); another policy writes the third action itself.
 
     Returns:
         ``(M,)``, one row for each task in its order, with the measures of
@@ -75,6 +80,8 @@ def evaluate(
     elif hasattr(policy, "check_fits"):
         policy.check_fits(base)
     env = with_sensor_noise(base, noise, seed) if conditions is None else with_conditions(base, flown, seed)
+    if isinstance(policy, FieldPolicy | Navigator):
+        env = with_declaration(env)
     restart(env)
     episodes = [_next_episodes(env, policy) for _ in range(math.ceil(count / num_envs))]
     return torch.cat(episodes)[:count]  # a last batch that is not full has flown the first tasks again

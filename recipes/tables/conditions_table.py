@@ -152,12 +152,19 @@ def cell(summary: dict[str, float]) -> str:
 
 
 def curves_of(config: Config) -> Curves:
-    """Return the SPL of each navigator in each panel, at size 0 first."""
+    """Return the SPL of each navigator in each panel, at size 0 first.
+
+    Raises:
+        ValueError: for two navigators of one name.
+    """
+    names = [text.partition("=")[0] for text in config.navigators]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise ValueError(f"{twice} is given twice: a figure has one line for a name; name a run, as policy:LABEL=RUN")
     base = make_env(config.tasks, config.regions, config.seed)
     count = 1 + sum(len(sizes) for _, sizes in PANELS.values())
     curves: dict[str, dict[str, list[float]]] = {panel: {} for panel in PANELS}
     with tqdm(total=count * len(config.navigators), unit="rollout") as bar:
-        for text in config.navigators:
+        for name, text in zip(names, config.navigators, strict=True):
 
             def spl(conditions: Conditions, text: str = text) -> float:
                 bar.update()
@@ -165,7 +172,7 @@ def curves_of(config: Config) -> Curves:
 
             first = spl(readings())
             for panel, (conditions, sizes) in PANELS.items():
-                curves[panel][text.partition("=")[0]] = [first, *(spl(conditions(size)) for size in sizes)]
+                curves[panel][name] = [first, *(spl(conditions(size)) for size in sizes)]
     return curves
 
 
