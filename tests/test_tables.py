@@ -140,6 +140,18 @@ def test_results_table_does_not_mix_settings_in_one_row(tmp_path: Path) -> None:
     assert {name: len(runs) for name, runs in groups.items()} == {"": 2, "low": 1}
 
 
+def test_results_table_does_not_mix_scenarios_in_one_row(tmp_path: Path) -> None:
+    """All their files have the same name."""
+    results = load("tables/results_table")
+    for seed, text in enumerate(("date = 2026-01-01", "date = 2026-01-01", "date = 2027-01-01")):
+        folder = finished(tmp_path / str(seed), seed)
+        (folder / "config.json").write_text(json.dumps({"seed": seed, "scenario": "scenario.toml"}))
+        (folder / "scenario.toml").write_text(text)
+    assert len(results.grouped([f"{tmp_path}/[01]"])[""]) == 2
+    with pytest.raises(UsageError, match="not seeds of one training: their scenarios differ; give each a name"):
+        results.grouped([f"{tmp_path}/*"])
+
+
 def test_results_table_says_what_is_wrong(tmp_path: Path) -> None:
     results = load("tables/results_table")
     run = finished(tmp_path / "run", 0)
@@ -192,6 +204,8 @@ def test_noise_table_refuses_evaluations_that_cannot_be_compared(tmp_path: Path)
     clean = evaluation(tmp_path / "clean", [0, 0, 0], flown)
     again = evaluation(tmp_path / "again", [0, 0, 0], flown)
     strict = evaluation(tmp_path / "strict", [0.1, 0.1, 10], flown, zeta=0.001)
+    ship = evaluation(tmp_path / "ship", [0.1, 0.1, 10], flown, conditions="ship")
+    calm = evaluation(tmp_path / "calm", [0.2, 0.2, 20], flown, conditions=None)
     old = evaluation(tmp_path / "old", [0.1, 0.1, 10], flown)
     (old / "settings.json").write_text("{}")
     (tmp_path / "file").touch()
@@ -201,6 +215,7 @@ def test_noise_table_refuses_evaluations_that_cannot_be_compared(tmp_path: Path)
         ([old], r"settings\.json holds no noise level"),
         ([clean, again], r"again has the noise \[0\.0, 0\.0, 0\.0\], as a folder before it"),
         ([clean, strict], "strict has zeta 0.001, the folders before it 0.01"),
+        ([calm, ship], "ship has conditions 'ship', the folders before it None"),
     ):
         with pytest.raises(UsageError, match=message):
             noise.make(noise.Config(tuple(folders), tmp_path / "t.md", tmp_path / "f.png"))

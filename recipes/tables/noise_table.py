@@ -26,8 +26,8 @@ RECIPE = "noise_table.py"
 Noise = tuple[float, ...]
 """Standard deviations of D [deg], I [deg], B_H [nT]."""
 
-SAME = ("tasks", "tasks_seed", "scenario", "zeta", "start_heading", "mode", "map_date")
-"""Settings that all evaluations must have in common."""
+MAY_DIFFER = ("noise", "navigators", "seed")
+"""Settings in which evaluations may differ; they have all others in common."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ def by_level(folders: Sequence[Path]) -> tuple[str, dict[Noise, Summaries]]:
         noise = tuple(float(value) for value in settings["noise"] or (0, 0, 0))
         if noise in levels:
             raise UsageError(f"{folder} has the noise {list(noise)}, as a folder before it: one folder for each level")
-        same = {key: settings.get(key) for key in SAME}
+        same = {key: value for key, value in settings.items() if key not in MAY_DIFFER}
         if differing := [key for key, value in same.items() if common.setdefault(key, value) != value]:
             key = differing[0]
             raise UsageError(f"{folder} has {key} {same[key]!r}, the folders before it {common[key]!r}")
         levels[noise] = summaries
-    return common["mode"] or "look-ahead", dict(sorted(levels.items()))
+    return common.get("mode") or "look-ahead", dict(sorted(levels.items()))
 
 
 def title(noise: Noise) -> str:

@@ -93,15 +93,18 @@ def _check_same_settings(folder: Path, other: Path) -> None:
     differ = [key for key in first if key in second and key not in MAY_DIFFER and first[key] != second[key]]
     if differ:
         key = differ[0]
+        said = "their scenarios differ" if key == "scenario" else f"{key} is {first[key]!r} and {second[key]!r}"
         raise UsageError(
-            f"{folder} and {other} are not seeds of one training: {key} is {first[key]!r} and {second[key]!r}; "
-            f"give each a name, as in NAME={other}"
+            f"{folder} and {other} are not seeds of one training: {said}; give each a name, as in NAME={other}"
         )
 
 
 def _settings(folder: Path) -> dict[str, Any]:
     path = folder / "config.json"
-    return json.loads(path.read_text()) if path.is_file() else {}
+    settings = json.loads(path.read_text()) if path.is_file() else {}
+    if settings.get("scenario") and (file := folder / Path(settings["scenario"]).name).is_file():
+        settings["scenario"] = file.read_text()  # all files have the same name in their folders
+    return settings
 
 
 def _place(folder: Path) -> dict[str, Any]:
