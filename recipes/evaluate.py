@@ -155,7 +155,8 @@ def settle(config: Config) -> tuple[Config, list[str]]:
         check_number(0, noise=level)
     if config.conditions and config.noise:
         raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
-    runs = trained_runs(config.navigators)
+    # Agents that train anywhere have seen every heading, many levels of noise, and no region in particular.
+    runs = [run for run in trained_runs(config.navigators) if run.kind != "anywhere"]
     path, places = config.scenario, list[str]()
     if config.tasks != "figure-4-1":  # which lies in the paper's region
         path, places = common_scenario(runs, config.scenario)

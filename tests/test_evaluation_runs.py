@@ -225,6 +225,15 @@ def test_runs_that_differ_need_a_choice(trained: Trained, tmp_path: Path) -> Non
     assert not (tmp_path / "out").exists()
 
 
+def test_an_agent_trained_anywhere_fits_every_evaluation(trained: Trained, tmp_path: Path) -> None:
+    """It has seen all headings and many levels of noise."""
+    run = f"anywhere={trained('anywhere', recipe='td3_anywhere.py', guided=None)}"
+    other = f"gg_td3={trained('noisy', noise=NOISE, start_heading='random')}"
+    said = flown(tmp_path / "out", run, other)
+    assert (said["start_heading"], tuple(said["noise"])) == ("random", NOISE)
+    assert "was trained" not in (tmp_path / "out" / "table.md").read_text()
+
+
 def test_an_agent_under_the_name_of_another_kind_is_refused(trained: Trained, tmp_path: Path) -> None:
     guided, plain = trained("guided"), trained("plain", guided=False)
     recurrent = trained("recurrent", recipe="td3_recurrent.py", guided=None)
