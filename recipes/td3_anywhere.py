@@ -34,7 +34,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_cr
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.training import Run, RunConfig, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, Discount, NonNegative, Positive, PositiveShare, Widths
+from magrl.training.config import Count, Discount, NonNegative, Positive, PositiveShare, Rising, Widths
 from magrl.transforms import DetourReward, RandomSensorNoise, SensorNoise, TrackView, TrueWay, sensor_levels
 
 RECIPE = "td3_anywhere.py"
@@ -57,7 +57,7 @@ class Config(RunConfig):
     # Environment
     num_regions: Count = 2048
     """Number of training regions, two on each random planet."""
-    distance_range_km: tuple[Positive, Positive] = (300.0, 500.0)
+    distance_range_km: Rising = (300.0, 500.0)
     """Shortest and longest distance of a task [km]."""
     max_steps: Count = 50
     """Moves after which an episode is truncated."""

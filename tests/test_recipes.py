@@ -10,6 +10,7 @@ from pathlib import Path
 import ppo
 import pytest
 import sac
+import td3_anywhere
 import td3_gradient_guided as recipe
 import td3_recurrent
 import torch
@@ -315,6 +316,7 @@ def test_saved_actor_is_the_stochastic_one_without_noise(module) -> None:
         {"batch_size": 321},
         {"alignment_weight": math.inf},
         {"exploration_noise": -0.1},
+        {"final_exploration_noise": 0.3},
         {"num_cells": ()},
         {"num_cells": (16, 0)},
         {"start_heading": "south"},
@@ -352,6 +354,12 @@ def test_bad_settings_are_refused_by_name(tmp_path: Path, bad: dict) -> None:
         (td3_recurrent, "--noise 0.05 0.05", "Missing value for argument '--noise'. Expected 3 values"),
         (recipe, "--num-envs 8 --collectors 3", "num_envs 8 cannot be divided evenly among 3 collectors"),
         (td3_recurrent, "--num-envs 1", "num_envs must be at least 2, got 1"),
+        (td3_recurrent, "--exploration-noise 0.05", "must not exceed exploration_noise 0.05"),
+        (
+            td3_anywhere,
+            "--distance-range-km 500 300",
+            "distance_range_km: must be two rising numbers, got (500.0, 300.0)",
+        ),
         (sac, "--total-frames 512", "batch_size 1024 must not exceed total_frames: no gradient step is possible"),
         (sac, "--buffer-size 1000", "buffer_size 1000 does not hold one batch of 1024"),
         (ppo, "--num-envs 8", "batch_size 1024 must not exceed num_envs * steps_per_batch, 128"),

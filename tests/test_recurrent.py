@@ -31,7 +31,7 @@ from magrl.agents import (
 )
 from magrl.agents.recurrent import STATE_KEYS, LastMove
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Scenario
-from magrl.training import UsageError, parse_config
+from magrl.training import Run, UsageError, parse_config
 from magrl.transforms import ObservationView
 
 SLICE, CELLS = 4, (16, 16)
@@ -494,6 +494,16 @@ def test_shortest_task_is_below_the_longest_of_the_scenario(tmp_path: Path) -> N
     path.write_text(json.dumps(content | {"distance_range_km": [50, 90]}))
     with pytest.raises(ValueError, match="shortest_task_km must be below 90, got 100"):
         settings(tmp_path / "run", scenario=path)
+
+
+def test_the_step_limit_of_a_scenario_is_that_of_the_evaluations(tmp_path: Path) -> None:
+    content = {"region": {"latitude": [40, 50], "longitude": [-30, -20]}, "date": "2026-07-01", "max_steps": 80}
+    path = tmp_path / "long.json"
+    path.write_text(json.dumps(content))
+    config = settings(tmp_path / "run", scenario=path)
+    with Run(config, recipe="mine.py", name="mine") as run:
+        assert recipe.make_base(run, config).max_steps == config.train_steps != 80
+        assert [env.max_steps for env in run.evaluation_envs()] == [80, 80]
 
 
 @pytest.mark.slow

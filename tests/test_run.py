@@ -51,6 +51,8 @@ def test_each_folder_in_use_has_its_message(tmp_path: Path) -> None:
         with pytest.raises(UsageError) as error:
             create_run_folder(folder)
         assert message in str(error.value)
+    with pytest.raises(UsageError, match=r"notes\.txt/run cannot be made \(Not a directory\): choose another --out"):
+        create_run_folder(foreign / "notes.txt" / "run")
 
 
 def in_run(config: RunConfig) -> Run:

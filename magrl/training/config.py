@@ -32,6 +32,15 @@ Threshold = Annotated[float, AfterValidator(check_zeta)]
 Noise = tuple[NonNegative, NonNegative, NonNegative]
 
 
+def _check_rising(values: tuple[float, float]) -> tuple[float, float]:
+    if values[0] >= values[1]:
+        raise ValueError(f"must be two rising numbers, got {values}")
+    return values
+
+
+Rising = Annotated[tuple[Positive, Positive], AfterValidator(_check_rising)]
+
+
 class UsageError(ValueError):
     """A command that cannot run as given; its message is shown without a traceback.
 
@@ -106,6 +115,9 @@ class RunConfig(CheckedModel):
             if None not in (said, own) and said != own:
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"the scenario says {name} = {said!r}, the training {own!r}: add {option} {said}")
+        start, end = (getattr(self, f"{stage}exploration_noise", 0.0) for stage in ("", "final_"))
+        if end > start:
+            raise ValueError(f"final_exploration_noise {end:g} must not exceed exploration_noise {start:g}")
         if scenario.arrival == "declared":
             raise ValueError('the scenario says arrival = "declared": the recipes train no agent that declares')
         return self

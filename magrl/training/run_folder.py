@@ -16,7 +16,8 @@ def create_run_folder(path: Path | str) -> Path:
     """Create the folder of a run; a run never writes over another.
 
     Raises:
-        UsageError: if it exists and is not empty, saying whether the run there is complete or can be resumed.
+        UsageError: if it exists and is not empty, saying whether the run there is complete or can be resumed; or if
+            it cannot be made.
 
     Example:
         >>> import tempfile
@@ -32,7 +33,10 @@ def create_run_folder(path: Path | str) -> Path:
                 f"{path} holds a run that is not complete: --resume {path}, choose another --out, or remove it"
             )
         raise UsageError(f"the run folder {path} is not empty: choose another --out")
-    path.mkdir(parents=True, exist_ok=True)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"the run folder {path} cannot be made ({error.strerror}): choose another --out") from error
     return path
 
 
