@@ -225,6 +225,9 @@ def test_navigators_say_what_they_need() -> None:
     assert {needs(name) for name in METAHEURISTICS} == {"the field at other places"}
     assert {needs(f"{name}:flown") for name in METAHEURISTICS} == {"nothing"}
     assert needs("ga", "flown") == "nothing"
+    small = GeomagneticNavEnv(num_envs=2, seed=0)
+    for mode in ("look-ahead", "flown"):
+        assert METAHEURISTICS["pso"](small, mode, 0).needs == needs("pso", mode)
     assert needs("gg_td3") == "training in the region"
     with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
         needs("dowsing")

@@ -9,6 +9,7 @@ import torch
 from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import plots
+from magrl.evaluation.maps import flights_figure
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import NAVIGATOR_NAMES
 from magrl.field import IGRF
@@ -93,6 +94,13 @@ def test_trajectories_end_where_the_episode_did(env) -> None:
     latitude, longitude = rollout["next", "position"][0, last].tolist()
     assert (round(longitude, 6), round(latitude, 6)) in ends
     assert "deg" in axes.get_legend().get_texts()[0].get_text()
+
+
+def test_flights_figure_has_axes_for_its_flights_alone(env) -> None:
+    rollout = env.rollout(2)
+    for count in range(1, 6):
+        flights = dict.fromkeys("abcde"[:count], rollout)
+        assert len(flights_figure(flights, env.field, env.region).axes) == count
 
 
 def test_paths_across_the_antimeridian_do_not_jump() -> None:

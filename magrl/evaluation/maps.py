@@ -48,11 +48,11 @@ def flights_figure(
     columns = min(len(rollouts), 3)
     rows = math.ceil(len(rollouts) / columns)
     figure = Figure(figsize=(6.4 * columns, 6.9 * rows), layout="constrained")
-    places = figure.subplots(rows, columns, squeeze=False).flat
+    places = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axes, (title, rollout) in zip(places, rollouts.items(), strict=False):
         draw_episodes(axes, rollout, field, region, episodes, names)
         axes.set_title(title)
-    for axes in list(places)[len(rollouts) :]:
+    for axes in places[len(rollouts) :]:
         axes.remove()
     return figure
 

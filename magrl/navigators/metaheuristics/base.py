@@ -155,6 +155,7 @@ class Metaheuristic(Navigator):
         if min(objective_floors) <= 0:
             raise ValueError(f"objective_floors must be three positive numbers (deg, deg, nT), got {objective_floors}")
         self.mode, self.field, self.oracle = mode, field, mode == "look-ahead"
+        self.needs = "the field at other places" if self.oracle else "nothing"
         self.population_size = checked("population_size", population_size, 2, 10_000, whole=True)
         self.generations = checked("generations", generations, 1, 10_000, whole=True)
         self.spread = checked("spread", spread, 1e-3, 1)
