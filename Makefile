@@ -95,11 +95,11 @@ earth: $(ANYWHERE:%=%/eval.json)  ## fly agents without a map and other navigato
 	  > docs/results/earth-700.md
 	$(RECIPE)/tables/earth_table.py anywhere kalman secant geodesic --distance-km 1200 1800 --max-steps 120 --tasks 2000 \
 	  > docs/results/earth-1200.md
-	$(RECIPE)/tables/publish.py docs/anywhere.md
+	$(RECIPE)/tables/publish.py docs/anywhere.md docs/benchmark.md
 
 # Table and figure of docs/conditions.md, from the pretrained policy; make -j2 makes both at once.
 conditions: docs/results/conditions.md docs/figures/conditions.png  ## fly navigators under the errors of real vehicles; about seven minutes
-	$(RECIPE)/tables/publish.py docs/conditions.md
+	$(RECIPE)/tables/publish.py docs/conditions.md docs/benchmark.md
 
 .PHONY: docs/results/conditions.md docs/figures/conditions.png
 docs/results/conditions.md: $(VENV)/.installed
