@@ -209,6 +209,7 @@ def test_bad_usage_is_refused_before_anything_is_written_or_flown(
         (("ga:flown", "ga"), {"mode": "flown"}, "^ga is given twice"),
         ((f"gg_td3={run}", f"gg_td3={run.parent / 'x' / '..' / run.name}"), {}, "is given twice"),
         ((f"gg_td3={run}", f"td3={run}"), {}, "^td3=.* is given twice"),
+        (("anywhere", f"anywhere={run}"), {}, "has the name of the pretrained anywhere: write policy:LABEL="),
         (("ga",), {"seed": -1}, "seed"),
         (("secant",), {"wandb_mode": "sometimes"}, "wandb_mode"),
         (("secant",), {"scenario": tmp_path / "missing.toml"}, "no scenario file at"),
@@ -316,7 +317,7 @@ def test_the_scripts_of_tables_run_as_commands(tmp_path: Path, monkeypatch, caps
         "sweep_table": ([str(tmp_path)], f"there is no run at {tmp_path}: a run folder holds config.json"),
         "sweep_metaheuristics": (["--tasks", "0"], "num_tasks must be a whole number from 1 on, got 0"),
     }
-    twice = ["anywhere", "anywhere=runs/A", "--figure", str(tmp_path / "figure.png")]
+    twice = ["anywhere=runs/A", "anywhere=runs/B", "--figure", str(tmp_path / "figure.png")]
     assert cases.keys() == {path.stem for path in (RECIPES / "tables").glob("*.py")}
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(RECIPES)])
     commands = [*cases.items(), ("conditions_table", (twice, "anywhere is given twice: a figure has one line"))]

@@ -174,7 +174,9 @@ def label(name: str, default_mode: str = "look-ahead") -> str:
 
 
 def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> None:
-    """Raise if a navigator is given twice: the same episodes twice are no spread over runs.
+    """Raise if a navigator is given twice, or the pretrained agent beside own runs under its name.
+
+    Neither is a spread over runs.
 
     Args:
         texts: navigators, as :func:`make_navigator` takes them.
@@ -196,6 +198,8 @@ def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> No
         key = Path(run).resolve() if run else (base, mode or (default_mode if base in METAHEURISTICS else ""))
         if key in seen:
             raise ValueError(f"{text} is given twice: the same episodes again are no spread over runs")
+        if run and base in PRETRAINED and base in texts:
+            raise ValueError(f"{text} has the name of the pretrained {base}: write policy:LABEL={run}")
         seen.add(key)
 
 

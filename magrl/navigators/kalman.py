@@ -50,7 +50,8 @@ class Kalman(QuasiNewton):
         step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
         bias: standard deviations of constant and slow errors of the readings, like ``noise``.
-        zeta: arrival threshold on the objective.
+        zeta: arrival threshold on the objective. The search takes the objective with the paper's floors
+            (:data:`magrl.guidance.OBJECTIVE_FLOORS`), as :class:`~magrl.transforms.SearchAim` does, in every region.
         search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
             it, the way is the estimated one.
 
