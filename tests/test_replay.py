@@ -249,10 +249,11 @@ def test_the_recipe_flies_the_run_first(recipe: Any, run: Path, tmp_path: Path) 
     assert Image.open(tmp_path / "a.gif").n_frames > 1
 
 
-def test_a_policy_of_another_recipe_has_the_name_of_its_run(recipe: Any, run: Path) -> None:
-    (run / "config.json").write_text(json.dumps({"recipe": "sac.py", "zeta": 0.01}))
-    data = written(recipe.replay(recipe.Config(run, navigators=(), num_tasks=2)))
-    assert [navigator["label"] for navigator in data["navigators"]] == ["agent"]
+def test_a_policy_of_another_recipe_has_the_name_of_its_run(recipe: Any, run: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(run, tmp_path / "sac-seed0")
+    (folder / "config.json").write_text(json.dumps({"recipe": "sac.py", "zeta": 0.01}))
+    data = written(recipe.replay(recipe.Config(folder, navigators=(), num_tasks=2)))
+    assert [navigator["label"] for navigator in data["navigators"]] == ["sac-seed0"]
 
 
 def test_a_declaration_elsewhere_is_a_false_arrival(recipe: Any, run: Path, tmp_path: Path) -> None:
