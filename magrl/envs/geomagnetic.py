@@ -141,8 +141,10 @@ class GeomagneticNavEnv(EnvBase):
         self.tasks = None if tasks is None else type(tasks)(*(values.to(self.device) for values in tasks))
         field = scenario.build_field(self.max_move_km + self.drift_km)
         self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
-        held = [*field.parameters(), *field.buffers()] if isinstance(field, torch.nn.Module) else []
-        self.field = copy.deepcopy(field).to(self.device) if any(x.device != self.device for x in held) else field
+        self.field = field
+        if isinstance(field, torch.nn.Module):  # the scenario's own stays where it is
+            held = (*field.parameters(), *field.buffers())
+            self.field = copy.deepcopy(field).to(self.device) if any(x.device != self.device for x in held) else field
 
     def _float64(self, values: Sequence[float]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
