@@ -155,8 +155,13 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
     board.start(log[elements].iloc[-1].tolist() if config.target is None else config.target)
     found = []
     for _, row in log.iterrows():
+        heading = row["heading"]
+        if abs(heading) <= 2 * math.pi:
+            # On board, a small heading may be the one commanded in radians; here no command was followed. The same
+            # course as a large number is not compared. A log in radians is named in notes().
+            heading -= math.copysign(360, heading)
         try:
-            told = board.step(*row[elements], row["heading"], row["distance"])
+            told = board.step(*row[elements], heading, row["distance"])
         except ValueError as error:
             joined_by = f" (moves are joined by --every-km {config.every_km:g})" if config.every_km else ""
             raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}{joined_by}") from error

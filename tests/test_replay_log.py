@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import sys
 from pathlib import Path
 
@@ -53,6 +54,16 @@ def test_the_example_with_other_columns(recipe, tmp_path: Path, capsys) -> None:
     assert "miss_km" not in other
     columns = ["move_km", "steer_deg", "north_km", "error_km", "confidence"]
     pd.testing.assert_frame_equal(table[columns], other[columns])
+
+
+def test_a_small_heading_is_not_compared_with_commands_that_nobody_followed(recipe) -> None:
+    """A northbound move of a few degrees is no heading in radians, whatever would have been commanded."""
+    config = recipe.Config(LOG, target=(5.0, 60.0, 21000.0))
+    log = recipe.read_log(config).head(3).copy()
+    steer = recipe.replay(config, log)["steer_deg"][0]
+    log.loc[1, "heading"] = math.radians(steer)
+    assert abs(steer - math.radians(steer)) > 10
+    assert len(recipe.replay(config, log)) == 3
 
 
 def test_short_moves_are_joined(recipe, tmp_path: Path) -> None:
