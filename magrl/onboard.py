@@ -1,4 +1,4 @@
-"""Navigation on board of one vehicle: plain numbers in, a command out, without an environment.
+"""Navigation on board one vehicle: plain numbers in, a command out, without an environment.
 
 Angles are in degrees, clockwise from true north, distances in kilometers, and intensities in nanotesla.
 """
@@ -80,7 +80,7 @@ class Command:
 
 
 class Onboard:
-    """A navigator on board of one vehicle.
+    """A navigator on board one vehicle.
 
     :meth:`start` takes the elements at the destination. The first :meth:`step` takes the reading at the start, every
     later one what the vehicle did since the last step by its own log and compass, and the reading at the end of that

@@ -132,7 +132,7 @@ def joined(log: pd.DataFrame, every_km: float) -> pd.DataFrame:
 
 
 def vehicle(config: Config, steps: int) -> Onboard:
-    """Return the vehicle on board of which the log is replayed."""
+    """Return the vehicle that replays the log."""
     named = config.navigator in NAMED or not config.navigator.endswith(".pt")
     return Onboard(
         config.navigator if named else load_policy(config.navigator),

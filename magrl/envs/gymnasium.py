@@ -173,7 +173,8 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     ``reset(seed=s)`` starts the first episode of vehicle 0 of the TorchRL environment of seed ``s``; each ``reset()``
     after it starts the next. The ``info`` of an episode's last step holds its measures (``success``, ``is_success``,
-    ``steps``, ``shortest_km``, ``length_km``, ``navigation_error_km``, ``spl``); otherwise it is empty.
+    ``steps``, ``shortest_km``, ``length_km``, ``navigation_error_km``, ``path_efficiency``, ``spl``); otherwise it is
+    empty.
 
     Args:
         render_mode: None, or ``"rgb_array"``: the track over the field's contours, ``(700, 700, 3)`` uint8.

@@ -193,7 +193,7 @@ Motion:
   of 0.1 m/s (chosen).
 - Low-cost: log to 10 % (chosen), current as for the ship.
 
-Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, any day of a month for the others (chosen).
+Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, 20 days of a month for the others (chosen).
 """
 
 
