@@ -66,14 +66,15 @@ def save_tensors(content: Any, path: Path) -> None:
     _sync_folder(path.parent)
 
 
-def load_tensors(path: Path | str) -> Any:
+def load_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
     """Read a file of :func:`save_tensors` from any source: it runs no code and takes no more memory than disk space.
 
     Args:
         path: path of the file.
+        device: device of the tensors.
 
     Returns:
-        What was saved, with tensors on the CPU.
+        What was saved.
 
     Raises:
         DamagedFileError: naming the file and what is wrong with it.
@@ -99,7 +100,7 @@ def load_tensors(path: Path | str) -> Any:
         with zipfile.ZipFile(io.BytesIO(body)) as archive:
             if any(item.compress_type != zipfile.ZIP_STORED for item in archive.infolist()):
                 raise DamagedFileError(f"{path} is damaged: it holds compressed entries")
-        return torch.load(io.BytesIO(body), map_location="cpu", weights_only=True)
+        return torch.load(io.BytesIO(body), map_location=device, weights_only=True)
     except DamagedFileError:
         raise
     except Exception as error:  # whatever zipfile and torch raise for a foreign archive

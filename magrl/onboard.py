@@ -146,7 +146,7 @@ class Onboard:
             made = Kalman(*bounds, self.sensor_std, max_steps, bias=self.bias_std, search=False)
         elif made == "run_and_tumble":
             made = RunAndTumble(*bounds)
-        self.navigator: Any = copy.deepcopy(made)
+        self.navigator: Any = copy.deepcopy(made).cpu()
         self.name = type(self.navigator).__name__
         if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *DATA_SHEET, "step_count", "done"}):
             raise ValueError(f"{self.name} reads {', '.join(unknown)}, which a vehicle does not know")

@@ -279,6 +279,25 @@ def test_best_policy_is_the_best() -> None:
     assert other.weights["weight"].item() == 30
 
 
+def test_parts_get_their_state_on_the_device_of_the_training(tmp_path: Path) -> None:
+    """A replay buffer keeps the tensors that it is given."""
+
+    class Part:
+        given: dict[str, torch.Tensor]
+
+        def state_dict(self) -> dict[str, torch.Tensor]:
+            return {"x": torch.ones(2)}
+
+        def load_state_dict(self, state_dict: dict[str, torch.Tensor]) -> None:
+            self.given = state_dict
+
+    checkpoints = Checkpoints(tmp_path, {"part": (part := Part())})
+    checkpoints.save(1)
+    for device in ("meta", "cpu"):
+        checkpoints.load(device)
+        assert part.given["x"].device.type == device
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_check_finite_names_key_and_vehicles(value: float) -> None:
     batch = TensorDict(

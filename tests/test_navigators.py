@@ -351,6 +351,16 @@ def test_bad_options_are_refused_with_their_value() -> None:
             Secant(**options)
 
 
+@pytest.mark.parametrize("name", ["anywhere", "secant", "kalman", "map_matching"])
+def test_navigators_are_on_the_device_of_their_environment(env, name: str, monkeypatch) -> None:
+    few = GeomagneticNavEnv(env.scenario, num_envs=2, seed=0)
+    navigator = make_navigator(name, few)
+    assert {x.device.type for x in (*navigator.parameters(), *navigator.buffers())} == {"cpu"}
+    monkeypatch.setattr(GeomagneticNavEnv, "device", torch.device("meta"))
+    navigator = make_navigator(name, few)
+    assert {x.device.type for x in (*navigator.parameters(), *navigator.buffers())} == {"meta"}
+
+
 def test_a_pair_is_two(env) -> None:
     with pytest.raises(ValueError, match="B_H"):
         ParallelApproach(env.field, pair=("D", "I", "B_H"))

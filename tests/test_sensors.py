@@ -301,6 +301,14 @@ def test_levels_and_readings_take_different_random_numbers() -> None:
     assert torch.corrcoef(both.T)[:3, 3:].abs().max() < 4.5 / math.sqrt(1000)
 
 
+def test_errors_continue_on_another_device() -> None:
+    """As after a resume: a checkpoint gives the streams on its own device."""
+    env = TransformedEnv(nav(3), RandomSensorNoise(seed=3))
+    env.reset()
+    noise, other = env.transform, torch.device("meta")
+    assert noise._next_episode(TensorDict(), torch.Size([3]), other).device == noise.streams.device == other
+
+
 def test_own_levels() -> None:
     env = TransformedEnv(nav(3), RandomSensorNoise(lambda u: torch.cat((u, u + 1, 0 * u), -1), draws=1))
     std = env.reset()["sensor_std"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 from dataclasses import replace
 from pathlib import Path
@@ -132,7 +133,7 @@ def write_step(path: Path | str, policy: FieldPolicy) -> None:
     """
     if Path(path).suffix != ".pt2":
         raise ValueError(f"a file for torch.export.load must end with .pt2, got {str(path)!r}")
-    module = VehicleStep(policy).eval()
+    module = VehicleStep(copy.deepcopy(policy).cpu()).eval()
     examples = torch.zeros(3), torch.ones(3), torch.zeros(2), torch.zeros(2, 3)
     with torch.no_grad():
         exported = torch.export.export(module, (*examples, *first_state()), strict=False)

@@ -142,7 +142,7 @@ class GeomagneticNavEnv(EnvBase):
         field = scenario.build_field(self.max_move_km + self.drift_km)
         self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
         self.field = field
-        if isinstance(field, torch.nn.Module):  # the scenario's own stays where it is
+        if isinstance(field, torch.nn.Module):  # that of the scenario stays where it is
             held = (*field.parameters(), *field.buffers())
             self.field = copy.deepcopy(field).to(self.device) if any(x.device != self.device for x in held) else field
 

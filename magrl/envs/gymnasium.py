@@ -33,7 +33,7 @@ Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
 def _box(*specs: TensorSpec) -> spaces.Space[Any]:
     """Return the space of one vehicle, from the specs that are concatenated in an array."""
-    low, high = (torch.cat([_bound(spec, end) for spec in specs]).cpu().numpy() for end in ("low", "high"))
+    low, high = (torch.cat([_bound(spec, end).cpu() for spec in specs]).numpy() for end in ("low", "high"))
     return spaces.Box(low, high, dtype=np.float32)
 
 

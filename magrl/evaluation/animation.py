@@ -56,7 +56,7 @@ def way_ellipse(position: Tensor, way: Tensor, covariance: Tensor, deviations: f
     check_tensor(2, 2, covariance=covariance)
     check_number(0, above=True, deviations=deviations)
     check_number(2, whole=True, points=points)
-    angle = torch.linspace(0, 2 * math.pi, points, dtype=torch.float64)
+    angle = torch.linspace(0, 2 * math.pi, points, dtype=torch.float64, device=way.device)
     values, axes = torch.linalg.eigh(covariance.double())
     circle = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
     ends = way.double() + deviations * (circle * values.clamp_min(0).sqrt()) @ axes.mT
@@ -111,7 +111,7 @@ def _frames(
     rollout: TensorDictBase, field: FieldModel, region: Region, title: str, width_px: int
 ) -> Iterator[Image.Image]:
     """Yield the frames; the estimate is that at the last reading."""
-    states = rollout[0]
+    states = rollout[0].cpu()
     distance = geodesic(*states["start_position"][0], *states["target_position"][0])[0].item()
     figure, _ = flight_map(rollout, field, region, title, estimates(states, SHOWN * distance))
     track = episode_tracks(rollout, region)[0].numpy()

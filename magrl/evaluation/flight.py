@@ -111,6 +111,7 @@ def flight_figure(rollout: TensorDictBase, field: FieldModel, region: Region, ti
         >>> flight_figure(env.rollout(3), env.field, env.region).axes[0].get_ylabel()
         'latitude [° N]'
     """
+    rollout = rollout.cpu()
     figure, path = flight_map(rollout, field, region, title)
     axes, states = figure.axes[0], rollout[0, 1:]
     if "way" in states.keys():  # noqa: SIM118 - a TensorDict is no mapping
@@ -148,6 +149,7 @@ def flight_map(
     check_type(TensorDictBase, rollout=rollout)
     if rollout.ndim != 2 or len(rollout) != 1:
         raise ValueError(f"a rollout must be of one vehicle, (1, T), got {tuple(rollout.shape)}")
+    rollout = rollout.cpu()
     start, target = rollout["start_position"][0, 0], rollout["target_position"][0, 0]
     path = region.unwrapped(torch.cat((start[None], rollout["next", "position"][0])))
     way, ends = region.unwrapped(shortest_path(start, target)), region.unwrapped(torch.stack((start, target)))

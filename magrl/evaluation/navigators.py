@@ -104,7 +104,7 @@ def make_navigator(
         # one that reads its own track is told what counts as arrived
         if isinstance(policy, FieldPolicy) and isinstance(view := policy.config.view, TrackView):
             view = replace(view, zeta=env.zeta, search=env.arrival.rule == "objective")
-            policy = FieldPolicy(replace(policy.config, view=view), policy.actor)
+            policy = FieldPolicy(replace(policy.config, view=view), policy.actor).to(env.device)
             policy.noise_std = noise
         try:
             policy.check_fits(env)
@@ -115,9 +115,9 @@ def make_navigator(
         return METAHEURISTICS[name](env, own_mode or mode, seed)
     if name in NAVIGATORS and not run and not own_mode:
         if name == "kalman":
-            return NAVIGATORS[name](env, mode, seed, noise, bias=bias)
+            return NAVIGATORS[name](env, mode, seed, noise, bias=bias).to(env.device)
         options = {"map_date": map_date} if name == "map_matching" else {}
-        return NAVIGATORS[name](env, mode, seed, tuple(map(math.hypot, noise, bias)), **options)
+        return NAVIGATORS[name](env, mode, seed, tuple(map(math.hypot, noise, bias)), **options).to(env.device)
     trained_names = [f"{trained}=RUN" for trained in TRAINED if trained != OWN]
     known = ", ".join([*PRETRAINED, *trained_names, "policy:NAME=FILE", *NAVIGATORS, *METAHEURISTICS])
     raise ValueError(f"unknown navigator {text!r}: choose from {known}")

@@ -75,7 +75,7 @@ def probability_within(way: Tensor, covariance: Tensor, radius_km: float) -> flo
     check_tensor(2, 2, covariance=covariance)
     check_number(0, above=True, radius_km=radius_km)
     values, axes = torch.linalg.eigh(covariance.double())
-    ends = way.double() + (_normal()[:, :2] * values.clamp_min(0).sqrt()) @ axes.mT
+    ends = way.double() + (_normal()[:, :2].to(way.device) * values.clamp_min(0).sqrt()) @ axes.mT
     return (ends.norm(dim=-1) <= radius_km).double().mean().item()
 
 

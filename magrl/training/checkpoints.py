@@ -10,6 +10,7 @@ import warnings
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -108,8 +109,11 @@ class Checkpoints:
             old.unlink()
         return path
 
-    def load(self) -> int:
+    def load(self, device: torch.device | str = "cpu") -> int:
         """Restore every part from the newest valid file, and warn of damaged ones.
+
+        Args:
+            device: device of the tensors that the parts are given; a replay buffer keeps them.
 
         Returns:
             Frames collected when the checkpoint was saved.
@@ -120,7 +124,7 @@ class Checkpoints:
         """
         for path in reversed(self.files()):
             try:
-                content = read_checkpoint(path)
+                content = read_checkpoint(path, device)
             except DamagedFileError as error:
                 warnings.warn(f"{error}; trying the previous checkpoint", stacklevel=2)
                 continue
@@ -145,11 +149,12 @@ class Checkpoints:
             self.folder.rmdir()
 
 
-def read_checkpoint(path: Path | str) -> dict[str, Any]:
+def read_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Read a checkpoint, after verifying the checksum of the file.
 
     Args:
         path: path of the file.
+        device: device of the tensors.
 
     Returns:
         ``format``, ``frames`` and ``parts``.
@@ -166,7 +171,7 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
         >>> content["frames"], list(content["parts"])
         (100, ['layer'])
     """
-    content = load_tensors(path)
+    content = load_tensors(path, device)
     if not isinstance(content, dict) or set(content) != {"format", "frames", "parts"}:
         raise DamagedFileError(f"{path} is not a checkpoint: it must hold format, frames and parts")
     if content["format"] != CHECKPOINT_FORMAT:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
+import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
@@ -46,17 +47,19 @@ def make_collector(
         options |= {"track_traj_ids": False, "auto_register_policy_transforms": False}
         return Collector(env, policy, return_same_td=True, **options)  # a batch is used before the next one is made
     if backend == "ray":
-        options |= {"backend_options": _ray_options(env)}
+        options |= {"backend_options": _ray_options(env, len(workers))}
     return Collector(list(workers), policy, backend=backend, sync=True, **options)
 
 
-def _ray_options(env: EnvBase) -> dict[str, Any]:
-    """Return options for one CPU per worker, and the module path on which workers find the recipe."""
+def _ray_options(env: EnvBase, workers: int) -> dict[str, Any]:
+    """Return options for one CPU and a share of the GPUs per worker, and the path on which workers find the recipe."""
     path = os.pathsep.join(filter(None, (*sys.path[:1], os.environ.get("PYTHONPATH"))))
     cluster: dict[str, Any] = {"log_to_driver": False, "include_dashboard": False}
     cluster["runtime_env"] = {"env_vars": {"PYTHONPATH": path}}
+    on_gpu = env.device is not None and env.device.type == "cuda"
+    gpus = min(1.0, torch.cuda.device_count() / workers) if on_gpu else 0
     return {
-        "remote_configs": {"num_cpus": 1, "num_gpus": int(env.device is not None and env.device.type == "cuda")},
+        "remote_configs": {"num_cpus": 1, "num_gpus": gpus},
         "ray_init_config": cluster,
     }
 

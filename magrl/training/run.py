@@ -179,7 +179,7 @@ class Run:
         self.checkpoints.parts["run"] = self.log
         if resumed:
             try:
-                self.checkpoints.load()
+                self.checkpoints.load(env.device or "cpu")
             except (ValueError, FileNotFoundError) as error:
                 raise UsageError(f"cannot resume: {error}") from error
         self._exits.callback(self.log.close)

@@ -82,6 +82,7 @@ class EpisodeErrors(ObservationTransform):
         if self.streams is None or self.streams.shape != batch:
             vehicle = torch.arange(batch.numel(), device=device).reshape(batch)
             self.streams = counter_stream(self.seed, torch.stack((vehicle, torch.full_like(vehicle, self.channel)), -1))
+        self.streams = self.streams.to(device)  # a checkpoint may come from another one
         stream = split(self.streams)
         mask = tensordict.get("_reset", None)
         # Advanced out of place: a checkpoint may hold the old tensor.
