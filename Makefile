@@ -160,7 +160,7 @@ FAST_RUNS := runs/td3_gradient_guided-fast-one-thread-seed0 runs/td3-fast-seed0
 COMPARED := gg_td3=$(word 1,$(PAPER_RUNS)) td3=$(word 2,$(PAPER_RUNS)) \
   "policy:Gradient-Guided TD3, preset fast=$(word 1,$(FAST_RUNS))/policy.pt" \
   "policy:TD3, preset fast=$(word 2,$(FAST_RUNS))/policy.pt"
-paper-run: $(foreach run,$(PAPER_RUNS) $(FAST_RUNS),$(run)/eval.json)  ## train both agents of Table 1 whole; some six hours on two cores (make -j2)
+paper-run: $(foreach run,$(PAPER_RUNS) $(FAST_RUNS),$(run)/eval.json)  ## train both agents of Table 1 whole; three to six hours on two cores (make -j2)
 	$(RECIPE)/tables/paper_run.py "Gradient-Guided TD3=$(word 1,$(PAPER_RUNS))" "TD3=$(word 2,$(PAPER_RUNS))" \
 	  "Gradient-Guided TD3, preset fast=$(word 1,$(FAST_RUNS))" "TD3, preset fast=$(word 2,$(FAST_RUNS))" \
 	  --figure docs/figures/paper-run.png > docs/results/paper-run.md
