@@ -35,6 +35,41 @@ WGS84_B_KM = WGS84_A_KM * (1 - WGS84_F)
 """Semi-minor axis of the WGS84 ellipsoid [km]."""
 
 
+def displaced(distance: Tensor, heading: Tensor, error: Tensor) -> Tensor:
+    """Return the displacement of a move with an error.
+
+    Args:
+        distance: ``(...)`` distance of the move [km].
+        heading: ``(...)`` its heading [rad, clockwise from true north].
+        error: ``(..., 2)`` what is added to it, northward and eastward [km].
+
+    Returns:
+        ``(..., 2)`` northward and eastward [km].
+
+    Example:
+        >>> displaced(torch.tensor(3.0), torch.tensor(0.0), torch.tensor([0.0, 4.0]))
+        tensor([3., 4.])
+    """
+    check_tensor(distance=distance, heading=heading)
+    check_tensor(2, error=error)
+    return distance.unsqueeze(-1) * torch.stack((torch.cos(heading), torch.sin(heading)), -1) + error
+
+
+def polar(displacement: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distance [km] and the heading [rad, clockwise from true north] of a displacement.
+
+    Args:
+        displacement: ``(..., 2)`` northward and eastward [km].
+
+    Example:
+        >>> polar(torch.tensor([0.0, 4.0]))
+        (tensor(4.), tensor(1.5708))
+    """
+    check_tensor(2, displacement=displacement)
+    north, east = displacement.unbind(-1)
+    return torch.hypot(north, east), torch.atan2(east, north)
+
+
 def wrap_angle(angle: Tensor) -> Tensor:
     """Wrap an angle to the half-open turn (-pi, pi].
 

@@ -6,7 +6,6 @@ from magrl.agents.policy import FieldPolicy, PolicyConfig, load_policy, save_pol
 from magrl.agents.pretrained import load_pretrained
 from magrl.agents.recurrent import RecurrentTD3Loss, make_recurrent_actor, recurrent_transforms
 from magrl.agents.td3 import SoftUpdate, TD3Loss, optimize, saturation_penalty
-from magrl.agents.vehicle_step import VehicleStep, first_state, write_step
 
 __all__ = [
     "ExportedPolicy",
@@ -15,9 +14,7 @@ __all__ = [
     "RecurrentTD3Loss",
     "SoftUpdate",
     "TD3Loss",
-    "VehicleStep",
     "export_policy",
-    "first_state",
     "load_policy",
     "load_pretrained",
     "make_actor",
@@ -27,5 +24,4 @@ __all__ = [
     "recurrent_transforms",
     "saturation_penalty",
     "save_policy",
-    "write_step",
 ]

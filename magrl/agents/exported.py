@@ -21,7 +21,7 @@ from magrl.agents.program import TensorProgram, export_module, trace_program
 from magrl.checks import check_finite, check_type
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.transforms import ObservationView
-from magrl.transforms.errors import EpisodeErrors
+from magrl.transforms.errors.base import EpisodeErrors
 
 READ_KEYS = (*PUBLIC_KEYS, "step_count")
 """Keys of the plain environment that an exported policy may read."""

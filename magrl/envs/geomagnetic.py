@@ -27,7 +27,8 @@ from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array, track_re
 from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import RegionTasks, Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
-from magrl.geodesy import move, wrap_angle
+from magrl.geodesy import displaced, move, polar, wrap_angle
+from magrl.transforms.errors.motion import DISPLACEMENT
 from magrl.transforms.view import ObservationView
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")
@@ -50,7 +51,9 @@ class GeomagneticNavEnv(EnvBase):
         num_envs: number of vehicles in the batch.
         max_steps: moves after which an episode is truncated; by default that of the scenario, or 50.
         max_move_km: longest move [km]; by default that of the scenario, or 50. Likewise the options with a value below:
-        drift_km: how much farther a :class:`~magrl.transforms.MotionError` may carry a vehicle [km].
+        drift_km: how much farther than its command a :class:`~magrl.transforms.MotionError` may carry a vehicle [km].
+            Above 0, the key ``displacement`` ``(N, 2)`` holds what such an error adds to a move, northward and eastward
+            [km].
         max_turn_rad: largest turn to either side before a move [rad], pi / 2.
         zeta: arrival threshold on the objective, below 3, its largest value at the start; 0.01.
         arrival: ``"objective"`` for the paper's rule; ``"distance"`` for arrival within ``arrival_radius_km``; or
@@ -183,8 +186,9 @@ class GeomagneticNavEnv(EnvBase):
     def _make_specs(self, box: Region | Regions) -> None:
         bounds = specs.field_bounds(self.field, box, self.device)
         many = len(self.region) if self.many else None
-        limits = self.max_move_km + self.drift_km, self.max_turn_rad
-        observation = specs.observation_spec(self.num_envs, bounds, *limits, many, self.arrival.declared)
+        limits = self.max_move_km, self.max_turn_rad
+        declared, drift = self.arrival.declared, self.drift_km
+        observation = specs.observation_spec(self.num_envs, bounds, *limits, many, declared, drift)
         self.observation_spec = observation.to(self.device)
         self.state_spec = specs.state_spec(self.observation_spec)
         self.action_spec = specs.bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
@@ -243,6 +247,7 @@ class GeomagneticNavEnv(EnvBase):
                 **flags,
                 **({specs.REGION: index[0].unsqueeze(-1)} if index else {}),
                 **({specs.DECLARED: flags["done"].clone()} if self.arrival.declared else {}),
+                **({DISPLACEMENT: zeros} if self.drift_km else {}),
             },
             batch_size=vehicle.shape,
             device=self.device,
@@ -263,12 +268,15 @@ class GeomagneticNavEnv(EnvBase):
     # Step
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = specs.checked_action(tensordict["action"], self.action_low, self.action_high, self.drift_km)
+        action = specs.checked_action(tensordict["action"], self.action_low, self.action_high)
         distance, turn = action[:, :2].unbind(-1)
         before = tensordict["position"]
         heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
         index = (tensordict[specs.REGION].squeeze(-1),) if self.many else ()
-        moved = torch.stack(move(before[:, 0], before[:, 1], heading, distance), -1)
+        course = heading
+        if self.drift_km:
+            distance, course = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
+        moved = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
         was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), *index).unbind(0)
         position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
         lost = ~(was_inside & is_inside)
@@ -306,6 +314,7 @@ class GeomagneticNavEnv(EnvBase):
                 "truncated": truncated,
                 **({specs.REGION: tensordict[specs.REGION]} if index else {}),
                 **({specs.DECLARED: ended} if self.arrival.declared else {}),
+                **({DISPLACEMENT: tensordict[DISPLACEMENT]} if self.drift_km else {}),
             },
             batch_size=tensordict.batch_size,
             device=self.device,

@@ -25,7 +25,7 @@ from torchrl.envs import CatTensors, TransformedEnv
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.envs.measures import path_measures
 from magrl.envs.navigation import check_choice, navigation_env
-from magrl.transforms.errors import EpisodeErrors
+from magrl.transforms.errors.base import EpisodeErrors
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]

@@ -11,6 +11,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from magrl.envs.region import Region
 from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
+from magrl.transforms.errors.motion import DISPLACEMENT
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Terms whose sum is ``reward``."""
@@ -28,6 +29,7 @@ STATE_KEYS = (
     "objective",
     "objective_weights",
     REGION,
+    DISPLACEMENT,
 )
 """Keys that a step reads: the state of an episode."""
 
@@ -104,6 +106,7 @@ def observation_spec(
     max_turn_rad: float,
     num_regions: int | None = None,
     declared: bool = False,
+    drift_km: float = 0.0,
 ) -> Composite:
     """Return the spec of what a step observes, privileged keys included.
 
@@ -114,6 +117,8 @@ def observation_spec(
         max_turn_rad: largest turn [rad].
         num_regions: number of regions, of which ``region`` is the index; None without that key.
         declared: whether there is the flag ``declared``.
+        drift_km: how much farther than its command errors of motion may carry a vehicle [km]; above 0, there is the key
+            ``displacement``.
 
     Example:
         >>> observation_spec(4, (torch.zeros(3), torch.ones(3)), 50.0, 1.5)["field"].shape
@@ -123,6 +128,8 @@ def observation_spec(
     highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
     more = {} if num_regions is None else {REGION: Bounded(0, num_regions - 1, (num_envs, 1), dtype=torch.int64)}
     more |= {DECLARED: _flag(num_envs)} if declared else {}
+    reach = 2 * max_move_km + drift_km  # from the end of a commanded move to that of a true one
+    more |= {DISPLACEMENT: Bounded(-reach, reach, (num_envs, 2), dtype=torch.float64)} if drift_km else {}
     return Composite(
         field=bounded(num_envs, low, high),
         target_field=bounded(num_envs, low, high),
@@ -140,14 +147,13 @@ def observation_spec(
     )
 
 
-def checked_action(action: Tensor, low: Tensor, high: Tensor, drift_km: float = 0.0) -> Tensor:
+def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Return actions in float64, rounded into their bounds.
 
     Args:
         action: ``(N, 2)`` distance [km], turn [rad]; ``(N, 3)`` where an arrival is declared.
         low: ``(2,)`` or ``(3,)`` lowest.
         high: ``(2,)`` or ``(3,)`` highest.
-        drift_km: how much farther than the highest distance errors of motion may carry a vehicle [km].
 
     Raises:
         ValueError: naming the vehicles whose action is not finite or beyond the bounds by more than rounding.
@@ -157,8 +163,6 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor, drift_km: float = 
         tensor([[50.,  0.]], dtype=torch.float64)
     """
     action = action.double()
-    if drift_km:
-        high = torch.cat((high[:1] + drift_km, high[1:]))
     slack = 1e-5 * (high - low)
     sound = (action >= low - slack) & (action <= high + slack)
     if torch.compiler.is_compiling() or action.is_cuda:

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from magrl import paper
 from magrl.checks import check_number, check_numbers, check_tensor, check_type
+from magrl.counters import counter_uniform
 from magrl.envs.region import MEAN_RADIUS_KM, PAPER_REGION, Region
 from magrl.envs.regions import Regions
 from magrl.geodesy import geodesic, move, wrap_angle, wrap_longitude
-from magrl.transforms.counters import counter_uniform
 
 TRIES_PER_ROUND = 8
 MAX_ROUNDS = 1000

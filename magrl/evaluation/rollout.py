@@ -20,7 +20,7 @@ from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.scenarios import with_declaration
 from magrl.navigators import Navigator
 from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
-from magrl.transforms.errors import EpisodeErrors
+from magrl.transforms.errors.base import EpisodeErrors
 
 
 def evaluate(

@@ -3,12 +3,11 @@
 from magrl.field.bank import FieldBank
 from magrl.field.crust import CrustedField, RandomCrust, crustal_spectrum
 from magrl.field.igrf import IGRF, Date, igrf_coefficients, parse_date
-from magrl.field.limits import check_earth_jump, check_earth_reading
 from magrl.field.model import FieldModel, elements_at, elements_gradient_at, elements_range
 from magrl.field.planets import random_planets
+from magrl.field.records import WEATHER, WeatherRecord, weather_record
 from magrl.field.regional import RegionalField
 from magrl.field.spherical import SphericalHarmonicField
-from magrl.field.weather import WEATHER, WeatherRecord, weather_record
 from magrl.field.wmmhr import WMMHR, wmmhr_coefficients
 
 __all__ = [
@@ -23,8 +22,6 @@ __all__ = [
     "RegionalField",
     "SphericalHarmonicField",
     "WeatherRecord",
-    "check_earth_jump",
-    "check_earth_reading",
     "crustal_spectrum",
     "elements_at",
     "elements_gradient_at",

@@ -187,7 +187,7 @@ class RunningEpisodes:
     """State of the running episodes of a collector, its environment and its transforms, and the collector's counts.
 
     TorchRL's collector leaves them out of its own ``state_dict``, so this class reads its private attributes
-    :data:`PRIVATE`, which ``tests/test_checkpoints.py`` guards against a change of TorchRL.
+    :data:`PRIVATE`, which ``tests/training/test_checkpoints.py`` guards against a change of TorchRL.
 
     Args:
         collector: collector in this process.

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from magrl.checks import check_type
@@ -66,6 +66,86 @@ class ObservationTransform(Transform):
         if key not in spec.keys(True, True):
             raise KeyError(f"{type(self).__name__} reads {key!r}, which is not among {sorted_keys(spec)}")
         return spec[key]
+
+
+class StatefulTransform(ObservationTransform):
+    """Base class of transforms that carry a state from step to step.
+
+    The state is in the TensorDict: it is reset by row, stored with the data, and resumed with them. A reset begins it,
+    and each step reads it from the TensorDict before the step. A subclass names its keys in :attr:`state_keys`, writes
+    it with everything else in :meth:`_begin` and :meth:`_advance`, and adds its specs in
+    ``transform_observation_spec``.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> class Odometer(StatefulTransform):
+        ...     state_keys = ["way"]
+        ...     def _begin(self, tensordict, values, mask):
+        ...         tensordict["way"] = values[0]
+        ...     def _advance(self, tensordict, values, state):
+        ...         tensordict["way"] = state[0] + values[0]
+        >>> step = TensorDict(way=torch.tensor([5.0]), next=TensorDict(move=torch.tensor([2.0])))
+        >>> Odometer(in_keys=["move"], out_keys=["way"])(step)["next", "way"]
+        tensor([7.])
+    """
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it."""
+        raise NotImplementedError
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:
+        """Write the first state; ``mask`` names the rows that are reset, None all of them."""
+        raise NotImplementedError
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        """Write the next state, given the values at ``in_keys`` after the step and the state before it."""
+        raise NotImplementedError
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        values = self._read(tensordict_reset)
+        if values is not None:
+            self._begin(tensordict_reset, values, tensordict.get("_reset", None))
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
+        if values is not None:
+            self._advance(next_tensordict, values, self._state(tensordict))
+        return next_tensordict
+
+    def _state(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Return the values at ``state_keys``; raise if one is missing."""
+        state = [tensordict.get(key, None) for key in self.state_keys]
+        missing = [key for key, value in zip(self.state_keys, state, strict=True) if value is None]
+        if missing:
+            raise KeyError(
+                f"{type(self).__name__} reads its state {missing}, which a reset writes: step from what reset() or "
+                f"step_mdp() returned; got {sorted_keys(tensordict)}"
+            )
+        return state
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Begin at a TensorDict of first values; on transitions, compute the step from the state at the root."""
+        if tensordict.get("next", None) is None:
+            return self._reset(tensordict, tensordict)
+        self._step(tensordict, tensordict["next"])
+        return tensordict
+
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Make the state part of the input, so that batched and parallel environments pass it to the next step."""
+        input_spec = super().transform_input_spec(input_spec)
+        if self.parent is None:
+            return input_spec
+        observed = self.transform_observation_spec(observed_spec(self).clone())
+        return with_state(input_spec, {key: observed[key] for key in self.state_keys})
+
+    @staticmethod
+    def _add(spec: Composite, like: TensorSpec, sizes: Mapping[NestedKey, tuple[int, ...]]) -> None:
+        """Add unbounded keys to an observation spec: their last dimensions follow the batch of another leaf."""
+        for key, size in sizes.items():
+            spec[key] = Unbounded((*like.shape[:-1], *size), device=like.device, dtype=like.dtype)
 
 
 def observed_spec(transform: Transform) -> Composite:

@@ -32,7 +32,7 @@ from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import check_distinct, label, make_navigator, needs
 from magrl.evaluation.plots import NAVIGATOR_COLORS
 from magrl.evaluation.tables import markdown_table
-from magrl.field.weather import WeatherRecord, weather_record
+from magrl.field.records import WeatherRecord, weather_record
 from magrl.files import check_writable
 from magrl.training import UsageError, command
 from magrl.transforms import CONDITIONS, Conditions, VectorErrors, conditions_named, with_conditions

@@ -1,0 +1,349 @@
+"""Navigation on board one vehicle: plain numbers in, a command out, without an environment.
+
+Angles are in degrees, clockwise from true north, distances in kilometers, and intensities in nanotesla.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose
+
+from magrl import tracking
+from magrl.agents import FieldPolicy, load_pretrained
+from magrl.checks import check_number, check_numbers, check_type
+from magrl.envs.geomagnetic import PUBLIC_KEYS
+from magrl.files import DamagedFileError, load_tensors, save_tensors
+from magrl.navigators import Kalman, RunAndTumble, Secant
+from magrl.onboard.limits import check_move, move_limits, out_of_range, view_of
+from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_jump, check_earth_reading
+from magrl.transforms import TrackGradient, TrackView
+from magrl.transforms.track_view import DATA_SHEET
+
+NAMED = ("anywhere", "secant", "kalman", "run_and_tumble")
+"""Navigators by name; any other is given as a module."""
+LONGEST_WAY_KM = 2500.0
+"""Estimated way beyond which an agent without a map is out of range: there its observation of the way saturates."""
+LOST_SURPRISE = 100.0
+"""Mean of the last surprises (:func:`magrl.tracking.surprise`) beyond which the readings do not fit the track. In
+simulation, it reached 5 with a right data sheet, and 31 under the conditions of an aircraft."""
+Values = tuple[float, ...]
+_SURPRISES, _LEAST_SURPRISES = 8, 4
+_FORMAT, _NOT_STARTED = 1, "the vehicle has no destination yet: call start(target) first"
+_OPTIONS = ("name", "sensor_std", "bias_std", "max_move_km", "max_turn_deg", "max_steps", "zeta", "arrival_km")
+_PLAIN = ("_step", "_steer", "_first", "_last", "_surprises")  # parts of the state that are numbers
+_STATES = ("state", "memory")  # attributes in which policies and navigators keep their state
+
+
+@dataclass(frozen=True)
+class Command:
+    """Hold the command of a step and the estimates of the destination.
+
+    Args:
+        distance_km: distance to move; 0 to stay and read again.
+        turn_deg: turn before the move, to the right.
+        heading_deg: heading after that turn, 0 to 360: what to steer.
+        way_km: estimated way to the destination, northward and eastward.
+        way_covariance_km2: its covariance, by rows.
+        confidence: estimated probability that the vehicle is at its destination.
+        stop: None, or ``"arrived"``, ``"lost"`` or ``"out of range"``; the vehicle is then told to stay.
+        reason: why to stop, as text.
+
+    Example:
+        >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
+        5.0
+    """
+
+    distance_km: float
+    turn_deg: float
+    heading_deg: float
+    way_km: tuple[float, float]
+    way_covariance_km2: tuple[tuple[float, float], tuple[float, float]]
+    confidence: float
+    stop: str | None = None
+    reason: str = ""
+
+    @property
+    def error_km(self) -> float:
+        """Root mean square error of the estimated way: the root of the trace of its covariance [km]."""
+        return math.sqrt(self.way_covariance_km2[0][0] + self.way_covariance_km2[1][1])
+
+
+class Onboard:
+    """A navigator on board one vehicle.
+
+    :meth:`start` takes the elements at the destination. The first :meth:`step` takes the reading at the start, every
+    later one what the vehicle did since the last step by its own log and compass, and the reading at the end of that
+    move. Each returns a :class:`Command`. A call that raises an error changes nothing: repeat it with right values.
+
+    Args:
+        navigator: ``"anywhere"`` for the pretrained agent, ``"secant"``, ``"kalman"`` or ``"run_and_tumble"``; or a
+            policy from :func:`magrl.load_policy`, or a navigator, of which the vehicle gets a copy.
+        sensor_std: standard deviations of the noise of D [deg], I [deg], B_H [nT], new in each reading.
+        bias_std: standard deviations of constant and slow errors of the same.
+        max_move_km: longest move; 50 km, or for a trained policy that of its training.
+        max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.
+        max_steps: moves after which the vehicle is lost.
+        zeta: arrival threshold on the objective F (Eq. 2-6).
+        arrival_km: distance that counts as arrived, in place of ``zeta``.
+        confidence: least estimated probability of arrival at which the vehicle stops.
+
+    Raises:
+        ValueError: for an option out of its range, an unknown navigator, one that reads more than the vehicle knows,
+            or moves that are shorter than those of a trained policy.
+
+    Example:
+        >>> vehicle = Onboard("secant", sensor_std=(0.02, 0.02, 2.0))
+        >>> vehicle.start((-11.6, 75.4, 13240.0))
+        >>> command = vehicle.step(3.5, 73.0, 15000.0, heading=290.0)
+        >>> round(command.distance_km, 1), command.heading_deg, command.stop
+        (6.1, 290.0, None)
+        >>> round(vehicle.step(3.4, 73.0, 14995.0, heading=290.0, distance=6.0).turn_deg, 3)
+        90.0
+    """
+
+    def __init__(
+        self,
+        navigator: str | TensorDictModuleBase = "anywhere",
+        *,
+        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
+        bias_std: Sequence[float] = (0.0, 0.0, 0.0),
+        max_move_km: float | None = None,
+        max_turn_deg: float | None = None,
+        max_steps: int = 120,
+        zeta: float = 0.01,
+        arrival_km: float | None = None,
+        confidence: float = 0.8,
+    ) -> None:
+        check_type((str, TensorDictModuleBase), navigator=navigator)
+        check_numbers(3, sensor_std=sensor_std, bias_std=bias_std)
+        check_number(0, sensor_std=min(sensor_std), bias_std=min(bias_std))
+        check_number(1, whole=True, max_steps=max_steps)
+        check_number(0, 3, above=True, zeta=zeta)
+        check_number(0, above=True, arrival_km=1.0 if arrival_km is None else arrival_km)
+        check_number(0, 1, above=True, confidence=confidence)
+        self.sensor_std, self.bias_std = tuple(map(float, sensor_std)), tuple(map(float, bias_std))
+        self.max_steps, self.zeta, self.arrival_km, self.confidence = max_steps, zeta, arrival_km, confidence
+        if isinstance(navigator, str) and navigator not in NAMED:
+            raise ValueError(f"unknown navigator {navigator!r}: choose from {', '.join(NAMED)}, or give a policy")
+        made: Any = load_pretrained("anywhere") if navigator == "anywhere" else navigator
+        known = None if isinstance(made, str) else made
+        self.max_move_km, self.max_turn_deg = move_limits(known, max_move_km, max_turn_deg)
+        bounds = self.max_move_km, math.radians(self.max_turn_deg)
+        if made == "secant":
+            made = Secant(*bounds, noise=tuple(map(math.hypot, self.sensor_std, self.bias_std)))
+        elif made == "kalman":
+            made = Kalman(*bounds, self.sensor_std, max_steps, bias=self.bias_std, search=False)
+        elif made == "run_and_tumble":
+            made = RunAndTumble(*bounds)
+        self.navigator: Any = copy.deepcopy(made).cpu()
+        self.name = type(self.navigator).__name__
+        if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *DATA_SHEET, "step_count", "done"}):
+            raise ValueError(f"{self.name} reads {', '.join(unknown)}, which a vehicle does not know")
+        self._adopt(zeta)
+        self.target: Any = None
+        self._estimates: Any = None
+
+    def _adopt(self, zeta: float) -> None:
+        """Take over the filter of an agent that has one, or make one."""
+        self._view = view = view_of(self.navigator)
+        self._track_agent = isinstance(view, TrackView)  # whether the agent makes the estimates
+        if isinstance(view, TrackView):  # it is told what counts as arrived
+            config = replace(self.navigator.config, view=replace(view, zeta=zeta, search=False))
+            self.navigator = FieldPolicy(config, self.navigator.actor)
+            self._observe, self._kept = self.navigator.observe, config.view.state_keys
+        else:
+            keys = ("field", "target_field", "move", "heading", *DATA_SHEET)
+            self._observe = Compose(TrackGradient(keys, range_km=1000.0, frame="vehicle"))
+            self._kept = ("track_mean", "track_covariance")
+
+    def start(self, target: Sequence[float]) -> None:
+        """Begin a way to the place with some elements: D [deg], I [deg], B_H [nT].
+
+        Raises:
+            ValueError: for elements that are not possible on the Earth, or beyond the range of the policy.
+        """
+        check_numbers(3, target=target)
+        declination, inclination, horizontal_intensity = target
+        check_earth_reading(declination, inclination, horizontal_intensity, what="the target")
+        if text := out_of_range(self._view, target):
+            raise ValueError(f"the target: {text}")
+        self.target = tuple(map(float, target))
+        self._step, self._estimates = 0, None
+        self._steer: float | None = None  # heading that the vehicle was to steer [deg]
+        self._first, self._last, self._surprises = Values(), Values(), Values()  # readings, the last with its course
+        for name in _STATES:
+            if hasattr(self.navigator, name):
+                setattr(self.navigator, name, [] if isinstance(getattr(self.navigator, name), list) else None)
+
+    def step(
+        self, declination: float, inclination: float, horizontal_intensity: float, heading: float, distance: float = 0.0
+    ) -> Command:
+        """Return what to do after a move.
+
+        Args:
+            declination: D at the end of the move [deg].
+            inclination: I there [deg].
+            horizontal_intensity: B_H there [nT].
+            heading: heading of the move [deg], -360 to 360; in the first step the heading at the start.
+            distance: length of the move [km]; 0 in the first step.
+
+        Raises:
+            RuntimeError: before :meth:`start`.
+            ValueError: for values that are not possible, naming the value and what would be right.
+        """
+        if self.target is None:
+            raise RuntimeError(_NOT_STARTED)
+        self._check((declination, inclination, horizontal_intensity), heading, distance)
+        reading = float(declination), float(inclination), float(horizontal_intensity)
+        course = math.remainder(math.radians(heading), 2 * math.pi)
+        turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
+        with torch.inference_mode():
+            observed, action = self._act(self._seen(reading, course, (distance, turn)))
+            self._first = self._first or reading
+            if self._last:
+                self._surprises = (*self._surprises, self._surprise(reading))[-_SURPRISES:]
+            self._last, self._step = (*reading, course), self._step + 1
+            command = self._command(observed, action, course)
+        self._steer = command.heading_deg
+        return command
+
+    def _check(self, reading: tuple[float, float, float], heading: float, distance: float) -> None:
+        """Raise unless a reading, a heading and a distance are possible, and possible together."""
+        check_earth_reading(*reading)
+        if not self._last:
+            if distance != 0:
+                raise ValueError(f"the first step takes the reading at the start: distance must be 0, got {distance!r}")
+            check_move(heading, distance, None, self.max_move_km)
+            if text := out_of_range(self._view, reading):
+                raise ValueError(f"the reading at the start: {text}")
+            return
+        check_move(heading, distance, self._steer, self.max_move_km)
+        check_earth_jump(self._last[:3], reading, distance, self.sensor_std)
+
+    def _seen(self, reading: Sequence[float], course: float, move: tuple[float, float]) -> TensorDict:
+        """Return what a policy reads, in a batch of one."""
+        rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
+        rows |= dict(zip(DATA_SHEET, (self.sensor_std, self.bias_std), strict=True))
+        seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
+        seen |= {"step_count": torch.tensor([[self._step]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
+        return TensorDict(seen, [1], device="cpu")
+
+    def _act(self, seen: TensorDict) -> tuple[TensorDictBase, tuple[float, float]]:
+        """Return the estimates, and distance [km] and turn [rad]; keep the state of the filter."""
+        before, now = self._estimates, seen.copy()
+        observed = self._observe(now) if before is None else self._observe(before.set("next", now))["next"]
+        self._estimates = observed.select(*self._kept)
+        if self._track_agent:  # FieldPolicy.forward would run its filter twice, for vehicles whose episode starts
+            action = self.navigator.act.denormalize("action", self.navigator.actor(observed)["action"])
+        else:
+            action = self.navigator(seen)["action"]
+        distance, turn = action[0].tolist()
+        return observed, (distance, turn)
+
+    @property
+    def _track(self) -> tracking.FieldTrack:
+        return tracking.FieldTrack(*(self._estimates[key][0] for key in ("track_mean", "track_covariance")))
+
+    def _surprise(self, reading: Sequence[float]) -> float:
+        """Return how badly the last reading fits the track, see :func:`magrl.tracking.surprise`."""
+        estimate = self._track.mean[0, 0].item() * tracking.ELEMENT_SCALES[0]
+        declination = reading[0] - 360 * round((reading[0] - estimate) / 360)
+        return tracking.surprise(self._track, (declination, *reading[1:]), self.sensor_std)
+
+    def _confidence(self, observed: TensorDictBase) -> float:
+        """Return the estimated probability that the vehicle is at its destination."""
+        if self.arrival_km is not None:
+            return tracking.probability_within(observed["way"][0], observed["way_covariance"][0], self.arrival_km)
+        variances = observed["track_covariance"][0, :, 0, 0].tolist()
+        known = zip(variances, tracking.ELEMENT_SCALES, self.sensor_std, self.bias_std, strict=True)
+        # A reading alone tells the field to within the noise of the sensor.
+        std = [math.hypot(min(math.sqrt(max(v, 0.0)) * unit, noise), bias) for v, unit, noise, bias in known]
+        here = observed["estimated_field"][0].tolist()
+        return tracking.probability_below(self._first, self.target, here, std, self.zeta)
+
+    def _command(self, observed: TensorDictBase, action: tuple[float, float], course: float) -> Command:
+        """Return the command, with the estimates northward and eastward."""
+        cos, sin = math.cos(course), math.sin(course)
+        (forward, right), ((ff, fr), (_, rr)) = observed["way"][0].tolist(), observed["way_covariance"][0].tolist()
+        north, east = cos * forward - sin * right, sin * forward + cos * right
+        ne = cos * sin * (ff - rr) + (cos * cos - sin * sin) * fr
+        nn = cos * cos * ff - 2 * cos * sin * fr + sin * sin * rr
+        ee = ff + rr - nn
+        confidence = self._confidence(observed)
+        stop, reason = self._stop(math.hypot(north, east), math.sqrt(nn + ee), confidence)
+        distance, turn = (0.0, 0.0) if stop else action
+        steer = math.degrees(course + turn) % 360.0
+        way = (north, east), ((nn, ne), (ne, ee))
+        return Command(distance, math.degrees(turn), steer, *way, confidence, stop, reason)
+
+    def _stop(self, way_km: float, error_km: float, confidence: float) -> tuple[str | None, str]:
+        """Return why to stop, and that as a sentence."""
+        level = sum(self._surprises) / max(len(self._surprises), 1)
+        if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
+            return "lost", f"readings deviate {level**0.5:.0f} times as much as expected: check sensors and compass"
+        if abs(self._last[1]) <= math.pi / 2 and tracking.steepest(self._track, 1) < EQUATOR_SLOPE_DEG:
+            return "lost", f"inclination {self._last[1]:g} hardly changes: it looks like radians; degrees are expected"
+        if text := out_of_range(self._view, self._last[:3]):
+            return "out of range", text
+        if self._track_agent and way_km - 2 * error_km > LONGEST_WAY_KM:
+            return "out of range", f"the way is {way_km:.0f} ± {error_km:.0f} km, the policy's {LONGEST_WAY_KM:g} km"
+        if confidence >= self.confidence:
+            rule = f"F < {self.zeta:g}" if self.arrival_km is None else f"within {self.arrival_km:g} km"
+            return "arrived", f"{rule} with an estimated probability of {confidence:.2f}"
+        if self._step > self.max_steps:
+            return "lost", f"{self.max_steps} moves without arrival"
+        return None, ""
+
+    def save(self, path: Path | str) -> None:
+        """Write the state of the way to a file, for :meth:`restore`.
+
+        Raises:
+            RuntimeError: before :meth:`start`.
+            OSError: if the file cannot be written.
+        """
+        if self.target is None:
+            raise RuntimeError(_NOT_STARTED)
+        kept = {name: getattr(self.navigator, name, None) for name in _STATES}
+        held = {name: value.to_dict() if isinstance(value, TensorDictBase) else value for name, value in kept.items()}
+        state = {name: getattr(self, name) for name in ("target", *_PLAIN)}
+        state["_estimates"] = None if self._estimates is None else self._estimates.to_dict()
+        save_tensors({"format": _FORMAT, "options": self._options(), "state": state, "navigator": held}, Path(path))
+
+    def restore(self, path: Path | str) -> None:
+        """Resume from a file of :meth:`save`: the same readings give the same commands, bit for bit.
+
+        Raises:
+            ValueError: for a file that is damaged, of another format, or of a vehicle with other options.
+        """
+        content = load_tensors(path)
+        parts = {"format", "options", "state", "navigator"}
+        if not isinstance(content, dict) or set(content) != parts or content["format"] != _FORMAT:
+            raise DamagedFileError(f"{path} is not the state of a vehicle of format {_FORMAT}")
+        options = self._options()
+        if other := [name for name in options if content["options"].get(name) != options[name]]:
+            raise ValueError(f"{path} is of a vehicle with another {other[0]}, {content['options'].get(other[0])!r}")
+        self.start(content["state"]["target"])
+        for name in _PLAIN:
+            setattr(self, name, content["state"][name])
+        if content["state"]["_estimates"] is not None:
+            self._estimates = TensorDict(content["state"]["_estimates"], [1], device="cpu")
+        for name, value in content["navigator"].items():
+            held = TensorDict(value, [1], device="cpu") if isinstance(value, dict) else value
+            if held is not None:
+                setattr(self.navigator, name, held)
+
+    def _options(self) -> dict[str, Any]:
+        """Return what a state depends on."""
+        weights = [value for value in self.navigator.state_dict().values() if isinstance(value, torch.Tensor)]
+        digest = hashlib.sha256(b"".join(value.cpu().numpy().tobytes() for value in weights)).hexdigest()
+        return {name: getattr(self, name) for name in _OPTIONS} | {"weights": digest}

@@ -1,0 +1,241 @@
+"""Conditions that vehicles navigate in: the errors of sensors, north reference and motion, and weather, as presets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from magrl.checks import check_number, check_type
+from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
+from magrl.transforms.errors.motion import MotionError
+from magrl.transforms.errors.north import NorthReferenceError, north_reference
+from magrl.transforms.errors.sensors import SensorErrors
+from magrl.transforms.errors.vector import VectorErrors
+from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Errors under which a vehicle navigates: of its sensors, its north reference and its motion, and the weather.
+
+    Args:
+        name: name for messages and tables.
+        speed_km_h: speed of the vehicle [km/h], for currents, the drift of a gyrocompass and the weather.
+        sensors: options of :class:`~magrl.transforms.SensorErrors`.
+        north: unit of :data:`~magrl.transforms.NORTH_REFERENCES`, or options of
+            :class:`~magrl.transforms.NorthReferenceError`; None without an error.
+        motion: options of :class:`~magrl.transforms.MotionError`; None without an error.
+        weather: options of :class:`~magrl.transforms.MagneticWeather`; None without weather.
+
+    Raises:
+        ValueError: for an option that is out of its range, or an unknown unit or record.
+        TypeError: for an option that the part does not have.
+
+    Example:
+        >>> ship = Conditions("ship", 24.0, sensors={"std": (0.02, 0.02, 5.0)}, north={"constant_deg": 0.1})
+        >>> ship.sensor_std, ship.bias_std
+        ((0.02, 0.02, 5.0), (0.1, 0.0, 0.0))
+    """
+
+    name: str
+    speed_km_h: float = SPEEDS_KM_H["ship"]
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+    north: str | Mapping[str, Any] | None = None
+    motion: Mapping[str, Any] | None = None
+    weather: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        check_type(str, name=self.name)
+        self.transforms()  # an error before they are used
+
+    @property
+    def perfect(self) -> bool:
+        """Whether there is no error."""
+        return not self.sensors and self.north is None and self.motion is None and self.weather is None
+
+    def transforms(self, seed: int = 0) -> list[EpisodeErrors]:
+        """Return the errors as transforms, in the order of an environment; see :func:`with_conditions`.
+
+        Args:
+            seed: seed of the errors.
+
+        Example:
+            >>> [type(part).__name__ for part in CONDITIONS["aircraft"].transforms()]
+            ['MotionError', 'MagneticWeather', 'SensorErrors', 'NorthReferenceError']
+        """
+        motion = [] if self.motion is None else [self._motion(seed)]
+        return [*motion, *self._readings(seed)]
+
+    def _motion(self, seed: int = 0) -> MotionError:
+        return MotionError(**(self.motion or {}), speed_km_h=self.speed_km_h, seed=seed)
+
+    def _readings(self, seed: int = 0) -> list[MagneticWeather | SensorErrors | NorthReferenceError]:
+        """Return the errors of the readings, in the order in which they arise."""
+        parts: list[MagneticWeather | SensorErrors | NorthReferenceError] = [SensorErrors(**self.sensors, seed=seed)]
+        if self.weather is not None:
+            parts.insert(0, MagneticWeather(**self.weather, speed_km_h=self.speed_km_h, seed=seed))
+        if isinstance(self.north, str):
+            parts.append(north_reference(self.north, speed_km_h=self.speed_km_h, seed=seed))
+        elif self.north is not None:
+            parts.append(NorthReferenceError(**self.north, seed=seed))
+        return parts
+
+    def drift_km(self, max_move_km: float) -> float:
+        """Return how much farther than a longest move the errors may carry a vehicle, rounded up [km].
+
+        Args:
+            max_move_km: longest move that a policy may command [km].
+
+        Raises:
+            ValueError: for a move that is not above 0.
+
+        Example:
+            >>> CONDITIONS["laboratory"].drift_km(50.0), CONDITIONS["ship"].drift_km(50.0)
+            (0.0, 4.0)
+        """
+        check_number(0, above=True, max_move_km=max_move_km)
+        if self.motion is None:
+            return 0.0
+        return float(max(0, math.ceil(self._motion().farthest_km(max_move_km) - max_move_km)))
+
+    @cached_property
+    def _told(self) -> list[tuple[float, ...]]:
+        reading = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
+        variances = zip(*(part.variances(reading) for part in self._readings()), strict=True)
+        return [tuple(round(std, 6) for std in sum(parts).sqrt().tolist()) for parts in variances]
+
+    @property
+    def sensor_std(self) -> tuple[float, ...]:
+        """Standard deviations of the errors that are new at each reading, at :data:`TYPICAL_FIELD`."""
+        return self._told[0]
+
+    @property
+    def bias_std(self) -> tuple[float, ...]:
+        """Standard deviations of the constant and the slow errors of the readings, at :data:`TYPICAL_FIELD`."""
+        return self._told[1]
+
+
+_CALIBRATED = VectorErrors(hard_iron_nt=(5.0,) * 3, soft_iron=((1e-4,) * 3,) * 3, attitude_deg=(0.01, 0.01))
+_MEMS = VectorErrors(hard_iron_nt=(30.0,) * 3, soft_iron=((5e-4,) * 3,) * 3, attitude_deg=(0.05, 0.05))
+_MONTH = {"record": "boulder-2016", "span_h": 480.0}
+
+CONDITIONS: Mapping[str, Conditions] = {
+    preset.name: preset
+    for preset in (
+        Conditions("laboratory"),
+        Conditions(
+            "aircraft",
+            SPEEDS_KM_H["aircraft"],
+            sensors={"std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            north="fiber-optic",
+            motion={"current_km_h": 2.1},
+            weather={"record": "quiet"},
+        ),
+        Conditions(
+            "ship",
+            SPEEDS_KM_H["ship"],
+            sensors={"std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            north="fiber-optic",
+            motion={"log_scale": 0.01, "current_km_h": 0.9},
+            weather={"record": "quiet", "span_h": 240.0},
+        ),
+        Conditions(
+            "underwater",
+            SPEEDS_KM_H["underwater"],
+            sensors={"std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            north="fiber-optic",
+            motion={"log_scale": 0.002, "current_km_h": 0.36, "eddies_km_h": 0.36, "eddy_km": 100.0},
+            weather=_MONTH,
+        ),
+        Conditions(
+            "low-cost",
+            SPEEDS_KM_H["ship"],
+            sensors={
+                "std": (0.2, 0.1, 75.0),
+                "resolution": (0.0, 0.0, 13.0),
+                "drift": (0.0, 0.0, 10.0),
+                "drift_length": 200.0,
+                "outage_rate": 0.02,
+                "vector": _MEMS,
+            },
+            north="low-cost",
+            motion={"log_scale": 0.05, "log_noise": 0.01, "current_km_h": 0.9},
+            weather=_MONTH,
+        ),
+    )
+}
+"""Presets. Limits of standards are read as two standard deviations; "chosen" is what has no source.
+
+Readings:
+
+- ``std``: chosen, the lowest level of noise of the published tables; it includes the vehicle's motion. Low-cost: roll
+  and pitch to 0.4 degrees root mean square (Moog Crossbow NAV440, data sheet rev. B), as a mean of 16 readings
+  (chosen), at :data:`TYPICAL_FIELD`.
+- Hard iron: 5 nT, the offset error of a fluxgate (Bartington Mag-03, data sheet), as what calibration leaves
+  (chosen); low-cost 30 nT (chosen). Soft iron: 1e-4 and 5e-4 (chosen).
+- Roll and pitch: 0.01 degrees (fiber-optic gyrocompass Octans, data sheet); low-cost 0.05 degrees constant (chosen).
+- Resolution 13 nT: PNI RM3100 at 200 cycles (support article of PNI). Drift and outages: chosen.
+
+North: see :data:`~magrl.transforms.NORTH_REFERENCES`.
+
+Motion:
+
+- Aircraft: inertial navigation to 2 nautical miles per hour for 95 % of flights (14 CFR part 121, appendix G), that is,
+  a constant error of the velocity with a root mean square of 2.1 km/h.
+- Ship: log to 2 % of the speed (IMO Resolution A.824(19), as amended by MSC.96(72)); current of half a knot (chosen).
+- Underwater: Doppler velocity log to 0.4 % (Teledyne RDI Workhorse Navigator, 300 kHz, data sheet); current and eddies
+  of 0.1 m/s (chosen).
+- Low-cost: log to 10 % (chosen), current as for the ship.
+
+Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, 20 days of a month for the others (chosen).
+"""
+
+
+def conditions_named(name: str) -> Conditions:
+    """Return a preset of :data:`CONDITIONS`.
+
+    Raises:
+        ValueError: for an unknown name, listing those known.
+
+    Example:
+        >>> conditions_named("aircraft").north
+        'fiber-optic'
+    """
+    if not isinstance(name, str) or name not in CONDITIONS:
+        raise ValueError(f"unknown conditions {name!r}: choose from {', '.join(CONDITIONS)}")
+    return CONDITIONS[name]
+
+
+def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -> EnvBase:
+    """Return an environment under conditions, or the environment itself if they have no error.
+
+    Args:
+        env: navigation environment; errors of motion need ``drift_km=conditions.drift_km(max_move_km)``.
+        conditions: conditions, or the name of a preset.
+        seed: seed of the errors.
+
+    Raises:
+        ValueError: for an unknown preset, or an environment that does not allow the farthest move.
+        TypeError: for another environment.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> aircraft = CONDITIONS["aircraft"]
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0, drift_km=aircraft.drift_km(50.0))
+        >>> sorted(set(with_conditions(env, aircraft).reset().keys()) & {"true_field", "sensor_std", "bias_std"})
+        ['bias_std', 'sensor_std', 'true_field']
+    """
+    conditions = conditions_named(conditions) if isinstance(conditions, str) else conditions
+    check_type(Conditions, conditions=conditions)
+    check_type(EnvBase, env=env)
+    if conditions.perfect:
+        return env
+    env = TransformedEnv(env, Compose(*conditions.transforms(seed)))
+    _ = env.action_spec  # an error before the first episode
+    return env

@@ -1,0 +1,290 @@
+"""Errors of motion: log, compass in motion, and currents. The vehicle goes elsewhere than it believes."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec, Unbounded
+
+from magrl.checks import check_number
+from magrl.counters import NORMAL_LIMIT, advanced, counter_stream, normal_of, stream_normal, stream_uniform
+from magrl.geodesy import displaced, local_frame, polar, wrap_angle
+from magrl.transforms.base import Keys, observed_spec, several_keys
+from magrl.transforms.errors.base import EpisodeErrors, check_sizes
+
+DISPLACEMENT = "displacement"
+"""Key of what an error of motion adds to a commanded move, northward and eastward [km] ``(..., 2)``."""
+EARTH_RADIUS_KM = 6371.0
+EDDIES = 8
+"""Number of waves of which a field of eddies is the sum."""
+
+
+class MotionError(EpisodeErrors):
+    """Move the vehicle elsewhere than it believes: errors of its log and of its compass in motion, and currents.
+
+    A policy chooses a distance and a turn, and believes that it moves so: ``move`` and ``heading`` are what was
+    commanded. On the ground the vehicle goes the distance times ``1 + scale + noise``, along its heading plus the
+    errors of the compass in motion, plus the current times the distance over the speed. The difference from the command
+    is written as ``displacement``, which the environment adds. The heading itself is right, so a declination measured
+    from it is, too; see :class:`~magrl.transforms.NorthReferenceError` for the contrary.
+
+    Sizes are standard deviations of normal errors, cut at four of them, so that the farthest move is known
+    (:meth:`farthest_km`). The environment must allow it: ``GeomagneticNavEnv(drift_km=...)``. Stands before every
+    transform of the action, such as its scaling.
+
+    Args:
+        log_scale: error of the log in an episode, as a share of the distance.
+        log_noise: error of the log in a move, as a share of the distance.
+        compass_deg: error of the compass in motion in an episode [deg].
+        heading_noise_deg: error of the compass in motion in a move [deg].
+        current_km_h: speed of a current whose direction is random in each episode [km/h].
+        eddies_km_h: root-mean-square speed of a field of eddies, another one in each episode [km/h]; see
+            :func:`eddy_velocity`. Its value at the start of a move holds for all of it.
+        eddy_km: wavelength of the eddies [km].
+        speed_km_h: speed of the vehicle through the water or the air [km/h]; needed with currents.
+        fixed: whether ``log_scale`` and ``compass_deg`` are the errors themselves, in every episode.
+        in_keys: last move ``(..., 2)``, distance [km] and turn [rad]; heading ``(..., 1)`` [rad]; and position
+            ``(..., 2)`` [deg].
+        true_keys: move of the environment ``(..., K)`` and direction of the true move ``(..., 1)`` [rad]. Privileged.
+        action_key: distance [km] and turn [rad] ``(..., 2)``; what follows is passed on.
+        error_key: errors of the episode: scale, compass [deg], direction of the current and phases of the eddies [rad].
+            Privileged.
+        stream_key: key of the state of the random numbers ``(..., 1)``, int64.
+        seed: seed of the errors.
+
+    Raises:
+        ValueError: for a negative size, errors of the log that could turn a move around, a current without a speed of
+            the vehicle, another number of keys, or an environment that does not allow the farthest move.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> errors = MotionError(log_scale=0.1, fixed=True)
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=1, seed=0, drift_km=5.0), errors)
+        >>> after = env.step(env.reset().set("action", torch.tensor([[50.0, 0.5]])))["next"]
+        >>> after["move"], after["true_move"]
+        (tensor([[50.0000,  0.5000]]), tensor([[55.0000,  0.5000]]))
+    """
+
+    channel = 4
+
+    def __init__(
+        self,
+        *,
+        log_scale: float = 0.0,
+        log_noise: float = 0.0,
+        compass_deg: float = 0.0,
+        heading_noise_deg: float = 0.0,
+        current_km_h: float = 0.0,
+        eddies_km_h: float = 0.0,
+        eddy_km: float = 200.0,
+        speed_km_h: float | None = None,
+        fixed: bool = False,
+        in_keys: Keys = ("move", "heading", "position"),
+        true_keys: Keys = ("true_move", "true_course"),
+        action_key: str = "action",
+        error_key: str = "motion_error",
+        stream_key: str = "motion_stream",
+        seed: int = 0,
+    ) -> None:
+        keys, true = several_keys(in_keys), several_keys(true_keys)
+        if len(keys) != 3 or len(true) != 2:
+            raise ValueError(
+                "MotionError takes 3 in_keys (move, heading, position) and 2 true_keys (move, course), "
+                f"got {keys} and {true}"
+            )
+        super().__init__(keys, keys[:2], stream_key=stream_key, seed=seed)
+        self.in_keys_inv = self.out_keys_inv = [action_key, keys[1]]
+        check_sizes(1, fixed=fixed, log_scale=(log_scale,), compass_deg=(compass_deg,))
+        check_number(0, log_noise=log_noise, heading_noise_deg=heading_noise_deg)
+        check_number(0, current_km_h=current_km_h, eddies_km_h=eddies_km_h)
+        check_number(0, above=True, eddy_km=eddy_km)
+        if current_km_h or eddies_km_h:
+            check_number(0, above=True, speed_km_h=speed_km_h)
+        self.log, self.turning = (log_scale, log_noise), (compass_deg, heading_noise_deg)
+        self.current_km_h, self.eddies_km_h, self.speed_km_h = current_km_h, eddies_km_h, float(speed_km_h or 1.0)
+        self.fixed, self.true_keys, self.action_key, self.error_key = fixed, true, action_key, error_key
+        shortest, _ = self._stretch
+        if shortest <= 0:
+            raise ValueError(f"log_scale {log_scale} and log_noise {log_noise} must keep every distance above 0")
+        self.register_buffer("_waves", eddy_waves(self.seed, eddy_km), persistent=False)
+        self.active = any((*self.log, *self.turning, current_km_h, eddies_km_h))
+
+    @property
+    def _stretch(self) -> tuple[float, float]:
+        """Smallest and largest ratio of a true distance through the water to its command."""
+        noise = NORMAL_LIMIT * self.log[1]
+        scale = (self.log[0],) * 2 if self.fixed else (-NORMAL_LIMIT * self.log[0], NORMAL_LIMIT * self.log[0])
+        return 1 + scale[0] - noise, 1 + scale[1] + noise
+
+    def farthest_km(self, max_move_km: float) -> float:
+        """Return the longest way on the ground of a commanded move [km].
+
+        Args:
+            max_move_km: longest move that a policy may command [km].
+
+        Raises:
+            ValueError: for a distance that is not above 0.
+
+        Example:
+            >>> MotionError(log_noise=0.01, current_km_h=3.0, speed_km_h=30.0).farthest_km(50.0)
+            57.00000000000001
+        """
+        check_number(0, above=True, max_move_km=max_move_km)
+        currents = self.current_km_h + math.sqrt(3 * EDDIES) * self.eddies_km_h
+        return max_move_km * (self._stretch[1] + currents / self.speed_km_h)
+
+    # Data
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        values = self._read(tensordict_reset)
+        if values is None:
+            return tensordict_reset
+        move, heading, _ = values
+        stream = self._next_episode(tensordict, tensordict_reset.batch_size, heading.device)
+        uniform = stream_uniform(stream, 3 + EDDIES)
+        constants = uniform.new_tensor((self.log[0], self.turning[0]))
+        constants = constants.expand_as(uniform[..., :2]) if self.fixed else constants * normal_of(uniform[..., :2])
+        errors = torch.cat((constants, 2 * math.pi * uniform[..., 2:]), -1)
+        tensordict_reset.set(self.error_key, errors.to(heading.dtype))
+        tensordict_reset.set(self.stream_key, advanced(stream, 3 + EDDIES).unsqueeze(-1))
+        return self._write(tensordict_reset, move, heading)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write what the errors add to the commanded move, which the environment adds."""
+        action, heading = (tensordict.get(key, None) for key in self.in_keys_inv)
+        if action is None or heading is None:
+            if self.missing_tolerance:
+                return tensordict
+            raise KeyError(f"MotionError reads {self.in_keys_inv}, one of which is missing")
+        if not self.active:
+            return tensordict
+        distance, turn = action[..., :2].double().unbind(-1)
+        return tensordict.set(DISPLACEMENT, self._error(tensordict, distance, wrap_angle(heading[..., 0] + turn)))
+
+    def _error(self, tensordict: TensorDictBase, distance: Tensor, bow: Tensor) -> Tensor:
+        """Return the way on the ground minus the commanded one, ``(..., 2)`` northward and eastward [km]."""
+        errors = self._written(tensordict, self.error_key).double()
+        scale, compass, direction = errors[..., :3].unbind(-1)
+        stretch, swing = stream_normal(self._written(tensordict, self.stream_key).squeeze(-1), 2).unbind(-1)
+        through = distance * (1 + scale + self.log[1] * stretch)
+        course = bow + torch.deg2rad(compass + self.turning[1] * swing)
+        way = through.unsqueeze(-1) * _unit(course) - distance.unsqueeze(-1) * _unit(bow)
+        hours = (distance / self.speed_km_h).unsqueeze(-1)
+        if self.current_km_h:
+            way = way + hours * self.current_km_h * _unit(direction)
+        if self.eddies_km_h:
+            position = self._written(tensordict, self.in_keys[2])
+            way = way + hours * self.eddies_km_h * eddy_velocity(position, self._waves, errors[..., 3:])
+        return way
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
+        if values is None:
+            return next_tensordict
+        stream, errors = (self._written(tensordict, key) for key in (self.stream_key, self.error_key))
+        next_tensordict.set(self.stream_key, advanced(stream, 2))
+        next_tensordict.set(self.error_key, errors)
+        move, heading, _ = values
+        if not self.active:
+            return self._write(next_tensordict, move, heading)
+        displacement = next_tensordict[DISPLACEMENT]
+        gone, course = polar(displaced(move[..., 0].double(), heading[..., 0].double(), displacement))
+        true_move = torch.stack((gone, move[..., 1].double()), -1).to(move.dtype)
+        true_course = torch.where(gone > 0, course, heading[..., 0]).unsqueeze(-1).to(heading.dtype)
+        return self._write(next_tensordict, true_move, true_course)
+
+    def _write(self, tensordict: TensorDictBase, move: Tensor, course: Tensor) -> TensorDictBase:
+        """Write the true move and its direction."""
+        return tensordict.set(self.true_keys[0], move).set(self.true_keys[1], course)
+
+    # Specs
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the true move, its direction, the errors and the state of the numbers."""
+        move, heading, position = (self._leaf(observation_spec, key) for key in self.in_keys)
+        if move.shape[-1:] != (2,) or heading.shape[-1:] != (1,) or position.shape[-1:] != (2,):
+            shapes = [tuple(leaf.shape) for leaf in (move, heading, position)]
+            raise ValueError(
+                f"MotionError needs a move (..., 2), a heading (..., 1), a position (..., 2), got {shapes}"
+            )
+        observation_spec[self.true_keys[0]] = Unbounded(move.shape, device=move.device, dtype=move.dtype)
+        observation_spec[self.true_keys[1]] = heading.clone()
+        of_errors = (*heading.shape[:-1], 3 + EDDIES)
+        observation_spec[self.error_key] = Unbounded(of_errors, device=heading.device, dtype=heading.dtype)
+        observation_spec[self.stream_key] = Unbounded(heading.shape, device=heading.device, dtype=torch.int64)
+        return observation_spec
+
+    @property
+    def _state_keys(self) -> list[NestedKey]:
+        return [*super()._state_keys, self.error_key]
+
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Make what a step reads part of the state, and check that the environment allows the farthest move.
+
+        Raises:
+            ValueError: if it does not, with the distance that is missing.
+        """
+        input_spec = super().transform_input_spec(input_spec)
+        if self.parent is None:
+            return input_spec
+        action = input_spec["full_action_spec"][self.action_key]
+        if self.active and isinstance(action, Bounded):
+            observed, commanded = observed_spec(self), float(action.space.high[..., 0].max())
+            known = DISPLACEMENT in observed.keys()  # noqa: SIM118 - a Composite is no mapping
+            allowed = float(observed[DISPLACEMENT].space.high.max()) - 2 * commanded if known else 0.0
+            drift = self.farthest_km(commanded) - commanded
+            if drift > allowed + 1e-6 * commanded:
+                raise ValueError(
+                    f"MotionError carries a vehicle up to {drift:.6g} km farther than its command, the environment "
+                    f"allows {allowed:.6g} km: create it with drift_km={math.ceil(100 * drift) / 100}"
+                )
+        return input_spec
+
+
+def eddy_waves(seed: int, wavelength_km: float) -> Tensor:
+    """Return wave vectors of random directions in space, ``(EDDIES, 3)`` [rad on the unit sphere].
+
+    Example:
+        >>> eddy_waves(0, 200.0).norm(dim=-1).mul(200 / (2 * math.pi)).round()[0]  # the Earth's radius
+        tensor(6371., dtype=torch.float64)
+    """
+    rows = torch.arange(EDDIES).unsqueeze(-1)
+    direction = stream_normal(counter_stream(seed, torch.nn.functional.pad(rows, (1, 0), value=-1)), 3)
+    return direction / direction.norm(dim=-1, keepdim=True) * (2 * math.pi * EARTH_RADIUS_KM / wavelength_km)
+
+
+def eddy_velocity(position: Tensor, waves: Tensor, phases: Tensor) -> Tensor:
+    """Return the velocity of a field of eddies, whose mean square over places and phases is 1.
+
+    The stream function is a sum of plane waves ``a / |k| sin(k·r + phase)`` in space, read on the unit sphere; the
+    velocity is its gradient times the vertical, ``v = grad psi x r``. It is smooth everywhere, and its divergence on
+    the sphere is 0. With M waves, a = sqrt(3 / M), and no speed exceeds sqrt(3 M).
+
+    Args:
+        position: ``(..., 2)`` latitude, longitude [deg].
+        waves: ``(M, 3)`` wave vectors k, from :func:`eddy_waves`.
+        phases: ``(..., M)`` [rad].
+
+    Returns:
+        ``(..., 2)`` northward and eastward.
+
+    Example:
+        >>> waves = torch.tensor([[0.0, 0.0, 1.0]])  # along the axis of the Earth: currents along the parallels
+        >>> eddy_velocity(torch.zeros(1, 2), waves, torch.zeros(1, 1))
+        tensor([[-0.0000, 1.7321]])
+    """
+    north, east, down = local_frame(*position.unbind(-1)).unbind(-2)
+    unit = waves / waves.norm(dim=-1, keepdim=True)
+    swing = torch.cos(-down @ waves.mT + phases) * math.sqrt(3 / len(waves))
+    gradient = swing @ unit
+    # gradient x up: northward is -(gradient·east), eastward is gradient·north
+    return torch.stack((-(gradient * east).sum(-1), (gradient * north).sum(-1)), -1)
+
+
+def _unit(angle: Tensor) -> Tensor:
+    return torch.stack((torch.cos(angle), torch.sin(angle)), -1)

@@ -1,0 +1,479 @@
+"""Measures of hand-made episodes: a straight line, a right angle, a failure, one move, standing still."""
+
+import itertools
+import math
+from functools import partial
+
+import pytest
+import scipy.stats
+import torch
+from support.episodes import episode, point
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import RewardSum, TransformedEnv
+
+from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks, planet_scenario
+from magrl.envs.measures import check_zeta, distance_to_arrival, path_efficiency, path_measures, spl
+from magrl.evaluation.intervals import bootstrap_interval, interquartile_mean, stratified_bootstrap, wilson_interval
+from magrl.evaluation.metrics import episode_measures, first_episode_mask, summarize
+from magrl.evaluation.rollout import evaluation_rollout
+from magrl.field import elements_at
+from magrl.geodesy import geodesic, move
+from magrl.guidance import objective
+from magrl.navigators import Secant
+
+
+def measures(*args, steps: int = 6) -> dict[str, float]:
+    return {key: float(value) for key, value in episode_measures(episode(*args, steps=steps)).items()}
+
+
+def test_straight_line() -> None:
+    got = measures([(50.0, 30.0)] * 4, point(200.0, 30.0), True)
+    assert got["success"] == 1
+    assert got["steps"] == 4
+    assert got["length_km"] == pytest.approx(200)
+    assert got["shortest_km"] == pytest.approx(200, abs=1e-3)
+    assert got["spl"] == pytest.approx(1, abs=1e-5)
+    assert got["path_efficiency"] == pytest.approx(1, abs=1e-5)
+    assert got["navigation_error_km"] == pytest.approx(0, abs=0.1)
+    assert got["smoothness_deg"] == pytest.approx(180, abs=1e-4)
+    assert got["heading_mae_deg"] == pytest.approx(0, abs=0.2)  # the bearing turns a little along the geodesic
+
+
+def test_right_angle() -> None:
+    got = measures([(30.0, 0.0), (40.0, 90.0)], point(50.0, math.degrees(math.atan2(40, 30))), True)
+    assert got["length_km"] == pytest.approx(70)
+    assert got["spl"] == pytest.approx(50 / 70, rel=1e-3)
+    assert got["smoothness_deg"] == pytest.approx(90, abs=1e-3)
+    first = math.degrees(math.atan2(40, 30))  # then the second leg points straight at the target
+    assert got["heading_mae_deg"] == pytest.approx(first / 2, abs=0.1)
+    assert got["heading_rmse_deg"] == pytest.approx(first / math.sqrt(2), abs=0.1)
+
+
+def test_failure_counts_nothing_towards_spl() -> None:
+    got = measures([(50.0, 180.0)] * 6, point(300.0, 0.0), False)
+    assert got["path_efficiency"] == pytest.approx(1, abs=1e-5)  # straight, but away
+    assert got["success"] == 0
+    assert got["spl"] == 0
+    assert got["steps"] == 6
+    assert got["navigation_error_km"] == pytest.approx(600, rel=1e-3)
+    assert got["heading_mae_deg"] == pytest.approx(180, abs=1e-3)
+
+
+def test_one_move_has_no_waypoint() -> None:
+    got = measures([(40.0, 10.0)], point(45.0, 10.0), True)
+    assert got["steps"] == 1
+    assert math.isnan(got["smoothness_deg"])
+    assert got["spl"] == 1  # arrival is declared a little before the point: never more than the shortest path
+    assert got["navigation_error_km"] == pytest.approx(5, abs=1e-3)
+
+
+def test_arrival_without_leaving() -> None:
+    got = measures([(0.0, 0.0)], point(10.0, 0.0), True)
+    assert got["length_km"] == 0
+    assert got["spl"] == 1
+    assert math.isnan(got["heading_mae_deg"])
+    assert math.isnan(got["path_efficiency"])
+
+
+def test_path_efficiency_is_that_of_the_way_made() -> None:
+    """There and back again: 20 km away after 80 km, whatever the destination; never above 1 by rounding."""
+    for target, success in (((20.0, 0.0), True), ((300.0, 90.0), False)):
+        got = measures([(50.0, 0.0), (30.0, 180.0)], point(*target), success)
+        assert got["path_efficiency"] == pytest.approx(0.25, abs=1e-6)
+    assert path_efficiency(torch.tensor([50.1, 10.0]), torch.tensor([50.0, 40.0])).tolist() == [1.0, 0.25]
+
+
+@pytest.mark.parametrize(("success", "distance", "expected"), [(True, 0.0, 1), (False, 0.0, 0), (True, 5.0, 0)])
+def test_start_at_the_destination(success: bool, distance: float, expected: float) -> None:
+    """An episode that has no way to go: not moving is the shortest path, moving is a detour."""
+    got = measures([(distance, 0.0)], (-5.0, 165.0), success)
+    assert (got["shortest_km"], got["spl"]) == (0, expected)
+    assert got["navigation_error_km"] == pytest.approx(distance, abs=1e-6)
+
+
+def test_spl_keeps_nan() -> None:
+    """A length that is not known gives no success."""
+    lengths = torch.tensor([math.nan, 1.0]), torch.tensor([1.0, math.nan])
+    assert spl(torch.tensor([True, True]), *lengths).isnan().all()
+
+
+def test_a_pause_is_neither_a_turn_nor_a_deviation() -> None:
+    got = measures([(50.0, 0.0), (0.0, 90.0), (50.0, 0.0)], point(100.0, 0.0), True)
+    assert got["smoothness_deg"] == pytest.approx(180, abs=1e-4)
+    assert got["heading_mae_deg"] == pytest.approx(0, abs=1e-3)
+
+
+def test_a_short_move_is_a_move() -> None:
+    got = measures([(0.01, 0.0), (0.02, 90.0)], point(100.0, 0.0), False)
+    assert got["smoothness_deg"] == pytest.approx(90, abs=1e-3)
+
+
+def test_only_the_first_episode_counts() -> None:
+    done = torch.tensor([[[False], [True], [False], [True]], [[False]] * 4])
+    assert (
+        first_episode_mask(done).tolist()
+        == first_episode_mask(done.squeeze(-1)).tolist()
+        == [[True, True, False, False], [True] * 4]
+    )
+
+
+def test_a_rollout_of_one_step_is_one() -> None:
+    got = measures([(40.0, 10.0)], point(100.0, 10.0), False, steps=1)
+    assert got["shortest_km"] == pytest.approx(100, abs=1e-3)
+    assert got["navigation_error_km"] == pytest.approx(60, abs=1e-3)
+
+
+def test_vehicles_are_measured_each_on_its_own() -> None:
+    alone = [
+        episode([(50.0, 30.0)] * 4, point(200.0, 30.0), True, 4),
+        episode([(30.0, 0.0), (40.0, 90.0)], point(50.0, 90.0), True, 4),
+        episode([(10.0, 180.0)] * 4, point(300.0, 0.0), False, 4),
+    ]
+    together = episode_measures(torch.cat(alone))
+    for index, one in enumerate(map(episode_measures, alone)):
+        for key, value in one.items():
+            torch.testing.assert_close(together[key][index : index + 1], value, equal_nan=True)
+
+
+def test_spl_by_hand() -> None:
+    """A detour, a path shorter than the geodesic, a failure, and a start at the destination."""
+    success = torch.tensor([True, True, False, True])
+    got = spl(success, torch.tensor([300.0, 300.0, 300.0, 100.0]), torch.tensor([400.0, 290.0, 300.0, 0.0]))
+    assert got.tolist() == [0.75, 1.0, 0.0, 1.0]
+    with pytest.raises(TypeError, match=r"success must be bool, got torch\.float32"):
+        spl(torch.ones(1), torch.ones(1), torch.ones(1))
+    with pytest.raises(TypeError, match="length_km must be a tensor"):
+        spl(success, torch.ones(4), 5)
+
+
+def test_path_measures_by_hand() -> None:
+    """One degree of longitude at the equator is 111.3195 km; one degree of latitude there, 110.5744 km."""
+    start, end, target = torch.tensor([[[0.0, 10.0]], [[0.0, 11.0]], [[1.0, 11.0]]], dtype=torch.float64)
+    got = path_measures(torch.tensor([True]), start, end, end, torch.tensor([2 * 111.3195], dtype=torch.float64))
+    assert [got[key].item() for key in ("shortest_km", "navigation_error_km", "spl")] == [
+        pytest.approx(111.3195, abs=1e-4),
+        pytest.approx(0, abs=1e-6),
+        pytest.approx(0.5, abs=1e-6),
+    ]
+    assert got["path_efficiency"].item() == pytest.approx(0.5, abs=1e-6)
+    got = path_measures(torch.tensor([False]), start, end, target, torch.tensor([111.3195]))
+    assert got["navigation_error_km"].item() == pytest.approx(110.5744, abs=1e-4)
+    assert (got["spl"].item(), got["length_km"].item()) == (0, pytest.approx(111.3195))
+    with pytest.raises(ValueError, match=r"end must have the shape \(..., 2\)"):
+        path_measures(torch.tensor([True]), start, torch.zeros(1, 3), target, torch.ones(1))
+
+
+def test_summary_of_one_success_and_one_failure() -> None:
+    episodes = {
+        "success": torch.tensor([True, False]),
+        "steps": torch.tensor([10, 50]),
+        "shortest_km": torch.tensor([400.0, 400.0]),
+        "length_km": torch.tensor([500.0, 1000.0]),
+        "navigation_error_km": torch.tensor([8.0, 20.0]),
+        "spl": torch.tensor([0.8, 0.0]),
+        "path_efficiency": torch.tensor([0.75, math.nan]),
+        "smoothness_deg": torch.tensor([170.0, 90.0]),
+        "heading_mae_deg": torch.tensor([5.0, 90.0]),
+        "heading_rmse_deg": torch.tensor([6.0, 95.0]),
+    }
+    summary = summarize(episodes)
+    assert summary["success_rate"] == 50
+    assert summary["success_rate_within_10km"] == 50
+    assert summary["success_rate_within_25km"] == 100
+    assert summary["spl"] == pytest.approx(40)
+    assert (summary["spl_low"], summary["spl_high"]) == pytest.approx((0, 80))  # of two values, both or neither
+    assert [summary[f"path_efficiency{end}"] for end in ("", "_low", "_high")] == [75, 75, 75]  # one of them moved
+    assert "spl_to_arrival" not in summary
+    summary |= summarize(episodes | {"spl_to_arrival": torch.tensor([0.6, 0.0])})
+    assert [summary[f"spl_to_arrival{end}"] for end in ("", "_low", "_high")] == pytest.approx([30, 0, 60])
+    assert summary["trajectory_length_m"] == 500_000
+    assert summary["trajectory_length_m_all"] == 750_000
+    assert (summary["steps"], summary["steps_all"]) == (10, 30)
+    assert summary["navigation_error_km"] == 8
+    assert summary["num_tasks"] == 2
+    low, high = wilson_interval(0.5, 2)
+    assert (summary["success_rate_low"], summary["success_rate_high"]) == (100 * low, 100 * high)
+
+
+def test_summary_at_the_edge_of_a_distance_and_of_two_paths() -> None:
+    """Ten kilometers are within ten; the mean of two values, drawn anew, is one of them or between."""
+    ones = ("length_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency")
+    episodes = dict.fromkeys(ones, torch.ones(2))
+    episodes |= {"success": torch.tensor([True, True]), "steps": torch.tensor([9, 9])}
+    summary = summarize(
+        episodes | {"navigation_error_km": torch.tensor([10.0, 25.0]), "spl": torch.tensor([0.5, 0.75])}
+    )
+    assert (summary["success_rate_within_10km"], summary["success_rate_within_25km"]) == (50, 100)
+    assert (summary["spl_low"], summary["spl_high"]) == (50, 75)
+
+
+def test_summary_without_success_is_nan_and_not_zero() -> None:
+    episodes = episode_measures(episode([(50.0, 180.0)] * 3, point(300.0, 0.0), False, 3))
+    assert math.isnan(summarize(episodes)["steps"])
+    assert summarize(episodes)["spl"] == 0
+    nowhere = {**episodes, "path_efficiency": torch.full((1,), math.nan)}
+    assert all(math.isnan(summarize(nowhere)[f"path_efficiency{end}"]) for end in ("", "_low", "_high"))
+
+
+def test_wilson_interval() -> None:
+    for rate, count, expected in ((0.5, 10, (0.2366, 0.7634)), (0.0, 20, (0.0, 0.1611)), (1.0, 20, (0.8389, 1.0))):
+        assert wilson_interval(rate, count) == pytest.approx(expected, abs=1e-4)
+
+
+def test_wilson_interval_of_half_a_standard_error() -> None:
+    """By hand: center 0.2125, half-width 0.06447, both over 1.025."""
+    assert wilson_interval(0.2, 10, z=0.5) == pytest.approx((0.14442, 0.27021), abs=1e-5)
+
+
+def test_wilson_interval_stays_within_all_and_nothing() -> None:
+    assert all(wilson_interval(1.0, count)[1] <= 1 for count in range(1, 500))
+    assert all(wilson_interval(0.0, count)[0] >= 0 for count in range(1, 500))
+
+
+def test_bootstrap_interval_of_a_known_spread() -> None:
+    torch.manual_seed(0)
+    values = torch.randn(2000, dtype=torch.float64)
+    low, high = bootstrap_interval(values)
+    half = 1.96 * values.std().item() / math.sqrt(2000)
+    assert low == pytest.approx(values.mean().item() - half, abs=0.005)
+    assert high == pytest.approx(values.mean().item() + half, abs=0.005)
+    assert bootstrap_interval(values) == bootstrap_interval(values, 1000, 0) == (low, high)
+
+
+def test_bootstrap_interval_of_one_draw_is_that_draw() -> None:
+    low, high = bootstrap_interval(torch.arange(10.0), resamples=1)
+    assert low == high
+
+
+def test_interquartile_mean_by_hand() -> None:
+    """A quarter of 4, 5 and 20 values is 1, 1 and 5; of fewer than 4 nothing is left out."""
+    assert interquartile_mean(torch.tensor([10.0, 1.0, 2.0, 0.0])).item() == 1.5
+    assert interquartile_mean(torch.tensor([[-90.0, 1.0, 2.0, 3.0, 90.0], [1.0, 1.0, 1.0, 9.0, 9.0]])).tolist() == [
+        2,
+        pytest.approx(11 / 3),
+    ]
+    assert interquartile_mean(torch.arange(20.0) ** 2).item() == sum(x * x for x in range(5, 15)) / 10
+    assert interquartile_mean(torch.tensor([1.0, 2.0, 9.0])).item() == 4
+    assert interquartile_mean(torch.tensor([1.0, 2.0, 3.0, math.nan])).isnan()
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 7, 20, 41])
+def test_interquartile_mean_is_that_of_scipy(count: int) -> None:
+    values = torch.rand(6, count, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
+    expected = scipy.stats.trim_mean(values.numpy(), 0.25, axis=1)
+    assert interquartile_mean(values).numpy() == pytest.approx(expected, abs=1e-12)
+
+
+def scores(count: int, seed: int = 0) -> Tensor:
+    return 99 - torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 2
+
+
+def test_stratified_bootstrap_is_that_of_scipy() -> None:
+    """Of one stratum; both ends within the noise of 10 000 resamples."""
+    values = scores(20)
+    expected = scipy.stats.bootstrap(
+        (values.numpy(),),
+        lambda x, axis: scipy.stats.trim_mean(x, 0.25, axis),
+        n_resamples=10_000,
+        method="percentile",
+        rng=1,
+    ).confidence_interval
+    assert stratified_bootstrap([values]) == pytest.approx(tuple(expected), abs=0.01)
+
+
+def test_stratified_bootstrap_draws_within_strata() -> None:
+    """Two groups without any spread: every resample has as many of each, so that the mean is always the same."""
+    low, high = torch.zeros(10), torch.full((10,), 100.0)
+    assert stratified_bootstrap([low, high]) == (50, 50)
+    pooled = stratified_bootstrap([torch.cat((low, high))])
+    assert pooled[0] < 20
+    assert pooled[1] > 80
+
+
+def test_stratified_bootstrap_shrinks_holds_the_mean_and_repeats() -> None:
+    widths = []
+    for count in (5, 20, 80, 320):
+        values = scores(count)
+        low, high = stratified_bootstrap([values])
+        assert low < interquartile_mean(values).item() < high
+        assert stratified_bootstrap([values]) == (low, high)
+        widths.append(high - low)
+    ratios = [after / before for before, after in itertools.pairwise(widths)]
+    assert stratified_bootstrap([values], seed=1) != (low, high)
+    assert all(0.3 < ratio < 0.75 for ratio in ratios), ratios  # four times the runs, half the width
+    assert all(math.isnan(end) for end in stratified_bootstrap([torch.tensor([1.0, math.nan])]))
+
+
+def test_stratified_bootstrap_holds_the_truth() -> None:
+    """In 95 % of 300 experiments of 20 normal scores: 285, and 271 or more in all but one of 10 000 repetitions."""
+    draws = torch.randn(300, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ends = [stratified_bootstrap([row], resamples=500) for row in draws]
+    assert 271 <= sum(low <= 0 <= high for low, high in ends) <= 297
+
+
+def nearest_on_grids(env: GeomagneticNavEnv, state: TensorDict, task: int, half_km: float) -> float:
+    """Return the distance to the nearest place of arrival on a grid, and on finer ones around that place: to 0.5 m."""
+    row = state[task : task + 1]
+    center, nearest = torch.zeros(2, 1, dtype=torch.float64), math.inf
+    for _ in range(4):
+        line = torch.linspace(-half_km, half_km, 121, dtype=torch.float64)
+        north, east = torch.cartesian_prod(line, line).T + center
+        places = torch.stack(move(*row["target_position"].T, torch.atan2(east, north), torch.hypot(north, east)), -1)
+        weights, target_field = row["objective_weights"].double(), row["target_field"].double()
+        f = objective(elements_at(env.field, places), target_field, weights)
+        inside = ((f < env.zeta) & env.edge.contains(places)).squeeze(-1)
+        distance_km, _ = geodesic(*row["start_position"].T, *places[inside].T)
+        nearest, index = (x.item() for x in distance_km.min(0))
+        center, half_km = torch.stack((north[inside], east[inside]))[:, index : index + 1], half_km / 20
+    return nearest
+
+
+def arrival_km(env: GeomagneticNavEnv, state: TensorDict) -> Tensor:
+    keys = ("start_position", "target_position", "objective_weights")
+    return distance_to_arrival(*(state[key] for key in keys), env.field, env.zeta, env.edge)
+
+
+@pytest.mark.parametrize(("zeta", "half_km"), [(0.001, 30.0), (0.01, 90.0), (0.1, 200.0)])
+def test_distance_to_arrival_is_that_of_a_search_on_grids(zeta: float, half_km: float) -> None:
+    env = GeomagneticNavEnv(num_envs=4, seed=2, zeta=zeta)
+    state = env.reset()
+    expected = [nearest_on_grids(env, state, task, half_km) for task in range(4)]
+    assert arrival_km(env, state).tolist() == pytest.approx(expected, abs=0.02)
+
+
+def test_places_outside_the_region_are_no_arrival() -> None:
+    """The destination lies on the northern edge and the start beyond it: the nearest place is on the edge."""
+    tasks = Tasks(torch.tensor([[-3.0, 165.0]]).double(), torch.tensor([[-6.0, 165.0]]).double())
+    env = GeomagneticNavEnv(Scenario(tasks=tasks), seed=0)
+    state = env.reset()
+    free_km = arrival_km(env, state).item()
+    env.edge = Region((-12.0, -6.0), (158.0, 172.0))
+    meridian_km, _ = geodesic(*tasks.start.T, *tasks.target.T)
+    assert arrival_km(env, state).item() == pytest.approx(meridian_km.item(), abs=0.01)
+    assert free_km < meridian_km.item() - 10
+
+
+def test_spl_to_arrival_is_weighted_by_the_nearer_distance() -> None:
+    env = GeomagneticNavEnv(num_envs=8, seed=0)
+    near_km = arrival_km(env, env.reset())
+    env.set_seed(0)
+    transformed = TransformedEnv(env, RewardSum())
+    rollout = evaluation_rollout(transformed, Secant(probe_km=10))
+    got = episode_measures(rollout, transformed)
+    assert got["success"].all()
+    assert got["spl_to_arrival"].tolist() == pytest.approx((near_km / got["length_km"]).tolist())
+    assert (got["spl_to_arrival"] < got["spl"]).all()
+    assert "spl_to_arrival" not in episode_measures(rollout)
+
+
+def test_each_of_many_regions_has_its_own_field() -> None:
+    """Tasks in three regions of other planets: as in an environment of each region alone."""
+    many = planet_scenario(3, seed=0)
+    env = GeomagneticNavEnv(many, num_envs=6, seed=0)
+    rollout = env.rollout(1)
+    start, target, weights, region = (
+        rollout[key][:, 0] for key in ("start_position", "target_position", "objective_weights", "region")
+    )
+    got = distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region.squeeze(-1))
+    assert len(region.unique()) > 1
+    for task, index in enumerate(region.flatten().tolist()):
+        alone = partial(env.field, index=torch.tensor(index))
+        alone.value_and_gradient = partial(env.field.value_and_gradient, index=torch.tensor(index))
+        row = (x[task : task + 1] for x in (start, target, weights))
+        expected = distance_to_arrival(*row, alone, env.zeta, env.edge[index])
+        assert got[task].item() == pytest.approx(expected.item(), abs=1e-6)
+    assert episode_measures(rollout, env)["spl_to_arrival"].isfinite().all()
+
+
+def test_an_episode_without_a_way_is_measured_without_nan() -> None:
+    """The vehicle starts where it has arrived, and stays there or moves."""
+    here = torch.tensor([[-5.0, 165.0]] * 2).double()
+    env = GeomagneticNavEnv(num_envs=2, seed=0)
+    state = env.reset().update({"start_position": here, "target_position": here})
+    assert arrival_km(env, state).tolist() == [0, 0]
+    beside = state.update({"start_position": here + 0.001})
+    assert arrival_km(env, beside).tolist() == [0, 0]
+    assert spl(torch.tensor([True, True]), arrival_km(env, state), torch.tensor([0.0, 5.0])).tolist() == [1, 0]
+
+
+def test_shortest_is_the_geodesic() -> None:
+    target = (-8.0, 164.0)
+    expected, _ = geodesic(*torch.tensor([-5.0, 165.0, *target], dtype=torch.float64))
+    assert measures([(50.0, 0.0)], target, False)["shortest_km"] == pytest.approx(float(expected))
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: bootstrap_interval([1.0, 2.0]), TypeError, "values must be a tensor"),
+        (lambda: bootstrap_interval(torch.zeros(0)), ValueError, r"values must be of shape \(M,\)"),
+        (lambda: bootstrap_interval(torch.zeros(2, 2)), ValueError, r"values must be of shape \(M,\).*\(2, 2\)"),
+        (lambda: bootstrap_interval(torch.ones(3), 0), ValueError, "resamples must be a whole number from 1 on, got 0"),
+        (
+            lambda: bootstrap_interval(torch.ones(3), 1.5),
+            ValueError,
+            "resamples must be a whole number from 1 on, got 1.5",
+        ),
+        (lambda: bootstrap_interval(torch.ones(3), 1, 0.5), ValueError, "seed must be a whole number, got 0.5"),
+        (lambda: interquartile_mean([1.0]), TypeError, "values must be a tensor"),
+        (lambda: interquartile_mean(torch.zeros(2, 0)), ValueError, r"values must be of shape \(\.\.\., R\).*\(2, 0\)"),
+        (lambda: interquartile_mean(torch.tensor(1.0)), ValueError, r"values must be of shape .*\(\)"),
+        (lambda: stratified_bootstrap([]), ValueError, r"strata must each be of shape \(R,\) with R >= 1, got \[\]"),
+        (lambda: stratified_bootstrap([torch.ones(2), torch.ones(0)]), ValueError, r"strata .*\[\(2,\), \(0,\)\]"),
+        (lambda: stratified_bootstrap([[1.0]]), TypeError, "stratum 0 must be a tensor"),
+        (lambda: stratified_bootstrap(5), TypeError, "strata must be a Sequence, got 5"),
+        (lambda: stratified_bootstrap([torch.ones(2)], 0), ValueError, "resamples must be a whole number from 1 on"),
+        (lambda: wilson_interval(1.01, 10), ValueError, "rate must be a finite number from 0 up to 1, got 1.01"),
+        (lambda: wilson_interval(-0.01, 10), ValueError, "rate must be a finite number from 0 up to 1, got -0.01"),
+        (lambda: wilson_interval(0.5, 0), ValueError, "count must be a whole number from 1 on, got 0"),
+        (lambda: wilson_interval(0.5, 1.5), ValueError, "count must be a whole number from 1 on, got 1.5"),
+        (lambda: wilson_interval(0.5, 10, z=0.0), ValueError, "z must be a finite number above 0, got 0"),
+    ],
+)
+def test_intervals_refuse_bad_values(call, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_intervals_accept_their_bounds() -> None:
+    assert bootstrap_interval(torch.ones(1), 1, -1) == (1.0, 1.0)
+    for rate in (0.0, 1.0):
+        low, high = wilson_interval(rate, 1)
+        assert 0 <= low < high <= 1
+
+
+def test_measures_refuse_what_they_cannot_use() -> None:
+    flags, lengths, places = torch.ones(2, dtype=torch.bool), torch.ones(2), torch.zeros(2, 2)
+    for call, error, message in (
+        (lambda: check_zeta(3), ValueError, "zeta must be below 3, got 3: the objective F is at most 3"),
+        (lambda: spl([True], lengths, lengths), TypeError, r"success must be a Tensor, got \[True\]"),
+        (lambda: spl(flags.long(), lengths, lengths), TypeError, "success must be bool, got torch.int64"),
+        (lambda: spl(flags, [1.0, 1.0], lengths), TypeError, "shortest_km must be a tensor"),
+        (lambda: path_measures(flags, places[:, :1], places, places, lengths), ValueError, r"start .*\(2, 1\)"),
+        (lambda: path_measures(flags, places, places[:, :1], places, lengths), ValueError, r"end .*\(2, 1\)"),
+        (lambda: path_measures(flags, places, places, places[:, :1], lengths), ValueError, r"target .*\(2, 1\)"),
+        (lambda: path_efficiency(1.0, lengths), TypeError, "straight_km must be a tensor"),
+        (
+            lambda: distance_to_arrival(flags, places, places, None, 0.01, None),
+            TypeError,
+            "start must hold real numbers",
+        ),
+        (lambda: distance_to_arrival(places, places, places, None, 0.01, None), ValueError, r"weights must have"),
+        (lambda: first_episode_mask([True]), TypeError, r"done must be a Tensor, got \[True\]"),
+        (lambda: first_episode_mask(torch.zeros(2, 3)), ValueError, "done must be bool of shape"),
+        (lambda: first_episode_mask(flags), ValueError, r"done must be bool of shape .*\(2,\)"),
+        (lambda: first_episode_mask(flags.expand(1, 3, 2)), ValueError, r"done must be bool of shape .*\(1, 3, 2\)"),
+    ):
+        with pytest.raises(error, match=message):
+            call()
+
+
+def test_path_measures_of_batches_of_any_shape() -> None:
+    """One value for each episode, whatever dimensions they are arranged in."""
+    start, end, target = torch.rand(3, 4, 5, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    success, length = torch.ones(4, 5, dtype=torch.bool), torch.full((4, 5), 300.0, dtype=torch.float64)
+    arranged = path_measures(success, start, end, target, length)
+    flat = path_measures(*(x.flatten(0, 1) for x in (success, start, end, target, length)))
+    for name, value in arranged.items():
+        torch.testing.assert_close(value.flatten(), flat[name])

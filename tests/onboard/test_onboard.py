@@ -1,0 +1,437 @@
+"""On board: the commands of the environment from plain numbers, refusals, stops, saved states, the exported step."""
+
+from __future__ import annotations
+
+import copy
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from magrl.agents import FieldPolicy, PolicyConfig, load_pretrained
+from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation.navigators import make_navigator
+from magrl.evaluation.rollout import restart
+from magrl.field import IGRF, elements_at
+from magrl.geodesy import geodesic
+from magrl.navigators import Geodesic, Kalman, Secant
+from magrl.onboard import Onboard, VehicleStep, check_earth_jump, check_earth_reading, write_step
+from magrl.onboard.vehicle import LOST_SURPRISE
+from magrl.tracking import probability_below, probability_within
+from magrl.transforms import with_sensor_noise
+
+TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
+NOISE = (0.02, 0.02, 2.0)
+NONE = (0.0, 0.0, 0.0)
+Known = tuple[float, ...]
+
+
+def environment(noise: tuple[float, float, float] = NONE) -> EnvBase:
+    return with_sensor_noise(GeomagneticNavEnv(num_envs=1, seed=3, start_heading="random"), noise, seed=1)
+
+
+def numbers(state) -> tuple[float, ...]:
+    """What a vehicle knows of a state of the environment: reading, heading [deg] and distance [km]."""
+    heading = math.degrees(state["heading"].item())
+    return (*state["field"][0].tolist(), heading, state["move"][0, 0].item())
+
+
+def episode(policy: TensorDictModuleBase, env: EnvBase, limit: int = 50) -> tuple[list[float], list[Known], list]:
+    """An episode: the target, what the vehicle knows in each state, and the actions of the policy."""
+    restart(env)
+    state, known, actions = env.reset(), [], []
+    target = state["target_field"][0].tolist()
+    while True:
+        known.append(numbers(state))
+        if state["done"].item() or len(actions) == limit:
+            return target, known, actions
+        with torch.no_grad():
+            actions.append(policy(state)["action"][0].tolist())
+        state = env.step(state)["next"]
+
+
+def region_policy(memory_size: int = 0) -> FieldPolicy:
+    torch.manual_seed(0)
+    view = environment().observation_view(observe_heading=not memory_size)
+    return FieldPolicy(PolicyConfig(view, (8,), memory_size=memory_size))
+
+
+def without_search(policy: TensorDictModuleBase) -> TensorDictModuleBase:
+    """A navigator that is not told that it has not arrived, as on board."""
+    if isinstance(policy, FieldPolicy):
+        view = replace(policy.config.view, search=False)
+        noise, policy = policy.noise_std, FieldPolicy(replace(policy.config, view=view), policy.actor)
+        policy.noise_std = noise
+    elif isinstance(policy, Kalman):
+        policy.search = False
+    return policy
+
+
+# The same commands as in the environment
+
+
+@pytest.mark.parametrize(
+    ("name", "noise"), [("anywhere", NONE), ("secant", NONE), ("kalman", NONE), ("anywhere", NOISE), ("secant", NOISE)]
+)
+def test_commands_are_those_of_the_environment(name: str, noise: tuple[float, float, float]) -> None:
+    """Over a whole episode; with perfect sensors, the vehicle knows at its end, and not before, that it has arrived."""
+    env = environment(noise)
+    policy = without_search(make_navigator(name, getattr(env, "base_env", env), noise=noise))
+    vehicle = Onboard(name, sensor_std=noise, max_steps=50, confidence=0.8 if noise == NONE else 1.0)
+    target, known, actions = episode(policy, env)
+    assert len(actions) > 5
+    vehicle.start(target)
+    for number, (distance, turn) in enumerate(actions):
+        command = vehicle.step(*known[number])
+        assert command.stop is None
+        assert command.distance_km == pytest.approx(distance, abs=1e-4)
+        assert math.radians(command.turn_deg) == pytest.approx(turn, abs=1e-5)
+        heading = known[number + 1][3]  # of the next state: what was steered
+        assert math.remainder(command.heading_deg - heading, 360) == pytest.approx(0, abs=1e-4)
+    if noise == NONE:
+        command = vehicle.step(*known[-1])
+        assert (command.stop, command.distance_km, command.turn_deg) == ("arrived", 0.0, 0.0)
+
+
+@pytest.mark.parametrize("memory_size", [0, 4])
+def test_commands_of_own_policies(memory_size: int) -> None:
+    """One that reads the turn and the field of a region, and one with a memory of its own."""
+    policy, vehicle = region_policy(memory_size), Onboard(region_policy(memory_size))
+    target, known, actions = episode(policy, environment(), limit=6)
+    vehicle.start(target)
+    for step, action in zip(known, actions, strict=False):
+        command = vehicle.step(*step)
+        assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx(tuple(action), abs=1e-5)
+
+
+@pytest.mark.parametrize("navigator", ["anywhere", "secant"])
+def test_the_estimated_way_is_northward_and_eastward(navigator: str) -> None:
+    """Whatever the heading, which a move of 0 km changes; and it is about the true one."""
+    env = environment()
+    target, known, _ = episode(Secant(), env)
+    vehicle = Onboard(navigator)
+    vehicle.start(target)
+    first = [vehicle.step(*step) for step in known[:6]][-1]
+    other = copy.deepcopy(vehicle)
+    again, turned = (v.step(*known[5][:3], known[5][3] + turn, 0.0) for v, turn in ((vehicle, 0.0), (other, 77.0)))
+    assert turned.way_km == pytest.approx(again.way_km, abs=0.01)
+    assert turned.way_covariance_km2[0] == pytest.approx(again.way_covariance_km2[0], rel=1e-3, abs=0.01)
+    (nn, ne), (en, ee) = turned.way_covariance_km2
+    assert ne == en
+    assert nn * ee > ne * ne
+    assert turned.error_km == pytest.approx(math.sqrt(nn + ee))
+    restart(env)
+    state = env.reset()
+    for step in known[1:6]:
+        action = [step[4], math.remainder(math.radians(step[3]) - state["heading"].item(), 2 * math.pi)]
+        state = env.step(state.set("action", torch.tensor([action])))["next"]
+    distance, bearing = geodesic(*state["position"][0], *state["target_position"][0])
+    true = (distance * torch.cos(bearing)).item(), (distance * torch.sin(bearing)).item()
+    assert math.dist(first.way_km, true) < 0.25 * distance.item()
+
+
+# State
+
+
+@pytest.mark.parametrize("navigator", ["anywhere", "kalman", "recurrent"])
+def test_a_restored_vehicle_goes_on_bit_for_bit(navigator: str, tmp_path: Path) -> None:
+    def vehicle() -> Onboard:
+        return Onboard(region_policy(4) if navigator == "recurrent" else navigator, sensor_std=NOISE)
+
+    first, second = vehicle(), vehicle()
+    target, known, _ = episode(Secant(), environment(), limit=6)
+    first.start(target)
+    first.save(tmp_path / "begun.pt")
+    second.restore(tmp_path / "begun.pt")
+    for number, step in enumerate(known):
+        assert first.step(*step) == second.step(*step)
+        if number == 2:
+            first.save(tmp_path / "state.pt")
+            second = vehicle()
+            second.restore(tmp_path / "state.pt")
+
+
+def test_a_state_of_another_vehicle_is_refused(tmp_path: Path) -> None:
+    path, vehicle = tmp_path / "state.pt", Onboard("secant", sensor_std=NOISE)
+    with pytest.raises(RuntimeError, match=r"call start\(target\) first"):
+        vehicle.save(path)
+    vehicle.start(TARGET)
+    vehicle.save(path)
+    with pytest.raises(ValueError, match=r"another sensor_std, \(0\.02, 0\.02, 2\.0\)"):
+        Onboard("secant").restore(path)
+    with pytest.raises(ValueError, match="another name, 'Secant'"):
+        Onboard("kalman", sensor_std=NOISE).restore(path)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match="damaged"):
+        vehicle.restore(path)
+
+
+def test_a_refused_call_changes_nothing() -> None:
+    first, second = Onboard("secant"), Onboard("secant")
+    for vehicle in (first, second):
+        vehicle.start(TARGET)
+        vehicle.step(*HERE, 290.0)
+    with pytest.raises(ValueError, match="inclination changed"):
+        first.step(3.5, -73.0, 15000.0, 290.0, 0.5)
+    after = (3.49, 73.001, 14999.0, 290.0, 0.5)
+    assert first.step(*after) == second.step(*after)
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((math.nan, 73.0, 15000.0, 0.0), r"declination \[deg\] must be a finite number from -180 up to 180, got nan"),
+        ((3.5, math.inf, 15000.0, 0.0), r"inclination \[deg\] must be a finite number from -90 up to 90, got inf"),
+        ((3.5, 73.0, "15000", 0.0), r"horizontal_intensity \[nT\] must be a finite number"),
+        ((3.5, 73.0, 15000.0, math.nan), r"heading \[deg\] must be a finite number from -360 up to 360, got nan"),
+        ((3.5, 73.0, 15000.0, 0.0, math.inf), "distance must be 0"),
+        ((3.5, 73.0, 15000.0, 0.0, 1.0), "distance must be 0"),
+        ((3.5, 73.0, 15.0, 0.0), "looks like microtesla, and nanotesla are expected"),
+        ((3.5, 0.0, 31.0, 0.0), "looks like microtesla"),
+        ((3.5, 73.0, 0.15, 0.0), "looks like gauss"),
+        ((3.5, 73.0, 60000.0, 0.0), "horizontal_intensity 60000 at an inclination of 73 deg is not possible"),
+        ((0.061, 1.274, 15000.0, 0.0), "the inclination looks like radians, and degrees are expected"),
+        ((-0.2, -1.2, 18000.0, 0.0), "the inclination looks like radians"),
+        ((3.5, 88.5, 1500.0, 0.0), "B_H 1500 nT is out of the range of the policy, 2000 to inf nT"),
+    ],
+)
+def test_first_readings_that_are_refused(values: tuple, message: str) -> None:
+    vehicle = Onboard("anywhere")
+    vehicle.start(TARGET)
+    with pytest.raises(ValueError, match=message):
+        vehicle.step(*values)
+    vehicle.step(*HERE, 0.0)  # a right one is taken
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((*HERE, 290.0, 30000.0), "distance 30000 km is longer than the longest move of this vehicle, 50 km"),
+        ((*HERE, 290.0, 56.0), "distance 56 km is longer"),
+        ((*HERE, 290.0, -1.0), r"distance \[km\] must be a finite number from 0 on, got -1"),
+        ((*HERE, 400.0, 1.0), r"heading \[deg\] must be a finite number from -360 up to 360, got 400"),
+        ((*HERE, math.radians(290.0), 1.0), "looks like radians: the vehicle was to steer 290.0 deg"),
+        ((*HERE, math.radians(-70.0), 1.0), "looks like radians"),
+        ((3.5, 73.0, 21000.0, 290.0, 40.0), r"B_H changed from 15000 to 21000 nT over 40 km.*at most 4400 nT"),
+        ((40.0, 73.0, 15000.0, 290.0, 20.0), "declination changed from 3.5 to 40 deg over 20 km"),
+        ((3.5, 60.0, 15000.0, 290.0, 20.0), "inclination changed from 73 to 60 deg over 20 km"),
+    ],
+)
+def test_later_readings_that_are_refused(values: tuple, message: str) -> None:
+    vehicle = Onboard("secant")  # its first move is straight on
+    vehicle.start(TARGET)
+    vehicle.step(*HERE, 290.0)
+    with pytest.raises(ValueError, match=message):
+        vehicle.step(*values)
+
+
+def test_step_before_start_and_bad_targets() -> None:
+    vehicle = Onboard("anywhere")
+    with pytest.raises(RuntimeError, match=r"call start\(target\) first"):
+        vehicle.step(*HERE, 0.0)
+    for target, message in (
+        ((-11.6, 75.4, 13.24), r"the target: .*microtesla"),
+        ((-0.2, 1.316, 13240.0), r"the target: .*radians"),
+        ((-11.6, 75.4), r"target must be 3 finite numbers"),
+        ((-11.6, 88.5, 1500.0), "the target: B_H 1500 nT is out of the range"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vehicle.start(target)
+    region = Onboard(region_policy())
+    with pytest.raises(ValueError, match=r"the target: D -11\.6 deg is out of the range of the policy"):
+        region.start(TARGET)
+    region.start((9.0, -25.0, 34500.0))
+    with pytest.raises(ValueError, match=r"the reading at the start: D 3\.5 deg is out of the range"):
+        region.step(*HERE, 0.0)
+
+
+def test_readings_all_over_the_earth_are_taken() -> None:
+    """Of IGRF, 1900 and 2030; moves of 50 km eastward and northward up to 85 degrees of latitude."""
+    for date in ("1900-01-01", "2030-01-01"):
+        latitude = torch.arange(-85.0, 85.1, 5.0, dtype=torch.float64)
+        place = torch.cartesian_prod(latitude, torch.arange(-180.0, 180.0, 15.0, dtype=torch.float64))
+        north = place + torch.tensor([0.45, 0.0])
+        east = torch.stack((place[:, 0], place[:, 1] + 0.45 / torch.cos(torch.deg2rad(place[:, 0]))), -1)
+        here, *there = (elements_at(IGRF(date), places).tolist() for places in (place, north, east))
+        for before, *after in zip(here, *there, strict=True):
+            check_earth_reading(*before)
+            for reading in after:
+                check_earth_jump(before, reading, 50.0)
+
+
+@pytest.mark.parametrize("navigator", ["anywhere", "secant"])
+def test_a_log_in_radians_at_middle_latitudes_is_never_an_arrival(navigator: str) -> None:
+    """A reading of 0.66 is possible at the magnetic equator; that it hardly changes along the way is not."""
+    field, vehicle = IGRF("2025-01-01"), Onboard(navigator)
+    place, target = torch.tensor([[26.0, 30.0]]), torch.tensor([[28.5, 32.0]])
+
+    def reading(where: torch.Tensor) -> list[float]:
+        d, i, h = elements_at(field, where.double())[0].tolist()
+        return [math.radians(d), math.radians(i), h]
+
+    vehicle.start(reading(target))
+    command, moves = vehicle.step(*reading(place), 0.0), 0
+    while command.stop is None and moves < 12:
+        distance, heading = command.distance_km or 20.0, math.radians(command.heading_deg)
+        north, east = math.cos(heading), math.sin(heading) / math.cos(math.radians(place[0, 0].item()))
+        place, moves = place + distance / 111.2 * torch.tensor([[north, east]]), moves + 1
+        command = vehicle.step(*reading(place), command.heading_deg, distance)
+    assert command.stop == "lost"
+    assert "looks like radians" in command.reason
+
+
+def test_the_magnetic_equator_is_no_log_in_radians() -> None:
+    field, vehicle = IGRF("2025-01-01"), Onboard("secant")
+    latitudes = torch.arange(8.0, 11.0, 0.1, dtype=torch.float64)
+    dips = elements_at(field, torch.stack((latitudes, torch.full_like(latitudes, 33.0)), -1))[:, 1]
+    equator = latitudes[dips.abs().argmin()].item()
+    vehicle.start(elements_at(field, torch.tensor([8.0, 40.0]).double()).tolist())
+    for number, longitude in enumerate(torch.arange(31.5, 34.5, 0.3)):
+        here = elements_at(field, torch.tensor([equator, longitude]).double()).tolist()
+        assert abs(here[1]) < 1.57
+        assert vehicle.step(*here, 90.0, 32.9 if number else 0.0).stop is None
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"navigator": "dowsing"}, "unknown navigator 'dowsing': choose from anywhere"),
+        ({"navigator": Geodesic()}, "Geodesic reads position, target_position, which a vehicle does not know"),
+        ({"max_move_km": 20.0}, "max_move_km must be at least 50, which the policy commands, got 20.0"),
+        ({"max_turn_deg": 45.0}, "max_turn_deg must be at least 90"),
+        ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std must be a finite number from 0 on, got -0.1"),
+        ({"zeta": 0.0}, "zeta must be"),
+        ({"arrival_km": -1.0}, "arrival_km must be"),
+        ({"confidence": 1.5}, "confidence must be"),
+        ({"max_steps": 0}, "max_steps must be"),
+    ],
+)
+def test_options_that_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Onboard(**options)
+
+
+# Stops
+
+
+def test_a_vehicle_is_lost_after_its_last_step() -> None:
+    vehicle = Onboard("secant", max_steps=2)
+    vehicle.start(TARGET)
+    stops = [vehicle.step(*HERE, 290.0, distance) for distance in (0.0, 0.5, 0.5)]
+    assert [command.stop for command in stops] == [None, None, "lost"]
+    assert stops[-1].reason == "2 moves without arrival"
+    assert (stops[-1].distance_km, stops[-1].turn_deg) == (0.0, 0.0)
+
+
+def test_readings_that_scatter_more_than_the_data_sheet_says_are_no_track() -> None:
+    """Noise of 0.5 degrees and 50 nT of sensors that are said to be perfect, and of sensors whose sheet says it."""
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(30, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.5, 0.5, 50.0])
+    stops = []
+    for sheet in (NONE, (0.5, 0.5, 50.0)):
+        vehicle = Onboard("secant", sensor_std=sheet)
+        vehicle.start(TARGET)
+        readings = (torch.tensor(HERE) + noise).tolist()
+        stops.append({vehicle.step(*r, 290.0, 1.0 if k else 0.0).stop for k, r in enumerate(readings)})
+    assert stops == [{None, "lost"}, {None}]
+    assert LOST_SURPRISE > 1
+
+
+def test_out_of_range_on_the_way() -> None:
+    weak = Onboard("anywhere")
+    weak.start((0.0, 88.0, 2100.0))
+    weak.step(0.0, 87.9, 2100.0, 0.0)
+    command = weak.step(0.0, 88.1, 1990.0, 0.0, 20.0)
+    assert (command.stop, command.distance_km) == ("out of range", 0.0)
+    assert "B_H 1990 nT is out of the range of the policy" in command.reason
+    region = Onboard(region_policy())
+    region.start((9.0, -25.0, 34500.0))
+    region.step(9.0, -36.5, 35000.0, 180.0)
+    command = region.step(9.0, -37.4, 34900.0, 180.0, 50.0)
+    assert (command.stop, command.distance_km) == ("out of range", 0.0)
+
+
+# Confidence
+
+
+def test_probabilities_are_those_of_normal_errors() -> None:
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.randn(200_000, 3, generator=generator, dtype=torch.float64)
+    first, target, estimate, std = (0.0, 60.0, 20000.0), (2.0, 58.0, 20500.0), (1.9, 58.1, 20480.0), (0.1, 0.1, 20.0)
+    errors = (torch.tensor(target) - torch.tensor(estimate)).double() + torch.tensor(std) * normal
+    share = ((errors / torch.tensor([2.0, 2.0, 500.0])).square().sum(-1) < 0.01).double().mean().item()
+    assert 0.3 < share < 0.9
+    assert probability_below(first, target, estimate, std, 0.01) == pytest.approx(share, abs=0.01)
+    covariance = torch.tensor([[100.0, 40.0], [40.0, 60.0]], dtype=torch.float64)
+    way = torch.tensor([15.0, -5.0], dtype=torch.float64)
+    ends = way + normal[:, :2] @ torch.linalg.cholesky(covariance).mT
+    share = (ends.norm(dim=-1) <= 20).double().mean().item()
+    assert probability_within(way, covariance, 20.0) == pytest.approx(share, abs=0.01)
+    across = (179.0, 60.0, 20000.0), (-179.0, 60.0, 20000.0)  # D through 180 degrees
+    near = {d: probability_below(*across, (d, 60.0, 20000.0), (1e-3, 0.0, 0.0), 0.01) for d in (-179.1, -179.5, 179.9)}
+    assert near == {-179.1: 1.0, -179.5: 0.0, 179.9: 0.0}
+
+
+@pytest.mark.parametrize(("arrival_km", "stop"), [(None, None), (25.0, None), (200.0, "arrived")])
+def test_the_rule_of_arrival(arrival_km: float | None, stop: str | None) -> None:
+    """At about 100 km from the destination, as flown before."""
+    target, known, _ = episode(Secant(), environment())
+    vehicle = Onboard("secant", arrival_km=arrival_km)
+    vehicle.start(target)
+    command = [vehicle.step(*step) for step in known[:-3]][-1]
+    assert 40 < math.hypot(*command.way_km) < 150
+    assert command.stop == stop
+
+
+# The exported step
+
+
+def test_the_exported_step_is_the_vehicle_without_torchrl(tmp_path: Path) -> None:
+    """Bit for bit over an episode, in a process that can import neither TorchRL nor tensordict nor magrl."""
+    policy = load_pretrained("anywhere")
+    policy = FieldPolicy(replace(policy.config, view=replace(policy.config.view, zeta=0.02)), policy.actor)
+    write_step(tmp_path / "step.pt2", policy)
+    vehicle = Onboard(policy, sensor_std=NOISE, zeta=0.02, confidence=1.0)
+    target, known, _ = episode(Secant(), environment(), limit=9)
+    vehicle.start(target)
+    commands = [vehicle.step(*step) for step in known]
+    assert not any(command.stop for command in commands)
+    actions = [(command.distance_km, math.radians(command.turn_deg)) for command in commands]
+    content = {"known": known, "target": target, "sheet": (NOISE, NONE), "actions": actions}
+    content |= {"mean": vehicle._estimates["track_mean"][0], "way": [command.way_km for command in commands]}
+    torch.save(content, tmp_path / "episode.pt")
+    code = """
+import math, sys, torch
+for name in ("torchrl", "tensordict", "magrl"):
+    sys.modules[name] = None
+module, episode = torch.export.load(sys.argv[1]).module(), torch.load(sys.argv[2])
+target, sheet = torch.tensor(episode["target"]), torch.tensor(episode["sheet"])
+state = torch.tensor(0), torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3).clone(), torch.zeros(3)
+for (d, i, h, heading, distance), action, way in zip(episode["known"], episode["actions"], episode["way"]):
+    course = math.remainder(math.radians(heading), 2 * math.pi)
+    moved, ahead, _, *state = module(torch.tensor([d, i, h]), target, torch.tensor([distance, course]), sheet, *state)
+    assert torch.equal(moved, torch.tensor(action)), (moved, action)
+    north, east = (math.cos(course) * ahead[0] - math.sin(course) * ahead[1],
+                   math.sin(course) * ahead[0] + math.cos(course) * ahead[1])
+    assert abs(north - way[0]) < 1e-3 and abs(east - way[1]) < 1e-3
+assert torch.equal(state[1], episode["mean"])
+print(len(episode["actions"]), "equal")
+"""
+    files = [str(tmp_path / name) for name in ("step.pt2", "episode.pt")]
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, *files], capture_output=True, text=True, check=False
+    )
+    assert run.stdout.strip() == "10 equal", run.stderr
+    with pytest.raises(ValueError, match=r"must read its own track \(TrackView\)"):
+        VehicleStep(region_policy())
+    with pytest.raises(ValueError, match=r"must end with \.pt2, got 'step\.onnx'"):
+        write_step("step.onnx", policy)

@@ -1,0 +1,136 @@
+"""What a user gets with `pip install`: the wheel, alone, in an environment that has never seen this tree."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import magrl
+
+ROOT = Path(__file__).parent.parent.parent
+LEFT_OUT = shutil.ignore_patterns(".*", "runs", "build", "dist", "wandb", "figures", "*.egg-info", "__pycache__")
+TOUR = """
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import gymnasium
+import magrl
+
+assert "torch" not in sys.modules
+assert gymnasium.make("magrl/GeomagneticNavigation-v0").reset(seed=0)[0].shape == (13,)
+
+import torch
+from torchrl.envs import Compose, TransformedEnv
+
+from magrl import guidance, navigators
+from magrl.envs.navigation import navigation_env
+from magrl.evaluation import plots, replay
+from magrl.navigators import metaheuristics
+
+assert Path(magrl.__file__).is_relative_to(sys.prefix), magrl.__file__
+assert version("magrl") == magrl.__version__, (version("magrl"), magrl.__version__)
+for name in magrl.__all__:
+    assert getattr(magrl, name) is not None
+
+field = magrl.IGRF("2026-07-01")
+assert field(torch.tensor(-2.0), torch.tensor(162.0)).shape == (3,)
+base = magrl.GeomagneticNavEnv(num_envs=4, seed=0)
+guided = [magrl.FieldGradient(base.field), magrl.GradientHeading(), magrl.AlignmentReward()]
+assert TransformedEnv(base, Compose(*guided)).rollout(3)["next", "reward"].shape == (4, 3, 1)
+plain = magrl.GeomagneticNavEnv(num_envs=4, seed=0, render_mode="rgb_array")
+for pilot in (navigators.Secant(), metaheuristics.build("pso", plain, "flown", seed=0)):
+    rollout = plain.rollout(12, pilot, break_when_any_done=False)
+    print(magrl.summarize(magrl.episode_measures(rollout))["success_rate"])
+plots.trajectories_figure(rollout, plain.field, plain.region).savefig("episodes.png")
+assert plain.render().shape == (700, 700, 3)
+replay.write_replay("page.html", replay.replay_data({"pso": rollout}, plain.field, plain.region, zeta=0.01))
+assert navigation_env(2, seed=0).reset()["observation"].shape == (2, 13)
+"""
+MYPY = """
+[mypy]
+strict = true
+cache_dir = {cache}
+[mypy-torch.*,torchrl.*,tensordict.*,numpy.*,matplotlib.*,gymnasium.*]
+follow_imports = skip
+"""
+SNIPPET = """
+import magrl
+from magrl.navigators.secant import Secant
+
+region = magrl.Region((-10, 0), (160, 170))
+scenario = magrl.Scenario(region=region, distance_range_km=(200, 400), date="2026-07-01", generation=14)
+env = magrl.GeomagneticNavEnv(scenario, num_envs=4, seed=0)
+rate: float = magrl.summarize(magrl.episode_measures(env.rollout(5, Secant())))["success_rate"]
+"""
+
+
+def run(*command: object, cwd: Path) -> str:
+    """Return the output of a command that runs without the tree on Python's path."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    done = subprocess.run([str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """Built from a copy of the tree: a build leaves files beside the source."""
+    folder = tmp_path_factory.mktemp("wheel")
+    shutil.copytree(ROOT, folder / "tree", ignore=LEFT_OUT)
+    options = ("--no-deps", "--no-index", "--no-build-isolation", "--disable-pip-version-check", "--wheel-dir", folder)
+    run(sys.executable, "-m", "pip", "wheel", *options, folder / "tree", cwd=folder)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def python(wheel: Path, tmp_path_factory) -> Path:
+    """Return Python of an environment with the wheel, which finds all else where the present environment has it."""
+    folder = tmp_path_factory.mktemp("user")
+    venv.create(folder / "venv", with_pip=False)
+    executable = folder / "venv" / "bin" / "python"
+    site = Path(run(executable, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder).strip())
+    # A path in a .pth file is searched last, and .pth files that lie there (such as this tree's own) are not read.
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    options = ("--no-deps", "--no-index", "--disable-pip-version-check")
+    run(sys.executable, "-m", "pip", "--python", executable, "install", *options, wheel, cwd=folder)
+    return executable
+
+
+def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        held = {Path(name) for name in archive.namelist()}
+    library = {path.relative_to(ROOT) for path in (ROOT / "magrl").rglob("*") if path.suffix == ".py"}
+    data = {Path("magrl/py.typed"), Path("magrl/evaluation/templates/replay.html")}
+    data |= {Path("magrl/evaluation/coastlines.npz"), Path("magrl/field/wmmhr2025.cof.gz")}
+    data |= {Path("magrl/field/weather.npz")}
+    data |= {Path(f"magrl/agents/pretrained/anywhere.{kind}") for kind in ("pt", "md")}
+    assert {path for path in held if path.parts[0] == "magrl"} == library | data
+    others = {path.parts[0] for path in held} - {"magrl"}
+    assert len(others) == 1
+    assert others.pop().endswith(".dist-info")
+    assert any(path.name == "LICENSE" for path in held)
+
+
+def test_wheel_works_without_the_tree(python: Path, tmp_path: Path) -> None:
+    assert len(run(python, "-c", TOUR, cwd=tmp_path).splitlines()) == 2
+    assert (tmp_path / "episodes.png").stat().st_size > 10_000
+
+
+def test_user_s_code_is_typed(python: Path, tmp_path: Path) -> None:
+    """Under mypy --strict: a script that is right passes, one that is wrong does not, and no public name is Any."""
+    (tmp_path / "mypy.ini").write_text(MYPY.format(cache=tmp_path / "cache"))
+    (tmp_path / "user.py").write_text(SNIPPET + "".join(f"reveal_type(magrl.{name})\n" for name in magrl.__all__))
+    check = (sys.executable, "-m", "mypy", "--config-file", "mypy.ini", "--python-executable", python)
+    said = run(*check, "user.py", cwd=tmp_path)
+    assert said.count("Revealed type is") == len(magrl.__all__)
+    assert 'Revealed type is "Any"' not in said, said
+    wrong = "import magrl\nmagrl.GeomagneticNavEnv(num_envs='four')\n"
+    assert "arg-type" in subprocess.run([*check, "-c", wrong], cwd=tmp_path, capture_output=True, text=True).stdout

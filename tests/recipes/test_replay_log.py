@@ -1,0 +1,110 @@
+"""The recipe that replays a log: estimates against truth, joined rows, files, and errors that name the row."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from magrl.training import UsageError
+
+ROOT = Path(__file__).parent.parent.parent
+LOG = ROOT / "docs" / "examples" / "log.csv"
+NOISE = ["--noise", "0.02", "0.02", "2"]
+
+
+def load(path: Path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    return load(ROOT / "recipes" / "replay_log.py")
+
+
+def test_the_example_is_what_its_command_writes(tmp_path: Path) -> None:
+    load(ROOT / "docs" / "examples" / "make_log.py").write(tmp_path / "log.csv")
+    assert (tmp_path / "log.csv").read_text() == LOG.read_text()
+
+
+def test_the_example_with_other_columns(recipe, tmp_path: Path, capsys) -> None:
+    """The estimate comes near the truth, the stated error holds, and no position enters: without them, the same."""
+    recipe.main([str(LOG), *NOISE, "--out", str(tmp_path / "a")])
+    table = pd.read_csv(tmp_path / "a" / "log.csv")
+    assert len(table) == len(pd.read_csv(LOG))
+    assert table["miss_km"].iloc[-1] < 6
+    assert table["miss_km"].iloc[-5] < 0.4 * table["miss_km"].iloc[1]
+    assert table["stop"].iloc[-1] == "arrived"
+    said = capsys.readouterr().out
+    assert (tmp_path / "a" / "log.md").read_text() in said
+    assert "Error of the estimated way at the end" in said
+    assert (tmp_path / "a" / "log.png").stat().st_size > 10_000
+    blind = pd.read_csv(LOG).drop(columns=["time", "latitude", "longitude"]).rename(columns={"D": "dec"})
+    blind.to_csv(tmp_path / "blind.csv", index=False)
+    recipe.main([str(tmp_path / "blind.csv"), *NOISE, "--declination", "dec", "--out", str(tmp_path / "b")])
+    other = pd.read_csv(tmp_path / "b" / "log.csv")
+    assert "miss_km" not in other
+    columns = ["move_km", "steer_deg", "north_km", "error_km", "confidence"]
+    pd.testing.assert_frame_equal(table[columns], other[columns])
+
+
+def test_a_small_heading_is_not_compared_with_commands_that_nobody_followed(recipe) -> None:
+    """A northbound move of a few degrees is no heading in radians, whatever would have been commanded."""
+    config = recipe.Config(LOG, target=(5.0, 60.0, 21000.0))
+    log = recipe.read_log(config).head(3).copy()
+    steer = recipe.replay(config, log)["steer_deg"][0]
+    log.loc[1, "heading"] = math.radians(steer)
+    assert abs(steer - math.radians(steer)) > 10
+    assert len(recipe.replay(config, log)) == 3
+
+
+def test_short_moves_are_joined(recipe, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = ["0,60,20000,0,0", "0,60,20000,0,3", "0,60,20000,90,4", "0,60,20000,90,2"]
+    path.write_text("\n".join(["D,I,B_H,heading,distance", *rows]))
+    log = recipe.read_log(recipe.Config(path))
+    joined = recipe.joined(log, 5.0)
+    assert joined["row"].tolist() == [1, 3, 4]
+    assert joined["distance"].tolist() == pytest.approx([0, 5, 2])
+    assert joined["heading"].tolist() == pytest.approx([0, 53.130102, 90])
+    pd.testing.assert_frame_equal(recipe.joined(log, 0.0), log, check_dtype=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "message"),
+    [
+        (("B_H", "H"), (), "has no column 'B_H' but 'time', 'D', 'I', 'H'.*name it by --horizontal"),
+        (("longitude", "lon"), (), "has no column 'longitude'.*name it by --longitude"),
+        (("1.310", "x"), (), r"row 2 of .*: D is 'x', which is not a number"),
+        (("1.310", ""), (), r"row 2 of .*: D is nan, which is not a number"),
+        (("14271.7", "14.27"), (), r"row 2 of .*microtesla"),
+        (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
+        (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest move"),
+        (("", ""), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
+        (("", ""), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
+        (("", ""), ("--every-km", "-1"), "every_km must be"),
+        (("", ""), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),
+    ],
+)
+def test_errors_name_what_is_wrong(recipe, tmp_path: Path, change, arguments, message: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(LOG.read_text().replace(*change, 1) if change[0] else LOG.read_text())
+    with pytest.raises(UsageError, match=message):
+        recipe.main([str(path), *arguments, "--out", str(tmp_path / "out")])
+
+
+def test_headings_that_may_be_radians_are_named(recipe, tmp_path: Path, capsys) -> None:
+    """The example with its headings in radians: no vehicle was to steer so, but no single row is impossible."""
+    log = pd.read_csv(LOG)
+    log["heading"] = log["heading"] / 57.29578
+    log.to_csv(tmp_path / "log.csv", index=False)
+    recipe.main([str(tmp_path / "log.csv"), *NOISE, "--out", str(tmp_path / "out")])
+    assert "If these are radians, convert them to degrees" in capsys.readouterr().out

@@ -1,0 +1,237 @@
+"""Conditions of real vehicles: presets, what navigators are told, what they may read, and the commands."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import evaluate
+import fly
+import pytest
+import torch
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import check_env_specs
+
+from magrl import tracking
+from magrl.agents.pretrained import load_pretrained
+from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
+from magrl.evaluation import evaluation_rollout
+from magrl.evaluation.navigators import make_navigator
+from magrl.field.elements import field_vector
+from magrl.field.records import weather_record
+from magrl.navigators import Kalman
+from magrl.training import UsageError
+from magrl.transforms import (
+    CONDITIONS,
+    TRUE_KEYS,
+    Conditions,
+    MagneticWeather,
+    MotionError,
+    NorthReferenceError,
+    SensorErrors,
+    VectorErrors,
+    with_conditions,
+)
+from magrl.transforms.errors.base import TYPICAL_FIELD
+from magrl.transforms.errors.sensors import OUTAGE_STD
+
+ERRORS = [name for name in CONDITIONS if name != "laboratory"]
+
+
+def nav(num_envs: int, drift_km: float = 0.0, **options: object) -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(num_envs=num_envs, seed=0, start_heading="random", drift_km=drift_km, **options)
+
+
+def under(name: str, num_envs: int = 2, seed: int = 0) -> EnvBase:
+    return with_conditions(nav(num_envs, CONDITIONS[name].drift_km(50.0)), name, seed)
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_conformance(name: str) -> None:
+    check_env_specs(under(name), break_when_any_done="both")
+
+
+def test_without_errors_the_environment_stays() -> None:
+    env = nav(2)
+    assert with_conditions(env, "laboratory") is env
+    assert CONDITIONS["laboratory"].sensor_std == CONDITIONS["laboratory"].bias_std == (0.0, 0.0, 0.0)
+
+
+def test_order_of_the_errors() -> None:
+    order = [MotionError, MagneticWeather, SensorErrors, NorthReferenceError]
+    assert [type(part) for part in CONDITIONS["low-cost"].transforms()] == order
+
+
+def test_an_environment_that_is_too_small_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"drift_km=3\.\d+"):
+        with_conditions(nav(2), "ship")
+
+
+class TypicalField(nn.Module):
+    """The field that data sheets are stated for, everywhere."""
+
+    def forward(self, latitude: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+        return field_vector(torch.tensor(TYPICAL_FIELD, dtype=torch.float64)).expand(*latitude.shape, 3)
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_what_is_told_is_the_size_of_the_errors(name: str) -> None:
+    env = under(name, 4000)
+    env.base_env.field = TypicalField()
+    state = env.reset()
+    error = state["field"] - state["true_field"]
+    told = (state["sensor_std"].square() + state["bias_std"].square()).sqrt()
+    torch.testing.assert_close((error / told).square().mean(0).sqrt(), torch.ones(3), rtol=0.12, atol=0)
+
+
+EVERY_ERROR = Conditions(
+    "own",
+    sensors={"scale": (0.01,) * 3, "outage_rate": 0.3, "vector": VectorErrors((10.0,) * 3, attitude_deg=(0.1, 0.1))},
+    north="marine",
+    weather={"record": "disturbed"},
+)
+
+
+@pytest.mark.parametrize("conditions", [*(CONDITIONS[name] for name in ERRORS), EVERY_ERROR], ids=lambda one: one.name)
+def test_what_is_told_is_the_same_everywhere(conditions: Conditions) -> None:
+    """If it depended on the true field, a policy could compute that field from it."""
+    rollout = with_conditions(nav(20, conditions.drift_km(50.0)), conditions).rollout(3)
+    white, slow = (rollout[key].flatten(0, 1) for key in ("sensor_std", "bias_std"))
+    read = white[:, 1] < OUTAGE_STD
+    assert 20 <= read.sum() < (55 if conditions is EVERY_ERROR else 61)
+    for told, expected in ((white[read], conditions.sensor_std), (slow, conditions.bias_std)):
+        torch.testing.assert_close(told, torch.tensor(expected).expand_as(told))
+        assert len(told.unique(dim=0)) == 1
+
+
+def test_the_variances_of_all_errors_add_up() -> None:
+    """By hand at I = 45 deg, B_H = 20000 nT, D = 0: weather, hard iron, bias, noise and north."""
+    weather = {"record": "disturbed"}
+    sensors = {"std": (0.3, 0.0, 4.0), "bias": (0.0, 0.0, 5.0), "vector": VectorErrors((10.0,) * 3)}
+    conditions = Conditions("own", sensors=sensors, north={"constant_deg": 0.4, "random_deg": 0.4}, weather=weather)
+    reading = torch.tensor([0.0, 45.0, 20000.0], dtype=torch.float64)
+    variances = zip(*(part.variances(reading) for part in conditions.transforms()), strict=True)
+    white, slow = (sum(parts).sqrt() for parts in variances)
+    moments = weather_record("disturbed").second_moments()
+    (north2, east2, down2), both = moments.diagonal(), moments[0, 2]
+    nanotesla = torch.stack((east2 + 100, (north2 + down2) / 2 - both + 100, north2 + 125)).sqrt()
+    degrees = torch.tensor([20000.0, 20000 * 2**0.5, 1.0], dtype=torch.float64).reciprocal()
+    degrees[:2] = torch.rad2deg(degrees[:2])
+    expected = nanotesla * degrees
+    expected[0] = torch.hypot(expected[0], torch.tensor(0.4, dtype=torch.float64))
+    torch.testing.assert_close(white, torch.tensor([0.5, 0.0, 4.0], dtype=torch.float64))
+    torch.testing.assert_close(slow, expected)
+
+
+def test_evaluations_repeat_and_seeds_differ() -> None:
+    env, kalman = under("low-cost", 3), Kalman(max_steps=4)
+    first, again = (evaluation_rollout(env, kalman)[:, :4] for _ in range(2))
+    assert (first == again).all()
+    assert not torch.equal(first["field"], evaluation_rollout(under("low-cost", 3, seed=1), kalman)[:, :4]["field"])
+
+
+@pytest.mark.parametrize("name", ["anywhere", "kalman"])
+def test_nothing_true_is_read(name: str) -> None:
+    """Actions stay when everything that is privileged is scrambled."""
+    env = under("low-cost", 5)
+    rollout = env.rollout(4, make_navigator(name, env.base_env))
+
+    def actions(scramble: bool) -> torch.Tensor:
+        navigator, found = make_navigator(name, env.base_env), []
+        for state in rollout.exclude("action", "next").unbind(1):
+            if scramble:
+                for key in {*PRIVILEGED_KEYS, *TRUE_KEYS} & set(state.keys()):
+                    state[key] = torch.rand_like(state[key].double()).to(state[key].dtype)
+            found.append(navigator(state)["action"])
+        return torch.stack(found, 1)
+
+    assert set(TRUE_KEYS) <= set(rollout.keys())
+    assert torch.equal(actions(scramble=True), actions(scramble=False))
+
+
+def test_navigators_are_told_what_they_can_tell_apart() -> None:
+    env, told = nav(2), {"noise": (0.3, 0.0, 3.0), "bias": (0.4, 0.1, 4.0)}
+    kalman, secant = make_navigator("kalman", env, **told), make_navigator("secant", env, **told)
+    assert (tuple(kalman.noise), kalman.bias) == ((0.3, 0.0, 3.0), (0.4, 0.1, 4.0))
+    assert secant.noise == pytest.approx([0.5, 0.1, 5.0])
+
+
+def test_a_biased_element_turns_the_way_of_kalman() -> None:
+    """The way of its first filter is that of the tracking module with the same bias."""
+    seen = nav(4).reset()
+    plain, biased = Kalman(noise=(0.05, 0.05, 5.0)), Kalman(noise=(0.05, 0.05, 5.0), bias=(3.0, 0.0, 0.0))
+    assert not torch.allclose(plain(seen.clone())["action"], biased(seen.clone())["action"])
+    reading, target = seen["field"].double(), seen["target_field"].double()
+    prior = tracking.dipole_prior(reading)
+    track = tracking.start(reading, prior.gradient, prior.std, (0.05, 0.05, 5.0), prior.azimuth)
+    ways = [tracking.way_to(track, target, 300.0, bias_std=bias).covariance for bias in ((0.0,) * 3, (3.0, 0.0, 0.0))]
+    assert (ways[1].diagonal(dim1=-2, dim2=-1) >= ways[0].diagonal(dim1=-2, dim2=-1)).all()
+
+
+def test_the_agent_heeds_constant_errors() -> None:
+    state, policy = nav(4).reset(), load_pretrained("anywhere")
+    without = policy(state.clone())["action"]
+    zeros = torch.zeros_like(state["field"])
+    assert torch.equal(policy(state.clone().set("bias_std", zeros))["action"], without)
+    biased = policy(state.clone().set("bias_std", zeros + torch.tensor([3.0, 0.0, 0.0])))["action"]
+    assert not torch.allclose(biased, without)
+
+
+# Commands
+
+
+def test_evaluate_under_conditions(tmp_path: Path) -> None:
+    out = tmp_path / "results"
+    config = evaluate.Config(("kalman",), tasks=5, conditions="ship", out=out, wandb_mode="disabled")
+    prepared = evaluate.prepare(config)
+    assert {type(part) for part in prepared.env.transform} >= {MotionError, NorthReferenceError}
+    assert prepared.navigators[0][0].bias == CONDITIONS["ship"].bias_std
+    assert evaluate.settings(prepared.config, prepared.env)["conditions"] == "ship"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"conditions": "ship", "noise": (0.1, 0.1, 1.0)},
+            "--conditions ship hold the noise of the sensors: omit --noise",
+        ),
+        ({"conditions": "sledge"}, "unknown conditions 'sledge': choose from laboratory, aircraft, ship"),
+    ],
+)
+def test_bad_conditions_of_the_commands_are_refused(tmp_path: Path, options: dict, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        evaluate.prepare(evaluate.Config(("secant",), out=tmp_path / "a", **options))
+    with pytest.raises(UsageError, match=message):
+        fly.prepare(fly.Config("60.4N 5.3E", "64.1N 21.9W", out=tmp_path / "b", **options))
+
+
+def test_fly_under_conditions(tmp_path: Path) -> None:
+    """With a heading that was chosen, which is the true one; the measured one has the error of the north reference."""
+    options = {"conditions": "underwater", "start_heading": 90.0, "max_steps": 2}
+    config = fly.Config("60.4N 5.3E", "64.1N 21.9W", navigator="secant", out=tmp_path, **options)
+    env, navigator = fly.prepare(config)
+    steps = fly.rollout(env, navigator, 90.0)
+    north = torch.rad2deg(steps["true_heading"] - steps["heading"])[0, 0]
+    torch.testing.assert_close(steps["true_heading"][0, 0], torch.tensor([torch.pi / 2]))
+    torch.testing.assert_close(north, steps["north_error"][0, 0, 2:], atol=1e-4, rtol=0)
+    assert north.abs() > 0.001
+
+
+@pytest.mark.parametrize("name", ["kalman", "secant", "map_matching"])
+def test_a_navigator_does_not_rely_on_the_reading_of_an_outage(name: str) -> None:
+    """It goes the same way whatever the reading is, within a percent of what the reading is worth otherwise."""
+    noise = (0.05, 0.05, 5.0)
+    env = with_conditions(GeomagneticNavEnv(num_envs=20, seed=0), Conditions("noise", sensors={"std": noise}), seed=0)
+    navigator = make_navigator(name, env.base_env, noise=noise)
+    state = env.rollout(4, navigator, break_when_any_done=False)[:, -1]["next"]
+
+    def turns(std: float, shift: float) -> torch.Tensor:
+        """Turns [rad] after a reading with ``std`` times the noise that is shifted by ``shift`` times the noise."""
+        field, told = state["field"] + shift * torch.tensor(noise), (std * torch.tensor(noise)).expand(20, 3)
+        return copy.deepcopy(navigator)(state.clone().update({"field": field, "sensor_std": told}))["action"][:, 1]
+
+    heeded, ignored = ((turns(std, 5.0) - turns(std, 0.0)).abs().mean() for std in (1.0, OUTAGE_STD))
+    assert heeded > 0.01
+    assert ignored < 0.01 * heeded

@@ -1,0 +1,194 @@
+"""The transforms in environments of other domains, as docs/transforms.md shows them."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import multiprocessing
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from magrl.geodesy import wrap_angle
+from magrl.transforms import FieldGradient, MinMaxNorm
+
+ROOT = Path(__file__).parent.parent.parent
+sys.path.append(str(ROOT / "docs" / "examples"))
+
+
+def example(name: str) -> ModuleType:
+    return importlib.import_module(name)
+
+
+plume, plume_env = example("plume"), example("plume_env")
+
+
+# The estuary
+
+
+def guided_plume(num_envs: int = 4) -> TransformedEnv:
+    return plume.make_env(num_envs, 30, seed=0, guided=True)
+
+
+def test_concentration_north_of_an_outfall_falls_with_the_root_of_the_distance() -> None:
+    west, _ = plume_env.OUTFALLS_KM
+    north = torch.tensor([1.0, 4.0, 100.0])
+    value = plume_env.concentration(west + torch.stack((north, torch.zeros(3)), -1))[:, 0]
+    torch.testing.assert_close(value, -north.log() / 2)
+
+
+def test_concentration_against_the_current_falls_by_the_spread() -> None:
+    """At 1 km south, r - x is 2 km."""
+    west, east = plume_env.OUTFALLS_KM
+    for index, outfall in enumerate((west, east)):
+        value = plume_env.concentration(outfall - torch.tensor([1.0, 0.0]))[index]
+        assert float(value) == pytest.approx(-2 / plume_env.SPREAD_KM)
+
+
+def test_tracers_change_five_times_as_fast_in_one_direction_as_in_another() -> None:
+    grid = torch.cartesian_prod(torch.linspace(0, 10, 101), torch.linspace(-5, 5, 101))
+    gradient = FieldGradient(plume_env.concentration)(TensorDict(position=grid))["field_gradient"]
+    assert float(torch.linalg.cond(gradient).median()) == pytest.approx(5.2, abs=0.1)
+
+
+def test_tracers_stay_within_their_spec() -> None:
+    grid = torch.cartesian_prod(torch.linspace(0, 10, 201), torch.linspace(-5, 5, 201))
+    value = plume_env.concentration(grid)
+    space = plume_env.PlumeEnv(1).observation_spec["tracers"].space
+    assert (space.low < value).all()
+    assert (value < space.high).all()
+
+
+@pytest.mark.parametrize("guided", [True, False])
+def test_plume_env_keeps_its_specs(guided: bool) -> None:
+    check_env_specs(plume.make_env(4, 5, seed=0, guided=guided), break_when_any_done="both")
+
+
+def test_a_move_of_the_plume_env_by_hand() -> None:
+    env = plume_env.PlumeEnv(1)
+    td = env.reset()
+    td["position"], td["heading"] = torch.tensor([[5.0, 4.5]]), torch.tensor([[0.0]])
+    after = env.step(td.set("action", torch.tensor([[0.5, math.pi / 3]])))["next"]
+    torch.testing.assert_close(after["position"], torch.tensor([[5.25, 4.5 + math.sqrt(3) / 4]]))
+    torch.testing.assert_close(after["heading"], torch.tensor([[math.pi / 3]]))
+    after = env.step(td.set("action", torch.tensor([[1.0, math.pi / 2]])))["next"]
+    torch.testing.assert_close(after["position"], torch.tensor([[5.0, 5.0]]))  # stopped by the bank
+
+
+def test_the_way_by_two_tracers_leads_to_the_target() -> None:
+    """An oracle that holds the theoretical heading arrives: so the transforms speak the language of this env too."""
+    env = TransformedEnv(plume_env.PlumeEnv(200), Compose(StepCounter(30), *plume.guidance()))
+
+    def hold(td: TensorDictBase) -> TensorDictBase:
+        turn = wrap_angle(td["way"] - td["heading"]).clamp(-math.pi / 2, math.pi / 2)
+        return td.set("action", torch.cat((torch.full_like(turn, 0.6), turn), -1))
+
+    flown = env.rollout(30, hold, break_when_any_done=False, break_when_all_done=True)
+    assert flown["next", "terminated"].any(1).double().mean() > 0.97
+    assert flown["way_valid"].double().mean() > 0.95
+
+
+def test_the_plume_reward_is_that_of_the_env_and_of_the_alignment() -> None:
+    env, plain = guided_plume(), plume.make_env(4, 30, seed=0, guided=False)
+    start, plain_start = env.reset(), plain.reset()
+    action = torch.rand(4, 2) * 2 - 1
+    after, plain_after = (e.step(td.set("action", action))["next"] for e, td in ((env, start), (plain, plain_start)))
+    assert start["way_valid"].all()
+    apart = wrap_angle(after["heading"] - start["way"]).abs()
+    torch.testing.assert_close(after["reward"], plain_after["reward"] - 0.2 * apart)
+
+
+def test_guided_plume_in_other_processes_is_the_one_in_this() -> None:
+    """Both kinds of nesting, over one pair of processes."""
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+    moves = torch.rand(2, 2, 4, 2) * 2 - 1
+
+    def rewards(env: EnvBase) -> torch.Tensor:
+        td = env.reset()
+        steps = [env.step(td.clone().set("action", move)) for move in moves]
+        return torch.stack([step["next", "reward"] for step in steps])
+
+    parallel = ParallelEnv(2, guided_plume, mp_start_method=method)
+    try:
+        check_env_specs(parallel)
+        parallel.set_seed(5)
+        there = rewards(parallel)
+    finally:
+        parallel.close()
+    serial = SerialEnv(2, guided_plume)
+    check_env_specs(serial)
+    serial.set_seed(5)
+    assert torch.equal(there, rewards(serial))
+
+
+def test_the_plume_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = {"seeds": 2, "total_frames": 128, "num_envs": 16, "init_random_frames": 32, "batch_size": 16}
+    trainings = plume.main(plume.Config(out=tmp_path, eval_every=4, eval_tasks=16, max_steps=5, **small))
+    assert {name: [run.frames for run in runs] for name, runs in trainings.items()} == {
+        "gg_td3": [[64, 128]] * 2,
+        "td3": [[64, 128]] * 2,
+    }
+    assert (tmp_path / "results" / "plume.md").read_text() in capsys.readouterr().out
+    for name in ("plume.png", "plume-tracks.png"):
+        assert (tmp_path / "figures" / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_same_seed_trains_the_same_plume_agent() -> None:
+    config = plume.Config(
+        total_frames=64, num_envs=16, init_random_frames=16, batch_size=16, eval_every=4, eval_tasks=4
+    )
+    weights = [plume.train(config, seed, guided=True).actor.state_dict() for seed in (1, 1, 2)]
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+    assert any(not torch.equal(weights[0][key], weights[2][key]) for key in weights[0])
+
+
+def test_the_table_of_the_plume_example() -> None:
+    runs = [plume.Training(None, [10, 20, 30, 40], success) for success in ([0, 50, 96, 90], [0, 95, 97, 99])]
+    lines = plume.table({"gg_td3": runs, "td3": [plume.Training(None, [10, 20], [0, 89])]}).splitlines()
+    assert lines[2] == "| Gradient-Guided TD3 | 2 | 25 (20–30) | 72 (50–95) | 94 (90–99) |"
+    assert lines[3] == "| TD3 | 1 | 1 of 1 never | 0 (0–0) | 89 (89–89) |"
+
+
+# Pendulum and classic control
+
+
+def test_the_pendulum_example() -> None:
+    pendulum = example("pendulum")
+    assert pendulum.main(pendulum.Config(steps=50)) == 0.0
+    torque = torch.full((5, 1), 0.5)
+    flights = (pendulum.fly(pendulum.make_env(0), scale * torque, 0)["next", "reward"] for scale in (1.0, 1.1))
+    assert not torch.equal(*flights)
+
+
+def test_the_classic_control_example(capsys: pytest.CaptureFixture[str]) -> None:
+    classic_control = example("classic_control")
+    rows = classic_control.main(classic_control.Config(steps=20))
+    assert len(rows) == 2 + 6 + 4
+    assert rows[9].startswith("| CartPole-v1 | 1 | -inf to inf | -3 to 3 |")
+    assert "CartPole-v1: MinMaxNorm needs finite bounds" in capsys.readouterr().out
+
+
+def test_an_open_side_is_refused_with_what_to_do() -> None:
+    with pytest.raises(ValueError, match=re.escape("give bounds={'observation': (low, high)} with a number on every")):
+        TransformedEnv(GymEnv("CartPole-v1"), MinMaxNorm(["observation"]))
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "MountainCarContinuous-v0", "Acrobot-v1", "CartPole-v1"])
+def test_gym_envs_keep_their_specs_when_scaled(name: str) -> None:
+    env = example("classic_control").make_env(name, open_bound=3.0)
+    check_env_specs(env)
+    if name == "Pendulum-v1":
+        assert env.action_spec.space.high.tolist() == [1.0]
+
+
+def test_numbers_without_bounds_go_on_beyond_the_interval() -> None:
+    env = example("classic_control").make_env("CartPole-v1", open_bound=0.01)
+    assert env.rollout(10)["scaled"].abs().max() > 1
+    assert env.observation_spec["scaled"].space.high.tolist() == [1.0, math.inf, 1.0, math.inf]
