@@ -21,18 +21,16 @@ from magrl.checks import check_numbers, check_tensor, require
 
 WGS84_A_KM = 6378.137
 """Semi-major axis of the WGS84 ellipsoid [km]."""
-
-
 WGS84_F = 1 / 298.257223563
 """Flattening of the WGS84 ellipsoid."""
-
-
 WGS84_E2 = WGS84_F * (2 - WGS84_F)
 """First eccentricity squared of the WGS84 ellipsoid."""
-
-
 WGS84_B_KM = WGS84_A_KM * (1 - WGS84_F)
 """Semi-minor axis of the WGS84 ellipsoid [km]."""
+MEAN_RADIUS_KM = 6371.0
+"""Mean radius of the Earth: of spherical distances [km]."""
+REFERENCE_RADIUS_KM = 6371.2
+"""Reference radius of the geomagnetic field: of spherical harmonics and dipoles [km]."""
 
 
 def displaced(distance: Tensor, heading: Tensor, error: Tensor) -> Tensor:

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from magrl import paper
 from magrl.checks import check_number, check_numbers, check_tensor
-from magrl.geodesy import check_box, geodesic, wrap_longitude
+from magrl.geodesy import MEAN_RADIUS_KM, check_box, geodesic, wrap_longitude
 
-MEAN_RADIUS_KM = 6371.0
 _SHORTEST_DEGREE_KM = 110.5  # a degree of arc is nowhere shorter on the ellipsoid
 
 

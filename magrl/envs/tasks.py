@@ -17,9 +17,9 @@ from torch import Tensor
 from magrl import paper
 from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.counters import counter_uniform
-from magrl.envs.region import MEAN_RADIUS_KM, PAPER_REGION, Region
+from magrl.envs.region import PAPER_REGION, Region
 from magrl.envs.regions import Regions
-from magrl.geodesy import geodesic, move, wrap_angle, wrap_longitude
+from magrl.geodesy import MEAN_RADIUS_KM, geodesic, move, wrap_angle, wrap_longitude
 
 TRIES_PER_ROUND = 8
 MAX_ROUNDS = 1000

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from magrl.checks import check_number, check_numbers, check_tensor, require
-from magrl.field.harmonics import REFERENCE_RADIUS_KM
 from magrl.field.model import FieldModel, Float64Module, in_chunks
-from magrl.geodesy import WGS84_E2, check_box, curvature_radii
+from magrl.geodesy import REFERENCE_RADIUS_KM, WGS84_E2, check_box, curvature_radii
 
 
 def crustal_spectrum(degree: Tensor) -> Tensor:

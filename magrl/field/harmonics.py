@@ -25,9 +25,7 @@ import torch
 from torch import Tensor
 
 from magrl.checks import check_number, check_tensor
-
-REFERENCE_RADIUS_KM = 6371.2
-"""Geomagnetic reference radius [km]: the ``a`` of the expansion."""
+from magrl.geodesy import REFERENCE_RADIUS_KM
 
 
 def differentiate(table: Tensor) -> Tensor:

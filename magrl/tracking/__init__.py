@@ -18,7 +18,6 @@ from magrl.tracking.filter import (
 from magrl.tracking.priors import (
     CURVATURE_NT,
     DIPOLE_STD_NT,
-    EARTH_RADIUS_KM,
     curl_relation,
     dipole_prior,
     field_curvature,
@@ -31,7 +30,6 @@ __all__ = [
     "CURVATURE_NT",
     "DIPOLE_STD_NT",
     "DISTANCE_SCALE_KM",
-    "EARTH_RADIUS_KM",
     "ELEMENT_SCALES",
     "SEARCH_KM",
     "VARIANCE_FLOOR",

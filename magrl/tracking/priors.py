@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from magrl.checks import check_tensor
+from magrl.geodesy import REFERENCE_RADIUS_KM
 from magrl.tracking.filter import GradientPrior, GradientRelation
 
 DIPOLE_STD_NT = ((150.0, 220.0), (165.0, 140.0), (185.0, 135.0))
@@ -19,8 +20,6 @@ components [nT per 100 km]. An angle changes by the disturbance over B_H (D) or 
 
 CURVATURE_NT = (8.5, 12.0, 8.5)
 """Standard deviation of the change of a gradient along the way, in the same way [nT per (100 km)^2]."""
-
-EARTH_RADIUS_KM = 6371.2  # reference radius of the geomagnetic field
 
 LATITUDE_STD_DEG = 20.0
 """Deviation of the latitude from the magnetic latitude [deg], of planets with tilted dipoles."""
@@ -50,8 +49,8 @@ def dipole_prior(reading: Tensor) -> GradientPrior:
     check_tensor(3, reading=reading)
     azimuth, inclination = torch.deg2rad(reading[..., :2]).unbind(-1)
     latitude = torch.atan2(torch.sin(inclination), 2 * torch.cos(inclination))
-    dip_slope = torch.rad2deg(2 / (1 + 3 * torch.sin(latitude).square())) / EARTH_RADIUS_KM
-    strength_slope = -reading[..., 2] * torch.tan(latitude) / EARTH_RADIUS_KM
+    dip_slope = torch.rad2deg(2 / (1 + 3 * torch.sin(latitude).square())) / REFERENCE_RADIUS_KM
+    strength_slope = -reading[..., 2] * torch.tan(latitude) / REFERENCE_RADIUS_KM
     slopes = torch.stack((torch.zeros_like(dip_slope), dip_slope, strength_slope), -1)
     northward = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
     std = torch.tensor(DIPOLE_STD_NT, dtype=slopes.dtype, device=slopes.device) / 100
@@ -111,7 +110,7 @@ def curl_relation(elements: Tensor) -> GradientRelation:
     tan = torch.sin(inclination) / (2 * torch.cos(inclination).clamp_min(_LEAST_COS))
     zero, per_degree = torch.zeros_like(cos), strength * math.radians(1)
     weights = torch.stack((per_degree * cos, per_degree * sin, zero, zero, sin, -cos), -1).unflatten(-1, (3, 2))
-    convergence = strength * sin / EARTH_RADIUS_KM
+    convergence = strength * sin / REFERENCE_RADIUS_KM
     spread = convergence.abs() * (1 + tan.square()) * math.radians(LATITUDE_STD_DEG)
     return GradientRelation(weights, convergence * tan, spread + CURL_STD_NT)
 

@@ -24,10 +24,9 @@ from magrl.field import (
     igrf_coefficients,
     wmmhr_coefficients,
 )
-from magrl.field.harmonics import REFERENCE_RADIUS_KM
 from magrl.field.planets import power_spectrum
 from magrl.field.wmmhr import WMMHR_SHA256
-from magrl.geodesy import curvature_radii, move
+from magrl.geodesy import REFERENCE_RADIUS_KM, curvature_radii, move
 
 DATA = Path(__file__).parent.parent / "data"
 BOX = (-10.0, 0.0), (160.0, 170.0)

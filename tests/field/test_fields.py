@@ -15,12 +15,11 @@ import torch
 from torch import nn
 
 from magrl.field.elements import measured_elements, seven_elements
-from magrl.field.harmonics import REFERENCE_RADIUS_KM
 from magrl.field.igrf import IGRF, igrf_coefficients, parse_date
 from magrl.field.model import elements_at, elements_gradient_at
 from magrl.field.regional import RegionalField
 from magrl.field.spherical import SphericalHarmonicField
-from magrl.geodesy import WGS84_A_KM, WGS84_B_KM, curvature_radii
+from magrl.geodesy import REFERENCE_RADIUS_KM, WGS84_A_KM, WGS84_B_KM, curvature_radii
 
 COEFFICIENT_FILES = {13: ppigrf.ppigrf.shc_fn_igrf13, 14: ppigrf.ppigrf.shc_fn_igrf14}
 LAST_YEAR = {13: 2025, 14: 2030}

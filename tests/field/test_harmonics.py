@@ -7,7 +7,6 @@ import scipy.special
 import torch
 
 from magrl.field.harmonics import (
-    REFERENCE_RADIUS_KM,
     basis,
     chebyshev,
     chebyshev_nodes,
@@ -20,6 +19,7 @@ from magrl.field.harmonics import (
     separate,
     waves,
 )
+from magrl.geodesy import REFERENCE_RADIUS_KM
 
 ROOT3 = math.sqrt(3)
 

@@ -12,13 +12,12 @@ from torchrl.data import Bounded, TensorSpec, Unbounded
 
 from magrl.checks import check_number
 from magrl.counters import NORMAL_LIMIT, advanced, counter_stream, normal_of, stream_normal, stream_uniform
-from magrl.geodesy import displaced, local_frame, polar, wrap_angle
+from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
 from magrl.transforms.base import Keys, observed_spec, several_keys
 from magrl.transforms.errors.base import EpisodeErrors, check_sizes
 
 DISPLACEMENT = "displacement"
 """Key of what an error of motion adds to a commanded move, northward and eastward [km] ``(..., 2)``."""
-EARTH_RADIUS_KM = 6371.0
 EDDIES = 8
 """Number of waves of which a field of eddies is the sum."""
 
@@ -255,7 +254,7 @@ def eddy_waves(seed: int, wavelength_km: float) -> Tensor:
     """
     rows = torch.arange(EDDIES).unsqueeze(-1)
     direction = stream_normal(counter_stream(seed, torch.nn.functional.pad(rows, (1, 0), value=-1)), 3)
-    return direction / direction.norm(dim=-1, keepdim=True) * (2 * math.pi * EARTH_RADIUS_KM / wavelength_km)
+    return direction / direction.norm(dim=-1, keepdim=True) * (2 * math.pi * MEAN_RADIUS_KM / wavelength_km)
 
 
 def eddy_velocity(position: Tensor, waves: Tensor, phases: Tensor) -> Tensor:
