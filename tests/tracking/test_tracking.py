@@ -8,13 +8,12 @@ import torch
 
 from magrl.field import IGRF, SphericalHarmonicField, elements_at, elements_gradient_at, random_planets
 from magrl.field.elements import measured_elements
-from magrl.geodesy import curvature_radii, local_frame, move, to_ecef
+from magrl.geodesy import REFERENCE_RADIUS_KM, curvature_radii, local_frame, move, to_ecef
 from magrl.tracking import (
     CURVATURE,
     CURVATURE_NT,
     DIPOLE_STD_NT,
     DISTANCE_SCALE_KM,
-    EARTH_RADIUS_KM,
     ELEMENT_SCALES,
     VARIANCE_FLOOR,
     FieldTrack,
@@ -448,7 +447,7 @@ def elements_on_sphere(field, latitude):
     zero = torch.zeros_like(latitude)
     normal, ground = local_frame(latitude, zero)[:, 2].neg(), to_ecef(latitude, zero)
     lever = (normal * ground).sum(-1)
-    altitude = (lever.square() - ground.square().sum(-1) + EARTH_RADIUS_KM**2).sqrt() - lever
+    altitude = (lever.square() - ground.square().sum(-1) + REFERENCE_RADIUS_KM**2).sqrt() - lever
     place = to_ecef(latitude, zero, altitude)
     geocentric = torch.atan2(place[:, 2], place[:, 0])
     ecef = local_frame(latitude, zero).mT @ field(latitude, zero, altitude).unsqueeze(-1)
@@ -461,7 +460,7 @@ def test_dipole_prior_is_the_gradient_of_a_dipole_on_a_sphere(dipole):
     latitude = torch.cat((torch.linspace(-80, -2, 20, dtype=F64), torch.linspace(2, 80, 20, dtype=F64)))
     (south, low), (north, high) = (elements_on_sphere(dipole, latitude + step) for step in (-0.01, 0.01))
     _, reading = elements_on_sphere(dipole, latitude)
-    slope = (high - low) / (EARTH_RADIUS_KM * (north - south)).unsqueeze(-1)
+    slope = (high - low) / (REFERENCE_RADIUS_KM * (north - south)).unsqueeze(-1)
     found = dipole_prior(reading)
     torch.testing.assert_close(found.azimuth, torch.zeros(40, dtype=F64), rtol=0, atol=1e-12)
     torch.testing.assert_close(found.gradient[:, 1:, 0], slope[:, 1:], rtol=1e-5, atol=0)
