@@ -1,7 +1,9 @@
 """Sphinx configuration: `make docs` builds the documentation in build/docs, without network access."""
 
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
@@ -11,7 +13,10 @@ import magrl  # noqa: E402 - this tree, not an installed version
 project, author, version = "magrl", "The magrl developers", magrl.__version__
 project_copyright = author
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.apidoc", "sphinx.ext.viewcode"]
-exclude_patterns = ["results", "api/modules.rst"]  # tables that are part of the pages, and a second list of modules
+
+linked = re.findall(r"\((results/[\w-]+\.md)\)", "".join(page.read_text() for page in ROOT.glob("docs/*.md")))
+tables = {f"results/{path.name}" for path in ROOT.glob("docs/results/*.md")}
+exclude_patterns = [*sorted(tables - set(linked)), "api/modules.rst"]  # tables inside pages; a second list of modules
 
 html_theme = "furo"
 html_title = f"magrl {version}"
@@ -33,3 +38,14 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True  # attributes as fields of their class, which may also be documented by autodoc
 napoleon_custom_sections = ["Source"]
+
+
+def add_title(app: Any, name: str, content: list[str]) -> None:  # noqa: ARG001
+    """Give a table that has a page of its own the name of its file as a title."""
+    if name.startswith("results/"):
+        content[0] = f"---\norphan: true\n---\n\n# {name.removeprefix('results/')}\n\n{content[0]}"
+
+
+def setup(app: Any) -> None:
+    """Connect the hooks of this project."""
+    app.connect("source-read", add_title)

@@ -3,8 +3,8 @@
     python docs/examples/plume.py
 
 Trains five seeds of each agent, one after the other: under three minutes on one idle core. Writes
-docs/results/plume.md, docs/figures/plume.png and docs/figures/plume-tracks.png. Expected: with guidance, the agent
-reaches a success rate of 90 % in less than half as many frames.
+docs/results/plume.md and docs/figures/plume.png. Expected: with guidance, the agent reaches a success rate of 90 % in
+less than half as many frames.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from pathlib import Path
 
 import torch
 import tyro
-from matplotlib.figure import Figure
-from plume_env import HIGH_KM, LOW_KM, PlumeEnv, concentration
+from plume_env import PlumeEnv, concentration
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch.optim import Adam
@@ -32,14 +31,13 @@ from torchrl.modules import AdditiveGaussianModule, TanhModule
 
 from magrl.agents import SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.agents.networks import make_mlp
-from magrl.envs.rendering import PATH, START, TARGET
 from magrl.evaluation import plots
-from magrl.evaluation.navigators import NAVIGATOR_NAMES
 from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
 
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
 OBSERVATION_SIZE, NUM_CELLS = 8, (128, 128)
 EVALUATION_SEED = 1_000_000
+LABELS = {"gg_td3": "Gradient-Guided TD3", "td3": "TD3"}
 
 
 @dataclass(frozen=True)
@@ -193,44 +191,22 @@ def table(trainings: Mapping[str, Sequence[Training]], success: float = 90.0) ->
             [run.success[len(run.success) // 2 - 1] for run in runs],
             [run.success[-1] for run in runs],
         )
-        lines.append(" | ".join((f"| {NAVIGATOR_NAMES[name]}", str(len(runs)), *map(spread, columns))) + " |")
+        lines.append(" | ".join((f"| {LABELS[name]}", str(len(runs)), *map(spread, columns))) + " |")
     return "\n".join(lines) + "\n"
 
 
-def tracks_figure(config: Config, actor: TensorDictSequential, count: int = 10) -> Figure:
-    """Draw evaluation episodes over the contours of both tracers."""
-    figure = Figure(figsize=(6.5, 6.9), layout="constrained")
-    axes = figure.subplots()
-    grid = torch.cartesian_prod(*(torch.linspace(low, high, 101) for low, high in zip(LOW_KM, HIGH_KM, strict=True)))
-    values, (north, east) = concentration(grid).unflatten(0, (101, 101)), grid.unflatten(0, (101, 101)).unbind(-1)
-    for index, (bank, color) in enumerate((("west", "#E69F00"), ("east", "#0072B2"))):
-        axes.contour(east, north, values[..., index], 14, colors=color, linewidths=0.5, linestyles="solid")
-        axes.plot([], color=color, lw=1, label=f"tracer of the {bank} bank")
-    rollout = evaluation_episodes(config, actor)[:count]
-    for path in torch.cat((rollout["position"], rollout["next", "position"][:, -1:]), 1):
-        axes.plot(*path.flip(-1).T, "o-", color=PATH, ms=2.5, lw=1.2)
-    ends = (("position", "s", START, "start"), ("target_position", "^", TARGET, "target"))
-    for key, mark, color, label in ends:
-        axes.plot(*rollout[key][:, 0].flip(-1).T, mark, color=color, ms=7, label=label)
-    axes.set(xlabel="east [km]", ylabel="north [km]", aspect="equal")
-    figure.legend(loc="outside upper center", ncols=4)
-    return figure
-
-
 def main(config: Config) -> dict[str, list[Training]]:
-    """Train every seed of both agents, and write the table and the figures."""
+    """Train every seed of both agents, and write the table and the figure."""
     trainings: dict[str, list[Training]] = {"gg_td3": [], "td3": []}
     for seed in range(config.seeds):
         for name, runs in trainings.items():
             runs.append(train(config, seed, guided=name == "gg_td3"))
-            print(f"{NAVIGATOR_NAMES[name]}, seed {seed}: {runs[-1].success[-1]:.1f} % arrive", flush=True)
+            print(f"{LABELS[name]}, seed {seed}: {runs[-1].success[-1]:.1f} % arrive", flush=True)
     for folder in ("results", "figures"):
         (config.out / folder).mkdir(parents=True, exist_ok=True)
     (config.out / "results" / "plume.md").write_text(table(trainings))
     curves = {name: [(run.frames, run.success) for run in runs] for name, runs in trainings.items()}
     plots.learning_curves(curves, "episodes that arrive [%]").savefig(config.out / "figures" / "plume.png", dpi=80)
-    tracks = tracks_figure(config, trainings["gg_td3"][0].actor)
-    tracks.savefig(config.out / "figures" / "plume-tracks.png", dpi=80)
     print(table(trainings), end="")
     return trainings
 

@@ -136,7 +136,7 @@ def test_the_plume_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         "td3": [[64, 128]] * 2,
     }
     assert (tmp_path / "results" / "plume.md").read_text() in capsys.readouterr().out
-    for name in ("plume.png", "plume-tracks.png"):
+    for name in ("plume.png",):
         assert (tmp_path / "figures" / name).read_bytes().startswith(b"\x89PNG")
 
 
