@@ -1,12 +1,18 @@
-"""The documentation agrees with the code: names, tests, links, examples, tables of keys, options and results."""
+"""The documentation agrees with the code: names, links, examples, commands, and tables of keys, options and results."""
 
+import ast
+import contextlib
 import importlib
 import importlib.util
 import inspect
+import io
 import json
 import math
 import re
+import runpy
+import shlex
 import sys
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -15,101 +21,56 @@ import torch
 from torchrl.data import Binary, Bounded, Composite
 from torchrl.envs import Compose, TransformedEnv
 
+import magrl
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
-from magrl.envs.episodes import DEFAULTS
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
-EXAMPLES = [
-    (page, block)
-    for page in PAGES
-    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
-]
+TEXTS = {page: page.read_text() for page in PAGES}
+ENVIRONMENT = TEXTS[ROOT / "docs" / "environment.md"]
 NOTEBOOK = ROOT / "docs" / "tutorial.ipynb"
-CELLS = ["".join(c["source"]) for c in json.loads(NOTEBOOK.read_text())["cells"] if c["cell_type"] == "code"]
-EXAMPLES += [(NOTEBOOK, "\n".join(CELLS))]
+CELLS = json.loads(NOTEBOOK.read_text())["cells"]
+BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
+EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
 BUDGET = {"total_frames = 60_000": "total_frames = 512", "= 512, 1024, 8": "= 64, 64, 1"}
 """Settings of trainings in examples, and those of their tests."""
-THEORY, ENVIRONMENT, OWN_DATA, RELIABILITY = (
-    (ROOT / "docs" / f"{name}.md").read_text() for name in ("theory", "environment", "own_data", "reliability")
-)
+MAKEFILE = (ROOT / "Makefile").read_text()
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+# Names and links
 
 
-def table_rows(text: str, header: str, first: str) -> dict[str, list[str]]:
-    """Return the rows of the first table after ``header`` whose first column is ``first``, by their name in it."""
-    assert header in text, header
-    text = text.partition(header)[2]
-    table = text[text.index(f"| {first} |") :].partition("\n\n")[0]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
-    return {row[0].strip("`"): row[1:] for row in rows}
-
-
-# Names
-
-
-def test_equations_have_functions_and_tests() -> None:
-    rows = [line for line in THEORY.splitlines() if re.match(r"\| (\d-\d|Table|Fig)", line)]
-    assert len(rows) >= 18
-    for row in rows:
-        assert "`" in row.split("|")[3], row
-        assert re.search(r"`tests/test_\w+\.py::\w+`", row), row
-
-
-@pytest.mark.parametrize("name", sorted(set(re.findall(r"`(magrl(?:\.\w+){2,3})`", THEORY))))
-def test_named_functions_exist(name: str) -> None:
-    module, _, attribute = name.rpartition(".")
-    assert hasattr(importlib.import_module(module), attribute)
-
-
-@pytest.mark.parametrize("name", sorted(set(re.findall(r"`(tests/test_\w+\.py(?:::\w+)?)`", THEORY))))
-def test_named_tests_exist(name: str) -> None:
-    path, _, test = name.partition("::")
-    assert re.search(rf"^(def|class) {test}\b" if test else "", (ROOT / path).read_text(), re.MULTILINE)
-
-
-def test_tests_of_guarantees_exist() -> None:
-    guarantees = RELIABILITY.partition("\n## ")[0]
-    rows = [line for line in guarantees.splitlines() if line.startswith("| ")]
-    assert len(rows) >= 20
-    for row in rows[1:]:
-        named = re.findall(r"`(test_\w+\.py)?(?:::)?(test_\w+)?`", row.split("|")[2])
-        assert named, row
-        file = ""
-        for path, test in named:
-            file = path or file
-            source = (ROOT / "tests" / file).read_text()
-            assert re.search(rf"^ *def {test}\b" if test else "", source, re.MULTILINE), f"{file}::{test}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+@each_page
+def test_links_and_names_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", TEXTS[page]):
         assert (page.parent / target).exists(), target
+    for name in re.findall(r"`(magrl(?:\.\w+){2,3})`", TEXTS[page] if page.name != "CHANGELOG.md" else ""):
+        module, _, attribute = name.rpartition(".")
+        assert importlib.util.find_spec(module), name
+        assert hasattr(importlib.import_module(module), attribute) or importlib.util.find_spec(name), name
 
 
-def test_every_page_is_in_the_list_of_the_readme() -> None:
-    readme = (ROOT / "README.md").read_text()
-    for page in [*ROOT.glob("docs/*.md"), NOTEBOOK]:
-        assert page.name == "index.md" or f"(docs/{page.name})" in readme, page.name
+def test_every_page_is_in_the_index_and_linked_from_the_readme() -> None:
+    index = TEXTS[ROOT / "docs" / "index.md"].splitlines()
+    for page in {*ROOT.glob("docs/*.md"), NOTEBOOK} - {ROOT / "docs" / "index.md"}:
+        assert page.stem in index
+        assert f"(docs/{page.name})" in TEXTS[ROOT / "README.md"]
 
 
-def test_citation_names_the_version_the_license_and_the_paper() -> None:
-    import magrl
-
+def test_citation_names_the_version_and_the_paper() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"version: {magrl.__version__}\n" in citation
-    assert "license: MIT\n" in citation
-    for text in (citation, THEORY, (ROOT / "README.md").read_text()):
-        assert re.search(r"arxiv[\s:]2410\.15837", text, re.IGNORECASE)
+    assert all("2410.15837" in text for text in (citation, TEXTS[ROOT / "README.md"]))
 
 
-# Examples
+# Examples and commands
 
 
 @pytest.fixture(scope="module")
-def run_folder(tmp_path_factory) -> Path:
+def reader(tmp_path_factory) -> Path:
     """Folder of a reader who has followed docs/start.md, with an untrained policy in runs/first."""
     folder = tmp_path_factory.mktemp("reader")
     (folder / "runs" / "first").mkdir(parents=True)
@@ -118,145 +79,122 @@ def run_folder(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("page", "block"), EXAMPLES, ids=lambda value: getattr(value, "name", None))
-def test_python_examples_run(page: Path, block: str, run_folder: Path, monkeypatch) -> None:
-    monkeypatch.chdir(run_folder)
+@pytest.mark.parametrize(("page", "code"), EXAMPLES, ids=lambda value: getattr(value, "name", ""))
+def test_python_examples_run(page: Path, code: str, reader: Path, monkeypatch) -> None:
+    monkeypatch.chdir(reader)
     for setting, small in BUDGET.items():
-        block = block.replace(setting, small)
-    names: dict[str, object] = {}
-    exec(compile(block, str(page), "exec"), names)
-    assert len(names) > 1, "an example should leave something behind"
+        code = code.replace(setting, small)
+    exec(compile(code, str(page), "exec"), {})
 
 
 def test_the_notebook_is_kept_without_outputs() -> None:
-    """The build of the documentation executes it."""
-    cells = json.loads(NOTEBOOK.read_text())["cells"]
-    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in CELLS)
     assert all(setting in EXAMPLES[-1][1] for setting in BUDGET)
 
 
-def test_a_training_of_another_algorithm_is_short() -> None:
-    block = next(block for page, block in EXAMPLES if page.name == "training_your_own.md")
-    assert len(block.splitlines()) <= 80
-    assert all(setting in block for setting in BUDGET)
+@cache
+def help_text(script: str) -> str:
+    """Return the --help of a script, or of a module after ``-m``."""
+    run, name = (runpy.run_module, script[3:]) if script.startswith("-m ") else (runpy.run_path, str(ROOT / script))
+    shown = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+        patch.setattr(sys, "argv", [script, "--help"])
+        patch.syspath_prepend(ROOT / "recipes")
+        patch.setenv("COLUMNS", "200")
+        run(name, run_name="__main__")
+    return shown.getvalue()
 
 
-# Tables of options
+def commands(text: str) -> list[list[str]]:
+    """Return the commands of shell blocks and of code in a text as words, without comments and what a loop adds."""
+    lines = [line for language, code in BLOCK.findall(text) if language == "sh" for line in code.splitlines()]
+    joined = "\n".join(lines).replace("\\\n", " ").splitlines()
+    prose = re.findall(r"`((?:make|python) [^`]+)`", BLOCK.sub("", text))
+    words = [shlex.split(part, comments=True) for line in joined + prose for part in line.split(";")]
+    return [[w for w in command if not re.match(r"do$|done$|[A-Z_]+=\d", w)] for command in words]
 
 
-def documented_default(text: str) -> object:
-    """Return the value that a cell of a table gives as a default; None for the word "random"."""
-    text = text.strip("`").replace("π", "math.pi")
-    if text == "random":
-        return None
-    try:
-        return eval(text, {"math": math, "Scenario": Scenario})
-    except (SyntaxError, NameError):
-        return text
+@each_page
+def test_scripts_options_and_targets_exist(page: Path) -> None:
+    for program, *rest in filter(None, commands(TEXTS[page])):
+        if program == "make":
+            assert re.search(rf"^{rest[0]}:", MAKEFILE, re.MULTILINE), rest
+        elif program.endswith("python"):
+            script = " ".join(rest[: 1 + (rest[0] == "-m")])
+            for flag in (word.partition("=")[0] for word in rest if word.startswith("--")):
+                assert re.search(rf"{flag}(?![\w-])", help_text(script)), f"{script} has no {flag}"
+            assert rest[0] == "-m" or (ROOT / script).is_file(), script
+    recipes = [str(path.relative_to(ROOT)) for path in ROOT.glob("recipes/*.py")]
+    known = "".join(map(help_text, [*recipes, "-m magrl.field"]))
+    for flag in re.findall(r"`(--[\w-]+)", TEXTS[page]):
+        assert re.search(rf"{flag}(?![\w-])", known), f"no script has {flag}"
 
 
-def test_options_of_the_environment_are_documented() -> None:
-    options = dict(inspect.signature(GeomagneticNavEnv.__init__).parameters)
-    options.pop("self")
-    rows = table_rows(ENVIRONMENT, "## Options", "option")
-    assert list(rows) == list(options)
-    for name in rows.keys() - {"scenario", "device"}:
-        default = DEFAULTS.get(name, options[name].default)
-        assert documented_default(rows[name][0]) == pytest.approx(default), name
-        assert (options[name].default is None) == (name in DEFAULTS or default is None), name
-    assert documented_default(rows["scenario"][0]) == Scenario()
+# Tables
 
 
-def test_fields_of_a_scenario_are_documented() -> None:
-    rows = table_rows(ENVIRONMENT, "## Scenario", "field")
-    assert list(rows) == list(Scenario.model_fields)
-    for name in rows.keys() - {"region", "date"}:
-        assert documented_default(rows[name][0]) == getattr(Scenario(), name), name
-    assert rows["date"][0] == Scenario().date.date().isoformat()
+def rows(header: str, first: str) -> dict[str, list[str]]:
+    """Return the rows of the first table after a header of docs/environment.md, by their name in its first column."""
+    text = ENVIRONMENT[ENVIRONMENT.index(header) :]
+    table = text[text.index(f"| {first} |") :].partition("\n\n")[0]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    return {row[0].strip("`"): row[1:] for row in cells}
 
 
-def test_keys_of_a_scenario_file_are_documented() -> None:
-    rows = table_rows(OWN_DATA, "## File format", "key")
-    keys = {name.partition(".")[0].partition("`")[0] for name in rows}
-    assert keys == Scenario.model_fields.keys() - {"field", "names"}
-
-
-# Tables of results
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@each_page
 def test_tables_are_those_that_were_measured(page: Path) -> None:
-    spec = importlib.util.spec_from_file_location("publish", ROOT / "recipes" / "tables" / "publish.py")
-    assert spec is not None
-    assert spec.loader is not None
-    publish = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = publish
-    spec.loader.exec_module(publish)
-    text = page.read_text()
-    assert publish.filled(text, ROOT) == text
+    for name, table in re.findall(r"<!-- table: (\S+) -->\n(.*?)<!-- end -->", TEXTS[page], re.DOTALL):
+        assert table.strip() == (ROOT / name).read_text().strip(), name
 
 
-# Tables of keys
+def test_options_of_the_environment_and_fields_of_the_scenario() -> None:
+    parameters = inspect.signature(GeomagneticNavEnv.__init__).parameters.values()
+    options = {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD and p.name != "self"}
+    fields = {name: getattr(Scenario(), name) for name in Scenario.model_fields}
+    for header, first, defaults in (("## Options", "option", options), ("## Scenario", "field", fields)):
+        documented = rows(header, first)
+        assert list(documented) == list(defaults)
+        for name in documented.keys() - {"scenario", "region", "date", "seed", "device"}:
+            assert ast.literal_eval(documented[name][0].strip("`")) == defaults[name], name
 
 
-def bounds_of(spec) -> str | list[list[float]]:
-    if isinstance(spec, Binary):
-        return "0 or 1"
-    if not isinstance(spec, Bounded):
-        return "none"
-    return torch.stack((spec.space.low[0], spec.space.high[0]), -1).double().flatten(0, -2).tolist()
+def numbers(bounds: str) -> list[float]:
+    plain = bounds.replace("−", "-").replace("π", str(math.pi)).strip("[]").replace("], [", ", ")
+    return [math.prod(1 / float(d) if i else float(d) for i, d in enumerate(n.split("/"))) for n in plain.split(",")]
 
 
-def written_bounds(text: str) -> str | list[list[float]]:
-    if not text.startswith("["):
-        return text
-    plain = text.replace("−", "-").replace("π", "math.pi")
-    return [[float(eval(number, {"math": math})) for number in pair.split(",")] for pair in plain[1:-1].split("], [")]
-
-
-def check_rows(rows: dict[str, list[str]], specs: Composite) -> None:
-    for key, (shape, dtype, _, bounds, _) in rows.items():
+def check_keys(documented: dict[str, list[str]], specs: Composite) -> None:
+    for key, (shape, dtype, _, bounds, _) in documented.items():
         spec = specs[key]
         assert shape.strip("`") == f"[N, {', '.join(map(str, spec.shape[1:]))}]", key
         assert dtype == str(spec.dtype).removeprefix("torch."), key
-        expected, written = bounds_of(spec), written_bounds(bounds)
-        if isinstance(expected, str) or isinstance(written, str):
-            assert written == expected, key
+        if isinstance(spec, Bounded) and not isinstance(spec, Binary):
+            found = torch.stack((spec.space.low[0], spec.space.high[0]), -1).double().flatten().tolist()
+            for written, value in zip(numbers(bounds), found, strict=True):
+                assert written == pytest.approx(value, abs=0.051 if abs(value) < 1000 else 0.51), key
         else:
-            for numbers in zip(chain(*written), chain(*expected), strict=True):
-                assert numbers[0] == pytest.approx(numbers[1], abs=0.051 if abs(numbers[1]) < 1000 else 0.51), key
-
-
-@pytest.fixture(scope="module")
-def env() -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(num_envs=7, seed=0)
+            assert bounds == ("0 or 1" if isinstance(spec, Binary) else "none"), key
 
 
 def all_specs(env) -> Composite:
-    parts = env.observation_spec, env.full_action_spec, env.full_reward_spec, env.full_done_spec
-    return Composite({key: part[key] for part in parts for key in part.keys(True, True)}, shape=env.batch_size)
+    kinds = env.observation_spec, env.full_action_spec, env.full_reward_spec, env.full_done_spec
+    return Composite(dict(chain(*(kind.items(True, True) for kind in kinds))), shape=env.batch_size)
 
 
-def test_table_of_keys_is_that_of_the_environment(env) -> None:
-    rows = table_rows(ENVIRONMENT, "## Keys", "key")
-    assert set(rows) == set(all_specs(env).keys(True, True))
-    check_rows(rows, all_specs(env))
-    readers = {key: row[-1] for key, row in rows.items()}
+def test_tables_of_keys() -> None:
+    base = GeomagneticNavEnv(num_envs=7, seed=0)
+    specs, documented = all_specs(base), rows("## Keys", "key")
+    assert set(documented) == set(specs.keys(True, True))
+    check_keys(documented, specs)
+    readers = {key: row[-1] for key, row in documented.items()}
     public = {key for key, reader in readers.items() if reader == "all policies"}
     assert public == {*PUBLIC_KEYS, "step_count"}
-    others = {"training", "written by policies"}
-    assert {key for key in readers if readers[key] not in others} - public == set(PRIVILEGED_KEYS)
+    trained = {key for key, reader in readers.items() if reader in ("training", "written by policies")}
+    assert readers.keys() - public - trained == {*PRIVILEGED_KEYS, "region"}
 
-
-def test_table_of_keys_that_transforms_add(env) -> None:
-    guidance = [FieldGradient(env.field), GradientHeading(), AlignmentReward(out_keys=["reward", "reward_alignment"])]
-    steps = [*guidance, *env.observation_view().observation_transforms()]
-    specs = all_specs(TransformedEnv(GeomagneticNavEnv(num_envs=7, seed=0), Compose(*steps)))
-    rows = table_rows(ENVIRONMENT, "transforms of the guided agent", "key")
-    added = {key for key in specs.keys(True, True) if not key.endswith("_scaled")} - set(
-        all_specs(env).keys(True, True)
-    )
-    assert set(rows) == added
-    check_rows(rows, specs)
-    privileged = {key for key in added if "gradient" in key or key.startswith("reward")}
-    assert {key for key, row in rows.items() if row[-1] != "all policies"} == privileged
+    guidance = [FieldGradient(base.field), GradientHeading(), AlignmentReward(out_keys=["reward", "reward_alignment"])]
+    steps = Compose(*guidance, *base.observation_view().observation_transforms())
+    added = all_specs(TransformedEnv(GeomagneticNavEnv(num_envs=7, seed=0), steps)).exclude(*specs.keys(True, True))
+    documented = rows("The transforms of the guided agent", "key")
+    assert set(documented) == {key for key in added.keys(True, True) if not key.endswith("_scaled")}
+    check_keys(documented, added)
