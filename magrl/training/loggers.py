@@ -49,7 +49,7 @@ def check_logger(logger: str, wandb_mode: str = "offline") -> None:
 
 
 def panels(row: Mapping[str, float], before: Mapping[str, float] | None = None) -> dict[str, float]:
-    """A row of curves under the names that loggers show them by.
+    """Return a row of curves under the names that loggers show them by.
 
     Args:
         row: columns of ``train.csv``; ``seconds``, ``frames`` and ``updates`` count from the start of the run.
@@ -84,7 +84,7 @@ class CurveLog:
 
     Args:
         name: name of the logger in the report of an error.
-        make: opens TorchRL's logger; None to disable logging.
+        make: function that opens TorchRL's logger; None to disable logging.
 
     Example:
         >>> log = CurveLog("nothing", None)
@@ -96,33 +96,37 @@ class CurveLog:
     """Id of the run in wandb."""
 
     def __init__(self, name: str, make: Callable[[], Any] | None) -> None:
-        self.name = name
-        self._before: dict[str, float] = {}
+        self.name, self._before = name, dict[str, float]()
         self._logger: Any = None
         if make is not None:
             self._logger = self._try(make)
 
     def _try(self, action: Callable[[], Any]) -> Any:
+        """Return the result of an action; report an error and disable the logger."""
         try:
             return action()
         except Exception as error:
             self._logger = None
             print(f"{self.name} failed and is disabled for the rest of this run: {error}", file=sys.stderr)
 
+    def _log(self, action: Callable[[Any], Any]) -> None:
+        """Call an action with TorchRL's logger, unless logging is disabled."""
+        if self._logger is not None:
+            self._try(lambda: action(self._logger))
+
     def row(self, row: Mapping[str, float]) -> None:
         """Log a row of curves; ``frames`` is the step."""
         curves, self._before = panels(row, self._before), dict(row)
-        if self._logger and curves:
-            self._try(lambda: self._log(curves, int(row["frames"])))
+        if curves:
+            self._log_curves(curves, int(row["frames"]))
 
-    def _log(self, curves: dict[str, float], frames: int) -> None:
-        self._logger.log_metrics(curves, step=frames)
+    def _log_curves(self, curves: dict[str, float], frames: int) -> None:
+        self._log(lambda logger: logger.log_metrics(curves, step=frames))
 
     def summary(self, values: Mapping[str, float]) -> None:
         """Log final values, at the step of the last row."""
-        if self._logger:
-            final = {key: value for key, value in values.items() if math.isfinite(value)}
-            self._try(lambda: self._logger.log_metrics(final, step=int(self._before.get("frames", 0))))
+        final = {key: value for key, value in values.items() if math.isfinite(value)}
+        self._log(lambda logger: logger.log_metrics(final, step=int(self._before.get("frames", 0))))
 
     def picture(self, name: str, path: Path) -> None:
         """Log an image file, if the logger shows images."""
@@ -135,39 +139,7 @@ class CurveLog:
 
     def close(self) -> None:
         """Close the logger."""
-        if self._logger and hasattr(self._logger.experiment, "close"):
-            self._try(lambda: self._logger.experiment.close())
-
-
-class ScalarLog(CurveLog):
-    """Curves in TensorBoard or CSV files, in a folder of the run folder that is named after the logger.
-
-    An existing folder is removed: a run that is resumed logs all its rows again.
-
-    Args:
-        folder: run folder.
-        logger: ``tensorboard`` or ``csv``.
-
-    Raises:
-        ValueError: for a logger that is unknown or not installed.
-
-    Example:
-        >>> import tempfile
-        >>> log = ScalarLog(Path(tempfile.mkdtemp()), "csv")
-        >>> log.row({"frames": 512, "eval_spl": 90.0})
-        >>> log.close()
-    """
-
-    def __init__(self, folder: Path, logger: str) -> None:
-        check_type(Path, folder=folder)
-        check_logger(logger)
-        super().__init__(logger, lambda: self._open(folder, logger))
-
-    def _open(self, folder: Path, logger: str) -> Any:
-        from torchrl.record.loggers import get_logger
-
-        shutil.rmtree(folder / logger, ignore_errors=True)
-        return get_logger(logger, logger_name=str(folder), experiment_name=logger)
+        self._log(lambda logger: getattr(logger.experiment, "close", lambda: None)())
 
 
 class WandbRun(CurveLog):
@@ -188,12 +160,11 @@ class WandbRun(CurveLog):
         ValueError: for an unknown mode.
 
     Example:
-        >>> import tempfile
-        >>> run = WandbRun(Path(tempfile.mkdtemp()), "disabled", {"seed": 0})
+        >>> run = WandbRun(Path("runs/A"), "disabled", {"seed": 0})
         >>> run.row({"frames": 512, "return": -3.5})
         >>> run.close()
-        >>> list(run.folder.iterdir())
-        []
+        >>> run.folder.exists()
+        False
     """
 
     def __init__(
@@ -216,91 +187,93 @@ class WandbRun(CurveLog):
         with _wandb_in(self.folder):
             return super()._try(action)
 
-    def _log(self, curves: dict[str, float], frames: int) -> None:
+    def _log_curves(self, curves: dict[str, float], frames: int) -> None:
         # The step of wandb is frames too, so that rows that a resumed run logs again are the same rows.
-        self._logger.experiment.log({"frames": frames, **curves}, step=frames, commit=True)
+        self._log(lambda logger: logger.experiment.log({"frames": frames, **curves}, step=frames, commit=True))
 
     def summary(self, values: Mapping[str, float]) -> None:
         """Log final values."""
-        if self._logger:
-            self._try(lambda: self._logger.experiment.summary.update(dict(values)))
+        self._log(lambda logger: logger.experiment.summary.update(dict(values)))
 
     def picture(self, name: str, path: Path) -> None:
         """Log an image file."""
-        if self._logger:
+
+        def log(logger: Any) -> None:
             import wandb
 
-            self._try(lambda: self._logger.experiment.log({f"figures/{name}": wandb.Image(str(path))}))
+            logger.experiment.log({f"figures/{name}": wandb.Image(str(path))})
+
+        self._log(log)
 
     def table(self, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Log a table with the columns of its first row; NaN is an empty cell."""
-        if self._logger:
+
+        def log(logger: Any) -> None:
             import wandb
 
-            def log() -> None:
-                cells = [[_plain(row[column]) for column in rows[0]] for row in rows]
-                table = wandb.Table(columns=list(rows[0]), data=cells, allow_mixed_types=True)
-                self._logger.experiment.log({name: table})
+            cells = [[_plain(row[column]) for column in rows[0]] for row in rows]
+            logger.experiment.log({name: wandb.Table(columns=list(rows[0]), data=cells, allow_mixed_types=True)})
 
-            self._try(log)
+        self._log(log)
 
     def artifact(self, path: Path, metadata: Mapping[str, Any]) -> None:
         """Log a model, named after its file and the run folder; wandb refers to the file and keeps no copy."""
-        if self._logger:
+
+        def log(logger: Any) -> None:
             import wandb
 
-            def log() -> None:
-                name = re.sub(r"[^\w.-]", "-", f"{path.stem}-{self.folder.name}", flags=re.ASCII)[:128]
-                model = wandb.Artifact(name, "model", metadata={key: _plain(x) for key, x in metadata.items()})
-                model.add_file(str(path.absolute()), policy="immutable", skip_cache=True)
-                self._logger.experiment.log_artifact(model)
+            name = re.sub(r"[^\w.-]", "-", f"{path.stem}-{self.folder.name}", flags=re.ASCII)[:128]
+            model = wandb.Artifact(name, "model", metadata={key: _plain(x) for key, x in metadata.items()})
+            model.add_file(str(path.absolute()), policy="immutable", skip_cache=True)
+            logger.experiment.log_artifact(model)
 
-            self._try(log)
+        self._log(log)
 
     def close(self) -> None:
         """Finish the run, and remove the debug logs of wandb, which hold paths of the machine."""
-        if self._logger:
-            self._try(lambda: self._logger.experiment.finish())
-            for link in (self.folder / "wandb").glob("debug*.log"):
-                link.unlink()
-            for logs in ((self.folder / "wandb" / "wandb"), *(self.folder / "wandb").glob("*run-*/logs")):
-                shutil.rmtree(logs, ignore_errors=True)
+        self._log(lambda logger: logger.experiment.finish())
+        for logs in (*self.folder.glob("wandb/debug*.log"), *self.folder.glob("wandb/*run-*/logs")):
+            logs.unlink() if logs.is_symlink() else shutil.rmtree(logs, ignore_errors=True)
+        shutil.rmtree(self.folder / "wandb" / "wandb", ignore_errors=True)
 
 
-def open_log(
-    logger: str,
-    folder: Path,
-    config: Mapping[str, Any],
-    *,
-    wandb_mode: str = "offline",
-    group: str = "",
-    tags: Sequence[str] = (),
-    run_id: str = "",
-) -> CurveLog:
+def open_log(logger: str, folder: Path, config: Mapping[str, Any], wandb_mode: str, **wandb_options: Any) -> CurveLog:
     """Return a logger of :data:`LOGGERS`.
+
+    TensorBoard and CSV files are in a folder of the run folder that is named after the logger. An existing one is
+    removed: a run that is resumed logs all its rows again.
 
     Args:
         logger: name of the logger.
         folder: run folder.
-        config: settings shown with the run.
+        config: settings shown by wandb.
         wandb_mode: ``offline``, ``online`` or ``disabled``.
-        group: runs that belong together.
-        tags: labels to filter runs by.
-        run_id: id of the run in wandb; an existing run is resumed.
+        **wandb_options: ``group``, ``tags`` and ``run_id`` of :class:`WandbRun`.
 
     Raises:
         ValueError: for an unknown logger or mode, or a logger that is not installed.
 
     Example:
         >>> import tempfile
-        >>> log = open_log("wandb", Path(tempfile.mkdtemp()), {"seed": 0}, wandb_mode="disabled")
-        >>> type(log).__name__
-        'WandbRun'
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     log = open_log("csv", Path(folder), {"seed": 0}, "disabled")
+        ...     log.row({"frames": 512, "eval_spl": 90.0})
+        ...     log.close()
+        ...     (Path(folder) / "csv" / "scalars" / "eval" / "spl.csv").read_text()
+        '512,90.0\n'
     """
+    check_type(Path, folder=folder)
     check_logger(logger, wandb_mode)
     if logger == "wandb":
-        return WandbRun(folder, wandb_mode, config, group, tags, run_id=run_id)
-    return ScalarLog(folder, logger)
+        return WandbRun(folder, wandb_mode, config, **wandb_options)
+    return CurveLog(logger, lambda: _scalar_logger(folder, logger))
+
+
+def _scalar_logger(folder: Path, logger: str) -> Any:
+    from torchrl.record.loggers import get_logger
+
+    shutil.rmtree(folder / logger, ignore_errors=True)
+    return get_logger(logger, logger_name=str(folder), experiment_name=logger)
 
 
 def _plain(value: Any) -> Any:
