@@ -53,8 +53,8 @@ from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, f
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
 from magrl.training import UsageError, command
+from magrl.training.checkpoints import create_run_folder
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
-from magrl.training.run_folder import create_run_folder
 from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
 
 RECIPE = "evaluate.py"

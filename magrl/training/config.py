@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from pydantic import AfterValidator, Field, model_validator
 from typing_extensions import Self
 
 from magrl import paper
-from magrl.checks import CheckedModel, check_type
+from magrl.checks import CheckedModel
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.measures import check_zeta
 from magrl.training.loggers import Logger, WandbMode, check_logger
@@ -103,10 +104,8 @@ class RunConfig(CheckedModel):
         try:
             torch.zeros(1, device=self.device).item()
         except (RuntimeError, AssertionError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(
-                f"device {self.device!r} cannot be used here ({reason}): choose another, such as cpu"
-            ) from None
+            said = f"device {self.device!r} cannot be used here ({str(error).splitlines()[0]})"
+            raise ValueError(f"{said}: choose another, such as cpu") from None
         try:
             scenario = self.load_scenario()
         except OSError as error:
@@ -250,18 +249,15 @@ def parse_config(
     """
     first = argparse.ArgumentParser(prog=recipe, add_help=False, allow_abbrev=False)
     first.add_argument("--resume", type=Path)
-    if len(presets) > 1:
-        first.add_argument("--preset", choices=list(presets))
+    first.add_argument("--preset", choices=list(presets))
     args = sys.argv[1:] if args is None else list(args)
-    helped = {"-h", "--help"} & set(args)
     known, others = first.parse_known_args(args)
-    preset = getattr(known, "preset", None)
-    if known.resume and not helped:
-        others += ["--preset", preset] if preset else []
+    if known.resume and not {"-h", "--help"} & set(args):
+        others += ["--preset", known.preset] if known.preset else []
         if others:
             raise UsageError(f"--resume takes its settings from the run: leave out {' '.join(others)}")
         return resumed_config(known.resume, kind, recipe)
-    default = presets[preset or next(iter(presets))]
+    default = presets[known.preset or next(iter(presets))]
     return tyro.cli(kind, default=default, args=args, prog=recipe, description=description)
 
 
@@ -278,12 +274,11 @@ def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
 
     Example:
         >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> _ = (folder / "config.json").write_text('{"recipe": "mine.py", "seed": 7}')
-        >>> resumed_config(folder, RunConfig, "mine.py").seed
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "config.json").write_text('{"recipe": "mine.py", "seed": 7}')
+        ...     resumed_config(Path(folder), RunConfig, "mine.py").seed
         7
     """
-    check_type(Path, folder=folder)
     path, result = folder / "config.json", folder / "eval.json"
     if not path.is_file():
         raise UsageError(f"there is no run to resume in {folder}: it holds no config.json")
@@ -303,14 +298,27 @@ def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
         raise UsageError(f"cannot resume from {path}: {error}") from error
 
 
-def command(recipe: str, train: Callable[[], Any]) -> None:
-    """Run a recipe from the command line: print a :class:`UsageError` in one line and exit with status 2.
+def command(recipe: str, main: Callable[[], Any]) -> None:
+    """Run a recipe from the command line.
+
+    A :class:`UsageError` is printed in one line, with exit status 2. Where the reader of the output ends first, as in
+    ``command --help | head``, the command ends without a traceback, with status 141, as after ``SIGPIPE``.
+
+    Args:
+        recipe: file name of the recipe.
+        main: function that reads the command line.
 
     Example:
         >>> command("mine.py", lambda: None)
     """
     try:
-        train()
+        try:
+            main()
+        finally:
+            sys.stdout.flush()
     except UsageError as error:
         print(f"{recipe}: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered is written at exit
+        raise SystemExit(141) from None

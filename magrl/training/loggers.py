@@ -18,8 +18,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from magrl.checks import check_type
-
 WANDB_PROJECT = "magrl"
 """Project of the runs, unless the environment variable WANDB_PROJECT is set."""
 
@@ -40,10 +38,9 @@ def check_logger(logger: str, wandb_mode: str = "offline") -> None:
         Traceback (most recent call last):
         ValueError: logger must be one of wandb, tensorboard, csv, got 'paper'
     """
-    if logger not in LOGGERS:
-        raise ValueError(f"logger must be one of {', '.join(LOGGERS)}, got {logger!r}")
-    if wandb_mode not in WANDB_MODES:
-        raise ValueError(f"wandb_mode must be one of {', '.join(WANDB_MODES)}, got {wandb_mode!r}")
+    for name, value, known in (("logger", logger, LOGGERS), ("wandb_mode", wandb_mode, WANDB_MODES)):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
     if logger == "tensorboard" and importlib.util.find_spec("tensorboard") is None:
         raise ValueError("the logger tensorboard is not installed: pip install 'magrl[tensorboard]'")
 
@@ -177,7 +174,6 @@ class WandbRun(CurveLog):
         *,
         run_id: str = "",
     ) -> None:
-        check_type(Path, folder=folder)
         check_logger("wandb", mode)
         self.folder, self.run_id = folder, run_id or uuid.uuid4().hex[:8]
         options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags)}
@@ -232,9 +228,10 @@ class WandbRun(CurveLog):
     def close(self) -> None:
         """Finish the run, and remove the debug logs of wandb, which hold paths of the machine."""
         self._log(lambda logger: logger.experiment.finish())
-        for logs in (*self.folder.glob("wandb/debug*.log"), *self.folder.glob("wandb/*run-*/logs")):
-            logs.unlink() if logs.is_symlink() else shutil.rmtree(logs, ignore_errors=True)
-        shutil.rmtree(self.folder / "wandb" / "wandb", ignore_errors=True)
+        for log in self.folder.glob("wandb/debug*.log"):
+            log.unlink()
+        for logs in (self.folder / "wandb" / "wandb", *self.folder.glob("wandb/*run-*/logs")):
+            shutil.rmtree(logs, ignore_errors=True)
 
 
 def open_log(logger: str, folder: Path, config: Mapping[str, Any], wandb_mode: str, **wandb_options: Any) -> CurveLog:
@@ -259,10 +256,9 @@ def open_log(logger: str, folder: Path, config: Mapping[str, Any], wandb_mode: s
         ...     log = open_log("csv", Path(folder), {"seed": 0}, "disabled")
         ...     log.row({"frames": 512, "eval_spl": 90.0})
         ...     log.close()
-        ...     (Path(folder) / "csv" / "scalars" / "eval" / "spl.csv").read_text()
-        '512,90.0\n'
+        ...     (Path(folder) / "csv" / "scalars" / "eval" / "spl.csv").read_text().strip()
+        '512,90.0'
     """
-    check_type(Path, folder=folder)
     check_logger(logger, wandb_mode)
     if logger == "wandb":
         return WandbRun(folder, wandb_mode, config, **wandb_options)
@@ -290,11 +286,9 @@ def _wandb_in(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        for key, value in before.items():
-            if value is None:
-                del os.environ[key]
-            else:
-                os.environ[key] = value
+        for key in own:
+            del os.environ[key]
+        os.environ.update({key: value for key, value in before.items() if value is not None})
 
 
 def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], options: Mapping[str, Any]) -> Any:
@@ -302,19 +296,11 @@ def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], options: M
     import wandb
     from torchrl.record.loggers import get_logger
 
-    private = wandb.Settings(
-        silent=True,
-        console="off",
-        host="private",
-        disable_git=True,
-        disable_code=True,
-        disable_job_creation=True,
-        x_disable_meta=True,
-        x_disable_stats=True,
-        x_disable_machine_info=True,
-    )
+    disabled = ["disable_git", "disable_code", "disable_job_creation"]
+    disabled += ["x_disable_meta", "x_disable_stats", "x_disable_machine_info"]
+    settings: dict[str, Any] = {"silent": True, "console": "off", "host": "private", **dict.fromkeys(disabled, True)}
     project = os.environ.get("WANDB_PROJECT", WANDB_PROJECT)
-    wandb_kwargs = {"project": project, "mode": mode, "config": dict(config), "settings": private}
+    wandb_kwargs = {"project": project, "mode": mode, "config": dict(config), "settings": wandb.Settings(**settings)}
     wandb_kwargs |= {"log_env_packages": False, **options}
     logger = get_logger("wandb", logger_name=str(folder), experiment_name=folder.name, wandb_kwargs=wandb_kwargs)
     logger.experiment.define_metric("frames")

@@ -25,7 +25,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.files import DamagedFileError, save_tensors
 from magrl.training import checkpoints as module
 from magrl.training.checkpoints import PRIVATE, Checkpoints, RunningEpisodes, read_checkpoint
-from magrl.training.statistics import BestPolicy
+from magrl.training.curves import BestPolicy
 
 
 class Counter:

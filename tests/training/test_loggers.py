@@ -18,9 +18,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from magrl.training import loggers
+from magrl.training.checkpoints import create_run_folder
 from magrl.training.curves import RunLog
 from magrl.training.loggers import ScalarLog, WandbRun, check_logger, panels
-from magrl.training.run_folder import create_run_folder
 
 RECIPES = Path(__file__).parent.parent.parent / "recipes"
 ROWS = (

@@ -17,11 +17,10 @@ import pytest
 import td3_gradient_guided as recipe
 
 from magrl.training import UsageError, command, loggers, parse_config
-from magrl.training.checkpoints import Checkpoints
+from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
 from magrl.training.config import resumed_config
 from magrl.training.loggers import WandbRun
-from magrl.training.run_folder import create_run_folder, locked
-from magrl.training.signals import StopRequest
+from magrl.training.run import StopRequest
 
 ROOT = Path(__file__).parent.parent.parent
 SMALL = shlex.split(

@@ -14,10 +14,9 @@ from torch import nn
 from magrl import paper
 from magrl.files import write_json
 from magrl.training import Run, RunConfig, UsageError
-from magrl.training.curves import RunLog
+from magrl.training.checkpoints import create_run_folder, locked
+from magrl.training.curves import BestPolicy, RunLog, TrainingStatistics, selection_score
 from magrl.training.run import passes_paper
-from magrl.training.run_folder import create_run_folder, locked
-from magrl.training.statistics import BestPolicy, TrainingStatistics, selection_score
 
 ROW = {"frames": 512, "return": 1.5, "eval_spl": 88.4, "return_alignment": -0.5}
 

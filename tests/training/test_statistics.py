@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from magrl.training.statistics import RETURN_TERMS, TrainingStatistics
+from magrl.training.curves import RETURN_TERMS, TrainingStatistics
 
 
 def batch(*ended: tuple[float, bool], running: int = 0, terms: dict[str, float] | None = None) -> TensorDict:
