@@ -60,6 +60,7 @@ from magrl.transforms import conditions_named, with_conditions, with_sensor_nois
 RECIPE = "evaluate.py"
 SHOWN = 24
 """Number of tasks in trajectories.png."""
+Pair = tuple[TensorDictModuleBase, ...]
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
 MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency", "spl_to_arrival")
 
@@ -124,16 +125,9 @@ def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]
     rollout = with_true_field(rollout)
     count = int(first_episode_mask(rollout["next", "done"]).sum(1)[0])
     states = [rollout[0, 0], *(rollout["next"][0, step] for step in range(count))]
-    return [
-        {
-            "navigator": name,
-            "step": step,
-            **dict(zip(("latitude", "longitude"), state["position"].tolist(), strict=True)),
-            **dict(zip(("D", "I", "B_H"), state["field"].tolist(), strict=True)),
-            "L": state["move"][0].item(),
-        }
-        for step, state in enumerate(states)
-    ]
+    values = ([*state["position"].tolist(), *state["field"].tolist(), state["move"][0].item()] for state in states)
+    names = ("latitude", "longitude", "D", "I", "B_H", "L")
+    return [{"navigator": name, "step": step} | dict(zip(names, row, strict=True)) for step, row in enumerate(values)]
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -174,19 +168,12 @@ def settle(config: Config) -> tuple[Config, list[str]]:
     return settled, [*warnings, *others, *noisy, *places]
 
 
-@dataclass
-class Prepared:
-    """What an evaluation flies: the environments of the tasks and of the example task, and navigators for both."""
-
-    config: Config
-    env: EnvBase
-    example_env: EnvBase
-    navigators: list[tuple[TensorDictModuleBase, ...]]
-    warnings: list[str]
-
-
-def prepare(config: Config) -> Prepared:
+def prepare(config: Config) -> tuple[Config, list[EnvBase], list[Pair], list[str]]:
     """Make environments and navigators, and the folder of the results.
+
+    Returns:
+        Settings with those of the runs; environments of the tasks and of the example task; each navigator for both;
+        warnings.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -223,7 +210,7 @@ def prepare(config: Config) -> Prepared:
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
-    return Prepared(config, *envs, navigators, warnings)
+    return config, envs, navigators, warnings
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
@@ -233,11 +220,10 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    prepared = prepare(config)
-    config, env = prepared.config, prepared.env
+    config, (env, example_env), navigators, warnings = prepare(config)
     names = task_names(env.scenario)
-    results = Results(warnings=prepared.warnings)
-    for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), prepared.navigators, strict=True):
+    results = Results(warnings=warnings)
+    for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
         name, _, run = text.partition("=")
         began = time.perf_counter()
         rollout = evaluation_rollout(env, navigator)
@@ -256,7 +242,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
             results.rollouts[label(name, config.mode)] = rollout[:SHOWN].clone()
-            results.paths += path_rows(name, evaluation_rollout(prepared.example_env, example))
+            results.paths += path_rows(name, evaluation_rollout(example_env, example))
     write(config, env, results)
     return results.summaries
 
@@ -266,24 +252,15 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
     texts = (text.partition("=") for text in config.navigators)
     return {
         "navigators": [f"{name}{equals}{Path(run).name}" for name, equals, run in texts],
-        "tasks": config.tasks,
         "num_tasks": env.num_envs,
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
-        "zeta": env.zeta,
         "arrival": env.arrival.rule,
         "arrival_radius_km": env.arrival.radius_km,
-        "max_steps": env.max_steps,
-        "max_move_km": env.max_move_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        "altitude_km": env.scenario.altitude_km,
-        "margin_deg": env.scenario.margin_deg,
-        "noise": config.noise,
-        "conditions": config.conditions,
-        "map_date": config.map_date,
-        "start_heading": env.start_heading,
-        "mode": config.mode,
-        "seed": config.seed,
+        **{key: getattr(config, key) for key in ("tasks", "noise", "conditions", "map_date", "mode", "seed")},
+        **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
+        **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
     }
 
 
@@ -293,16 +270,15 @@ def write(config: Config, env: EnvBase, results: Results) -> None:
         write_csv(config.out / f"{name}.csv", getattr(results, name))
     write_json(config.out / "summary.json", results.summaries)
     write_json(config.out / "settings.json", settings(config, env))
-    notes = "".join(f"\nWarning: {text}.\n" for text in results.warnings)
-    if any(config.noise or ()):
-        levels = "{:g} deg, {:g} deg, {:g} nT".format(*config.noise)
-        notes = f"\nStandard deviations of the noise on D, I and B_H: {levels}.\n{notes}"
-    if config.conditions:
-        notes = f"\nConditions: {config.conditions}.\n{notes}"
-    if config.map_date:
-        notes = f"\nDate of the map of map matching: {config.map_date}.\n{notes}"
-    if env.arrival.rule != "objective":
-        notes = f"\nArrival: {env.arrival.rule}, within {env.arrival.radius_km:g} km.\n{notes}"
+    lines = {
+        "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
+        "Date of the map of map matching": config.map_date,
+        "Conditions": config.conditions,
+        "Standard deviations of the noise on D, I and B_H": any(config.noise or ())
+        and "{:g} deg, {:g} deg, {:g} nT".format(*config.noise),
+    }
+    notes = "".join(f"\n{name}: {text}.\n" for name, text in lines.items() if text)
+    notes += "".join(f"\nWarning: {text}.\n" for text in results.warnings)
     ahead = config.kilometers or env.arrival.rule != "objective"
     whole = comparison_table(results.summaries, config.mode, published=not config.scenario, kilometers=ahead)
     (config.out / "table.md").write_text(whole + notes)

@@ -37,6 +37,8 @@ from magrl.onboard import NAMED, Onboard
 from magrl.training import UsageError, command
 
 RECIPE = "replay_log.py"
+COMMANDED = ["move_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
+"""Columns of what the navigator would have commanded and estimated."""
 FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}"}
 """Formats of columns of log.md, where not one decimal."""
 
@@ -161,24 +163,13 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
             # course as a large number is not compared. A log in radians is named in notes().
             heading -= math.copysign(360, heading)
         try:
-            told = board.step(*row[elements], heading, row["distance"])
+            order = board.step(*row[elements], heading, row["distance"])
         except ValueError as error:
             joined_by = f" (moves are joined by --every-km {config.every_km:g})" if config.every_km else ""
             raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}{joined_by}") from error
-        found.append(
-            {
-                "move_km": told.distance_km,
-                "turn_deg": told.turn_deg,
-                "steer_deg": told.heading_deg,
-                "north_km": told.way_km[0],
-                "east_km": told.way_km[1],
-                "error_km": told.error_km,
-                "confidence": told.confidence,
-                "stop": told.stop or "",
-                "covariance": told.way_covariance_km2,
-            }
-        )
-    return pd.concat((log.reset_index(drop=True), pd.DataFrame(found)), axis=1)
+        row = (order.distance_km, order.turn_deg, order.heading_deg, *order.way_km, order.error_km, order.confidence)
+        found.append((*row, order.stop or "", order.way_covariance_km2))
+    return pd.concat((log.reset_index(drop=True), pd.DataFrame(found, columns=COMMANDED)), axis=1)
 
 
 def with_truth(config: Config, table: pd.DataFrame) -> pd.DataFrame:
@@ -233,9 +224,11 @@ def figure(table: pd.DataFrame, title: str) -> plt.Figure:
     size = 4 * np.sqrt(np.maximum(values, 0))
     angle = math.degrees(math.atan2(axes[0, 1], axes[1, 1]))
     plan.add_patch(Ellipse(guess[-1, ::-1], size[1], size[0], angle=angle, fill=False, color="#D55E00"))
-    extent = np.concatenate((place, guess[len(guess) // 4 :]))
     plan.set(xlabel="east of the start [km]", ylabel="north of the start [km]", aspect="equal", title=title)
-    plan.set(xlim=_limits(extent[:, 1]), ylim=_limits(extent[:, 0]))
+    seen = np.concatenate((place, guess[len(guess) // 4 :]))
+    low, high = seen.min(0), seen.max(0)
+    (bottom, left_end), (top, right_end) = low - 0.1 * (high - low) - 10, high + 0.1 * (high - low) + 10
+    plan.set(xlim=(left_end, right_end), ylim=(bottom, top))
     distance, error = np.hypot(*way.T), table["error_km"].to_numpy(dtype=float)
     left.plot(travelled, distance, "o-", color="#0072B2", markersize=3, label="estimated")
     left.fill_between(travelled, np.maximum(distance - error, 0), distance + error, alpha=0.2, label="± error")
@@ -250,11 +243,6 @@ def figure(table: pd.DataFrame, title: str) -> plt.Figure:
         axis.grid(alpha=0.3)
         axis.legend(frameon=False, fontsize=8)
     return drawn
-
-
-def _limits(values: np.ndarray) -> tuple[float, float]:
-    slack = 0.1 * (values.max() - values.min()) + 10
-    return values.min() - slack, values.max() + slack
 
 
 def markdown(table: pd.DataFrame) -> str:
