@@ -38,7 +38,7 @@ docs: $(VENV)/.installed-docs  ## build the documentation in build/docs
 	$(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet docs build/docs
 	@echo "Open build/docs/index.html"
 
-bench: $(VENV)/.installed-dev  ## run the benchmarks; about six minutes on two cores
+bench: $(VENV)/.installed-dev  ## run the benchmarks; about four minutes on two cores
 	$(RUN)/python -m benchmarks $(ARGS)
 	$(RECIPE)/tables/publish.py docs/performance.md
 
@@ -73,11 +73,10 @@ tables: $(call needed,$(TABLES))  ## make the tables of the documentation, all o
 figures: $(call needed,$(FIGURES))  ## draw the figures, all or FIGURES="globe"; section-4 and noise after their tables
 	$(RECIPE)/tables/figures.py $(FIGURES)
 
-pictures: runs/td3_gradient_guided-fast-seed0/eval.json  ## draw a flight and make the animations
+pictures: $(VENV)/.installed  ## draw and animate the flight of the README
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --out runs/flight
 	cp runs/flight/flight.png docs/figures/flight.png
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --noise 0.05 0.05 5 --out runs/flight --animate docs/figures/flight.gif
-	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 --gif docs/figures/replay.gif
 
 # Trainings: name of the run, number of threads, recipe and options.
 define training

@@ -1,4 +1,4 @@
-"""Every figure of docs/performance.md, measured side by side: `python -m benchmarks`, about six minutes on two cores.
+"""Every figure of docs/performance.md, measured side by side: `python -m benchmarks`, about four minutes on two cores.
 
 Prints each part as it is measured. `--only PART` measures one part. Results are written to runs/benchmarks.json, and
 for the documents where --publish is given.
@@ -11,9 +11,7 @@ import os
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # read when torch is imported: see recipes/td3_gradient_guided.py
 
 import argparse
-import math
 import platform
-import statistics
 import time
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -36,26 +34,13 @@ COMPARISONS = {
     "training": training.rows,
 }
 """Parts that give rows of the table."""
-OTHERS = {
-    "vehicles": env.cost_by_number,
-    "time-to-paper": training.to_the_papers_figures,
-    "profile": profile_training.shares,
-}
-"""Parts that give other figures: microseconds of a step by number of vehicles, seconds from the start of the process to
-SR 97 % and SPL 88.4 %, and shares of a training."""
+OTHERS = {"vehicles": env.cost_by_number, "profile": profile_training.shares}
+"""Parts that give other figures: microseconds of a step by number of vehicles, and shares of a training."""
 
 
 def table(rows: Iterable[Row]) -> str:
     """Return the Markdown table of some rows."""
     return HEADER + "".join(f"{row}\n" for row in rows)
-
-
-def seconds_table(seconds: list[float]) -> str:
-    """Return a table of the times of single runs and their median."""
-    known = [value for value in seconds if math.isfinite(value)]
-    cells = [f"{value:.1f}" for value in seconds] + [f"**{statistics.median(known):.1f}**" if known else "—"]
-    heads = [f"seed {seed}" for seed in range(len(seconds))] + ["median"]
-    return f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|\n| {' | '.join(cells)} |\n"
 
 
 def cost_figure(costs: list[dict[str, float]]) -> plt.Figure:
@@ -101,7 +86,6 @@ class Report:
             raise SystemExit(f"nothing is published: {', '.join(missing)} was not measured")
         results = DOCS / "results"
         (results / "performance.md").write_text(f"{table(self.rows)}\n{self.summary()}")
-        (results / "time_to_paper.md").write_text(seconds_table(self.content["time-to-paper"]))
         (results / "profile.md").write_text(profile_training.table(self.content["profile"]))
         cost_figure(self.content["vehicles"]).savefig(DOCS / "figures" / "cost-by-vehicles.png", dpi=110)
 

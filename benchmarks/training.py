@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
-import signal
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,7 +19,6 @@ from stable_baselines3.common.noise import NormalActionNoise
 from benchmarks.sb3_vec_env import BatchedVecEnv
 from benchmarks.timing import Row
 from magrl.envs.gymnasium import ENV_ID
-from magrl.training.run import passes_paper
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 sys.path.insert(0, str(RECIPES))
@@ -75,41 +71,6 @@ def rows(frames: int = 20_480, repeats: int = 3) -> list[Row]:
     return [Row(what, mine, theirs, statistics.median(ratios), min(ratios), max(ratios), "≥ 1.15")]
 
 
-def seconds_to_the_paper(seed: int, limit: float = 120.0) -> float:
-    """Return the seconds from the start of the process to the results of the paper; NaN where it takes longer."""
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "run"
-        command = [sys.executable, str(RECIPES / "td3_gradient_guided.py"), "--seed", str(seed), "--out", str(out)]
-        command += ["--wandb-mode", "disabled", "--eval-tasks-small", "1000", "--eval-every", "10"]
-        began = time.perf_counter()
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-            while process.poll() is None and time.perf_counter() - began < limit:
-                time.sleep(0.05)
-                if any(passes_paper(row) for row in rows_of(out / "train.csv")):
-                    seconds = time.perf_counter() - began
-                    process.send_signal(signal.SIGKILL)
-                    return seconds
-            process.kill()
-    return float("nan")
-
-
-def rows_of(path: Path) -> list[dict[str, float]]:
-    """Return the rows of a file that are complete."""
-    if not path.exists():
-        return []
-    with path.open() as file:
-        return [
-            {key: float(value) for key, value in row.items()}
-            for row in csv.DictReader(file)
-            if None not in row.values() and "" not in row.values()
-        ]
-
-
-def to_the_papers_figures(seeds: range = range(5)) -> list[float]:
-    """Return the seconds from the start of the process to SR 97 %, SPL 88.4 % on 1000 tasks that no training sees."""
-    return [seconds_to_the_paper(seed) for seed in seeds]
-
-
 if __name__ == "__main__":
     torch.manual_seed(0)
-    print(*rows(), to_the_papers_figures(), sep="\n")
+    print(*rows())

@@ -164,10 +164,10 @@ def of_two_elements(navigator: Spec, base: GeomagneticNavEnv) -> TensorDictModul
 
 
 def rows_of(of: Sequence[str], navigators: Sequence[str]) -> str:
-    """Return the rows of some navigators from other tables in docs/results, without their column of runs."""
+    """Return the rows of some navigators from other tables in docs/results."""
     lines = [line for name in of for line in (RESULTS / f"{name}.md").read_text().splitlines()]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    by_label = {row[0]: [*row[:2], *row[3:]] for row in cells}
+    by_label = {row[0]: row for row in cells}
     return markdown_table(by_label["navigator"], [by_label[label(name)] for name in navigators])
 
 
