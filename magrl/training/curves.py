@@ -189,7 +189,9 @@ class RunLog:
     ) -> None:
         check_logger(logger, wandb_mode)
         self.folder, self.columns, self.rows = folder, tuple(columns), list[dict[str, float]]()
-        self._open_log = partial(open_log, logger, folder, config, wandb_mode, group=label, tags=(label,))
+        self._open_log = partial(
+            open_log, logger, folder, config, wandb_mode, group=label, tags=(label,) if label else ()
+        )
         self._began = time.perf_counter()
         if not resumed:
             self._open([], uuid.uuid4().hex[:8])

@@ -202,7 +202,7 @@ def conditions(tasks: int | None) -> Figures:
     """
     base = earth_env(tasks or 200, reach_km=DRIFT_KM, drift_km=DRIFT_KM)
     figure = Figure(figsize=(11, 7.5), layout="constrained")
-    panels = figure.subplots(3, 4, sharey=True).flat
+    panels = list(figure.subplots(3, 4, sharey=True).flat)
     for navigator in tqdm(declarations()["conditions"]["navigators"], unit="navigator"):
         alone = summarize(flown(navigator, base, sensors()))["spl"]
         look = {"color": plots.NAVIGATOR_COLORS[navigator], "label": label(navigator).partition(" (")[0]}
