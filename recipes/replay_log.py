@@ -26,6 +26,8 @@ import numpy as np
 import pandas as pd
 import torch
 import tyro
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.patches import Ellipse
 
 from magrl.agents import load_policy
@@ -33,7 +35,7 @@ from magrl.checks import check_number
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
-from magrl.onboard import NAMED, Onboard
+from magrl.onboard import Onboard
 from magrl.training import UsageError, command
 
 RECIPE = "replay_log.py"
@@ -135,9 +137,8 @@ def joined(log: pd.DataFrame, every_km: float) -> pd.DataFrame:
 
 def vehicle(config: Config, steps: int) -> Onboard:
     """Return the vehicle that replays the log."""
-    named = config.navigator in NAMED or not config.navigator.endswith(".pt")
     return Onboard(
-        config.navigator if named else load_policy(config.navigator),
+        load_policy(config.navigator) if config.navigator.endswith(".pt") else config.navigator,
         sensor_std=config.noise,
         bias_std=config.bias,
         max_steps=steps,
@@ -211,38 +212,51 @@ def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
 def figure(table: pd.DataFrame, title: str) -> plt.Figure:
     """Return a figure of the track with the estimates of the destination, and of the distance that is left."""
     drawn, (plan, left) = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
-    (place, turn), way = places(table), table[["north_km", "east_km"]].to_numpy(dtype=float)
-    travelled, number = table["distance"].cumsum(), np.arange(len(table))
-    steer = np.radians(table["steer_deg"].to_numpy(dtype=float)) + turn
-    plan.plot(place[:, 1], place[:, 0], "-", color="0.4", label="track")
-    arrows = {"angles": "xy", "width": 0.004, "color": "#0072B2", "label": "commanded heading"}
-    plan.quiver(place[:, 1], place[:, 0], np.sin(steer), np.cos(steer), **arrows)
-    guess = place + turned(way, turn)
-    dots = plan.scatter(guess[:, 1], guess[:, 0], c=number, cmap="viridis", s=18, zorder=3, label="estimated target")
+    dots = draw_track(plan, table)
     drawn.colorbar(dots, ax=plan, label="row of the table", shrink=0.8)
-    values, axes = np.linalg.eigh(np.array(table["covariance"].iloc[-1]))
-    size = 4 * np.sqrt(np.maximum(values, 0))
-    angle = math.degrees(math.atan2(axes[0, 1], axes[1, 1]))
-    plan.add_patch(Ellipse(guess[-1, ::-1], size[1], size[0], angle=angle, fill=False, color="#D55E00"))
     plan.set(xlabel="east of the start [km]", ylabel="north of the start [km]", aspect="equal", title=title)
-    seen = np.concatenate((place, guess[len(guess) // 4 :]))
-    low, high = seen.min(0), seen.max(0)
-    (bottom, left_end), (top, right_end) = low - 0.1 * (high - low) - 10, high + 0.1 * (high - low) + 10
-    plan.set(xlim=(left_end, right_end), ylim=(bottom, top))
-    distance, error = np.hypot(*way.T), table["error_km"].to_numpy(dtype=float)
-    left.plot(travelled, distance, "o-", color="#0072B2", markersize=3, label="estimated")
-    left.fill_between(travelled, np.maximum(distance - error, 0), distance + error, alpha=0.2, label="± error")
-    if "miss_km" in table:
-        true = table[["true_north_km", "true_east_km"]].to_numpy(dtype=float)
-        target = place[0] + true[0]
-        plan.plot(target[1], target[0], "*", color="#D55E00", markersize=14, zorder=2, label="true target")
-        left.plot(travelled, np.hypot(*true.T), "k--", label="true")
-        left.plot(travelled, table["miss_km"], color="#D55E00", label="error of the estimate")
-    left.set(xlabel="distance moved [km]", ylabel="way to the destination [km]", ylim=(0, 1.3 * distance.max()))
-    for axis in (plan, left):
-        axis.grid(alpha=0.3)
-        axis.legend(frameon=False, fontsize=8)
+    draw_distance(left, table)
+    for axes in (plan, left):
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize=8)
     return drawn
+
+
+def draw_track(axes: Axes, table: pd.DataFrame) -> PathCollection:
+    """Draw the track, commanded headings and estimates of the destination, and return the dots of these."""
+    place, turn = places(table)
+    way = table[["north_km", "east_km"]].to_numpy(dtype=float)
+    steer = np.radians(table["steer_deg"].to_numpy(dtype=float)) + turn
+    axes.plot(place[:, 1], place[:, 0], "-", color="0.4", label="track")
+    arrows = {"angles": "xy", "width": 0.004, "color": "#0072B2", "label": "commanded heading"}
+    axes.quiver(place[:, 1], place[:, 0], np.sin(steer), np.cos(steer), **arrows)
+    guess = place + turned(way, turn)
+    look = {"c": np.arange(len(table)), "cmap": "viridis", "s": 18, "zorder": 3, "label": "estimated target"}
+    dots = axes.scatter(guess[:, 1], guess[:, 0], **look)
+    values, vectors = np.linalg.eigh(np.array(table["covariance"].iloc[-1]))
+    size = 4 * np.sqrt(np.maximum(values, 0))
+    angle = math.degrees(math.atan2(vectors[0, 1], vectors[1, 1]))
+    axes.add_patch(Ellipse(guess[-1, ::-1], size[1], size[0], angle=angle, fill=False, color="#D55E00"))
+    if "miss_km" in table:
+        target = place[0] + table[["true_north_km", "true_east_km"]].to_numpy(dtype=float)[0]
+        axes.plot(target[1], target[0], "*", color="#D55E00", markersize=14, zorder=2, label="true target")
+    seen = np.concatenate((place, guess[len(guess) // 4 :]))
+    slack = 0.1 * (seen.max(0) - seen.min(0)) + 10
+    low, high = seen.min(0) - slack, seen.max(0) + slack
+    axes.set(xlim=(low[1], high[1]), ylim=(low[0], high[0]))
+    return dots
+
+
+def draw_distance(axes: Axes, table: pd.DataFrame) -> None:
+    """Draw the estimated and the true distance to the destination."""
+    travelled, error = table["distance"].cumsum(), table["error_km"].to_numpy(dtype=float)
+    distance = np.hypot(table["north_km"], table["east_km"])
+    axes.plot(travelled, distance, "o-", color="#0072B2", markersize=3, label="estimated")
+    axes.fill_between(travelled, np.maximum(distance - error, 0), distance + error, alpha=0.2, label="± error")
+    if "miss_km" in table:
+        axes.plot(travelled, np.hypot(table["true_north_km"], table["true_east_km"]), "k--", label="true")
+        axes.plot(travelled, table["miss_km"], color="#D55E00", label="error of the estimate")
+    axes.set(xlabel="distance moved [km]", ylabel="way to the destination [km]", ylim=(0, 1.3 * distance.max()))
 
 
 def markdown(table: pd.DataFrame) -> str:
@@ -269,9 +283,8 @@ def notes(table: pd.DataFrame) -> list[str]:
         found.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")
     if "miss_km" in table:
         last = table.iloc[-1]
-        found.append(
-            f"Error of the estimated way at the end: {last['miss_km']:.1f} km; stated {last['error_km']:.1f} km."
-        )
+        miss, stated = last["miss_km"], last["error_km"]
+        found.append(f"Error of the estimated way at the end: {miss:.1f} km; stated {stated:.1f} km.")
     return found
 
 
