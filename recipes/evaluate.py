@@ -156,14 +156,12 @@ def settle(config: Config) -> tuple[Config, list[str]]:
         path, places = common_scenario(runs, config.scenario)
     own = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
     zeta, warnings = arrival_threshold(config.navigators, own.zeta)
-    heading, others = agreed(
-        runs, lambda run: run.start_heading, own.start_heading, "north", name="start heading", option="--start-heading"
-    )
+    named = {"name": "start heading", "option": "--start-heading"}
+    heading, others = agreed(runs, lambda run: run.start_heading, own.start_heading, "north", **named)
     noise, noisy = NO_NOISE, list[str]()
     if not config.conditions:
-        noise, noisy = agreed(
-            runs, lambda run: run.noise, config.noise, NO_NOISE, name="sensor noise", option="--noise"
-        )
+        named = {"name": "sensor noise", "option": "--noise"}
+        noise, noisy = agreed(runs, lambda run: run.noise, config.noise, NO_NOISE, **named)
     settled = replace(config, scenario=path, zeta=zeta, start_heading=heading, noise=noise)
     return settled, [*warnings, *others, *noisy, *places]
 
@@ -189,28 +187,30 @@ def prepare(config: Config) -> tuple[Config, list[EnvBase], list[Pair], list[str
         config, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        flown = conditions_named(config.conditions or "laboratory")
-        drift_km = flown.drift_km(scenario.max_move_km or 50.0)
-        bases = [
-            GeomagneticNavEnv(place, num_envs=len(task_names(place)), drift_km=drift_km, seed=config.seed)
-            for place in (scenario, example)
-        ]
-        if config.conditions:
-            envs = [with_conditions(base, flown, config.seed) for base in bases]
-        else:
-            envs = [with_sensor_noise(base, config.noise, config.seed) for base in bases]
-        envs = [with_declaration(env) for env in envs]
-        told = flown.sensor_std if config.conditions else config.noise, config.map_date, flown.bias_std
-        navigators = [
-            tuple(make_navigator(text, base, config.mode, config.seed, *told) for base in bases)
-            for text in config.navigators
-        ]
+        envs, navigators = make_fleet(config, (scenario, example))
         if config.export:
             check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
     return config, envs, navigators, warnings
+
+
+def make_fleet(config: Config, scenarios: Sequence[Scenario]) -> tuple[list[EnvBase], list[Pair]]:
+    """Return the environment of each scenario with its errors, and each navigator for all of them."""
+    conditions = conditions_named(config.conditions or "laboratory")
+    drift_km = conditions.drift_km(scenarios[0].max_move_km or 50.0)
+    bases = [
+        GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), drift_km=drift_km, seed=config.seed)
+        for scenario in scenarios
+    ]
+    if config.conditions:
+        sensor_std, envs = conditions.sensor_std, [with_conditions(base, conditions, config.seed) for base in bases]
+    else:
+        sensor_std, envs = config.noise, [with_sensor_noise(base, config.noise, config.seed) for base in bases]
+    options = config.mode, config.seed, sensor_std, config.map_date, conditions.bias_std
+    navigators = [tuple(make_navigator(text, base, *options) for base in bases) for text in config.navigators]
+    return [with_declaration(env) for env in envs], navigators
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:

@@ -190,17 +190,7 @@ class Run:
         self._exits.callback(collector.shutdown)
         self.checkpoints = Checkpoints(self.folder / "checkpoints", parts)
         resumed = bool(self.config.resume and self.checkpoints.files())  # otherwise it starts again from its seed
-        terms = ("return", *(f"return_{term}" for term in RETURN_TERMS))
-        columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", *self.losses)
-        self.log = RunLog(
-            self.folder,
-            (*columns, *(f"eval_{key}" for key in EVALUATED)),
-            self.settings,
-            logger=self.config.logger,
-            wandb_mode=self.config.wandb_mode,
-            label=self.name,
-            resumed=resumed,
-        )
+        self.log = self._make_log(resumed)
         self.checkpoints.parts["run"] = self.log
         if resumed:
             try:
@@ -208,6 +198,13 @@ class Run:
             except (ValueError, FileNotFoundError) as error:
                 raise UsageError(f"cannot resume: {error}") from error
         self._exits.callback(self.log.close)
+
+    def _make_log(self, resumed: bool) -> RunLog:
+        terms = ("return", *(f"return_{term}" for term in RETURN_TERMS))
+        columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", *self.losses)
+        columns += tuple(f"eval_{key}" for key in EVALUATED)
+        options = {"logger": self.config.logger, "wandb_mode": self.config.wandb_mode, "label": self.name}
+        return RunLog(self.folder, columns, self.settings, **options, resumed=resumed)
 
     @property
     def remaining(self) -> float:
