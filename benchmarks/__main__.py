@@ -11,6 +11,7 @@ import os
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # read when torch is imported: see recipes/td3_gradient_guided.py
 
 import argparse
+import importlib
 import platform
 import time
 from collections.abc import Iterable
@@ -21,21 +22,25 @@ from typing import Any
 import matplotlib.pyplot as plt
 import torch
 
-from benchmarks import env, fields, onboard, profile_training, training, update
 from benchmarks.timing import HEADER, Row
 from magrl.files import write_json
 
 DOCS = Path(__file__).parent.parent / "docs"
-COMPARISONS = {
-    "fields": fields.rows,
-    "env": env.rows,
-    "onboard": onboard.rows,
-    "update": update.rows,
-    "training": training.rows,
-}
-"""Parts that give rows of the table."""
-OTHERS = {"vehicles": env.cost_by_number, "profile": profile_training.shares}
-"""Parts that give other figures: microseconds of a step by number of vehicles, and shares of a training."""
+COMPARISONS = ("fields", "env", "onboard", "update", "training")
+"""Modules that give rows of the table; each is imported when it is measured."""
+OTHERS = {"vehicles": ("env", "cost_by_number"), "profile": ("profile_training", "shares")}
+"""Module and function of other figures: microseconds of a step by number of vehicles, and shares of a training."""
+
+
+def measure(module: str, function: str = "rows") -> Any:
+    """Return the result of a function of a module of the benchmarks."""
+    return getattr(importlib.import_module(f"benchmarks.{module}"), function)()
+
+
+def shares_table(shares: dict[str, float]) -> str:
+    """Return shares in percent as a Markdown table."""
+    lines = ["| part | % |", "|---|---|", *(f"| {part} | {100 * share:.0f} |" for part, share in shares.items())]
+    return "\n".join(lines) + "\n"
 
 
 def table(rows: Iterable[Row]) -> str:
@@ -66,11 +71,11 @@ class Report:
     def take(self, part: str) -> None:
         """Measure a part and print it."""
         if part in COMPARISONS:
-            rows = COMPARISONS[part]()
+            rows = measure(part)
             self.rows += rows
             print(table(rows), flush=True)
         else:
-            self.content[part] = OTHERS[part]()
+            self.content[part] = measure(*OTHERS[part])
             print(f"{part}: {self.content[part]}\n", flush=True)
 
     def summary(self) -> str:
@@ -86,7 +91,7 @@ class Report:
             raise SystemExit(f"nothing is published: {', '.join(missing)} was not measured")
         results = DOCS / "results"
         (results / "performance.md").write_text(f"{table(self.rows)}\n{self.summary()}")
-        (results / "profile.md").write_text(profile_training.table(self.content["profile"]))
+        (results / "profile.md").write_text(shares_table(self.content["profile"]))
         cost_figure(self.content["vehicles"]).savefig(DOCS / "figures" / "cost-by-vehicles.png", dpi=110)
 
 

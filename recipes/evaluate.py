@@ -28,7 +28,7 @@ import csv
 import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -67,9 +67,8 @@ MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_effi
 
 def free_folder() -> Path:
     """Return the first of runs/evaluation, runs/evaluation-2, ... that is not there."""
-    folder = Path("runs/evaluation")
-    others = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
-    return next(path for path in itertools.chain((folder,), others) if not path.exists())
+    names = itertools.chain(("evaluation",), (f"evaluation-{number}" for number in itertools.count(2)))
+    return next(path for path in map(Path("runs").joinpath, names) if not path.exists())
 
 
 @dataclass(frozen=True)
@@ -128,14 +127,6 @@ def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]
     values = ([*state["position"].tolist(), *state["field"].tolist(), state["move"][0].item()] for state in states)
     names = ("latitude", "longitude", "D", "I", "B_H", "L")
     return [{"navigator": name, "step": step} | dict(zip(names, row, strict=True)) for step, row in enumerate(values)]
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with the columns of the first."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def settle(config: Config) -> tuple[Config, list[str]]:
@@ -267,7 +258,11 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
 def write(config: Config, env: EnvBase, results: Results) -> None:
     """Write the files of the results, and the runs as a table in wandb."""
     for name in ("episodes", "runs", "paths"):
-        write_csv(config.out / f"{name}.csv", getattr(results, name))
+        rows = getattr(results, name)
+        with (config.out / f"{name}.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
     write_json(config.out / "summary.json", results.summaries)
     write_json(config.out / "settings.json", settings(config, env))
     lines = {
@@ -296,8 +291,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Read the command line, evaluate and print the table."""
     config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
     evaluate(config)
-    print((config.out / "table.md").read_text())
-    print(f"Results are in {config.out}")
+    print((config.out / "table.md").read_text(), f"Results are in {config.out}", sep="\n")
 
 
 if __name__ == "__main__":

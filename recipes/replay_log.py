@@ -21,13 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import torch
 import tyro
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from magrl.agents import load_policy
@@ -39,6 +39,7 @@ from magrl.onboard import Onboard
 from magrl.training import UsageError, command
 
 RECIPE = "replay_log.py"
+ELEMENTS = ["declination", "inclination", "horizontal"]
 COMMANDED = ["move_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
 """Columns of what the navigator would have commanded and estimated."""
 FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}"}
@@ -100,7 +101,7 @@ def read_log(config: Config) -> pd.DataFrame:
     log = pd.DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
     if config.time in raw:
         log["time"] = raw[config.time]
-    wanted = ["declination", "inclination", "horizontal", "heading", "distance"]
+    wanted = [*ELEMENTS, "heading", "distance"]
     if config.latitude in raw or config.longitude in raw:
         wanted += ["latitude", "longitude"]
     for option in wanted:
@@ -135,27 +136,16 @@ def joined(log: pd.DataFrame, every_km: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def vehicle(config: Config, steps: int) -> Onboard:
-    """Return the vehicle that replays the log."""
-    return Onboard(
-        load_policy(config.navigator) if config.navigator.endswith(".pt") else config.navigator,
-        sensor_std=config.noise,
-        bias_std=config.bias,
-        max_steps=steps,
-        zeta=config.zeta,
-        arrival_km=config.arrival_km,
-    )
-
-
 def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
     """Return what the navigator would have commanded and estimated after each row, beside the row itself.
 
     Raises:
         UsageError: for a row that no vehicle can have recorded, with its number.
     """
-    elements = ["declination", "inclination", "horizontal"]
-    board = vehicle(config, len(log))
-    board.start(log[elements].iloc[-1].tolist() if config.target is None else config.target)
+    navigator = load_policy(config.navigator) if config.navigator.endswith(".pt") else config.navigator
+    sheet = {"sensor_std": config.noise, "bias_std": config.bias}
+    board = Onboard(navigator, max_steps=len(log), zeta=config.zeta, arrival_km=config.arrival_km, **sheet)
+    board.start(log[ELEMENTS].iloc[-1].tolist() if config.target is None else config.target)
     found = []
     for _, row in log.iterrows():
         heading = row["heading"]
@@ -164,10 +154,9 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
             # course as a large number is not compared. A log in radians is named in notes().
             heading -= math.copysign(360, heading)
         try:
-            order = board.step(*row[elements], heading, row["distance"])
+            order = board.step(*row[ELEMENTS], heading, row["distance"])
         except ValueError as error:
-            joined_by = f" (moves are joined by --every-km {config.every_km:g})" if config.every_km else ""
-            raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}{joined_by}") from error
+            raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}") from error
         row = (order.distance_km, order.turn_deg, order.heading_deg, *order.way_km, order.error_km, order.confidence)
         found.append((*row, order.stop or "", order.way_covariance_km2))
     return pd.concat((log.reset_index(drop=True), pd.DataFrame(found, columns=COMMANDED)), axis=1)
@@ -209,9 +198,10 @@ def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.stack((cos * north - sin * east, sin * north + cos * east), -1)
 
 
-def figure(table: pd.DataFrame, title: str) -> plt.Figure:
+def figure(table: pd.DataFrame, title: str) -> Figure:
     """Return a figure of the track with the estimates of the destination, and of the distance that is left."""
-    drawn, (plan, left) = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
+    drawn = Figure(figsize=(12, 5.4), layout="constrained")
+    plan, left = drawn.subplots(1, 2)
     dots = draw_track(plan, table)
     drawn.colorbar(dots, ax=plan, label="row of the table", shrink=0.8)
     plan.set(xlabel="east of the start [km]", ylabel="north of the start [km]", aspect="equal", title=title)
@@ -261,14 +251,14 @@ def draw_distance(axes: Axes, table: pd.DataFrame) -> None:
 
 def markdown(table: pd.DataFrame) -> str:
     """Return the table with rounded numbers."""
-    hidden = ["declination", "inclination", "horizontal", "latitude", "longitude", "covariance"]
+    hidden = [*ELEMENTS, "latitude", "longitude", "covariance"]
     shown = table.drop(columns=[name for name in hidden if name in table])
 
-    def cell(name: str, value: object) -> object:
-        return FORMATS.get(name, "{:.1f}").format(value) if isinstance(value, (int, float)) else value
-
-    rows = [[cell(name, row[name]) for name in shown] for _, row in shown.iterrows()]
-    return markdown_table(list(shown), rows)
+    cells = [
+        [FORMATS.get(name, "{:.1f}").format(x) if isinstance(x, (int, float)) else x for x in shown[name]]
+        for name in shown
+    ]
+    return markdown_table(list(shown), zip(*cells, strict=True))
 
 
 def notes(table: pd.DataFrame) -> list[str]:
@@ -288,12 +278,13 @@ def notes(table: pd.DataFrame) -> list[str]:
     return found
 
 
-def run(config: Config) -> pd.DataFrame:
-    """Replay the log, write the files and return the table.
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line, replay the log, write the files and print the table.
 
     Raises:
         UsageError: for a log or a setting that is wrong.
     """
+    config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
     log = read_log(config)
     try:
         check_number(0, every_km=config.every_km)
@@ -305,16 +296,7 @@ def run(config: Config) -> pd.DataFrame:
     table.drop(columns="covariance").to_csv(config.out / "log.csv", index=False)
     (config.out / "log.md").write_text("\n".join([markdown(table), "", *notes(table), ""]))
     figure(table, f"{config.log.name}: {config.navigator}").savefig(config.out / "log.png", dpi=110)
-    plt.close("all")
-    return table
-
-
-def main(args: Sequence[str] | None = None) -> None:
-    """Read the command line, replay the log and print the table."""
-    config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
-    run(config)
-    print((config.out / "log.md").read_text())
-    print(f"The picture is {config.out / 'log.png'}")
+    print((config.out / "log.md").read_text(), f"The picture is {config.out / 'log.png'}", sep="\n")
 
 
 if __name__ == "__main__":

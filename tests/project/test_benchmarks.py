@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks import __main__ as bench
-from benchmarks import env, onboard, profile_training, update
+from benchmarks import env, onboard, update
 from benchmarks.timing import Row, alternate
 
 
@@ -21,7 +21,7 @@ def test_alternate_takes_times_in_turn() -> None:
 def test_tables_and_figure() -> None:
     text = bench.table([Row("a: b", 1.0, 2.5, 2.5, 2.0, 3.0, "≥ 2")])
     assert "| a: b | 1 | 2.5 | 2.50 | 2.00–3.00 | ≥ 2 |" in text
-    assert "| b | 25 |" in profile_training.table({"a": 0.75, "b": 0.25})
+    assert "| b | 25 |" in bench.shares_table({"a": 0.75, "b": 0.25})
     figure = bench.cost_figure([{"vehicles": n, "raw_us": 1 / n, "guided_us": 2 / n} for n in (64, 128)])
     assert [line.get_label() for line in figure.axes[0].lines] == ["raw step", "guided, in a collector"]
 
@@ -52,7 +52,7 @@ def test_plain_step_is_the_step_of_the_recipe() -> None:
 
 
 def test_results_are_written(monkeypatch, tmp_path, capsys) -> None:
-    monkeypatch.setitem(bench.COMPARISONS, "env", lambda: [Row("env", 1.0, 2.0, 2.0, 1.9, 2.1)])
+    monkeypatch.setattr(env, "rows", lambda: [Row("env", 1.0, 2.0, 2.0, 1.9, 2.1)])
     out = tmp_path / "new" / "bench.json"
     bench.main(["--only", "env", "--out", str(out)])
     assert [row["what"] for row in json.loads(out.read_text())["rows"]] == ["env"]

@@ -17,6 +17,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 MAKEFILE = (ROOT / "Makefile").read_text()
 RECIPE_OF = {"train": "recipes/td3_gradient_guided.py", "replay": "recipes/replay.py", "bench": "-m benchmarks"}
 RECIPE_OF |= {"fly": "recipes/fly.py", "anywhere": "recipes/td3_anywhere.py"}
+TABLES = set(re.findall(r"^\[([\w-]+)\]$", (ROOT / "recipes/tables/tables.toml").read_text(), re.MULTILINE))
 """Scripts that get the ARGS of a make target; pytest and mutmut have their own."""
 TOOLS = {"tensorboard", "wandb", "chromium"}
 """Other programs in the documents, whose flags are not checked."""
@@ -70,6 +71,7 @@ def check_command(words: list[str]) -> None:
         for word in rest:
             name, equals, value = word.partition("=")
             assert equals or re.search(rf"^{word}:", MAKEFILE, re.MULTILINE), f"make has no target {word}"
+            assert name != "TABLES" or set(value.split()) <= TABLES, value
             if name == "ARGS" and rest[0] in RECIPE_OF:
                 has_flags(RECIPE_OF[rest[0]], shlex.split(value))
     elif program in ("python", ".venv/bin/python"):
@@ -97,8 +99,9 @@ def test_commands_can_be_given(page: Path, monkeypatch) -> None:
 
 def test_flags_in_the_text_exist(monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    scripts = [str(path.relative_to(ROOT)) for path in (*ROOT.glob("recipes/*.py"), *ROOT.glob("recipes/tables/*.py"))]
-    modules = ["-m benchmarks", "-m benchmarks.fields", "-m magrl.field"]
+    scripts = [str(path.relative_to(ROOT)) for path in ROOT.glob("recipes/*.py")]
+    scripts += [f"recipes/tables/{name}.py" for name in ("grid", "figures", "publish")]
+    modules = ["-m benchmarks", "-m magrl.field"]
     known = "".join(help_text(script) for script in [*scripts, *modules])
     for page in PAGES:
         for flag in re.findall(r"`(--[\w-]+)[^`]*`", page.read_text()):
