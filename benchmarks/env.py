@@ -1,16 +1,12 @@
-"""Cost of the environment's step: field, framework, number of regions and of vehicles."""
+"""Cost of the environment's step: transforms and collector, number of regions and of vehicles."""
 
 from __future__ import annotations
 
-import cProfile
 import time
 
-import torch
-from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 
-from benchmarks.profile_training import shares_of, table
 from benchmarks.timing import Row, alternate
 from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.transforms import (
@@ -25,22 +21,6 @@ from magrl.transforms import (
 VEHICLES = 1024
 REGIONS = 2048
 NUMBERS = [2**k for k in range(6, 15)]
-
-
-class FreeField(nn.Module):
-    """A field without cost: the same vector everywhere, computed in advance."""
-
-    def __init__(self, num_envs: int) -> None:
-        super().__init__()
-        self.register_buffer(
-            "vector", torch.tensor((35000.0, 5000.0, -10000.0), dtype=torch.float64).repeat(num_envs, 1)
-        )
-
-    def forward(self, latitude: Tensor, _: Tensor) -> Tensor:
-        """Return north, east, down [nT]."""
-        if latitude.shape == self.vector.shape[:1]:
-            return self.vector
-        return self.vector[0].expand(*latitude.shape, 3)
 
 
 class Stepper:
@@ -103,15 +83,11 @@ def with_every_sensor_error(env: GeomagneticNavEnv) -> TransformedEnv:
 
 
 def rows(repeats: int = 15) -> list[Row]:
-    """Return what the field and the framework cost, as the speed of less beside the speed of all."""
-    env = GeomagneticNavEnv(num_envs=VEHICLES, seed=0)
-    free = GeomagneticNavEnv(num_envs=VEHICLES, seed=0)
-    step, free_step = Stepper(env), Stepper(free)
-    free.field = FreeField(VEHICLES)
-    bank = planet_scenario(REGIONS, seed=0)
+    """Return what guidance, regions and errors of sensors cost, as the speed of all beside the speed of less."""
+    step = Stepper(GeomagneticNavEnv(num_envs=VEHICLES, seed=0))
     over_bank, over_one = (
         Running(GeomagneticNavEnv(scenario, num_envs=VEHICLES, start_heading="random", seed=0))
-        for scenario in (bank, Scenario())
+        for scenario in (planet_scenario(REGIONS, seed=0), Scenario())
     )
     disturbed, plain = (
         Running(make(GeomagneticNavEnv(num_envs=VEHICLES, seed=0)))
@@ -119,37 +95,10 @@ def rows(repeats: int = 15) -> list[Row]:
     )
     options = {"repeats": repeats, "inner": 50}
     return [
-        alternate("env step: the same without a field", step, free_step, goal="≥ 0.40", **options),
         alternate("guided env in a Collector: raw env step", Collecting(VEHICLES), step, goal="≥ 0.25", **options),
         alternate(f"env over {REGIONS} regions: over one", over_bank, over_one, goal="≥ 0.50", **options),
         alternate("env with all sensor errors: without", disturbed, plain, goal="≥ 0.67", **options),
     ]
-
-
-PARTS = {
-    "the raw step": ("geomagnetic.py", "_step"),
-    "the field's gradient, and that of the elements": ("model.py", "elements_gradient_at"),
-    "the theoretical heading": ("guidance.py", "parallel_approach"),
-    "new episodes": ("geomagnetic.py", "_reset"),
-}
-"""Parts of a step in a collector; the rest is TorchRL's resets, copies and specs, and the other transforms."""
-
-
-def shares(steps: int = 100) -> dict[str, float]:
-    """Return the share of each part in the time of a step in a collector."""
-    collecting, profiler = Collecting(VEHICLES), cProfile.Profile()
-    for _ in range(60):  # until episodes end at different steps
-        collecting()
-    began = time.perf_counter()
-    with profiler:
-        for _ in range(steps):
-            collecting()
-    return shares_of(profiler, PARTS, time.perf_counter() - began)
-
-
-def steps_per_second(seconds: float = 2.0) -> float:
-    """Return the vehicle-steps per second of the raw step."""
-    return VEHICLES / time_of(Stepper(GeomagneticNavEnv(num_envs=VEHICLES, seed=0)), seconds)
 
 
 def cost_by_number(seconds: float = 0.5) -> list[dict[str, float]]:
@@ -176,7 +125,5 @@ def time_of(function: Stepper | Collecting, seconds: float) -> float:
 if __name__ == "__main__":
     for row in rows():
         print(row)
-    print(f"{steps_per_second() / 1e6:.2f} million vehicle-steps a second")
     for line in cost_by_number():
         print(line)
-    print(table(shares()))

@@ -7,7 +7,7 @@ import math
 import torch
 from tensordict import TensorDictBase
 
-from benchmarks.timing import HEADER, Row, alternate
+from benchmarks.timing import HEADER, Row, alternate, one_thread
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
 from magrl.onboard import Onboard
@@ -55,12 +55,8 @@ def rows(repeats: int = 60) -> list[Row]:
     Args:
         repeats: pairs of times for each row.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         return [row(name, repeats) for name in NAVIGATORS]
-    finally:
-        torch.set_num_threads(threads)
 
 
 def row(name: str, repeats: int) -> Row:

@@ -53,11 +53,5 @@ def shares_of(profiler: cProfile.Profile, parts: dict[str, tuple[str, str]], tot
     return found | {"the rest": 1 - sum(found.values())}
 
 
-def table(found: dict[str, float]) -> str:
-    """Return the shares in percent as a Markdown table."""
-    lines = ["| part | % |", "|---|---|", *(f"| {part} | {100 * share:.0f} |" for part, share in found.items())]
-    return "\n".join(lines) + "\n"
-
-
 if __name__ == "__main__":
-    print(table(shares()))
+    print(shares())

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+
+import torch
 
 HEADER = "| baseline | magrl ms | baseline ms | speed-up | quartiles | goal |\n|---|---|---|---|---|---|\n"
 
@@ -36,6 +39,17 @@ class Row:
         """Return a line of the Markdown table that starts with :data:`HEADER`."""
         cells = (f"{self.magrl_ms:.3g}", f"{self.baseline_ms:.3g}", f"{self.speed_up:.2f}")
         return f"| {self.what} | {' | '.join(cells)} | {self.low:.2f}–{self.high:.2f} | {self.goal} |"
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Use one thread in torch, and restore the number afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def alternate(

@@ -1,9 +1,8 @@
-"""Gradient step of the recipe beside one in plain PyTorch, its matrix products alone, and itself in bfloat16."""
+"""Gradient step of the recipe beside one in plain PyTorch, and in bfloat16 beside float32."""
 
 from __future__ import annotations
 
 import copy
-import itertools
 import sys
 from pathlib import Path
 
@@ -110,68 +109,27 @@ class Plain:
                 torch._foreach_lerp_(self.target_weights, self.weights, CONFIG.tau)
 
 
-class Products:
-    """The matrix products of a gradient step, and nothing else."""
-
-    def __init__(self, size: int) -> None:
-        actor = [size, *CONFIG.num_cells, 2]
-        critic = [size + 2, *CONFIG.num_cells, 1]
-        batch = CONFIG.batch_size
-        # Target actor and critics forward; critics forward, gradients of weights, gradients of all but the inputs.
-        self.critic_step = self.forward(actor, batch) + 4 * self.forward(critic, batch)
-        self.critic_step += 2 * (self.weights(critic, batch) + self.inputs(critic, batch)[1:])
-        # Actor and one critic forward, back through the critic to the action, back through the actor.
-        self.actor_step = self.forward(actor, batch) + self.forward(critic, batch) + self.inputs(critic, batch)
-        self.actor_step += self.weights(actor, batch) + self.inputs(actor, batch)[1:]
-        self.updates = 0
-
-    @staticmethod
-    def forward(sizes: list[int], batch: int) -> list[tuple[Tensor, Tensor]]:
-        """Inputs by weights."""
-        return [(torch.rand(batch, a), torch.rand(b, a).t()) for a, b in itertools.pairwise(sizes)]
-
-    @staticmethod
-    def weights(sizes: list[int], batch: int) -> list[tuple[Tensor, Tensor]]:
-        """Output gradients by inputs."""
-        return [(torch.rand(batch, b).t(), torch.rand(batch, a)) for a, b in itertools.pairwise(sizes)]
-
-    @staticmethod
-    def inputs(sizes: list[int], batch: int) -> list[tuple[Tensor, Tensor]]:
-        """Output gradients by weights."""
-        return [(torch.rand(batch, b), torch.rand(b, a)) for a, b in itertools.pairwise(sizes)]
-
-    def update(self) -> None:
-        """The products of a step of the critics, and every second time of the actor."""
-        self.updates += 1
-        for left, right in self.critic_step + (self.actor_step if self.updates % CONFIG.policy_delay == 0 else []):
-            torch.mm(left, right)
-
-
 def rows(repeats: int = 15) -> list[Row]:
-    """Return the two comparisons; a time is the mean of ten steps."""
+    """Return the comparisons of the presets fast and paper; a time is the mean of ten steps."""
     torch.manual_seed(0)
-    recipe, plain, products = (kind(OBSERVATION_SIZE) for kind in (Recipe, Plain, Products))
+    recipe, plain = Recipe(OBSERVATION_SIZE), Plain(OBSERVATION_SIZE)
     batch = transitions(OBSERVATION_SIZE, CONFIG.batch_size)
     after = batch["next"]
     tensors = (batch["observation"], batch["action"], after["reward"], after["observation"], after["terminated"])
-
-    def ours() -> None:
-        recipe.update(batch)
-
-    options = {"repeats": repeats, "inner": 10}
-    return [
-        alternate("gradient step: plain PyTorch", ours, lambda: plain.update(*tensors), goal="≥ 0.95", **options),
-        alternate("gradient step: its matrix products alone", ours, products.update, goal="≥ 0.56", **options),
-        of_the_paper(**options),
-    ]
-
-
-def of_the_paper(**options: int) -> Row:
-    """Return the gradient step of preset paper in bfloat16, beside that in float32."""
-    batch = transitions(OBSERVATION_SIZE, PAPER.batch_size)
+    large = transitions(OBSERVATION_SIZE, PAPER.batch_size)
     rounded, exact = (Recipe(OBSERVATION_SIZE, PAPER, precision) for precision in ("bfloat16", "float32"))
-    what = "gradient step of preset paper, bfloat16: float32"
-    return alternate(what, lambda: rounded.update(batch), lambda: exact.update(batch), goal="≥ 1.43", **options)
+    return [
+        alternate(what, magrl, baseline, goal=goal, repeats=repeats, inner=10)
+        for what, magrl, baseline, goal in (
+            ("gradient step: plain PyTorch", lambda: recipe.update(batch), lambda: plain.update(*tensors), "≥ 0.95"),
+            (
+                "gradient step of preset paper, bfloat16: float32",
+                lambda: rounded.update(large),
+                lambda: exact.update(large),
+                "≥ 1.43",
+            ),
+        )
+    ]
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ import csv
 import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -53,22 +53,22 @@ from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, f
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
 from magrl.training import UsageError, command
+from magrl.training.checkpoints import create_run_folder
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
-from magrl.training.run_folder import create_run_folder
 from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
 
 RECIPE = "evaluate.py"
 SHOWN = 24
 """Number of tasks in trajectories.png."""
+Pair = tuple[TensorDictModuleBase, ...]
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
 MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency", "spl_to_arrival")
 
 
 def free_folder() -> Path:
     """Return the first of runs/evaluation, runs/evaluation-2, ... that is not there."""
-    folder = Path("runs/evaluation")
-    others = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
-    return next(path for path in itertools.chain((folder,), others) if not path.exists())
+    names = itertools.chain(("evaluation",), (f"evaluation-{number}" for number in itertools.count(2)))
+    return next(path for path in map(Path("runs").joinpath, names) if not path.exists())
 
 
 @dataclass(frozen=True)
@@ -124,24 +124,9 @@ def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]
     rollout = with_true_field(rollout)
     count = int(first_episode_mask(rollout["next", "done"]).sum(1)[0])
     states = [rollout[0, 0], *(rollout["next"][0, step] for step in range(count))]
-    return [
-        {
-            "navigator": name,
-            "step": step,
-            **dict(zip(("latitude", "longitude"), state["position"].tolist(), strict=True)),
-            **dict(zip(("D", "I", "B_H"), state["field"].tolist(), strict=True)),
-            "L": state["move"][0].item(),
-        }
-        for step, state in enumerate(states)
-    ]
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with the columns of the first."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    values = ([*state["position"].tolist(), *state["field"].tolist(), state["move"][0].item()] for state in states)
+    names = ("latitude", "longitude", "D", "I", "B_H", "L")
+    return [{"navigator": name, "step": step} | dict(zip(names, row, strict=True)) for step, row in enumerate(values)]
 
 
 def settle(config: Config) -> tuple[Config, list[str]]:
@@ -162,31 +147,22 @@ def settle(config: Config) -> tuple[Config, list[str]]:
         path, places = common_scenario(runs, config.scenario)
     own = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
     zeta, warnings = arrival_threshold(config.navigators, own.zeta)
-    heading, others = agreed(
-        runs, lambda run: run.start_heading, own.start_heading, "north", name="start heading", option="--start-heading"
-    )
+    named = {"name": "start heading", "option": "--start-heading"}
+    heading, others = agreed(runs, lambda run: run.start_heading, own.start_heading, "north", **named)
     noise, noisy = NO_NOISE, list[str]()
     if not config.conditions:
-        noise, noisy = agreed(
-            runs, lambda run: run.noise, config.noise, NO_NOISE, name="sensor noise", option="--noise"
-        )
+        named = {"name": "sensor noise", "option": "--noise"}
+        noise, noisy = agreed(runs, lambda run: run.noise, config.noise, NO_NOISE, **named)
     settled = replace(config, scenario=path, zeta=zeta, start_heading=heading, noise=noise)
     return settled, [*warnings, *others, *noisy, *places]
 
 
-@dataclass
-class Prepared:
-    """What an evaluation flies: the environments of the tasks and of the example task, and navigators for both."""
-
-    config: Config
-    env: EnvBase
-    example_env: EnvBase
-    navigators: list[tuple[TensorDictModuleBase, ...]]
-    warnings: list[str]
-
-
-def prepare(config: Config) -> Prepared:
+def prepare(config: Config) -> tuple[Config, list[EnvBase], list[Pair], list[str]]:
     """Make environments and navigators, and the folder of the results.
+
+    Returns:
+        Settings with those of the runs; environments of the tasks and of the example task; each navigator for both;
+        warnings.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -202,28 +178,30 @@ def prepare(config: Config) -> Prepared:
         config, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        flown = conditions_named(config.conditions or "laboratory")
-        drift_km = flown.drift_km(scenario.max_move_km or 50.0)
-        bases = [
-            GeomagneticNavEnv(place, num_envs=len(task_names(place)), drift_km=drift_km, seed=config.seed)
-            for place in (scenario, example)
-        ]
-        if config.conditions:
-            envs = [with_conditions(base, flown, config.seed) for base in bases]
-        else:
-            envs = [with_sensor_noise(base, config.noise, config.seed) for base in bases]
-        envs = [with_declaration(env) for env in envs]
-        told = flown.sensor_std if config.conditions else config.noise, config.map_date, flown.bias_std
-        navigators = [
-            tuple(make_navigator(text, base, config.mode, config.seed, *told) for base in bases)
-            for text in config.navigators
-        ]
+        envs, navigators = make_fleet(config, (scenario, example))
         if config.export:
             check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
-    return Prepared(config, *envs, navigators, warnings)
+    return config, envs, navigators, warnings
+
+
+def make_fleet(config: Config, scenarios: Sequence[Scenario]) -> tuple[list[EnvBase], list[Pair]]:
+    """Return the environment of each scenario with its errors, and each navigator for all of them."""
+    conditions = conditions_named(config.conditions or "laboratory")
+    drift_km = conditions.drift_km(scenarios[0].max_move_km or 50.0)
+    bases = [
+        GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), drift_km=drift_km, seed=config.seed)
+        for scenario in scenarios
+    ]
+    if config.conditions:
+        sensor_std, envs = conditions.sensor_std, [with_conditions(base, conditions, config.seed) for base in bases]
+    else:
+        sensor_std, envs = config.noise, [with_sensor_noise(base, config.noise, config.seed) for base in bases]
+    options = config.mode, config.seed, sensor_std, config.map_date, conditions.bias_std
+    navigators = [tuple(make_navigator(text, base, *options) for base in bases) for text in config.navigators]
+    return [with_declaration(env) for env in envs], navigators
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
@@ -233,11 +211,10 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    prepared = prepare(config)
-    config, env = prepared.config, prepared.env
+    config, (env, example_env), navigators, warnings = prepare(config)
     names = task_names(env.scenario)
-    results = Results(warnings=prepared.warnings)
-    for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), prepared.navigators, strict=True):
+    results = Results(warnings=warnings)
+    for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
         name, _, run = text.partition("=")
         began = time.perf_counter()
         rollout = evaluation_rollout(env, navigator)
@@ -256,7 +233,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
             results.rollouts[label(name, config.mode)] = rollout[:SHOWN].clone()
-            results.paths += path_rows(name, evaluation_rollout(prepared.example_env, example))
+            results.paths += path_rows(name, evaluation_rollout(example_env, example))
     write(config, env, results)
     return results.summaries
 
@@ -266,43 +243,37 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
     texts = (text.partition("=") for text in config.navigators)
     return {
         "navigators": [f"{name}{equals}{Path(run).name}" for name, equals, run in texts],
-        "tasks": config.tasks,
         "num_tasks": env.num_envs,
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
-        "zeta": env.zeta,
         "arrival": env.arrival.rule,
         "arrival_radius_km": env.arrival.radius_km,
-        "max_steps": env.max_steps,
-        "max_move_km": env.max_move_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        "altitude_km": env.scenario.altitude_km,
-        "margin_deg": env.scenario.margin_deg,
-        "noise": config.noise,
-        "conditions": config.conditions,
-        "map_date": config.map_date,
-        "start_heading": env.start_heading,
-        "mode": config.mode,
-        "seed": config.seed,
+        **{key: getattr(config, key) for key in ("tasks", "noise", "conditions", "map_date", "mode", "seed")},
+        **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
+        **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
     }
 
 
 def write(config: Config, env: EnvBase, results: Results) -> None:
     """Write the files of the results, and the runs as a table in wandb."""
     for name in ("episodes", "runs", "paths"):
-        write_csv(config.out / f"{name}.csv", getattr(results, name))
+        rows = getattr(results, name)
+        with (config.out / f"{name}.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
     write_json(config.out / "summary.json", results.summaries)
     write_json(config.out / "settings.json", settings(config, env))
-    notes = "".join(f"\nWarning: {text}.\n" for text in results.warnings)
-    if any(config.noise or ()):
-        levels = "{:g} deg, {:g} deg, {:g} nT".format(*config.noise)
-        notes = f"\nStandard deviations of the noise on D, I and B_H: {levels}.\n{notes}"
-    if config.conditions:
-        notes = f"\nConditions: {config.conditions}.\n{notes}"
-    if config.map_date:
-        notes = f"\nDate of the map of map matching: {config.map_date}.\n{notes}"
-    if env.arrival.rule != "objective":
-        notes = f"\nArrival: {env.arrival.rule}, within {env.arrival.radius_km:g} km.\n{notes}"
+    lines = {
+        "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
+        "Date of the map of map matching": config.map_date,
+        "Conditions": config.conditions,
+        "Standard deviations of the noise on D, I and B_H": any(config.noise or ())
+        and "{:g} deg, {:g} deg, {:g} nT".format(*config.noise),
+    }
+    notes = "".join(f"\n{name}: {text}.\n" for name, text in lines.items() if text)
+    notes += "".join(f"\nWarning: {text}.\n" for text in results.warnings)
     ahead = config.kilometers or env.arrival.rule != "objective"
     whole = comparison_table(results.summaries, config.mode, published=not config.scenario, kilometers=ahead)
     (config.out / "table.md").write_text(whole + notes)
@@ -320,8 +291,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Read the command line, evaluate and print the table."""
     config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
     evaluate(config)
-    print((config.out / "table.md").read_text())
-    print(f"Results are in {config.out}")
+    print((config.out / "table.md").read_text(), f"Results are in {config.out}", sep="\n")
 
 
 if __name__ == "__main__":

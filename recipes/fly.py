@@ -129,6 +129,27 @@ def places(config: Config, field: IGRF) -> tuple[Tensor, Tensor, float]:
     return start, target, distance_km
 
 
+def check_settings(config: Config) -> None:
+    """Raise unless noise, conditions and heading can be flown."""
+    for level in config.noise:
+        check_number(0, noise=level)
+    if config.conditions and any(config.noise):
+        raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
+    if config.start_heading != "random":
+        check_number(-360, 360, start_heading=config.start_heading)
+
+
+def check_files(config: Config) -> None:
+    """Raise unless all files can be written."""
+    if config.export:
+        export.check_suffix(config.export)
+    if config.animate and config.animate.suffix != ".gif":
+        raise ValueError(f"an animation must end in .gif, got {config.animate}")
+    for file in (config.out / "flight.png", config.out / "flight.json", config.export, config.animate):
+        if file:
+            check_writable(file)
+
+
 def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
     """Return the environment and the navigator, and check the files.
 
@@ -136,10 +157,7 @@ def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
         UsageError: for anything that is wrong with the settings.
     """
     try:
-        for level in config.noise:
-            check_number(0, noise=level)
-        if config.conditions and any(config.noise):
-            raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
+        check_settings(config)
         conditions = conditions_named(config.conditions or "laboratory")
         drift_km = conditions.drift_km(50.0)
         field = IGRF(config.date)
@@ -154,8 +172,6 @@ def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
             drift_km=drift_km,
             seed=config.seed,
         )
-        if config.start_heading != "random":
-            check_number(-360, 360, start_heading=config.start_heading)
         track = TrackGradient(("field", "target_field", "move", "heading", *DATA_SHEET), range_km=1000.0)
         noise, errors = config.noise, [SensorNoise(config.noise, seed=config.seed)]
         if config.conditions:
@@ -163,13 +179,7 @@ def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
         env = TransformedEnv(base, Compose(*errors, track))
         told = {"noise": noise, "bias": conditions.bias_std}
         navigator = make_navigator(config.navigator, base, seed=config.seed, **told)
-        if config.export:
-            export.check_suffix(config.export)
-        if config.animate and config.animate.suffix != ".gif":
-            raise ValueError(f"an animation must end in .gif, got {config.animate}")
-        own = filter(None, (config.export, config.animate))
-        for file in (config.out / "flight.png", config.out / "flight.json", *own):
-            check_writable(file)
+        check_files(config)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
     return env, Watched(navigator, distance_km)

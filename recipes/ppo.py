@@ -28,9 +28,9 @@ from torchrl.objectives.value import GAE
 
 from magrl.agents import FieldPolicy, PolicyConfig, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
-from magrl.training import Run, RunConfig, command, parse_config
+from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, Discount, NonNegative, Positive, Share, Widths
+from magrl.training.config import Count, GuidanceConfig, LearningConfig, NonNegative, Positive, Share
 from magrl.transforms import AlignmentReward, DistanceCost, FieldGradient, GradientHeading, ObservationView, SensorNoise
 
 RECIPE = "ppo.py"
@@ -43,27 +43,22 @@ TRANSITION = (
 )
 
 
-class Config(RunConfig):
+class Config(LearningConfig, GuidanceConfig):
     """Settings of a training."""
 
+    # Own defaults of shared settings
     total_frames: Count = 393_216
-    """Steps of all vehicles together."""
     eval_every: Count = 8
-    """Collected batches between evaluations on the validation tasks."""
+    learning_rate: Positive = 1e-3
+    final_learning_rate: Positive = 2e-5
 
     # Environment
     start_heading: Literal["north", "random"] = "north"
     """Heading at the start of an episode."""
-    alignment_weight: float = 3.0
-    """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
-    alignment_offset: float = math.pi / 4
-    """Heading deviation at which the alignment reward changes sign [rad]."""
     distance_cost: NonNegative = 0.1
     """Cost of a move [1/km]."""
 
     # Networks
-    num_cells: Widths = (128, 128, 128)
-    """Width of each hidden layer."""
     layer_norm: bool = True
     """Layer normalization in the actor."""
 
@@ -74,8 +69,6 @@ class Config(RunConfig):
     """Passes over a collected batch."""
     batch_size: Count = 1024
     """Transitions per gradient step."""
-    gamma: Discount = 0.9
-    """Discount factor."""
     gae_lambda: Share = 0.95
     """Factor lambda of the generalized advantage estimate."""
     clip_epsilon: Positive = 0.2
@@ -84,16 +77,8 @@ class Config(RunConfig):
     """Weight of the entropy of the action."""
     scale: Positive = 0.5
     """Standard deviation of the action before the tanh at the start."""
-    learning_rate: Positive = 1e-3
-    """Learning rate of Adam at the start."""
-    final_learning_rate: Positive = 2e-5
-    """Learning rate at the end; linear in between."""
     clip_gradient: Positive = 1.0
     """Largest norm of the gradient."""
-    reward_scale: Positive = 0.05
-    """Factor on rewards for the critic; reported rewards are unscaled."""
-    saturation_weight: NonNegative = 0.05
-    """Weight of the penalty on the actor's mean before the tanh; falls linearly to 0."""
 
     @model_validator(mode="after")
     def _fits(self) -> Config:

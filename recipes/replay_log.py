@@ -21,11 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import torch
 import tyro
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from magrl.agents import load_policy
@@ -33,10 +35,13 @@ from magrl.checks import check_number
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
-from magrl.onboard import NAMED, Onboard
+from magrl.onboard import Onboard
 from magrl.training import UsageError, command
 
 RECIPE = "replay_log.py"
+ELEMENTS = ["declination", "inclination", "horizontal"]
+COMMANDED = ["move_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
+"""Columns of what the navigator would have commanded and estimated."""
 FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}"}
 """Formats of columns of log.md, where not one decimal."""
 
@@ -96,7 +101,7 @@ def read_log(config: Config) -> pd.DataFrame:
     log = pd.DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
     if config.time in raw:
         log["time"] = raw[config.time]
-    wanted = ["declination", "inclination", "horizontal", "heading", "distance"]
+    wanted = [*ELEMENTS, "heading", "distance"]
     if config.latitude in raw or config.longitude in raw:
         wanted += ["latitude", "longitude"]
     for option in wanted:
@@ -131,28 +136,16 @@ def joined(log: pd.DataFrame, every_km: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def vehicle(config: Config, steps: int) -> Onboard:
-    """Return the vehicle that replays the log."""
-    named = config.navigator in NAMED or not config.navigator.endswith(".pt")
-    return Onboard(
-        config.navigator if named else load_policy(config.navigator),
-        sensor_std=config.noise,
-        bias_std=config.bias,
-        max_steps=steps,
-        zeta=config.zeta,
-        arrival_km=config.arrival_km,
-    )
-
-
 def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
     """Return what the navigator would have commanded and estimated after each row, beside the row itself.
 
     Raises:
         UsageError: for a row that no vehicle can have recorded, with its number.
     """
-    elements = ["declination", "inclination", "horizontal"]
-    board = vehicle(config, len(log))
-    board.start(log[elements].iloc[-1].tolist() if config.target is None else config.target)
+    navigator = load_policy(config.navigator) if config.navigator.endswith(".pt") else config.navigator
+    sheet = {"sensor_std": config.noise, "bias_std": config.bias}
+    board = Onboard(navigator, max_steps=len(log), zeta=config.zeta, arrival_km=config.arrival_km, **sheet)
+    board.start(log[ELEMENTS].iloc[-1].tolist() if config.target is None else config.target)
     found = []
     for _, row in log.iterrows():
         heading = row["heading"]
@@ -161,24 +154,12 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
             # course as a large number is not compared. A log in radians is named in notes().
             heading -= math.copysign(360, heading)
         try:
-            told = board.step(*row[elements], heading, row["distance"])
+            order = board.step(*row[ELEMENTS], heading, row["distance"])
         except ValueError as error:
-            joined_by = f" (moves are joined by --every-km {config.every_km:g})" if config.every_km else ""
-            raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}{joined_by}") from error
-        found.append(
-            {
-                "move_km": told.distance_km,
-                "turn_deg": told.turn_deg,
-                "steer_deg": told.heading_deg,
-                "north_km": told.way_km[0],
-                "east_km": told.way_km[1],
-                "error_km": told.error_km,
-                "confidence": told.confidence,
-                "stop": told.stop or "",
-                "covariance": told.way_covariance_km2,
-            }
-        )
-    return pd.concat((log.reset_index(drop=True), pd.DataFrame(found)), axis=1)
+            raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}") from error
+        row = (order.distance_km, order.turn_deg, order.heading_deg, *order.way_km, order.error_km, order.confidence)
+        found.append((*row, order.stop or "", order.way_covariance_km2))
+    return pd.concat((log.reset_index(drop=True), pd.DataFrame(found, columns=COMMANDED)), axis=1)
 
 
 def with_truth(config: Config, table: pd.DataFrame) -> pd.DataFrame:
@@ -217,56 +198,67 @@ def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
     return np.stack((cos * north - sin * east, sin * north + cos * east), -1)
 
 
-def figure(table: pd.DataFrame, title: str) -> plt.Figure:
+def figure(table: pd.DataFrame, title: str) -> Figure:
     """Return a figure of the track with the estimates of the destination, and of the distance that is left."""
-    drawn, (plan, left) = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
-    (place, turn), way = places(table), table[["north_km", "east_km"]].to_numpy(dtype=float)
-    travelled, number = table["distance"].cumsum(), np.arange(len(table))
-    steer = np.radians(table["steer_deg"].to_numpy(dtype=float)) + turn
-    plan.plot(place[:, 1], place[:, 0], "-", color="0.4", label="track")
-    arrows = {"angles": "xy", "width": 0.004, "color": "#0072B2", "label": "commanded heading"}
-    plan.quiver(place[:, 1], place[:, 0], np.sin(steer), np.cos(steer), **arrows)
-    guess = place + turned(way, turn)
-    dots = plan.scatter(guess[:, 1], guess[:, 0], c=number, cmap="viridis", s=18, zorder=3, label="estimated target")
+    drawn = Figure(figsize=(12, 5.4), layout="constrained")
+    plan, left = drawn.subplots(1, 2)
+    dots = draw_track(plan, table)
     drawn.colorbar(dots, ax=plan, label="row of the table", shrink=0.8)
-    values, axes = np.linalg.eigh(np.array(table["covariance"].iloc[-1]))
-    size = 4 * np.sqrt(np.maximum(values, 0))
-    angle = math.degrees(math.atan2(axes[0, 1], axes[1, 1]))
-    plan.add_patch(Ellipse(guess[-1, ::-1], size[1], size[0], angle=angle, fill=False, color="#D55E00"))
-    extent = np.concatenate((place, guess[len(guess) // 4 :]))
     plan.set(xlabel="east of the start [km]", ylabel="north of the start [km]", aspect="equal", title=title)
-    plan.set(xlim=_limits(extent[:, 1]), ylim=_limits(extent[:, 0]))
-    distance, error = np.hypot(*way.T), table["error_km"].to_numpy(dtype=float)
-    left.plot(travelled, distance, "o-", color="#0072B2", markersize=3, label="estimated")
-    left.fill_between(travelled, np.maximum(distance - error, 0), distance + error, alpha=0.2, label="± error")
-    if "miss_km" in table:
-        true = table[["true_north_km", "true_east_km"]].to_numpy(dtype=float)
-        target = place[0] + true[0]
-        plan.plot(target[1], target[0], "*", color="#D55E00", markersize=14, zorder=2, label="true target")
-        left.plot(travelled, np.hypot(*true.T), "k--", label="true")
-        left.plot(travelled, table["miss_km"], color="#D55E00", label="error of the estimate")
-    left.set(xlabel="distance moved [km]", ylabel="way to the destination [km]", ylim=(0, 1.3 * distance.max()))
-    for axis in (plan, left):
-        axis.grid(alpha=0.3)
-        axis.legend(frameon=False, fontsize=8)
+    draw_distance(left, table)
+    for axes in (plan, left):
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize=8)
     return drawn
 
 
-def _limits(values: np.ndarray) -> tuple[float, float]:
-    slack = 0.1 * (values.max() - values.min()) + 10
-    return values.min() - slack, values.max() + slack
+def draw_track(axes: Axes, table: pd.DataFrame) -> PathCollection:
+    """Draw the track, commanded headings and estimates of the destination, and return the dots of these."""
+    place, turn = places(table)
+    way = table[["north_km", "east_km"]].to_numpy(dtype=float)
+    steer = np.radians(table["steer_deg"].to_numpy(dtype=float)) + turn
+    axes.plot(place[:, 1], place[:, 0], "-", color="0.4", label="track")
+    arrows = {"angles": "xy", "width": 0.004, "color": "#0072B2", "label": "commanded heading"}
+    axes.quiver(place[:, 1], place[:, 0], np.sin(steer), np.cos(steer), **arrows)
+    guess = place + turned(way, turn)
+    look = {"c": np.arange(len(table)), "cmap": "viridis", "s": 18, "zorder": 3, "label": "estimated target"}
+    dots = axes.scatter(guess[:, 1], guess[:, 0], **look)
+    values, vectors = np.linalg.eigh(np.array(table["covariance"].iloc[-1]))
+    size = 4 * np.sqrt(np.maximum(values, 0))
+    angle = math.degrees(math.atan2(vectors[0, 1], vectors[1, 1]))
+    axes.add_patch(Ellipse(guess[-1, ::-1], size[1], size[0], angle=angle, fill=False, color="#D55E00"))
+    if "miss_km" in table:
+        target = place[0] + table[["true_north_km", "true_east_km"]].to_numpy(dtype=float)[0]
+        axes.plot(target[1], target[0], "*", color="#D55E00", markersize=14, zorder=2, label="true target")
+    seen = np.concatenate((place, guess[len(guess) // 4 :]))
+    slack = 0.1 * (seen.max(0) - seen.min(0)) + 10
+    low, high = seen.min(0) - slack, seen.max(0) + slack
+    axes.set(xlim=(low[1], high[1]), ylim=(low[0], high[0]))
+    return dots
+
+
+def draw_distance(axes: Axes, table: pd.DataFrame) -> None:
+    """Draw the estimated and the true distance to the destination."""
+    travelled, error = table["distance"].cumsum(), table["error_km"].to_numpy(dtype=float)
+    distance = np.hypot(table["north_km"], table["east_km"])
+    axes.plot(travelled, distance, "o-", color="#0072B2", markersize=3, label="estimated")
+    axes.fill_between(travelled, np.maximum(distance - error, 0), distance + error, alpha=0.2, label="± error")
+    if "miss_km" in table:
+        axes.plot(travelled, np.hypot(table["true_north_km"], table["true_east_km"]), "k--", label="true")
+        axes.plot(travelled, table["miss_km"], color="#D55E00", label="error of the estimate")
+    axes.set(xlabel="distance moved [km]", ylabel="way to the destination [km]", ylim=(0, 1.3 * distance.max()))
 
 
 def markdown(table: pd.DataFrame) -> str:
     """Return the table with rounded numbers."""
-    hidden = ["declination", "inclination", "horizontal", "latitude", "longitude", "covariance"]
+    hidden = [*ELEMENTS, "latitude", "longitude", "covariance"]
     shown = table.drop(columns=[name for name in hidden if name in table])
 
-    def cell(name: str, value: object) -> object:
-        return FORMATS.get(name, "{:.1f}").format(value) if isinstance(value, (int, float)) else value
-
-    rows = [[cell(name, row[name]) for name in shown] for _, row in shown.iterrows()]
-    return markdown_table(list(shown), rows)
+    cells = [
+        [FORMATS.get(name, "{:.1f}").format(x) if isinstance(x, (int, float)) else x for x in shown[name]]
+        for name in shown
+    ]
+    return markdown_table(list(shown), zip(*cells, strict=True))
 
 
 def notes(table: pd.DataFrame) -> list[str]:
@@ -281,18 +273,18 @@ def notes(table: pd.DataFrame) -> list[str]:
         found.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")
     if "miss_km" in table:
         last = table.iloc[-1]
-        found.append(
-            f"Error of the estimated way at the end: {last['miss_km']:.1f} km; stated {last['error_km']:.1f} km."
-        )
+        miss, stated = last["miss_km"], last["error_km"]
+        found.append(f"Error of the estimated way at the end: {miss:.1f} km; stated {stated:.1f} km.")
     return found
 
 
-def run(config: Config) -> pd.DataFrame:
-    """Replay the log, write the files and return the table.
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line, replay the log, write the files and print the table.
 
     Raises:
         UsageError: for a log or a setting that is wrong.
     """
+    config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
     log = read_log(config)
     try:
         check_number(0, every_km=config.every_km)
@@ -304,16 +296,7 @@ def run(config: Config) -> pd.DataFrame:
     table.drop(columns="covariance").to_csv(config.out / "log.csv", index=False)
     (config.out / "log.md").write_text("\n".join([markdown(table), "", *notes(table), ""]))
     figure(table, f"{config.log.name}: {config.navigator}").savefig(config.out / "log.png", dpi=110)
-    plt.close("all")
-    return table
-
-
-def main(args: Sequence[str] | None = None) -> None:
-    """Read the command line, replay the log and print the table."""
-    config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
-    run(config)
-    print((config.out / "log.md").read_text())
-    print(f"The picture is {config.out / 'log.png'}")
+    print((config.out / "log.md").read_text(), f"The picture is {config.out / 'log.png'}", sep="\n")
 
 
 if __name__ == "__main__":

@@ -32,9 +32,9 @@ from torchrl.modules import AdditiveGaussianModule
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
-from magrl.training import Run, RunConfig, command, parse_config
+from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, Discount, NonNegative, Positive, PositiveShare, Rising, Widths
+from magrl.training.config import Count, Discount, NonNegative, Positive, Rising, TransitionConfig
 from magrl.transforms import DetourReward, RandomSensorNoise, SensorNoise, TrackView, TrueWay, sensor_levels
 
 RECIPE = "td3_anywhere.py"
@@ -42,17 +42,24 @@ OBSERVED = ("observation", "true_way_scaled")
 TRANSITION = (*OBSERVED, "action", *(("next", k) for k in (*OBSERVED, "reward", "done", "terminated")))
 
 
-class Config(RunConfig):
+class Config(TransitionConfig):
     """Settings of a training; the defaults are those of the preset."""
 
     preset: Literal["fast", "far"] = "fast"
     """Source of the defaults: destinations 300-500 km away, or 150-1800 km."""
+
+    # Own defaults of shared settings
     total_frames: Count = 1_228_800
-    """Steps of all vehicles together."""
     eval_every: Count = 200
-    """Collected batches between evaluations on the validation tasks."""
     eval_tasks_small: Count = 500
-    """Number of validation tasks, which select the policy that is kept."""
+    buffer_size: Count = 400_000
+    init_random_frames: Annotated[int, Field(ge=0)] = 4096
+    gamma: Discount = 0.99
+    learning_rate: Positive = 1e-3
+    final_learning_rate: Positive = 2e-5
+    final_exploration_noise: NonNegative = 0.02
+    noise_clip: NonNegative = 0.3
+    saturation_weight: NonNegative = 0.02
 
     # Environment
     num_regions: Count = 2048
@@ -65,50 +72,11 @@ class Config(RunConfig):
     """Prior standard deviation of the way to the destination along each axis [km]."""
     step_cost: NonNegative = 0.02
     """Penalty for each move; arriving is worth 10, and a detour as long as the task costs 10."""
-
     noise_exponent: Positive = 1.5
     """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
 
-    # Networks
-    num_cells: Widths = (128, 128, 128)
-    """Width of each hidden layer."""
-
-    # TD3
-    updates_per_batch: Count = 8
-    """Gradient steps after each step of all vehicles."""
-    batch_size: Count = 1024
-    """Transitions per gradient step."""
-    buffer_size: Count = 400_000
-    """Capacity of the replay buffer [transitions]."""
-    init_random_frames: Annotated[int, Field(ge=0)] = 4096
-    """Steps with random actions before the policy acts."""
-    gamma: Discount = 0.99
-    """Discount factor."""
-    tau: PositiveShare = 0.01
-    """Polyak averaging factor of the target networks."""
-    policy_delay: Count = 2
-    """Critic updates per update of the actor and the target networks."""
-    learning_rate: Positive = 1e-3
-    """Learning rate of Adam at the start."""
-    final_learning_rate: Positive = 2e-5
-    """Learning rate at the end; linear in between."""
-    exploration_noise: NonNegative = 0.2
-    """Standard deviation of the exploration noise at the start, for actions in [-1, 1]."""
-    final_exploration_noise: NonNegative = 0.02
-    """Standard deviation of the exploration noise at the end; linear in between."""
-    policy_noise: NonNegative = 0.1
-    """Standard deviation of the noise of target policy smoothing."""
-    noise_clip: NonNegative = 0.3
-    """Largest noise of target policy smoothing."""
-    saturation_weight: NonNegative = 0.02
-    """Weight of the penalty on the actor's outputs before the tanh; falls linearly to 0."""
-
     @model_validator(mode="after")
     def _fits(self) -> Config:
-        if self.buffer_size < self.batch_size:
-            raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
-        if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
-            raise ValueError(f"batch_size {self.batch_size} must not exceed total_frames: no gradient step is possible")
         if self.scenario is not None:
             raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
         return self

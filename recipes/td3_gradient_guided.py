@@ -17,10 +17,10 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each ot
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import model_validator
 from tensordict.nn import TensorDictSequential
 from torch.optim import Adam
 from torchrl.collectors import BaseCollector
@@ -31,9 +31,9 @@ from torchrl.modules import AdditiveGaussianModule
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
-from magrl.training import Run, RunConfig, command, parse_config
+from magrl.training import Run, command, parse_config
 from magrl.training.collectors import CollectorBackend, make_collector, worker_seed
-from magrl.training.config import Count, Discount, NonNegative, Positive, PositiveShare, Widths
+from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, TransitionConfig
 from magrl.transforms import AlignmentReward, DistanceCost, FieldGradient, GradientHeading, ObservationView, SensorNoise
 
 RECIPE = "td3_gradient_guided.py"
@@ -41,7 +41,7 @@ TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "r
 ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 
 
-class Config(RunConfig):
+class Config(TransitionConfig, GuidanceConfig):
     """Settings of a training; the defaults are those of the preset."""
 
     preset: Literal["fast", "paper", "td3-fast", "td3-paper"] = "fast"
@@ -56,10 +56,6 @@ class Config(RunConfig):
     # Environment
     start_heading: Literal["north", "random"] = "north"
     """Heading at the start of an episode."""
-    alignment_weight: float = 3.0
-    """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
-    alignment_offset: float = math.pi / 4
-    """Heading deviation at which the alignment reward changes sign [rad]."""
     distance_cost: NonNegative = 0.0
     """Cost of a move [1/km]; 0.1 in preset fast, none in the paper."""
     objective_limit: Positive | None = None
@@ -72,51 +68,15 @@ class Config(RunConfig):
     """Observe target elements minus measured elements."""
 
     # Networks
-    num_cells: Widths = (128, 128, 128)
-    """Width of each hidden layer."""
     layer_norm: bool = True
     """Layer normalization in actor and critics."""
 
     # TD3
-    updates_per_batch: Count = 8
-    """Gradient steps after each step of all vehicles."""
-    batch_size: Count = 1024
-    """Transitions per gradient step."""
-    buffer_size: Count = 200_000
-    """Capacity of the replay buffer [transitions]."""
-    init_random_frames: Annotated[int, Field(ge=0)] = 1024
-    """Steps with random actions before the policy acts."""
-    gamma: Discount = 0.9
-    """Discount factor."""
-    tau: PositiveShare = 0.01
-    """Polyak averaging factor of the target networks."""
-    policy_delay: Count = 2
-    """Critic updates per update of the actor and the target networks."""
-    learning_rate: Positive = 2e-3
-    """Learning rate of Adam at the start."""
-    final_learning_rate: Positive = 4e-5
-    """Learning rate at the end; linear in between."""
-    exploration_noise: NonNegative = 0.2
-    """Standard deviation of the exploration noise at the start, for actions in [-1, 1]."""
-    final_exploration_noise: NonNegative = 0.1
-    """Standard deviation of the exploration noise at the end; linear in between."""
-    policy_noise: NonNegative = 0.1
-    """Standard deviation of the noise of target policy smoothing."""
-    noise_clip: NonNegative = 0.5
-    """Largest noise of target policy smoothing."""
-    reward_scale: Positive = 0.05
-    """Factor on rewards for the critics; reported rewards are unscaled."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Precision of the hidden layers in gradient steps; bfloat16 is faster where the processor has it."""
-    saturation_weight: NonNegative = 0.05
-    """Weight of the penalty on the actor's outputs before the tanh; falls linearly to 0."""
 
     @model_validator(mode="after")
     def _fits(self) -> Config:
-        if self.buffer_size < self.batch_size:
-            raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
-        if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
-            raise ValueError(f"batch_size {self.batch_size} must not exceed total_frames: no gradient step is possible")
         if self.num_envs % self.collectors:
             raise ValueError(f"num_envs {self.num_envs} cannot be divided evenly among {self.collectors} collectors")
         return self

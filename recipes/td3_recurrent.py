@@ -38,9 +38,9 @@ from magrl.agents import (
 )
 from magrl.agents.recurrent import STATE_KEYS
 from magrl.envs import GeomagneticNavEnv
-from magrl.training import Run, RunConfig, command, parse_config
+from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, Discount, NonNegative, Positive, PositiveShare, Share, Widths
+from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, PositiveShare, Share, TD3Config
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, ObservationView, SensorNoise
 
 RECIPE = "td3_recurrent.py"
@@ -49,13 +49,15 @@ OBSERVED = ("observation", "move_scaled", "heading_vector", *STATE_KEYS)
 TRANSITION = (*OBSERVED, "is_init", "action", *(("next", k) for k in (*OBSERVED, "reward", "done", "terminated")))
 
 
-class Config(RunConfig):
+class Config(TD3Config, GuidanceConfig):
     """Settings of a training."""
 
+    # Own defaults of shared settings
     total_frames: Count = 163_840
-    """Steps of all vehicles together."""
     eval_every: Count = 10
-    """Collected batches between evaluations on the validation tasks."""
+    buffer_size: Count = 163_840
+    exploration_noise: NonNegative = 0.5
+    alignment_offset: float = 0.0  # the paper's pi / 4 pays for short steps
 
     # Environment
     train_steps: Count = 24
@@ -63,14 +65,8 @@ class Config(RunConfig):
     shortest_task_km: Positive = 100.0
     """Shortest distance of training tasks [km]; evaluation tasks keep the paper's. Near destinations are found by
     chance, which teaches the critics the reward for arriving."""
-    alignment_weight: float = 3.0
-    """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
-    alignment_offset: float = 0.0
-    """Heading deviation at which the alignment reward changes sign [rad]; the paper's pi / 4 pays for short steps."""
 
     # Networks
-    num_cells: Widths = (128, 128, 128)
-    """Width of each hidden layer."""
     memory_size: Count = 64
     """Width of the LSTM."""
 
@@ -83,38 +79,14 @@ class Config(RunConfig):
     """Slices of episodes per gradient step."""
     slice_length: Count = 24
     """Longest slice [steps]."""
-    buffer_size: Count = 163_840
-    """Capacity of the replay buffer [transitions]."""
-    gamma: Discount = 0.9
-    """Discount factor."""
-    tau: PositiveShare = 0.01
-    """Polyak averaging factor of the target networks."""
-    policy_delay: Count = 2
-    """Critic updates per update of the actor and the target networks."""
-    learning_rate: Positive = 2e-3
-    """Learning rate of Adam at the start."""
-    final_learning_rate: Positive = 4e-5
-    """Learning rate at the end; linear in between."""
     memory_rate: Positive = 5.0
     """Learning rate of the LSTM, as a multiple of the actor's."""
     heading_weight: NonNegative = 0.0
     """Weight of an auxiliary loss that teaches the LSTM the heading."""
-    exploration_noise: NonNegative = 0.5
-    """Standard deviation of the exploration noise at the start, for actions in [-1, 1]."""
-    final_exploration_noise: NonNegative = 0.1
-    """Standard deviation of the exploration noise after noise_share of the training."""
     noise_share: PositiveShare = 0.3
     """Share of the training in which the exploration noise falls."""
     random_share: Share = 0.1
     """Share of training actions that are drawn at random."""
-    policy_noise: NonNegative = 0.1
-    """Standard deviation of the noise of target policy smoothing."""
-    noise_clip: NonNegative = 0.5
-    """Largest noise of target policy smoothing."""
-    reward_scale: Positive = 0.05
-    """Factor on rewards for the critics; reported rewards are unscaled."""
-    saturation_weight: NonNegative = 0.05
-    """Weight of the penalty on the actor's outputs before the tanh; falls linearly to 0."""
     clip_memory: Positive = 1.0
     """Largest norm of the gradient of the LSTM."""
 

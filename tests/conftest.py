@@ -27,7 +27,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 @pytest.fixture
 def signalled(monkeypatch) -> Callable:
     """Return a context in which a training gets a signal after it has collected batch ``iteration``, counted from 1."""
-    from magrl.training.statistics import TrainingStatistics
+    from magrl.training.curves import TrainingStatistics
 
     @contextlib.contextmanager
     def context(iteration: int, number: int) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""Checkpoints that resume a training exactly where it stopped.
+"""Run folders with their lock, and checkpoints that resume a training exactly where it stopped.
 
 A checkpoint is one file, written under another name, synchronized and renamed, so that it is either complete or absent.
 It holds tensors, numbers and text only.
@@ -6,24 +6,82 @@ It holds tensors, numbers and text only.
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from filelock import FileLock, Timeout
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.envs import TransformedEnv
 
 from magrl.checks import check_number
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.files import DamagedFileError, load_tensors, save_tensors
+from magrl.training.config import UsageError
 
 CHECKPOINT_FORMAT = 1
 _PATTERN = "checkpoint-*.pt"
 PRIVATE = ("_carrier", "_frames", "_iter")
 """Private attributes of TorchRL's ``Collector`` that :class:`RunningEpisodes` saves and restores."""
+
+
+def create_run_folder(path: Path | str) -> Path:
+    """Create the folder of a run; a run never writes over another.
+
+    Raises:
+        UsageError: if it exists and is not empty, saying whether the run there is complete or can be resumed; or if
+            it cannot be made.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     create_run_folder(Path(folder) / "run").name
+        'run'
+    """
+    path = Path(path)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        state = f"the run folder {path} is not empty"
+        if (path / "eval.json").is_file():
+            state = f"the run in {path} is complete"
+        elif (path / "config.json").is_file():
+            state = f"{path} holds a run that is not complete, which --resume {path} completes"
+        raise UsageError(f"{state}: choose another --out, or remove it")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"the run folder {path} cannot be made ({error.strerror}): choose another --out") from error
+    return path
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Claim a run folder for this process while the block runs; a kill releases it too.
+
+    Raises:
+        UsageError: if another process writes it.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, locked(Path(folder)):
+        ...     with locked(Path(folder)):  # doctest: +ELLIPSIS
+        ...         pass
+        Traceback (most recent call last):
+        magrl.training.config.UsageError: another process is writing the run folder ...
+    """
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise UsageError(f"another process is writing the run folder {folder}") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class Stateful(Protocol):
@@ -52,17 +110,16 @@ class Checkpoints:
         keep: number of files to keep; with two, one damaged file does not lose the training.
 
     Raises:
-        TypeError: for a part without these methods, naming it.
         ValueError: for a number of files below 1.
 
     Example:
         >>> import tempfile
         >>> from torch import nn
         >>> layer, other = nn.Linear(2, 1), nn.Linear(2, 1)
-        >>> folder = tempfile.mkdtemp()
-        >>> Checkpoints(folder, {"layer": layer}).save(100).name
-        'checkpoint-000000000100.pt'
-        >>> Checkpoints(folder, {"layer": other}).load()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     print(Checkpoints(folder, {"layer": layer}).save(100).name)
+        ...     Checkpoints(folder, {"layer": other}).load()
+        checkpoint-000000000100.pt
         100
         >>> bool((layer.weight == other.weight).all())
         True
@@ -70,9 +127,6 @@ class Checkpoints:
 
     def __init__(self, folder: Path | str, parts: dict[str, Stateful], keep: int = 2) -> None:
         check_number(1, whole=True, keep=keep)
-        for name, part in parts.items():
-            if not (hasattr(part, "state_dict") and hasattr(part, "load_state_dict")):
-                raise TypeError(f"the part {name} must have state_dict and load_state_dict, got {part!r}")
         self.folder, self.parts, self.keep = Path(folder), dict(parts), keep
 
     def files(self) -> list[Path]:
@@ -95,13 +149,9 @@ class Checkpoints:
         check_number(0, whole=True, frames=frames)
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"checkpoint-{frames:012d}.pt"
-        content = {
-            "format": CHECKPOINT_FORMAT,
-            "frames": frames,
-            "parts": {name: part.state_dict() for name, part in self.parts.items()},
-        }
+        parts = {name: part.state_dict() for name, part in self.parts.items()}
         try:
-            save_tensors(content, path)
+            save_tensors({"format": CHECKPOINT_FORMAT, "frames": frames, "parts": parts}, path)
         except Exception as error:
             kept = f"the newest checkpoint is {self.files()[-1]}" if self.files() else "there is no older checkpoint"
             raise OSError(f"the checkpoint {path} could not be written ({error}); {kept}") from error
@@ -143,10 +193,7 @@ class Checkpoints:
 
     def clear(self) -> None:
         """Remove all checkpoints, once a training is complete."""
-        for path in self.folder.glob("checkpoint-*"):
-            path.unlink()
-        if self.folder.is_dir() and not any(self.folder.iterdir()):
-            self.folder.rmdir()
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def read_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
@@ -166,8 +213,8 @@ def read_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dic
     Example:
         >>> import tempfile
         >>> from torch import nn
-        >>> path = Checkpoints(tempfile.mkdtemp(), {"layer": nn.Linear(2, 1)}).save(100)
-        >>> content = read_checkpoint(path)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     content = read_checkpoint(Checkpoints(folder, {"layer": nn.Linear(2, 1)}).save(100))
         >>> content["frames"], list(content["parts"])
         (100, ['layer'])
     """
@@ -175,11 +222,8 @@ def read_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dic
     if not isinstance(content, dict) or set(content) != {"format", "frames", "parts"}:
         raise DamagedFileError(f"{path} is not a checkpoint: it must hold format, frames and parts")
     if content["format"] != CHECKPOINT_FORMAT:
-        raise ValueError(
-            f"{path} is a checkpoint of format {content['format']!r}; this version reads {CHECKPOINT_FORMAT}"
-        )
-    if not isinstance(content["frames"], int) or not isinstance(content["parts"], dict):
-        raise DamagedFileError(f"{path} is not a checkpoint: frames must be a number and parts a dictionary")
+        found = content["format"]
+        raise ValueError(f"{path} is a checkpoint of format {found!r}; this version reads {CHECKPOINT_FORMAT}")
     return content
 
 
@@ -212,7 +256,7 @@ class RunningEpisodes:
             "running": {key: value for key, value in running.items() if isinstance(value, Tensor)},
             "episode": self.env.episode,
             "seed": self.env.seed,
-            "transforms": self.collector.env.state_dict() if self._transformed else {},
+            "transforms": self.collector.env.state_dict(),
             "frames": self.collector._frames,
             "iterations": self.collector._iter,
         }
@@ -225,15 +269,9 @@ class RunningEpisodes:
         """
         collector, device = self.collector, self.env.device
         running = TensorDict(state_dict["running"], batch_size=self.env.batch_size, device=device).unflatten_keys(".")
-        expected = set(collector.env.reset().keys(True, True))
-        if not expected <= set(running.keys(True, True)):
-            raise ValueError(f"running episodes lack {sorted(map(str, expected - set(running.keys(True, True))))}")
+        if missing := set(collector.env.reset().keys(True, True)) - set(running.keys(True, True)):
+            raise ValueError(f"running episodes lack {sorted(map(str, missing))}")
         collector._carrier = running
         collector._frames, collector._iter = int(state_dict["frames"]), int(state_dict["iterations"])
         self.env.seed, self.env.episode = int(state_dict["seed"]), state_dict["episode"].to(device)
-        if self._transformed:
-            collector.env.load_state_dict(state_dict["transforms"])
-
-    @property
-    def _transformed(self) -> bool:
-        return isinstance(self.collector.env, TransformedEnv)
+        collector.env.load_state_dict(state_dict["transforms"])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +17,7 @@ from pydantic import AfterValidator, Field, model_validator
 from typing_extensions import Self
 
 from magrl import paper
-from magrl.checks import CheckedModel, check_type
+from magrl.checks import CheckedModel
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.measures import check_zeta
 from magrl.training.loggers import Logger, WandbMode, check_logger
@@ -102,10 +104,8 @@ class RunConfig(CheckedModel):
         try:
             torch.zeros(1, device=self.device).item()
         except (RuntimeError, AssertionError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(
-                f"device {self.device!r} cannot be used here ({reason}): choose another, such as cpu"
-            ) from None
+            said = f"device {self.device!r} cannot be used here ({str(error).splitlines()[0]})"
+            raise ValueError(f"{said}: choose another, such as cpu") from None
         try:
             scenario = self.load_scenario()
         except OSError as error:
@@ -115,9 +115,6 @@ class RunConfig(CheckedModel):
             if None not in (said, own) and said != own:
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"the scenario says {name} = {said!r}, the training {own!r}: add {option} {said}")
-        start, end = (getattr(self, f"{stage}exploration_noise", 0.0) for stage in ("", "final_"))
-        if end > start:
-            raise ValueError(f"final_exploration_noise {end:g} must not exceed exploration_noise {start:g}")
         if scenario.arrival == "declared":
             raise ValueError('the scenario says arrival = "declared": the recipes train no agent that declares')
         return self
@@ -130,6 +127,101 @@ class RunConfig(CheckedModel):
         """Return a setting on its line from ``name`` to ``final_name``, with a share of the training remaining."""
         start, end = getattr(self, name), getattr(self, f"final_{name}")
         return end + remaining * (start - end)
+
+
+class LearningConfig(RunConfig):
+    """Settings that all algorithms share.
+
+    Example:
+        >>> LearningConfig(gamma=1.0)
+        Traceback (most recent call last):
+        ValueError: gamma must be less than 1, got 1.0
+    """
+
+    num_cells: Widths = (128, 128, 128)
+    """Width of each hidden layer."""
+    gamma: Discount = 0.9
+    """Discount factor."""
+    learning_rate: Positive = 2e-3
+    """Learning rate of Adam at the start."""
+    final_learning_rate: Positive = 4e-5
+    """Learning rate of Adam at the end; linear in between."""
+    saturation_weight: NonNegative = 0.05
+    """Weight of the penalty on the actor's outputs before the tanh; falls linearly to 0."""
+
+
+class GuidanceConfig(RunConfig):
+    """Settings of the guidance by the theoretical heading, and of the scale of rewards.
+
+    Example:
+        >>> GuidanceConfig(reward_scale=0.0)
+        Traceback (most recent call last):
+        ValueError: reward_scale must be greater than 0, got 0.0
+    """
+
+    alignment_weight: float = 3.0
+    """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
+    alignment_offset: float = math.pi / 4
+    """Heading deviation at which the alignment reward changes sign [rad]."""
+    reward_scale: Positive = 0.05
+    """Factor on the rewards that the critics learn from; reported rewards are unscaled."""
+
+
+class TD3Config(LearningConfig):
+    """Settings that all TD3 recipes share.
+
+    Example:
+        >>> TD3Config(exploration_noise=0.05)
+        Traceback (most recent call last):
+        ValueError: final_exploration_noise 0.1 must not exceed exploration_noise 0.05
+    """
+
+    buffer_size: Count = 200_000
+    """Capacity of the replay buffer [transitions]."""
+    tau: PositiveShare = 0.01
+    """Polyak averaging factor of the target networks."""
+    policy_delay: Count = 2
+    """Critic updates per update of the actor and the target networks."""
+    exploration_noise: NonNegative = 0.2
+    """Standard deviation of the exploration noise at the start, for actions in [-1, 1]."""
+    final_exploration_noise: NonNegative = 0.1
+    """Standard deviation of the exploration noise at the end; linear in between."""
+    policy_noise: NonNegative = 0.1
+    """Standard deviation of the noise of target policy smoothing."""
+    noise_clip: NonNegative = 0.5
+    """Largest noise of target policy smoothing."""
+
+    @model_validator(mode="after")
+    def _explores_less_at_the_end(self) -> Self:
+        start, end = self.exploration_noise, self.final_exploration_noise
+        if end > start:
+            raise ValueError(f"final_exploration_noise {end:g} must not exceed exploration_noise {start:g}")
+        return self
+
+
+class TransitionConfig(TD3Config):
+    """Settings of TD3 recipes that replay single transitions.
+
+    Example:
+        >>> TransitionConfig(buffer_size=100)
+        Traceback (most recent call last):
+        ValueError: buffer_size 100 does not hold one batch of 1024
+    """
+
+    updates_per_batch: Count = 8
+    """Gradient steps after each step of all vehicles."""
+    batch_size: Count = 1024
+    """Transitions per gradient step."""
+    init_random_frames: Annotated[int, Field(ge=0)] = 1024
+    """Steps with random actions before the policy acts."""
+
+    @model_validator(mode="after")
+    def _batch_fits(self) -> Self:
+        if self.buffer_size < self.batch_size:
+            raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
+        if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
+            raise ValueError(f"batch_size {self.batch_size} must not exceed total_frames: no gradient step is possible")
+        return self
 
 
 Config = TypeVar("Config", bound=RunConfig)
@@ -157,18 +249,15 @@ def parse_config(
     """
     first = argparse.ArgumentParser(prog=recipe, add_help=False, allow_abbrev=False)
     first.add_argument("--resume", type=Path)
-    if len(presets) > 1:
-        first.add_argument("--preset", choices=list(presets))
+    first.add_argument("--preset", choices=list(presets))
     args = sys.argv[1:] if args is None else list(args)
-    helped = {"-h", "--help"} & set(args)
     known, others = first.parse_known_args(args)
-    preset = getattr(known, "preset", None)
-    if known.resume and not helped:
-        others += ["--preset", preset] if preset else []
+    if known.resume and not {"-h", "--help"} & set(args):
+        others += ["--preset", known.preset] if known.preset else []
         if others:
             raise UsageError(f"--resume takes its settings from the run: leave out {' '.join(others)}")
         return resumed_config(known.resume, kind, recipe)
-    default = presets[preset or next(iter(presets))]
+    default = presets[known.preset or next(iter(presets))]
     return tyro.cli(kind, default=default, args=args, prog=recipe, description=description)
 
 
@@ -185,12 +274,11 @@ def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
 
     Example:
         >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> _ = (folder / "config.json").write_text('{"recipe": "mine.py", "seed": 7}')
-        >>> resumed_config(folder, RunConfig, "mine.py").seed
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "config.json").write_text('{"recipe": "mine.py", "seed": 7}')
+        ...     resumed_config(Path(folder), RunConfig, "mine.py").seed
         7
     """
-    check_type(Path, folder=folder)
     path, result = folder / "config.json", folder / "eval.json"
     if not path.is_file():
         raise UsageError(f"there is no run to resume in {folder}: it holds no config.json")
@@ -210,14 +298,27 @@ def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
         raise UsageError(f"cannot resume from {path}: {error}") from error
 
 
-def command(recipe: str, train: Callable[[], Any]) -> None:
-    """Run a recipe from the command line: print a :class:`UsageError` in one line and exit with status 2.
+def command(recipe: str, main: Callable[[], Any]) -> None:
+    """Run a recipe from the command line.
+
+    A :class:`UsageError` is printed in one line, with exit status 2. Where the reader of the output ends first, as in
+    ``command --help | head``, the command ends without a traceback, with status 141, as after ``SIGPIPE``.
+
+    Args:
+        recipe: file name of the recipe.
+        main: function that reads the command line.
 
     Example:
         >>> command("mine.py", lambda: None)
     """
     try:
-        train()
+        try:
+            main()
+        finally:
+            sys.stdout.flush()
     except UsageError as error:
         print(f"{recipe}: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered is written at exit
+        raise SystemExit(141) from None

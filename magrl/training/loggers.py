@@ -18,8 +18,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from magrl.checks import check_type
-
 WANDB_PROJECT = "magrl"
 """Project of the runs, unless the environment variable WANDB_PROJECT is set."""
 
@@ -40,16 +38,15 @@ def check_logger(logger: str, wandb_mode: str = "offline") -> None:
         Traceback (most recent call last):
         ValueError: logger must be one of wandb, tensorboard, csv, got 'paper'
     """
-    if logger not in LOGGERS:
-        raise ValueError(f"logger must be one of {', '.join(LOGGERS)}, got {logger!r}")
-    if wandb_mode not in WANDB_MODES:
-        raise ValueError(f"wandb_mode must be one of {', '.join(WANDB_MODES)}, got {wandb_mode!r}")
+    for name, value, known in (("logger", logger, LOGGERS), ("wandb_mode", wandb_mode, WANDB_MODES)):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
     if logger == "tensorboard" and importlib.util.find_spec("tensorboard") is None:
         raise ValueError("the logger tensorboard is not installed: pip install 'magrl[tensorboard]'")
 
 
 def panels(row: Mapping[str, float], before: Mapping[str, float] | None = None) -> dict[str, float]:
-    """A row of curves under the names that loggers show them by.
+    """Return a row of curves under the names that loggers show them by.
 
     Args:
         row: columns of ``train.csv``; ``seconds``, ``frames`` and ``updates`` count from the start of the run.
@@ -84,7 +81,7 @@ class CurveLog:
 
     Args:
         name: name of the logger in the report of an error.
-        make: opens TorchRL's logger; None to disable logging.
+        make: function that opens TorchRL's logger; None to disable logging.
 
     Example:
         >>> log = CurveLog("nothing", None)
@@ -96,33 +93,37 @@ class CurveLog:
     """Id of the run in wandb."""
 
     def __init__(self, name: str, make: Callable[[], Any] | None) -> None:
-        self.name = name
-        self._before: dict[str, float] = {}
+        self.name, self._before = name, dict[str, float]()
         self._logger: Any = None
         if make is not None:
             self._logger = self._try(make)
 
     def _try(self, action: Callable[[], Any]) -> Any:
+        """Return the result of an action; report an error and disable the logger."""
         try:
             return action()
         except Exception as error:
             self._logger = None
             print(f"{self.name} failed and is disabled for the rest of this run: {error}", file=sys.stderr)
 
+    def _log(self, action: Callable[[Any], Any]) -> None:
+        """Call an action with TorchRL's logger, unless logging is disabled."""
+        if self._logger is not None:
+            self._try(lambda: action(self._logger))
+
     def row(self, row: Mapping[str, float]) -> None:
         """Log a row of curves; ``frames`` is the step."""
         curves, self._before = panels(row, self._before), dict(row)
-        if self._logger and curves:
-            self._try(lambda: self._log(curves, int(row["frames"])))
+        if curves:
+            self._log_curves(curves, int(row["frames"]))
 
-    def _log(self, curves: dict[str, float], frames: int) -> None:
-        self._logger.log_metrics(curves, step=frames)
+    def _log_curves(self, curves: dict[str, float], frames: int) -> None:
+        self._log(lambda logger: logger.log_metrics(curves, step=frames))
 
     def summary(self, values: Mapping[str, float]) -> None:
         """Log final values, at the step of the last row."""
-        if self._logger:
-            final = {key: value for key, value in values.items() if math.isfinite(value)}
-            self._try(lambda: self._logger.log_metrics(final, step=int(self._before.get("frames", 0))))
+        final = {key: value for key, value in values.items() if math.isfinite(value)}
+        self._log(lambda logger: logger.log_metrics(final, step=int(self._before.get("frames", 0))))
 
     def picture(self, name: str, path: Path) -> None:
         """Log an image file, if the logger shows images."""
@@ -135,39 +136,7 @@ class CurveLog:
 
     def close(self) -> None:
         """Close the logger."""
-        if self._logger and hasattr(self._logger.experiment, "close"):
-            self._try(lambda: self._logger.experiment.close())
-
-
-class ScalarLog(CurveLog):
-    """Curves in TensorBoard or CSV files, in a folder of the run folder that is named after the logger.
-
-    An existing folder is removed: a run that is resumed logs all its rows again.
-
-    Args:
-        folder: run folder.
-        logger: ``tensorboard`` or ``csv``.
-
-    Raises:
-        ValueError: for a logger that is unknown or not installed.
-
-    Example:
-        >>> import tempfile
-        >>> log = ScalarLog(Path(tempfile.mkdtemp()), "csv")
-        >>> log.row({"frames": 512, "eval_spl": 90.0})
-        >>> log.close()
-    """
-
-    def __init__(self, folder: Path, logger: str) -> None:
-        check_type(Path, folder=folder)
-        check_logger(logger)
-        super().__init__(logger, lambda: self._open(folder, logger))
-
-    def _open(self, folder: Path, logger: str) -> Any:
-        from torchrl.record.loggers import get_logger
-
-        shutil.rmtree(folder / logger, ignore_errors=True)
-        return get_logger(logger, logger_name=str(folder), experiment_name=logger)
+        self._log(lambda logger: getattr(logger.experiment, "close", lambda: None)())
 
 
 class WandbRun(CurveLog):
@@ -188,12 +157,11 @@ class WandbRun(CurveLog):
         ValueError: for an unknown mode.
 
     Example:
-        >>> import tempfile
-        >>> run = WandbRun(Path(tempfile.mkdtemp()), "disabled", {"seed": 0})
+        >>> run = WandbRun(Path("runs/A"), "disabled", {"seed": 0})
         >>> run.row({"frames": 512, "return": -3.5})
         >>> run.close()
-        >>> list(run.folder.iterdir())
-        []
+        >>> run.folder.exists()
+        False
     """
 
     def __init__(
@@ -206,7 +174,6 @@ class WandbRun(CurveLog):
         *,
         run_id: str = "",
     ) -> None:
-        check_type(Path, folder=folder)
         check_logger("wandb", mode)
         self.folder, self.run_id = folder, run_id or uuid.uuid4().hex[:8]
         options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags)}
@@ -216,91 +183,93 @@ class WandbRun(CurveLog):
         with _wandb_in(self.folder):
             return super()._try(action)
 
-    def _log(self, curves: dict[str, float], frames: int) -> None:
+    def _log_curves(self, curves: dict[str, float], frames: int) -> None:
         # The step of wandb is frames too, so that rows that a resumed run logs again are the same rows.
-        self._logger.experiment.log({"frames": frames, **curves}, step=frames, commit=True)
+        self._log(lambda logger: logger.experiment.log({"frames": frames, **curves}, step=frames, commit=True))
 
     def summary(self, values: Mapping[str, float]) -> None:
         """Log final values."""
-        if self._logger:
-            self._try(lambda: self._logger.experiment.summary.update(dict(values)))
+        self._log(lambda logger: logger.experiment.summary.update(dict(values)))
 
     def picture(self, name: str, path: Path) -> None:
         """Log an image file."""
-        if self._logger:
+
+        def log(logger: Any) -> None:
             import wandb
 
-            self._try(lambda: self._logger.experiment.log({f"figures/{name}": wandb.Image(str(path))}))
+            logger.experiment.log({f"figures/{name}": wandb.Image(str(path))})
+
+        self._log(log)
 
     def table(self, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Log a table with the columns of its first row; NaN is an empty cell."""
-        if self._logger:
+
+        def log(logger: Any) -> None:
             import wandb
 
-            def log() -> None:
-                cells = [[_plain(row[column]) for column in rows[0]] for row in rows]
-                table = wandb.Table(columns=list(rows[0]), data=cells, allow_mixed_types=True)
-                self._logger.experiment.log({name: table})
+            cells = [[_plain(row[column]) for column in rows[0]] for row in rows]
+            logger.experiment.log({name: wandb.Table(columns=list(rows[0]), data=cells, allow_mixed_types=True)})
 
-            self._try(log)
+        self._log(log)
 
     def artifact(self, path: Path, metadata: Mapping[str, Any]) -> None:
         """Log a model, named after its file and the run folder; wandb refers to the file and keeps no copy."""
-        if self._logger:
+
+        def log(logger: Any) -> None:
             import wandb
 
-            def log() -> None:
-                name = re.sub(r"[^\w.-]", "-", f"{path.stem}-{self.folder.name}", flags=re.ASCII)[:128]
-                model = wandb.Artifact(name, "model", metadata={key: _plain(x) for key, x in metadata.items()})
-                model.add_file(str(path.absolute()), policy="immutable", skip_cache=True)
-                self._logger.experiment.log_artifact(model)
+            name = re.sub(r"[^\w.-]", "-", f"{path.stem}-{self.folder.name}", flags=re.ASCII)[:128]
+            model = wandb.Artifact(name, "model", metadata={key: _plain(x) for key, x in metadata.items()})
+            model.add_file(str(path.absolute()), policy="immutable", skip_cache=True)
+            logger.experiment.log_artifact(model)
 
-            self._try(log)
+        self._log(log)
 
     def close(self) -> None:
         """Finish the run, and remove the debug logs of wandb, which hold paths of the machine."""
-        if self._logger:
-            self._try(lambda: self._logger.experiment.finish())
-            for link in (self.folder / "wandb").glob("debug*.log"):
-                link.unlink()
-            for logs in ((self.folder / "wandb" / "wandb"), *(self.folder / "wandb").glob("*run-*/logs")):
-                shutil.rmtree(logs, ignore_errors=True)
+        self._log(lambda logger: logger.experiment.finish())
+        for log in self.folder.glob("wandb/debug*.log"):
+            log.unlink()
+        for logs in (self.folder / "wandb" / "wandb", *self.folder.glob("wandb/*run-*/logs")):
+            shutil.rmtree(logs, ignore_errors=True)
 
 
-def open_log(
-    logger: str,
-    folder: Path,
-    config: Mapping[str, Any],
-    *,
-    wandb_mode: str = "offline",
-    group: str = "",
-    tags: Sequence[str] = (),
-    run_id: str = "",
-) -> CurveLog:
+def open_log(logger: str, folder: Path, config: Mapping[str, Any], wandb_mode: str, **wandb_options: Any) -> CurveLog:
     """Return a logger of :data:`LOGGERS`.
+
+    TensorBoard and CSV files are in a folder of the run folder that is named after the logger. An existing one is
+    removed: a run that is resumed logs all its rows again.
 
     Args:
         logger: name of the logger.
         folder: run folder.
-        config: settings shown with the run.
+        config: settings shown by wandb.
         wandb_mode: ``offline``, ``online`` or ``disabled``.
-        group: runs that belong together.
-        tags: labels to filter runs by.
-        run_id: id of the run in wandb; an existing run is resumed.
+        **wandb_options: ``group``, ``tags`` and ``run_id`` of :class:`WandbRun`.
 
     Raises:
         ValueError: for an unknown logger or mode, or a logger that is not installed.
 
     Example:
         >>> import tempfile
-        >>> log = open_log("wandb", Path(tempfile.mkdtemp()), {"seed": 0}, wandb_mode="disabled")
-        >>> type(log).__name__
-        'WandbRun'
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     log = open_log("csv", Path(folder), {"seed": 0}, "disabled")
+        ...     log.row({"frames": 512, "eval_spl": 90.0})
+        ...     log.close()
+        ...     (Path(folder) / "csv" / "scalars" / "eval" / "spl.csv").read_text().strip()
+        '512,90.0'
     """
     check_logger(logger, wandb_mode)
     if logger == "wandb":
-        return WandbRun(folder, wandb_mode, config, group, tags, run_id=run_id)
-    return ScalarLog(folder, logger)
+        return WandbRun(folder, wandb_mode, config, **wandb_options)
+    return CurveLog(logger, lambda: _scalar_logger(folder, logger))
+
+
+def _scalar_logger(folder: Path, logger: str) -> Any:
+    from torchrl.record.loggers import get_logger
+
+    shutil.rmtree(folder / logger, ignore_errors=True)
+    return get_logger(logger, logger_name=str(folder), experiment_name=logger)
 
 
 def _plain(value: Any) -> Any:
@@ -317,11 +286,9 @@ def _wandb_in(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        for key, value in before.items():
-            if value is None:
-                del os.environ[key]
-            else:
-                os.environ[key] = value
+        for key in own:
+            del os.environ[key]
+        os.environ.update({key: value for key, value in before.items() if value is not None})
 
 
 def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], options: Mapping[str, Any]) -> Any:
@@ -329,19 +296,11 @@ def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], options: M
     import wandb
     from torchrl.record.loggers import get_logger
 
-    private = wandb.Settings(
-        silent=True,
-        console="off",
-        host="private",
-        disable_git=True,
-        disable_code=True,
-        disable_job_creation=True,
-        x_disable_meta=True,
-        x_disable_stats=True,
-        x_disable_machine_info=True,
-    )
+    disabled = ["disable_git", "disable_code", "disable_job_creation"]
+    disabled += ["x_disable_meta", "x_disable_stats", "x_disable_machine_info"]
+    settings: dict[str, Any] = {"silent": True, "console": "off", "host": "private", **dict.fromkeys(disabled, True)}
     project = os.environ.get("WANDB_PROJECT", WANDB_PROJECT)
-    wandb_kwargs = {"project": project, "mode": mode, "config": dict(config), "settings": private}
+    wandb_kwargs = {"project": project, "mode": mode, "config": dict(config), "settings": wandb.Settings(**settings)}
     wandb_kwargs |= {"log_env_packages": False, **options}
     logger = get_logger("wandb", logger_name=str(folder), experiment_name=folder.name, wandb_kwargs=wandb_kwargs)
     logger.experiment.define_metric("frames")

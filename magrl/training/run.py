@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import math
 import shutil
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -28,16 +31,44 @@ from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
 from magrl.evaluation.scenarios import task_names
 from magrl.files import write_json
-from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful
+from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder, locked
 from magrl.training.config import RunConfig, UsageError
-from magrl.training.curves import RunLog
-from magrl.training.run_folder import create_run_folder, locked
-from magrl.training.signals import StopRequest
-from magrl.training.statistics import RETURN_TERMS, BestPolicy, TrainingStatistics, selection_score
+from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
 from magrl.transforms import with_sensor_noise
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
 """Measures of the validation tasks in ``train.csv``, there with the prefix ``eval_``."""
+
+
+class StopRequest:
+    """Context that records Ctrl-C and SIGTERM until the loop can stop without losing work; a second one stops at once.
+
+    Attributes:
+        exit_code: exit status that the signal asks for, or None.
+
+    Example:
+        >>> with StopRequest() as stop:
+        ...     stop.exit_code is None
+        True
+    """
+
+    def __init__(self) -> None:
+        self.exit_code: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():  # elsewhere signals cannot be handled
+            self._before = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, _: FrameType | None) -> None:
+        if self.exit_code is not None:
+            raise KeyboardInterrupt
+        self.exit_code = 128 + number  # exit status that a shell reports for a process ended by a signal
 
 
 class Run:
@@ -64,6 +95,7 @@ class Run:
         self, config: RunConfig, *, recipe: str, name: str, losses: tuple[str, ...] = ("loss_critic", "loss_actor")
     ) -> None:
         self.config, self.recipe, self.losses = config, recipe, losses
+        self.scenario = config.load_scenario()
         self.name = f"{name}-{config.scenario.stem}" if config.scenario else name
         if any(config.noise):
             self.name += "-noise-" + "-".join(f"{level:g}" for level in config.noise)
@@ -76,10 +108,6 @@ class Run:
 
     def __enter__(self) -> Self:
         torchrl_logger.setLevel("WARNING")
-        try:
-            self.scenario = self.config.load_scenario()
-        except (ValueError, OSError) as error:
-            raise UsageError(str(error)) from error
         if self.config.resume is None:
             create_run_folder(self.folder)
         with contextlib.ExitStack() as exits:
@@ -121,11 +149,11 @@ class Run:
         if self.scenario.tasks is not None:
             self._own = self._evaluation_env(self.scenario, paper.TEST_SEED, options)
         sets = ((self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED))
-        scenarios = (self.scenario.with_tasks(self.scenario.random_tasks(*each)) for each in sets)
-        first, second = (
-            self._evaluation_env(scenario, seed, options) for scenario, (_, seed) in zip(scenarios, sets, strict=True)
+        validation, test = (
+            self._evaluation_env(self.scenario.with_tasks(self.scenario.random_tasks(*each)), each[1], options)
+            for each in sets
         )
-        return first, second
+        return validation, test
 
     def _evaluation_env(self, scenario: Scenario, seed: int, options: dict[str, Any]) -> EnvBase:
         base = GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), seed=seed, **options)
@@ -161,21 +189,8 @@ class Run:
             parts["episodes"] = RunningEpisodes(collector, env)
         self._exits.callback(collector.shutdown)
         self.checkpoints = Checkpoints(self.folder / "checkpoints", parts)
-        resumed = self.config.resume is not None and bool(
-            self.checkpoints.files()
-        )  # otherwise it starts again from its seed
-        terms = ("return", *(f"return_{term}" for term in RETURN_TERMS))
-        columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", *self.losses)
-        self.log = RunLog(
-            self.folder,
-            (*columns, *(f"eval_{key}" for key in EVALUATED)),
-            self.settings,
-            logger=self.config.logger,
-            wandb_mode=self.config.wandb_mode,
-            group=self.name,
-            tags=[self.name],
-            resumed=resumed,
-        )
+        resumed = bool(self.config.resume and self.checkpoints.files())  # otherwise it starts again from its seed
+        self.log = self._make_log(resumed)
         self.checkpoints.parts["run"] = self.log
         if resumed:
             try:
@@ -183,6 +198,13 @@ class Run:
             except (ValueError, FileNotFoundError) as error:
                 raise UsageError(f"cannot resume: {error}") from error
         self._exits.callback(self.log.close)
+
+    def _make_log(self, resumed: bool) -> RunLog:
+        terms = ("return", *(f"return_{term}" for term in RETURN_TERMS))
+        columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", *self.losses)
+        columns += tuple(f"eval_{key}" for key in EVALUATED)
+        options = {"logger": self.config.logger, "wandb_mode": self.config.wandb_mode, "label": self.name}
+        return RunLog(self.folder, columns, self.settings, **options, resumed=resumed)
 
     @property
     def remaining(self) -> float:
@@ -212,12 +234,11 @@ class Run:
                 if self.complete or self.statistics.iterations % self.config.eval_every == 0:
                     progress.set_postfix_str(self._evaluate())
                 progress.update(getattr(self.statistics, counted) - progress.n)
-                if self.complete:
-                    break
-                if self.stop.exit_code or time.perf_counter() - saved >= self.config.checkpoint_every:
+                stopped = self.stop.exit_code is not None
+                if not self.complete and (stopped or time.perf_counter() - saved >= self.config.checkpoint_every):
                     self.checkpoints.save(self.statistics.frames)
                     saved = time.perf_counter()
-                if self.stop.exit_code:
+                if self.complete or stopped:
                     break
 
     @property
@@ -236,10 +257,8 @@ class Run:
         """Evaluate on the validation tasks, keep the best policy, add a row of curves; return a short report."""
         episodes = episode_measures(evaluation_rollout(self.validation, self.policy))
         summary = summarize(episodes)
-        limit = self.validation.max_steps
-        self.best.offer(
-            selection_score(summary["spl"], episodes["success"], episodes["steps"], limit), self.policy.actor
-        )
+        score = selection_score(summary["spl"], episodes["success"], episodes["steps"], self.validation.max_steps)
+        self.best.offer(score, self.policy.actor)
         row = self.statistics.row() | {"seconds": self.log.seconds}
         self.log.row(row | {f"eval_{key}": summary[key] for key in EVALUATED})
         earned = f"{row['return']:.0f}" if math.isfinite(row["return"]) else "not known yet"
@@ -280,12 +299,6 @@ class Run:
         self.log.result(result, navigator=self.name)
         self.checkpoints.clear()
         self._report(result)
-        if not self.statistics.updates:
-            print(
-                f"Warning: no gradient step was made in {result['frames']} frames, so the policy is untrained: "
-                "increase total_frames (and total_episodes), or reduce batch_size",
-                file=sys.stderr,
-            )
         return result
 
     def _report_stop(self) -> None:
@@ -297,17 +310,22 @@ class Run:
         raise SystemExit(self.stop.exit_code)
 
     def _report(self, result: dict[str, float]) -> None:
-        arrived = (
-            f"{result['steps']:.1f} steps, {result['trajectory_length_m'] / 1000:.0f} km, "
-            f"navigation error {result['navigation_error_km']:.1f} km"
-            if result["success_rate"]
-            else "no episode arrived"
-        )
+        arrived = "no episode arrived"
+        if result["success_rate"]:
+            kilometers = result["trajectory_length_m"] / 1000
+            arrived = f"{result['steps']:.1f} steps, {kilometers:.0f} km"
+            arrived += f", navigation error {result['navigation_error_km']:.1f} km"
         print(
             f"\n{result['num_tasks']} test tasks: success rate {result['success_rate']:.1f} %, "
             f"SPL {result['spl']:.1f} %, {arrived}\n"
             f"Trained in {result['training_seconds']:.0f} s; results, curves and figures are in {self.folder}"
         )
+        if not result["updates"]:
+            print(
+                f"Warning: no gradient step was made in {result['frames']} frames, so the policy is untrained: "
+                "increase total_frames (and total_episodes), or reduce batch_size",
+                file=sys.stderr,
+            )
 
 
 def passes_paper(row: dict[str, float]) -> bool:

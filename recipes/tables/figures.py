@@ -1,133 +1,294 @@
-"""Draw the figures of the paper's Section 4 from the files of recipes/evaluate.py and of trainings.
+"""Draw the figures of the documentation from flights, and from the results of the tables in tables.toml.
 
-    python recipes/tables/figures.py --results runs/comparison --gg-td3 runs/A runs/B --td3 runs/C --out docs/figures
+    python recipes/tables/figures.py section-4 noise learning     # from the runs of tables comparison, noise, learning
+    python recipes/tables/figures.py conditions globe --out runs  # from new flights; five minutes and one minute
 
-Field contours (4-1), return (4-2), success rate (4-3), trajectories (4-4), convergence (4-5), box plots (4-6).
+Figures: section-4 (field contours 4-1, trajectories 4-4, convergence 4-5, box plots 4-6), learning (return 4-2, success
+rate 4-3, SPL), noise, conditions (the cost of each error alone), globe (a map of the Earth), paper-run (learning curves
+of whole trainings).
 """
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
+
 import csv
-from collections.abc import Mapping, Sequence
+import json
+import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import torch
 import tyro
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+from tqdm import tqdm
 
-from magrl.envs import PAPER_REGION, Scenario, named_tasks
+from magrl.envs import PAPER_REGION, Scenario, Tasks, named_tasks
 from magrl.envs.rendering import draw_tracks
-from magrl.evaluation import plots
+from magrl.evaluation import plots, summarize
+from magrl.evaluation.flight import coastlines
+from magrl.evaluation.navigators import label
+from magrl.evaluation.runs import NO_NOISE
+from magrl.field import IGRF, elements_at
+from magrl.field.records import WeatherRecord, weather_record
+from magrl.files import check_writable
 from magrl.training import UsageError, command
+from magrl.transforms import Conditions, VectorErrors
+
+sys.path.insert(0, str(Path(__file__).parent))
+from flights import DRIFT_KM, earth_env, flown
+from globe import Measures, earth_tasks, measured, weakest_change
+from grid import declarations
+from trainings import level_name, matching, read_curves
 
 RECIPE = "figures.py"
-CURVES = {
+Figures = Mapping[str, Figure]
+"""Figures by file name."""
+LEARNING = {
     "fig-4-2-reward": ("return", "return, mean of the last 200 episodes"),
     "fig-4-3-success": ("success_rate", "success rate over the last 200 episodes [%]"),
     "learning-spl": ("eval_spl", "SPL on the validation tasks [%]"),
 }
 """Column and label of each figure of learning curves."""
+PAPER_RUN = {
+    "return": "return, mean of\nthe last 200 episodes",
+    "success_rate": "success rate over\nthe last 200 episodes [%]",
+    "eval_spl": "SPL on the\nvalidation tasks [%]",
+}
 SHOWN = ("gg_td3", "td3", "recurrent", "ga", "pso", "afsa", "secant", "parallel")
-"""Navigators in the figures of evaluations."""
+"""Navigators in the figures of Section 4."""
 BOXES = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
-
-Row = Mapping[str, str]
+STD, SPEED_KM_H = (0.05, 0.05, 5.0), 24.0
+"""Noise and speed of the vehicle in figure conditions."""
+WEAK_NT, PARALLEL = 8000, 0.1
+"""Contours of the map: B_H, and the weakest change below which gradients are nearly parallel."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """Sources and destination of the figures."""
+    """Figures to draw."""
 
-    results: Path
-    """Folder that recipes/evaluate.py wrote."""
-    gg_td3: tuple[Path, ...] = ()
-    """Run folders of Gradient-Guided TD3, for the learning curves."""
-    td3: tuple[Path, ...] = ()
-    """Run folders of TD3, for the learning curves."""
+    figures: tyro.conf.Positional[tuple[str, ...]]
+    """Names of figures."""
+    tasks: int | None = None
+    """Number of tasks of the flights; 200 for conditions and 10 000 for globe by default."""
     out: Path = Path("docs/figures")
     """Folder of the figures; files of the same name are replaced."""
 
 
-def read_csv(path: Path) -> list[Row]:
-    """Return the rows of a file.
+# Section 4 of the paper
 
-    Raises:
-        UsageError: for a missing file.
-    """
-    if not path.is_file():
-        raise UsageError(f"there is no {path}: is the evaluation or the training complete?")
+
+def columns_by_navigator(path: Path, only_successes: bool = False) -> dict[str, dict[str, list[float]]]:
+    """Return the columns of a file of recipes/evaluate.py for each navigator of :data:`SHOWN`."""
+    found: dict[str, dict[str, list[float]]] = {}
     with path.open() as file:
-        return list(csv.DictReader(file))
+        for row in csv.DictReader(file):
+            name = row.pop("navigator")
+            if name in SHOWN and not (only_successes and row["success"] != "True"):
+                for key, value in row.items():
+                    number = float({"True": 1, "False": 0, "": "nan"}.get(value, value))
+                    found.setdefault(name, {}).setdefault(key, []).append(number)
+    return found
 
 
-def grouped(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return rows by navigator, in order of appearance, without navigators that figures do not show."""
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(row["navigator"], []).append(row)
-    return {name: rows for name, rows in groups.items() if name in SHOWN}
-
-
-def column(rows: Sequence[Row], name: str) -> list[float]:
-    """Return a column as numbers; empty cells become NaN.
-
-    Raises:
-        UsageError: for a missing column.
-    """
-    if rows and name not in rows[0]:
-        raise UsageError(f"there is no column {name!r}: the file is of another version of magrl")
-    return [float(row[name] or "nan") for row in rows]
-
-
-def contours() -> Figure:
-    """Return Fig. 4-1: the field over the region, and the paper's example task."""
-    figure = Figure(figsize=(7, 7.4), layout="constrained")
-    task = named_tasks("figure-4-1")
-    draw_tracks(figure.subplots(), Scenario().build_field(), PAPER_REGION, [task.start], task.target)
-    return figure
-
-
-def learning_figures(config: Config) -> dict[str, Figure]:
-    """Return the learning curves by file name."""
-    runs = {"gg_td3": config.gg_td3, "td3": config.td3}
-    curves = {name: [read_csv(run / "train.csv") for run in folders] for name, folders in runs.items() if folders}
-    if not curves:
-        return {}
-    return {
-        figure: plots.learning_curves(
-            {name: [(column(run, "frames"), column(run, measure)) for run in group] for name, group in curves.items()},
-            label,
-        )
-        for figure, (measure, label) in CURVES.items()
-    }
-
-
-def comparison_figures(results: Path) -> dict[str, Figure]:
-    """Return the figures of the example task and the box plots, by file name."""
-    paths, episodes = (grouped(read_csv(results / f"{name}.csv")) for name in ("paths", "episodes"))
+def section_4(_: int | None) -> Figures:
+    """Return the field over the region, the example task of each navigator, and box plots."""
+    contours = Figure(figsize=(7, 7.4), layout="constrained")
     field, task = Scenario().build_field(), named_tasks("figure-4-1")
-    tracks = {name: (column(rows, "latitude"), column(rows, "longitude")) for name, rows in paths.items()}
-    series = {name: {key: column(rows, key) for key in ("D", "I", "B_H", "L")} for name, rows in paths.items()}
-    successes = {name: [row for row in rows if row["success"] == "True"] for name, rows in episodes.items()}
-    boxes = {name: {key: column(rows, key) for key in BOXES} for name, rows in successes.items() if rows}
+    draw_tracks(contours.subplots(), field, PAPER_REGION, [task.start], task.target)
+    folder = Path(declarations()["comparison"]["folder"])
+    paths = columns_by_navigator(folder / "paths.csv")
+    episodes = columns_by_navigator(folder / "episodes.csv", only_successes=True)
+    tracks = {name: (columns["latitude"], columns["longitude"]) for name, columns in paths.items()}
+    boxes = {name: {key: columns[key] for key in BOXES} for name, columns in episodes.items()}
     return {
+        "fig-4-1-contours": contours,
         "fig-4-4-trajectories": plots.compared_trajectories(tracks, field, task),
-        "fig-4-5-convergence": plots.convergence(series, field, task),
+        "fig-4-5-convergence": plots.convergence(paths, field, task),
         "fig-4-6-boxes": plots.box_plots(boxes),
     }
 
 
+def learning(_: int | None) -> Figures:
+    """Return the learning curves of the runs of table learning."""
+    runs = declarations()["learning"]["runs"]
+    found = {name: [read_curves(run) for run in matching(pattern)] for name, pattern in runs.items()}
+    return {
+        figure: plots.learning_curves(
+            {name: [(list(c["frames"]), list(c[column])) for c in curves] for name, curves in found.items()}, title
+        )
+        for figure, (column, title) in LEARNING.items()
+    }
+
+
+def noise(_: int | None) -> Figures:
+    """Return SR and SPL over the noise, from the evaluations of table noise."""
+    levels = declarations()["noise"]["levels"]
+    found = {level_name(std): Path(f"runs/noise-{std[0]:g}/summary.json").read_text() for std in levels}
+    return {"noise": plots.noise_figure({name: json.loads(text) for name, text in found.items()}, "look-ahead")}
+
+
+def paper_run(_: int | None) -> Figures:
+    """Return the curves of the runs of table paper-run, over the moves of the vehicle."""
+    figure = Figure(figsize=(8, 8.4), layout="constrained")
+    panels = figure.subplots(len(PAPER_RUN), sharex=True)
+    runs = {name: read_curves(run) for name, run in declarations()["paper-run"]["runs"].items()}
+    for axes, (column, title) in zip(panels, PAPER_RUN.items(), strict=True):
+        for name, curves in runs.items():
+            axes.plot(curves["frames"], curves[column], label=name, lw=1.2)
+        axes.set_ylabel(title)
+        axes.grid(alpha=0.3)
+    panels[0].legend(fontsize=8)
+    panels[-1].set_xlabel("moves of the vehicle")
+    panels[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
+    return {"paper-run": figure}
+
+
+# The cost of each error
+
+
+def sensors(**errors: object) -> Conditions:
+    """Return conditions with errors of the sensors beside the noise."""
+    return Conditions("sensors", sensors={"std": STD, **errors})
+
+
+def motion(**errors: float) -> Conditions:
+    """Return conditions with errors of motion."""
+    return Conditions("motion", SPEED_KM_H, sensors={"std": STD}, motion=errors)
+
+
+def weather(factor: float) -> Conditions:
+    """Return conditions with a multiple of the weather of a month."""
+    month = weather_record("boulder-2016")
+    record = WeatherRecord(factor * month.variation, month.first, month.last, f"{factor:g} x {month.name}")
+    return Conditions("weather", SPEED_KM_H, sensors={"std": STD}, weather={"record": record})
+
+
+def north(size: float) -> Conditions:
+    """Return conditions with a constant error of the north reference."""
+    return Conditions("north", sensors={"std": STD}, north={"constant_deg": size, "fixed": True})
+
+
+PANELS: Mapping[str, tuple[Callable[[float], Conditions], tuple[float, ...]]] = {
+    "bias of D [°]": (lambda size: sensors(bias=(size, 0.0, 0.0)), (0.1, 0.3, 1.0, 3.0)),
+    "north reference, constant b [°]": (north, (0.1, 0.5, 1.0, 3.0)),
+    "bias of I [°]": (lambda size: sensors(bias=(0.0, size, 0.0)), (0.05, 0.1, 0.2, 0.5)),
+    "hard iron [nT]": (lambda size: sensors(vector=VectorErrors((size,) * 3)), (10.0, 30.0, 60.0, 100.0)),
+    "roll and pitch [°]": (lambda size: sensors(vector=VectorErrors(attitude_deg=(size,) * 2)), (0.02, 0.05, 0.1, 0.2)),
+    "drift of $B_H$ over 200 km [nT]": (
+        lambda size: sensors(drift=(0.0, 0.0, size), drift_length=200.0),
+        (10.0, 30.0, 60.0, 100.0),
+    ),
+    "weather, 1 = January 2016": (weather, (0.5, 1.0, 2.0, 4.0)),
+    "outages [share of readings]": (lambda size: sensors(outage_rate=size), (0.05, 0.1, 0.3, 0.5)),
+    "scale of the log [share]": (lambda size: motion(log_scale=size), (0.02, 0.05, 0.1, 0.15)),
+    "compass in motion [°]": (lambda size: motion(compass_deg=size), (2.0, 5.0, 10.0, 20.0)),
+    "current [share of the speed]": (lambda size: motion(current_km_h=size * SPEED_KM_H), (0.05, 0.1, 0.2, 0.4)),
+}
+"""Conditions of each error by its size, and sizes; of normal errors the standard deviation."""
+
+
+def conditions(tasks: int | None) -> Figures:
+    """Return a panel for each error, SPL over its size for each navigator of table conditions.
+
+    Everything else is as at the noise alone, which is the first point of each panel.
+    """
+    base = earth_env(tasks or 200, reach_km=DRIFT_KM, drift_km=DRIFT_KM)
+    figure = Figure(figsize=(11, 7.5), layout="constrained")
+    panels = list(figure.subplots(3, 4, sharey=True).flat)
+    for navigator in tqdm(declarations()["conditions"]["navigators"], unit="navigator"):
+        alone = summarize(flown(navigator, base, sensors()))["spl"]
+        look = {"color": plots.NAVIGATOR_COLORS[navigator], "label": label(navigator).partition(" (")[0]}
+        for axes, (make, sizes) in zip(panels, PANELS.values(), strict=False):
+            spl = [summarize(flown(navigator, base, make(size)))["spl"] for size in sizes]
+            axes.plot([alone, *spl], marker="o", ms=3, lw=1.3, **look)
+    for axes, (title, (_, sizes)) in zip(panels, PANELS.items(), strict=False):
+        axes.set_xticks(range(len(sizes) + 1), [f"{size:g}" for size in (0.0, *sizes)])
+        axes.set_xlabel(title, fontsize=9)
+        axes.set_ylim(0, 101)
+        axes.grid(alpha=0.3)
+    for axes in figure.axes[::4]:
+        axes.set_ylabel("SPL [%]")
+    figure.axes[-1].axis("off")
+    figure.axes[-1].legend(*figure.axes[0].get_legend_handles_labels(), loc="center")
+    return {"conditions": figure}
+
+
+# The map of the Earth
+
+
+def globe(tasks: int | None) -> Figures:
+    """Return the map of the tasks of table globe, with perfect sensors."""
+    field, ends = IGRF("2025-01-01"), earth_tasks(tasks or 10_000)
+    return {"globe": globe_map(field, ends, measured(declarations()["globe"]["navigator"], field, ends, NO_NOISE))}
+
+
+def globe_map(field: IGRF, tasks: Tasks, measures: Measures) -> Figure:
+    """Return the map of the Earth (Mollweide's equal-area projection) with each task at its start."""
+    figure = Figure(figsize=(9, 4.9), layout="constrained")
+    axes = figure.add_subplot(projection="mollweide")
+    axes.plot(*np.radians(coastlines()).T[::-1], color="#8c8c8c", lw=0.6)
+    draw_field(axes, field)
+    (north, east), arrived = np.radians(tasks.start.numpy()).T, measures["success"].numpy()
+    order = np.flatnonzero(arrived)[(-measures["spl"].numpy()[arrived]).argsort(kind="stable")]  # detours on top
+    spl = 100 * measures["spl"].numpy()[order]
+    dots = axes.scatter(east[order], north[order], c=spl, s=4, lw=0, cmap="viridis", vmin=50, vmax=100)
+    axes.plot(east[~arrived], north[~arrived], "x", color="#D55E00", ms=5, mew=1.5, label="not arrived")
+    figure.colorbar(dots, shrink=0.7, pad=0.02, label="SPL of arrived tasks [%]", extend="min")
+    axes.set(xticklabels=[], yticklabels=[])
+    axes.grid(lw=0.3)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def draw_field(axes: Axes, field: IGRF) -> None:
+    """Draw the dip poles, where B_H is weak, and where gradients are nearly parallel."""
+    latitude, longitude = torch.arange(-89.5, 90.0).double(), torch.arange(-180.0, 181.0).double()
+    places = torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
+    intensity, weakest = elements_at(field, places)[..., 2], weakest_change(field, places)
+    where = np.radians(longitude.numpy()), np.radians(latitude.numpy())
+    for values, level, look in ((intensity, WEAK_NT, "-"), (weakest, PARALLEL, ":")):
+        axes.contour(*where, values, [level], colors="black", linewidths=0.9, linestyles=look)
+    axes.plot([], [], "k-", lw=0.9, label=f"$B_H$ = {WEAK_NT} nT")
+    axes.plot([], [], "k:", lw=0.9, label=f"weakest change {PARALLEL}")
+    halves = (places[half].reshape(-1, 2)[intensity[half].argmin()] for half in (latitude < 0, latitude > 0))
+    north, east = np.radians(torch.stack(tuple(halves)).numpy()).T
+    axes.plot(east, north, "*", color="white", ms=13, mec="black", clip_on=False, zorder=4, label="dip pole")
+
+
+FIGURES: Mapping[str, Callable[[int | None], Figures]] = {
+    "section-4": section_4,
+    "learning": learning,
+    "noise": noise,
+    "conditions": conditions,
+    "globe": globe,
+    "paper-run": paper_run,
+}
+
+
 def draw(config: Config) -> None:
-    """Draw every figure that there are data for.
+    """Draw figures.
 
     Raises:
-        UsageError: for a missing file or column.
+        UsageError: for an unknown figure, or a missing file.
     """
-    figures = {"fig-4-1-contours": contours(), **learning_figures(config), **comparison_figures(config.results)}
-    config.out.mkdir(parents=True, exist_ok=True)
-    for name, figure in figures.items():
-        figure.savefig(config.out / f"{name}.png", dpi=110)
-        print(config.out / f"{name}.png")
+    if unknown := [name for name in config.figures if name not in FIGURES] or not config.figures:
+        raise UsageError(f"unknown figure {unknown}: choose from {', '.join(FIGURES)}")
+    try:
+        for name in config.figures:
+            for file, figure in FIGURES[name](config.tasks).items():
+                check_writable(config.out / f"{file}.png")
+                figure.savefig(config.out / f"{file}.png", dpi=110)
+                print(config.out / f"{file}.png")
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from error
 
 
 if __name__ == "__main__":

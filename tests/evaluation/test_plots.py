@@ -14,7 +14,7 @@ from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import NAVIGATOR_NAMES
 from magrl.field import IGRF
 from magrl.navigators import NAVIGATORS
-from magrl.training.statistics import RETURN_TERMS
+from magrl.training.curves import RETURN_TERMS
 
 
 @pytest.fixture(scope="module")

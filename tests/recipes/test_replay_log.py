@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import sys
+import runpy
 from pathlib import Path
 
 import pandas as pd
 import pytest
+import replay_log as recipe
 
 from magrl.training import UsageError
 
@@ -17,25 +17,12 @@ LOG = ROOT / "docs" / "examples" / "log.csv"
 NOISE = ["--noise", "0.02", "0.02", "2"]
 
 
-def load(path: Path):
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def recipe():
-    return load(ROOT / "recipes" / "replay_log.py")
-
-
 def test_the_example_is_what_its_command_writes(tmp_path: Path) -> None:
-    load(ROOT / "docs" / "examples" / "make_log.py").write(tmp_path / "log.csv")
+    runpy.run_path(str(ROOT / "docs" / "examples" / "make_log.py"))["write"](tmp_path / "log.csv")
     assert (tmp_path / "log.csv").read_text() == LOG.read_text()
 
 
-def test_the_example_with_other_columns(recipe, tmp_path: Path, capsys) -> None:
+def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
     """The estimate comes near the truth, the stated error holds, and no position enters: without them, the same."""
     recipe.main([str(LOG), *NOISE, "--out", str(tmp_path / "a")])
     table = pd.read_csv(tmp_path / "a" / "log.csv")
@@ -56,7 +43,7 @@ def test_the_example_with_other_columns(recipe, tmp_path: Path, capsys) -> None:
     pd.testing.assert_frame_equal(table[columns], other[columns])
 
 
-def test_a_small_heading_is_not_compared_with_commands_that_nobody_followed(recipe) -> None:
+def test_a_small_heading_is_not_compared_with_commands_that_nobody_followed() -> None:
     """A northbound move of a few degrees is no heading in radians, whatever would have been commanded."""
     config = recipe.Config(LOG, target=(5.0, 60.0, 21000.0))
     log = recipe.read_log(config).head(3).copy()
@@ -66,7 +53,7 @@ def test_a_small_heading_is_not_compared_with_commands_that_nobody_followed(reci
     assert len(recipe.replay(config, log)) == 3
 
 
-def test_short_moves_are_joined(recipe, tmp_path: Path) -> None:
+def test_short_moves_are_joined(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     rows = ["0,60,20000,0,0", "0,60,20000,0,3", "0,60,20000,90,4", "0,60,20000,90,2"]
     path.write_text("\n".join(["D,I,B_H,heading,distance", *rows]))
@@ -94,14 +81,14 @@ def test_short_moves_are_joined(recipe, tmp_path: Path) -> None:
         (("", ""), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),
     ],
 )
-def test_errors_name_what_is_wrong(recipe, tmp_path: Path, change, arguments, message: str) -> None:
+def test_errors_name_what_is_wrong(tmp_path: Path, change, arguments, message: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text(LOG.read_text().replace(*change, 1) if change[0] else LOG.read_text())
     with pytest.raises(UsageError, match=message):
         recipe.main([str(path), *arguments, "--out", str(tmp_path / "out")])
 
 
-def test_headings_that_may_be_radians_are_named(recipe, tmp_path: Path, capsys) -> None:
+def test_headings_that_may_be_radians_are_named(tmp_path: Path, capsys) -> None:
     """The example with its headings in radians: no vehicle was to steer so, but no single row is impossible."""
     log = pd.read_csv(LOG)
     log["heading"] = log["heading"] / 57.29578

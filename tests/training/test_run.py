@@ -1,149 +1,103 @@
-"""Runs: folders that are never overwritten, curves that are on disk at once, statistics and the best policy."""
+"""Runs around a training: folder, settings, noise, resume after any end, and several collecting processes."""
 
-import csv
+import importlib.util
 import json
-import math
+import random
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import td3_gradient_guided as recipe
 import torch
-from tensordict import TensorDict
-from torch import nn
 
-from magrl import paper
-from magrl.files import write_json
-from magrl.training import Run, RunConfig, UsageError
-from magrl.training.curves import RunLog
-from magrl.training.run import passes_paper
-from magrl.training.run_folder import create_run_folder, locked
-from magrl.training.statistics import BestPolicy, TrainingStatistics, selection_score
+from magrl.training import Run, RunConfig, UsageError, command, parse_config
+from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
+from magrl.training.collectors import worker_seed
+from magrl.training.run import StopRequest, passes_paper
 
-ROW = {"frames": 512, "return": 1.5, "eval_spl": 88.4, "return_alignment": -0.5}
-
-
-# The folder
+ROOT = Path(__file__).parent.parent.parent
+AZORES = ROOT / "docs" / "examples" / "azores.toml"
+NOISE = (0.05, 0.05, 5.0)
+SMALL = shlex.split(
+    "--num-envs 16 --total-frames 320 --num-cells 16 16 --batch-size 32 --buffer-size 1000 --init-random-frames 32 "
+    "--updates-per-batch 1 --eval-every 10 --eval-tasks-small 4 --eval-tasks 6 --wandb-mode disabled"
+)
 
 
-def test_new_and_empty_folders_are_accepted(tmp_path: Path) -> None:
-    folder = create_run_folder(tmp_path / "a" / "run")
-    assert folder.is_dir()
-    assert create_run_folder(folder) == folder
-
-
-def test_each_folder_in_use_has_its_message(tmp_path: Path) -> None:
-    """A complete run, an interrupted run and a foreign folder need different actions of the user."""
-    complete, interrupted, foreign = (tmp_path / name for name in ("complete", "interrupted", "foreign"))
-    for folder, files in (
-        (complete, ("config.json", "eval.json")),
-        (interrupted, ("config.json",)),
-        (foreign, ("notes.txt",)),
-    ):
-        folder.mkdir()
-        for name in files:
-            (folder / name).touch()
-    for folder, message in (
-        (complete, f"the run in {complete} is complete: choose another --out, or remove it"),
-        (interrupted, f"{interrupted} holds a run that is not complete: --resume {interrupted}, choose another --out"),
-        (foreign, f"the run folder {foreign} is not empty: choose another --out"),
-        (foreign / "notes.txt", "notes.txt is not empty: choose another --out"),
-    ):
-        with pytest.raises(UsageError) as error:
-            create_run_folder(folder)
-        assert message in str(error.value)
-    with pytest.raises(UsageError, match=r"notes\.txt/run cannot be made \(Not a directory\): choose another --out"):
-        create_run_folder(foreign / "notes.txt" / "run")
+def parse(*args: str) -> recipe.Config:
+    return parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, recipe.__doc__, args)
 
 
 def in_run(config: RunConfig) -> Run:
     return Run(config, recipe="mine.py", name="mine")
 
 
-def test_config_is_written_with_the_folder(tmp_path: Path) -> None:
-    config = RunConfig(out=tmp_path / "run", seed=4, wandb_mode="disabled")
+# The folder
+
+
+def test_config_and_scenario_are_written_with_the_folder(tmp_path: Path) -> None:
+    config = RunConfig(out=tmp_path / "run", seed=4, wandb_mode="disabled", scenario=AZORES)
     with in_run(config) as run:
-        assert {path.name for path in run.folder.iterdir()} == {".lock", "config.json"}
+        assert {path.name for path in run.folder.iterdir()} == {".lock", "config.json", "scenario.toml"}
         written = json.loads((run.folder / "config.json").read_text())
         assert (written["recipe"], written["seed"]) == ("mine.py", 4)
-        assert (written["out"], written["resume"], written["scenario"]) == ("run", None, None)
+        assert (written["out"], written["resume"], written["scenario"]) == ("run", None, "scenario.toml")
+        assert (run.folder / "scenario.toml").read_text() == AZORES.read_text()
         with pytest.raises(UsageError, match="another process"), locked(run.folder):
             pass
     with locked(run.folder):
         pass
 
 
-def test_scenario_is_copied_with_the_config(tmp_path: Path) -> None:
-    path = tmp_path / "azores.toml"
-    path.write_text("date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n")
-    with in_run(RunConfig(out=tmp_path / "run", scenario=path)) as run:
-        assert run.scenario.region.latitude == (40.0, 50.0)
-        assert (run.folder / "scenario.toml").read_text() == path.read_text()
-        assert json.loads((run.folder / "config.json").read_text())["scenario"] == "scenario.toml"
-
-
-def test_start_that_fails_leaves_no_folder(tmp_path: Path, monkeypatch) -> None:
-    """Before anything was collected; so the same command can be given again."""
+def test_only_a_start_that_fails_removes_the_folder(tmp_path: Path, monkeypatch) -> None:
+    """So the same command can be given again; what was collected, another's folder and a resumed run stay."""
 
     def broken(*_: object, **__: object) -> None:
         raise MemoryError("no room for the collector")
 
     monkeypatch.setattr(recipe, "make_collector", broken)
-    out = tmp_path / "run"
     with pytest.raises(MemoryError, match="no room"):
-        recipe.train(recipe.Config(out=out, num_envs=4, eval_tasks_small=2, eval_tasks=2, num_cells=(8,)))
-    assert not out.exists()
-
-
-def test_config_that_cannot_be_written_leaves_no_folder(tmp_path: Path, monkeypatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError("no space left")
-
-    monkeypatch.setattr(Run, "_write_config", full)
-    with pytest.raises(OSError, match="no space"), in_run(RunConfig(out=tmp_path / "run")):
-        pass
+        recipe.train(parse(*SMALL, "--out", str(tmp_path / "run")))
     assert not (tmp_path / "run").exists()
-
-
-def test_failure_after_the_first_batch_keeps_the_folder(tmp_path: Path) -> None:
     run = in_run(RunConfig(out=tmp_path / "run"))
     run.statistics.frames = 1
     with pytest.raises(RuntimeError), run:
         raise RuntimeError
+    with pytest.raises(RuntimeError), in_run(RunConfig(out=tmp_path / "run", resume=tmp_path / "run")):
+        raise RuntimeError
+    with pytest.raises(UsageError), in_run(RunConfig(out=tmp_path / "run")):
+        pass
     assert (tmp_path / "run" / "config.json").is_file()
 
 
-def test_failure_of_a_resumed_run_keeps_the_folder(tmp_path: Path) -> None:
-    """Even before its first batch."""
-    (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(RuntimeError), in_run(RunConfig(out=tmp_path, resume=tmp_path)):
-        raise RuntimeError
-    assert (tmp_path / "config.json").read_text() == "{}"
+def test_second_process_is_kept_out(tmp_path: Path, capsys) -> None:
+    folder = create_run_folder(tmp_path / "run")
+    (folder / "config.json").write_text(json.dumps({"recipe": recipe.RECIPE}))
+    with locked(folder), pytest.raises(SystemExit) as stop:
+        command(recipe.RECIPE, lambda: recipe.main(["--resume", str(folder)]))
+    message = f"td3_gradient_guided.py: another process is writing the run folder {folder}\n"
+    assert (stop.value.code, capsys.readouterr().err) == (2, message)
+    assert {path.name for path in folder.iterdir()} == {"config.json", ".lock"}
 
 
-def test_folder_of_another_is_not_removed(tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").touch()
-    with pytest.raises(UsageError), in_run(RunConfig(out=tmp_path)):
-        pass
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+def test_run_is_named_after_its_scenario_and_noise() -> None:
+    for options, name in (({}, "mine"), ({"scenario": AZORES, "noise": (0.05, 0, 1)}, "mine-azores-noise-0.05-0-1")):
+        run = in_run(RunConfig(seed=2, **options))
+        assert (run.name, run.folder) == (name, Path("runs") / f"{name}-seed2")
 
 
-# Curves
-
-
-def test_json_has_no_nan(tmp_path: Path) -> None:
-    write_json(tmp_path / "x.json", {"a": math.nan, "b": 1.5, "c": "text", "d": (1, 2)})
-    assert json.loads((tmp_path / "x.json").read_text()) == {"a": None, "b": 1.5, "c": "text", "d": [1, 2]}
-
-
-def test_rows_are_on_disk_when_written(tmp_path: Path) -> None:
-    log = RunLog(tmp_path, list(ROW), {"seed": 0})
-    log.row(ROW)
-    with (tmp_path / "train.csv").open() as file:
-        assert [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)] == [ROW]
-    with pytest.raises(ValueError, match="unknown_column"):
-        log.row({"unknown_column": 1.0})
-    log.close()
-    assert {path.name for path in tmp_path.iterdir()} == {"train.csv"}
+def test_validation_and_test_have_the_noise_of_the_run(tmp_path: Path) -> None:
+    for noise, share in ((NOISE, 1.0), ((0.0, 0.0, 0.0), 0.0)):
+        with in_run(RunConfig(out=tmp_path / f"run{share}", noise=noise, eval_tasks=6, eval_tasks_small=4)) as run:
+            states = [env.reset() for env in run.evaluation_envs(zeta=0.01)]
+        errors = [state["field"] - state.get("true_field", state["field"]) for state in states]
+        assert [(error != 0).double().mean().item() for error in errors] == [share, share]
+        assert not share or not torch.equal(errors[0], errors[1][:4])
 
 
 @pytest.mark.parametrize(("rate", "spl", "passes"), [(97.0, 88.4, True), (96.9, 99.0, False), (99.0, 88.3, False)])
@@ -151,95 +105,142 @@ def test_results_of_the_paper(rate: float, spl: float, passes: bool) -> None:
     assert passes_paper({"eval_success_rate": rate, "eval_spl": spl}) is passes
 
 
-# Statistics and the best policy
+# Resume
 
 
-def steps(done: list[bool], success: list[bool], **sums: list[float]) -> TensorDict:
-    """Return a batch of transitions; TorchRL's RewardSum writes sums from the start of the episode."""
-    flags = {"done": torch.tensor(done).unsqueeze(-1), "success": torch.tensor(success).unsqueeze(-1)}
-    values = {key: torch.tensor(value).unsqueeze(-1) for key, value in sums.items()}
-    return TensorDict(next=TensorDict(**flags, **values), batch_size=[len(done)])
+def test_stop_request_waits_and_a_second_one_does_not() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with StopRequest() as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.exit_code == 143
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_statistics_count_ended_episodes_only() -> None:
-    statistics = TrainingStatistics(window=3)
-    statistics.add(
-        steps(
-            [False, True, True],
-            [False, True, False],
-            episode_reward=[9.0, 100.0, -50.0],
-            episode_reward_destination=[9.0, 200.0, 0.0],
-            episode_reward_proximity=[9.0, -100.0, -50.0],
-        )
-    )
-    row = statistics.row()
-    assert (row["frames"], row["episodes"], row["updates"]) == (3, 2, 0)
-    assert (row["success_rate"], row["return"]) == (50.0, 25.0)
-    assert (row["return_destination"], row["return_proximity"]) == (100.0, -75.0)
-    assert math.isnan(row["return_alignment"]), "an agent without guidance has no such term"
-    statistics.add(steps([True, True], [True, True], episode_reward=[10.0, 20.0]))
-    assert statistics.row()["return"] == pytest.approx((-50 + 10 + 20) / 3), "the last three episodes"
+@pytest.mark.usefixtures("without_figures")
+def test_run_that_ended_before_its_first_checkpoint_starts_again(tmp_path: Path, same_outcome, monkeypatch) -> None:
+    """``config.json`` is there as soon as the folder is, and the seed leads to the same training."""
+    folder, whole = tmp_path / "killed", tmp_path / "whole"
+    recipe.train(parse(*SMALL, "--out", str(whole)))
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "save", killed)
+        with pytest.raises(KeyboardInterrupt):
+            recipe.train(parse(*SMALL, "--out", str(folder), "--checkpoint-every", "0"))
+    assert not (folder / "checkpoints").exists()
+    recipe.train(parse("--resume", str(folder)))
+    assert same_outcome(folder, whole)
 
 
-def test_statistics_are_restored() -> None:
-    statistics, other = TrainingStatistics(), TrainingStatistics()
-    statistics.add(steps([True], [True], episode_reward=[7.0]))
-    statistics.updates, statistics.losses = 5, {"loss_critic": torch.tensor(0.25)}
-    other.load_state_dict(statistics.state_dict())
-    row, expected = other.row(), statistics.row()
-    assert row.keys() == expected.keys()
-    assert all(row[key] == expected[key] or math.isnan(row[key]) for key in row)
-    assert (row["updates"], row["loss_critic"], other.iterations) == (5, 0.25, 1)
+@pytest.mark.filterwarnings("ignore:.*trying the previous checkpoint")
+@pytest.mark.usefixtures("without_figures")
+def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> None:
+    """The curves so far stay in their file."""
+    with signalled(5, signal.SIGTERM), pytest.raises(SystemExit):
+        recipe.train(parse(*SMALL, "--eval-every", "2", "--out", str(tmp_path)))
+    curves = (tmp_path / "train.csv").read_text()
+    config = tmp_path / "config.json"
+    settings = config.read_text()
+    config.write_text(settings.replace("16,\n    16", "24,\n    24"))
+    with pytest.raises(UsageError, match=r"cannot resume: .*checkpoint-\d+\.pt: loss does not fit this training"):
+        recipe.train(parse("--resume", str(tmp_path)))
+    config.write_text(settings)
+    for file in tmp_path.glob("checkpoints/*.pt"):
+        file.write_bytes(b"")
+    with pytest.raises(UsageError, match="cannot resume: there is no valid checkpoint in"):
+        recipe.train(parse("--resume", str(tmp_path)))
+    assert len(curves.splitlines()) == 3
+    assert (tmp_path / "train.csv").read_text() == curves
 
 
-def test_selection_score_by_hand() -> None:
-    steps_taken, success = torch.tensor([10, 20, 30]), torch.tensor([True, True, False])
-    assert selection_score(60.0, success, steps_taken, max_steps=50) == pytest.approx(60 - (10 + 20 + 50) / 3)
+def run_process(*args: str, kill_after: float | None = None) -> int:
+    """Run the recipe to its end, or until some seconds after its first checkpoint; return the exit code."""
+    folder = Path(args[-1])
+    process = subprocess.Popen([sys.executable, str(ROOT / "recipes" / recipe.RECIPE), *args])
+    if kill_after is not None:
+        while process.poll() is None and not list(folder.glob("checkpoints/checkpoint-*.pt")):
+            time.sleep(0.01)
+        time.sleep(kill_after)
+        process.kill()
+    return process.wait()
 
 
-def test_selection_score_cannot_prefer_early_failure() -> None:
-    """Of policies with the same successes, leaving the map at once is worth no more than flying to the end."""
-    success = torch.tensor([True, False, False])
-    early, late = torch.tensor([20, 1, 1]), torch.tensor([20, 50, 50])
-    assert selection_score(30.0, success, early, 50) == selection_score(30.0, success, late, 50)
-    arrives = torch.tensor([True, True, False])
-    for taken in (1, 30, 50):
-        later = torch.tensor([20, taken, 1])
-        assert selection_score(30.0, arrives, later, 50) >= selection_score(30.0, success, early, 50)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_many_kills(tmp_path: Path, same_outcome: Callable, seed: int, monkeypatch) -> None:
+    """Kill a training several times, let it end, and compare it with one that was left alone."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # as in this process: other numbers round differently
+    folder, whole, survived, moments = tmp_path / "killed", tmp_path / "whole", 0, random.Random(seed)
+    options = (*SMALL, "--total-frames", "3200", "--checkpoint-every", "0.05", "--out")
+    assert run_process(*options, str(whole)) == 0
+    code = run_process(*options, str(folder), kill_after=moments.uniform(0, 1))
+    while code == -signal.SIGKILL:
+        survived += 1
+        code = run_process("--resume", str(folder), kill_after=moments.uniform(0, 5) if survived < 5 else None)
+        assert code in (0, -signal.SIGKILL)
+    assert same_outcome(folder, whole)
+    assert survived >= 1
 
 
-def test_best_policy_refuses_a_score_that_is_not_finite() -> None:
-    best = BestPolicy()
-    for score in (math.nan, math.inf):
-        with pytest.raises(ValueError, match="score must be a finite number"):
-            best.offer(score, nn.Linear(1, 1))
-    assert best.weights is None
+# Several collecting processes
 
 
-# Settings
+@pytest.fixture
+def _without_ray():
+    yield
+    if "ray" in sys.modules:
+        sys.modules["ray"].shutdown()
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        ({"device": "foo"}, "device 'foo' cannot be used here"),
-        ({"device": "meta"}, "device 'meta' cannot be used here"),
-        ({"scenario": Path("nowhere.toml")}, "there is no scenario file at nowhere.toml"),
-        ({"seed": paper.TEST_SEED}, "seed must be less than"),
-        ({"seed": paper.VALIDATION_SEED}, "seed must be less than"),
-        ({"total_frames": 0}, "total_frames must be greater than or equal to 1, got 0"),
-        ({"total_episodes": 0}, "total_episodes"),
-        ({"checkpoint_every": math.nan}, "checkpoint_every"),
-        ({"logger": "paper"}, "logger"),
-        ({"speed": 1}, "unknown key 'speed'"),
-    ],
-    ids=str,
-)
-def test_bad_settings_are_refused(bad: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        RunConfig(**bad)
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_figures", "_without_ray")
+@pytest.mark.parametrize("backend", ["process", "ray"])
+def test_interrupted_training_of_several_processes_resumes(
+    backend: str, tmp_path: Path, signalled, monkeypatch
+) -> None:
+    """Other processes start new episodes; frames and updates add up, and weights that change here act there."""
+    if backend == "ray" and importlib.util.find_spec("ray") is None:
+        pytest.skip("ray is an extra")
+    run, made = tmp_path / "run", {}
+    config = parse(*SMALL).replace(num_envs=8, num_cells=(8,), batch_size=16, init_random_frames=16, total_frames=80)
+    with signalled(4, signal.SIGTERM), pytest.raises(SystemExit):
+        recipe.train(config.replace(out=run, collectors=2, collector_backend=backend))
+
+    def recorded(name: str, kind: type) -> None:
+        class Recorded(kind):
+            def __init__(self, *args, **options) -> None:
+                super().__init__(*args, **options)
+                made[name] = self
+
+        monkeypatch.setattr(recipe, kind.__name__, Recorded)
+
+    def turn_right(*_: object, **__: object) -> None:
+        with torch.no_grad():
+            made["loss"].networks.actor[0].module[-1].bias.fill_(50.0)
+
+    recorded("loss", recipe.TD3Loss)
+    recorded("buffer", recipe.TensorDictReplayBuffer)
+    monkeypatch.setattr(recipe, "optimize", turn_right)
+    recipe.train(parse("--resume", str(run)))
+    result = json.loads((run / "eval.json").read_text())
+    assert (result["frames"], result["updates"]) == (80, 9)
+    stored = made["buffer"][:]
+    assert all(len(batch["observation"].unique(dim=0)) == 8 for batch in stored.split(8))
+    assert (stored["action"][: 4 * 8] < 0).any()
+    assert (stored["action"][-8:] > 0.3).all()  # 1, less the noise of exploration
 
 
-def test_linear_goes_from_start_to_end() -> None:
-    config = recipe.Config(learning_rate=3e-3, final_learning_rate=1e-3)
-    assert [config.linear("learning_rate", x) for x in (1.0, 0.5, 0.0)] == pytest.approx([3e-3, 2e-3, 1e-3])
+def test_workers_fly_random_tasks_of_their_own() -> None:
+    """None of the tasks of the scenario file, of the validation or the test."""
+    config = recipe.Config(scenario=AZORES, num_envs=8, collectors=2)
+    assert config.load_scenario().tasks is not None
+    base = recipe.GeomagneticNavEnv(config.load_scenario().with_tasks(None))
+    env = recipe.worker_env(config, base.observation_view(), 0)
+    assert len(env.reset()["position"].unique(dim=0)) == 4
+    seeds = [worker_seed(seed, index) for seed in (0, 1, 1_999_999_999) for index in range(3)]
+    assert len(set(seeds)) == len(seeds)
+    assert all(0 <= seed < 2_000_000_000 for seed in seeds)

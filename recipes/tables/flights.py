@@ -1,0 +1,72 @@
+"""Flights of the tables: random regions of the Earth, and navigators with the data sheets of their sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from magrl import paper
+from magrl.envs import GeomagneticNavEnv, earth_scenario
+from magrl.evaluation import episode_measures, evaluation_rollout
+from magrl.evaluation.navigators import make_navigator
+from magrl.evaluation.runs import NO_NOISE, Noise
+from magrl.transforms import Conditions, with_conditions, with_sensor_noise
+
+FAR_KM = 500.0
+"""Longest distance of the paper's tasks; beyond, regions are larger and cells begin with kilometers."""
+DRIFT_KM = 40.0
+"""How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
+SEED = 3 * paper.FIRST_RESERVED_SEED
+"""Seed of regions and tasks, beyond those of trainings and of frozen sets."""
+Spec = str | Mapping[str, Any]
+"""Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
+
+
+def flown(
+    navigator: TensorDictModuleBase | Spec, base: GeomagneticNavEnv, errors: Noise | Conditions
+) -> TensorDictBase:
+    """Return the measures of an episode of each vehicle, under noise or under the conditions of a real vehicle."""
+    if isinstance(errors, Conditions):
+        env, std, bias = with_conditions(base, errors, base.seed), errors.sensor_std, errors.bias_std
+    else:
+        env, std, bias = with_sensor_noise(base, errors, base.seed), errors, NO_NOISE
+    if isinstance(navigator, str):
+        navigator = {"name": navigator}
+    if isinstance(navigator, Mapping):
+        options = {key: value for key, value in navigator.items() if key != "name"}
+        navigator = make_navigator(navigator["name"], base, noise=std, bias=bias, **options)
+    return episode_measures(evaluation_rollout(env, navigator))
+
+
+def earth_env(
+    tasks: int,
+    distance_km: Sequence[float] = paper.DISTANCE_KM,
+    date: str = "2025-01-01",
+    regions: int = 128,
+    *,
+    num_envs: int | None = None,
+    reach_km: float = 0.0,
+    crust: bool = False,
+    **options: Any,
+) -> GeomagneticNavEnv:
+    """Return an environment of frozen tasks in random regions of the Earth, large enough for the longest distance.
+
+    Args:
+        tasks: number of tasks.
+        distance_km: shortest and longest distance of a task [km].
+        date: date of the field.
+        regions: number of regions.
+        num_envs: number of vehicles; by default one for each task.
+        reach_km: how far errors may carry a vehicle beyond its longest move [km].
+        crust: whether the field is WMMHR, with the crust, in place of IGRF.
+        options: options of the environment.
+    """
+    far = distance_km[1] > FAR_KM
+    size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"half_size_deg": 10, "max_latitude": 70}
+    size |= {"distance_range_km": tuple(distance_km), "max_move_km": 50.0 + reach_km, "crust": crust}
+    scenario = earth_scenario(regions, SEED, date, **size)
+    scenario = scenario.with_tasks(scenario.random_tasks(tasks, SEED))
+    return GeomagneticNavEnv(scenario, num_envs=num_envs or tasks, start_heading="random", seed=0, **options)

@@ -1,0 +1,233 @@
+"""Make the tables that recipes/tables/tables.toml declares: navigators by errors, tasks, dates and seeds.
+
+    python recipes/tables/grid.py earth conditions --out docs/results        # writes earth.md and conditions.md
+    python recipes/tables/grid.py earth --navigators policy:MINE=mine.pt     # the same table of other navigators
+    python recipes/tables/grid.py earth --tasks 200                          # faster
+
+Without --out, tables are printed. Navigators are given the data sheets of their sensors. A cell holds the success rate
+(SR) and the success weighted by path length (SPL) in percent, and the mean number of steps of successful episodes;
+beyond 500 km, the share of episodes that end within 25 km of the destination comes first. Tables of trained agents read
+the run folders that they name; `make tables` trains what is missing.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
+
+import contextlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from tensordict.nn import TensorDictModuleBase
+from tqdm import tqdm
+
+from magrl import paper
+from magrl.envs import GeomagneticNavEnv, Region, Scenario
+from magrl.evaluation import summarize
+from magrl.evaluation.navigators import check_distinct, label, needs
+from magrl.evaluation.runs import NO_NOISE, Noise
+from magrl.evaluation.tables import markdown_table
+from magrl.files import check_writable
+from magrl.navigators import ParallelApproach, Secant
+from magrl.training import UsageError, command
+from magrl.transforms import Conditions, conditions_named
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+sys.path.insert(0, str(Path(__file__).parent))
+import aboard
+import globe
+import trainings
+from flights import DRIFT_KM, FAR_KM, Spec, earth_env, flown
+
+RECIPE = "grid.py"
+LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
+"""Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
+FILE, RESULTS = Path(__file__).parent / "tables.toml", Path("docs/results")
+EAST_OF_THE_PAPER = Region((-10, 0), (175, 185))
+
+
+@dataclass(frozen=True)
+class Config:
+    """Tables to make."""
+
+    tables: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Names of tables in the file; all by default."""
+    navigators: tuple[str, ...] | None = None
+    """Navigators in place of those of the table, as in recipes/evaluate.py."""
+    tasks: int | None = None
+    """Number of tasks in place of that of the table."""
+    file: Path = FILE
+    """File that declares the tables."""
+    out: Path | None = None
+    """Folder of the tables, which are replaced; by default they are printed."""
+
+
+def earth(
+    navigators: Sequence[Spec],
+    *,
+    conditions: Sequence[str] = (),
+    tasks: int = 4000,
+    dates: Sequence[str] = ("2025-01-01",),
+    distance_km: Sequence[float] = paper.DISTANCE_KM,
+    max_steps: int = 50,
+    crust: bool = False,
+) -> str:
+    """Return a row for each date and navigator, with a column for each level of noise or each of some conditions."""
+    columns: dict[str, Noise | Conditions] = {name: conditions_named(name) for name in conditions}
+    columns = columns or {", ".join(f"{level:g}" for level in noise): noise for noise in LEVELS}
+    drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM} if conditions else {}
+    measures = ["success_rate_within_25km"] * (distance_km[1] > FAR_KM) + ["success_rate", "spl", "steps"]
+    rows = []
+    for date in dates:
+        base = earth_env(tasks, distance_km, date, max_steps=max_steps, crust=crust, **drift)
+        for navigator in tqdm(navigators, unit="navigator"):
+            summaries = [summarize(flown(navigator, base, errors)) for errors in columns.values()]
+            cells = [" / ".join(f"{summary[name]:.1f}" for name in measures) for summary in summaries]
+            rows.append([*[date] * (len(dates) > 1), *names(navigator), *[1] * (not conditions), *cells])
+    head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["runs"] * (not conditions), *columns]
+    return markdown_table(head, rows)
+
+
+def names(navigator: Spec) -> list[str]:
+    """Return the label of a navigator, with the date of its map if that is given, and what it needs."""
+    options = {"name": navigator} if isinstance(navigator, str) else navigator
+    name = options["name"].partition("=")[0]
+    return [label(name) + (f", map of {options['map_date']}" if "map_date" in options else ""), needs(name)]
+
+
+def random_boxes(count: int, seed: int) -> list[Scenario]:
+    """Return scenarios in random boxes, uniform over the sphere and rounded to a degree, that a vehicle can use.
+
+    The boxes are 10 degrees wide and high, with latitudes up to 60 degrees. A box that a scenario refuses (a weak
+    horizontal field, a declination that jumps) is drawn again.
+    """
+    draw = torch.Generator().manual_seed(seed)
+    highest = torch.sin(torch.deg2rad(torch.tensor(55.0, dtype=torch.float64)))
+    found: list[Scenario] = []
+    while len(found) < count:
+        height, turn = torch.rand(2, generator=draw, dtype=torch.float64).tolist()
+        middle = torch.rad2deg(torch.asin((2 * height - 1) * highest)).item()
+        south, west = round(middle - 5), round(360 * turn) - 180
+        scenario = Scenario(region=Region((south, south + 10), (west, west + 10)), objective_floors=None)
+        with contextlib.suppress(ValueError):
+            scenario.build_field()
+            found.append(scenario)
+    return found
+
+
+def place(scenario: Scenario) -> str:
+    """Return a box as text, such as ``10°S to 0°, 175°E to 185°E``."""
+    (south, _), (west, _) = scenario.region.latitude, scenario.region.longitude
+    west = (west + 180) % 360 - 180
+    edges = [f"{abs(x):g}°" + ("S" if x < 0 else "N" if x > 0 else "") for x in (south, south + 10)]
+    edges += [f"{abs(x):g}°" + ("W" if x < 0 else "E" if x > 0 else "") for x in (west, west + 10)]
+    return "{} to {}, {} to {}".format(*edges)
+
+
+def boxes(navigators: Sequence[Spec], *, boxes: int = 24, tasks: int = 500, seed: int = 1) -> str:
+    """Return SR and SPL of navigators in random boxes, and in the box east of the paper's, without floors of Eq. 2-6.
+
+    A navigator with two ``elements`` estimates its way from these alone.
+    """
+    scenarios = [*random_boxes(boxes, seed), Scenario(region=EAST_OF_THE_PAPER, objective_floors=None)]
+    measured = []
+    for scenario in tqdm(scenarios, unit="box"):
+        base = GeomagneticNavEnv(scenario.with_tasks(scenario.random_tasks(tasks, seed)), num_envs=tasks, seed=0)
+        summaries = [summarize(flown(of_two_elements(navigator, base), base, NO_NOISE)) for navigator in navigators]
+        measured.append([(summary["success_rate"], summary["spl"]) for summary in summaries])
+    random = torch.tensor(measured[:-1], dtype=torch.float64)  # (boxes, navigators, measures)
+    values = [*measured[:-1], random.mean(0).tolist(), random.amin(0).tolist(), measured[-1]]
+    first = [*map(place, scenarios[:-1]), "**mean**", "**lowest**", place(scenarios[-1])]
+    rows = [[name, *(f"{rate:.1f} / {spl:.1f}" for rate, spl in row)] for name, row in zip(first, values, strict=True)]
+    heads = [navigator if isinstance(navigator, str) else f"{navigator['name']}, D and I" for navigator in navigators]
+    return markdown_table(["box", *(f"{head}, SR / SPL" for head in heads)], rows)
+
+
+def of_two_elements(navigator: Spec, base: GeomagneticNavEnv) -> TensorDictModuleBase | Spec:
+    """Return the navigator of two ``elements``, or the same where it has all three."""
+    if isinstance(navigator, str):
+        return navigator
+    pair = tuple(navigator["elements"])
+    return Secant(elements=pair) if navigator["name"] == "secant" else ParallelApproach(base.field, pair=pair)
+
+
+def rows_of(of: Sequence[str], navigators: Sequence[str]) -> str:
+    """Return the rows of some navigators from other tables in docs/results."""
+    lines = [line for name in of for line in (RESULTS / f"{name}.md").read_text().splitlines()]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    by_label = {row[0]: row for row in cells}
+    return markdown_table(by_label["navigator"], [by_label[label(name)] for name in navigators])
+
+
+KINDS: Mapping[str, Callable[..., str]] = {
+    "earth": earth,
+    "boxes": boxes,
+    "rows": rows_of,
+    "globe": globe.globe,
+    "onboard": aboard.onboard,
+    "evaluation": trainings.evaluation,
+    "short": trainings.short,
+    "noise_levels": trainings.noise_levels,
+    "results": trainings.results,
+    "learning": trainings.learning,
+    "curves": trainings.curves,
+}
+"""Function of each kind of table; its arguments are the options in the file."""
+
+
+def declarations(file: Path = FILE) -> dict[str, dict[str, Any]]:
+    """Return the kind and the options of each table in a file."""
+    return tomllib.loads(file.read_text())
+
+
+def make(config: Config) -> None:
+    """Make the tables.
+
+    Raises:
+        UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
+    """
+    known = declarations(config.file)
+    changes = {"navigators": config.navigators, "tasks": config.tasks}
+    given = {key: value for key, value in changes.items() if value is not None}
+    if unknown := [name for name in config.tables if name not in known]:
+        raise UsageError(f"{config.file} declares no table {', '.join(unknown)}: choose from {', '.join(known)}")
+    for name in config.tables or known:
+        try:
+            text = table(**known[name] | given)
+        except (ValueError, OSError, TypeError) as error:
+            raise UsageError(f"{name}: {error}") from error
+        if config.out is None:
+            print(text)
+        else:
+            check_writable(config.out / f"{name}.md")
+            (config.out / f"{name}.md").write_text(text.rstrip() + "\n")
+
+
+def table(kind: str, **options: Any) -> str:
+    """Return a table of a kind.
+
+    Raises:
+        TypeError: for an option that the kind does not have.
+        ValueError: for an unknown kind, or a navigator that is given twice.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"unknown kind {kind!r}: choose from {', '.join(KINDS)}")
+    inspect.signature(KINDS[kind]).bind(**options)
+    check_distinct([text for text in options.get("navigators", ()) if isinstance(text, str)])
+    return KINDS[kind](**options)
+
+
+if __name__ == "__main__":
+    command(RECIPE, lambda: make(tyro.cli(Config, prog=RECIPE, description=__doc__)))

@@ -1,0 +1,93 @@
+"""The recipe of the agent without a map: its environment, what its agent may not know, and what it trains on."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import td3_anywhere as recipe
+import torch
+from torch import Tensor
+from torchrl.envs.utils import check_env_specs
+
+from magrl import paper
+from magrl.agents import PolicyConfig
+from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
+from magrl.field import IGRF, elements_at, igrf_coefficients
+from magrl.training import parse_config
+from magrl.transforms import RandomSensorNoise, TrackView
+
+SMALL = {"num_regions": 8, "num_envs": 16, "total_frames": 160, "max_steps": 5, "num_cells": (16, 16)}
+SMALL |= {"batch_size": 32, "buffer_size": 1000, "init_random_frames": 32, "updates_per_batch": 2, "eval_every": 10}
+SMALL |= {"eval_tasks_small": 4, "eval_tasks": 6, "wandb_mode": "disabled"}
+VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
+
+
+def training_env(noise: tuple[float, float, float] = (0.0, 0.0, 0.0)):
+    scenario = planet_scenario(8, seed=3, **recipe.FAST.regions)
+    base = GeomagneticNavEnv(scenario, num_envs=6, start_heading="random", seed=5)
+    return recipe.make_env(base, VIEW, recipe.Config(noise=noise))
+
+
+def test_specs_of_the_training_environment() -> None:
+    for noise in ((0.0, 0.0, 0.0), (0.05, 0.05, 5.0)):
+        env = training_env(noise)
+        check_env_specs(env, break_when_any_done="both")
+        assert env.observation_spec["observation"].shape == (6, 15)
+        assert (type(env.transform[0]) is RandomSensorNoise) == (not any(noise))
+        assert env.transform[0].seed == 5
+
+
+def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
+    td = training_env().rollout(4, break_when_any_done=False)["next"]
+    torch.testing.assert_close(td["true_way_scaled"], td["true_way"] / 200)
+    assert 0.4 < td["true_way_scaled"].norm(dim=-1).mean() < 3.0
+    torch.testing.assert_close(td["episode_reward"], td["reward"].cumsum(1))
+    assert "episode_reward_proximity" not in td.keys()  # noqa: SIM118
+    assert PolicyConfig(VIEW, (8,)).make_actor().in_keys == ["observation"]
+    assert recipe.OBSERVED == ("observation", "true_way_scaled")
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_only_the_spectrum_of_the_earth_is_trained_on(tmp_path, monkeypatch, same_outcome) -> None:
+    """On an Earth whose coefficients have other signs, and thus the same spectrum, the training is the same."""
+
+    def other_earth(*_: object) -> Tensor:
+        earth = igrf_coefficients("2022-01-01", 13)
+        signs = torch.randint(0, 2, (2, *earth.shape), generator=torch.Generator().manual_seed(1)) * 2 - 1
+        return torch.complex(earth.real * signs[0], earth.imag * signs[1])
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the coefficients of the Earth are read")
+
+    seeds = []
+
+    def without_earth(count: int, seed: int, **options: object) -> Scenario:
+        seeds.append(seed)
+        return planet_scenario(count, seed, **options)
+
+    recipe.train(recipe.FAST.replace(out=tmp_path / "earth", **SMALL))
+    monkeypatch.setattr("magrl.field.planets.igrf_coefficients", other_earth)
+    monkeypatch.setattr("magrl.envs.random_regions.igrf_coefficients", refuse)
+    monkeypatch.setattr("magrl.field.igrf.igrf_coefficients", refuse)  # of IGRF as a field model
+    monkeypatch.setattr(recipe, "earth_scenario", without_earth)
+    recipe.train(recipe.FAST.replace(out=tmp_path / "other", **SMALL))
+    assert seeds == [paper.TEST_SEED]  # the test tasks alone are on Earth
+    assert same_outcome(tmp_path / "earth", tmp_path / "other")
+
+
+def test_fields_of_the_planets_are_not_that_of_the_earth() -> None:
+    """Beside the dipole: at the same places, the rest of both fields is not correlated."""
+    scenario = planet_scenario(256, seed=0, **recipe.FAST.regions)
+    middle = torch.stack((scenario.region.latitude.mean(-1), scenario.region.longitude.mean(-1)), -1)
+    planets = elements_at(scenario.field, middle, torch.arange(256))
+    earth = elements_at(IGRF("2025-01-01"), middle)
+    correlation = torch.corrcoef(torch.stack((planets[:, 0], earth[:, 0])))[0, 1]  # D of an axial dipole is 0
+    assert abs(correlation) < 0.25  # four standard deviations
+
+
+def test_presets() -> None:
+    for name, far in (("fast", False), ("far", True)):
+        config = parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, None, ["--preset", name])
+        assert (config.preset, config.regions.get("distance_law") == "log") == (name, far)
+        assert planet_scenario(2, seed=0, **config.regions).distance_range_km == config.distance_range_km

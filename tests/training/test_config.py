@@ -1,0 +1,150 @@
+"""Settings of runs, the command line, the settings of a run that is resumed, and how a command ends."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import td3_gradient_guided as recipe
+
+from magrl import paper
+from magrl.training import RunConfig, UsageError, command, parse_config
+from magrl.training.config import resumed_config
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def parse(*args: str) -> recipe.Config:
+    return parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, recipe.__doc__, args)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"device": "foo"}, "device 'foo' cannot be used here"),
+        ({"device": "meta"}, "device 'meta' cannot be used here"),
+        ({"scenario": Path("nowhere.toml")}, "there is no scenario file at nowhere.toml"),
+        ({"seed": paper.TEST_SEED}, "seed must be less than"),
+        ({"seed": paper.VALIDATION_SEED}, "seed must be less than"),
+        ({"total_frames": 0}, "total_frames must be greater than or equal to 1, got 0"),
+        ({"checkpoint_every": math.nan}, "checkpoint_every"),
+        ({"zeta": 3.0}, "zeta must be below 3, got 3"),
+        ({"noise": (0.05, -0.05, 5.0)}, "noise.1 must be greater than or equal to 0, got -0.05"),
+        ({"noise": (0.05, 0.05)}, "noise"),
+        ({"logger": "paper"}, "logger"),
+        ({"speed": 1}, "unknown key 'speed'"),
+    ],
+    ids=str,
+)
+def test_bad_settings_of_a_run(bad: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RunConfig(**bad)
+
+
+def test_scenario_and_settings_must_agree(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    text = "date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n"
+    path.write_text(text + "zeta = 0.02\n")
+    with pytest.raises(ValueError, match=r"zeta = 0\.02, the training 0\.01: add --zeta 0\.02"):
+        RunConfig(scenario=path)
+    path.write_text(text + 'arrival = "declared"\n')
+    with pytest.raises(ValueError, match="the recipes train no agent that declares"):
+        RunConfig(scenario=path)
+    path.write_text(text.replace("[40, 50]", "[75, 85]"))
+    with pytest.raises(ValueError, match=r"mine.toml: region.latitude \(75.0, 85.0\): with margin_deg 5"):
+        RunConfig(scenario=path)
+
+
+def test_linear_goes_from_start_to_end() -> None:
+    config = recipe.Config(learning_rate=3e-3, final_learning_rate=1e-3)
+    assert [config.linear("learning_rate", x) for x in (1.0, 0.5, 0.0)] == pytest.approx([3e-3, 2e-3, 1e-3])
+
+
+# Runs that are resumed
+
+MINE = '"recipe": "td3_gradient_guided.py"'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "holds no config.json"),
+        ("", "cannot resume"),
+        ("[]", "not of this version of magrl: start the training again in a new folder"),
+        ('{"recipe": "td3_recurrent.py"}', r"the run was started by td3_recurrent\.py: resume it with that recipe"),
+        (f'{{{MINE}, "wings": 2}}', "unknown key 'wings'"),
+        (f'{{{MINE}, "gamma": 2.0}}', "gamma must be less than 1, got 2.0"),
+        (f'{{{MINE}, "num_cells": 8}}', "num_cells"),
+        (f'{{{MINE}, "scenario": 7}}', "cannot resume"),
+        (f'{{{MINE}, "scenario": "scenario.toml"}}', "there is no scenario file at"),
+        (f'{{{MINE}, "wandb_mode": "loud"}}', "wandb_mode must be 'offline', 'online' or 'disabled'"),
+    ],
+)
+def test_other_files_are_not_resumed(tmp_path: Path, content: str | None, message: str) -> None:
+    if content is not None:
+        (tmp_path / "config.json").write_text(content)
+    with pytest.raises(UsageError, match=message) as error:
+        parse("--resume", str(tmp_path))
+    assert str(tmp_path) in str(error.value)
+
+
+def test_complete_run_and_other_options_are_refused(tmp_path: Path) -> None:
+    for name in ("config.json", "eval.json"):
+        (tmp_path / name).write_text("{}")
+    with pytest.raises(UsageError, match=r"is complete: its results are in .*eval\.json"):
+        parse("--resume", str(tmp_path))
+    with pytest.raises(UsageError, match=r"leave out --seed 1 --preset paper$"):
+        parse("--preset", "paper", "--resume", str(tmp_path), "--seed", "1")
+
+
+def test_resumed_settings_are_those_of_the_run(tmp_path: Path) -> None:
+    """However the folder is written; paths are those of this machine."""
+    settings = {"recipe": recipe.RECIPE, "seed": 7, "num_cells": [8, 8], "guided": False}
+    (tmp_path / "config.json").write_text(json.dumps(settings))
+    for text in (f"--resume={tmp_path}", f"--resume {tmp_path}/."):
+        config = parse(*text.split())
+        assert (config.seed, config.num_cells, config.guided) == (7, (8, 8), False)
+        assert config.out == config.resume == tmp_path
+    assert resumed_config(tmp_path, recipe.Config, recipe.RECIPE) == config
+
+
+# The end of a command
+
+
+def test_bad_usage_is_one_line_and_bugs_keep_their_traceback(capsys) -> None:
+    def fail(kind: type[Exception]) -> None:
+        raise kind("no such run")
+
+    with pytest.raises(SystemExit) as stop:
+        command("mine.py", lambda: fail(UsageError))
+    assert (stop.value.code, capsys.readouterr().err) == (2, "mine.py: no such run\n")
+    with pytest.raises(ValueError, match="no such run"):
+        command("mine.py", lambda: fail(ValueError))
+
+
+def test_reader_that_ends_first_leaves_no_traceback(tmp_path: Path, monkeypatch, capsys) -> None:
+    """As in `command --help | head -1`."""
+    with (tmp_path / "out").open("w") as file, monkeypatch.context() as patch:
+
+        def broken(*_: object) -> None:
+            raise BrokenPipeError
+
+        patch.setattr(sys, "stdout", SimpleNamespace(write=broken, flush=broken, fileno=file.fileno))
+        with pytest.raises(SystemExit) as stop:
+            command("mine.py", lambda: print("help"))
+    assert (stop.value.code, capsys.readouterr().err) == (141, "")
+    for script in [*ROOT.glob("recipes/*.py"), *(ROOT / f"recipes/tables/{name}.py" for name in ("grid", "figures"))]:
+        assert "    command(RECIPE, " in script.read_text(), script.name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", ["recipes/fly.py", "-m magrl.field"])
+def test_help_of_a_process_whose_reader_ends_first(script: str) -> None:
+    command = [sys.executable, *script.split(), "--help"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert "Traceback" not in process.stderr.read()
+    assert process.returncode in (141, -13)

@@ -1,0 +1,82 @@
+"""Statistics of a training by hand, the selection of its best policy, and curves that are on disk at once."""
+
+import csv
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from magrl.training.curves import BestPolicy, RunLog, TrainingStatistics, selection_score
+
+
+def steps(done: list[bool], success: list[bool], **sums: list[float]) -> TensorDict:
+    """Return a batch of transitions; TorchRL's RewardSum writes sums from the start of the episode."""
+    flags = {"done": torch.tensor(done).unsqueeze(-1), "success": torch.tensor(success).unsqueeze(-1)}
+    values = {key: torch.tensor(value).unsqueeze(-1) for key, value in sums.items()}
+    return TensorDict(next=TensorDict(**flags, **values), batch_size=[len(done)])
+
+
+def test_statistics_count_ended_episodes_only() -> None:
+    statistics = TrainingStatistics(window=3)
+    assert math.isnan(statistics.row()["return"])
+    sums = {
+        "episode_reward": [9.0, 100.0, -50.0],
+        "episode_reward_destination": [9.0, 200.0, 0.0],
+        "episode_reward_proximity": [9.0, -100.0, -50.0],
+    }
+    statistics.add(steps([False, True, True], [False, True, False], **sums))
+    statistics.losses["loss_critic"] = torch.tensor(0.25)
+    row = statistics.row()
+    assert (row["frames"], row["episodes"], row["updates"], statistics.iterations) == (3, 2, 0, 1)
+    assert (row["success_rate"], row["return"], row["loss_critic"]) == (50.0, 25.0, 0.25)
+    assert (row["return_destination"], row["return_proximity"]) == (100.0, -75.0)
+    assert math.isnan(row["return_alignment"]), "an agent without guidance has no such term"
+    statistics.add(steps([True, True], [True, True], episode_reward=[10.0, 20.0]))
+    assert statistics.row()["return"] == pytest.approx((-50 + 10 + 20) / 3), "the last three episodes"
+
+
+def test_statistics_continue_from_their_state() -> None:
+    one, other = TrainingStatistics(), TrainingStatistics()
+    one.add(steps([True, True], [True, False], episode_reward=[300.0, 100.0], episode_reward_alignment=[1.0, 2.0]))
+    one.updates, one.losses = 4, {"loss_actor": torch.tensor(-0.5)}
+    other.load_state_dict(one.state_dict())
+    for statistics in (one, other):
+        statistics.add(steps([True], [True], episode_reward=[20.0]))
+    assert (other.frames, other.episodes, other.iterations, other.updates) == (3, 3, 2, 4)
+    assert str(other.row()) == str(one.row())
+    assert other.row()["return"] == 140
+
+
+def test_selection_score_cannot_prefer_early_failure() -> None:
+    """A failed episode counts as the step limit: leaving the map at once is worth no more than flying to the end."""
+    success = torch.tensor([True, True, False])
+    assert selection_score(60.0, success, torch.tensor([10, 20, 30]), 50) == pytest.approx(60 - (10 + 20 + 50) / 3)
+    assert selection_score(60.0, success, torch.tensor([10, 20, 1]), 50) == pytest.approx(60 - (10 + 20 + 50) / 3)
+
+
+def test_best_policy_is_the_best() -> None:
+    best, layer = BestPolicy(), nn.Linear(1, 1)
+    for score, weight in ((1.0, 10.0), (3.0, 30.0), (2.0, 20.0)):
+        nn.init.constant_(layer.weight, weight)
+        best.offer(score, layer)
+    other = BestPolicy()
+    other.load_state_dict(best.state_dict())
+    other.offer(2.9, layer)
+    assert (other.score, other.weights["weight"].item()) == (3, 30)
+    with pytest.raises(ValueError, match="score must be a finite number"):
+        best.offer(math.nan, layer)
+
+
+def test_rows_are_on_disk_when_written(tmp_path: Path) -> None:
+    row = {"frames": 512, "return": 1.5, "eval_spl": 88.4, "return_alignment": -0.5}
+    log = RunLog(tmp_path, list(row), {"seed": 0})
+    log.row(row)
+    with (tmp_path / "train.csv").open() as file:
+        assert [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)] == [row]
+    with pytest.raises(ValueError, match="unknown_column"):
+        log.row({"unknown_column": 1.0})
+    log.close()
+    assert {path.name for path in tmp_path.iterdir()} == {"train.csv"}
