@@ -335,12 +335,13 @@ def check_positions(latitude: Tensor, longitude: Tensor) -> None:
     require(longitude.abs() < math.inf, longitude, "longitude {} is not a finite number of degrees")
 
 
-def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> None:
+def check_box(latitude: tuple[float, ...], longitude: tuple[float, ...], name: str = "") -> None:
     """Raise unless a latitude-longitude box is finite, not empty, and rises from south to north and west to east.
 
     Args:
         latitude: southern and northern edge [deg].
         longitude: western and eastern edge [deg]; (170, 190) crosses the antimeridian.
+        name: name of the box in messages, such as " of box 3".
 
     Raises:
         ValueError: with the values.
@@ -352,13 +353,12 @@ def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> 
             ...
         ValueError: latitudes (0, -10) must rise from south to north within [-90, 90] degrees
     """
-    check_numbers(2, latitudes=latitude, longitudes=longitude)
-    south, north = latitude
-    west, east = longitude
-    if not (-90 <= south < north <= 90):
-        raise ValueError(f"latitudes {latitude} must rise from south to north within [-90, 90] degrees")
-    if not (math.isfinite(west) and math.isfinite(east) and west < east <= west + 360):
+    check_numbers(2, **{f"latitudes{name}": latitude, f"longitudes{name}": longitude})
+    (south, north), (west, east) = latitude, longitude
+    if not -90 <= south < north <= 90:
+        raise ValueError(f"latitudes {latitude}{name} must rise from south to north within [-90, 90] degrees")
+    if not west < east <= west + 360:
         raise ValueError(
-            f"longitudes {longitude} must rise from west to east by at most 360 degrees "
+            f"longitudes {longitude}{name} must rise from west to east by at most 360 degrees "
             "(write a box across the antimeridian as, for example, (170, 190))"
         )
