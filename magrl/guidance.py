@@ -124,8 +124,8 @@ def proximity_reward(
         tensor(10.)
     """
     check_tensor(objective_before=objective_before, objective_after=objective_after)
+    check_number(0, above=True, optional=True, limit=limit)
     if limit is not None:
-        check_number(0, above=True, limit=limit)
         objective_before, objective_after = objective_before.clamp(max=limit), objective_after.clamp(max=limit)
     return -weight * (objective_after - objective_before)
 
@@ -151,8 +151,7 @@ def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
         tensor([ 4.0000,  0.8000, -7.2000])
     """
     check_tensor(proximity=proximity, step=step)
-    if not max_steps >= 1:
-        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    check_number(1, max_steps=max_steps)
     late = step > max_steps / 2
     return proximity - late * (step.to(proximity.dtype) / max_steps) * proximity.abs()
 

@@ -11,7 +11,6 @@ from support.field_checks import f64
 from torch import Tensor
 
 from magrl.field import FieldBank, RegionalField, SphericalHarmonicField, igrf_coefficients, random_planets
-from magrl.geodesy import curvature_radii
 
 ROUNDING_NT = 1e-8
 TOLERANCE_NT = 1e-3
@@ -78,18 +77,6 @@ def test_each_expansion_is_its_planet_at_any_turn(bank: FieldBank, planets: Tens
         assert (gradient[here] - expected[1]).abs().max() < 1e-5 * expected[1].abs().max(), box
 
 
-def test_the_gradient_is_that_of_the_expansion(bank: FieldBank) -> None:
-    """What autograd finds per degree."""
-    latitude, longitude, index = inside(50)
-    gradient = bank.value_and_gradient(latitude, longitude, index)[1]
-    meridian, prime_vertical = curvature_radii(latitude)
-    km = torch.deg2rad(torch.stack((meridian, prime_vertical * torch.cos(torch.deg2rad(latitude)))))
-    place = latitude.requires_grad_(), longitude.requires_grad_()
-    for component in range(3):
-        slopes = torch.autograd.grad(bank(*place, index)[:, component].sum(), place)
-        torch.testing.assert_close(torch.stack(slopes) / km, gradient[:, component].T, rtol=1e-9, atol=1e-9)
-
-
 def test_a_box_on_a_pole_and_a_whole_turn(planets: Tensor) -> None:
     edges = f64(80, 90, 0, 5).view(2, 2), f64(-20, 20, -180, 180).view(2, 2)
     bank = FieldBank.build(planets, torch.tensor([1, 2]), *edges, degree=60)
@@ -113,19 +100,6 @@ def test_the_edges_belong_to_the_box_and_beyond_is_nan(bank: FieldBank) -> None:
     ):
         for found in (bank(latitude, longitude, index), *bank.value_and_gradient(latitude, longitude, index)):
             assert found.isnan().all()
-
-
-def test_shapes_and_dtypes(bank: FieldBank) -> None:
-    for shape in ((), (3,), (2, 3), (2, 0)):
-        for dtype in (torch.float32, torch.float64):
-            place = torch.full(shape, -5.0, dtype=dtype), torch.full(shape, 175.0, dtype=dtype)
-            value, gradient = bank.value_and_gradient(*place, torch.zeros(shape, dtype=torch.int64))
-            assert value.shape == (*shape, 3)
-            assert gradient.shape == (*shape, 3, 2)
-            assert value.dtype == gradient.dtype == torch.float64
-    both = bank(f64(5.0), f64(175.0), torch.tensor([0, 5]))
-    assert both.shape == (2, 3)
-    assert (both[0] != both[1]).any()
 
 
 def test_chunks_do_not_show_and_a_bank_is_compiled_whole(bank: FieldBank) -> None:

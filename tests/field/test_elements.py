@@ -1,6 +1,5 @@
 """The magnetic elements of Eq. 2-1: signs, limits, inverse and Jacobian."""
 
-import itertools
 import math
 
 import pytest
@@ -67,12 +66,6 @@ def test_angles_on_the_axes(b_ned, declination, inclination):
     assert measured_elements(f64(*b_ned))[:2].tolist() == pytest.approx([declination, inclination], abs=1e-13)
 
 
-def test_no_field_at_all_is_no_nan():
-    nothing = torch.zeros(3, dtype=torch.float64)
-    assert torch.equal(torch.stack(seven_elements(nothing)), torch.zeros(7, dtype=torch.float64))
-    assert torch.equal(elements_jacobian(nothing), torch.zeros(3, 3, dtype=torch.float64))
-
-
 def test_paper_example_has_a_negative_inclination():
     """2 S, 162 E in the paper: D 8.019, I -16.150, B_H 35467.990."""
     found = measured_elements(field_vector(f64(8.019, -16.150, 35467.990)))
@@ -100,25 +93,13 @@ def test_jacobian_matches_autograd(differentiate):
     assert ((elements_jacobian(b_ned) - expected).abs() / row).max() < 1e-12
 
 
-def test_jacobian_at_a_magnetic_pole_is_zero_where_it_is_undefined():
-    """The rows of D and B_H have no direction there; a change of B_z alone changes no element."""
-    jacobian = elements_jacobian(f64(0.0, 0.0, 5e4))
-    assert torch.isfinite(jacobian).all()
+@pytest.mark.parametrize("down", [0.0, 5e4])
+def test_without_a_horizontal_field_no_derivative_is_nan(down):
+    """The rows of D and B_H, which have no direction there, are zero; a change of B_z alone changes no element."""
+    jacobian = elements_jacobian(f64(0.0, 0.0, down))
+    assert jacobian.isfinite().all()
     assert torch.equal(jacobian[[0, 2]], torch.zeros(2, 3, dtype=torch.float64))
     assert torch.equal(jacobian[:, 2], torch.zeros(3, dtype=torch.float64))
-
-
-def test_gradient_is_the_chain_rule():
-    """The elements of B + G d, differentiated in d."""
-    b_ned, gradient = random_fields(50, seed=3), random_fields(50, 2, seed=4).mT / 1e3
-
-    def along(d, b, g):
-        return measured_elements(b + g @ d)
-
-    origin = torch.zeros(50, 2, dtype=torch.float64)
-    expected = torch.func.vmap(torch.func.jacrev(along))(origin, b_ned, gradient)
-    found = elements_gradient(b_ned, gradient)
-    assert ((found - expected).abs() / expected.abs().amax(-1, keepdim=True)).max() < 1e-12
 
 
 def test_gradient_worked_by_hand():
@@ -130,25 +111,6 @@ def test_gradient_worked_by_hand():
     expected[0, 1] = math.degrees(1 / 100)  # D turns by dB_y / B_H
     expected[1, 0] = math.degrees(2 * 100 / (100**2 + 100**2))  # I by B_H dB_z / B_F^2
     torch.testing.assert_close(found, expected, rtol=1e-14, atol=0)
-
-
-def test_shapes_and_dtypes():
-    for shape, dtype in itertools.product(SHAPES, DTYPES):
-        check_shapes_and_dtypes(shape, dtype)
-
-
-def check_shapes_and_dtypes(shape, dtype):
-    b_ned = random_fields(*shape, seed=5).to(dtype)
-    gradient = torch.ones(*shape, 3, 2, dtype=dtype)
-    outputs = {
-        (*shape, 3): (measured_elements(b_ned), field_vector(measured_elements(b_ned))),
-        (*shape, 3, 3): (elements_jacobian(b_ned),),
-        (*shape, 3, 2): (elements_gradient(b_ned, gradient),),
-        shape: seven_elements(b_ned),
-    }
-    for expected, found in outputs.items():
-        assert {x.shape for x in found} == {torch.Size(expected)}
-        assert {x.dtype for x in found} == {dtype}
 
 
 def test_measured_elements_are_the_first_three():

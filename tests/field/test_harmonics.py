@@ -88,18 +88,6 @@ def test_derivative_tables_worked_by_hand(degree, potential_entries, along_x, al
     torch.testing.assert_close(meaningful(found), expected, rtol=0, atol=1e-14)
 
 
-def test_entries_that_mean_nothing_are_ignored():
-    clean = random_table(4, 1)
-    soiled = clean + torch.triu(torch.full_like(clean, 7 - 5j), diagonal=1)
-    soiled[:, 0] += 3j  # there is no sine of order 0
-    torch.testing.assert_close(differentiate(soiled), differentiate(clean), rtol=0, atol=0)
-
-
-def test_derivatives_commute():
-    twice = meaningful(differentiate(differentiate(random_table(5, 2))))
-    torch.testing.assert_close(twice, twice.transpose(0, 1), rtol=1e-13, atol=1e-13)
-
-
 # --- basis ------------------------------------------------------------------------------------------------------------
 
 

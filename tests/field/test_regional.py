@@ -7,7 +7,6 @@ import torch
 from support.field_checks import f64, relative_error
 
 from magrl.field.igrf import IGRF
-from magrl.field.model import elements_at, elements_gradient_at
 from magrl.field.regional import RegionalField
 from magrl.geodesy import curvature_radii
 
@@ -81,12 +80,6 @@ def test_the_edges_belong_to_the_box_however_they_round(igrf):
         assert field(f64(*latitude), f64(*longitude)).isfinite().all(), (latitude, longitude)
 
 
-def test_region_with_a_geographic_pole_on_its_edge(igrf):
-    field = RegionalField(igrf, (80.0, 90.0), (-20.0, 20.0))
-    latitude, longitude = f64(81.0, 89.0, 90.0), f64(-19.0, 3.0, 10.0)
-    torch.testing.assert_close(field(latitude, longitude), igrf(latitude, longitude), rtol=0, atol=1e-3)
-
-
 @pytest.mark.parametrize("model", ["igrf", "region"])
 def test_shapes_and_dtypes_of_models(model, request):
     field = request.getfixturevalue(model)
@@ -147,14 +140,6 @@ def test_an_error_above_the_tolerance_raises(igrf, degree, tolerance_nt):
 def test_bad_boxes_and_settings_raise(igrf, options, message):
     with pytest.raises(ValueError, match=message):
         RegionalField(igrf, **{"latitude": (-10, 0), "longitude": (160, 170)} | options)
-
-
-def test_elements_at_positions(region):
-    position = f64(-8.0, 164.0).expand(2, 3, 2)
-    elements, gradient = elements_at(region, position), elements_gradient_at(region, position)
-    assert elements.shape == (2, 3, 3)
-    assert gradient.shape == (2, 3, 3, 2)
-    assert elements[1, 2].tolist() == pytest.approx([9.228, -26.923, 35199.415], abs=1.5)
 
 
 def test_a_region_survives_a_state_dict(region):

@@ -9,9 +9,8 @@ import torch
 from support.field_checks import central_differences, f64, globe, relative_error
 from torch import nn
 
-from magrl.field.elements import measured_elements, seven_elements
+from magrl.field.elements import seven_elements
 from magrl.field.igrf import IGRF, igrf_coefficients
-from magrl.field.model import elements_gradient_at
 from magrl.field.spherical import SphericalHarmonicField
 from magrl.geodesy import REFERENCE_RADIUS_KM, WGS84_A_KM, WGS84_B_KM
 
@@ -82,13 +81,6 @@ def test_gradient_matches_central_differences(igrf, altitude_km):
     assert_same(value, model(latitude, longitude))
 
 
-def test_gradient_of_the_elements_matches_central_differences(igrf):
-    latitude, longitude = globe(300, 3, highest_latitude=60)
-    expected = central_differences(lambda lat, lon: measured_elements(igrf(lat, lon)), latitude, longitude)
-    found = elements_gradient_at(igrf, torch.stack((latitude, longitude), -1))
-    assert ((found - expected).abs() / expected.abs().amax(-1, keepdim=True)).max() < 1e-8
-
-
 @pytest.mark.parametrize("pole", [90.0, -90.0])
 def test_a_pole_is_an_ordinary_point(igrf, pole):
     """The field is the same from every side; turning the meridian of north by 90 degrees turns its components."""
@@ -101,14 +93,6 @@ def test_a_pole_is_an_ordinary_point(igrf, pole):
     beside = igrf(latitude * (1 - 1e-8), longitude)
     torch.testing.assert_close(beside, field, rtol=0, atol=0.01)  # a tenth of a meter away
     assert all(x.isfinite().all() for x in igrf.value_and_gradient(latitude, longitude))
-
-
-def test_the_antimeridian_is_no_seam(igrf):
-    latitude = torch.linspace(-89, 89, 30, dtype=torch.float64).unsqueeze(-1)
-    value, gradient = igrf.value_and_gradient(latitude, f64(180.0, -180.0, 540.0))
-    for other in (1, 2):
-        assert_same(value[:, other], value[:, 0])
-        assert_same(gradient[:, other], gradient[:, 0])
 
 
 def test_altitudes_broadcast_and_chunks_do_not_show(igrf):
