@@ -1,4 +1,4 @@
-"""Nothing that a vehicle acts by depends on what it cannot know: the private keys of the environment and of the errors."""
+"""Actions and observations do not depend on the private keys of the environment and of the errors."""
 
 from __future__ import annotations
 
