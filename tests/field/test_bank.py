@@ -129,14 +129,6 @@ def test_another_device_and_a_cast_keep_float64(bank: FieldBank) -> None:
     assert (value.device.type, value.shape, gradient.shape) == ("meta", (10, 3), (10, 3, 2))
 
 
-def test_a_bank_survives_a_state_dict(bank: FieldBank, planets: Tensor) -> None:
-    places = inside(10)
-    other = FieldBank.build(planets.flip(0), PLANET, *boxes(f64(*range(6)), f64(*range(6)), 10.0, 10.0))
-    other.load_state_dict(bank.state_dict())
-    assert torch.equal(other(*places), bank(*places))
-    assert set(bank.state_dict()) == {"coefficients", "scaling", "error_nt"}
-
-
 def test_a_bank_of_given_coefficients() -> None:
     expansion = torch.zeros(1, 3, 2, 2)
     expansion[0, 2, 1, 0], expansion[0, 1, 0, 1] = 5.0, 7.0  # down rises northward, east rises eastward

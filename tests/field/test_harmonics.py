@@ -160,20 +160,6 @@ def test_separated_weights_give_what_the_basis_gives(degree):
     )
 
 
-def test_products_and_waves_worked_by_hand():
-    """At twice the reference radius, 60 degrees from the pole, 30 degrees east; degree 3."""
-    a, root = REFERENCE_RADIUS_KM, math.sqrt(3)
-    at = torch.tensor([[root * a], [a], [root / 2], [0.5]], dtype=torch.float64)
-    features, lift = products(at[0], at[1], 3)
-    # (a/r)^(i+1) cos(60 i), i = 0 to 3; then two more powers of a/r for i = 0 and 1
-    expected = [0.5, 0.25 / 2, -0.125 / 2, -0.0625, 0.125, 0.0625 / 2]
-    torch.testing.assert_close(features.squeeze(-1), torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-15)
-    assert lift.item() == pytest.approx(root / 4, abs=1e-15)  # (a/r) sin 60
-    sines_then_cosines = [0.5 * 10, root / 2, 10.0, 1.0, root / 2 * 10, 0.5, 0.0]
-    found = waves(at[2], at[3], torch.full_like(lift, 10.0), 3).squeeze(-1)
-    torch.testing.assert_close(found, torch.tensor(sines_then_cosines, dtype=torch.float64), rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize("flattening", [0.0, 1 / 298.257])
 def test_weights_on_a_surface(flattening):
     """A spheroid about as flat as the Earth needs 12 polynomials beyond the degree, a sphere none."""

@@ -39,15 +39,6 @@ def test_the_spectrum_is_the_earth_s(planets: Tensor) -> None:
     assert (standard_error < 0.02).all()
 
 
-def test_every_coefficient_of_a_degree_has_the_same_variance(planets: Tensor) -> None:
-    for n in range(2, 14):
-        square = coefficients(planets, n).square()
-        expected = 1.25 * power_spectrum(EARTH)[n] / ((n + 1) * (2 * n + 1))
-        error = (square.mean(0) - expected) / (square.std(0) / math.sqrt(COUNT))
-        assert error.abs().max() < 4.5, n
-        assert coefficients(planets, n).mean(0).abs().max() < 4.5 * math.sqrt(expected / COUNT), n
-
-
 def test_the_power_of_a_degree_varies_by_planet_and_degree(planets: Tensor) -> None:
     """At a high degree, the factor of 0.5 to 2 is most of the variance of the power: 0.1875 + 2 (1.75) / (2n + 1)."""
     ratio = power_spectrum(planets)[:, 1:] / power_spectrum(EARTH)[1:]

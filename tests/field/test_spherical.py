@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from support.field_checks import central_differences, f64, globe, relative_error
-from torch import nn
 
 from magrl.field.elements import seven_elements
 from magrl.field.igrf import IGRF, igrf_coefficients
@@ -104,14 +103,6 @@ def test_altitudes_broadcast_and_chunks_do_not_show(igrf):
     for one, other in zip(found, expected, strict=True):
         assert_same(one, other)
     assert_same(found[0][2], igrf(latitude, longitude, 600.0))
-
-
-@pytest.mark.parametrize("cast", [lambda m: m.to(torch.float32), nn.Module.half], ids=["to", "half"])
-def test_a_cast_to_lower_precision_keeps_float64(cast):
-    field, position = IGRF("2022-01-01", 13), (f64(-8.0), f64(164.0))
-    before = field(*position)
-    assert cast(field) is field
-    assert torch.equal(field(*position), before)
 
 
 @pytest.mark.parametrize(
