@@ -248,6 +248,9 @@ def test_geodesic_of_whole_degrees_is_not_cut_to_whole_kilometers():
     distance, bearing = geodesic(*torch.tensor([0, 0, 0, 1]))
     assert float(distance) == pytest.approx(111.319491, abs=1e-4)
     assert float(bearing) == pytest.approx(math.pi / 2, abs=1e-6)
+    single, double = torch.ones(2), f64(1.0, 2.0)
+    for inputs in ((double, single, single, single), (single, single, single, double)):
+        assert [x.dtype for x in geodesic(*inputs)] == [torch.float64, torch.float64]
 
 
 @pytest.mark.parametrize("place", [0, 1, 2, 3])
