@@ -14,7 +14,6 @@ from magrl.field.harmonics import (
     differentiate,
     field_table,
     gradient_table,
-    on_surface,
     products,
     separate,
     waves,
@@ -158,28 +157,6 @@ def test_separated_weights_give_what_the_basis_gives(degree):
     torch.testing.assert_close(
         separated(weights, degree, ecef), weights @ basis(ecef, degree), rtol=0, atol=1e-12 * degree**2
     )
-
-
-@pytest.mark.parametrize("flattening", [0.0, 1 / 298.257])
-def test_weights_on_a_surface(flattening):
-    """A spheroid about as flat as the Earth needs 12 polynomials beyond the degree, a sphere none."""
-    degree, count = 8, 9 if flattening == 0 else 21
-    weights = separate(field_table(random_table(degree - 1, 15)), degree)
-
-    def spheroid(parametric):
-        shape = torch.stack((parametric.cos(), (1 - flattening) * parametric.sin()))
-        return REFERENCE_RADIUS_KM * shape
-
-    angles, _ = chebyshev_nodes(count)
-    short = on_surface(weights, *spheroid(math.pi / 2 - angles))
-    assert short.shape == (3, 2 * degree + 1, count)
-    generator = torch.Generator().manual_seed(16)
-    latitude, longitude = torch.rand(2, 100, generator=generator, dtype=torch.float64) * 3 - 1.5
-    features, lift = products(*spheroid(latitude), degree)
-    expected = contract(weights, features, waves(longitude.cos(), longitude.sin(), lift, degree))
-    orders = waves(longitude.cos(), longitude.sin(), latitude.cos(), degree)
-    found = contract(short, chebyshev(latitude.sin(), count), orders)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize("count", [2, 3, 8, 27])
