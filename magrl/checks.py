@@ -95,7 +95,13 @@ def check_tensor(*last: int, **tensors: object) -> None:
 
 
 def check_number(
-    low: float = -math.inf, high: float = math.inf, *, above: bool = False, whole: bool = False, **numbers: object
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    above: bool = False,
+    whole: bool = False,
+    optional: bool = False,
+    **numbers: object,
 ) -> None:
     """Raise unless each value is a finite number from ``low`` to ``high``.
 
@@ -104,6 +110,7 @@ def check_number(
         high: largest allowed value.
         above: whether ``low`` itself is excluded.
         whole: whether the number must be an integer.
+        optional: whether None is allowed.
         numbers: values by the name that the message uses.
 
     Raises:
@@ -115,12 +122,19 @@ def check_number(
         ValueError: num_envs must be a whole number from 1 on, got 1.5
     """
     for name, value in numbers.items():
-        number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
-        if not number or not math.isfinite(value) or not low <= value <= high or (above and value == low):  # type: ignore
+        if optional and value is None:
+            continue
+        sound = _is_finite(value, Integral if whole else Real) and low <= value <= high  # type: ignore[operator]
+        if not sound or (above and value == low):
             kind = "a whole number" if whole else "a finite number"
             start = "" if low == -math.inf else f" {'above' if above else 'from'} {low:g}"
             end = f" up to {high:g}" if high < math.inf else " on" if start and not above else ""
             raise ValueError(f"{name} must be {kind}{start}{end}, got {value!r}")
+
+
+def _is_finite(value: object, kind: type = Real) -> bool:
+    """Return whether a value is a finite number of a kind, and not a bool."""
+    return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
 
 
 def check_numbers(count: int, **values: object) -> None:
@@ -136,8 +150,7 @@ def check_numbers(count: int, **values: object) -> None:
     """
     for name, value in values.items():
         given = list(value) if isinstance(value, Iterable) else []
-        sound = all(isinstance(x, Real) and not isinstance(x, bool) and math.isfinite(x) for x in given)
-        if len(given) != count or not sound:
+        if len(given) != count or not all(map(_is_finite, given)):
             raise ValueError(f"{name} must be {count} finite numbers, got {value!r}")
 
 

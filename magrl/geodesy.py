@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from functools import reduce
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -82,9 +83,13 @@ def wrap_angle(angle: Tensor) -> Tensor:
         tensor([-0.5000,  1.0000])
     """
     check_tensor(angle=angle)
-    wrapped = math.pi - torch.remainder(math.pi - angle, 2 * math.pi)
+    return _wrap(angle, math.pi)
+
+
+def _wrap(value: Tensor, half: float) -> Tensor:
+    wrapped = half - torch.remainder(half - value, 2 * half)
     # In float32 the remainder of a tiny negative number rounds up to the full turn.
-    return torch.where(wrapped <= -math.pi, wrapped + 2 * math.pi, wrapped)
+    return torch.where(wrapped <= -half, wrapped + 2 * half, wrapped)
 
 
 def wrap_longitude(longitude: Tensor) -> Tensor:
@@ -101,8 +106,7 @@ def wrap_longitude(longitude: Tensor) -> Tensor:
         tensor([-179.,  180.,  180.])
     """
     check_tensor(longitude=longitude)
-    wrapped = 180 - torch.remainder(180 - longitude, 360)
-    return torch.where(wrapped <= -180, wrapped + 360, wrapped)
+    return _wrap(longitude, 180.0)
 
 
 def curvature_radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,32 +178,14 @@ def to_ecef(latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float = 0
     return torch.stack(parts, -1)
 
 
-def from_ecef_surface(ecef: Tensor) -> tuple[Tensor, Tensor]:
-    """Return geodetic latitude and longitude of points on or very near the ellipsoid.
+def _surface_latitude(horizontal: Tensor, z: Tensor) -> Tensor:
+    """Return the latitude [deg] of a point on the ellipsoid from its distances to axis and equatorial plane [km].
 
-    One step of Bowring's method (1976): exact on the surface and within 1e-9 degrees for heights below 10 km.
-
-    Args:
-        ecef: ``(..., 3)`` [km].
-
-    Returns:
-        Latitude and longitude, each ``(...)`` [deg], the longitude in [-180, 180].
+    One step of Bowring's method: exact on the surface, and within 1e-9 degrees for heights below 10 km.
 
     Source:
         B. R. Bowring, Transformation from spatial to geographical coordinates, Survey Review 23 (1976).
-
-    Example:
-        >>> lat, lon = from_ecef_surface(to_ecef(torch.tensor(-8.0), torch.tensor(164.0)))
-        >>> round(float(lat), 3), round(float(lon), 3)
-        (-8.0, 164.0)
     """
-    check_tensor(3, ecef=ecef)
-    x, y, z = ecef.unbind(-1)
-    return _surface_latitude(torch.hypot(x, y), z), torch.rad2deg(torch.atan2(y, x))
-
-
-def _surface_latitude(horizontal: Tensor, z: Tensor) -> Tensor:
-    """Return the latitude [deg] of a point on the ellipsoid from its distances to axis and equatorial plane [km]."""
     up, out = z * WGS84_A_KM, horizontal * WGS84_B_KM
     scale = torch.hypot(up, out)
     top = z + WGS84_E2 / (1 - WGS84_E2) * WGS84_B_KM * (up / scale) ** 3
@@ -277,40 +263,65 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
     inputs = (latitude1, longitude1, latitude2, longitude2)
     check_tensor(latitude1=latitude1, longitude1=longitude1, latitude2=latitude2, longitude2=longitude2)
     for latitude in (latitude1, latitude2):
-        beyond = latitude.abs() > 90
-        if beyond.any():
-            raise ValueError(f"latitude {latitude[beyond][0].item()} is not between -90 and 90 degrees")
+        require(~(latitude.abs() > 90), latitude, "latitude {} is not between -90 and 90 degrees")
     lat1, lon1, lat2, lon2 = (torch.deg2rad(x.double()) for x in torch.broadcast_tensors(*inputs))
     u1, u2 = (torch.atan2((1 - WGS84_F) * torch.sin(lat), torch.cos(lat)) for lat in (lat1, lat2))
-    su1, cu1, su2, cu2 = torch.sin(u1), torch.cos(u1), torch.sin(u2), torch.cos(u2)
+    ends = torch.sin(u1), torch.cos(u1), torch.sin(u2), torch.cos(u2)
     difference = wrap_angle(lon2 - lon1)
-    lam, change = difference, torch.zeros_like(difference)
+    lam = difference
     for _ in range(30):
-        # atan2 is accurate for tiny arcs, where the cosine alone is not.
-        x, y = cu2 * torch.sin(lam), cu1 * su2 - su1 * cu2 * torch.cos(lam)
-        sin_sigma = torch.hypot(x, y)
-        cos_sigma = su1 * su2 + cu1 * cu2 * torch.cos(lam)
-        sigma = torch.atan2(sin_sigma, cos_sigma)
-        sin_alpha = cu1 * cu2 * torch.sin(lam) / sin_sigma.clamp_min(1e-300)
-        cos2_alpha = (1 - sin_alpha**2).clamp_min(0)
-        mid = cos_sigma - 2 * su1 * su2 / cos2_alpha.clamp_min(1e-15)
-        mid = torch.where(cos2_alpha < 1e-14, torch.zeros_like(mid), mid)  # an equatorial line has no midpoint term
-        c = WGS84_F / 16 * cos2_alpha * (4 + WGS84_F * (4 - 3 * cos2_alpha))
-        series = sigma + c * sin_sigma * (mid + c * cos_sigma * (2 * mid**2 - 1))
-        previous, lam = lam, difference + (1 - c) * WGS84_F * sin_alpha * series
+        arc = _auxiliary_arc(lam, *ends)
+        previous, lam = lam, difference + _longitude_excess(arc)
         change = (lam - previous).abs()
         if bool((change < 1e-12).all()):
             break
-    k = cos2_alpha * (WGS84_A_KM**2 / WGS84_B_KM**2 - 1)
+    converged = (change < 1e-11) & (lam.abs() <= math.pi)
+    dtype = reduce(torch.promote_types, (x.dtype for x in inputs), torch.float32)
+    found = _arc_length(arc), wrap_angle(torch.atan2(arc.east, arc.north))
+    distance, bearing = (torch.where(converged, x, torch.nan).to(dtype) for x in found)
+    return distance, bearing
+
+
+class _Arc(NamedTuple):
+    """A great circle's arc on Vincenty's auxiliary sphere."""
+
+    east: Tensor  # components of its direction at the start, times its sine
+    north: Tensor
+    sigma: Tensor  # angular length
+    sin: Tensor
+    cos: Tensor
+    sin_alpha: Tensor  # of the azimuth at the equator
+    cos2_alpha: Tensor
+    mid: Tensor  # cosine of twice the distance of its midpoint from the equator
+
+
+def _auxiliary_arc(lam: Tensor, su1: Tensor, cu1: Tensor, su2: Tensor, cu2: Tensor) -> _Arc:
+    """Return the arc between reduced latitudes, of sines ``su`` and cosines ``cu``, that are ``lam`` apart [rad]."""
+    # atan2 is accurate for tiny arcs, where the cosine alone is not.
+    east, north = cu2 * torch.sin(lam), cu1 * su2 - su1 * cu2 * torch.cos(lam)
+    sin, cos = torch.hypot(east, north), su1 * su2 + cu1 * cu2 * torch.cos(lam)
+    sin_alpha = cu1 * cu2 * torch.sin(lam) / sin.clamp_min(1e-300)
+    cos2_alpha = (1 - sin_alpha**2).clamp_min(0)
+    mid = cos - 2 * su1 * su2 / cos2_alpha.clamp_min(1e-15)
+    mid = torch.where(cos2_alpha < 1e-14, torch.zeros_like(mid), mid)  # an equatorial line has no midpoint term
+    return _Arc(east, north, torch.atan2(sin, cos), sin, cos, sin_alpha, cos2_alpha, mid)
+
+
+def _longitude_excess(arc: _Arc) -> Tensor:
+    """Return by how much the longitude on the auxiliary sphere exceeds that on the ellipsoid (Vincenty's Eq. 11)."""
+    c = WGS84_F / 16 * arc.cos2_alpha * (4 + WGS84_F * (4 - 3 * arc.cos2_alpha))
+    series = arc.sigma + c * arc.sin * (arc.mid + c * arc.cos * (2 * arc.mid**2 - 1))
+    return (1 - c) * WGS84_F * arc.sin_alpha * series
+
+
+def _arc_length(arc: _Arc) -> Tensor:
+    """Return the length of an arc on the ellipsoid [km] (Vincenty's Eqs. 3, 4, 6 and 19)."""
+    k = arc.cos2_alpha * (WGS84_A_KM**2 / WGS84_B_KM**2 - 1)
     a = 1 + k / 16384 * (4096 + k * (-768 + k * (320 - 175 * k)))
     b = k / 1024 * (256 + k * (-128 + k * (74 - 47 * k)))
-    inner = cos_sigma * (2 * mid**2 - 1) - b / 6 * mid * (4 * sin_sigma**2 - 3) * (4 * mid**2 - 3)
-    distance = WGS84_B_KM * a * (sigma - b * sin_sigma * (mid + b / 4 * inner))
-    converged = (change < 1e-11) & (lam.abs() <= math.pi)
-    nan = torch.full_like(distance, float("nan"))
-    bearing = wrap_angle(torch.atan2(x, y))
-    dtype = reduce(torch.promote_types, (x.dtype for x in inputs), torch.float32)
-    return torch.where(converged, distance, nan).to(dtype), torch.where(converged, bearing, nan).to(dtype)
+    mid = arc.mid
+    inner = arc.cos * (2 * mid**2 - 1) - b / 6 * mid * (4 * arc.sin**2 - 3) * (4 * mid**2 - 3)
+    return WGS84_B_KM * a * (arc.sigma - b * arc.sin * (mid + b / 4 * inner))
 
 
 def check_positions(latitude: Tensor, longitude: Tensor) -> None:
@@ -335,12 +346,13 @@ def check_positions(latitude: Tensor, longitude: Tensor) -> None:
     require(longitude.abs() < math.inf, longitude, "longitude {} is not a finite number of degrees")
 
 
-def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> None:
+def check_box(latitude: tuple[float, ...], longitude: tuple[float, ...], name: str = "") -> None:
     """Raise unless a latitude-longitude box is finite, not empty, and rises from south to north and west to east.
 
     Args:
         latitude: southern and northern edge [deg].
         longitude: western and eastern edge [deg]; (170, 190) crosses the antimeridian.
+        name: name of the box in messages, such as " of box 3".
 
     Raises:
         ValueError: with the values.
@@ -352,13 +364,12 @@ def check_box(latitude: tuple[float, float], longitude: tuple[float, float]) -> 
             ...
         ValueError: latitudes (0, -10) must rise from south to north within [-90, 90] degrees
     """
-    check_numbers(2, latitudes=latitude, longitudes=longitude)
-    south, north = latitude
-    west, east = longitude
-    if not (-90 <= south < north <= 90):
-        raise ValueError(f"latitudes {latitude} must rise from south to north within [-90, 90] degrees")
-    if not (math.isfinite(west) and math.isfinite(east) and west < east <= west + 360):
+    check_numbers(2, **{f"latitudes{name}": latitude, f"longitudes{name}": longitude})
+    (south, north), (west, east) = latitude, longitude
+    if not -90 <= south < north <= 90:
+        raise ValueError(f"latitudes {latitude}{name} must rise from south to north within [-90, 90] degrees")
+    if not west < east <= west + 360:
         raise ValueError(
-            f"longitudes {longitude} must rise from west to east by at most 360 degrees "
+            f"longitudes {longitude}{name} must rise from west to east by at most 360 degrees "
             "(write a box across the antimeridian as, for example, (170, 190))"
         )

@@ -124,8 +124,8 @@ def proximity_reward(
         tensor(10.)
     """
     check_tensor(objective_before=objective_before, objective_after=objective_after)
+    check_number(0, above=True, optional=True, limit=limit)
     if limit is not None:
-        check_number(0, above=True, limit=limit)
         objective_before, objective_after = objective_before.clamp(max=limit), objective_after.clamp(max=limit)
     return -weight * (objective_after - objective_before)
 
@@ -151,8 +151,7 @@ def late_decay(proximity: Tensor, step: Tensor, max_steps: int) -> Tensor:
         tensor([ 4.0000,  0.8000, -7.2000])
     """
     check_tensor(proximity=proximity, step=step)
-    if not max_steps >= 1:
-        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    check_number(1, whole=True, max_steps=max_steps)
     late = step > max_steps / 2
     return proximity - late * (step.to(proximity.dtype) / max_steps) * proximity.abs()
 
@@ -198,7 +197,7 @@ def parallel_approach(
         input is NaN.
 
     Raises:
-        ValueError: for shapes that do not match, or a crossing angle outside [0, pi/2).
+        ValueError: for shapes that do not match, or a crossing angle outside [0, pi/2].
 
     Source:
         Eqs. 3-12 to 3-15, after the bionic navigation of Wang et al. (2018).
@@ -211,8 +210,7 @@ def parallel_approach(
     """
     check_tensor(2, field=field, target_field=target_field)
     check_tensor(2, 2, gradient=gradient)
-    if not 0 <= min_crossing < math.pi / 2:
-        raise ValueError(f"min_crossing must be in [0, pi/2), got {min_crossing}")
+    check_number(0, math.pi / 2, min_crossing=min_crossing)
     (g1n, g1e), (g2n, g2e) = (row.unbind(-1) for row in gradient.unbind(-2))
     e1, e2 = (target_field - field).unbind(-1)
     determinant = g1n * g2e - g1e * g2n

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
 torch.set_num_threads(1)
 
 # Every run checks the same examples, so that a failure is a change in the code. HYPOTHESIS_PROFILE=search draws others.
-settings.register_profile("ci", derandomize=True, max_examples=50, deadline=None, database=None)
+settings.register_profile("ci", derandomize=True, max_examples=25, deadline=None, database=None)
 settings.register_profile("search", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 

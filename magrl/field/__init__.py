@@ -1,7 +1,6 @@
-"""Models of the geomagnetic field: IGRF, spherical harmonics, the crust, and fast regional expansions of each."""
+"""Models of the geomagnetic field: IGRF, WMMHR, spherical harmonics, and fast regional expansions of each."""
 
 from magrl.field.bank import FieldBank
-from magrl.field.crust import CrustedField, RandomCrust, crustal_spectrum
 from magrl.field.igrf import IGRF, Date, igrf_coefficients, parse_date
 from magrl.field.model import FieldModel, elements_at, elements_gradient_at, elements_range
 from magrl.field.planets import random_planets
@@ -14,15 +13,12 @@ __all__ = [
     "IGRF",
     "WEATHER",
     "WMMHR",
-    "CrustedField",
     "Date",
     "FieldBank",
     "FieldModel",
-    "RandomCrust",
     "RegionalField",
     "SphericalHarmonicField",
     "WeatherRecord",
-    "crustal_spectrum",
     "elements_at",
     "elements_gradient_at",
     "elements_range",

@@ -42,20 +42,20 @@ _DIGITS = {"deg": 6, "nT": 4, "km": 9}
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    made = argparse.ArgumentParser(
+    command = argparse.ArgumentParser(
         prog="python -m magrl.field", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    made.add_argument("points", type=Path, help="table of the points: .csv or .parquet")
-    made.add_argument("--out", type=Path, help="result: .csv or .parquet; by default beside the points, with _field")
+    command.add_argument("points", type=Path, help="table of the points: .csv or .parquet")
+    command.add_argument("--out", type=Path, help="result: .csv or .parquet; by default beside the points, with _field")
     for name, meaning in (("latitude", "geodetic latitude [deg]"), ("longitude", "longitude [deg]")):
-        made.add_argument(f"--{name}", default=name, help=f"column of the {meaning}, or a number; default {name}")
-    height = made.add_mutually_exclusive_group()
+        command.add_argument(f"--{name}", default=name, help=f"column of the {meaning}, or a number; default {name}")
+    height = command.add_mutually_exclusive_group()
     height.add_argument("--altitude", help="column of the altitude above the ellipsoid, or a number; default altitude")
     height.add_argument("--depth", help="column of the depth below the ellipsoid, or a number; default depth")
-    made.add_argument("--unit", choices=UNITS_KM, default="km", help="unit of altitude or depth; default km")
-    made.add_argument("--date", default="date", help="column of the date, or a date; default date")
-    made.add_argument("--generation", type=int, choices=(13, 14), default=14, help="generation of IGRF; default 14")
-    return made
+    command.add_argument("--unit", choices=UNITS_KM, default="km", help="unit of altitude or depth; default km")
+    command.add_argument("--date", default="date", help="column of the date, or a date; default date")
+    command.add_argument("--generation", type=int, choices=(13, 14), default=14, help="generation of IGRF; default 14")
+    return command
 
 
 def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
@@ -76,14 +76,11 @@ def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
     """
     if not len(table):
         raise ValueError("the table has no row")
-    latitude, longitude = (_numbers(table, getattr(options, name), name) for name in ("latitude", "longitude"))
-    altitude_km = _altitude_km(table, options)
-    for name, values, low, high in (("latitude", latitude, -90.0, 90.0), ("longitude", longitude, -360.0, 360.0)):
-        _check_rows(getattr(options, name), values, low, high, "degrees")
-    dates = _column(table, options.date, "date", _date)
-    field = IGRF(dates, options.generation)
-    place = (torch.from_numpy(values) for values in (latitude, longitude, altitude_km))
-    found = _columns(*field.value_and_gradient(*place))
+    latitude = _numbers(table, options.latitude, "latitude", -90.0, 90.0, "degrees")
+    longitude = _numbers(table, options.longitude, "longitude", -360.0, 360.0, "degrees")
+    place = (latitude, longitude, _altitude_km(table, options))
+    field = IGRF(_column(table, options.date, "date", _date), options.generation)
+    found = _columns(*field.value_and_gradient(*map(torch.from_numpy, place)))
     if taken := sorted(found.keys() & set(table.columns)):
         raise ValueError(f"the table has columns {', '.join(taken)} already: rename them, or remove them")
     return table.assign(**found)
@@ -104,24 +101,19 @@ def _columns(value: torch.Tensor, gradient: torch.Tensor) -> dict[str, NDArray[n
 
 def _altitude_km(table: DataFrame, options: argparse.Namespace) -> NDArray[np.float64]:
     """Return altitudes above the ellipsoid [km] ``(P,)``."""
-    given = [name for name in _HEIGHTS if getattr(options, name) is not None]
-    names = given or [name for name in _HEIGHTS if name in table.columns]
+    given = [name for name in _SIGNS if getattr(options, name) is not None]
+    names = given or [name for name in _SIGNS if name in table.columns]
     if len(names) != 1:
         which = "both columns altitude and depth" if names else f"neither altitude nor depth among {_listed(table)}"
         raise ValueError(f"the table has {which}: choose with --altitude or --depth, such as --altitude 0")
     (name,) = names
-    values = _numbers(table, getattr(options, name) or name, name) * UNITS_KM[options.unit]
-    sign = -1.0 if name == "depth" else 1.0
-    low, high = sorted(sign * limit for limit in IGRF.altitude_range_km)
-    hint = "km: is it in meters? Then add --unit m" if options.unit == "km" else "km"
-    _check_rows(getattr(options, name) or name, values, low, high, f"{hint}; {name} is {_HEIGHTS[name]}")
-    return sign * values
+    low, high = sorted(_SIGNS[name] * limit / UNITS_KM[options.unit] for limit in IGRF.altitude_range_km)
+    hint = ": is it in meters? Then add --unit m" if options.unit == "km" else ""
+    values = _numbers(table, getattr(options, name) or name, name, low, high, f"{options.unit}{hint}")
+    return _SIGNS[name] * UNITS_KM[options.unit] * values
 
 
-_HEIGHTS = {
-    "altitude": "above the ellipsoid, and negative below it",
-    "depth": "below the ellipsoid, and negative above it",
-}
+_SIGNS = {"altitude": 1.0, "depth": -1.0}
 
 
 def _column(table: DataFrame, text: str, name: str, read: Callable[[Any], Any]) -> NDArray[Any]:
@@ -136,27 +128,29 @@ def _column(table: DataFrame, text: str, name: str, read: Callable[[Any], Any]) 
     values = table[text].tolist()
     known: dict[Any, Any] = {}
     try:
-        for row, value in enumerate(values, start=1):  # noqa: B007 - for the message
-            if value not in known:
-                known[value] = read(value)
+        for value in dict.fromkeys(values):
+            known[value] = read(value)
     except ValueError as error:
-        raise ValueError(f"row {row}, {text}: {error}") from None
+        raise ValueError(f"row {values.index(value) + 1}, {text}: {error}") from None
     return np.array([known[value] for value in values])
 
 
-def _numbers(table: DataFrame, text: str, name: str) -> NDArray[np.float64]:
-    return _column(table, text, name, _number).astype(np.float64)
+def _numbers(table: DataFrame, text: str, name: str, low: float, high: float, unit: str) -> NDArray[np.float64]:
+    """Return the numbers of a column ``(P,)``; raise unless all are from ``low`` to ``high``."""
+    values = _column(table, text, name, _number).astype(np.float64)
+    outside = (values < low) | (values > high)
+    if outside.any():
+        row = int(outside.argmax())
+        raise ValueError(f"row {row + 1}, {text}: {values[row]:g} is not from {low:g} to {high:g} {unit}")
+    return values
 
 
-def _number(value: object) -> float:
+def _number(value: Any) -> float:
     """Return a finite number."""
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise ValueError(f"{short(value)} is not a finite number")
-    return number
+    with contextlib.suppress(TypeError, ValueError):
+        if math.isfinite(number := float(value)):
+            return number
+    raise ValueError(f"{short(value)} is not a finite number")
 
 
 def _date(value: Any) -> np.datetime64:
@@ -164,13 +158,6 @@ def _date(value: Any) -> np.datetime64:
     with contextlib.suppress(TypeError, ValueError):
         value = float(value)
     return np.datetime64(parse_date(value), "us")
-
-
-def _check_rows(text: str, values: NDArray[np.float64], low: float, high: float, unit: str) -> None:
-    outside = (values < low) | (values > high)
-    if outside.any():
-        row = int(outside.argmax())
-        raise ValueError(f"row {row + 1}, {text}: {values[row]:g} is not from {low:g} to {high:g} {unit}")
 
 
 def _listed(table: DataFrame) -> str:
@@ -201,11 +188,10 @@ def read_points(path: Path) -> DataFrame:
 def write_points(path: Path, table: DataFrame) -> None:
     """Write a table, in the format of the suffix; in Parquet, columns of numbers that were text become numbers."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".csv":
+        return table.to_csv(path, index=False)
     try:
-        if path.suffix == ".parquet":
-            table.apply(_as_numbers).to_parquet(path, index=False)
-        else:
-            table.to_csv(path, index=False)
+        return table.apply(_as_numbers).to_parquet(path, index=False)
     except ImportError as error:
         raise ValueError(NO_PARQUET) from error
 
@@ -247,5 +233,6 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `--help | head` ends without a traceback
+    if hasattr(signal, "SIGPIPE"):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # end without a traceback when `head` closes the pipe
     main()

@@ -9,9 +9,10 @@ from typing_extensions import Self
 
 from magrl.checks import check_number, check_tensor, require
 from magrl.field import harmonics
-from magrl.field.harmonics import chebyshev, chebyshev_nodes
+from magrl.field.harmonics import chebyshev, chebyshev_nodes, checked_gauss
 from magrl.field.model import Float64Module, in_chunks
-from magrl.geodesy import curvature_radii, to_ecef
+from magrl.field.regional import box_scaling, in_half_spans, inside_box
+from magrl.geodesy import check_box, curvature_radii, to_ecef
 
 
 class FieldBank(Float64Module):
@@ -55,12 +56,14 @@ class FieldBank(Float64Module):
         if expansion.ndim != 4 or expansion.shape[1:] != (3, *expansion.shape[-1:] * 2) or expansion.shape[-1] < 2:
             raise ValueError(f"expansion must have the shape (K, 3, n, n) with n >= 2, got {tuple(expansion.shape)}")
         terms = expansion.shape[-1]
-        latitude, longitude = checked_boxes(latitude, longitude)
-        if len(latitude) != len(expansion):
-            raise ValueError(f"latitude must hold {len(expansion)} boxes, as expansion, got {len(latitude)}")
+        edges = torch.stack(checked_boxes(latitude, longitude), 1)
+        if len(edges) != len(expansion):
+            raise ValueError(f"latitude must hold {len(expansion)} boxes, as expansion, got {len(edges)}")
         self.degree = terms - 1
-        self.register_buffer("coefficients", _product_layout(expansion.double()))
-        self.register_buffer("scaling", _scaling(latitude, longitude).to(expansion.device))
+        # The latitude order, then, as in RegionalField, the longitude order and within it the component.
+        coefficients = expansion.double().permute(0, 2, 3, 1).flatten(2).contiguous()
+        self.register_buffer("coefficients", coefficients)
+        self.register_buffer("scaling", box_scaling(edges).to(expansion.device))
         self.register_buffer("slopes", _slopes(terms).to(expansion.device), persistent=False)
         self.register_buffer("error_nt", torch.full_like(self.scaling[:, 0, 0], torch.nan))
 
@@ -96,21 +99,24 @@ class FieldBank(Float64Module):
         """
         check_number(1, whole=True, degree=degree)
         check_number(0, above=True, tolerance_nt=tolerance_nt)
-        latitude, longitude = (x.cpu() for x in checked_boxes(latitude, longitude))
-        gauss, planet_index = _checked_planets(gauss, planet_index, len(latitude))
-        weights, planet = _surface_weights(gauss), planet_index.split(_BOXES)
-        boxes = list(zip(planet, latitude.split(_BOXES), longitude.split(_BOXES), strict=True))
+        edges = torch.stack(checked_boxes(latitude, longitude), 1).cpu()
+        gauss = checked_gauss(gauss, batch=True).cpu()
+        check_index(planet_index, len(gauss), "planet_index")
+        if planet_index.shape != edges.shape[:1]:
+            raise ValueError(f"planet_index must have the shape ({len(edges)},), got {tuple(planet_index.shape)}")
+        planet_index, weights = planet_index.cpu(), _surface_weights(gauss)
+        boxes = list(zip(planet_index.split(_BOXES), edges.split(_BOXES), strict=True))
         angles, from_nodes = chebyshev_nodes(degree + 1)
-        samples = (_synthesis(weights[k], *_inside(angles.cos(), lat, lon)) for k, lat, lon in boxes)
+        samples = (_synthesis(weights[k], *inside_box(angles.cos(), box)) for k, box in boxes)
         bank = cls(torch.cat([from_nodes @ x @ from_nodes.T for x in samples]), latitude, longitude)
         unit = torch.linspace(-1, 1, 4 * degree + 1, dtype=torch.float64)
         polynomials = chebyshev(unit, degree + 1)
         errors = []
-        for (k, lat, lon), table in zip(boxes, bank.coefficients.split(_BOXES), strict=True):
+        for (k, box), table in zip(boxes, bank.coefficients.cpu().split(_BOXES), strict=True):
             found = polynomials.T @ table.unflatten(2, (-1, 3)).permute(0, 3, 1, 2) @ polynomials
-            errors.append((found - _synthesis(weights[k], *_inside(unit, lat, lon))).abs().amax((1, 2, 3)))
+            errors.append((found - _synthesis(weights[k], *inside_box(unit, box))).abs().amax((1, 2, 3)))
         bank.error_nt.copy_(torch.cat(errors))
-        bank._check_error(planet_index, latitude, longitude, float(tolerance_nt))
+        bank._check_error(planet_index, edges, tolerance_nt)
         return bank
 
     def __len__(self) -> int:
@@ -156,21 +162,21 @@ class FieldBank(Float64Module):
 
     def _points(self, latitude: Tensor, longitude: Tensor, index: Tensor) -> tuple[torch.Size, list[Tensor]]:
         """Return the shape of the positions, positions ``(2, P)`` and indices ``(P,)``."""
-        check_tensor(latitude=latitude, longitude=longitude, index=index)
+        check_tensor(latitude=latitude, longitude=longitude)
         check_index(index, len(self.coefficients))
         latitude, longitude, index = torch.broadcast_tensors(latitude.double(), longitude.double(), index)
         return index.shape, [torch.stack((latitude, longitude)).reshape(2, -1), index.reshape(-1)]
 
     def _value(self, position: Tensor, index: Tensor) -> Tensor:
         """Return north, east, down: ``(3, P)`` [nT]."""
-        unit = self._unit(position, self.scaling.index_select(0, index))
+        unit = in_half_spans(position, self.scaling.index_select(0, index).movedim(0, -1))
         latitude, longitude = chebyshev(unit, self.degree + 1).unbind(1)
         return self._sum_latitude(index, latitude).mul_(longitude.unsqueeze(1)).sum(0)
 
     def _value_and_gradient(self, position: Tensor, index: Tensor) -> Tensor:
         """Return the vector [nT], then the derivative of each component northward and eastward [nT/km]: ``(9, P)``."""
-        scaling = self.scaling.index_select(0, index)
-        polynomials = chebyshev(self._unit(position, scaling), self.degree + 1)
+        scaling = self.scaling.index_select(0, index).movedim(0, -1)
+        polynomials = chebyshev(in_half_spans(position, scaling), self.degree + 1)
         slopes = (self.slopes @ polynomials.flatten(1)).reshape(polynomials.shape)
         both = torch.cat((polynomials[:, 0], slopes[:, 0]), -1)
         terms = self._sum_latitude(index.repeat(2), both).unflatten(-1, (2, -1))
@@ -178,7 +184,7 @@ class FieldBank(Float64Module):
         value, north = (terms * polynomials[:, 1:].unsqueeze(1)).sum(0).unbind(1)
         meridian, prime_vertical = curvature_radii(position[0])
         radius_km = torch.stack((meridian, prime_vertical * torch.cos(torch.deg2rad(position[0]))))
-        per_km = torch.rad2deg(scaling[..., 1].T / radius_km)
+        per_km = torch.rad2deg(scaling[:, 1] / radius_km)
         return torch.cat((value, north * per_km[0], east * per_km[1]))
 
     def _sum_latitude(self, index: Tensor, polynomials: Tensor) -> Tensor:
@@ -190,23 +196,15 @@ class FieldBank(Float64Module):
         )
         return bags.T.contiguous().unflatten(0, (terms, 3))
 
-    def _unit(self, position: Tensor, scaling: Tensor) -> Tensor:
-        """Return latitude and longitude ``(2, P)`` in half spans from the centers of the boxes; NaN beyond [-1, 1]."""
-        center, per_degree = scaling.movedim(0, -1).unbind(1)
-        north, east = position - center
-        unit = torch.stack((north, torch.sub(east, torch.round(east / 360), alpha=360))) * per_degree
-        # The edges belong to the box, even if scaling rounds them out of it.
-        return unit.masked_fill_(unit.abs() > 1 + 1e-12, float("nan"))
-
-    def _check_error(self, planet_index: Tensor, latitude: Tensor, longitude: Tensor, tolerance_nt: float) -> None:
+    def _check_error(self, planet_index: Tensor, edges: Tensor, tolerance_nt: float) -> None:
         """Raise unless every error is within the tolerance; an error that is NaN is the worst."""
         worst = int(self.error_nt.nan_to_num(torch.inf).argmax())
         if not self.error_nt[worst] <= tolerance_nt:
+            latitude, longitude = map(tuple, edges[worst].tolist())
             raise ValueError(
                 f"the expansion of degree {self.degree} misses the field by {self.error_nt[worst]:.3g} nT in box "
-                f"{worst}, of planet {planet_index[worst]}, latitudes {tuple(latitude[worst].tolist())}, longitudes "
-                f"{tuple(longitude[worst].tolist())}; the tolerance is {tolerance_nt:.3g} nT: raise the degree or "
-                "shrink the boxes"
+                f"{worst}, of planet {planet_index[worst]}, latitudes {latitude}, longitudes {longitude}; the "
+                f"tolerance is {tolerance_nt:.3g} nT: raise the degree or shrink the boxes"
             )
 
     def extra_repr(self) -> str:
@@ -236,22 +234,6 @@ def check_index(index: Tensor, count: int, name: str = "index") -> None:
         torch._assert_async(good.all(), message)
 
 
-def _checked_planets(gauss: Tensor, planet_index: Tensor, boxes: int) -> tuple[Tensor, Tensor]:
-    if not isinstance(gauss, Tensor) or not gauss.is_complex():
-        kind = gauss.dtype if isinstance(gauss, Tensor) else f"{gauss!r}"
-        raise TypeError(f"gauss must be a tensor of complex numbers g - i h, got {kind}")
-    if gauss.ndim != 3 or gauss.shape[1] != gauss.shape[2] or gauss.shape[1] < 2:
-        raise ValueError(f"gauss must have the shape (P, N + 1, N + 1) with N >= 1, got {tuple(gauss.shape)}")
-    if not torch.isfinite(torch.view_as_real(gauss)).all():
-        raise ValueError("gauss holds non-finite coefficients")
-    check_tensor(planet_index=planet_index)
-    if planet_index.shape != (boxes,):
-        raise ValueError(f"planet_index must have the shape ({boxes},), as the boxes, got {tuple(planet_index.shape)}")
-    planet_index = planet_index.cpu()
-    check_index(planet_index, len(gauss), "planet_index")
-    return gauss.to("cpu", torch.complex128), planet_index
-
-
 def checked_boxes(latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
     """Return the edges of boxes ``(K, 2)`` as float64; raise unless there is one and all are sound.
 
@@ -264,44 +246,14 @@ def checked_boxes(latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
         shapes = f"{tuple(latitude.shape)} and {tuple(longitude.shape)}"
         raise ValueError(f"latitude and longitude must have the shape (K, 2) with K >= 1, got {shapes}")
     latitude, longitude = latitude.double(), longitude.double()
-    (south, north), (west, east) = latitude.T, longitude.T
-    sound = (south >= -90) & (south < north) & (north <= 90)
-    rising = (west < east) & (east <= west + 360)
-    for good, edges, name, rule in (
-        (sound, latitude, "latitudes", "rise from south to north within [-90, 90] degrees"),
-        (rising, longitude, "longitudes", "rise from west to east by at most 360 degrees"),
-    ):
-        if not good.all():
-            k = int((~good).nonzero()[0])
-            raise ValueError(f"{name} {tuple(edges[k].tolist())} of box {k} must {rule}")
+    for k, (parallels, meridians) in enumerate(zip(latitude.tolist(), longitude.tolist(), strict=True)):
+        check_box(tuple(parallels), tuple(meridians), f" of box {k}")
     return latitude, longitude
-
-
-def _product_layout(expansion: Tensor) -> Tensor:
-    """Return coefficients in the layout of the sums: ``(K, 3, n, n)`` to ``(K, n, 3 n)``.
-
-    The latitude order, then, as in RegionalField, the longitude order and within it the component.
-    """
-    return expansion.permute(0, 2, 3, 1).flatten(2).contiguous()
-
-
-def _scaling(latitude: Tensor, longitude: Tensor) -> Tensor:
-    """Return center [deg] and half spans per degree, of latitude and longitude: ``(K, 2, 2)``."""
-    low, high = torch.stack((latitude, longitude), 1).unbind(-1)
-    return torch.stack(((low + high) / 2, 2 / (high - low)), -1)
 
 
 def _slopes(terms: int) -> Tensor:
     """Return the matrix from Chebyshev polynomials to their derivatives: ``(terms, terms)``."""
     return nn.functional.pad(torch.from_numpy(np.polynomial.chebyshev.chebder(np.eye(terms)).T.copy()), (0, 1))
-
-
-def _inside(unit: Tensor, latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
-    """Return latitudes and longitudes ``(B, U)`` at fractions of the half spans of boxes ``(B, 2)``."""
-    edges = torch.stack((latitude, longitude))
-    low, high = edges.unsqueeze(-1).unbind(-2)
-    north, east = (high - low) / 2 * unit + (low + high) / 2
-    return north, east
 
 
 def _surface_weights(gauss: Tensor) -> Tensor:
@@ -315,8 +267,8 @@ def _surface_weights(gauss: Tensor) -> Tensor:
     axis, _, z = to_ecef(90 - torch.rad2deg(angles), torch.zeros_like(angles)).unbind(-1)
     parts = []
     for some in gauss.split(max(1, _BOXES * 14**3 // degree**3)):  # temporary memory grows with the cube of the degree
-        tables = torch.cat([harmonics.field_table(table) for table in some])
-        parts.append(harmonics.on_surface(harmonics.separate(tables, degree), axis, z).unflatten(0, (-1, 3)))
+        tables = harmonics.separate(harmonics.field_table(some).flatten(0, 1), degree)
+        parts.append(harmonics.on_surface(tables, axis, z).unflatten(0, (-1, 3)))
     return torch.cat(parts)
 
 

@@ -72,11 +72,8 @@ def seven_elements(b_ned: Tensor) -> Elements:
         >>> float(e.B_F), round(float(e.I), 2)
         (50000.0, -53.13)
     """
-    check_tensor(3, b_ned=b_ned)
+    declination, inclination, horizontal = measured_elements(b_ned).unbind(-1)
     north, east, down = b_ned.unbind(-1)
-    horizontal = torch.hypot(north, east)
-    declination = torch.rad2deg(torch.atan2(east + 0.0, north + 0.0))  # adding zero removes the sign of a zero
-    inclination = torch.rad2deg(torch.atan2(down, horizontal))
     return Elements(declination, inclination, horizontal, north, east, down, torch.hypot(horizontal, down))
 
 

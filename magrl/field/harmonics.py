@@ -24,7 +24,6 @@ import math
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor
 from magrl.geodesy import REFERENCE_RADIUS_KM
 
 
@@ -37,17 +36,12 @@ def differentiate(table: Tensor) -> Tensor:
     Returns:
         Complex ``(..., 3, N + 2, N + 2)``: derivatives along x, y, z, per unit of the reference radius.
 
-    Raises:
-        TypeError: for a table that is not complex.
-        ValueError: for a table that is not square.
-
     Example:
         >>> monopole = torch.ones(1, 1, dtype=torch.complex128)
         >>> differentiate(monopole)[2].real  # d(1/r)/dz = -z/r^3
         tensor([[ 0.,  0.],
                 [-1.,  0.]], dtype=torch.float64)
     """
-    _check_table(table=table)
     size = table.shape[-1]
     n = torch.arange(size, dtype=torch.float64, device=table.device).unsqueeze(-1)
     m = torch.arange(size, dtype=torch.float64, device=table.device)
@@ -67,15 +61,31 @@ def differentiate(table: Tensor) -> Tensor:
     return torch.stack(((lowered - raised) / 2, 1j * (lowered + raised) / 2, dz), -3)
 
 
-def _check_table(*, single: bool = False, **tables: Tensor) -> None:
-    """Raise unless each table is complex and square, and ``(N + 1, N + 1)`` without a batch if ``single``."""
-    for name, table in tables.items():
-        if not isinstance(table, Tensor) or not table.is_complex():
-            kind = table.dtype if isinstance(table, Tensor) else f"{table!r}"
-            raise TypeError(f"{name} must be a tensor of complex numbers g - i h, got {kind}")
-        if table.ndim < 2 or table.shape[-1] != table.shape[-2] or (single and table.ndim != 2):
-            wanted = "(N + 1, N + 1)" if single else "(..., N + 1, N + 1)"
-            raise ValueError(f"{name} must have the shape {wanted}, got {tuple(table.shape)}")
+def checked_gauss(gauss: Tensor, *, batch: bool = False) -> Tensor:
+    """Return Gauss coefficients as complex128.
+
+    Args:
+        gauss: complex ``(N + 1, N + 1)`` table ``g - i h`` [nT], N >= 1.
+        batch: whether there are many tables, ``(P, N + 1, N + 1)``.
+
+    Raises:
+        TypeError: for coefficients that are not a complex tensor.
+        ValueError: for another shape, or non-finite coefficients.
+
+    Example:
+        >>> checked_gauss(torch.zeros(3, 2, dtype=torch.complex128))
+        Traceback (most recent call last):
+        ValueError: gauss must have the shape (N + 1, N + 1) with N >= 1, got (3, 2)
+    """
+    if not isinstance(gauss, Tensor) or not gauss.is_complex():
+        kind = gauss.dtype if isinstance(gauss, Tensor) else repr(gauss)
+        raise TypeError(f"gauss must be a tensor of complex numbers g - i h, got {kind}")
+    if gauss.ndim != 2 + batch or gauss.shape[-1] != gauss.shape[-2] or gauss.shape[-1] < 2:
+        wanted = "(P, N + 1, N + 1)" if batch else "(N + 1, N + 1)"
+        raise ValueError(f"gauss must have the shape {wanted} with N >= 1, got {tuple(gauss.shape)}")
+    if not torch.isfinite(torch.view_as_real(gauss)).all():
+        raise ValueError("gauss holds non-finite coefficients")
+    return gauss.to(torch.complex128)
 
 
 def basis(ecef_km: Tensor, degree: int) -> Tensor:
@@ -88,19 +98,10 @@ def basis(ecef_km: Tensor, degree: int) -> Tensor:
     Returns:
         ``((degree + 1) * (degree + 2), P)``: for each degree its orders 0 to n, for each order cosine and sine.
 
-    Raises:
-        ValueError: for another shape, the center of the Earth, where the harmonics are infinite, or a degree below 0.
-
     Example:
         >>> basis(torch.tensor([[0.0, 0.0, REFERENCE_RADIUS_KM]]), 1).squeeze(-1)  # at the pole only m = 0 is not zero
         tensor([1., 0., 1., 0., 0., 0.])
     """
-    check_tensor(3, ecef_km=ecef_km)
-    check_number(0, whole=True, degree=degree)
-    if ecef_km.ndim != 2:
-        raise ValueError(f"ecef_km must have the shape (P, 3), got {tuple(ecef_km.shape)}")
-    if (ecef_km == 0).all(-1).any():
-        raise ValueError("ecef_km holds the center of the Earth, (0, 0, 0), where the harmonics are infinite")
     x, y, z = (ecef_km / REFERENCE_RADIUS_KM).unbind(-1)
     inverse_r2 = 1 / (x * x + y * y + z * z)
     x, y, z = x * inverse_r2, y * inverse_r2, z * inverse_r2
@@ -126,14 +127,10 @@ def field_table(gauss: Tensor) -> Tensor:
     """Return the real weights of the field over a basis.
 
     Args:
-        gauss: complex ``(N + 1, N + 1)`` table ``g - i h`` [nT].
+        gauss: complex ``(..., N + 1, N + 1)`` tables ``g - i h`` [nT].
 
     Returns:
-        ``(3, K)`` weights of Bx, By, Bz [nT] over :func:`basis` of degree N + 1.
-
-    Raises:
-        TypeError: for a table that is not complex.
-        ValueError: for another shape.
+        ``(..., 3, K)`` weights of Bx, By, Bz [nT] over :func:`basis` of degree N + 1.
 
     Example:
         >>> g10 = torch.zeros(2, 2, dtype=torch.complex128)
@@ -141,7 +138,6 @@ def field_table(gauss: Tensor) -> Tensor:
         >>> field_table(g10).shape
         torch.Size([3, 12])
     """
-    _check_table(single=True, gauss=gauss)
     return _weights(-differentiate(gauss))
 
 
@@ -149,27 +145,22 @@ def gradient_table(gauss: Tensor) -> Tensor:
     """Return the real weights of the gradient of the field over a basis.
 
     Args:
-        gauss: complex ``(N + 1, N + 1)`` table ``g - i h`` [nT].
+        gauss: complex ``(..., N + 1, N + 1)`` tables ``g - i h`` [nT].
 
     Returns:
-        ``(9, K)`` weights of dB_i/dx_j [nT/km], row-major in (i, j), over :func:`basis` of degree N + 2.
-
-    Raises:
-        TypeError: for a table that is not complex.
-        ValueError: for another shape.
+        ``(..., 9, K)`` weights of dB_i/dx_j [nT/km], row-major in (i, j), over :func:`basis` of degree N + 2.
 
     Example:
         >>> gradient_table(torch.zeros(2, 2, dtype=torch.complex128)).shape
         torch.Size([9, 20])
     """
-    _check_table(single=True, gauss=gauss)
-    return _weights(differentiate(-differentiate(gauss)).flatten(0, 1)) / REFERENCE_RADIUS_KM
+    return _weights(differentiate(-differentiate(gauss)).flatten(-4, -3)) / REFERENCE_RADIUS_KM
 
 
 def _weights(table: Tensor) -> Tensor:
-    """Return lower triangles of complex tables in the layout of :func:`basis`: ``(R, N, N)`` to ``(R, N (N + 1))``."""
+    """Return lower triangles of complex tables in the layout of :func:`basis`: ``(..., N (N + 1))``."""
     n, m = torch.tril_indices(table.shape[-1], table.shape[-1], device=table.device)
-    return torch.view_as_real(table[:, n, m].conj().resolve_conj()).flatten(1)
+    return torch.view_as_real(table[..., n, m].conj().resolve_conj()).flatten(-2)
 
 
 def chebyshev_nodes(count: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
@@ -187,7 +178,6 @@ def chebyshev_nodes(count: int, device: torch.device | None = None) -> tuple[Ten
         >>> (to_coefficients @ torch.cos(2 * angles)).round().abs()
         tensor([0., 0., 1.], dtype=torch.float64)
     """
-    check_number(1, whole=True, count=count)
     k = torch.arange(count, dtype=torch.float64, device=device)
     angles = (k + 0.5) * (math.pi / count)
     matrix = torch.cos(k.unsqueeze(-1) * angles) * (2 / count)

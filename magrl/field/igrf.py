@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from numbers import Real
 from typing import Any, ClassVar
@@ -88,8 +88,8 @@ def parse_dates(dates: Sequence[Date] | NDArray[Any]) -> NDArray[np.datetime64]:
 
 
 @cache
-def _igrf_tables(generation: int) -> tuple[list[datetime.datetime], np.ndarray]:
-    """Return epochs and complex Gauss tables ``(epochs, N + 1, N + 1)`` of one IGRF generation, from ppigrf."""
+def _igrf_tables(generation: int) -> tuple[NDArray[np.datetime64], NDArray[np.complex128]]:
+    """Return epochs ``(E,)`` and complex Gauss tables ``(E, N + 1, N + 1)`` of one IGRF generation, from ppigrf."""
     from ppigrf import ppigrf  # imports pandas, so only where it is needed
 
     files = {13: ppigrf.shc_fn_igrf13, 14: ppigrf.shc_fn_igrf14}
@@ -99,7 +99,7 @@ def _igrf_tables(generation: int) -> tuple[list[datetime.datetime], np.ndarray]:
     n, m = np.array(list(g.columns)).T
     table = np.zeros((len(g), n.max() + 1, n.max() + 1), dtype=np.complex128)
     table[:, n, m] = g.to_numpy() - 1j * h.to_numpy()
-    return [epoch.to_pydatetime() for epoch in g.index], table
+    return g.index.to_numpy("M8[us]"), table
 
 
 def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
@@ -122,47 +122,29 @@ def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
         >>> round(float(igrf_coefficients("2020-01-01")[1, 0].real), 2)
         -29403.41
     """
-    epochs, table = _igrf_tables(generation)
-    when = parse_date(date)
-    _check_span(when, when, generation)
-    right = next(k for k in range(1, len(epochs)) if when <= epochs[k])
-    weight = (when - epochs[right - 1]) / (epochs[right] - epochs[right - 1])
-    return torch.from_numpy((1 - weight) * table[right - 1] + weight * table[right])
+    tables, shares = _epochs_and_shares(np.array(parse_date(date), dtype="M8[us]"), generation)
+    return (shares.reshape(-1, 1, 1) * tables).sum(0)
 
 
-def _check_span(first: datetime.datetime, last: datetime.datetime, generation: int) -> None:
-    epochs, _ = _igrf_tables(generation)
-    for when in (first, last):
-        if not epochs[0] <= when <= epochs[-1]:
-            raise ValueError(
-                f"date {when.isoformat()} is outside IGRF-{generation}, which is valid from {epochs[0].date()} "
-                f"to {epochs[-1].date()}"
-            )
-
-
-def _shares(dates: NDArray[np.datetime64], generation: int) -> tuple[Tensor, Tensor]:
+def _epochs_and_shares(dates: NDArray[np.datetime64], generation: int) -> tuple[Tensor, Tensor]:
     """Return Gauss tables of the epochs around some dates, and the share of each epoch in the field of each date.
 
     Returns:
         Complex ``(E, 14, 14)`` and ``(E, ...)`` float64; the shares of a date are those of linear interpolation.
     """
-    _check_span(dates.min().item(), dates.max().item(), generation)
     epochs, table = _igrf_tables(generation)
-    nodes = np.array(epochs, dtype="M8[us]")
-    right = np.searchsorted(nodes, dates.ravel()).clip(1)
-    weight = (dates.ravel() - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
-    share, column = np.zeros((len(nodes), dates.size)), np.arange(dates.size)
+    outside = dates[(dates < epochs[0]) | (dates > epochs[-1])]
+    if outside.size:
+        first, last = epochs[[0, -1]].astype("M8[D]")
+        raise ValueError(
+            f"date {outside[0].item().isoformat()} is outside IGRF-{generation}, which is valid from {first} to {last}"
+        )
+    right = np.searchsorted(epochs, dates.ravel()).clip(1)
+    weight = (dates.ravel() - epochs[right - 1]) / (epochs[right] - epochs[right - 1])
+    share, column = np.zeros((len(epochs), dates.size)), np.arange(dates.size)
     share[right - 1, column], share[right, column] = 1 - weight, weight
     used = share.any(1)
     return torch.from_numpy(table[used]), torch.from_numpy(share[used].reshape(-1, *dates.shape))
-
-
-def _expansions(date: Any, generation: int) -> tuple[Tensor, Tensor | None, datetime.datetime | NDArray[np.datetime64]]:
-    """Return tables ``(E, 14, 14)``, the shares of many dates ``(E, ...)``, and the parsed date or dates."""
-    if np.ndim(date) == 0:
-        return igrf_coefficients(date, generation).unsqueeze(0), None, parse_date(date)
-    dates = parse_dates(date)
-    return *_shares(dates, generation), dates
 
 
 class IGRF(SphericalHarmonicField):
@@ -205,7 +187,13 @@ class IGRF(SphericalHarmonicField):
         altitude_km: float = 0.0,
         chunk: int = 16384,
     ) -> None:
-        gauss, share, self.date = _expansions(date, generation)
+        self.date: datetime.datetime | NDArray[np.datetime64]
+        if np.ndim(date):  # type: ignore[arg-type]
+            self.date = parse_dates(date)  # type: ignore[arg-type]
+            gauss, share = _epochs_and_shares(self.date, generation)
+        else:
+            self.date = parse_date(date)  # type: ignore[arg-type]
+            gauss, share = igrf_coefficients(self.date, generation).unsqueeze(0), None
         super().__init__(gauss[0], altitude_km=altitude_km, chunk=chunk)
         self.generation = generation
         # Of many dates, this is the field of their first epoch; those of the others follow it.
@@ -213,47 +201,27 @@ class IGRF(SphericalHarmonicField):
         self.others = nn.ModuleList(others)
         self.register_buffer("share", share, persistent=False)
 
-    def forward(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None) -> Tensor:
-        """Return the field vector ``(..., 3)`` [nT], as in the parent class; ``...`` is also that of the dates."""
-        if self.share is None:
-            return super().forward(latitude, longitude, altitude_km)
-        return self._mixed(SphericalHarmonicField.forward, (3,), latitude, longitude, altitude_km)
-
-    def value_and_gradient(
-        self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return the vector and its gradient, as in the parent class; ``...`` is also that of the dates."""
-        if self.share is None:
-            return super().value_and_gradient(latitude, longitude, altitude_km)
-
-        def both(field: SphericalHarmonicField, *place: Tensor) -> Tensor:
-            value, gradient = SphericalHarmonicField.value_and_gradient(field, *place)
-            return torch.cat((value.unsqueeze(-1), gradient), -1)
-
-        found = self._mixed(both, (3, 3), latitude, longitude, altitude_km)
-        return found[..., 0], found[..., 1:]
-
-    def _mixed(
-        self, evaluate: Callable[..., Tensor], size: tuple[int, ...], latitude: Tensor, longitude: Tensor, altitude: Any
+    def _evaluate(
+        self, rows: int, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None
     ) -> Tensor:
-        """Return the sum over epochs of what each gives, times its share, at the places where it has any."""
-        assert self.share is not None
-        shape, points = self._points(latitude, longitude, altitude)
+        """Return rows of the field as the parent class; of many dates, the sum over epochs of each times its share."""
+        if self.share is None:
+            return super()._evaluate(rows, latitude, longitude, altitude_km)
+        points = self._points(latitude, longitude, altitude_km)
         try:
-            whole = torch.broadcast_shapes(shape, self.share.shape[1:])
+            shape = torch.broadcast_shapes(points[0].shape, self.share.shape[1:])
         except RuntimeError:
             raise ValueError(
-                f"positions of shape {tuple(shape)} do not broadcast with dates of shape "
+                f"positions of shape {tuple(points[0].shape)} do not broadcast with dates of shape "
                 f"{tuple(self.share.shape[1:])}: give a date for each position"
             ) from None
-        points = [x.reshape(shape).expand(whole).flatten() for x in points[: 2 if altitude is None else 3]]
-        found = points[0].new_zeros(points[0].numel(), *size)
+        points = tuple(x.expand(shape).flatten() for x in points[: 2 if altitude_km is None else 3])
+        found = points[0].new_zeros(rows, points[0].numel())
         for field, share in zip((self, *self.others), self.share, strict=True):
-            share = share.expand(whole).flatten()
-            rows = share.nonzero().squeeze(-1)
-            part = evaluate(field, *(x[rows] for x in points))
-            found[rows] += share[rows].reshape(-1, *(1 for _ in size)) * part
-        return found.reshape(*whole, *size)
+            share = share.expand(shape).flatten()
+            used = share.nonzero().squeeze(-1)
+            found[:, used] += share[used] * SphericalHarmonicField._evaluate(field, rows, *(x[used] for x in points))
+        return found.reshape(rows, *shape)
 
     def extra_repr(self) -> str:
         """Return the date, the generation and the default height as text."""

@@ -13,7 +13,7 @@ from typing import Protocol
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_tensor
 from magrl.field.elements import elements_gradient, measured_elements
 
 
@@ -77,16 +77,12 @@ def in_chunks(function: Callable[..., Tensor], points: Sequence[Tensor], rows: i
     Returns:
         ``(rows, P)``.
 
-    Raises:
-        ValueError: for a chunk below 1.
-
     Example:
         >>> import torch
         >>> in_chunks(lambda x: torch.stack((x, x * x)), [torch.arange(5.0)], rows=2, chunk=2)
         tensor([[ 0.,  1.,  2.,  3.,  4.],
                 [ 0.,  1.,  4.,  9., 16.]])
     """
-    check_number(1, whole=True, chunk=chunk)
     count = points[0].shape[-1]
     if count <= chunk:
         return function(*points)

@@ -65,7 +65,7 @@ class WeatherRecord:
         check_type(str, name=self.name)
         end = len(self.variation) - 1
         check_number(0, end, whole=True, first=self.first)
-        check_number(self.first, end, whole=True, last=end if self.last is None else self.last)
+        check_number(self.first, end, whole=True, optional=True, last=self.last)
 
     def starts(self, span_h: float) -> Tensor:
         """Return the minutes at which an episode can start so that no minute of it is missing, ``(S,)`` int64.

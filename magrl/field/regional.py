@@ -57,14 +57,17 @@ class RegionalField(Float64Module):
         check_number(1, whole=True, degree=degree)
         check_number(0, above=True, tolerance_nt=tolerance_nt)
         self.latitude, self.longitude, self.degree = tuple(latitude), tuple(longitude), int(degree)
-        self.tolerance_nt = float(tolerance_nt)
+        edges = torch.tensor((self.latitude, self.longitude), dtype=torch.float64)
         angles, from_nodes = chebyshev_nodes(degree + 1)
-        samples = model(*self._grid(angles.cos())).to("cpu", torch.float64)
+        samples = model(*torch.meshgrid(*inside_box(angles.cos(), edges), indexing="ij")).to("cpu", torch.float64)
         expansion = torch.einsum("ia,jb,abc->cij", from_nodes, from_nodes, samples)
-        self.register_buffer("coefficients", _with_derivatives(expansion, self._half_spans()))
-        self.register_buffer("scaling", self._scaling(), persistent=False)
-        self.error_nt = self._worst_error(model)
-        """Largest difference from the model at the check points [nT]."""
+        scaling = box_scaling(edges)
+        self.register_buffer("coefficients", _with_derivatives(expansion, (edges[:, 1] - edges[:, 0]) / 2))
+        self.register_buffer("scaling", scaling.unsqueeze(-1), persistent=False)
+        check_points = torch.linspace(-1, 1, 4 * degree + 1, dtype=torch.float64)
+        grid = torch.meshgrid(*inside_box(check_points, edges), indexing="ij")
+        self.error_nt = float((self(*grid) - model(*grid).to("cpu", torch.float64)).abs().max())
+        """Largest difference from the model on a grid four times as fine as the nodes, corners included [nT]."""
         if not self.error_nt <= tolerance_nt:
             raise ValueError(
                 f"the expansion of degree {degree} misses the model by {self.error_nt:.3g} nT on latitudes {latitude}, "
@@ -108,37 +111,9 @@ class RegionalField(Float64Module):
         return in_chunks(sums, [position.reshape(2, -1)], rows, self.CHUNK).reshape(rows, *position.shape[1:])
 
     def _sums(self, coefficients: Tensor, position: Tensor) -> Tensor:
-        polynomials = chebyshev(self._unit(position), self.degree + 1)
+        polynomials = chebyshev(in_half_spans(position, self.scaling), self.degree + 1)
         terms = (coefficients @ polynomials[:, 0]).unflatten(0, (-1, self.degree + 1, 3))
         return terms.mul_(polynomials[:, 1:]).sum(1).flatten(0, 1)
-
-    def _unit(self, position: Tensor) -> Tensor:
-        """Return latitude and longitude ``(2, P)`` in half spans from the center of the box; NaN beyond [-1, 1]."""
-        center, turns, per_degree = self.scaling
-        offset = position - center
-        unit = torch.sub(offset, torch.round(offset * turns), alpha=360) * per_degree
-        # The edges belong to the box, even if scaling rounds them out of it.
-        return unit.masked_fill_(unit.abs() > 1 + 1e-12, float("nan"))
-
-    def _scaling(self) -> Tensor:
-        """Return center [deg], turns per degree and half spans per degree, of latitude and longitude: ``(3, 2, 1)``."""
-        centers = sum(self.latitude) / 2, sum(self.longitude) / 2
-        rows = (centers, (0.0, 1 / 360), tuple(1 / half for half in self._half_spans()))
-        return torch.tensor(rows, dtype=torch.float64).unsqueeze(-1)
-
-    def _half_spans(self) -> tuple[float, float]:
-        return (self.latitude[1] - self.latitude[0]) / 2, (self.longitude[1] - self.longitude[0]) / 2
-
-    def _grid(self, unit: Tensor) -> tuple[Tensor, Tensor]:
-        half_lat, half_lon = self._half_spans()
-        lat, lon = unit * half_lat + sum(self.latitude) / 2, unit * half_lon + sum(self.longitude) / 2
-        grid = torch.meshgrid(lat, lon, indexing="ij")
-        return grid[0], grid[1]
-
-    def _worst_error(self, model: FieldModel) -> float:
-        """Return the largest difference on a grid four times as fine as the nodes, corners included."""
-        points = self._grid(torch.linspace(-1, 1, 4 * self.degree + 1, dtype=torch.float64))
-        return float((self(*points) - model(*points).to("cpu", torch.float64)).abs().max())
 
     def extra_repr(self) -> str:
         """Return the box, the degree and the measured error as text."""
@@ -147,12 +122,73 @@ class RegionalField(Float64Module):
         )
 
 
-def _with_derivatives(expansion: Tensor, half_spans: tuple[float, float]) -> Tensor:
+def box_scaling(edges: Tensor) -> Tensor:
+    """Return what :func:`in_half_spans` needs of boxes.
+
+    Args:
+        edges: ``(..., 2, 2)`` latitude and longitude, of each the lower and the upper edge [deg].
+
+    Returns:
+        ``(..., 2, 2)``: of latitude and longitude, the center [deg] and half spans per degree.
+
+    Example:
+        >>> box_scaling(torch.tensor([[-10.0, 0.0], [160.0, 180.0]]))
+        tensor([[-5.0000e+00,  2.0000e-01],
+                [ 1.7000e+02,  1.0000e-01]])
+    """
+    low, high = edges.unbind(-1)
+    return torch.stack(((low + high) / 2, 2 / (high - low)), -1)
+
+
+def in_half_spans(position: Tensor, scaling: Tensor) -> Tensor:
+    """Return positions as fractions of the half spans of boxes.
+
+    Args:
+        position: ``(2, P)`` latitude and longitude [deg], any turn.
+        scaling: ``(2, 2, P)`` or ``(2, 2, 1)``, from :func:`box_scaling`.
+
+    Returns:
+        ``(2, P)`` from the centers, in [-1, 1]; NaN outside the box.
+
+    Example:
+        >>> scaling = box_scaling(torch.tensor([[-10.0, 0.0], [160.0, 180.0]])).unsqueeze(-1)
+        >>> in_half_spans(torch.tensor([[-10.0, -5.0], [-180.0, 150.0]]), scaling)
+        tensor([[-1.,  0.],
+                [ 1., nan]])
+    """
+    center, per_degree = scaling.unbind(1)
+    offset = position - center
+    offset[1] -= 360 * torch.round(offset[1] / 360)
+    unit = offset * per_degree
+    # The edges belong to the box, even if scaling rounds them out of it.
+    return unit.masked_fill_(unit.abs() > 1 + 1e-12, float("nan"))
+
+
+def inside_box(unit: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+    """Return latitudes and longitudes at fractions of the half spans of boxes.
+
+    Args:
+        unit: ``(U,)`` from the center, in [-1, 1].
+        edges: ``(..., 2, 2)`` latitude and longitude, of each the lower and the upper edge [deg].
+
+    Returns:
+        ``(..., U)`` each [deg].
+
+    Example:
+        >>> inside_box(torch.tensor([-1.0, 0.0]), torch.tensor([[-10.0, 0.0], [160.0, 180.0]]))
+        (tensor([-10.,  -5.]), tensor([160., 170.]))
+    """
+    low, high = edges.unsqueeze(-1).unbind(-2)
+    latitude, longitude = ((high - low) / 2 * unit + (low + high) / 2).unbind(-2)
+    return latitude, longitude
+
+
+def _with_derivatives(expansion: Tensor, half_spans: Tensor) -> Tensor:
     """Return value and derivative coefficients in the layout of one matrix product.
 
     Args:
         expansion: ``(3, K, K)`` coefficients over latitude and longitude.
-        half_spans: half of the height and width of the box [deg].
+        half_spans: ``(2,)`` half of the height and width of the box [deg].
 
     Returns:
         ``(9 K, K)``: the components, their derivatives northward, then eastward, per degree of arc; within each the
@@ -160,6 +196,6 @@ def _with_derivatives(expansion: Tensor, half_spans: tuple[float, float]) -> Ten
     """
     table = expansion.numpy()
     north, east = np.zeros_like(table), np.zeros_like(table)
-    north[:, :-1] = np.polynomial.chebyshev.chebder(table, axis=1) / half_spans[0]
-    east[:, :, :-1] = np.polynomial.chebyshev.chebder(table, axis=2) / half_spans[1]
+    north[:, :-1] = np.polynomial.chebyshev.chebder(table, axis=1) / float(half_spans[0])
+    east[:, :, :-1] = np.polynomial.chebyshev.chebder(table, axis=2) / float(half_spans[1])
     return torch.from_numpy(np.stack((table, north, east))).permute(0, 3, 1, 2).flatten(0, 2)

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from magrl.checks import check_number, check_tensor, check_type, require
+from magrl.checks import check_number, check_tensor, require
 from magrl.field import harmonics
 from magrl.field.model import Float64Module, in_chunks
 from magrl.geodesy import WGS84_A_KM, WGS84_E2, check_positions
@@ -24,7 +24,7 @@ class SphericalHarmonicField(Float64Module):
         chunk: points evaluated at a time; temporary memory is about 1 kB per point on a CPU and 6 kB on an accelerator.
 
     Raises:
-        TypeError: if ``gauss`` is not a tensor.
+        TypeError: if ``gauss`` is not a complex tensor.
         ValueError: for a table of another shape or with non-finite values, an altitude below -100 km, a chunk below 1.
 
     Example:
@@ -45,16 +45,11 @@ class SphericalHarmonicField(Float64Module):
 
     def __init__(self, gauss: Tensor, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
         super().__init__()
-        check_type(Tensor, gauss=gauss)
         check_number(1, whole=True, chunk=chunk)
-        if gauss.ndim != 2 or gauss.shape[0] != gauss.shape[1] or gauss.shape[0] < 2:
-            raise ValueError(f"gauss must be a square (N + 1, N + 1) table with N >= 1, got shape {tuple(gauss.shape)}")
-        if not torch.isfinite(torch.view_as_real(gauss.to(torch.complex128))).all():
-            raise ValueError("gauss holds non-finite coefficients")
-        self.degree = gauss.shape[0] - 1
-        self.altitude_km = self._checked_altitude(altitude_km)
-        self.chunk = int(chunk)
-        gauss = gauss.to(torch.complex128)
+        check_number(altitude_km=altitude_km)
+        gauss = harmonics.checked_gauss(gauss)
+        self._check_altitude(torch.tensor(altitude_km, dtype=torch.float64))
+        self.degree, self.altitude_km, self.chunk = len(gauss) - 1, float(altitude_km), int(chunk)
         value, gradient = harmonics.field_table(gauss), harmonics.gradient_table(gauss)
         padding = (0, gradient.shape[1] - value.shape[1])
         both = torch.cat((nn.functional.pad(value, padding), gradient[list(_INDEPENDENT)]))
@@ -78,12 +73,7 @@ class SphericalHarmonicField(Float64Module):
         Raises:
             ValueError: for a latitude beyond 90 degrees, or a non-finite position.
         """
-        shape, points = self._points(latitude, longitude, altitude_km)
-        return (
-            in_chunks(partial(self._value, altitude_km is None), points, 3, self.chunk)
-            .reshape(3, *shape)
-            .movedim(0, -1)
-        )
+        return self._evaluate(3, latitude, longitude, altitude_km).movedim(0, -1)
 
     def value_and_gradient(
         self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None
@@ -105,37 +95,36 @@ class SphericalHarmonicField(Float64Module):
         Raises:
             ValueError: for a latitude beyond 90 degrees, or a non-finite position.
         """
-        shape, points = self._points(latitude, longitude, altitude_km)
-        rows = in_chunks(partial(self._value_and_gradient, altitude_km is None), points, 9, self.chunk)
-        return rows[:3].reshape(3, *shape).movedim(0, -1), rows[3:].reshape(3, 2, *shape).movedim((0, 1), (-2, -1))
+        rows = self._evaluate(9, latitude, longitude, altitude_km)
+        return rows[:3].movedim(0, -1), rows[3:].unflatten(0, (3, 2)).movedim((0, 1), (-2, -1))
 
-    @property
-    def _altitudes(self) -> str:
-        """Altitudes that are valid, as text."""
-        lowest, highest = self.altitude_range_km
-        if highest == math.inf:
-            return f"a finite number from {lowest:g} km on"
-        return f"from {lowest:g} to {highest:g} km (a depth is negative): is it in meters? Divide by 1000"
+    def _evaluate(
+        self, rows: int, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None
+    ) -> Tensor:
+        """Return the first 3 or all 9 rows of :meth:`_value_and_gradient`: ``(rows, ...)``."""
+        points = self._points(latitude, longitude, altitude_km)
+        function = partial(self._value if rows == 3 else self._value_and_gradient, altitude_km is None)
+        found = in_chunks(function, [x.reshape(-1) for x in points], rows, self.chunk)
+        return found.reshape(rows, *points[0].shape)
 
-    def _checked_altitude(self, altitude_km: float) -> float:
-        check_number(altitude_km=altitude_km)
-        lowest, highest = self.altitude_range_km
-        if not lowest <= altitude_km <= highest:
-            raise ValueError(f"altitude_km {altitude_km} is not {self._altitudes}")
-        return float(altitude_km)
-
-    def _points(
-        self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None
-    ) -> tuple[torch.Size, list[Tensor]]:
-        inputs = (latitude, longitude, self.altitude_km if altitude_km is None else altitude_km)
-        check_tensor(**{f"input {i}": x for i, x in enumerate(inputs) if isinstance(x, Tensor)})
-        tensors = [torch.as_tensor(x, dtype=torch.float64, device=self.value_weights.device) for x in inputs]
+    def _points(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None) -> tuple[Tensor, ...]:
+        """Return latitude, longitude and altitude in float64, broadcast and checked."""
+        altitude_km = self.altitude_km if altitude_km is None else altitude_km
+        if not isinstance(altitude_km, Tensor):
+            altitude_km = torch.tensor(altitude_km, dtype=torch.float64)
+        check_tensor(latitude=latitude, longitude=longitude, altitude_km=altitude_km)
+        tensors = [x.to(self.value_weights.device, torch.float64) for x in (latitude, longitude, altitude_km)]
         check_positions(tensors[0], tensors[1])
+        self._check_altitude(tensors[2])
+        return torch.broadcast_tensors(*tensors)
+
+    def _check_altitude(self, altitude_km: Tensor) -> None:
         lowest, highest = self.altitude_range_km
-        sound = (tensors[2] >= lowest) & (tensors[2] <= highest) & (tensors[2] < math.inf)
-        require(sound, tensors[2], f"altitude_km {{}} is not {self._altitudes}")
-        tensors = list(torch.broadcast_tensors(*tensors))
-        return tensors[0].shape, [x.reshape(-1) for x in tensors]
+        allowed = f"from {lowest:g} to {highest:g} km (a depth is negative): is it in meters? Divide by 1000"
+        if highest == math.inf:
+            allowed = f"a finite number from {lowest:g} km on"
+        sound = (altitude_km >= lowest) & (altitude_km <= highest) & (altitude_km < math.inf)
+        require(sound, altitude_km, f"altitude_km {{}} is not {allowed}")
 
     def _value(self, level: bool, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> Tensor:
         """Return north, east, down, ``(3, P)`` [nT]; ``level`` if the altitude is the model's."""

@@ -1,6 +1,5 @@
 """The magnetic elements of Eq. 2-1: signs, limits, inverse and Jacobian."""
 
-import itertools
 import math
 
 import pytest
@@ -55,40 +54,22 @@ def test_signs_in_every_octant(north, declination_north, east, down):
         ((-1.0, -0.0, 0.0), 180.0, 0.0),
         ((0.0, -1.0, 0.0), -90.0, 0.0),
         ((1.0, 0.0, -1.0), 0.0, -45.0),
+        ((-0.0, -0.0, 5e4), 0.0, 90.0),
+        ((0.0, -0.0, -5e4), 0.0, -90.0),
     ],
 )
 def test_angles_on_the_axes(b_ned, declination, inclination):
-    """D is in (-180, 180]: due south is +180, however its zero is signed."""
+    """D is in (-180, 180]: due south is +180, however its zero is signed; at a magnetic pole it is 0."""
     found = seven_elements(f64(*b_ned))
     assert float(found.D) == pytest.approx(declination, abs=1e-13)
     assert float(found.I) == pytest.approx(inclination, abs=1e-13)
     assert measured_elements(f64(*b_ned))[:2].tolist() == pytest.approx([declination, inclination], abs=1e-13)
 
 
-@pytest.mark.parametrize("down", [5e4, -5e4])
-@pytest.mark.parametrize("north", [0.0, -0.0])
-@pytest.mark.parametrize("east", [0.0, -0.0])
-def test_declination_is_zero_at_a_magnetic_pole(north, east, down):
-    b_ned = f64(north, east, down)
-    assert measured_elements(b_ned).tolist() == [0.0, math.copysign(90.0, down), 0.0]
-    assert (float(seven_elements(b_ned).D), float(seven_elements(b_ned).B_F)) == (0.0, 5e4)
-
-
-def test_no_field_at_all_is_no_nan():
-    nothing = torch.zeros(3, dtype=torch.float64)
-    assert torch.equal(torch.stack(seven_elements(nothing)), torch.zeros(7, dtype=torch.float64))
-    assert torch.equal(elements_jacobian(nothing), torch.zeros(3, 3, dtype=torch.float64))
-
-
 def test_paper_example_has_a_negative_inclination():
     """2 S, 162 E in the paper: D 8.019, I -16.150, B_H 35467.990."""
     found = measured_elements(field_vector(f64(8.019, -16.150, 35467.990)))
     torch.testing.assert_close(found, f64(8.019, -16.150, 35467.990), rtol=1e-13, atol=0)
-
-
-def test_field_vector_worked_by_hand():
-    found = field_vector(f64(30.0, -45.0, 20000.0))
-    torch.testing.assert_close(found, f64(10000 * math.sqrt(3), 10000.0, -20000.0), rtol=1e-14, atol=0)
 
 
 def test_differences_in_declination_are_wrapped_and_others_are_not_rounded():
@@ -112,33 +93,13 @@ def test_jacobian_matches_autograd(differentiate):
     assert ((elements_jacobian(b_ned) - expected).abs() / row).max() < 1e-12
 
 
-def test_jacobian_at_a_magnetic_pole_is_zero_where_it_is_undefined():
-    """The rows of D and B_H have no direction there; a change of B_z alone changes no element."""
-    jacobian = elements_jacobian(f64(0.0, 0.0, 5e4))
-    assert torch.isfinite(jacobian).all()
+@pytest.mark.parametrize("down", [0.0, 5e4])
+def test_without_a_horizontal_field_no_derivative_is_nan(down):
+    """The rows of D and B_H, which have no direction there, are zero; a change of B_z alone changes no element."""
+    jacobian = elements_jacobian(f64(0.0, 0.0, down))
+    assert jacobian.isfinite().all()
     assert torch.equal(jacobian[[0, 2]], torch.zeros(2, 3, dtype=torch.float64))
     assert torch.equal(jacobian[:, 2], torch.zeros(3, dtype=torch.float64))
-
-
-def test_jacobian_of_a_unit_field():
-    """North alone: D turns with the east, I with what points down, B_H with the north."""
-    expected = torch.zeros(3, 3, dtype=torch.float64)
-    expected[0, 1] = expected[1, 2] = math.degrees(1)
-    expected[2, 0] = 1
-    torch.testing.assert_close(elements_jacobian(f64(1.0, 0.0, 0.0)), expected, rtol=1e-14, atol=0)
-
-
-def test_gradient_is_the_chain_rule():
-    """The elements of B + G d, differentiated in d."""
-    b_ned, gradient = random_fields(50, seed=3), random_fields(50, 2, seed=4).mT / 1e3
-
-    def along(d, b, g):
-        return measured_elements(b + g @ d)
-
-    origin = torch.zeros(50, 2, dtype=torch.float64)
-    expected = torch.func.vmap(torch.func.jacrev(along))(origin, b_ned, gradient)
-    found = elements_gradient(b_ned, gradient)
-    assert ((found - expected).abs() / expected.abs().amax(-1, keepdim=True)).max() < 1e-12
 
 
 def test_gradient_worked_by_hand():
@@ -152,25 +113,6 @@ def test_gradient_worked_by_hand():
     torch.testing.assert_close(found, expected, rtol=1e-14, atol=0)
 
 
-def test_shapes_and_dtypes():
-    for shape, dtype in itertools.product(SHAPES, DTYPES):
-        check_shapes_and_dtypes(shape, dtype)
-
-
-def check_shapes_and_dtypes(shape, dtype):
-    b_ned = random_fields(*shape, seed=5).to(dtype)
-    gradient = torch.ones(*shape, 3, 2, dtype=dtype)
-    outputs = {
-        (*shape, 3): (measured_elements(b_ned), field_vector(measured_elements(b_ned))),
-        (*shape, 3, 3): (elements_jacobian(b_ned),),
-        (*shape, 3, 2): (elements_gradient(b_ned, gradient),),
-        shape: seven_elements(b_ned),
-    }
-    for expected, found in outputs.items():
-        assert {x.shape for x in found} == {torch.Size(expected)}
-        assert {x.dtype for x in found} == {dtype}
-
-
 def test_measured_elements_are_the_first_three():
     b_ned = random_fields(7, seed=6)
     assert Elements._fields[:3] == NAMES
@@ -178,12 +120,8 @@ def test_measured_elements_are_the_first_three():
     for index, name in enumerate(NAMES):
         assert element_index(name) == index
         assert torch.equal(measured_elements(b_ned)[:, index], getattr(seven_elements(b_ned), name))
-
-
-def test_an_unknown_element_is_refused():
-    for name in ("B_F", "d", "", "H"):
-        with pytest.raises(ValueError, match=rf"unknown magnetic element '{name}'.*D, I, B_H"):
-            element_index(name)
+    with pytest.raises(ValueError, match="unknown magnetic element 'H': choose from D, I, B_H"):
+        element_index("H")
 
 
 def test_nan_in_a_component_is_nan_in_what_depends_on_it():
@@ -202,21 +140,9 @@ def test_nan_in_a_component_is_nan_in_what_depends_on_it():
     assert elements_gradient(f64(1.0, 1.0, 1.0), torch.full((3, 2), math.nan, dtype=torch.float64)).isnan().all()
 
 
-def test_vectors_of_another_size_are_refused_by_name() -> None:
-    for function, name in (
-        (seven_elements, "b_ned"),
-        (measured_elements, "b_ned"),
-        (elements_jacobian, "b_ned"),
-        (field_vector, "elements"),
-    ):
-        with pytest.raises(ValueError, match=rf"{name} must have the shape \(\.\.\., 3\), got \(2,\)"):
-            function(torch.zeros(2))
-        with pytest.raises(TypeError, match=f"{name} must be a tensor"):
-            function([1.0, 2.0, 3.0])
-
-
-def test_gradients_of_another_size_are_refused_by_name() -> None:
+@pytest.mark.parametrize("function", [seven_elements, measured_elements, elements_jacobian, field_vector])
+def test_vectors_of_another_size_raise(function) -> None:
+    with pytest.raises(ValueError, match=r"must have the shape \(\.\.\., 3\), got \(2,\)"):
+        function(torch.zeros(2))
     with pytest.raises(ValueError, match=r"b_gradient must have the shape \(\.\.\., 3, 2\), got \(2, 2\)"):
         elements_gradient(torch.ones(3), torch.zeros(2, 2))
-    with pytest.raises(ValueError, match=r"b_gradient must have the shape \(\.\.\., 3, 2\), got \(3, 3\)"):
-        elements_gradient(torch.ones(3), torch.zeros(3, 3))

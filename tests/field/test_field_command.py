@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -45,29 +44,16 @@ def test_the_field_of_each_row_is_that_of_its_date_and_altitude(points) -> None:
         assert row["F_nT"] == pytest.approx(vector.norm().item(), abs=1e-3)
         found = [row[name] for name in ("D_deg", "I_deg", "B_H_nT")]
         np.testing.assert_allclose(found, elements_at(field, place), rtol=0, atol=1e-3)
-        names = [f"d{x}_{way}_{unit}_per_km" for x, unit in (("D", "deg"), ("I", "deg"), ("B_H", "nT"))
-                 for way in ("north", "east")]  # fmt: skip
+        units = {"D": "deg", "I": "deg", "B_H": "nT"}
+        names = [f"d{x}_{side}_{unit}_per_km" for x, unit in units.items() for side in ("north", "east")]
         np.testing.assert_allclose(row[names].tolist(), elements_gradient_at(field, place).flatten(), rtol=0, atol=1e-8)
 
 
-def test_columns_have_any_name_a_value_of_all_rows_and_meters(points, tmp_path) -> None:
+def test_options_name_columns_depth_unit_and_one_date(points, tmp_path) -> None:
     points.write_text("lat,lon,down\n-2,162,500\n60,5,11000\n")
     out = tmp_path / "new" / "out.csv"
-    options = [
-        "--latitude",
-        "lat",
-        "--longitude",
-        "lon",
-        "--depth",
-        "down",
-        "--unit",
-        "m",
-        "--date",
-        "2022-01-01",
-        "--generation",
-        "13",
-    ]
-    main([str(points), *options, "--out", str(out)])
+    options = "--latitude lat --longitude lon --depth down --unit m --date 2022-01-01 --generation 13"
+    main([str(points), *options.split(), "--out", str(out)])
     found = pandas.read_csv(out)[["X_nT", "Y_nT", "Z_nT"]].to_numpy()
     place = torch.tensor([[-2.0, 60.0], [162.0, 5.0]], dtype=torch.float64)
     expected = IGRF("2022-01-01", 13)(*place, torch.tensor([-0.5, -11.0]))
@@ -78,22 +64,14 @@ def test_columns_have_any_name_a_value_of_all_rows_and_meters(points, tmp_path) 
     ("old", "new", "options", "message"),
     [
         ("0.5", "5000", "", "row 1, altitude: 5000 is not from -15 to 1000 km: is it in meters? Then add --unit m"),
-        ("0.5", "-20", "", "row 1, altitude: -20 is not from -15 to 1000 km"),
         ("60.4", "north", "", "row 2, latitude: 'north' is not a finite number"),
-        ("60.4", "", "", "row 2, latitude: '' is not a finite number"),
         ("60.4", "91", "", "row 2, latitude: 91 is not from -90 to 90 degrees"),
         ("162.0", "1620", "", "row 1, longitude: 1620 is not from -360 to 360 degrees"),
         ("1999.5", "May", "", "row 2, date: date 'May' is not an ISO date"),
-        ("1999.5", "20220101", "", "row 2, date: date 20220101.0 is not a year"),
         ("1999.5", "1850-01-01", "", "1850-01-01T00:00:00 is outside IGRF-14, which is valid from 1900-01-01"),
         ("altitude", "height", "", "neither altitude nor depth among id, latitude, longitude, height, date"),
         ("id", "depth", "", "both columns altitude and depth: choose with --altitude or --depth"),
-        (
-            "latitude",
-            "lat",
-            "",
-            "'latitude' is no column of the table and no latitude: choose among id, lat, longitude",
-        ),
+        ("latitude", "lat", "", "'latitude' is no column of the table and no latitude: choose among id, lat"),
         ("id", "D_deg", "", "the table has columns D_deg already"),
         (POINTS.partition("\n")[2], "", "", "the table has no row"),
         ("", "", "--altitude 5000", "5000 is not from -15 to 1000 km"),
@@ -101,19 +79,19 @@ def test_columns_have_any_name_a_value_of_all_rows_and_meters(points, tmp_path) 
         ("", "", "--out points.csv", "would replace the points"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_row(points, monkeypatch, capsys, old, new, options, message) -> None:
+def test_errors_name_the_row_and_the_value(points, monkeypatch, capsys, old, new, options, message) -> None:
     monkeypatch.chdir(points.parent)
     points.write_text(POINTS.replace(old, new, 1) if old else POINTS)
     with pytest.raises(SystemExit) as exit_:
         main(["points.csv", *options.split()])
     assert exit_.value.code == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
     assert not points.with_name("points_field.csv").exists()
 
 
-def test_a_missing_file_and_a_missing_engine_are_said(points, monkeypatch, capsys) -> None:
+def test_missing_file_and_missing_engine_raise(points, monkeypatch, capsys) -> None:
     def without_engine(*_, **__):
         raise ImportError("no engine")
 
@@ -139,7 +117,13 @@ def test_columns_of_numbers_are_numbers_in_parquet(tmp_path: Path, monkeypatch) 
     assert table[["name", "date"]].to_numpy().tolist() == [["a", "2025-06-01"], ["7", "2022-01-01"]]
 
 
-def test_it_runs_as_a_command(points) -> None:
-    command = [sys.executable, "-W", "ignore", "-m", "magrl.field", str(points)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert re.fullmatch(r"The field at 3 points is in .*points_field\.csv\n", done.stdout)
+def test_help_ends_without_a_traceback_when_the_pipe_is_closed() -> None:
+    done = subprocess.run(
+        f"{sys.executable} -W ignore -m magrl.field points.csv --help | head -n 1",
+        shell=True,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.startswith("usage: python -m magrl.field")
+    assert done.stderr == ""

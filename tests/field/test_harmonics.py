@@ -14,7 +14,6 @@ from magrl.field.harmonics import (
     differentiate,
     field_table,
     gradient_table,
-    on_surface,
     products,
     separate,
     waves,
@@ -88,27 +87,6 @@ def test_derivative_tables_worked_by_hand(degree, potential_entries, along_x, al
     torch.testing.assert_close(meaningful(found), expected, rtol=0, atol=1e-14)
 
 
-def test_differentiate_is_batched_and_linear():
-    tables = torch.stack([random_table(4, seed) for seed in range(6)]).reshape(2, 3, 5, 5)
-    found = differentiate(tables)
-    assert found.shape == (2, 3, 3, 6, 6)
-    torch.testing.assert_close(found[1, 2], differentiate(tables[1, 2]), rtol=0, atol=0)
-    combined = differentiate(2 * tables[0, 0] - 3 * tables[1, 1])
-    torch.testing.assert_close(combined, 2 * found[0, 0] - 3 * found[1, 1], rtol=1e-14, atol=1e-13)
-
-
-def test_entries_that_mean_nothing_are_ignored():
-    clean = random_table(4, 1)
-    soiled = clean + torch.triu(torch.full_like(clean, 7 - 5j), diagonal=1)
-    soiled[:, 0] += 3j  # there is no sine of order 0
-    torch.testing.assert_close(differentiate(soiled), differentiate(clean), rtol=0, atol=0)
-
-
-def test_derivatives_commute():
-    twice = meaningful(differentiate(differentiate(random_table(5, 2))))
-    torch.testing.assert_close(twice, twice.transpose(0, 1), rtol=1e-13, atol=1e-13)
-
-
 # --- basis ------------------------------------------------------------------------------------------------------------
 
 
@@ -129,24 +107,6 @@ def test_basis_is_the_schmidt_normalized_legendre_functions(degree):
     torch.testing.assert_close(found, torch.stack(rows), rtol=1e-11, atol=1e-13)
 
 
-@pytest.mark.parametrize("pole", [1.0, -1.0])
-def test_basis_on_the_axis(pole):
-    """There every S_n0 is (+-1)^n and every other order vanishes."""
-    ecef = torch.tensor([[0.0, 0.0, pole * REFERENCE_RADIUS_KM]], dtype=torch.float64)
-    expected = [float(kind == m == 0) * pole**n for n in range(6) for m in range(n + 1) for kind in (0, 1)]
-    torch.testing.assert_close(
-        basis(ecef, 5).squeeze(-1), torch.tensor(expected, dtype=torch.float64), atol=1e-15, rtol=0
-    )
-
-
-def test_basis_keeps_float32_and_takes_no_points():
-    ecef = random_points(5, 4)
-    single = basis(ecef.float(), 8)
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), basis(ecef, 8), rtol=1e-4, atol=1e-5)
-    assert basis(ecef[:0], 3).shape == (20, 0)
-
-
 # --- field and gradient -----------------------------------------------------------------------------------------------
 
 
@@ -158,8 +118,9 @@ def test_field_is_minus_the_gradient_of_the_potential(degree):
     torch.testing.assert_close(found, -slope, rtol=1e-10, atol=1e-10 * float(slope.abs().max()))
 
 
-@pytest.mark.parametrize("degree", [1, 2, 6])
+@pytest.mark.parametrize("degree", [1, 6])
 def test_gradient_is_the_derivative_of_the_field(degree):
+    """And has no trace, since there are no sources, and is symmetric, since there is no curl."""
     table, ecef = random_table(degree, 7), random_points(10, 8)
     weights = field_table(table)
     jacobian = torch.stack(
@@ -167,35 +128,9 @@ def test_gradient_is_the_derivative_of_the_field(degree):
     )
     found = (gradient_table(table) @ basis(ecef, degree + 2)).T.unflatten(-1, (3, 3))
     torch.testing.assert_close(found, jacobian, rtol=1e-10, atol=1e-10 * float(jacobian.abs().max()))
-
-
-def test_field_of_an_axial_dipole():
-    """B = -g a^3 (r^2 z_hat - 3 z r_vec) / r^5: -g along z on the equator, +2 g along z at the north pole."""
-    a = REFERENCE_RADIUS_KM
-    table = column(1, {(1, 0): -30000.0})
-    points = torch.tensor([[a, 0, 0], [0, a, 0], [0, 0, a], [0, 0, -a], [2 * a, 0, 0]], dtype=torch.float64)
-    found = (field_table(table) @ basis(points, 2)).T
-    along_z = torch.tensor([30000.0, 30000.0, -60000.0, -60000.0, 3750.0], dtype=torch.float64)
-    expected = torch.stack((torch.zeros(5), torch.zeros(5), along_z), -1).double()
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("degree", [1, 6, 13])
-def test_the_field_has_no_sources_and_no_curl(degree):
-    tensor = (gradient_table(random_table(degree, 9)) @ basis(random_points(200, 10), degree + 2)).T.unflatten(
-        -1, (3, 3)
-    )
-    largest = tensor.abs().amax((-2, -1))
-    divergence = tensor.diagonal(dim1=-2, dim2=-1).sum(-1)
-    assert (divergence.abs() / largest).max() < 1e-12
-    assert ((tensor - tensor.mT).abs().amax((-2, -1)) / largest).max() < 1e-12
-
-
-def test_shapes_of_the_weight_tables():
-    table = random_table(3, 11)
-    assert field_table(table).shape == (3, 5 * 6)
-    assert gradient_table(table).shape == (9, 6 * 7)
-    assert field_table(table).dtype == gradient_table(table).dtype == torch.float64
+    batch = torch.stack((table, 2 * table))
+    torch.testing.assert_close(gradient_table(batch)[1], 2 * gradient_table(table), rtol=0, atol=0)
+    torch.testing.assert_close(field_table(batch)[1], 2 * weights, rtol=0, atol=0)
 
 
 # --- separated synthesis ----------------------------------------------------------------------------------------------
@@ -224,56 +159,6 @@ def test_separated_weights_give_what_the_basis_gives(degree):
     )
 
 
-def test_products_and_waves_worked_by_hand():
-    """At twice the reference radius, 60 degrees from the pole, 30 degrees east; degree 3."""
-    a, root = REFERENCE_RADIUS_KM, math.sqrt(3)
-    at = torch.tensor([[root * a], [a], [root / 2], [0.5]], dtype=torch.float64)
-    features, lift = products(at[0], at[1], 3)
-    # (a/r)^(i+1) cos(60 i), i = 0 to 3; then two more powers of a/r for i = 0 and 1
-    expected = [0.5, 0.25 / 2, -0.125 / 2, -0.0625, 0.125, 0.0625 / 2]
-    torch.testing.assert_close(features.squeeze(-1), torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-15)
-    assert lift.item() == pytest.approx(root / 4, abs=1e-15)  # (a/r) sin 60
-    sines_then_cosines = [0.5 * 10, root / 2, 10.0, 1.0, root / 2 * 10, 0.5, 0.0]
-    found = waves(at[2], at[3], torch.full_like(lift, 10.0), 3).squeeze(-1)
-    torch.testing.assert_close(found, torch.tensor(sines_then_cosines, dtype=torch.float64), rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("pole", [1.0, -1.0])
-def test_separated_field_at_a_pole(pole):
-    """On the axis every meridian gives the same vector, and its neighborhood joins on."""
-    table = random_table(5, 14)
-    weights = separate(field_table(table), 6)
-    longitude = torch.linspace(0, 6, 7, dtype=torch.float64)
-    on_axis = torch.zeros_like(longitude)
-    features, lift = products(on_axis, torch.full_like(longitude, pole * REFERENCE_RADIUS_KM), 6)
-    found = contract(weights, features, waves(longitude.cos(), longitude.sin(), lift, 6))
-    ecef = torch.tensor([[0.0, 0.0, pole * REFERENCE_RADIUS_KM]], dtype=torch.float64)
-    expected = (field_table(table) @ basis(ecef, 6)).expand(3, 7)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("flattening", [0.0, 1 / 298.257])
-def test_weights_on_a_surface(flattening):
-    """A spheroid about as flat as the Earth needs 12 polynomials beyond the degree, a sphere none."""
-    degree, count = 8, 9 if flattening == 0 else 21
-    weights = separate(field_table(random_table(degree - 1, 15)), degree)
-
-    def spheroid(parametric):
-        shape = torch.stack((parametric.cos(), (1 - flattening) * parametric.sin()))
-        return REFERENCE_RADIUS_KM * shape
-
-    angles, _ = chebyshev_nodes(count)
-    short = on_surface(weights, *spheroid(math.pi / 2 - angles))
-    assert short.shape == (3, 2 * degree + 1, count)
-    generator = torch.Generator().manual_seed(16)
-    latitude, longitude = torch.rand(2, 100, generator=generator, dtype=torch.float64) * 3 - 1.5
-    features, lift = products(*spheroid(latitude), degree)
-    expected = contract(weights, features, waves(longitude.cos(), longitude.sin(), lift, degree))
-    orders = waves(longitude.cos(), longitude.sin(), latitude.cos(), degree)
-    found = contract(short, chebyshev(latitude.sin(), count), orders)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
-
-
 @pytest.mark.parametrize("count", [2, 3, 8, 27])
 def test_chebyshev_polynomials_and_their_coefficients(count):
     x = torch.linspace(-1, 1, 11, dtype=torch.float64)
@@ -282,14 +167,3 @@ def test_chebyshev_polynomials_and_their_coefficients(count):
     angles, to_coefficients = chebyshev_nodes(count)
     identity = to_coefficients @ chebyshev(angles.cos(), count).T
     torch.testing.assert_close(identity, torch.eye(count, dtype=torch.float64), rtol=0, atol=1e-14)
-
-
-def test_the_synthesis_can_be_differentiated():
-    weights, ecef = separate(field_table(random_table(4, 17)), 5), random_points(6, 18)
-    inputs = [x.detach().requires_grad_() for x in cylindrical(ecef)]
-
-    def field(axis, z, cosine, sine):
-        features, lift = products(axis, z, 5)
-        return contract(weights, features, waves(cosine, sine, lift, 5))
-
-    assert torch.autograd.gradcheck(field, inputs, eps=1e-5, atol=1e-5)

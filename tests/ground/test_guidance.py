@@ -1,6 +1,5 @@
 """The paper's equations, each against a case worked by hand and in its limits."""
 
-import itertools
 import math
 
 import pytest
@@ -19,19 +18,8 @@ from magrl.guidance import (
     proximity_reward,
 )
 
-SHAPES = ((), (3,), (2, 3), (0,))
 DTYPES = (torch.float32, torch.float64)
 FLOORS = torch.tensor(OBJECTIVE_FLOORS, dtype=torch.float64)
-
-
-def shapes_and_dtypes(check):
-    """A test that runs a check for every shape and dtype."""
-
-    def test():
-        for shape, dtype in itertools.product(SHAPES, DTYPES):
-            check(shape, dtype)
-
-    return test
 
 
 def f64(*values):
@@ -52,11 +40,6 @@ def test_weights_and_objective_worked_by_hand():
     torch.testing.assert_close(weights, f64(1 / 4, 1 / 100, 1 / 40000), rtol=1e-14, atol=0)
     found = objective(f64(9.0, -24.0, 35180.0), target, weights)
     torch.testing.assert_close(found, f64(0.25 + 0.04 + 0.01), rtol=1e-12, atol=0)
-
-
-def test_objective_at_both_ends():
-    start, target = f64(8.0, -16.0, 35000.0), f64(10.0, -26.0, 35200.0)
-    weights = objective_weights(start, target, FLOORS)
     assert float(objective(start, target, weights)) == pytest.approx(3.0, abs=1e-12)
     assert float(objective(target, target, weights)) == 0.0
 
@@ -75,23 +58,6 @@ def test_small_differences_are_floored():
         target = start + 1000.0 + torch.diag(share * FLOORS - 1000.0)  # one element at a time
         weights = objective_weights(start, target, FLOORS).diagonal()
         torch.testing.assert_close(weights, (counted * FLOORS) ** -2, rtol=1e-9, atol=0)
-
-
-def test_floored_objective_of_an_episode_without_a_difference():
-    """With both ends alike, being off by one floor in each element is F = 3."""
-    here = f64(8.0, -16.0, 35000.0)
-    weights = objective_weights(here, here, FLOORS)
-    assert float(objective(here, here, weights)) == 0.0
-    assert float(objective(here + FLOORS, here, weights)) == pytest.approx(3.0, rel=1e-9)
-
-
-@shapes_and_dtypes
-def test_objective_shapes_and_dtypes(shape, dtype):
-    field, target = randn(*shape, 3).to(dtype), randn(*shape, 3, seed=1).to(dtype)
-    weights = objective_weights(field, target, FLOORS.to(dtype))
-    value = objective(field, target, weights)
-    assert (weights.shape, weights.dtype) == ((*shape, 3), dtype)
-    assert (value.shape, value.dtype) == ((*shape, 1), dtype)
 
 
 # --- rewards, Eqs. 3-3 to 3-6 -----------------------------------------------------------------------------------------
@@ -120,11 +86,6 @@ def test_a_limit_of_the_objective_leaves_no_gain_in_a_round_trip(limit):
     assert float(found.sum()) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_proximity_adds_up_along_a_path():
-    values = f64(3.0, 1.7, 2.2, 0.4, 0.0)
-    assert float(proximity_reward(values[:-1], values[1:], 10.0).sum()) == pytest.approx(30.0, rel=1e-12)
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_late_gains_shrink_and_late_losses_grow(dtype):
     step = torch.tensor([[1], [25], [26], [40], [50]])  # 25 is half way: not yet
@@ -138,11 +99,6 @@ def test_late_gains_shrink_and_late_losses_grow(dtype):
 def test_late_decay_of_an_odd_limit_starts_past_its_half():
     found = late_decay(torch.ones(2, dtype=torch.float64), torch.tensor([3, 4]), 7)
     torch.testing.assert_close(found, f64(1.0, 3 / 7), rtol=0, atol=1e-7)
-
-
-def test_late_decay_broadcasts_over_vehicles():
-    found = late_decay(torch.ones(4, 1), torch.tensor([[10], [30], [40], [50]]), 50)
-    torch.testing.assert_close(found, torch.tensor([[1.0], [0.4], [0.2], [0.0]]), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("offset_deg", [45.0, 0.0])
@@ -164,23 +120,8 @@ def test_alignment(offset_deg, dtype):
     found = alignment_reward(angle, reference, 3.0, math.radians(offset_deg))
     expected = 3 * (math.radians(offset_deg) - deviation)
     torch.testing.assert_close(found, expected, rtol=0, atol=60 * torch.finfo(dtype).eps)
-
-
-def test_alignment_by_default_pays_up_to_three_quarters_of_pi():
-    found = alignment_reward(f64(0.0, math.pi / 4, math.pi), f64(0.0), 3.0)
-    torch.testing.assert_close(found, 3 * f64(math.pi / 4, 0.0, -3 * math.pi / 4), rtol=0, atol=1e-14)
-
-
-def test_reward_shapes():
-    for shape in SHAPES:
-        values = torch.zeros(shape)
-        rewards = (
-            proximity_reward(values, values, 10.0),
-            late_decay(values, torch.ones(shape, dtype=torch.int64), 50),
-            alignment_reward(values, values, 3.0),
-            destination_reward(values.bool(), 200.0),
-        )
-        assert {x.shape for x in rewards} == {torch.Size(shape)}
+    if offset_deg == 45:
+        assert torch.equal(found, alignment_reward(angle, reference, 3.0))
 
 
 # --- parallel approach, Eq. 3-15 --------------------------------------------------------------------------------------
@@ -204,14 +145,6 @@ def approach_along(gradient, heading, distance=1.0):
     return parallel_approach(here, here + error, gradient)
 
 
-def test_approach_worked_by_hand():
-    """The first element grows by 2 eastward, the second by 1 northward: errors (2, -1) are 1 east and 1 south."""
-    gradient = f64(0.0, 2.0, 1.0, 0.0).reshape(2, 2)
-    heading, valid = parallel_approach(f64(5.0, 7.0), f64(7.0, 6.0), gradient)
-    assert float(heading) == pytest.approx(math.radians(135), abs=1e-14)
-    assert bool(valid)
-
-
 @pytest.mark.parametrize("name", GRADIENTS)
 def test_approach_points_at_the_destination_in_every_quadrant(name):
     gradient = torch.tensor(GRADIENTS[name], dtype=torch.float64)
@@ -222,11 +155,6 @@ def test_approach_points_at_the_destination_in_every_quadrant(name):
     assert valid.all()
     assert ((heading > -math.pi) & (heading <= math.pi)).all()
     assert wrap_angle(heading - expected).abs().max() < 1e-12
-
-
-def test_both_signs_of_the_determinant_are_tried():
-    determinants = [torch.linalg.det(torch.tensor(rows)) for rows in GRADIENTS.values()]
-    assert min(determinants) < 0 < max(determinants)
 
 
 def random_approaches(count, seed):
@@ -244,43 +172,6 @@ def test_approach_is_the_direction_of_the_inverse():
     assert wrap_angle(heading[:, 0] - torch.atan2(solved[:, 1], solved[:, 0])).abs().max() < 1e-12
 
 
-def test_opposite_errors_have_opposite_headings():
-    gradient, error = random_approaches(200, 4)
-    zero = torch.zeros_like(error)
-    there, back = (parallel_approach(zero, way * error, gradient)[0] for way in (1, -1))
-    assert (wrap_angle(there - back).abs() - math.pi).abs().max() < 1e-12
-
-
-@pytest.mark.parametrize("turn_deg", [17.0, 90.0, -120.0, 180.0])
-def test_turning_the_axes_turns_the_heading(turn_deg):
-    gradient, error = random_approaches(200, 6)
-    turn = math.radians(turn_deg)
-    rotation = f64(math.cos(turn), math.sin(turn), -math.sin(turn), math.cos(turn)).reshape(2, 2)
-    zero = torch.zeros_like(error)
-    plain, turned = (parallel_approach(zero, error, g)[0] for g in (gradient, gradient @ rotation.T))
-    assert wrap_angle(plain - turn - turned).abs().max() < 1e-12
-
-
-@pytest.mark.parametrize("scale", [(1000.0, 1.0), (1.0, 1e-6), (-2.0, 1.0), (-3.0, -5.0)])
-def test_the_units_of_an_element_do_not_matter(scale):
-    gradient, error = random_approaches(200, 8)
-    zero, factor = torch.zeros_like(error), f64(*scale)
-    heading, _ = parallel_approach(zero, error, gradient)
-    scaled, valid = parallel_approach(zero, error * factor, gradient * factor.unsqueeze(-1))
-    assert valid.all()
-    assert wrap_angle(heading - scaled).abs().max() < 1e-12
-
-
-def test_the_order_of_the_elements_does_not_matter():
-    gradient, error = random_approaches(200, 10)
-    zero = torch.zeros_like(error)
-    heading, swapped = (
-        parallel_approach(zero, error, gradient)[0],
-        parallel_approach(zero, error.flip(-1), gradient.flip(-2))[0],
-    )
-    assert wrap_angle(heading - swapped).abs().max() < 1e-12
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_nearly_parallel_gradients_are_flagged(dtype):
     crossing = torch.deg2rad(f64(0.0, 1.9, 2.1, 90.0, 177.9, 178.1, 180.0, -1.9, -2.1))
@@ -293,10 +184,6 @@ def test_nearly_parallel_gradients_are_flagged(dtype):
     assert torch.equal(valid, expected.expand(3, 9))
     assert torch.isfinite(heading).all()
     assert torch.equal(heading != 0, valid)
-
-
-def test_an_only_move_is_late():
-    assert late_decay(f64(4.0, -4.0), torch.tensor([1, 1]), 1).tolist() == [0.0, -8.0]
 
 
 def test_the_least_crossing_can_be_chosen():
@@ -326,24 +213,6 @@ def test_an_approach_without_direction_is_heading_zero_and_flagged(gradient, err
     assert float(heading) == 0
 
 
-def test_one_element_on_target_still_has_a_heading():
-    """Along the line on which that element stays: here due east and due west."""
-    gradient, here = torch.eye(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-    for error, expected in (((0.0, 1.0), math.pi / 2), ((0.0, -1.0), -math.pi / 2), ((-1.0, 0.0), math.pi)):
-        heading, valid = parallel_approach(here, f64(*error), gradient)
-        assert bool(valid)
-        assert float(heading) == pytest.approx(expected, abs=1e-15)
-
-
-@shapes_and_dtypes
-def test_approach_shapes_and_dtypes(shape, dtype):
-    gradient = torch.tensor(GRADIENTS["paper"], dtype=dtype).expand(*shape, 2, 2)
-    heading, valid = approach_along(gradient, torch.full(shape, 2.0, dtype=dtype))
-    assert (heading.shape, heading.dtype) == ((*shape, 1), dtype)
-    assert (valid.shape, valid.dtype) == ((*shape, 1), torch.bool)
-    assert (heading - 2).abs().sum() < 100 * torch.finfo(dtype).eps
-
-
 def test_the_best_pair_crosses_nearest_to_a_right_angle():
     """Directions of the three gradients [deg]; 170 and 10 degrees cross at 20, as 10 and 30 do."""
     rows = {
@@ -362,12 +231,6 @@ def test_the_best_pair_crosses_nearest_to_a_right_angle():
         assert found.tolist() == list(rows.values())
 
 
-@shapes_and_dtypes
-def test_best_pair_shapes_and_dtypes(shape, dtype):
-    gradient = torch.tensor([[1.0, 0.0], [1.0, 0.1], [0.0, 3.0], [1.0, 1.0]], dtype=dtype).expand(*shape, 4, 2)
-    assert torch.equal(best_pair(gradient), torch.tensor([0, 2]).expand(*shape, 2))
-
-
 @pytest.mark.parametrize("bad", [0.0, math.nan])
 def test_a_gradient_that_is_zero_or_nan_is_not_of_the_best_pair(bad):
     for missing, expected in enumerate(([1, 2], [0, 2], [0, 1])):
@@ -376,8 +239,31 @@ def test_a_gradient_that_is_zero_or_nan_is_not_of_the_best_pair(bad):
         assert best_pair(gradient).tolist() == expected
 
 
-def test_a_flag_belongs_to_its_own_vehicle():
-    gradient = torch.stack((torch.eye(2), torch.ones(2, 2), -torch.eye(2))).double()
-    heading, valid = parallel_approach(torch.zeros(3, 2).double(), f64(1.0, 0.0).expand(3, 2), gradient)
+@pytest.mark.parametrize("function", [objective_weights, objective])
+def test_elements_must_be_the_same(function):
+    good = [torch.ones(2, 3)] * 3
+    for k, shape in ((0, (2, 1)), (1, (2, 2)), (2, ())):
+        with pytest.raises(ValueError, match=r"the last dimensions must be the same elements, got .*\(2, 3\)"):
+            function(*[*good[:k], torch.ones(shape), *good[k + 1 :]])
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_nan_is_masked_in_its_own_vehicle(place):
+    inputs = [torch.zeros(3, 2), torch.ones(3, 2), torch.eye(2).expand(3, 2, 2).clone()]
+    inputs[place][1] = math.nan
+    heading, valid = parallel_approach(*inputs)
     assert valid.squeeze(-1).tolist() == [True, False, True]
-    torch.testing.assert_close(heading.squeeze(-1), f64(0.0, 0.0, math.pi), rtol=0, atol=1e-15)
+    assert heading[1] == 0
+
+
+def test_bad_arguments_raise():
+    with pytest.raises(TypeError, match="arrived must be a tensor of bools"):
+        destination_reward(torch.zeros(2), 1.0)
+    with pytest.raises(ValueError, match="max_steps must be a whole number from 1 on, got 0"):
+        late_decay(torch.zeros(1), torch.ones(1), 0)
+    with pytest.raises(ValueError, match="limit must be a finite number above 0, got 0"):
+        proximity_reward(torch.zeros(1), torch.zeros(1), 1.0, 0)
+    with pytest.raises(ValueError, match=r"min_crossing must be a finite number from 0 up to 1\.5708, got -1"):
+        parallel_approach(torch.zeros(2), torch.zeros(2), torch.eye(2), -1)
+    with pytest.raises(ValueError, match=r"at least two elements \(\.\.\., E, 2\), got \(1, 2\)"):
+        best_pair(torch.zeros(1, 2))

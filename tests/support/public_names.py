@@ -14,17 +14,13 @@ PACKAGES = (
     "navigators",
     "navigators.metaheuristics",
     "agents",
+    "onboard",
     "evaluation",
     "training",
 )
 """Packages whose ``__all__`` is public."""
-MODULES = ("checks", "files", "geodesy", "guidance", "onboard", "envs.gymnasium")
+MODULES = ("checks", "files", "geodesy", "guidance", "envs.gymnasium")
 """Modules whose functions and classes are public."""
-
-
-def homes() -> Iterator[ModuleType]:
-    """Every public package and module."""
-    yield from (import_module(f"magrl.{name}") for name in (*PACKAGES, *MODULES))
 
 
 def is_code(member: object) -> bool:
@@ -48,20 +44,3 @@ def public_members() -> dict[str, object]:
         for name in names
         if is_code(member := getattr(import_module(f"magrl.{home}"), name))
     }
-
-
-def new_methods(cls: type) -> Iterator[str]:
-    """Public methods with arguments that no parent has; the rows of a class cover those that override one."""
-    for name, member in vars(cls).items():
-        inherited = any(name in vars(parent) for parent in cls.__mro__[1:])
-        ours = inspect.isfunction(member) and not name.startswith("_") and not inherited
-        if ours and len(inspect.signature(member).parameters) > 1:
-            yield name
-
-
-def public_names() -> Iterator[str]:
-    """Public functions, classes and methods."""
-    for path, member in public_members().items():
-        yield path
-        if inspect.isclass(member):
-            yield from (f"{path}.{method}" for method in new_methods(member))

@@ -1,0 +1,97 @@
+"""Actions and observations do not depend on the private keys of the environment and of the errors."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose, Transform, TransformedEnv
+
+from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_pretrained, make_actor
+from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
+from magrl.evaluation.navigators import make_navigator
+from magrl.navigators import NAVIGATORS
+from magrl.transforms import CONDITIONS, TRUE_KEYS, with_conditions
+
+ORACLES = {"parallel", "geodesic"}
+METAHEURISTICS = {"ga", "pso", "afsa"}  # oracles but in the mode "flown"
+CONDITION = CONDITIONS["low-cost"]
+PRIVATE = {*PRIVILEGED_KEYS, *TRUE_KEYS}
+TOLD = ["sensor_std", "bias_std"]
+
+
+def base_env(seed: int = 5) -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(num_envs=3, seed=seed, drift_km=CONDITION.drift_km(50.0))
+
+
+@pytest.fixture(scope="module")
+def states() -> list[TensorDict]:
+    torch.manual_seed(0)
+    rollout = with_conditions(base_env(), CONDITION).rollout(6)
+    assert set(rollout.keys()) >= PRIVATE
+    return list(rollout.exclude("action", "next").unbind(1))
+
+
+def scrambled(state: TensorDict) -> TensorDict:
+    """Return a state with other values of all private keys."""
+    state = state.clone()
+    for key in PRIVATE & set(state.keys()):
+        value = state[key]
+        state[key] = ~value if value.dtype == torch.bool else value + torch.rand(value.shape).mul(9).to(value.dtype) + 1
+    return state
+
+
+def policy(kind: str) -> TensorDictModuleBase:
+    torch.manual_seed(0)
+    env = base_env()
+    if kind == "feedforward":
+        return FieldPolicy(PolicyConfig(env.observation_view(), (8,)))
+    if kind == "recurrent":
+        return FieldPolicy(PolicyConfig(env.observation_view(observe_heading=False), (8,), memory_size=4))
+    if kind == "exported":
+        view = env.observation_view()
+        steps = Compose(*view.observation_transforms(), view.action_transform())
+        return export_policy(make_actor(view.size, (8,)), TransformedEnv(env, steps))
+    return make_navigator(kind, env)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *sorted(set(NAVIGATORS) - ORACLES - METAHEURISTICS),
+        *(f"{name}:flown" for name in sorted(METAHEURISTICS)),
+        *("feedforward", "recurrent", "exported", "anywhere"),
+    ],
+)
+def test_actions_do_not_depend_on_private_keys(kind: str, states: list[TensorDict]) -> None:
+    plain, blind = policy(kind), policy(kind)
+    assert not getattr(plain, "oracle", False)
+    for state in states:
+        assert torch.equal(plain(state.clone())["action"], blind(scrambled(state))["action"])
+
+
+def written(transforms: list[Transform], states: list[TensorDict]) -> list[TensorDict]:
+    """What transforms write into successive states of an environment."""
+    chain, found = Compose(*transforms), []
+    for state in states:
+        found.append(chain._step(found[-1], state) if found else chain._reset(state, state))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["view", "track", "errors"])
+def test_observations_do_not_depend_on_private_keys(kind: str, states: list[TensorDict]) -> None:
+    """Those of both views, with all that they carry along, and the standard deviations that a vehicle is told."""
+
+    def transforms() -> list[Transform]:
+        views = {"view": base_env().observation_view(), "track": load_pretrained("anywhere").config.view}
+        return CONDITION.transforms(1) if kind == "errors" else views[kind].observation_transforms()
+
+    for plain, blind in zip(
+        written(transforms(), [state.clone() for state in states]),
+        written(transforms(), [scrambled(state) for state in states]),
+        strict=True,
+    ):
+        keys = TOLD if kind == "errors" else sorted(plain.keys() - PRIVATE)
+        assert kind == "errors" or "observation" in keys
+        assert all(torch.equal(plain[key], blind[key]) for key in keys)
