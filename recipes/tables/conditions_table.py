@@ -50,24 +50,24 @@ Curves = Mapping[str, Mapping[str, Sequence[float]]]
 
 def readings(**errors: object) -> Conditions:
     """Return conditions with errors of the sensors beside the noise."""
-    return Conditions("sensors", sensors={"std": NOISE, **errors})
+    return Conditions("sensors", sensors={"sensor_std": NOISE, **errors})
 
 
 def moves(**errors: float) -> Conditions:
     """Return conditions with errors of motion."""
-    return Conditions("motion", SPEED_KM_H, sensors={"std": NOISE}, motion=errors)
+    return Conditions("motion", SPEED_KM_H, sensors={"sensor_std": NOISE}, motion=errors)
 
 
 def weather(factor: float) -> Conditions:
     """Return conditions with a multiple of the weather of a month."""
     month = weather_record("boulder-2016")
     record = WeatherRecord(factor * month.variation, month.first, month.last, f"{factor:g} x {month.name}")
-    return Conditions("weather", SPEED_KM_H, sensors={"std": NOISE}, weather={"record": record})
+    return Conditions("weather", SPEED_KM_H, sensors={"sensor_std": NOISE}, weather={"record": record})
 
 
 def north(size: float) -> Conditions:
     """Return conditions with a constant error of the north reference."""
-    return Conditions("north", sensors={"std": NOISE}, north={"constant_deg": size, "fixed": True})
+    return Conditions("north", sensors={"sensor_std": NOISE}, north={"constant_deg": size, "fixed": True})
 
 
 PANELS: Mapping[str, tuple[Callable[[float], Conditions], tuple[float, ...]]] = {

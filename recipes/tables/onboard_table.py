@@ -68,7 +68,9 @@ def errors(config: Config) -> dict[str, Conditions]:
     """Return the errors of the vehicle, by the name of the row."""
     if config.conditions:
         return {name: conditions_named(name) for name in config.conditions}
-    noise = {f"{d:g}°, {i:g}°, {h:g} nT": Conditions("noise", 100.0, sensors={"std": (d, i, h)}) for d, i, h in NOISE}
+    noise = {
+        f"{d:g}°, {i:g}°, {h:g} nT": Conditions("noise", 100.0, sensors={"sensor_std": (d, i, h)}) for d, i, h in NOISE
+    }
     return {"none": conditions_named("laboratory"), **noise}
 
 
