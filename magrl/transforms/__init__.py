@@ -7,25 +7,13 @@ module where that makes sense.
 
 from magrl.transforms.alignment import AlignmentReward, FieldGradient, GradientHeading
 from magrl.transforms.declaration import DeclareArrival
-from magrl.transforms.errors import (
-    CONDITIONS,
-    NORTH_REFERENCES,
-    SPEEDS_KM_H,
-    TRUE_KEYS,
-    Conditions,
-    MagneticWeather,
-    MotionError,
-    NorthReferenceError,
-    RandomSensorNoise,
-    SensorErrors,
-    SensorNoise,
-    VectorErrors,
-    conditions_named,
-    north_reference,
-    sensor_levels,
-    with_conditions,
-    with_sensor_noise,
-)
+from magrl.transforms.errors.conditions import CONDITIONS, TRUE_KEYS, Conditions, conditions_named, with_conditions
+from magrl.transforms.errors.motion import MotionError
+from magrl.transforms.errors.noise import RandomSensorNoise, SensorNoise, sensor_levels, with_sensor_noise
+from magrl.transforms.errors.north import NORTH_REFERENCES, NorthReferenceError, north_reference
+from magrl.transforms.errors.sensors import SensorErrors
+from magrl.transforms.errors.vector import VectorErrors
+from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
 from magrl.transforms.observation import AngleVector, TargetDifference
 from magrl.transforms.rewards import DetourReward, DistanceCost, TrueWay
 from magrl.transforms.scaling import MinMaxNorm

@@ -11,24 +11,14 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.func import jacfwd, vmap
-from torchrl.data import Binary, Bounded, TensorSpec, Unbounded
-from torchrl.envs import Transform
+from torchrl.data import Binary, Bounded, Composite
 
 from magrl import guidance
 from magrl.checks import check_number, check_tensor
 from magrl.field.elements import element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import wrap_angle
-from magrl.transforms.base import (
-    Keys,
-    ObservationTransform,
-    expect_keys,
-    key_list,
-    observed_spec,
-    several_keys,
-    sorted_keys,
-    with_state,
-)
+from magrl.transforms.base import Keys, ObservationTransform, StepReward, expect_keys, key_list, several_keys
 
 
 class FieldGradient(ObservationTransform):
@@ -64,38 +54,34 @@ class FieldGradient(ObservationTransform):
     ) -> None:
         super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
         expect_keys(self, 1, 1)
-        if not hasattr(field, "value_and_gradient") and not callable(field):
+        self.elements = hasattr(field, "value_and_gradient")
+        if not self.elements and not callable(field):
             raise ValueError(
                 "field must have value_and_gradient(latitude, longitude), or be a function of a position (2,), "
                 f"got {type(field).__name__}"
             )
         self.field = field
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is not None:
-            next_tensordict.set(self.out_keys[0], self._apply_transform(values[0]))
-        return next_tensordict
-
-    def _apply_transform(self, position: Tensor) -> Tensor:
-        if hasattr(self.field, "value_and_gradient"):
-            return elements_gradient_at(cast(FieldModel, self.field), position).to(torch.get_default_dtype())
+    def _compute(self, values: list[Tensor]) -> list[Tensor]:
+        (position,) = values
+        if self.elements:
+            return [elements_gradient_at(cast(FieldModel, self.field), position).to(torch.get_default_dtype())]
         check_tensor(2, position=position)
         gradient = vmap(jacfwd(self.field))(position.reshape(-1, 2))
         if gradient.ndim != 3:
             raise ValueError(f"field must turn a position (2,) into values (E,), got {tuple(gradient.shape[1:-1])}")
-        return gradient.reshape(*position.shape[:-1], *gradient.shape[1:])
+        return [gradient.reshape(*position.shape[:-1], *gradient.shape[1:])]
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the gradient, unbounded."""
         leaf = self._leaf(observation_spec, self.in_keys[0])
         if leaf.shape[-1:] != (2,):
             raise ValueError(f"FieldGradient reads positions of shape (..., 2), got {tuple(leaf.shape)}")
-        shape, dtype = torch.Size((*leaf.shape[:-1], 3, 2)), torch.get_default_dtype()
-        if not hasattr(self.field, "value_and_gradient"):
-            like = self._apply_transform(leaf.zero())
-            shape, dtype = like.shape, like.dtype
-        observation_spec[self.out_keys[0]] = Unbounded(shape, device=leaf.device, dtype=dtype)
+        count, dtype = 3, torch.get_default_dtype()
+        if not self.elements:
+            (like,) = self._compute([leaf.zero()])
+            count, dtype = like.shape[-2], like.dtype
+        self._add(observation_spec, leaf, {self.out_keys[0]: (count, 2)}, dtype)
         return observation_spec
 
 
@@ -162,15 +148,8 @@ class GradientHeading(ObservationTransform):
         self.wrapped = [0] if pair == "auto" or "D" in pair else []
         self.min_crossing = math.radians(min_crossing_deg)
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is not None:
-            heading, valid = self._apply_transform(*values)
-            next_tensordict.set(self.out_keys[0], heading)
-            next_tensordict.set(self.out_keys[1], valid)
-        return next_tensordict
-
-    def _apply_transform(self, value: Tensor, target: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    def _compute(self, values: list[Tensor]) -> tuple[Tensor, Tensor]:
+        value, target, gradient = values
         error, gradient = target - value, gradient.to(value.dtype)
         for column in self.wrapped:
             error[..., column] = torch.rad2deg(wrap_angle(torch.deg2rad(error[..., column])))
@@ -181,7 +160,7 @@ class GradientHeading(ObservationTransform):
             error, gradient = error.gather(-1, pair), gradient.gather(-2, pair.unsqueeze(-1).expand(*pair.shape, 2))
         return guidance.parallel_approach(torch.zeros_like(error), error, gradient, self.min_crossing)
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the heading, in [-pi, pi], and its mask."""
         value, target, gradient = (self._leaf(observation_spec, key) for key in self.in_keys)
         held = [0, 1, 2] if self.pair is None else self.pair
@@ -196,14 +175,14 @@ class GradientHeading(ObservationTransform):
         return observation_spec
 
 
-class AlignmentReward(Transform):
+class AlignmentReward(StepReward):
     """Add the alignment term of Eq. 3-6 to the reward: high where an angle is close to a reference.
 
     The reference is read before the move, the angle (the heading of the move just made) after it. In a replay buffer or
     as a module, the angle and the reward are those under ``"next"``.
 
     Args:
-        in_keys: the angle and the reference [rad], of equal shape; and optionally a mask of the reference, where False
+        in_keys: the angle and the reference ``(..., 1)`` [rad]; and optionally a mask of the reference, where False
             makes the term 0.
         out_keys: one reward, to which the term is added (created if the environment has none of that name), and
             optionally a second one for the term alone, such as ``["reward", "reward_alignment"]``.
@@ -230,56 +209,25 @@ class AlignmentReward(Transform):
         offset: float = math.pi / 4,
     ) -> None:
         super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
-        if len(self.in_keys) not in (2, 3) or len(self.out_keys) not in (1, 2):
-            raise ValueError(
-                f"AlignmentReward takes 2 or 3 in_keys (angle, reference, mask) and 1 or 2 out_keys (reward, term), "
-                f"got {self.in_keys} and {self.out_keys}"
-            )
+        expect_keys(self, (2, 3), (1, 2))
         check_number(weight=weight, offset=offset)
         self.weight, self.offset = float(weight), float(offset)
 
-    def term(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
-        """Return the term that is added to the reward of a step, in the shape of the angle."""
-        angle, (reference, *mask) = next_tensordict[self.in_keys[0]], (tensordict[key] for key in self.in_keys[1:])
-        value = guidance.alignment_reward(angle, reference, self.weight, self.offset)
-        return torch.where(mask[0], value, 0.0) if mask else value
+    @property
+    def step_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict after it: the angle."""
+        return self.in_keys[:1]
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for key, source in zip(self.in_keys, (next_tensordict, tensordict, tensordict), strict=False):
-            if source.get(key, None) is None:
-                if self.missing_tolerance:
-                    return next_tensordict
-                raise KeyError(f"AlignmentReward reads {key!r}, which is not among {sorted_keys(source)}")
-        term = self.term(tensordict, next_tensordict)
-        reward = next_tensordict.get(self.out_keys[0], None)
-        next_tensordict.set(self.out_keys[0], term if reward is None else reward + term)
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it: the reference and its mask."""
+        return self.in_keys[1:]
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        term = guidance.alignment_reward(values[0], state[0], self.weight, self.offset)
+        for mask in state[1:]:
+            term = torch.where(mask, term, 0.0)
+        reward = tensordict.get(self.out_keys[0], None)
+        tensordict.set(self.out_keys[0], term if reward is None else reward + term)
         for key in self.out_keys[1:]:
-            next_tensordict.set(key, term)
-        return next_tensordict
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Add the term to the reward under ``next`` of transitions."""
-        if tensordict.get("next", None) is None:
-            raise KeyError(
-                "AlignmentReward needs transitions: the reference at the root and the angle and reward under "
-                f"'next', got {sorted_keys(tensordict)}"
-            )
-        self._step(tensordict, tensordict["next"])
-        return tensordict
-
-    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Remove the bounds of the reward; rewards that the environment lacks get the shape of the angle."""
-        for key in self.out_keys:
-            leaf = reward_spec[key] if key in reward_spec.keys(True, True) else self._observation(self.in_keys[0])
-            reward_spec[key] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
-        return reward_spec
-
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make the reference part of the state, so that batched and parallel environments pass it to the next step."""
-        return with_state(input_spec, {key: self._observation(key) for key in self.in_keys[1:]})
-
-    def _observation(self, key: NestedKey) -> TensorSpec:
-        spec = observed_spec(self)
-        if key not in spec.keys(True, True):
-            raise KeyError(f"AlignmentReward reads {key!r}, which is not among the observations {sorted_keys(spec)}")
-        return spec[key]
+            tensordict.set(key, term)

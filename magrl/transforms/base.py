@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
@@ -16,19 +17,31 @@ Keys = Sequence[NestedKey]
 
 
 class ObservationTransform(Transform):
-    """Base class of transforms that add an observation: they also run at reset, and on plain TensorDicts.
+    """Base class of transforms that write observations: they also run at reset, and on plain TensorDicts.
+
+    A subclass computes the values at ``out_keys`` from those at ``in_keys`` in :meth:`_compute`.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> class Kilometers(ObservationTransform):
-        ...     def _call(self, next_tensordict):
-        ...         (meters,) = self._read(next_tensordict)
-        ...         return next_tensordict.set(self.out_keys[0], meters / 1000)
+        ...     def _compute(self, values):
+        ...         return [values[0] / 1000]
         >>> depth = TensorDict(depth_m=torch.tensor([500.0]))
         >>> Kilometers(in_keys=["depth_m"], out_keys=["depth_km"])(depth)["depth_km"]
         tensor([0.5000])
     """
+
+    def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
+        """Return the values at ``out_keys``, given those at ``in_keys``."""
+        raise NotImplementedError
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(next_tensordict)
+        if values is not None:
+            for key, value in zip(self.out_keys, self._compute(values), strict=True):
+                next_tensordict.set(key, value)
+        return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
         return self._call(tensordict_reset)
@@ -37,15 +50,24 @@ class ObservationTransform(Transform):
         """Read ``in_keys`` and write ``out_keys`` of a TensorDict, with or without an environment."""
         return self._call(tensordict)
 
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor] | None:
-        """Return the values at ``in_keys``, or None if one is missing and missing keys are tolerated."""
-        values = [tensordict.get(key, None) for key in self.in_keys]
-        missing = [key for key, value in zip(self.in_keys, values, strict=True) if value is None]
+    def _read(
+        self, tensordict: TensorDictBase, keys: Keys | None = None, *, state: bool = False
+    ) -> list[Tensor] | None:
+        """Return the values at ``keys``, by default ``in_keys``; None if one is missing and this is tolerated."""
+        keys = self.in_keys if keys is None else keys
+        values = [tensordict.get(key, None) for key in keys]
+        missing = [key for key, value in zip(keys, values, strict=True) if value is None]
         if not missing:
             return values
         if self.missing_tolerance:
             return None
-        raise KeyError(f"{type(self).__name__} reads {missing}, which are not among {sorted_keys(tensordict)}")
+        name, known = type(self).__name__, sorted_keys(tensordict)
+        if not state:
+            raise KeyError(f"{name} reads {missing}, which are not among {known}")
+        raise KeyError(
+            f"{name} reads its state {missing}, which a reset writes: step from what reset() or step_mdp() returned; "
+            f"got {known}"
+        )
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Raise if an out_key is part of the environment's state: its next step would start from the written value.
@@ -67,6 +89,18 @@ class ObservationTransform(Transform):
             raise KeyError(f"{type(self).__name__} reads {key!r}, which is not among {sorted_keys(spec)}")
         return spec[key]
 
+    @staticmethod
+    def _add(
+        spec: Composite,
+        like: TensorSpec,
+        sizes: Mapping[NestedKey, tuple[int, ...]],
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        """Add unbounded keys to a spec: their last dimensions follow the batch of another leaf."""
+        for key, size in sizes.items():
+            shape = (*like.shape[:-1], *size)
+            spec[key] = Unbounded(shape, device=like.device, dtype=dtype or like.dtype)
+
 
 class StatefulTransform(ObservationTransform):
     """Base class of transforms that carry a state from step to step.
@@ -80,13 +114,13 @@ class StatefulTransform(ObservationTransform):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> class Odometer(StatefulTransform):
-        ...     state_keys = ["way"]
+        ...     state_keys = ["path_km"]
         ...     def _begin(self, tensordict, values, mask):
-        ...         tensordict["way"] = values[0]
+        ...         tensordict["path_km"] = values[0]
         ...     def _advance(self, tensordict, values, state):
-        ...         tensordict["way"] = state[0] + values[0]
-        >>> step = TensorDict(way=torch.tensor([5.0]), next=TensorDict(move=torch.tensor([2.0])))
-        >>> Odometer(in_keys=["move"], out_keys=["way"])(step)["next", "way"]
+        ...         tensordict["path_km"] = state[0] + values[0]
+        >>> step = TensorDict(path_km=torch.tensor([5.0]), next=TensorDict(move=torch.tensor([2.0])))
+        >>> Odometer(in_keys=["move"], out_keys=["path_km"])(step)["next", "path_km"]
         tensor([7.])
     """
 
@@ -95,12 +129,17 @@ class StatefulTransform(ObservationTransform):
         """Keys that a step reads from the TensorDict before it."""
         raise NotImplementedError
 
+    @property
+    def step_keys(self) -> Keys:
+        """Keys that a step reads from the TensorDict after it: ``in_keys``, unless some are read before it alone."""
+        return self.in_keys
+
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:
         """Write the first state; ``mask`` names the rows that are reset, None all of them."""
         raise NotImplementedError
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        """Write the next state, given the values at ``in_keys`` after the step and the state before it."""
+        """Write the next state, given the values at ``step_keys`` after the step and the state before it."""
         raise NotImplementedError
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -110,21 +149,14 @@ class StatefulTransform(ObservationTransform):
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is not None:
-            self._advance(next_tensordict, values, self._state(tensordict))
+        values, state = self._read(next_tensordict, self.step_keys), self._state(tensordict)
+        if values is not None and state is not None:
+            self._advance(next_tensordict, values, state)
         return next_tensordict
 
-    def _state(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Return the values at ``state_keys``; raise if one is missing."""
-        state = [tensordict.get(key, None) for key in self.state_keys]
-        missing = [key for key, value in zip(self.state_keys, state, strict=True) if value is None]
-        if missing:
-            raise KeyError(
-                f"{type(self).__name__} reads its state {missing}, which a reset writes: step from what reset() or "
-                f"step_mdp() returned; got {sorted_keys(tensordict)}"
-            )
-        return state
+    def _state(self, tensordict: TensorDictBase) -> list[Tensor] | None:
+        """Return the values at ``state_keys``; None if one is missing and this is tolerated."""
+        return self._read(tensordict, self.state_keys, state=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Begin at a TensorDict of first values; on transitions, compute the step from the state at the root."""
@@ -139,13 +171,43 @@ class StatefulTransform(ObservationTransform):
         if self.parent is None:
             return input_spec
         observed = self.transform_observation_spec(observed_spec(self).clone())
-        return with_state(input_spec, {key: observed[key] for key in self.state_keys})
+        return with_state(input_spec, {key: self._leaf(observed, key) for key in self.state_keys})
 
-    @staticmethod
-    def _add(spec: Composite, like: TensorSpec, sizes: Mapping[NestedKey, tuple[int, ...]]) -> None:
-        """Add unbounded keys to an observation spec: their last dimensions follow the batch of another leaf."""
-        for key, size in sizes.items():
-            spec[key] = Unbounded((*like.shape[:-1], *size), device=like.device, dtype=like.dtype)
+
+class StepReward(StatefulTransform):
+    """Base class of rewards that depend on values before a step and after it; a reset has none.
+
+    A subclass writes ``out_keys`` in :meth:`_advance`. Their specs become unbounded; a reward that the environment
+    lacks has the shape ``(..., 1)``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> import torch
+        >>> class Climb(StepReward):
+        ...     state_keys = ["height"]
+        ...     def _advance(self, tensordict, values, state):
+        ...         tensordict["reward"] = values[0] - state[0]
+        >>> step = TensorDict(height=torch.tensor([5.0]), next=TensorDict(height=torch.tensor([7.0])))
+        >>> Climb(in_keys=["height"], out_keys=["reward"])(step)["next", "reward"]
+        tensor([2.])
+    """
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        return tensordict_reset
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the reward of transitions."""
+        if tensordict.get("next", None) is None:
+            raise KeyError(f"{type(self).__name__} needs transitions, with 'next', got {sorted_keys(tensordict)}")
+        return super().forward(tensordict)
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """Remove the bounds of the reward, or add it."""
+        like = self._leaf(observed_spec(self), self.in_keys[0])
+        for key in self.out_keys:
+            known = key in reward_spec.keys(True, True)
+            self._add(reward_spec, reward_spec[key] if known else like, {key: (1,)})
+        return reward_spec
 
 
 def observed_spec(transform: Transform) -> Composite:
@@ -220,7 +282,7 @@ def several_keys(keys: Keys) -> list[NestedKey]:
     return [unravel_key(key) for key in keys]
 
 
-def expect_keys(transform: Transform, num_in: int, num_out: int) -> None:
+def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int | Sequence[int]) -> None:
     """Raise unless a transform has the given numbers of keys.
 
     Raises:
@@ -229,15 +291,17 @@ def expect_keys(transform: Transform, num_in: int, num_out: int) -> None:
     Example:
         >>> from torchrl.envs import CatTensors
         >>> joined = CatTensors(["field", "move"], "observation")
-        >>> expect_keys(joined, 2, 1)
+        >>> expect_keys(joined, (2, 3), 1)
         >>> expect_keys(joined, 3, 1)
         Traceback (most recent call last):
             ...
         ValueError: CatTensors takes 3 in_keys and 1 out_keys, got ['field', 'move'] and ['observation']
     """
     check_type(Transform, transform=transform)
-    if len(transform.in_keys) != num_in or len(transform.out_keys) != num_out:
+    counts = [(count,) if isinstance(count, int) else count for count in (num_in, num_out)]
+    if len(transform.in_keys) not in counts[0] or len(transform.out_keys) not in counts[1]:
+        ins, outs = (" or ".join(map(str, count)) for count in counts)
         raise ValueError(
-            f"{type(transform).__name__} takes {num_in} in_keys and {num_out} out_keys, "
+            f"{type(transform).__name__} takes {ins} in_keys and {outs} out_keys, "
             f"got {transform.in_keys} and {transform.out_keys}"
         )

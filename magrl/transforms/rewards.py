@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
+from inspect import signature
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import Composite
 
 from magrl.checks import check_number, check_tensor
 from magrl.geodesy import geodesic
-from magrl.transforms.base import (
-    Keys,
-    ObservationTransform,
-    expect_keys,
-    key_list,
-    observed_spec,
-    several_keys,
-    sorted_keys,
-    with_state,
-)
+from magrl.transforms.base import Keys, ObservationTransform, StepReward, expect_keys, key_list, several_keys
 
 
 class TrueWay(ObservationTransform):
@@ -49,22 +42,16 @@ class TrueWay(ObservationTransform):
         super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
         expect_keys(self, 3, 1)
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is not None:
-            next_tensordict.set(self.out_keys[0], self._way(*values))
-        return next_tensordict
-
-    @staticmethod
-    def _way(position: Tensor, target: Tensor, heading: Tensor) -> Tensor:
+    def _compute(self, values: list[Tensor]) -> list[Tensor]:
+        position, target, heading = values
         distance_km, bearing = geodesic(*position.unbind(-1), *target.unbind(-1))
         angle = bearing - heading.squeeze(-1)
-        return (distance_km.unsqueeze(-1) * torch.stack((torch.cos(angle), torch.sin(angle)), -1)).to(heading.dtype)
+        way = distance_km.unsqueeze(-1) * torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+        return [way.to(heading.dtype)]
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the way, unbounded."""
-        leaf = self._leaf(observation_spec, self.in_keys[2])
-        observation_spec[self.out_keys[0]] = Unbounded((*leaf.shape[:-1], 2), device=leaf.device, dtype=leaf.dtype)
+        self._add(observation_spec, self._leaf(observation_spec, self.in_keys[2]), {self.out_keys[0]: (2,)})
         return observation_spec
 
 
@@ -109,7 +96,7 @@ def detour_reward(
     return arrival * arrived - detour * wasted - step - lost_penalty * lost
 
 
-class DetourReward(ObservationTransform):
+class DetourReward(StepReward):
     """Write a reward for arriving on a short path, see :func:`detour_reward`.
 
     In place of the reward of the environment. It reads the true way before and after the move, so it is privileged.
@@ -118,13 +105,11 @@ class DetourReward(ObservationTransform):
         in_keys: true way ``(..., 2)`` [km], last move ``(..., K)`` with the distance [km] first, start position and
             target position ``(..., 2)`` [deg], and the flags ``(..., 1)`` success and terminated.
         out_keys: one reward ``(..., 1)``.
-        arrival: reward for arriving.
-        detour: penalty for a detour as long as the task.
-        step: penalty for each move.
-        lost_penalty: penalty for leaving the region.
+        **weights: those of :func:`detour_reward`.
 
     Raises:
         ValueError: for a negative weight, or another number of keys.
+        TypeError: for an unknown weight.
 
     Example:
         >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
@@ -138,61 +123,34 @@ class DetourReward(ObservationTransform):
         self,
         in_keys: Keys = ("true_way", "move", "start_position", "target_position", "success", "terminated"),
         out_keys: NestedKey | Keys = ("reward",),
-        *,
-        arrival: float = 10.0,
-        detour: float = 10.0,
-        step: float = 0.08,
-        lost_penalty: float = 5.0,
+        **weights: float,
     ) -> None:
         super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
         expect_keys(self, 6, 1)
-        check_number(0, arrival=arrival, detour=detour, step=step, lost_penalty=lost_penalty)
-        self.weights = {"arrival": arrival, "detour": detour, "step": step, "lost_penalty": lost_penalty}
+        signature(detour_reward).bind_partial(**weights)  # an unknown weight is an error before the first step
+        check_number(0, **weights)  # type: ignore[arg-type]
+        self.weights = weights
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
-        return tensordict_reset  # a reset has no reward
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it: the true way."""
+        return self.in_keys[:1]
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values, before = self._read(next_tensordict), tensordict.get(self.in_keys[0], None)
-        if before is None and not self.missing_tolerance:
-            known = f"among {sorted_keys(tensordict)}"
-            raise KeyError(f"DetourReward reads {self.in_keys[0]!r} before the move, which is not {known}")
-        if values is None or before is None:
-            return next_tensordict
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         after, move, start, target, success, terminated = values
         task_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
         reward = detour_reward(
             move[..., :1],
-            before.norm(dim=-1, keepdim=True) - after.norm(dim=-1, keepdim=True),
+            state[0].norm(dim=-1, keepdim=True) - after.norm(dim=-1, keepdim=True),
             task_km.unsqueeze(-1).to(move.dtype),
             success,
             terminated & ~success,
             **self.weights,
         )
-        return next_tensordict.set(self.out_keys[0], reward)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the reward of transitions."""
-        if tensordict.get("next", None) is None:
-            raise KeyError(f"DetourReward needs transitions, with 'next', got {sorted_keys(tensordict)}")
-        self._step(tensordict, tensordict["next"])
-        return tensordict
-
-    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Make the reward unbounded; a key that the environment lacks gets the shape of a flag."""
-        way = self._observed_way()
-        reward_spec[self.out_keys[0]] = Unbounded((*way.shape[:-1], 1), device=way.device, dtype=way.dtype)
-        return reward_spec
-
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make the true way part of the state, so that batched and parallel environments pass it to the next step."""
-        return with_state(super().transform_input_spec(input_spec), {self.in_keys[0]: self._observed_way()})
-
-    def _observed_way(self) -> TensorSpec:
-        return self._leaf(observed_spec(self), self.in_keys[0])
+        tensordict.set(self.out_keys[0], reward)
 
 
-class DistanceCost(ObservationTransform):
+class DistanceCost(StepReward):
     """Subtract a cost of the distance of each move from a reward.
 
     Without it, a move that brings the vehicle no nearer costs no more than waiting.
@@ -220,27 +178,11 @@ class DistanceCost(ObservationTransform):
         check_number(0, cost=cost)
         self.cost = float(cost)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
-        return tensordict_reset  # a reset has no reward
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it: none."""
+        return []
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is None:
-            return next_tensordict
-        reward = next_tensordict[self.out_keys[0]]
-        return next_tensordict.set(self.out_keys[0], reward - self.cost * values[0][..., :1])
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Subtract the cost from the reward of transitions."""
-        if tensordict.get("next", None) is None:
-            raise KeyError(
-                f"DistanceCost needs transitions, with move and reward under 'next', got {sorted_keys(tensordict)}"
-            )
-        self._call(tensordict["next"])
-        return tensordict
-
-    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Remove the bounds of the reward."""
-        leaf = reward_spec[self.out_keys[0]]
-        reward_spec[self.out_keys[0]] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
-        return reward_spec
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:  # noqa: ARG002
+        key, cost = self.out_keys[0], self.cost * values[0][..., :1]
+        tensordict.set(key, tensordict[key] - cost)

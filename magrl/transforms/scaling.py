@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from magrl.checks import check_numbers
-from magrl.transforms.base import Keys, ObservationTransform, key_list, sorted_keys
+from magrl.checks import check_numbers, check_type
+from magrl.transforms.base import Keys, ObservationTransform, key_list
 
 
 class MinMaxNorm(ObservationTransform):
@@ -35,9 +35,8 @@ class MinMaxNorm(ObservationTransform):
         interval: image of the bounds.
 
     Raises:
-        ValueError: for bounds that are not finite and rising, bounds of a key that is not used, an empty interval, or
-            an in-place key that is part of the environment's state.
-        RuntimeError: if bounds are needed that were neither given nor found in a spec.
+        ValueError: for bounds that are not finite and rising, bounds of a key that is not used, bounds that are neither
+            given nor in a spec, an empty interval, or an in-place key that is part of the environment's state.
 
     Example:
         >>> from tensordict import TensorDict
@@ -76,16 +75,19 @@ class MinMaxNorm(ObservationTransform):
         for index in range(len(self._bounded_keys)):
             self.register_buffer(f"low_{index}", None)
             self.register_buffer(f"high_{index}", None)
-        if not isinstance(bounds or {}, Mapping):
-            raise ValueError(f"bounds must be a mapping from keys to (low, high), got {bounds!r}")
-        for key, pair in (bounds or {}).items():
+        bounds = {} if bounds is None else bounds
+        check_type(Mapping, bounds=bounds)
+        for key, pair in bounds.items():
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
                 raise ValueError(f"the bounds of {key!r} must be (low, high), got {pair!r}")
-            if unravel_key(key) not in self._bounded_keys:
-                raise ValueError(f"bounds are given for {key!r}, which is not among the keys {self._bounded_keys}")
             self._set_bounds(unravel_key(key), *(_as_float(bound) for bound in pair))
 
     # Bounds
+
+    def _index(self, key: NestedKey) -> int:
+        if key not in self._bounded_keys:
+            raise ValueError(f"MinMaxNorm does not scale {key!r}: its keys are {self._bounded_keys}")
+        return self._bounded_keys.index(key)
 
     def _set_bounds(self, key: NestedKey, low: Tensor, high: Tensor) -> None:
         dtype = torch.promote_types(low.dtype, high.dtype)
@@ -97,52 +99,31 @@ class MinMaxNorm(ObservationTransform):
                 f"MinMaxNorm needs finite bounds that rise for {key!r}, got low {low.tolist()}, high {high.tolist()}: "
                 f"give bounds={{{key!r}: (low, high)}} with a number on every side"
             )
-        index = self._bounded_keys.index(key)
+        index = self._index(key)
         setattr(self, f"low_{index}", low.clone())
         setattr(self, f"high_{index}", high.clone())
 
     def _bounds(self, key: NestedKey) -> tuple[Tensor, Tensor]:
-        if key not in self._bounded_keys:
-            raise KeyError(f"MinMaxNorm does not scale {key!r}: its keys are {self._bounded_keys}")
-        index = self._bounded_keys.index(key)
+        index = self._index(key)
         if getattr(self, f"low_{index}") is None:
-            self._bounds_from_parent(key)
+            raise ValueError(
+                f"MinMaxNorm knows no bounds for {key!r}: give bounds={{{key!r}: (low, high)}}, or attach the "
+                "transform to an environment whose spec for it is bounded"
+            )
         return getattr(self, f"low_{index}"), getattr(self, f"high_{index}")
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Read the bounds of the environment that the transform is attached to, where its specs have any."""
+        """Read the bounds that are missing from the specs of the environment that the transform is attached to."""
         super().set_container(container)
         parent = self.parent
-        if parent is not None:
-            for key in self._bounded_keys:
-                for spec in (parent.full_observation_spec, parent.full_action_spec, parent.full_state_spec):
-                    if key in spec.keys(True, True) and isinstance(spec[key], Bounded):
-                        self._bounds_from_spec(key, spec[key], len(parent.batch_size))
-
-    def _bounds_from_parent(self, key: NestedKey) -> None:
-        parent = self.parent
         if parent is None:
-            raise RuntimeError(
-                f"MinMaxNorm knows no bounds for {key!r}: give them as bounds={{{key!r}: (low, high)}}, or attach the "
-                "transform to an environment whose spec for it is bounded"
-            )
-        for spec in (parent.full_observation_spec, parent.full_action_spec, parent.full_state_spec):
-            if key in spec.keys(True, True):
-                self._bounds_from_spec(key, spec[key], len(parent.batch_size))
-                return
-        raise RuntimeError(f"MinMaxNorm found no spec for {key!r} in the environment")
-
-    def _bounds_from_spec(self, key: NestedKey, spec: TensorSpec, batch_dims: int) -> None:
-        index = self._bounded_keys.index(key)
-        if getattr(self, f"low_{index}") is not None:
             return
-        if not isinstance(spec, Bounded):
-            raise ValueError(
-                f"MinMaxNorm needs bounds for {key!r}, but its spec is {type(spec).__name__}: "
-                f"give bounds={{{key!r}: (low, high)}}"
-            )
-        first = (0,) * batch_dims
-        self._set_bounds(key, spec.space.low[first], spec.space.high[first])
+        for spec in (parent.full_observation_spec, parent.full_action_spec, parent.full_state_spec):
+            for key in self._bounded_keys:
+                leaf = spec[key] if key in spec.keys(True, True) else None
+                if isinstance(leaf, Bounded) and getattr(self, f"low_{self._index(key)}") is None:
+                    row = (0,) * len(parent.batch_size)
+                    self._set_bounds(key, leaf.space.low[row], leaf.space.high[row])
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
         for name, buffer in list(self._buffers.items()):
@@ -166,31 +147,24 @@ class MinMaxNorm(ObservationTransform):
         return torch.lerp(low.expand_as(value), high.expand_as(value), (value - start) / (end - start))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            value = next_tensordict.get(in_key, None)
-            if value is not None:
-                next_tensordict.set(out_key, self.normalize(in_key, value))
-            elif not self.missing_tolerance:
-                raise KeyError(f"MinMaxNorm reads {in_key!r}, which is not among {sorted_keys(next_tensordict)}")
+        for key, scaled in zip(self.in_keys, self.out_keys, strict=True):
+            for value in self._read(next_tensordict, [key]) or ():
+                next_tensordict.set(scaled, self.normalize(key, value))
         return next_tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        for in_key, out_key in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
-            value = tensordict.get(out_key, None)
-            if value is not None:
-                tensordict.set(in_key, self.denormalize(in_key, value))
-            elif not self.missing_tolerance:
-                raise KeyError(f"MinMaxNorm reads {out_key!r}, which is not among {sorted_keys(tensordict)}")
+        for key, scaled in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
+            for value in self._read(tensordict, [scaled]) or ():
+                tensordict.set(key, self.denormalize(key, value))
         return tensordict
 
     # Specs
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the scaled entries; bounded ones stay bounded."""
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if in_key in observation_spec.keys(True, True) or in_key not in self.in_keys_inv:
-                leaf = self._leaf(observation_spec, in_key)
-                observation_spec[out_key] = self._scaled_spec(in_key, leaf, observation_spec)
+                observation_spec[out_key] = self._scaled_spec(in_key, self._leaf(observation_spec, in_key))
         return observation_spec
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
@@ -200,13 +174,13 @@ class MinMaxNorm(ObservationTransform):
             for name in ("full_action_spec", "full_state_spec"):
                 spec = input_spec[name]
                 if spec is not None and in_key in spec.keys(True, True):
-                    spec[out_key] = self._scaled_spec(in_key, spec[in_key], spec)
-                    if in_key != out_key:
-                        del spec[in_key]
+                    leaf = spec[in_key]
+                    del spec[in_key]
+                    spec[out_key] = self._scaled_spec(in_key, leaf)
         return input_spec
 
-    def _scaled_spec(self, key: NestedKey, spec: TensorSpec, root: Composite) -> TensorSpec:
-        self._bounds_from_spec(key, spec, len(root.shape))
+    def _scaled_spec(self, key: NestedKey, spec: TensorSpec) -> TensorSpec:
+        self._bounds(key)  # an error before the first episode
         if not isinstance(spec, Bounded):
             dtype = spec.dtype if spec.dtype.is_floating_point else torch.get_default_dtype()
             return Unbounded(spec.shape, device=spec.device, dtype=dtype)

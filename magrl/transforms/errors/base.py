@@ -1,4 +1,4 @@
-"""Base of the errors of sensors and of motion: random numbers for each vehicle and episode, kept in the TensorDict.
+"""Base of the errors: random numbers of each vehicle and episode, what is true, and what a vehicle knows of accuracy.
 
 The random numbers of an error are a pure function of (seed, vehicle, episode, step). Each episode has a stream of
 them, whose state is in the TensorDict, so that a step depends on its input alone. The transform itself only holds the
@@ -7,162 +7,254 @@ streams from which the next episodes split off.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec
-from torchrl.envs import EnvBase, Transform
+from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number, check_numbers
 from magrl.counters import advanced, counter_stream, split
-from magrl.transforms.base import Keys, ObservationTransform, observed_spec, with_state
-
-TRUE_KEYS = (
-    "true_field",
-    "true_heading",
-    "true_move",
-    "true_course",
-    "sensor_error",
-    "north_error",
-    "motion_error",
-    "sensor_stream",
-    "north_stream",
-    "motion_stream",
-    "weather_clock",
-)
-"""Keys of the errors that a policy may not read: what is true, the errors, and the states of their random numbers."""
+from magrl.transforms.base import Keys, StatefulTransform
 
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 """D [deg], I [deg], B_H [nT] at middle latitudes, for which data sheets state the errors that depend on the field.
 
-What a vehicle is told is the same everywhere. Stated for the true field, or for a reading to which an error is still
-added, it would give that field or that reading away.
+What a vehicle knows of its accuracy is the same everywhere. Stated for the true field, or for a reading to which an
+error is still added, it would give that field or that reading away.
 """
 
 
-class EpisodeErrors(ObservationTransform):
-    """Base class of transforms whose random numbers belong to a vehicle and an episode.
+class Episode(NamedTuple):
+    """State of an episode at a reading: its errors, the stream of random numbers, and whether it begins here."""
+
+    errors: Tensor
+    stream: Tensor
+    first: bool
+
+
+class EpisodeErrors(StatefulTransform):
+    """Base class of errors whose random numbers belong to a vehicle and an episode.
+
+    A subclass draws the errors of new episodes in :meth:`_constants`, and writes what they change in :meth:`_disturb`.
+    On a TensorDict without an environment, an episode begins in each row.
 
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
-        stream_key: key of the state of the random numbers ``(..., 1)``, int64.
+        error_key: key of the errors of an episode ``(..., size)``. Privileged: a policy must not read it.
+        stream_key: key of the state of the random numbers ``(..., 1)``, int64. Privileged.
         seed: seed of the errors. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
 
     Raises:
         ValueError: for a seed that is not a whole number.
+        KeyError: for a step from a TensorDict without the state.
 
     Example:
-        >>> EpisodeErrors(["field"], ["field"], stream_key="stream", seed=0.5)
+        >>> EpisodeErrors(["field"], ["field"], seed=0.5)
         Traceback (most recent call last):
         ValueError: seed must be a whole number, got 0.5
     """
 
     channel: ClassVar[int] = 0
     """Second counter: it separates the numbers of a class from others of the same seed."""
+    true_keys: ClassVar[tuple[str, ...]] = ()
+    """Default keys of true values, which are privileged."""
+    error_key: NestedKey = "error"
+    stream_key: NestedKey = "stream"
+    in_sizes: tuple[int | None, ...] = ()
+    """Last dimensions of the values at ``in_keys``; None for any."""
+    size: int
+    """Numbers that hold the errors of an episode."""
+    error_dtype: ClassVar[torch.dtype | None] = None
+    """Type of these numbers; by default that of the first value."""
+    draws = 0
+    """Random numbers that an episode takes before its first reading."""
+    step_draws = 0
+    """Random numbers of each reading."""
     streams: Tensor | None
 
-    def __init__(self, in_keys: Keys, out_keys: Keys, *, stream_key: NestedKey, seed: int) -> None:
+    def __init__(
+        self,
+        in_keys: Keys,
+        out_keys: Keys,
+        *,
+        error_key: NestedKey | None = None,
+        stream_key: NestedKey | None = None,
+        seed: int = 0,
+    ) -> None:
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         check_number(whole=True, seed=seed)
-        self.stream_key, self.seed = stream_key, int(seed)
+        self.seed = int(seed)
+        self.error_key, self.stream_key = error_key or self.error_key, stream_key or self.stream_key
         self.register_buffer("streams", None)
-        self._earlier: frozenset[NestedKey] | None = None
+
+    # Episodes
 
     def restart(self) -> None:
         """Begin with the first episode of each vehicle again, so that the episodes repeat their errors."""
         self.streams = None
 
-    def _next_episode(self, tensordict: TensorDictBase, batch: torch.Size, device: torch.device) -> Tensor:
+    def _next_episode(self, batch: torch.Size, device: torch.device, mask: Tensor | None) -> Tensor:
         """Return the streams of new episodes; the rows of vehicles that are not reset are placeholders."""
         if self.streams is None or self.streams.shape != batch:
             vehicle = torch.arange(batch.numel(), device=device).reshape(batch)
             self.streams = counter_stream(self.seed, torch.stack((vehicle, torch.full_like(vehicle, self.channel)), -1))
         self.streams = self.streams.to(device)  # a checkpoint may come from another one
         stream = split(self.streams)
-        mask = tensordict.get("_reset", None)
         # Advanced out of place: a checkpoint may hold the old tensor.
         self.streams = advanced(self.streams, 1 if mask is None else mask.reshape(batch).long())
         return stream
-
-    @staticmethod
-    def _of_new_episodes(tensordict: TensorDictBase, stream: Tensor, draw: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return what is drawn from the streams of the vehicles that are reset; the rows of the others are 0."""
-        mask = tensordict.get("_reset", None)
-        if mask is None:
-            return draw(stream)
-        mask = mask.reshape(stream.shape)
-        drawn = draw(stream[mask])
-        return drawn.new_zeros(*stream.shape, drawn.shape[-1]).masked_scatter(mask.unsqueeze(-1), drawn)
-
-    def set_container(self, container: Transform | EnvBase) -> None:
-        """Become part of a chain of transforms or of an environment."""
-        super().set_container(container)
-        self._earlier = None
-
-    def empty_cache(self) -> None:
-        """Forget the environment before this transform, and its keys."""
-        super().empty_cache()
-        self._earlier = None
-
-    def _comes_before(self, key: NestedKey | None) -> bool:
-        """Return whether the environment or a transform before this one writes a key."""
-        if self._earlier is None:
-            if self.parent is None:
-                return False
-            self._earlier = frozenset(observed_spec(self).keys(True, True))
-        return key in self._earlier
-
-    def _keep(self, tensordict: TensorDictBase, key: NestedKey | None, value: Tensor) -> None:
-        """Write a true value, unless a transform before this one has written it: the first error keeps it."""
-        if key is not None and not self._comes_before(key):
-            tensordict.set(key, value)
-
-    def _tell(self, tensordict: TensorDictBase, key: NestedKey, std: Tensor, reading: Tensor) -> None:
-        """Write standard deviations ``(E,)`` that the vehicle is told; their squares add to those written before."""
-        std = std.to(reading.dtype)
-        told = torch.hypot(tensordict[key], std) if self._comes_before(key) else std.expand_as(reading).clone()
-        tensordict.set(key, told)
-
-    def _written(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            known = "which its reset writes: step from what reset() or step_mdp() returned"
-            raise KeyError(f"{type(self).__name__} reads {key!r}, {known}")
-        return value
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Raise an error: the errors of an episode begin with its reset."""
-        raise NotImplementedError(f"{type(self).__name__} needs an environment: append it to a TransformedEnv")
-
-    @property
-    def _state_keys(self) -> list[NestedKey]:
-        """Keys of this transform's observations that its next step reads."""
-        return [self.stream_key]
-
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make what a step reads part of the state, so that environments in other processes pass it to the step."""
-        input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
-            return input_spec
-        observed = self.transform_observation_spec(observed_spec(self).clone())
-        return with_state(input_spec, {key: observed[key] for key in self._state_keys})
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
         saved = state_dict.get(f"{prefix}streams")
         self.streams = None if saved is None else torch.empty_like(saved)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
+    # Data
 
-def check_sizes(count: int, *, fixed: bool = False, **sizes: Sequence[float]) -> None:
-    """Raise unless each size of an error is some finite numbers, from 0 on if they are standard deviations.
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it."""
+        return [self.error_key, self.stream_key]
+
+    def _constants(self, stream: Tensor) -> Tensor:
+        """Return the errors of new episodes ``(..., size)``."""
+        raise NotImplementedError
+
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
+        """Write what the errors change in the values at ``in_keys``; return the errors for the next step."""
+        raise NotImplementedError
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:
+        stream = self._next_episode(tensordict.batch_size, values[0].device, mask)
+        errors = self._constants(stream).to(self.error_dtype or values[0].dtype)
+        self._write(tensordict, values, Episode(errors, advanced(stream, self.draws), first=True))
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        errors, stream, *_ = state
+        self._write(tensordict, values, Episode(errors, advanced(stream.squeeze(-1), self.step_draws), first=False))
+
+    def _write(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> None:
+        tensordict.set(self.error_key, self._disturb(tensordict, values, episode))
+        tensordict.set(self.stream_key, episode.stream.unsqueeze(-1))
+
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
+
+        Args:
+            field: ``(..., E)`` reading.
+
+        Returns:
+            Both ``(..., E)``.
+        """
+        return torch.zeros_like(field), torch.zeros_like(field)
+
+    def farthest_km(self, max_move_km: float) -> float:
+        """Return the longest path on the ground of a commanded move [km].
+
+        Args:
+            max_move_km: longest move that a policy may command [km].
+
+        Raises:
+            ValueError: for a move that is not above 0.
+        """
+        check_number(0, above=True, max_move_km=max_move_km)
+        return max_move_km
+
+    # Specs
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Check the shapes that are read, and add the errors and the state of the random numbers.
+
+        Raises:
+            KeyError: for a key that is missing.
+            ValueError: for a value of another shape.
+        """
+        leaves = [self._leaf(observation_spec, key) for key in self.in_keys]
+        for key, leaf, size in zip(self.in_keys, leaves, self.in_sizes, strict=False):
+            if size is not None and leaf.shape[-1:] != (size,):
+                raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(leaf.shape)}")
+        self._add(observation_spec, leaves[0], {self.error_key: (self.size,)}, self.error_dtype)
+        self._add(observation_spec, leaves[0], {self.stream_key: (1,)}, torch.int64)
+        return observation_spec
+
+
+class ReadingErrors(EpisodeErrors):
+    """Base class of errors of a reading, which keep its true value and state its accuracy.
+
+    The accuracy follows from :meth:`variances` at :data:`TYPICAL_FIELD`. Variances add up over the errors of a chain,
+    and the first error of a chain keeps the true value.
 
     Args:
-        count: how many numbers each has.
+        in_keys: of the transform.
+        out_keys: of the transform.
+        true_key: key of the true value, or None to leave it out. Privileged.
+        std_key: key of the standard deviations of the errors that are new in each reading ``(..., E)``.
+        bias_key: key of those of constant and slow errors ``(..., E)``.
+        **options: of :class:`EpisodeErrors`.
+
+    Example:
+        >>> ReadingErrors(["field"], ["measured"]).true_key
+        'true_field'
+    """
+
+    true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
+    reading: ClassVar[int] = 0
+    """Index of the reading among ``in_keys`` and ``out_keys``."""
+    _accuracy: Tensor
+
+    def __init__(
+        self,
+        in_keys: Keys,
+        out_keys: Keys,
+        *,
+        true_key: NestedKey | None = "true_field",
+        std_key: NestedKey = "sensor_std",
+        bias_key: NestedKey = "bias_std",
+        **options: Any,
+    ) -> None:
+        super().__init__(in_keys, out_keys, **options)
+        self.true_key, self.std_key, self.bias_key = true_key, std_key, bias_key
+
+    def _set_accuracy(self) -> None:
+        """Compute the standard deviations that the vehicle knows, when all sizes are set."""
+        count = self.in_sizes[self.reading]
+        field = torch.tensor(TYPICAL_FIELD if count == 3 else (0.0,) * (count or 0), dtype=torch.float64)
+        accuracy = torch.stack(self.variances(field)).sqrt().to(torch.get_default_dtype())
+        self.register_buffer("_accuracy", accuracy, persistent=False)
+
+    def _measure(
+        self, tensordict: TensorDictBase, value: Tensor, reading: Tensor, sensor_std: Tensor | None = None
+    ) -> None:
+        """Write a reading, its true value and its accuracy; ``sensor_std`` if it is not the same in all readings."""
+        if self.true_key is not None and tensordict.get(self.true_key, None) is None:
+            tensordict.set(self.true_key, value)
+        tensordict.set(self.out_keys[self.reading], reading)
+        known, slow = self._accuracy.to(reading.dtype)
+        for key, std in ((self.std_key, known if sensor_std is None else sensor_std), (self.bias_key, slow)):
+            before = tensordict.get(key, None)
+            tensordict.set(key, std.expand_as(reading).clone() if before is None else torch.hypot(before, std))
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the true value, the accuracy, the errors and the state of the numbers; the reading is unbounded."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        leaf = observation_spec[self.in_keys[self.reading]]
+        if self.true_key is not None and self.true_key not in observation_spec.keys(True, True):
+            observation_spec[self.true_key] = leaf.clone()
+        keys = self.out_keys[self.reading], self.std_key, self.bias_key
+        self._add(observation_spec, leaf, dict.fromkeys(keys, leaf.shape[-1:]))
+        return observation_spec
+
+
+def check_sizes(count: int | None = None, *, fixed: bool = False, **sizes: Sequence[float]) -> None:
+    """Raise unless each size of an error consists of finite numbers, from 0 on if they are standard deviations.
+
+    Args:
+        count: how many numbers each has; None for any number of them.
         fixed: whether they are constant errors themselves, which may be negative.
         sizes: values by the name that the message uses.
 
@@ -175,7 +267,8 @@ def check_sizes(count: int, *, fixed: bool = False, **sizes: Sequence[float]) ->
         ValueError: bias must be standard deviations, which are not negative, got (0.1, 0.1, -5.0)
     """
     for name, values in sizes.items():
-        check_numbers(count, **{name: values})
+        held = len(values) if count is None and isinstance(values, Sequence) else count
+        check_numbers(held or 1, **{name: values})
         if not fixed and min(values) < 0:
             raise ValueError(f"{name} must be standard deviations, which are not negative, got {values!r}")
 
@@ -184,7 +277,7 @@ def gauss_markov(value: Tensor, std: Tensor | float, distance: Tensor | float, l
     """Return a first-order Gauss-Markov process after a distance: stationary, with an exponential autocorrelation.
 
     x becomes ``phi x + std sqrt(1 - phi^2) w`` with ``phi = exp(-distance / length)``, so that the result does not
-    depend on how a distance is divided into steps.
+    depend on how a distance is divided into steps. An infinite distance draws a first value.
 
     Args:
         value: ``(...)`` x before the distance.

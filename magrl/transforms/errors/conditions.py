@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from magrl.checks import check_number, check_type
+from magrl.checks import check_type
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NorthReferenceError, north_reference
@@ -38,7 +38,7 @@ class Conditions:
         TypeError: for an option that the part does not have.
 
     Example:
-        >>> ship = Conditions("ship", 24.0, sensors={"std": (0.02, 0.02, 5.0)}, north={"constant_deg": 0.1})
+        >>> ship = Conditions("ship", 24.0, sensors={"sensor_std": (0.02, 0.02, 5.0)}, north={"constant_deg": 0.1})
         >>> ship.sensor_std, ship.bias_std
         ((0.02, 0.02, 5.0), (0.1, 0.0, 0.0))
     """
@@ -57,7 +57,7 @@ class Conditions:
     @property
     def perfect(self) -> bool:
         """Whether there is no error."""
-        return not self.sensors and self.north is None and self.motion is None and self.weather is None
+        return not (self.sensors or self.north or self.motion) and self.weather is None
 
     def transforms(self, seed: int = 0) -> list[EpisodeErrors]:
         """Return the errors as transforms, in the order of an environment; see :func:`with_conditions`.
@@ -66,25 +66,20 @@ class Conditions:
             seed: seed of the errors.
 
         Example:
-            >>> [type(part).__name__ for part in CONDITIONS["aircraft"].transforms()]
+            >>> [type(error).__name__ for error in CONDITIONS["aircraft"].transforms()]
             ['MotionError', 'MagneticWeather', 'SensorErrors', 'NorthReferenceError']
         """
-        motion = [] if self.motion is None else [self._motion(seed)]
-        return [*motion, *self._readings(seed)]
-
-    def _motion(self, seed: int = 0) -> MotionError:
-        return MotionError(**(self.motion or {}), speed_km_h=self.speed_km_h, seed=seed)
-
-    def _readings(self, seed: int = 0) -> list[MagneticWeather | SensorErrors | NorthReferenceError]:
-        """Return the errors of the readings, in the order in which they arise."""
-        parts: list[MagneticWeather | SensorErrors | NorthReferenceError] = [SensorErrors(**self.sensors, seed=seed)]
+        errors: list[EpisodeErrors] = []
+        if self.motion:
+            errors.append(MotionError(**self.motion, speed_km_h=self.speed_km_h, seed=seed))
         if self.weather is not None:
-            parts.insert(0, MagneticWeather(**self.weather, speed_km_h=self.speed_km_h, seed=seed))
+            errors.append(MagneticWeather(**self.weather, speed_km_h=self.speed_km_h, seed=seed))
+        errors.append(SensorErrors(**self.sensors, seed=seed))
         if isinstance(self.north, str):
-            parts.append(north_reference(self.north, speed_km_h=self.speed_km_h, seed=seed))
-        elif self.north is not None:
-            parts.append(NorthReferenceError(**self.north, seed=seed))
-        return parts
+            errors.append(north_reference(self.north, speed_km_h=self.speed_km_h, seed=seed))
+        elif self.north:
+            errors.append(NorthReferenceError(**self.north, seed=seed))
+        return errors
 
     def drift_km(self, max_move_km: float) -> float:
         """Return how much farther than a longest move the errors may carry a vehicle, rounded up [km].
@@ -99,26 +94,25 @@ class Conditions:
             >>> CONDITIONS["laboratory"].drift_km(50.0), CONDITIONS["ship"].drift_km(50.0)
             (0.0, 4.0)
         """
-        check_number(0, above=True, max_move_km=max_move_km)
-        if self.motion is None:
-            return 0.0
-        return float(max(0, math.ceil(self._motion().farthest_km(max_move_km) - max_move_km)))
+        farthest_km = max(error.farthest_km(max_move_km) for error in self.transforms())
+        return float(max(0, math.ceil(farthest_km - max_move_km)))
 
     @cached_property
-    def _told(self) -> list[tuple[float, ...]]:
-        reading = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
-        variances = zip(*(part.variances(reading) for part in self._readings()), strict=True)
-        return [tuple(round(std, 6) for std in sum(parts).sqrt().tolist()) for parts in variances]
+    def _accuracy(self) -> list[tuple[float, ...]]:
+        """Standard deviations of new errors, and of constant and slow ones, as a vehicle knows them."""
+        field = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
+        variances = zip(*(error.variances(field) for error in self.transforms()), strict=True)
+        return [tuple(round(std, 6) for std in sum(each).sqrt().tolist()) for each in variances]
 
     @property
     def sensor_std(self) -> tuple[float, ...]:
         """Standard deviations of the errors that are new at each reading, at :data:`TYPICAL_FIELD`."""
-        return self._told[0]
+        return self._accuracy[0]
 
     @property
     def bias_std(self) -> tuple[float, ...]:
         """Standard deviations of the constant and the slow errors of the readings, at :data:`TYPICAL_FIELD`."""
-        return self._told[1]
+        return self._accuracy[1]
 
 
 _CALIBRATED = VectorErrors(hard_iron_nt=(5.0,) * 3, soft_iron=((1e-4,) * 3,) * 3, attitude_deg=(0.01, 0.01))
@@ -132,7 +126,7 @@ CONDITIONS: Mapping[str, Conditions] = {
         Conditions(
             "aircraft",
             SPEEDS_KM_H["aircraft"],
-            sensors={"std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            sensors={"sensor_std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
             north="fiber-optic",
             motion={"current_km_h": 2.1},
             weather={"record": "quiet"},
@@ -140,7 +134,7 @@ CONDITIONS: Mapping[str, Conditions] = {
         Conditions(
             "ship",
             SPEEDS_KM_H["ship"],
-            sensors={"std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            sensors={"sensor_std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
             north="fiber-optic",
             motion={"log_scale": 0.01, "current_km_h": 0.9},
             weather={"record": "quiet", "span_h": 240.0},
@@ -148,7 +142,7 @@ CONDITIONS: Mapping[str, Conditions] = {
         Conditions(
             "underwater",
             SPEEDS_KM_H["underwater"],
-            sensors={"std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            sensors={"sensor_std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
             north="fiber-optic",
             motion={"log_scale": 0.002, "current_km_h": 0.36, "eddies_km_h": 0.36, "eddy_km": 100.0},
             weather=_MONTH,
@@ -157,7 +151,7 @@ CONDITIONS: Mapping[str, Conditions] = {
             "low-cost",
             SPEEDS_KM_H["ship"],
             sensors={
-                "std": (0.2, 0.1, 75.0),
+                "sensor_std": (0.2, 0.1, 75.0),
                 "resolution": (0.0, 0.0, 13.0),
                 "drift": (0.0, 0.0, 10.0),
                 "drift_length": 200.0,
@@ -174,9 +168,9 @@ CONDITIONS: Mapping[str, Conditions] = {
 
 Readings:
 
-- ``std``: chosen, the lowest level of noise of the published tables; it includes the vehicle's motion. Low-cost: roll
-  and pitch to 0.4 degrees root mean square (Moog Crossbow NAV440, data sheet rev. B), as a mean of 16 readings
-  (chosen), at :data:`TYPICAL_FIELD`.
+- ``sensor_std``: chosen, the lowest level of noise of the published tables; it includes the vehicle's motion.
+  Low-cost: roll and pitch to 0.4 degrees root mean square (Moog Crossbow NAV440, data sheet rev. B), as a mean of 16
+  readings (chosen), at :data:`TYPICAL_FIELD`.
 - Hard iron: 5 nT, the offset error of a fluxgate (Bartington Mag-03, data sheet), as what calibration leaves
   (chosen); low-cost 30 nT (chosen). Soft iron: 1e-4 and 5e-4 (chosen).
 - Roll and pitch: 0.01 degrees (fiber-optic gyrocompass Octans, data sheet); low-cost 0.05 degrees constant (chosen).
@@ -195,6 +189,16 @@ Motion:
 
 Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, 20 days of a month for the others (chosen).
 """
+
+
+TRUE_KEYS = tuple(
+    dict.fromkeys(
+        str(key)
+        for kind in (MotionError, MagneticWeather, SensorErrors, NorthReferenceError)
+        for key in (*kind.true_keys, kind.error_key, kind.stream_key)
+    )
+)
+"""Keys of the errors that a policy may not read: what is true, the errors, and the states of their random numbers."""
 
 
 def conditions_named(name: str) -> Conditions:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number
-from magrl.counters import NORMAL_LIMIT, advanced, counter_stream, normal_of, stream_normal, stream_uniform
+from magrl.counters import NORMAL_LIMIT, counter_stream, normal_of, stream_normal, stream_uniform
 from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
-from magrl.transforms.base import Keys, observed_spec, several_keys
-from magrl.transforms.errors.base import EpisodeErrors, check_sizes
+from magrl.transforms.base import Keys, expect_keys, observed_spec, several_keys
+from magrl.transforms.errors.base import Episode, EpisodeErrors
 
 DISPLACEMENT = "displacement"
 """Key of what an error of motion adds to a commanded move, northward and eastward [km] ``(..., 2)``."""
@@ -48,12 +49,10 @@ class MotionError(EpisodeErrors):
         fixed: whether ``log_scale`` and ``compass_deg`` are the errors themselves, in every episode.
         in_keys: last move ``(..., 2)``, distance [km] and turn [rad]; heading ``(..., 1)`` [rad]; and position
             ``(..., 2)`` [deg].
-        true_keys: move of the environment ``(..., K)`` and direction of the true move ``(..., 1)`` [rad]. Privileged.
+        out_keys: true move ``(..., 2)`` and its direction ``(..., 1)`` [rad]. Privileged.
         action_key: distance [km] and turn [rad] ``(..., 2)``; what follows is passed on.
-        error_key: errors of the episode: scale, compass [deg], direction of the current and phases of the eddies [rad].
-            Privileged.
-        stream_key: key of the state of the random numbers ``(..., 1)``, int64.
-        seed: seed of the errors.
+        **options: of :class:`~magrl.transforms.errors.base.EpisodeErrors`: other keys, and the seed. The errors of the
+            episode are scale, compass [deg], direction of the current and phases of the eddies [rad].
 
     Raises:
         ValueError: for a negative size, errors of the log that could turn a move around, a current without a speed of
@@ -70,6 +69,10 @@ class MotionError(EpisodeErrors):
     """
 
     channel = 4
+    true_keys = ("true_move", "true_course")
+    error_key, stream_key = "motion_error", "motion_stream"
+    in_sizes = (2, 1, 2)
+    size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2
 
     def __init__(
         self,
@@ -84,34 +87,25 @@ class MotionError(EpisodeErrors):
         speed_km_h: float | None = None,
         fixed: bool = False,
         in_keys: Keys = ("move", "heading", "position"),
-        true_keys: Keys = ("true_move", "true_course"),
-        action_key: str = "action",
-        error_key: str = "motion_error",
-        stream_key: str = "motion_stream",
-        seed: int = 0,
+        out_keys: Keys = ("true_move", "true_course"),
+        action_key: NestedKey = "action",
+        **options: Any,
     ) -> None:
-        keys, true = several_keys(in_keys), several_keys(true_keys)
-        if len(keys) != 3 or len(true) != 2:
-            raise ValueError(
-                "MotionError takes 3 in_keys (move, heading, position) and 2 true_keys (move, course), "
-                f"got {keys} and {true}"
-            )
-        super().__init__(keys, keys[:2], stream_key=stream_key, seed=seed)
-        self.in_keys_inv = self.out_keys_inv = [action_key, keys[1]]
-        check_sizes(1, fixed=fixed, log_scale=(log_scale,), compass_deg=(compass_deg,))
+        super().__init__(several_keys(in_keys), several_keys(out_keys), **options)
+        expect_keys(self, 3, 2)
+        self.in_keys_inv = self.out_keys_inv = [action_key, self.in_keys[1]]
+        check_number(-math.inf if fixed else 0, log_scale=log_scale, compass_deg=compass_deg)
         check_number(0, log_noise=log_noise, heading_noise_deg=heading_noise_deg)
         check_number(0, current_km_h=current_km_h, eddies_km_h=eddies_km_h)
         check_number(0, above=True, eddy_km=eddy_km)
         if current_km_h or eddies_km_h:
             check_number(0, above=True, speed_km_h=speed_km_h)
-        self.log, self.turning = (log_scale, log_noise), (compass_deg, heading_noise_deg)
+        self.log, self.compass, self.fixed = (log_scale, log_noise), (compass_deg, heading_noise_deg), fixed
         self.current_km_h, self.eddies_km_h, self.speed_km_h = current_km_h, eddies_km_h, float(speed_km_h or 1.0)
-        self.fixed, self.true_keys, self.action_key, self.error_key = fixed, true, action_key, error_key
         shortest, _ = self._stretch
         if shortest <= 0:
             raise ValueError(f"log_scale {log_scale} and log_noise {log_noise} must keep every distance above 0")
         self.register_buffer("_waves", eddy_waves(self.seed, eddy_km), persistent=False)
-        self.active = any((*self.log, *self.turning, current_km_h, eddies_km_h))
 
     @property
     def _stretch(self) -> tuple[float, float]:
@@ -121,106 +115,69 @@ class MotionError(EpisodeErrors):
         return 1 + scale[0] - noise, 1 + scale[1] + noise
 
     def farthest_km(self, max_move_km: float) -> float:
-        """Return the longest way on the ground of a commanded move [km].
-
-        Args:
-            max_move_km: longest move that a policy may command [km].
-
-        Raises:
-            ValueError: for a distance that is not above 0.
+        """Return the longest path on the ground of a commanded move [km].
 
         Example:
             >>> MotionError(log_noise=0.01, current_km_h=3.0, speed_km_h=30.0).farthest_km(50.0)
             57.00000000000001
         """
-        check_number(0, above=True, max_move_km=max_move_km)
         currents = self.current_km_h + math.sqrt(3 * EDDIES) * self.eddies_km_h
-        return max_move_km * (self._stretch[1] + currents / self.speed_km_h)
+        return super().farthest_km(max_move_km) * (self._stretch[1] + currents / self.speed_km_h)
 
     # Data
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        values = self._read(tensordict_reset)
-        if values is None:
-            return tensordict_reset
-        move, heading, _ = values
-        stream = self._next_episode(tensordict, tensordict_reset.batch_size, heading.device)
-        uniform = stream_uniform(stream, 3 + EDDIES)
-        constants = uniform.new_tensor((self.log[0], self.turning[0]))
-        constants = constants.expand_as(uniform[..., :2]) if self.fixed else constants * normal_of(uniform[..., :2])
-        errors = torch.cat((constants, 2 * math.pi * uniform[..., 2:]), -1)
-        tensordict_reset.set(self.error_key, errors.to(heading.dtype))
-        tensordict_reset.set(self.stream_key, advanced(stream, 3 + EDDIES).unsqueeze(-1))
-        return self._write(tensordict_reset, move, heading)
+    def _constants(self, stream: Tensor) -> Tensor:
+        uniform = stream_uniform(stream, self.draws)
+        sizes = uniform.new_tensor((self.log[0], self.compass[0]))
+        constants = sizes.expand_as(uniform[..., :2]) if self.fixed else sizes * normal_of(uniform[..., :2])
+        return torch.cat((constants, 2 * math.pi * uniform[..., 2:]), -1)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the errors add to the commanded move, which the environment adds."""
-        action, heading = (tensordict.get(key, None) for key in self.in_keys_inv)
-        if action is None or heading is None:
-            if self.missing_tolerance:
-                return tensordict
-            raise KeyError(f"MotionError reads {self.in_keys_inv}, one of which is missing")
-        if not self.active:
-            return tensordict
+        values = self._read(tensordict, [*self.in_keys_inv, self.in_keys[2]])
+        state = self._state(tensordict)
+        if values is not None and state is not None:
+            tensordict.set(DISPLACEMENT, self._displacement(*values, *state))
+        return tensordict
+
+    def _displacement(
+        self, action: Tensor, heading: Tensor, position: Tensor, errors: Tensor, stream: Tensor
+    ) -> Tensor:
+        """Return the move on the ground minus the commanded one, ``(..., 2)`` northward and eastward [km]."""
         distance, turn = action[..., :2].double().unbind(-1)
-        return tensordict.set(DISPLACEMENT, self._error(tensordict, distance, wrap_angle(heading[..., 0] + turn)))
-
-    def _error(self, tensordict: TensorDictBase, distance: Tensor, bow: Tensor) -> Tensor:
-        """Return the way on the ground minus the commanded one, ``(..., 2)`` northward and eastward [km]."""
-        errors = self._written(tensordict, self.error_key).double()
+        bow, errors = wrap_angle(heading[..., 0] + turn), errors.double()
         scale, compass, direction = errors[..., :3].unbind(-1)
-        stretch, swing = stream_normal(self._written(tensordict, self.stream_key).squeeze(-1), 2).unbind(-1)
+        stretch, swing = stream_normal(stream.squeeze(-1), 2).unbind(-1)
         through = distance * (1 + scale + self.log[1] * stretch)
-        course = bow + torch.deg2rad(compass + self.turning[1] * swing)
-        way = through.unsqueeze(-1) * _unit(course) - distance.unsqueeze(-1) * _unit(bow)
+        course = bow + torch.deg2rad(compass + self.compass[1] * swing)
+        displacement = through.unsqueeze(-1) * _unit(course) - distance.unsqueeze(-1) * _unit(bow)
         hours = (distance / self.speed_km_h).unsqueeze(-1)
-        if self.current_km_h:
-            way = way + hours * self.current_km_h * _unit(direction)
+        displacement = displacement + hours * self.current_km_h * _unit(direction)
         if self.eddies_km_h:
-            position = self._written(tensordict, self.in_keys[2])
-            way = way + hours * self.eddies_km_h * eddy_velocity(position, self._waves, errors[..., 3:])
-        return way
+            velocity = eddy_velocity(position, self._waves, errors[..., 3:])
+            displacement = displacement + hours * self.eddies_km_h * velocity
+        return displacement
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is None:
-            return next_tensordict
-        stream, errors = (self._written(tensordict, key) for key in (self.stream_key, self.error_key))
-        next_tensordict.set(self.stream_key, advanced(stream, 2))
-        next_tensordict.set(self.error_key, errors)
-        move, heading, _ = values
-        if not self.active:
-            return self._write(next_tensordict, move, heading)
-        displacement = next_tensordict[DISPLACEMENT]
-        gone, course = polar(displaced(move[..., 0].double(), heading[..., 0].double(), displacement))
-        true_move = torch.stack((gone, move[..., 1].double()), -1).to(move.dtype)
-        true_course = torch.where(gone > 0, course, heading[..., 0]).unsqueeze(-1).to(heading.dtype)
-        return self._write(next_tensordict, true_move, true_course)
-
-    def _write(self, tensordict: TensorDictBase, move: Tensor, course: Tensor) -> TensorDictBase:
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         """Write the true move and its direction."""
-        return tensordict.set(self.true_keys[0], move).set(self.true_keys[1], course)
+        move, heading, _ = values
+        if not episode.first:
+            distance, bow = move[..., 0].double(), heading[..., 0].double()
+            distance, course = polar(displaced(distance, bow, tensordict[DISPLACEMENT]))
+            move = torch.stack((distance, move[..., 1].double()), -1).to(move.dtype)
+            heading = torch.where(distance > 0, course, heading[..., 0]).unsqueeze(-1).to(heading.dtype)
+        tensordict.set(self.out_keys[0], move).set(self.out_keys[1], heading)
+        return episode.errors
 
     # Specs
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the true move, its direction, the errors and the state of the numbers."""
-        move, heading, position = (self._leaf(observation_spec, key) for key in self.in_keys)
-        if move.shape[-1:] != (2,) or heading.shape[-1:] != (1,) or position.shape[-1:] != (2,):
-            shapes = [tuple(leaf.shape) for leaf in (move, heading, position)]
-            raise ValueError(
-                f"MotionError needs a move (..., 2), a heading (..., 1), a position (..., 2), got {shapes}"
-            )
-        observation_spec[self.true_keys[0]] = Unbounded(move.shape, device=move.device, dtype=move.dtype)
-        observation_spec[self.true_keys[1]] = heading.clone()
-        of_errors = (*heading.shape[:-1], 3 + EDDIES)
-        observation_spec[self.error_key] = Unbounded(of_errors, device=heading.device, dtype=heading.dtype)
-        observation_spec[self.stream_key] = Unbounded(heading.shape, device=heading.device, dtype=torch.int64)
+        observation_spec = super().transform_observation_spec(observation_spec)
+        move, heading, _ = (observation_spec[key] for key in self.in_keys)
+        self._add(observation_spec, move, {self.out_keys[0]: (2,)})
+        observation_spec[self.out_keys[1]] = heading.clone()
         return observation_spec
-
-    @property
-    def _state_keys(self) -> list[NestedKey]:
-        return [*super()._state_keys, self.error_key]
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make what a step reads part of the state, and check that the environment allows the farthest move.
@@ -231,17 +188,18 @@ class MotionError(EpisodeErrors):
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
-        action = input_spec["full_action_spec"][self.action_key]
-        if self.active and isinstance(action, Bounded):
-            observed, commanded = observed_spec(self), float(action.space.high[..., 0].max())
-            known = DISPLACEMENT in observed.keys()  # noqa: SIM118 - a Composite is no mapping
-            allowed = float(observed[DISPLACEMENT].space.high.max()) - 2 * commanded if known else 0.0
-            drift = self.farthest_km(commanded) - commanded
-            if drift > allowed + 1e-6 * commanded:
-                raise ValueError(
-                    f"MotionError carries a vehicle up to {drift:.6g} km farther than its command, the environment "
-                    f"allows {allowed:.6g} km: create it with drift_km={math.ceil(100 * drift) / 100}"
-                )
+        observed, commanded = (
+            observed_spec(self),
+            float(input_spec["full_action_spec"][self.in_keys_inv[0]].space.high[..., 0].max()),
+        )
+        known = DISPLACEMENT in observed.keys()  # noqa: SIM118 - a Composite is no mapping
+        allowed = float(observed[DISPLACEMENT].space.high.max()) - 2 * commanded if known else 0.0
+        drift = self.farthest_km(commanded) - commanded
+        if not known or drift > allowed + 1e-6 * commanded:
+            raise ValueError(
+                f"MotionError carries a vehicle up to {drift:.6g} km farther than its command, the environment allows "
+                f"{allowed:.6g} km: create it with drift_km={math.ceil(100 * drift) / 100}"
+            )
         return input_spec
 
 

@@ -10,33 +10,26 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.counters import advanced, stream_uniform
+from magrl.counters import stream_uniform
 from magrl.transforms.base import Keys, expect_keys, key_list
-from magrl.transforms.errors.base import EpisodeErrors
+from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes
 
 
-class SensorNoise(EpisodeErrors):
+class SensorNoise(ReadingErrors):
     """Add white noise to a reading, independent for each element, at reset and at each step.
 
-    The reading is ``value + std * z`` with a standard normal ``z``. Beside it, the transform writes the true value, the
-    data sheet of the sensors, which a policy may read (the standard deviations, and those of constant errors, which are
-    0), and the state of the random numbers.
+    The reading is ``value + sensor_std * z`` with a standard normal ``z``. Beside it, the transform writes the true
+    value, the standard deviations, which a policy may read, and the state of the random numbers.
     In ``Compose``, a transform that reads the true value stands before this one, such as ``GradientHeading``.
 
     Args:
-        std: standard deviation of each element in its unit, E numbers. If all are 0, the reading is the value.
+        sensor_std: standard deviation of each element in its unit, E numbers. If all are 0, the reading is the value.
         in_keys: one value ``(..., E)``.
         out_keys: its reading ``(..., E)``, in place by default.
-        true_key: key of the true value, or None to leave it out. Privileged: a policy must not read it. Where a
-            transform before this one has written it, it stays.
-        std_key: key of the standard deviations ``(..., E)``.
-        bias_key: key of those of constant errors ``(..., E)``: 0, or what a transform before this one has written.
-        stream_key: key of the state of the random numbers ``(..., 1)``, int64.
-        seed: seed of the noise. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
+        **options: of :class:`~magrl.transforms.errors.base.ReadingErrors`: other keys, and the seed.
 
     Raises:
         ValueError: for standard deviations that are negative or not finite, a seed that is not a whole number, more
@@ -53,90 +46,43 @@ class SensorNoise(EpisodeErrors):
     """
 
     channel = 1
-    draws = 0
-    """Random numbers that an episode takes before its first reading."""
+    error_key, stream_key = "sensor_error", "sensor_stream"
 
     def __init__(
         self,
-        std: Sequence[float],
+        sensor_std: Sequence[float],
         *,
         in_keys: NestedKey | Keys = ("field",),
         out_keys: NestedKey | Keys = ("field",),
-        true_key: NestedKey | None = "true_field",
-        std_key: NestedKey = "sensor_std",
-        bias_key: NestedKey = "bias_std",
-        stream_key: NestedKey = "sensor_stream",
-        seed: int = 0,
+        **options: Any,
     ) -> None:
-        super().__init__(key_list(in_keys), key_list(out_keys), stream_key=stream_key, seed=seed)
+        super().__init__(key_list(in_keys), key_list(out_keys), **options)
         expect_keys(self, 1, 1)
-        self.std = check_std(std)
-        self.true_key, self.std_key, self.bias_key = true_key, std_key, bias_key
+        check_sizes(sensor_std=sensor_std)
+        self.sensor_std = tuple(float(std) for std in sensor_std)
+        self.size = self.step_draws = len(self.sensor_std)
+        self.in_sizes = (self.size,)
+        self._set_accuracy()
 
-    # Data
+    def _constants(self, stream: Tensor) -> Tensor:
+        """Return the standard deviations of an episode ``(..., E)``."""
+        return torch.tensor(self.sensor_std, device=stream.device).expand(*stream.shape, -1)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        values = self._read(tensordict_reset)
-        if values is not None:
-            stream = self._next_episode(tensordict, tensordict_reset.batch_size, values[0].device)
-            tensordict_reset.set(self.std_key, self._levels(stream).to(values[0].dtype))
-            tensordict_reset.set(self.stream_key, advanced(stream, self.draws).unsqueeze(-1))
-        return self._call(tensordict_reset)
-
-    def _levels(self, stream: Tensor) -> Tensor:
-        """Return the standard deviations of an episode, ``(..., E)``."""
-        return torch.tensor(self.std, device=stream.device).expand(*stream.shape, -1)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self._read(next_tensordict) is not None:
-            stream, std = (self._written(tensordict, key) for key in (self.stream_key, self.std_key))
-            next_tensordict.set(self.stream_key, advanced(stream, len(self.std)))
-            next_tensordict.set(self.std_key, std)
-        return self._call(next_tensordict)
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is None:
-            return next_tensordict
-        stream, std = (self._written(next_tensordict, key) for key in (self.stream_key, self.std_key))
-        self._keep(next_tensordict, self.true_key, values[0])
-        if not self._comes_before(self.bias_key):
-            next_tensordict.set(self.bias_key, torch.zeros_like(values[0]))
-        return next_tensordict.set(self.out_keys[0], self._reading(values[0], std, stream))
-
-    def _reading(self, value: Tensor, std: Tensor, stream: Tensor) -> Tensor:
-        """Return what the sensors measure of a value ``(..., E)``."""
-        if not any(self.std):
-            return value
-        uniform = stream_uniform(stream.squeeze(-1), len(self.std))
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
+        uniform = stream_uniform(episode.stream, self.step_draws)
         normal = math.sqrt(2) * torch.erfinv(2 * uniform - 1 + 2.0**-53)  # the shift keeps it finite and centered
-        return value + std * normal.to(value.dtype)
+        self._measure(tensordict, values[0], values[0] + episode.errors * normal.to(values[0].dtype), episode.errors)
+        return episode.errors
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Measure the value of a TensorDict that holds the state of the random numbers."""
-        return self._call(tensordict)
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
 
-    # Specs
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the true value, the standard deviations and the state of the numbers; the reading is unbounded."""
-        leaf = self._leaf(observation_spec, self.in_keys[0])
-        if leaf.shape[-1:] != (len(self.std),):
-            raise ValueError(
-                f"{type(self).__name__} has {len(self.std)} standard deviations, one for each element; "
-                f"{self.in_keys[0]!r} is {tuple(leaf.shape)}"
-            )
-        if self.true_key is not None and not self._comes_before(self.true_key):
-            observation_spec[self.true_key] = leaf.clone()
-        for key in (self.out_keys[0], self.std_key, self.bias_key):
-            observation_spec[key] = Unbounded(leaf.shape, device=leaf.device, dtype=leaf.dtype)
-        shape = (*observation_spec.shape, 1)
-        observation_spec[self.stream_key] = Unbounded(shape, device=leaf.device, dtype=torch.int64)
-        return observation_spec
-
-    @property
-    def _state_keys(self) -> list[NestedKey]:
-        return [*super()._state_keys, self.std_key]
+        Example:
+            >>> SensorNoise((1.0, 2.0)).variances(torch.zeros(2))
+            (tensor([1., 4.]), tensor([0., 0.]))
+        """
+        check_tensor(self.in_sizes[0] or 0, field=field)
+        return field.new_tensor(self.sensor_std).square().expand_as(field), torch.zeros_like(field)
 
 
 class RandomSensorNoise(SensorNoise):
@@ -145,7 +91,7 @@ class RandomSensorNoise(SensorNoise):
     Args:
         levels: function of uniform numbers ``(..., draws)`` in [0, 1) that returns standard deviations ``(..., E)``.
         draws: how many uniform numbers it takes.
-        **options: of :class:`SensorNoise`, except ``std``.
+        **options: of :class:`SensorNoise`, except ``sensor_std``.
 
     Raises:
         TypeError: for ``levels`` that cannot be called.
@@ -165,11 +111,10 @@ class RandomSensorNoise(SensorNoise):
         if not callable(levels):
             raise TypeError(f"levels must be a function of uniform numbers, got {levels!r}")
         check_number(1, whole=True, draws=draws)
-        elements = len(levels(torch.full((draws,), 0.5)))
-        super().__init__([1.0] * elements, **options)  # a placeholder: each episode has levels of its own
+        super().__init__(levels(torch.full((draws,), 0.5)).tolist(), **options)  # those of a typical episode
         self.levels, self.draws = levels, draws
 
-    def _levels(self, stream: Tensor) -> Tensor:
+    def _constants(self, stream: Tensor) -> Tensor:
         return self.levels(stream_uniform(stream, self.draws))
 
 
@@ -204,34 +149,12 @@ def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
     return torch.where(none < 0.15, 0.0, level)
 
 
-def check_std(std: Sequence[float]) -> tuple[float, ...]:
-    """Return standard deviations as floats; raise unless they are finite numbers from 0 on.
-
-    Raises:
-        ValueError: with the values.
-
-    Example:
-        >>> check_std((0.05, -0.05, 5))
-        Traceback (most recent call last):
-        ValueError: std must be finite numbers from 0 on, one for each element, got (0.05, -0.05, 5)
-    """
-    try:
-        numbers = list(std)
-        for number in numbers:
-            check_number(0, std=number)
-    except (TypeError, ValueError):
-        numbers = []
-    if not numbers:
-        raise ValueError(f"std must be finite numbers from 0 on, one for each element, got {std!r}")
-    return tuple(float(number) for number in numbers)
-
-
-def with_sensor_noise(env: EnvBase, std: Sequence[float], seed: int = 0) -> EnvBase:
-    """Return an environment whose readings have white noise, or the environment itself if ``std`` is 0 throughout.
+def with_sensor_noise(env: EnvBase, sensor_std: Sequence[float], seed: int = 0) -> EnvBase:
+    """Return an environment whose readings have white noise, or the environment itself if there is none.
 
     Args:
         env: environment with the key ``field``.
-        std: standard deviation of each element, as :class:`SensorNoise` takes it.
+        sensor_std: standard deviation of each element, as :class:`SensorNoise` takes it.
         seed: seed of the noise.
 
     Raises:
@@ -244,6 +167,6 @@ def with_sensor_noise(env: EnvBase, std: Sequence[float], seed: int = 0) -> EnvB
         >>> with_sensor_noise(env, (0.0, 0.0, 0.0)) is env
         True
     """
-    noisy = any(check_std(std))
+    noise = SensorNoise(sensor_std, seed=seed)
     check_type(EnvBase, env=env)
-    return TransformedEnv(env, SensorNoise(std, seed=seed)) if noisy else env
+    return TransformedEnv(env, noise) if any(noise.sensor_std) else env

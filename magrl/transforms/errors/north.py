@@ -11,13 +11,13 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import pad
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import Composite
 
-from magrl.checks import check_number, check_tensor
-from magrl.counters import advanced, stream_normal
+from magrl.checks import check_number
+from magrl.counters import stream_normal
 from magrl.geodesy import wrap_angle, wrap_longitude
-from magrl.transforms.base import Keys, several_keys
-from magrl.transforms.errors.base import EpisodeErrors, check_sizes, gauss_markov
+from magrl.transforms.base import Keys, expect_keys, several_keys
+from magrl.transforms.errors.base import Episode, ReadingErrors, gauss_markov
 
 SCHULER_HOURS = 1.407
 """Period of a gyrocompass's slow oscillation, 84.4 minutes (M. Schuler, Physikalische Zeitschrift 24, 1923)."""
@@ -39,7 +39,7 @@ NORTH_REFERENCES: Mapping[str, Mapping[str, float]] = {
 """
 
 
-class NorthReferenceError(EpisodeErrors):
+class NorthReferenceError(ReadingErrors):
     """Measure directions from the vehicle's own north, which lies at an error b clockwise of true north.
 
     Every direction that the vehicle measures is smaller by b: its ``heading`` and D. A vehicle that steers a measured
@@ -47,8 +47,8 @@ class NorthReferenceError(EpisodeErrors):
 
     b has a constant part, a drift (first-order Gauss-Markov) and a part that is new at each reading, each normal, cut
     at four standard deviations. The measured ``heading`` takes the place of the true one, which is kept in
-    ``true_heading`` and given back to the environment for its step. What the vehicle is told of D grows: ``sensor_std``
-    by the random part, ``bias_std`` by the others (without the factor of the latitude, which it does not know).
+    ``true_heading`` and given back to the environment for its step. ``sensor_std`` of D grows by the random part,
+    ``bias_std`` by the others (without the factor of the latitude, which a vehicle does not know).
 
     It stands after the transforms of the field's errors, and after those that read the true heading.
 
@@ -58,17 +58,12 @@ class NorthReferenceError(EpisodeErrors):
         random_deg: standard deviation of the random part [deg].
         drift_length_km: correlation length of the drift, with ``drift_deg`` alone [km].
         fixed: whether ``constant_deg`` is the constant part itself, in every episode; it may then be negative.
-        in_keys: heading ``(..., 1)`` [rad], elements ``(..., E)`` with D [deg] first, the last move, whose first number
+        in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, the last move, whose first number
             is the distance [km], and optionally the position ``(..., 2)``, latitude and longitude [deg]: b then grows
             with the secant of the latitude, as that of every gyrocompass does.
         true_heading_key: key of the true heading ``(..., 1)``. Privileged.
-        true_key: key of the true elements, if no transform before this one has written it. Privileged.
-        std_key: key of the standard deviations of the elements ``(..., E)``.
-        bias_key: key of those of their constant and slow errors ``(..., E)``.
-        rated_key: key of the former that a transform before this one wrote; for its next step.
-        error_key: key of constant part, drift and b itself ``(..., 3)`` [deg]. Privileged.
-        stream_key: key of the state of the random numbers ``(..., 1)``, int64.
-        seed: seed of the errors.
+        **options: of :class:`~magrl.transforms.errors.base.ReadingErrors`: other keys, and the seed. The errors of the
+            episode are constant part, drift and b itself [deg].
 
     Raises:
         ValueError: for a negative size, a drift without its length, or another number of keys.
@@ -84,6 +79,11 @@ class NorthReferenceError(EpisodeErrors):
     """
 
     channel = 3
+    true_keys = ("true_field", "true_heading")
+    error_key, stream_key = "north_error", "north_stream"
+    reading = 1
+    in_sizes = (1, 3, None, 2)
+    size, draws, step_draws = 3, 1, 2
 
     def __init__(
         self,
@@ -95,142 +95,68 @@ class NorthReferenceError(EpisodeErrors):
         fixed: bool = False,
         in_keys: Keys = ("heading", "field", "move"),
         true_heading_key: NestedKey = "true_heading",
-        true_key: NestedKey = "true_field",
-        std_key: NestedKey = "sensor_std",
-        bias_key: NestedKey = "bias_std",
-        rated_key: NestedKey = "rated_std",
-        error_key: NestedKey = "north_error",
-        stream_key: NestedKey = "north_stream",
-        seed: int = 0,
+        **options: Any,
     ) -> None:
         keys = several_keys(in_keys)
-        if len(keys) not in (3, 4):
-            raise ValueError(
-                f"NorthReferenceError takes 3 or 4 in_keys (heading, elements, move, and the position), got {keys}"
-            )
-        super().__init__(keys, keys[:2], stream_key=stream_key, seed=seed)
-        self.in_keys_inv, self.out_keys_inv = [keys[0]], [true_heading_key]
-        check_sizes(1, fixed=fixed, constant_deg=(constant_deg,))
+        super().__init__(keys, keys[:2], **options)
+        expect_keys(self, (3, 4), 2)
+        self.in_keys_inv, self.out_keys_inv = keys[:1], [true_heading_key]
+        check_number(-math.inf if fixed else 0, constant_deg=constant_deg)
         check_number(0, drift_deg=drift_deg, random_deg=random_deg)
         if drift_deg:
             check_number(0, above=True, drift_length_km=drift_length_km)
-        self.sizes, self.drift_length_km, self.fixed = (constant_deg, drift_deg, random_deg), drift_length_km, fixed
-        told = torch.tensor([[random_deg], [math.hypot(constant_deg, drift_deg)]])
-        self.register_buffer("_told", told, persistent=False)
-        self.true_heading_key, self.true_key, self.std_key = true_heading_key, true_key, std_key
-        self.bias_key, self.rated_key, self.error_key = bias_key, rated_key, error_key
+        self.sizes, self.drift_length_km = (constant_deg, drift_deg, random_deg), float(drift_length_km or 1)
+        self.fixed = fixed
+        self._set_accuracy()
 
     # Data
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        values = self._read(tensordict_reset)
-        if values is None:
-            return tensordict_reset
-        stream = self._next_episode(tensordict, tensordict_reset.batch_size, values[0].device)
-        first, drift, white = stream_normal(stream, 3).to(values[0].dtype).split(1, -1)
-        constant = self.sizes[0] * (torch.ones_like(first) if self.fixed else first)
-        tensordict_reset.set(self.stream_key, advanced(stream, 3).unsqueeze(-1))
-        return self._measure(tensordict_reset, values, constant, self.sizes[1] * drift, white)
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it."""
+        return [*super().state_keys, *self.out_keys_inv]
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is None:
-            return next_tensordict
-        stream, error = (self._written(tensordict, key) for key in (self.stream_key, self.error_key))
-        next_tensordict.set(self.stream_key, advanced(stream, 2))
-        constant, drift, _ = error.split(1, -1)
-        white = torch.zeros_like(drift)
-        if any(self.sizes[1:]):
-            walk, white = stream_normal(stream.squeeze(-1), 2).to(drift.dtype).split(1, -1)
-        if self.sizes[1]:
-            drift = gauss_markov(drift, self.sizes[1], values[2][..., :1], float(self.drift_length_km or 0), walk)
-        return self._measure(next_tensordict, values, constant, drift, white)
+    def _constants(self, stream: Tensor) -> Tensor:
+        normal = stream_normal(stream, 1).to(torch.get_default_dtype())
+        return pad(self.sizes[0] * (torch.ones_like(normal) if self.fixed else normal), (0, 2))
 
-    def _measure(
-        self, tensordict: TensorDictBase, values: list[Tensor], constant: Tensor, drift: Tensor, white: Tensor
-    ) -> TensorDictBase:
-        """Write the measured heading and elements, what is true, and the error."""
-        heading, field, _, *position = values
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
+        heading, field, move, *position = values
+        errors, stream, first = episode
+        constant, drift, _ = errors.split(1, -1)
+        walk, white = stream_normal(stream, 2).to(errors.dtype).split(1, -1)
+        drift = gauss_markov(drift, self.sizes[1], math.inf if first else move[..., :1], self.drift_length_km, walk)
         error = constant + drift + self.sizes[2] * white
-        if not any(self.sizes):
-            return self._write(tensordict, heading, field, torch.cat((constant, drift, error), -1), values[:2])
         if position:
             error = error / torch.cos(torch.deg2rad(position[0][..., :1])).to(error.dtype)
-        seen = [wrap_angle(heading - torch.deg2rad(error)), _less(field, error)]
-        return self._write(tensordict, heading, field, torch.cat((constant, drift, error), -1), seen)
-
-    def _write(
-        self, tensordict: TensorDictBase, heading: Tensor, field: Tensor, error: Tensor, seen: list[Tensor]
-    ) -> TensorDictBase:
-        """Write what is true, the error, and the measured heading and elements."""
-        self._keep(tensordict, self.true_key, field)
-        tensordict.set(self.true_heading_key, heading)
-        tensordict.set(self.error_key, error)
-        for key, value in zip(self.out_keys, seen, strict=True):
-            tensordict.set(key, value)
-        if self._comes_before(self.std_key):
-            tensordict.set(self.rated_key, tensordict[self.std_key])
-        of_elements = pad(self._told, (0, field.shape[-1] - 1))  # 0 but for D
-        for told, std in zip((self.std_key, self.bias_key), of_elements, strict=True):
-            self._tell(tensordict, told, std, field)
-        return tensordict
+        tensordict.set(self.out_keys_inv[0], heading)
+        tensordict.set(self.out_keys[0], wrap_angle(heading - torch.deg2rad(error)))
+        declination = wrap_longitude(field[..., :1] - error)
+        self._measure(tensordict, field, torch.cat((declination, field[..., 1:]), -1))
+        return torch.cat((constant, drift, error), -1)
 
     def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances of the errors of a reading: of new errors, and of constant and slow ones.
-
-        Args:
-            field: ``(..., E)`` reading.
-
-        Returns:
-            Both ``(..., E)``.
+        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
 
         Example:
             >>> NorthReferenceError(2.0, random_deg=1.0).variances(torch.zeros(3))
             (tensor([1., 0., 0.]), tensor([4., 0., 0.]))
         """
-        check_tensor(field=field)
-        white, slow = pad(self._told.square(), (0, field.shape[-1] - 1)).to(field.dtype)
-        return white.expand_as(field), slow.expand_as(field)
+        constant, drift, random = (size**2 for size in self.sizes)
+        white, slow = super().variances(field)
+        white[..., 0], slow[..., 0] = random, constant + drift
+        return white, slow
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Give the true heading to the environment, and their standard deviations to the transforms before this one."""
-        if tensordict.get(self.true_heading_key, None) is None and self.missing_tolerance:
-            return tensordict
-        tensordict.set(self.in_keys[0], self._written(tensordict, self.true_heading_key))
-        if self._comes_before(self.std_key):
-            tensordict.set(self.std_key, self._written(tensordict, self.rated_key))
-        return tensordict
+        """Give the true heading to the environment."""
+        state = self._state(tensordict)
+        return tensordict if state is None else tensordict.set(self.in_keys_inv[0], state[-1])
 
-    # Specs
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what is true, the error and the state of the numbers; the elements are unbounded."""
-        heading, field, *others = (self._leaf(observation_spec, key) for key in self.in_keys)
-        if heading.shape[-1:] != (1,) or (others[1:] and others[1].shape[-1:] != (2,)):
-            shapes = [tuple(leaf.shape) for leaf in (heading, *others[1:])]
-            raise ValueError(f"NorthReferenceError needs a heading (..., 1) and a position (..., 2), got {shapes}")
-        if not self._comes_before(self.true_key):
-            observation_spec[self.true_key] = field.clone()
-        if self._comes_before(self.std_key):
-            observation_spec[self.rated_key] = observation_spec[self.std_key].clone()
-        observation_spec[self.true_heading_key] = heading.clone()
-        for key in (self.out_keys[1], self.std_key, self.bias_key):
-            observation_spec[key] = Unbounded(field.shape, device=field.device, dtype=field.dtype)
-        of_error = (*heading.shape[:-1], 3)
-        observation_spec[self.error_key] = Unbounded(of_error, device=heading.device, dtype=heading.dtype)
-        observation_spec[self.stream_key] = Unbounded(heading.shape, device=heading.device, dtype=torch.int64)
+        observation_spec = super().transform_observation_spec(observation_spec)
+        observation_spec[self.out_keys_inv[0]] = observation_spec[self.in_keys[0]].clone()
         return observation_spec
-
-    @property
-    def _state_keys(self) -> list[NestedKey]:
-        rated = [self.rated_key] if self._comes_before(self.std_key) else []
-        return [*super()._state_keys, self.true_heading_key, self.error_key, *rated]
-
-
-def _less(field: Tensor, error_deg: Tensor) -> Tensor:
-    """Return elements whose declination is smaller by an error, in (-180, 180]."""
-    declination = wrap_longitude(field[..., :1] - error_deg)
-    return torch.cat((declination, field[..., 1:]), -1)
 
 
 def north_reference(name: str, *, speed_km_h: float, **options: Any) -> NorthReferenceError:
@@ -252,5 +178,5 @@ def north_reference(name: str, *, speed_km_h: float, **options: Any) -> NorthRef
         raise ValueError(f"unknown north reference {name!r}: choose from {', '.join(NORTH_REFERENCES)}")
     check_number(0, above=True, speed_km_h=speed_km_h)
     keys = ("heading", "field", "move") if name == "low-cost" else ("heading", "field", "move", "position")
-    sizes = (NORTH_REFERENCES[name].get(f"{part}_deg", 0.0) for part in ("constant", "drift", "random"))
-    return NorthReferenceError(*sizes, drift_length_km=SCHULER_HOURS * speed_km_h, in_keys=keys, **options)
+    options = {**NORTH_REFERENCES[name], "drift_length_km": SCHULER_HOURS * speed_km_h, "in_keys": keys, **options}
+    return NorthReferenceError(**options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,49 +10,49 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec, Unbounded
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.counters import advanced, normal_of, stream_normal, stream_uniform
-from magrl.transforms.errors.base import TYPICAL_FIELD, check_sizes, gauss_markov
-from magrl.transforms.errors.noise import SensorNoise
+from magrl.counters import normal_of, stream_normal, stream_uniform
+from magrl.transforms.base import Keys, expect_keys, key_list, several_keys
+from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, gauss_markov
 from magrl.transforms.errors.vector import VectorErrors
 
 OUTAGE_STD = 1e4
 """Standard deviation of a repeated reading, in the unit of each element: a filter ignores it."""
 
 
-class SensorErrors(SensorNoise):
+class SensorErrors(ReadingErrors):
     """Add the errors of real sensors to a reading.
 
     In this order: the errors of a vector magnetometer, scale error, bias, drift, white noise, rounding, and outages, in
     which the last reading is repeated. Bias and scale error are constant in an episode; the drift is a first-order
-    Gauss-Markov process along the way. Sizes are standard deviations of normal errors (cut at four of them), E numbers
+    Gauss-Markov process along the path. Sizes are standard deviations of normal errors (cut at four of them), E numbers
     in the unit of each element; those that are not given are 0.
 
-    The vehicle is told the data sheets: ``sensor_std`` is that of the errors which are new at each reading (noise and
-    rounding), during an outage :data:`OUTAGE_STD`; ``bias_std`` that of the constant and the slow ones. Both are roots
-    of sums of variances, at :data:`~magrl.transforms.errors.TYPICAL_FIELD`.
+    ``sensor_std`` becomes that of the errors which are new at each reading (noise and rounding), during an outage
+    :data:`OUTAGE_STD`; ``bias_std`` that of the constant and the slow ones. Both are roots of sums of variances, at
+    :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
     Args:
-        std: white noise.
+        sensor_std: white noise.
         bias: constant error.
         scale: error of the scale, as a share of the value, where the elements are D, I, B_H.
         drift: slow drift.
-        drift_length: its correlation length [unit of the distance in ``move_key``, or steps]; with ``drift`` alone.
+        drift_length: its correlation length [unit of the distance of a move, or steps]; with ``drift`` alone.
         resolution: the reading is rounded to multiples of this; 0 for no rounding.
         outage_rate: probability that a reading is missing; never the first of an episode.
         vector: errors of a vector magnetometer, where the elements are D, I, B_H.
         fixed: whether bias and scale are the errors themselves, in every episode.
-        heading_key: key of the heading ``(..., 1)`` [rad] in whose axes ``vector`` acts.
-        move_key: key of the last move, whose first number is its distance; None for a drift by steps.
-        error_key: key of the errors of the episode ``(..., K)``: bias, scale error, drift, last reading, and those of
-            ``vector``. Privileged.
-        **options: of :class:`~magrl.transforms.SensorNoise`, except ``std``.
+        in_keys: a value ``(..., E)``; optionally the last move ``(..., K)``, whose first number is its distance,
+            without which the drift is by steps; and optionally the heading ``(..., 1)`` [rad], in whose axes ``vector``
+            acts.
+        out_keys: the reading ``(..., E)``, in place by default.
+        **options: of :class:`~magrl.transforms.errors.base.ReadingErrors`: other keys, and the seed. The errors of the
+            episode are bias, scale error, drift, last reading, and those of ``vector``.
 
     Raises:
-        ValueError: for sizes that are negative or of another number than ``std``, a rate outside [0, 1), a drift
-            without its length, or ``scale`` or ``vector`` with other than three elements.
+        ValueError: for sizes that are negative or of another number than ``sensor_std``, a rate outside [0, 1), a drift
+            without its length, ``scale`` or ``vector`` with other than three elements, or ``vector`` without a heading.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -63,10 +64,11 @@ class SensorErrors(SensorNoise):
     """
 
     channel = 2
+    error_key, stream_key = "sensor_error", "sensor_stream"
 
     def __init__(
         self,
-        std: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
         *,
         bias: Sequence[float] | None = None,
         scale: Sequence[float] | None = None,
@@ -76,140 +78,73 @@ class SensorErrors(SensorNoise):
         outage_rate: float = 0.0,
         vector: VectorErrors | None = None,
         fixed: bool = False,
-        heading_key: NestedKey = "heading",
-        move_key: NestedKey | None = "move",
-        error_key: NestedKey = "sensor_error",
+        in_keys: Keys = ("field", "move", "heading"),
+        out_keys: NestedKey | Keys = ("field",),
         **options: Any,
     ) -> None:
-        super().__init__(std, **options)
-        count = len(self.std)
-        given = {"bias": bias, "scale": scale, "drift": drift, "resolution": resolution}
-        sizes = {name: (0.0,) * count if values is None else values for name, values in given.items()}
-        for name, values in sizes.items():
-            check_sizes(count, fixed=fixed and name in ("bias", "scale"), **{name: values})
+        super().__init__(several_keys(in_keys), key_list(out_keys), **options)
+        expect_keys(self, (1, 2, 3), 1)
+        check_sizes(sensor_std=sensor_std)
+        self.count = len(sensor_std)
+        sizes = {"bias": bias, "scale": scale, "drift": drift, "resolution": resolution}
+        for name, values in {"noise": sensor_std, **sizes}.items():
+            values = (0.0,) * self.count if values is None else values
+            check_sizes(self.count, fixed=fixed and name in ("bias", "scale"), **{name: values})
             self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.get_default_dtype()), persistent=False)
         check_number(0, 1, outage_rate=outage_rate)
         if outage_rate == 1:
             raise ValueError("outage_rate must be below 1, got 1: no reading would be new")
-        self.drifting, self.rounded = any(sizes["drift"]), any(sizes["resolution"])
-        if self.drifting:
+        if drift is not None and any(drift):
             check_number(0, above=True, drift_length=drift_length)
         if vector is not None:
             check_type(VectorErrors, vector=vector)
-        for name, given_errors in (("scale", any(sizes["scale"])), ("vector", vector is not None)):
-            if given_errors and count != 3:
-                raise ValueError(f"{name} acts on D, I and B_H, got {count} elements in std")
-        self.drift_length, self.outage_rate, self.vector = drift_length, float(outage_rate), vector
-        self.fixed, self.heading_key, self.move_key, self.error_key = fixed, heading_key, move_key, error_key
-        self.register_buffer("_noise", torch.tensor(self.std), persistent=False)
-        self.draws = 2 * count + (vector.draws if vector else 0)
-        field = torch.tensor(TYPICAL_FIELD if count == 3 else (0.0,) * count, dtype=torch.float64)
-        for name, variance in zip(("_white_std", "_slow_std"), self.variances(field), strict=True):
-            self.register_buffer(name, variance.sqrt().to(self._bias.dtype), persistent=False)
-
-    # Data
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        values = self._read(tensordict_reset)
-        if values is None:
-            return tensordict_reset
-        stream = self._next_episode(tensordict, tensordict_reset.batch_size, values[0].device)
-        errors = self._of_new_episodes(tensordict, stream, self._constants).to(values[0].dtype)
-        tensordict_reset.set(self.stream_key, advanced(stream, self.draws).unsqueeze(-1))
-        return self._measure(tensordict_reset, values[0], errors, first=True)
+            expect_keys(self, 3, 1)
+        if self.count != 3 and (vector is not None or any(scale or ())):
+            raise ValueError(f"scale and vector act on D, I and B_H, got {self.count} elements in sensor_std")
+        self.drift_length, self.outage_rate, self.vector = float(drift_length or 1), float(outage_rate), vector
+        self.fixed, self.in_sizes = fixed, (self.count, None, 1)
+        self.size = 4 * self.count + (vector.size if vector else 0)
+        self.draws = 2 * self.count + (vector.draws if vector else 0)
+        self.step_draws = 2 * self.count + 1
+        self._set_accuracy()
 
     def _constants(self, stream: Tensor) -> Tensor:
-        """Return the errors at the start of episodes ``(..., K)``, without drift and last reading."""
-        count = len(self.std)
-        normal = stream_normal(stream, self.draws)
-        drawn = torch.ones_like(normal[..., : 2 * count]) if self.fixed else normal[..., : 2 * count]
-        parts = [drawn * torch.cat((self._bias, self._scale)), torch.zeros_like(drawn)]
-        if self.vector is not None:
-            parts.append(self.vector.constants(normal[..., 2 * count :]))
-        return torch.cat(parts, -1)
+        """Return the errors of an episode ``(..., size)``, without drift and last reading."""
+        normal, vector = stream_normal(stream, self.draws).tensor_split([2 * self.count], -1)
+        drawn = torch.ones_like(normal) if self.fixed else normal
+        constants = drawn * torch.cat((self._bias, self._scale)), torch.zeros_like(drawn)
+        return torch.cat((*constants, self.vector.constants(vector) if self.vector else vector), -1)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is None:
-            return next_tensordict
-        stream, errors = (self._written(tensordict, key) for key in (self.stream_key, self.error_key))
-        next_tensordict.set(self.stream_key, advanced(stream, 2 * len(self.std) + 1))
-        return self._measure(next_tensordict, values[0], errors, first=False)
-
-    def _measure(self, tensordict: TensorDictBase, value: Tensor, errors: Tensor, first: bool) -> TensorDictBase:
-        """Write a reading of a value, its accuracy, the true value and the errors."""
-        count, dtype = len(self.std), value.dtype
-        uniform = stream_uniform(tensordict[self.stream_key].squeeze(-1), 2 * count + 1)
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
+        (value, *others), count, dtype = values, self.count, values[0].dtype
+        errors, stream, first = episode
+        uniform = stream_uniform(stream, self.step_draws)
         noise, walk = normal_of(uniform[..., :-1]).to(dtype).split(count, -1)
         bias, scale, drift, last, vector = errors.tensor_split([count, 2 * count, 3 * count, 4 * count], -1)
-        if self.drifting:
-            drift = self._drifted(tensordict, drift, walk, first)
-        reading = value
-        if self.vector is not None:
-            reading = self.vector.disturb(reading, tensordict[self.heading_key], vector)
+        distance = math.inf if first else others[0][..., :1] if others else 1.0
+        drift = gauss_markov(drift, self._drift.to(dtype), distance, self.drift_length, walk)
+        reading = self.vector.disturb(value, others[1], vector) if self.vector else value
         reading = reading + (reading * scale + bias + drift + noise * self._noise)
-        if self.rounded:
-            step = self._resolution.to(dtype)
-            reading = torch.where(step > 0, torch.round(reading / step) * step, reading)
-        std = self._white_std.to(dtype).expand_as(reading).clone()
-        if self.outage_rate and not first:
-            missing = uniform[..., -1:] < self.outage_rate
-            reading, std = torch.where(missing, last, reading), torch.where(missing, OUTAGE_STD, std)
-        self._keep(tensordict, self.true_key, value)
-        tensordict.set(self.out_keys[0], reading)
-        tensordict.set(self.std_key, std)
-        self._tell(tensordict, self.bias_key, self._slow_std, reading)
-        return tensordict.set(self.error_key, torch.cat((bias, scale, drift, reading, vector), -1))
-
-    def _drifted(self, tensordict: TensorDictBase, drift: Tensor, normal: Tensor, first: bool) -> Tensor:
-        std = self._drift.to(drift.dtype)
-        if first:
-            return std * normal
-        distance = 1.0 if self.move_key is None else tensordict[self.move_key][..., :1]
-        return gauss_markov(drift, std, distance, float(self.drift_length or 0), normal)
+        step = self._resolution.to(dtype)
+        reading = torch.where(step > 0, torch.round(reading / step) * step, reading)
+        missing = (uniform[..., -1:] < self.outage_rate) & (not first)
+        reading = torch.where(missing, last, reading)
+        self._measure(tensordict, value, reading, torch.where(missing, OUTAGE_STD, self._accuracy[0].to(dtype)))
+        return torch.cat((bias, scale, drift, reading, vector), -1)
 
     def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances of the errors of a reading: of new errors, and of constant and slow ones.
-
-        Args:
-            field: ``(..., E)`` reading.
-
-        Returns:
-            Both ``(..., E)``.
+        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
 
         Example:
             >>> SensorErrors((1.0, 1.0), bias=(2.0, 0.0)).variances(torch.zeros(2))
             (tensor([1., 1.]), tensor([4., 0.]))
         """
-        check_tensor(len(self.std), field=field)
+        check_tensor(self.count, field=field)
         noise, bias, scale, drift, resolution = (
-            getattr(self, f"_{part}").to(field.dtype).square()
-            for part in ("noise", "bias", "scale", "drift", "resolution")
+            getattr(self, f"_{name}").to(field.dtype).square()
+            for name in ("noise", "bias", "scale", "drift", "resolution")
         )
         slow = bias + drift + scale * field.square()
         if self.vector is not None:
             slow = slow + self.vector.variance(field)
         return (noise + resolution / 12).expand_as(field), slow
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Raise an error: the errors of an episode begin with its reset."""
-        raise NotImplementedError("SensorErrors needs an environment: append it to a TransformedEnv")
-
-    # Specs
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the true value, the accuracy, the errors and the state of the numbers; the reading is unbounded."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        needed = [self.heading_key] * (self.vector is not None) + [self.move_key] * self.drifting
-        for key in needed:
-            if key is not None:
-                self._leaf(observation_spec, key)
-        reading = observation_spec[self.out_keys[0]]
-        size = 4 * len(self.std) + (self.vector.size if self.vector else 0)
-        shape = (*reading.shape[:-1], size)
-        observation_spec[self.error_key] = Unbounded(shape, device=reading.device, dtype=reading.dtype)
-        return observation_spec
-
-    @property
-    def _state_keys(self) -> list[NestedKey]:
-        return [*super()._state_keys, self.error_key]

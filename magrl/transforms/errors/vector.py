@@ -123,14 +123,10 @@ class VectorErrors:
         total2 = horizontal2 * (1 + tan2)
         vector = hard + soft * total2
         per_radian2 = math.degrees(1) ** 2
-        return torch.stack(
-            (
-                per_radian2 * vector / horizontal2 + attitude * tan2,
-                per_radian2 * vector / total2 + attitude,
-                vector + attitude / per_radian2 * horizontal2 * tan2,
-            ),
-            -1,
-        )
+        declination = per_radian2 * vector / horizontal2 + attitude * tan2
+        inclination = per_radian2 * vector / total2 + attitude
+        horizontal = vector + attitude / per_radian2 * horizontal2 * tan2
+        return torch.stack((declination, inclination, horizontal), -1)
 
 
 def _leveling(attitude: Tensor) -> Tensor:

@@ -11,11 +11,9 @@ import pytest
 import torch
 from torch import nn
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import check_env_specs
 
-from magrl import tracking
 from magrl.agents.pretrained import load_pretrained
-from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
+from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
@@ -24,7 +22,6 @@ from magrl.navigators import Kalman
 from magrl.training import UsageError
 from magrl.transforms import (
     CONDITIONS,
-    TRUE_KEYS,
     Conditions,
     MagneticWeather,
     MotionError,
@@ -45,11 +42,6 @@ def nav(num_envs: int, drift_km: float = 0.0, **options: object) -> GeomagneticN
 
 def under(name: str, num_envs: int = 2, seed: int = 0) -> EnvBase:
     return with_conditions(nav(num_envs, CONDITIONS[name].drift_km(50.0)), name, seed)
-
-
-@pytest.mark.parametrize("name", ERRORS)
-def test_conformance(name: str) -> None:
-    check_env_specs(under(name), break_when_any_done="both")
 
 
 def test_without_errors_the_environment_stays() -> None:
@@ -108,7 +100,7 @@ def test_what_is_told_is_the_same_everywhere(conditions: Conditions) -> None:
 def test_the_variances_of_all_errors_add_up() -> None:
     """By hand at I = 45 deg, B_H = 20000 nT, D = 0: weather, hard iron, bias, noise and north."""
     weather = {"record": "disturbed"}
-    sensors = {"std": (0.3, 0.0, 4.0), "bias": (0.0, 0.0, 5.0), "vector": VectorErrors((10.0,) * 3)}
+    sensors = {"sensor_std": (0.3, 0.0, 4.0), "bias": (0.0, 0.0, 5.0), "vector": VectorErrors((10.0,) * 3)}
     conditions = Conditions("own", sensors=sensors, north={"constant_deg": 0.4, "random_deg": 0.4}, weather=weather)
     reading = torch.tensor([0.0, 45.0, 20000.0], dtype=torch.float64)
     variances = zip(*(part.variances(reading) for part in conditions.transforms()), strict=True)
@@ -125,29 +117,12 @@ def test_the_variances_of_all_errors_add_up() -> None:
 
 
 def test_evaluations_repeat_and_seeds_differ() -> None:
-    env, kalman = under("low-cost", 3), Kalman(max_steps=4)
-    first, again = (evaluation_rollout(env, kalman)[:, :4] for _ in range(2))
-    assert (first == again).all()
-    assert not torch.equal(first["field"], evaluation_rollout(under("low-cost", 3, seed=1), kalman)[:, :4]["field"])
-
-
-@pytest.mark.parametrize("name", ["anywhere", "kalman"])
-def test_nothing_true_is_read(name: str) -> None:
-    """Actions stay when everything that is privileged is scrambled."""
-    env = under("low-cost", 5)
-    rollout = env.rollout(4, make_navigator(name, env.base_env))
-
-    def actions(scramble: bool) -> torch.Tensor:
-        navigator, found = make_navigator(name, env.base_env), []
-        for state in rollout.exclude("action", "next").unbind(1):
-            if scramble:
-                for key in {*PRIVILEGED_KEYS, *TRUE_KEYS} & set(state.keys()):
-                    state[key] = torch.rand_like(state[key].double()).to(state[key].dtype)
-            found.append(navigator(state)["action"])
-        return torch.stack(found, 1)
-
-    assert set(TRUE_KEYS) <= set(rollout.keys())
-    assert torch.equal(actions(scramble=True), actions(scramble=False))
+    rollouts = []
+    for seed in (0, 0, 1):
+        env = with_conditions(nav(3, CONDITIONS["low-cost"].drift_km(50.0), max_steps=3), "low-cost", seed)
+        rollouts += [evaluation_rollout(env, Kalman(max_steps=3)) for _ in range(2)]
+    assert all((rollout == rollouts[0]).all() for rollout in rollouts[1:4])
+    assert not torch.equal(rollouts[0]["field"], rollouts[4]["field"])
 
 
 def test_navigators_are_told_what_they_can_tell_apart() -> None:
@@ -155,18 +130,6 @@ def test_navigators_are_told_what_they_can_tell_apart() -> None:
     kalman, secant = make_navigator("kalman", env, **told), make_navigator("secant", env, **told)
     assert (tuple(kalman.noise), kalman.bias) == ((0.3, 0.0, 3.0), (0.4, 0.1, 4.0))
     assert secant.noise == pytest.approx([0.5, 0.1, 5.0])
-
-
-def test_a_biased_element_turns_the_way_of_kalman() -> None:
-    """The way of its first filter is that of the tracking module with the same bias."""
-    seen = nav(4).reset()
-    plain, biased = Kalman(noise=(0.05, 0.05, 5.0)), Kalman(noise=(0.05, 0.05, 5.0), bias=(3.0, 0.0, 0.0))
-    assert not torch.allclose(plain(seen.clone())["action"], biased(seen.clone())["action"])
-    reading, target = seen["field"].double(), seen["target_field"].double()
-    prior = tracking.dipole_prior(reading)
-    track = tracking.start(reading, prior.gradient, prior.std, (0.05, 0.05, 5.0), prior.azimuth)
-    ways = [tracking.way_to(track, target, 300.0, bias_std=bias).covariance for bias in ((0.0,) * 3, (3.0, 0.0, 0.0))]
-    assert (ways[1].diagonal(dim1=-2, dim2=-1) >= ways[0].diagonal(dim1=-2, dim2=-1)).all()
 
 
 def test_the_agent_heeds_constant_errors() -> None:
@@ -223,7 +186,9 @@ def test_fly_under_conditions(tmp_path: Path) -> None:
 def test_a_navigator_does_not_rely_on_the_reading_of_an_outage(name: str) -> None:
     """It goes the same way whatever the reading is, within a percent of what the reading is worth otherwise."""
     noise = (0.05, 0.05, 5.0)
-    env = with_conditions(GeomagneticNavEnv(num_envs=20, seed=0), Conditions("noise", sensors={"std": noise}), seed=0)
+    env = with_conditions(
+        GeomagneticNavEnv(num_envs=20, seed=0), Conditions("noise", sensors={"sensor_std": noise}), seed=0
+    )
     navigator = make_navigator(name, env.base_env, noise=noise)
     state = env.rollout(4, navigator, break_when_any_done=False)[:, -1]["next"]
 

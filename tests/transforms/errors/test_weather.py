@@ -4,35 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache, partial
 
 import pytest
 import torch
-from support.conformance import Conformance
-from support.environments import parallel
-from tensordict import TensorDict, TensorDictBase
+from support.errors import flown, nav
+from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs import EnvBase, TransformedEnv
 
-from magrl.envs import GeomagneticNavEnv, Scenario
-from magrl.evaluation import evaluation_rollout
-from magrl.field import WEATHER, FieldModel, WeatherRecord, weather_record
+from magrl.field import WEATHER, WeatherRecord, weather_record
 from magrl.field.elements import field_vector
-from magrl.navigators import Secant
-from magrl.transforms import SPEEDS_KM_H, FieldGradient, GradientHeading, MagneticWeather, SensorNoise
+from magrl.transforms import SPEEDS_KM_H, MagneticWeather
 
 NAN = math.nan
 SHIP = SPEEDS_KM_H["ship"]
-
-
-@cache
-def field() -> FieldModel:
-    return Scenario().build_field()
-
-
-def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0} | options))
 
 
 def ship(num_envs: int = 2, **options: object) -> TransformedEnv:
@@ -106,49 +91,7 @@ def test_errors_of_records() -> None:
         WeatherRecord(torch.zeros(5, 3), first=2, last=1)
 
 
-# Conformance
-
-
-def chain() -> Transform:
-    return Compose(
-        FieldGradient(field()), GradientHeading(), MagneticWeather(speed_km_h=SHIP), SensorNoise((0.05, 0.05, 5.0))
-    )
-
-
-CASES: dict[str, Callable[[], Transform]] = {
-    "ship": partial(MagneticWeather, speed_km_h=SHIP),
-    "own record": lambda: MagneticWeather(ramp(), speed_km_h=500.0),
-    "chain": chain,
-}
-
-
-@pytest.mark.parametrize("base", [nav])
-@pytest.mark.parametrize("make", CASES.values(), ids=CASES.keys())
-class TestConformance(Conformance):
-    test_trans_serial_env_check = None  # a batch of environments has no step limit, from which a span follows
-
-
-def test_a_step_in_another_process_starts_from_the_clock_that_it_is_sent() -> None:
-    env = parallel(ship)
-    try:
-        check_env_specs(env)
-        state = env.rand_action(env.reset())
-        after = [env.step(state.clone())["next"].clone() for _ in range(3)]
-        for key in ("weather_clock", "field"):
-            assert torch.equal(after[0][key], after[1][key])
-            assert torch.equal(after[0][key], after[2][key])
-    finally:
-        env.close()
-
-
 # Along an episode
-
-
-def flown(env: EnvBase, actions: Tensor) -> list[TensorDictBase]:
-    states = [env.reset()]
-    for action in actions:
-        states.append(step_mdp(env.step(states[-1].clone().set("action", action))))
-    return states
 
 
 def test_the_variation_of_the_minute_is_added_to_the_vector() -> None:
@@ -174,32 +117,17 @@ def test_elements_by_hand() -> None:
     """400 nT eastward on a field of 300 nT northward: D = atan(4/3), I = atan(500/500), B_H = 500."""
     record = WeatherRecord(torch.tensor([[0.0, 0.0, 0.0], [0.0, 400.0, 500.0]]))
     td = TensorDict(field=torch.tensor([0.0, 0.0, 300.0]), move=torch.zeros(2))
-    td["weather_clock"] = torch.tensor([0.0, 1.9], dtype=torch.float64)
-    measured = MagneticWeather(record, speed_km_h=1.0, span_h=0.0)(td)
+    weather = MagneticWeather(record, speed_km_h=1.0, span_h=0.0)
+    before = weather(td.clone()).set("weather_clock", torch.tensor([1.0, 0.0], dtype=torch.float64))
+    measured = weather(before.set("next", td))["next"]
     torch.testing.assert_close(measured["field"], torch.tensor([53.1301, 45.0, 500.0]))
     assert measured["true_field"].tolist() == [0.0, 0.0, 300.0]
-
-
-def test_without_variation_the_elements_stay() -> None:
-    still = WeatherRecord(torch.zeros(20000, 3))
-    env = ship(20, record=still)
-    td, expected = env.rollout(5, Secant()), nav(20).rollout(5, Secant())
-    torch.testing.assert_close(td["next", "field"], expected["next", "field"], rtol=1e-6, atol=1e-5)
 
 
 def test_the_clock_stops_at_the_span() -> None:
     env = ship(record=ramp(61), speed_km_h=100.0, reading_s=0.0, span_h=1.0)
     states = flown(env, torch.tensor([[40.0, 0.0]] * 4).unsqueeze(1).expand(-1, 2, -1))
     assert [state["weather_clock"][0].tolist() for state in states] == [[0, 0], [0, 24], [0, 48], [0, 60], [0, 60]]
-
-
-def test_guidance_before_the_weather_knows_none_of_it() -> None:
-    guidance = FieldGradient(field()), GradientHeading()
-    plain = TransformedEnv(nav(5), Compose(*guidance)).reset()
-    state = TransformedEnv(nav(5), chain()).reset()
-    assert torch.equal(state["gradient_heading"], plain["gradient_heading"])
-    assert torch.equal(state["true_field"], plain["field"])  # neither weather nor noise
-    assert not torch.equal(state["field"], plain["field"])
 
 
 # Starts
@@ -228,55 +156,18 @@ def test_starts_are_a_function_of_seed_vehicle_and_episode() -> None:
     assert torch.equal(starts(few), first)
 
 
-def test_partial_reset_starts_an_episode_and_leaves_the_others_alone() -> None:
-    env, whole = ship(4), ship(4)
-    expected = torch.stack((starts(whole), starts(whole)))
-    td = step_mdp(env.rollout(3, break_when_any_done=False)[:, -1])
-    kept, chosen = td.clone(), torch.tensor([False, True, True, False])
-    after = env.reset(td.set("_reset", chosen.unsqueeze(-1)))
-    for key in ("field", "true_field", "weather_clock"):
-        assert torch.equal(after[key][~chosen], kept[key][~chosen]), key
-    assert torch.equal(after["weather_clock"][:, 0], torch.where(chosen, expected[1], expected[0]))
-    assert after["weather_clock"][chosen, 1].eq(0).all()
-
-
-def test_state_holds_the_episodes() -> None:
-    env, other = ship(3), ship(3)
-    for _ in range(3):
-        env.reset()
-    other.load_state_dict(env.state_dict())
-    assert torch.equal(starts(other), starts(env))
-
-
-# Policies and errors
-
-
-def test_a_navigator_reads_what_is_measured() -> None:
-    states = evaluation_rollout(ship(4), Secant())[:, :5]
-
-    def actions(change: Callable[[TensorDictBase], object]) -> Tensor:
-        navigator, moves = Secant(), []
-        for state in states.unbind(1):
-            change(state := state.clone())
-            moves.append(navigator(state)["action"])
-        return torch.stack(moves)
-
-    plain = actions(lambda _: None)
-    assert torch.equal(actions(lambda state: state["true_field"].fill_(NAN)), plain)
-    assert torch.equal(actions(lambda state: state["weather_clock"].fill_(NAN)), plain)
-    assert not torch.equal(actions(lambda state: state["field"].mul_(1.01)), plain)
+# Errors
 
 
 @pytest.mark.parametrize(
     ("make", "says"),
     [
         (lambda: MagneticWeather(speed_km_h=0), "speed_km_h .*0"),
-        (lambda: MagneticWeather(speed_km_h=-5.0), "speed_km_h .*-5.0"),
         (lambda: MagneticWeather(speed_km_h=SHIP, reading_s=-1), "reading_s .*-1"),
         (lambda: MagneticWeather("storm", speed_km_h=SHIP), "'storm'.*quiet, disturbed"),
         (lambda: MagneticWeather("college", speed_km_h=SHIP, span_h=24.1), r"24.1 h .*'college'.*23.9 h"),
         (lambda: MagneticWeather(speed_km_h=SHIP, in_keys=["field"]), r"\['field'\]"),
-        (lambda: MagneticWeather(speed_km_h=SHIP)._limits(), "needs span_h"),
+        (lambda: MagneticWeather(speed_km_h=SHIP)(nav().reset()), "needs span_h"),
         # 50 moves of 50 km at 6.1 km/h take 411 h, and 13 days follow the disturbed one
         (lambda: ship(speed_km_h=SPEEDS_KM_H["underwater"]).specs, r"410.6\d* h .*'disturbed'.* 237.1 h"),
     ],
@@ -284,10 +175,3 @@ def test_a_navigator_reads_what_is_measured() -> None:
 def test_errors(make: Callable[[], object], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         make()
-
-
-def test_other_environments_need_a_span() -> None:
-    with pytest.raises(KeyError, match=r"'weather_clock'.*reset"):
-        ship().step(nav().reset().set("action", torch.zeros(2, 2)))
-    with pytest.raises(ValueError, match=r"\(\.\.\., 3\)"):
-        _ = ship(in_keys=["move", "move"]).specs

@@ -3,33 +3,21 @@
 from __future__ import annotations
 
 import math
-import pickle
-from functools import cache, partial
 
 import pytest
 import torch
-from support.environments import parallel
+from support.errors import nav
 from tensordict import TensorDict
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from magrl.envs import GeomagneticNavEnv, Scenario
-from magrl.field.regional import RegionalField
+from magrl.envs import GeomagneticNavEnv
 from magrl.geodesy import geodesic, move
 from magrl.navigators import Secant
 from magrl.transforms import DetourReward, DistanceCost, TrueWay
 from magrl.transforms.rewards import detour_reward
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
-
-
-@cache
-def field() -> RegionalField:
-    return Scenario().build_field()
-
-
-def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0} | options))
 
 
 def chain(**options: float) -> Compose:
@@ -120,38 +108,10 @@ def test_reward_replaces_that_of_the_environment_or_stands_beside_it() -> None:
 # Specs and errors
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        rewarded,
-        lambda: TransformedEnv(nav(), pickle.loads(pickle.dumps(chain()))),
-        lambda: TransformedEnv(nav(), Compose(TrueWay(), DetourReward(out_keys=["detour"]))),
-        lambda: SerialEnv(2, rewarded),
-        lambda: TransformedEnv(SerialEnv(2, nav), chain()),
-        partial(parallel, rewarded),
-    ],
-    ids=["single", "pickled", "beside", "serial", "of serial", "parallel"],
-)
-def test_specs(make) -> None:
-    env = make()
-    try:
-        check_env_specs(env)
-        assert "true_way" in env.full_state_spec.keys()  # noqa: SIM118
-    finally:
-        env.close()
-
-
-def test_specs_of_the_environment_are_not_mutated() -> None:
-    base = nav()
-    before = base.specs.clone()
-    TransformedEnv(base, chain()).rollout(2)
-    assert base.specs == before
-
-
 def test_what_is_missing_is_named() -> None:
     """Without the way before the move there is no reward, and that of the environment must not pass for it."""
     td = rewarded().rollout(2)[:, 0]
-    with pytest.raises(KeyError, match=r"DetourReward reads .*true_way.* before the move"):
+    with pytest.raises(KeyError, match=r"DetourReward reads its state .*true_way"):
         DetourReward()(td.exclude("true_way"))
     with pytest.raises(KeyError, match=r"DetourReward reads .*success"):
         DetourReward()(td.exclude(("next", "success")))
@@ -177,3 +137,11 @@ def test_distance_cost_is_paid_for_each_kilometer() -> None:
     terms = costly["next", "reward_destination"] + costly["next", "reward_proximity"]
     torch.testing.assert_close(reward, terms - 0.05 * move[..., :1])
     assert (move[..., 0] == 30).all()
+
+
+@pytest.mark.parametrize("reward", [lambda: DistanceCost(-1.0), lambda: DetourReward(step=-1.0)])
+def test_a_negative_weight_is_refused(reward) -> None:
+    with pytest.raises(ValueError, match=r"(cost|step) must be .*-1\.0"):
+        reward()
+    with pytest.raises(TypeError, match="speed"):
+        DetourReward(speed=1.0)

@@ -1,0 +1,74 @@
+"""Environments and episodes on which the tests of the errors stand."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.field import FieldModel
+from magrl.transforms import MagneticWeather, MotionError, NorthReferenceError, SensorErrors, VectorErrors
+
+STD = (0.05, 0.05, 5.0)
+
+
+@cache
+def field() -> FieldModel:
+    return Scenario().build_field(80.0)
+
+
+def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0, "drift_km": 30.0} | options))
+
+
+def under(*errors: Transform, num_envs: int = 2) -> TransformedEnv:
+    return TransformedEnv(nav(num_envs), Compose(*errors))
+
+
+def sensor_errors(**options: object) -> SensorErrors:
+    sizes = {"bias": (0.1, 0.1, 20.0), "scale": (0.0, 0.0, 1e-3), "drift": (0.05, 0.05, 10.0), "drift_length": 200.0}
+    vector = VectorErrors((50.0,) * 3, ((1e-3,) * 3,) * 3, (0.1, 0.1))
+    rest = {"resolution": (0.01, 0.01, 1.0), "outage_rate": 0.2, "vector": vector}
+    return SensorErrors(STD, **(sizes | rest | options))
+
+
+def north_error(**options: object) -> NorthReferenceError:
+    keys = ("heading", "field", "move", "position")
+    return NorthReferenceError(0.5, 0.3, 0.2, drift_length_km=100.0, in_keys=keys, **options)
+
+
+def motion_error(**options: object) -> MotionError:
+    errors = {"log_scale": 0.02, "log_noise": 0.01, "compass_deg": 3.0, "heading_noise_deg": 1.0}
+    return MotionError(**errors, current_km_h=2.0, eddies_km_h=0.5, speed_km_h=30.0, **options)
+
+
+def every_error(seed: int = 0) -> Compose:
+    weather = MagneticWeather(speed_km_h=24.0, span_h=100.0, seed=seed)
+    return Compose(motion_error(seed=seed), weather, sensor_errors(seed=seed), north_error(seed=seed))
+
+
+def all_errors(num_envs: int = 2, seed: int = 0) -> TransformedEnv:
+    return TransformedEnv(nav(num_envs), every_error(seed))
+
+
+def actions(steps: int, num_envs: int) -> Tensor:
+    draws = torch.rand(steps, num_envs, 2, generator=torch.Generator().manual_seed(0))
+    return draws * torch.tensor([50.0, 1.5])
+
+
+def flown(env: EnvBase, steps: Tensor) -> list[TensorDict]:
+    """States of some moves, the first included."""
+    states = [env.reset()]
+    for action in steps:
+        states.append(step_mdp(env.step(states[-1].clone().set("action", action))))
+    return states
+
+
+def assert_same(one: TensorDict, other: TensorDict, rows: Tensor | slice = slice(None)) -> None:
+    for key in one.keys(True, True):
+        assert torch.equal(one[key][rows], other[key][rows]), key

@@ -1,0 +1,148 @@
+"""White noise: its distribution, its levels, and what it leaves alone."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy import stats
+from support.errors import STD, actions, flown, nav, under
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from magrl.evaluation import episode_measures, evaluation_rollout
+from magrl.navigators import Secant
+from magrl.transforms import (
+    FieldGradient,
+    GradientHeading,
+    RandomSensorNoise,
+    SensorNoise,
+    sensor_levels,
+    with_sensor_noise,
+)
+
+F64 = torch.float64
+
+
+def test_noise_is_white_and_normal() -> None:
+    """Along vehicles, episodes and readings."""
+    noise = SensorNoise((1.0, 1.0, 1.0))
+    data = TensorDict(field=torch.zeros(50_000, 3, dtype=F64), batch_size=[50_000])
+    first, second = noise(data.clone()), noise(data.clone())["field"]
+    third = noise(first.clone().set("next", data.clone()))["next", "field"]
+    drawn = first["field"]
+    torch.testing.assert_close(drawn.std(0), torch.ones(3, dtype=F64), atol=0.008, rtol=0)
+    for element in drawn.unbind(-1):
+        assert stats.kstest(element, "norm").pvalue > 1e-3
+    joint = torch.cat((drawn[1:], drawn[:-1], second[1:], third[1:]), -1)
+    assert torch.corrcoef(joint.T).triu(1).abs().max() < 4.5 / math.sqrt(50_000)
+
+
+def test_noise_is_finite_at_both_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends = torch.tensor([[0.0, 0.5, 1 - 2.0**-53]], dtype=F64)
+    monkeypatch.setattr("magrl.transforms.errors.noise.stream_uniform", lambda *_: ends)
+    data = TensorDict(field=torch.zeros(1, 3, dtype=F64), batch_size=[1])
+    low, middle, high = SensorNoise((1.0, 1.0, 1.0))(data)["field"][0].tolist()
+    assert low == -high
+    assert 8 < high < 9
+    assert middle == pytest.approx(0, abs=1e-15)
+
+
+def test_readings_are_truth_plus_noise_and_nothing_else_changes() -> None:
+    steps = actions(4, 400)
+    noise, places = [], []
+    for true, measured in zip(
+        flown(nav(400), steps), flown(TransformedEnv(nav(400), SensorNoise(STD)), steps), strict=True
+    ):
+        assert torch.equal(measured["true_field"], true["field"])
+        for key in ("position", "objective", "success", "move", "target_field", "done"):
+            assert torch.equal(measured[key], true[key])
+        assert measured["sensor_std"].unique(dim=0).tolist() == [pytest.approx(STD)]
+        assert measured["bias_std"].eq(0).all()
+        noise.append((measured["field"] - true["field"]) / torch.tensor(STD))
+        places.append(torch.cat((noise[-1].double(), true["position"], true["target_position"]), -1))
+    torch.testing.assert_close(torch.stack(noise).std((0, 1)), torch.ones(3), atol=0.06, rtol=0)
+    assert torch.corrcoef(torch.stack(noise).flatten(1)).triu(1).abs().max() < 0.15  # new at each step
+    # A seed is shared with the env, whose tasks are drawn by the counters (vehicle, episode, attempt).
+    assert torch.corrcoef(places[0].T)[:3, 3:].abs().max() < 4.5 / math.sqrt(400)
+
+
+def test_without_noise_the_reading_is_the_value_to_the_bit() -> None:
+    td = under(SensorNoise((0.0, 0.0, 0.0))).rollout(3, Secant())
+    expected = nav().rollout(3, Secant())
+    assert torch.equal(td["next", "field"], expected["next", "field"])
+    assert torch.equal(td["action"], expected["action"])
+    base = nav()
+    assert with_sensor_noise(base, (0.0, 0.0, 0.0)) is base
+    assert isinstance(with_sensor_noise(base, (0.0, 0.0, 1.0)), TransformedEnv)
+
+
+def test_guidance_before_the_noise_uses_the_truth() -> None:
+    guidance = [FieldGradient(nav().field), GradientHeading()]
+    state = under(*guidance, SensorNoise((1.0, 1.0, 100.0))).reset()
+    plain = under(*(part.clone() for part in guidance)).reset()
+    assert torch.equal(state["gradient_heading"], plain["gradient_heading"])
+    assert not torch.equal(state["field"], plain["field"])
+
+
+def test_levels_by_hand() -> None:
+    #                       none  common  own factors        D poor  by
+    uniform = torch.tensor(
+        [
+            [0.1499, 0.0, 0.5, 0.5, 0.5, 0.0, 0.5],  # perfect sensors
+            [0.15, 0.5 ** (2 / 3), 0.5, 0.5, 0.5, 0.3, 0.5],  # a tenth of the largest
+            [0.99, 1.0, 0.0, 1.0, 0.5, 0.9, 0.5],  # a hundredth, with factors 0.398, 2.512, 1
+            [0.99, 0.0, 0.5, 0.5, 0.5, 0.29, 0.5],  # a poor north reference: 1 + 6 / 2
+        ],
+        dtype=F64,
+    )
+    factor = 10**0.4
+    expected = [[0, 0, 0], [0.02, 0.02, 2.0], [0.002 / factor, 0.002 * factor, 0.2], [0.8, 0.2, 20]]
+    torch.testing.assert_close(sensor_levels(uniform), torch.tensor(expected, dtype=F64))
+    uniform[1, 1] = 0.5
+    torch.testing.assert_close(sensor_levels(uniform, 1.0), torch.tensor(expected, dtype=F64))
+
+
+def test_random_noise_has_the_level_of_its_episode() -> None:
+    env = under(RandomSensorNoise(seed=3), num_envs=2000)
+    td = torch.stack([s.select("field", "true_field", "sensor_std") for s in flown(env, actions(6, 2000))])
+    std = td["sensor_std"]
+    assert torch.equal(std, std[:1].expand_as(std))
+    silent = (std == 0).all(-1)
+    assert silent[0].double().mean() == pytest.approx(0.15, abs=0.03)
+    assert torch.equal(td["field"][silent], td["true_field"][silent])
+    loud = std[..., 2] > 0.05  # above the rounding of float32
+    z = ((td["field"] - td["true_field"])[..., 2] / std[..., 2])[loud]
+    assert stats.kstest(z.double(), "norm").pvalue > 1e-3
+    again = env.reset()["sensor_std"]
+    assert ((again != std[0]).any(-1) | (again == 0).all(-1)).double().mean() > 0.95
+
+
+def test_own_levels() -> None:
+    """Of as many numbers as they need, which are not those of the readings."""
+
+    def levels(uniform: Tensor) -> Tensor:
+        return torch.cat((uniform, uniform + 1, 0 * uniform), -1)
+
+    state = under(RandomSensorNoise(levels, draws=1), num_envs=1000).reset()
+    std = state["sensor_std"]
+    torch.testing.assert_close(std[:, 1] - std[:, 0], torch.ones(1000))
+    assert std[:, 2].eq(0).all()
+    z = (state["field"] - state["true_field"])[:, :2] / std[:, :2]
+    assert torch.corrcoef(torch.cat((z, std[:, :1]), -1).T).triu(1).abs().max() < 4.5 / math.sqrt(1000)
+    with pytest.raises(ValueError, match=r"draws .*0"):
+        RandomSensorNoise(draws=0)
+    with pytest.raises(TypeError, match=r"levels .*'loud'"):
+        RandomSensorNoise("loud")
+
+
+def test_evaluation_flies_the_same_noise_in_every_call() -> None:
+    """So that navigators are compared on equal terms, and a table does not depend on their order."""
+    env = TransformedEnv(nav(50, start_heading="random"), SensorNoise(STD))
+    one, other = (evaluation_rollout(env, Secant()) for _ in range(2))
+    assert torch.equal(one["next", "field"], other["next", "field"])
+    perfect = evaluation_rollout(nav(50, start_heading="random"), Secant())
+    assert torch.equal(one["position"][:, 0], perfect["position"][:, 0])
+    assert episode_measures(perfect)["spl"].mean() - episode_measures(one)["spl"].mean() > 0.05

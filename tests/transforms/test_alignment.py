@@ -1,0 +1,247 @@
+"""Gradient guidance: slopes, headings and the alignment reward, by hand and by other ways of computing them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from support.errors import field, nav
+from tensordict import TensorDict
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, TransformedEnv
+
+from magrl.field.model import elements_at
+from magrl.geodesy import move
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
+
+DTYPES = [torch.float32, torch.float64]
+D_EAST_I_NORTH_B_SOUTH_EAST = [[0.0, 0.01], [0.02, 0.0], [-1.0, 1.0]]
+
+
+def test_field_gradient_is_the_slope_between_neighbors() -> None:
+    """Central differences over 2 km northward and eastward, on the ellipsoid."""
+    env = TransformedEnv(nav(6), FieldGradient(field()))
+    td = env.rollout(3)["next"]
+    latitude, longitude = td["position"].unbind(-1)
+    slopes = []
+    for heading in (0.0, math.pi / 2):
+        ends = [
+            torch.stack(move(latitude, longitude, torch.full_like(latitude, h), torch.ones_like(latitude)), -1)
+            for h in (heading, heading + math.pi)
+        ]
+        slopes.append((elements_at(field(), ends[0]) - elements_at(field(), ends[1])) / 2)
+    torch.testing.assert_close(td["field_gradient"].double(), torch.stack(slopes, -1), rtol=1e-4, atol=1e-6)
+
+
+def heading_of(
+    here: list[float], there: list[float], gradient: list[list[float]], dtype: torch.dtype = torch.float64, **options
+) -> tuple[float, bool]:
+    """The heading in degrees and the mask, for one place."""
+    names = ("field", "target_field", "field_gradient")
+    td = TensorDict({n: torch.tensor(x, dtype=dtype) for n, x in zip(names, (here, there, gradient), strict=True)})
+    out = GradientHeading(**options)(td)
+    return math.degrees(out["gradient_heading"]), bool(out["gradient_heading_valid"])
+
+
+def nav_with_gradient(spread: float) -> TensorDict:
+    """64 places whose gradients point in random directions."""
+    draw = torch.Generator().manual_seed(0)
+    scale = torch.tensor([0.01, 0.02, 1.0])
+    gradient = torch.randn(64, 3, 2, generator=draw) * scale.unsqueeze(-1)
+    here = torch.tensor([8.0, -16.0, 35000.0]).expand(64, 3)
+    there = here + spread * 100 * scale * torch.randn(64, 3, generator=draw)
+    return TensorDict(field=here, target_field=there, field_gradient=gradient, batch_size=[64])
+
+
+@pytest.mark.parametrize(
+    ("error", "degrees"),
+    [
+        ((0.0, 1.0), 0.0),
+        ((1.0, 0.0), 90.0),
+        ((0.0, -1.0), 180.0),
+        ((-1.0, 0.0), -90.0),
+        ((0.5, 1.0), 45.0),  # 50 km to the east and 50 to the north
+        ((-0.5, -1.0), -135.0),
+    ],
+)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_pair_of_angles(error: tuple[float, float], degrees: float, dtype: torch.dtype) -> None:
+    there = [8 + error[0], -16 + error[1], 35000.0]
+    heading, valid = heading_of([8.0, -16.0, 35000.0], there, D_EAST_I_NORTH_B_SOUTH_EAST, dtype)
+    assert valid
+    assert heading == pytest.approx(degrees, abs=1e-3 if dtype == torch.float32 else 1e-9)
+
+
+@pytest.mark.parametrize("pair", [("I", "B_H"), ("B_H", "I"), (1, 2), ("I", 2)])
+def test_pair_of_inclination_and_intensity(pair: tuple[str | int, str | int]) -> None:
+    """2 deg of I are 100 km north; 200 nT then ask for 300 km east. D, which asks for west, is not heard."""
+    heading, valid = heading_of([8.0, -16.0, 35000.0], [7.0, -14.0, 35200.0], D_EAST_I_NORTH_B_SOUTH_EAST, pair=pair)
+    assert valid
+    assert heading == pytest.approx(math.degrees(math.atan2(300, 100)), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "pair"),
+    [
+        ([[0.0, 0.01], [0.02, 0.0], [-1.0, 1.0]], ("D", "I")),
+        ([[0.0, 0.01], [-0.001, 0.02], [-1.0, 0.1]], ("D", "B_H")),
+        ([[0.0, 0.0], [0.02, 0.0], [-1.0, 1.0]], ("I", "B_H")),
+    ],
+)
+def test_automatic_pair_is_the_one_that_crosses_best(gradient: list, pair: tuple[str, str]) -> None:
+    here, there = [179.5, -16.0, 35000.0], [-180.0, -14.0, 35200.0]
+    heading, valid = heading_of(here, there, gradient, pair="auto")
+    assert valid
+    assert heading == heading_of(here, there, gradient, pair=pair)[0]
+
+
+def test_automatic_pair_has_no_heading_where_no_two_gradients_cross() -> None:
+    parallel = [[0.0, 0.01], [0.0, 0.02], [0.0, 1.0]]
+    for gradient, there in (
+        (parallel, [7.0, -14.0, 35200.0]),
+        (D_EAST_I_NORTH_B_SOUTH_EAST, [8.0, -16.0, 35000.0]),
+    ):
+        assert heading_of([8.0, -16.0, 35000.0], there, gradient, pair="auto") == (0.0, False)
+
+
+def test_automatic_pair_in_a_batch_is_chosen_place_by_place() -> None:
+    td = nav_with_gradient(2.0)
+    automatic = GradientHeading(pair="auto")(td.clone())
+    fixed = [GradientHeading(pair=pair)(td.clone()) for pair in (("D", "I"), ("D", "B_H"), ("I", "B_H"))]
+    names = ("gradient_heading", "gradient_heading_valid")
+    heading, valid = (torch.stack([out[name] for out in (automatic, *fixed)]) for name in names)
+    assert valid[0].all()
+    same = heading[0] == heading[1:]
+    assert same.any(0).all()
+    assert [bool(same[k].any()) for k in range(3)] == [True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "degrees"), [(179.0, -179.0, 90.0), (-179.5, 179.5, -90.0), (-1.0, 1.0, 90.0)]
+)
+def test_declination_is_taken_the_short_way(here: float, there: float, degrees: float) -> None:
+    gradient = [[0.0, 0.01], [0.02, 0.0]]
+    heading, valid = heading_of([here, 0.0], [there, 0.0], gradient)
+    assert valid
+    assert heading == pytest.approx(degrees, abs=1e-9)
+
+
+def test_an_index_is_taken_as_it_stands() -> None:
+    heading, _ = heading_of([179.0, 0.0], [-179.0, 0.0], [[0.0, 0.01], [0.02, 0.0]], pair=(0, 1))
+    assert heading == pytest.approx(-90.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("crossing_deg", "least_deg", "expected"),
+    [(1.9, 2.0, False), (2.1, 2.0, True), (1.9, 0.0, True), (30, 45, False)],
+)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_near_parallel_gradients_are_masked(crossing_deg: float, least_deg: float, expected: bool, sign: int) -> None:
+    turn = math.radians(sign * crossing_deg)
+    gradient = [[3.0, 0.0], [5 * math.cos(turn), 5 * math.sin(turn)]]
+    heading, valid = heading_of([0.0, 0.0], [0.1, 0.2], gradient, pair=(0, 1), min_crossing_deg=least_deg)
+    assert valid is expected
+    assert valid or heading == 0.0
+
+
+@pytest.mark.parametrize(
+    ("there", "gradient"),
+    [
+        ([1.0, 1.0], [[0.0, 0.0], [0.0, 1.0]]),
+        ([1.0, 1.0], [[1.0, 2.0], [2.0, 4.0]]),
+        ([0.0, 0.0], [[1.0, 0.0], [0.0, 1.0]]),
+    ],
+    ids=["no gradient", "parallel", "on target"],
+)
+@pytest.mark.parametrize("least_deg", [0.0, 2.0])
+def test_no_direction_is_masked_and_not_nan(there: list[float], gradient: list[list[float]], least_deg: float) -> None:
+    assert heading_of([0.0, 0.0], there, gradient, pair=(0, 1), min_crossing_deg=least_deg) == (0.0, False)
+
+
+def guided() -> TransformedEnv:
+    return TransformedEnv(nav(4), Compose(FieldGradient(field()), GradientHeading()))
+
+
+def transition(**changes: object) -> TensorDict:
+    """One step whose angles are all different, so that reading a wrong one gives another number."""
+    entries = {"angle": 1.3, "reference": 0.1, "trusted": True}
+    after = {"angle": 0.4, "reference": -0.8, "trusted": False, "reward": 7.0}
+    after = {name: torch.tensor([value]) for name, value in after.items()}
+    td = TensorDict({name: torch.tensor([value]) for name, value in entries.items()} | {"next": TensorDict(after)})
+    return td.update(changes)
+
+
+@pytest.mark.parametrize("mask", [[], ["trusted"]])
+def test_angle_after_the_move_and_reference_and_mask_before_it(mask: list[str]) -> None:
+    out = AlignmentReward(["angle", "reference", *mask])(transition())
+    assert float(out["next", "reward"]) == pytest.approx(7 + 3 * (math.pi / 4 - 0.3), abs=1e-5)
+
+
+def test_masked_reference_earns_nothing_even_if_it_is_nan() -> None:
+    td = transition(trusted=torch.tensor([False]), reference=torch.tensor([float("nan")]))
+    assert float(AlignmentReward(["angle", "reference", "trusted"])(td)["next", "reward"]) == 7.0
+
+
+@pytest.mark.parametrize(("angle", "reference", "apart"), [(3.0, -3.0, 2 * math.pi - 6), (-math.pi, math.pi, 0.0)])
+def test_deviation_is_wrapped(angle: float, reference: float, apart: float) -> None:
+    td = transition(reference=torch.tensor([reference]))
+    td["next", "angle"] = torch.tensor([angle])
+    out = AlignmentReward(["angle", "reference"])(td)
+    assert float(out["next", "reward"]) == pytest.approx(7 + 3 * (math.pi / 4 - apart), abs=1e-5)
+
+
+def test_reward_is_created_when_missing() -> None:
+    out = AlignmentReward(["angle", "reference"], "alignment")(transition())
+    assert float(out["next", "reward"]) == 7.0
+    assert float(out["next", "alignment"]) == pytest.approx(3 * (math.pi / 4 - 0.3), abs=1e-5)
+    assert "alignment" not in out
+
+
+def test_in_the_env_the_second_out_key_is_what_the_first_one_gained() -> None:
+    env = TransformedEnv(guided(), AlignmentReward(out_keys=["reward", "reward_alignment"]))
+    td = env.rollout(5)["next"]
+    base = td["reward_destination"] + td["reward_proximity"]
+    assert td["reward_alignment"].std() > 0.5
+    torch.testing.assert_close(td["reward"] - base, td["reward_alignment"], rtol=0, atol=1e-4)
+    assert set(env.reward_keys) >= {"reward", "reward_alignment"}
+    assert isinstance(env.full_reward_spec["reward_alignment"], Unbounded)
+
+
+def test_without_next_the_error_says_what_is_needed() -> None:
+    with pytest.raises(KeyError, match="AlignmentReward needs transitions, with 'next'"):
+        AlignmentReward(["angle", "reference"])(transition().exclude("next"))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: FieldGradient("IGRF"), "value_and_gradient.*str"),
+        (lambda: FieldGradient(field(), ["x", "y"]), r"FieldGradient.*\['x', 'y'\]"),
+        (lambda: GradientHeading(pair=("D", "Z")), "'Z'.*D, I, B_H"),
+        (lambda: GradientHeading(pair=("D", 0)), r"\('D', 0\)"),
+        (lambda: GradientHeading(pair=5), "pair .*5"),
+        (lambda: GradientHeading(min_crossing_deg=90.0), "min_crossing_deg.*90.0"),
+        (lambda: GradientHeading(["x", "y"]), r"GradientHeading.*\['x', 'y'\]"),
+        (lambda: AlignmentReward(["x"]), r"2 or 3 in_keys and 1 or 2 out_keys, got \['x'\]"),
+        (lambda: AlignmentReward(weight=math.nan), "weight.*nan"),
+    ],
+)
+def test_bad_options(make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: FieldGradient(field(), ["field"]), r"\(2, 3\)"),
+        (lambda: FieldGradient(lambda position: position.sum(-1)), r"values \(E,\), got \(\)"),
+        (lambda: GradientHeading(["field", "move", "field_gradient"]), r"\(2, 3\), \(2, 2\)"),
+        (lambda: GradientHeading(pair=(0, 3)), r"\[0, 3\].*\(2, 3\)"),
+    ],
+)
+def test_wrong_shapes(make, message: str) -> None:
+    env = TransformedEnv(nav(), Compose(FieldGradient(field()), make()))
+    with pytest.raises(ValueError, match=message):
+        _ = env.specs

@@ -1,0 +1,296 @@
+"""TorchRL's conformance list for all transforms by two tables: in environments, and on data."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import pytest
+import torch
+from support.conformance import Conformance
+from support.environments import PlaneEnv, nested, parallel
+from support.errors import all_errors, every_error, field, nav
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, EnvBase, PendulumEnv, Transform, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from magrl.transforms import (
+    AlignmentReward,
+    AngleVector,
+    DetourReward,
+    DistanceCost,
+    FieldGradient,
+    GradientHeading,
+    MinMaxNorm,
+    RandomSensorNoise,
+    SensorErrors,
+    TargetDifference,
+    TrueWay,
+)
+from magrl.transforms.base import key_list, several_keys
+
+pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
+
+
+def hyperbola_and_wave(position: Tensor) -> Tensor:
+    """Two values at a place: the gradients are (east, north) and (0, cos east)."""
+    north, east = position.unbind(-1)
+    return torch.stack((north * east, torch.sin(east)), -1)
+
+
+def guided() -> Transform:
+    """Every transform of a guided agent at once, in the order of use."""
+    return Compose(
+        FieldGradient(field()),
+        GradientHeading(pair="auto"),
+        AlignmentReward(out_keys=["reward", "reward_alignment"]),
+        DistanceCost(0.01),
+        RandomSensorNoise(),
+        TargetDifference(),
+        AngleVector(["heading"], ["course"]),
+        MinMaxNorm(["move"], ["m"], ["action"]),
+    )
+
+
+def of_scents() -> Transform:
+    keys = {"in_keys": [nested("scent")], "out_keys": [nested("smelled")], "true_key": None}
+    return SensorErrors((0.5, 0.0), bias=(1.0, 0.0), drift=(1.0, 1.0), drift_length=3.0, **keys)
+
+
+def heading_of_scents() -> Transform:
+    keys = [nested(name) for name in ("scent", "scent_there", "slope")]
+    return GradientHeading(keys, [nested("way"), nested("way_valid")], pair=(0, 1))
+
+
+def alignment_of_angles() -> Transform:
+    return AlignmentReward([nested("angle"), nested("reference"), nested("trusted")], [nested("reward")])
+
+
+def pendulum() -> Transform:
+    return MinMaxNorm(["th", "thdot"], ["a", "b"], ["action"], ["torque"], interval=(0.0, 1.0))
+
+
+plane = partial(PlaneEnv, (3,), torch.float64)
+ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
+    "guided": (nav, guided),
+    "rewarded": (nav, lambda: Compose(TrueWay(), DetourReward())),
+    "reward beside": (nav, lambda: Compose(TrueWay(), DetourReward(out_keys=["detour"]))),
+    "every error": (nav, every_error),
+    "errors of a plane": (plane, of_scents),
+    "scaled plane": (PlaneEnv, lambda: MinMaxNorm([nested("obs")], in_keys_inv=[nested("action")])),
+    "scaled pendulum": (PendulumEnv, pendulum),
+    "gradient of a function": (plane, lambda: FieldGradient(hyperbola_and_wave, [nested("place")], [nested("g")])),
+    "heading of scents": (plane, heading_of_scents),
+    "alignment of angles": (plane, alignment_of_angles),
+}
+
+
+@pytest.mark.parametrize(("base", "make"), ENV_CASES.values(), ids=ENV_CASES.keys())
+class TestConformance(Conformance):
+    """Of each case."""
+
+
+def guided_env() -> EnvBase:
+    return TransformedEnv(nav(), guided())
+
+
+@pytest.mark.parametrize("make", [all_errors, guided_env])
+def test_a_step_in_another_process_starts_from_the_state_that_it_is_sent(make: Callable[[], EnvBase]) -> None:
+    """And not from the last one there."""
+    env = parallel(make)
+    try:
+        check_env_specs(env)
+        state = env.rand_action(env.reset())
+        one, _, other = (env.step(step.clone())["next"].clone() for step in (state, env.rand_action(state), state))
+        assert (one == other).all()
+    finally:
+        env.close()
+
+
+def test_transforms_around_other_processes() -> None:
+    env = TransformedEnv(parallel(nav), Compose(TrueWay(), DetourReward(), RandomSensorNoise()))
+    try:
+        check_env_specs(env)
+    finally:
+        env.close()
+
+
+class DataCase(NamedTuple):
+    transform: Callable[[], Transform]
+    inputs: Callable[[Callable[..., Tensor]], dict[str, Tensor]]  # from a source of uniform numbers in [0, 1)
+    outputs: Callable[[dict[str, Tensor]], dict[str, Tensor]]  # computed another way
+
+
+def deviation(angle: Tensor, reference: Tensor) -> Tensor:
+    """Return the angle between two arrows, in [0, pi]."""
+    return torch.acos(torch.cos(angle.double() - reference.double()))
+
+
+def direction(error: Tensor, gradient: Tensor) -> Tensor:
+    """Return the direction of J^-1 (B_T - B), by a linear solver."""
+    north, east = torch.linalg.solve(gradient.double(), error.double()).unbind(-1)
+    return torch.atan2(east, north).unsqueeze(-1)
+
+
+DATA_CASES = {
+    "MinMaxNorm": DataCase(
+        lambda: MinMaxNorm(["x"], ["y"], bounds={"x": (torch.tensor([0.0, -2.0]), torch.tensor([10.0, 2.0]))}),
+        lambda rand: {"x": 20 * rand(2) - 5},
+        lambda td: {"y": torch.stack((td["x"][..., 0] / 5 - 1, td["x"][..., 1] / 2), -1)},
+    ),
+    "AngleVector": DataCase(
+        lambda: AngleVector(["x"], ["y"]),
+        lambda rand: {"x": 8 * rand(1) - 4},
+        lambda td: {"y": torch.cat((torch.sin(td["x"] + math.pi / 2), torch.sin(td["x"])), -1)},
+    ),
+    "TargetDifference": DataCase(
+        lambda: TargetDifference(["x", "x_there"], ["y"]),
+        lambda rand: {"x": rand(3), "x_there": rand(3)},
+        lambda td: {"y": -(td["x"] - td["x_there"])},
+    ),
+    "FieldGradient": DataCase(
+        lambda: FieldGradient(hyperbola_and_wave, ["x"], ["y"]),
+        lambda rand: {"x": rand(2)},
+        lambda td: {
+            "y": torch.stack((td["x"].flip(-1), torch.stack((0 * td["x"][..., 0], td["x"][..., 1].cos()), -1)), -2)
+        },
+    ),
+    "GradientHeading": DataCase(
+        lambda: GradientHeading(["x", "x_there", "slope"], ["y", "valid"], pair=(0, 1)),
+        lambda rand: {
+            "x": rand(2),
+            "x_there": rand(2),
+            "slope": torch.stack((rand(2) + torch.tensor([1.0, 0.0]), rand(2) - torch.tensor([1.0, -1.0])), -2),
+        },
+        lambda td: {
+            "y": direction(td["x_there"] - td["x"], td["slope"]),
+            "valid": torch.ones_like(td["x"][..., :1], dtype=torch.bool),
+        },
+    ),
+    "AlignmentReward": DataCase(
+        lambda: AlignmentReward(["angle", "reference", "ok"], ["r", "term"], weight=2.0, offset=0.5),
+        lambda rand: {
+            "angle": 3 * rand(1),
+            "reference": 3 * rand(1) - 3,
+            "ok": rand(1) > 0.3,
+            "next": TensorDict(angle=3 * rand(1), reference=3 * rand(1) - 3, r=rand(1)),
+        },
+        lambda td: {
+            ("next", "term"): td["ok"] * 2.0 * (0.5 - deviation(td["next"]["angle"], td["reference"])),
+            ("next", "r"): td["next"]["r"] + td["ok"] * 2.0 * (0.5 - deviation(td["next"]["angle"], td["reference"])),
+        },
+    ),
+}
+
+
+def data_of(case: DataCase, *batch: int, dtype: torch.dtype = torch.float32) -> tuple[TensorDict, dict]:
+    """Return a TensorDict of inputs, and what the transform must add to it or change in it."""
+    draw = torch.Generator().manual_seed(0)
+    inputs = case.inputs(lambda *shape: torch.rand(*batch, *shape, dtype=dtype, generator=draw))
+    return TensorDict(inputs, batch), case.outputs(copy.deepcopy(inputs))
+
+
+def check_outputs(td: TensorDict, expected: dict) -> None:
+    for name, value in expected.items():
+        torch.testing.assert_close(td[name], value.to(td[name].dtype), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("case", DATA_CASES.values(), ids=DATA_CASES.keys())
+class TestConformanceOnData:
+    @pytest.mark.parametrize(("batch", "dtype"), [((), torch.float32), ((2, 3), torch.float64)])
+    def test_transform_no_env(self, case: DataCase, batch: tuple[int, ...], dtype: torch.dtype) -> None:
+        td, expected = data_of(case, *batch, dtype=dtype)
+        given, tensors = td.clone(), dict(td.items(True, True))
+        out = Compose(case.transform())(td)
+        check_outputs(out, expected)
+        assert all(out[name].dtype in (dtype, torch.bool) for name in expected)
+        for name in given.keys(True, True):
+            assert name in expected or torch.equal(out[name], given[name]), name
+            assert torch.equal(tensors[name], given[name]), f"{name} was written in place"
+
+    def test_transform_model(self, case: DataCase) -> None:
+        td, expected = data_of(case, 3)
+        name = next(iter(expected))
+        after = TensorDictModule(nn.Softplus(), in_keys=[name], out_keys=["after"])
+        out = TensorDictSequential(case.transform(), after)(td)
+        torch.testing.assert_close(out["after"], nn.functional.softplus(out[name]))
+        check_outputs(out, expected)
+
+    def test_transform_rb(self, case: DataCase) -> None:
+        td, expected = data_of(case, 10)
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), batch_size=7)
+        buffer.append_transform(case.transform())
+        buffer.extend(td.set("row", torch.arange(10)))
+        for _ in range(2):  # the second sample shows that the first was not written back into the storage
+            sample = buffer.sample()
+            check_outputs(sample, {name: value[sample["row"]] for name, value in expected.items()})
+
+    def test_transform_compiled(self, case: DataCase) -> None:
+        """As one graph, without breaks. ``aot_eager`` traces as ``eager`` does, and checks the graph further."""
+        td, expected = data_of(case, 3)
+        torch.compiler.reset()
+        check_outputs(torch.compile(case.transform(), fullgraph=True, backend="aot_eager")(td), expected)
+
+    def test_copies_do_the_same(self, case: DataCase) -> None:
+        for copied in (Transform.clone, copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))):
+            td, expected = data_of(case, 3)
+            check_outputs(copied(case.transform())(td), expected)
+
+    def test_a_missing_key_is_named_or_tolerated(self, case: DataCase) -> None:
+        transform, (td, _) = case.transform(), data_of(case, 3)
+        missing = transform.in_keys[-1]
+        del td[missing]
+        with pytest.raises(KeyError, match=f"{type(transform).__name__} reads .*{missing}"):
+            transform(td)
+        transform.set_missing_tolerance(True)
+        assert (transform(td.clone()) == td).all()
+
+
+def test_partial_reset_leaves_the_others_alone() -> None:
+    env = TransformedEnv(nav(4), guided())
+    td = env.rollout(3, break_when_any_done=False)[:, -1]["next"]
+    chosen = torch.tensor([True, False, False, True])
+    after = env.reset(td.clone().set("_reset", chosen.unsqueeze(-1)))
+    for key in ("m", "course", "field_difference", "field_gradient", "gradient_heading", "sensor_std"):
+        assert torch.equal(after[key][~chosen], td[key][~chosen]), key
+        assert (after[key] != td[key])[chosen].flatten(1).any(-1).all() or key == "sensor_std", key
+
+
+@pytest.mark.parametrize("make", [lambda: AngleVector(["heading"], ["heading"]), lambda: MinMaxNorm(["target_field"])])
+def test_writing_over_the_state_of_the_env_is_refused(make: Callable[[], Transform]) -> None:
+    transform = make()
+    with pytest.raises(ValueError, match=f"{type(transform).__name__}.*{transform.out_keys[0]!r}.*state"):
+        TransformedEnv(nav(), transform).rollout(2)
+
+
+def test_a_reader_before_its_writer_is_refused() -> None:
+    for reader in (GradientHeading(), AlignmentReward(["heading", "gradient_heading"])):
+        with pytest.raises(KeyError, match=rf"{type(reader).__name__} reads '(field_gradient|gradient_heading)'"):
+            _ = TransformedEnv(nav(), Compose(reader, FieldGradient(field()), GradientHeading())).specs
+
+
+def test_keys() -> None:
+    for keys in ("x", ["x"], [("x",)]):
+        assert key_list(keys) == ["x"]
+    assert key_list(("agents", "x")) == [("agents", "x")]
+    assert several_keys(("agents", "x")) == ["agents", "x"]
+    for keys in ("x", 5, [5]):
+        with pytest.raises(TypeError, match="keys must be a sequence of names"):
+            several_keys(keys)
+
+
+def test_all_errors_are_deterministic_in_a_chain() -> None:
+    """Scaled actions reach the errors of motion as kilometers and radians."""
+    norm = MinMaxNorm(in_keys_inv=["action"], bounds={"action": ((0.0, -1.5), (50.0, 1.5))})
+    scaled, plain = TransformedEnv(nav(), Compose(*every_error(), norm)), all_errors()
+    action = torch.tensor([[0.0, 0.5], [1.0, -1.0]])
+    one = scaled.step(scaled.reset().set("action", action))["next"]
+    other = plain.step(plain.reset().set("action", torch.tensor([[25.0, 0.75], [50.0, -1.5]])))["next"]
+    torch.testing.assert_close(one["position"], other["position"])
