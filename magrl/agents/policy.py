@@ -23,8 +23,7 @@ from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
 from magrl.checks import check_finite, check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.files import DamagedFileError, load_tensors, save_tensors
-from magrl.transforms import ObservationView
-from magrl.transforms.track_view import TrackView
+from magrl.transforms import ObservationView, TrackView
 
 POLICY_FORMAT = 2
 VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}

@@ -27,7 +27,7 @@ from magrl.navigators import Kalman, RunAndTumble, Secant
 from magrl.onboard.limits import check_move, move_limits, out_of_range, view_of
 from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_jump, check_earth_reading
 from magrl.transforms import TrackGradient, TrackView
-from magrl.transforms.track_view import DATA_SHEET
+from magrl.transforms.track import STD_KEYS
 
 NAMED = ("anywhere", "secant", "kalman", "run_and_tumble")
 """Navigators by name; any other is given as a module."""
@@ -140,14 +140,14 @@ class Onboard:
         self.max_move_km, self.max_turn_deg = move_limits(known, max_move_km, max_turn_deg)
         bounds = self.max_move_km, math.radians(self.max_turn_deg)
         if made == "secant":
-            made = Secant(*bounds, noise=tuple(map(math.hypot, self.sensor_std, self.bias_std)))
+            made = Secant(*bounds, sensor_std=tuple(map(math.hypot, self.sensor_std, self.bias_std)))
         elif made == "kalman":
-            made = Kalman(*bounds, self.sensor_std, max_steps, bias=self.bias_std, search=False)
+            made = Kalman(*bounds, self.sensor_std, max_steps, bias_std=self.bias_std, search=False)
         elif made == "run_and_tumble":
             made = RunAndTumble(*bounds)
         self.navigator: Any = copy.deepcopy(made).cpu()
         self.name = type(self.navigator).__name__
-        if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *DATA_SHEET, "step_count", "done"}):
+        if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *STD_KEYS, "step_count", "done"}):
             raise ValueError(f"{self.name} reads {', '.join(unknown)}, which a vehicle does not know")
         self._adopt(zeta)
         self.target: Any = None
@@ -162,7 +162,7 @@ class Onboard:
             self.navigator = FieldPolicy(config, self.navigator.actor)
             self._observe, self._kept = self.navigator.observe, config.view.state_keys
         else:
-            keys = ("field", "target_field", "move", "heading", *DATA_SHEET)
+            keys = ("field", "target_field", "move", "heading", *STD_KEYS)
             self._observe = Compose(TrackGradient(keys, range_km=1000.0, frame="vehicle"))
             self._kept = ("track_mean", "track_covariance")
 
@@ -233,7 +233,7 @@ class Onboard:
     def _seen(self, reading: Sequence[float], course: float, move: tuple[float, float]) -> TensorDict:
         """Return what a policy reads, in a batch of one."""
         rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
-        rows |= dict(zip(DATA_SHEET, (self.sensor_std, self.bias_std), strict=True))
+        rows |= dict(zip(STD_KEYS, (self.sensor_std, self.bias_std), strict=True))
         seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
         seen |= {"step_count": torch.tensor([[self._step]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")

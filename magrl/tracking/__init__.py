@@ -9,6 +9,7 @@ from magrl.tracking.filter import (
     FieldTrack,
     GradientPrior,
     GradientRelation,
+    estimated_field,
     estimated_gradient,
     predict,
     relate,
@@ -22,7 +23,16 @@ from magrl.tracking.priors import (
     dipole_prior,
     field_curvature,
 )
-from magrl.tracking.search import SEARCH_KM, VISITED, arrival_ellipse, unvisited, unvisited_yet, visit
+from magrl.tracking.search import (
+    SEARCH_KM,
+    VISITED,
+    arrival_ellipse,
+    arrival_weights,
+    unvisited,
+    unvisited_yet,
+    visit,
+)
+from magrl.tracking.track import ELEMENT_PERIODS, aim, continued, displacement_of, read, related, way_from
 from magrl.tracking.way import Way, way_to
 
 __all__ = [
@@ -30,6 +40,7 @@ __all__ = [
     "CURVATURE_NT",
     "DIPOLE_STD_NT",
     "DISTANCE_SCALE_KM",
+    "ELEMENT_PERIODS",
     "ELEMENT_SCALES",
     "SEARCH_KM",
     "VARIANCE_FLOOR",
@@ -38,15 +49,22 @@ __all__ = [
     "GradientPrior",
     "GradientRelation",
     "Way",
+    "aim",
     "arrival_ellipse",
+    "arrival_weights",
+    "continued",
     "curl_relation",
     "dipole_prior",
+    "displacement_of",
+    "estimated_field",
     "estimated_gradient",
     "field_curvature",
     "predict",
     "probability_below",
     "probability_within",
+    "read",
     "relate",
+    "related",
     "start",
     "steepest",
     "surprise",
@@ -54,5 +72,6 @@ __all__ = [
     "unvisited_yet",
     "update",
     "visit",
+    "way_from",
     "way_to",
 ]

@@ -13,11 +13,11 @@ from magrl.tracking.filter import (
     ELEMENT_SCALES,
     FieldTrack,
     PerElement,
-    check_track,
-    common,
-    first,
-    parts,
-    positive,
+    _broadcast,
+    _elements_first,
+    _entries,
+    _nonnegative_or_nan,
+    _units,
 )
 
 _LEAST_VARIANCE = 1e-8  # of a remaining difference: keeps the squares of the weights inside float32
@@ -68,17 +68,17 @@ def way_to(
         >>> way_to(track, torch.tensor([3.0, 4.0]), 1000.0, scales=(1.0, 1.0)).displacement.round()
         tensor([300., 200.])
     """
-    count = check_track(track)
+    unit = _units(track, scales)
+    count = unit.shape[-1]
     check_tensor(count, target=target)
     check_number(0, above=True, range_km=range_km)
-    unit = positive("scales", scales, count, track.mean)
-    target = target.to(track.mean.dtype) / unit
-    bias = positive("bias_std", (0.0,) * count if bias_std is None else bias_std, count, track.mean) / unit
-    shape = common(track.mean.shape[:-1], target.shape, bias.shape)
-    (value, north, east), (p00, p01, p02, p11, p12, p22) = parts(track, shape)
-    p00 = p00 + first(bias, shape).square()
+    target = target.to(unit.dtype) / unit
+    bias = _nonnegative_or_nan("bias_std", (0.0,) * count if bias_std is None else bias_std, count, unit) / unit
+    shape = _broadcast(track.mean.shape[:-1], target.shape, bias.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = _entries(track, shape)
+    p00 = p00 + _elements_first(bias, shape).square()
     ridge = (DISTANCE_SCALE_KM / range_km) ** 2
-    terms = torch.stack((first(target, shape) - value, north, east))
+    terms = torch.stack((_elements_first(target, shape) - value, north, east))
     expected, twice1, twice2, twice12 = p00 + (p11 + p22) / ridge, 2 * p01, 2 * p02, 2 * p12
     together = None
     for _ in range(3):

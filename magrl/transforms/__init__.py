@@ -6,7 +6,6 @@ module where that makes sense.
 """
 
 from magrl.transforms.alignment import AlignmentReward, FieldGradient, GradientHeading
-from magrl.transforms.declaration import DeclareArrival
 from magrl.transforms.errors import (
     CONDITIONS,
     NORTH_REFERENCES,
@@ -26,13 +25,10 @@ from magrl.transforms.errors import (
     with_conditions,
     with_sensor_noise,
 )
-from magrl.transforms.observation import AngleVector, TargetDifference
 from magrl.transforms.rewards import DetourReward, DistanceCost, TrueWay
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.search import SearchAim
-from magrl.transforms.track import TrackGradient
-from magrl.transforms.track_view import TrackObservation, TrackView
-from magrl.transforms.view import ObservationView
+from magrl.transforms.track import DeclareArrival, SearchAim, TrackGradient
+from magrl.transforms.views import AngleVector, ObservationView, TargetDifference, TrackObservation, TrackView
 
 __all__ = [
     "CONDITIONS",

@@ -66,8 +66,8 @@ def sweep(config: Config) -> str:
     head = ["noise: D °, I °, B_H nT", *(f"{length:g} km" for length in LENGTHS_KM), "chosen: SR / SPL / TNT"]
     rows = []
     for noise in tqdm(NOISE, unit="level"):
-        swept = [measure(scenario, Secant(probe_km=length, noise=noise), noise, config) for length in LENGTHS_KM]
-        chosen = Secant(noise=noise)
+        swept = [measure(scenario, Secant(probe_km=length, sensor_std=noise), noise, config) for length in LENGTHS_KM]
+        chosen = Secant(sensor_std=noise)
         cell = f"{chosen.probe_km:.1f} km: {measure(scenario, chosen, noise, config)}"
         rows.append([", ".join(format(x, "g") for x in noise), *swept, cell])
     return markdown_table(head, rows)

@@ -45,7 +45,7 @@ def success_and_spl(base: GeomagneticNavEnv, navigator: Kalman, noise: tuple[flo
     ("noise", "success", "spl"), [((0.0, 0.0, 0.0), 99.0, 97.0), (NOISE, 97.0, 86.0), ((0.1, 0.1, 10.0), 93.0, 83.0)]
 )
 def test_it_arrives_without_a_map_with_and_without_noise(noise: tuple[float, ...], success: float, spl: float) -> None:
-    found = success_and_spl(env(), Kalman(noise=noise), noise)
+    found = success_and_spl(env(), Kalman(sensor_std=noise), noise)
     assert found > (success, 0), found
     assert found[1] > spl, found
 
@@ -62,15 +62,15 @@ def test_it_reads_nothing_privileged() -> None:
 
 def test_the_predicted_covariance_is_that_of_the_filter_after_the_move() -> None:
     """Where the gradients are known, a move teaches nothing, and the formula is that of way_to in a linear field."""
-    navigator = Kalman(noise=NOISE)
+    navigator = Kalman(sensor_std=NOISE)
     slope = torch.tensor([[[0.1, 0.4, 0.2], [0.0, -0.2, 0.9], [0.0, 0.5, 0.5]]], dtype=F64) * 1e4
     covariance = 1e-4 * torch.eye(3, dtype=F64).expand(1, 3, 3, 3)
     track = FieldTrack(slope, covariance)
     moves, left = torch.tensor([[[20.0, 10.0]]], dtype=F64), torch.tensor([[[150.0, -40.0]]], dtype=F64)
     found = navigator._covariance_after(track, moves, left)
     moved = tracking.predict(track, moves[:, 0], (0.0, 0.0, 0.0), navigator.scales)
-    scales = torch.tensor(navigator.scales, dtype=F64)
-    after = tracking.update(moved, moved.mean[..., 0] * scales, navigator.noise, navigator.scales)
+    scales = navigator.scales
+    after = tracking.update(moved, moved.mean[..., 0] * scales, navigator.sensor_std, navigator.scales)
     target = (after.mean[..., 0] + after.mean[..., 1:] @ (left[0, 0] / 100)) * scales
     expected = tracking.way_to(after, target, navigator.range_km, navigator.scales).covariance
     torch.testing.assert_close(found[:, 0], expected, rtol=1e-3, atol=1e-9)
@@ -84,7 +84,7 @@ def test_a_crossing_move_is_worth_more_than_one_along_the_way() -> None:
     track = FieldTrack(memory["mean"], memory["covariance"])
     leg = torch.tensor([[30.0, 0.0]], dtype=F64)
     track = tracking.predict(track, leg, navigator.curvature, navigator.scales)
-    reading = track.mean[..., 0] * torch.tensor(navigator.scales, dtype=F64)
+    reading = track.mean[..., 0] * navigator.scales
     track = tracking.update(track, reading, NOISE, navigator.scales)
     moves = torch.tensor([[[10.0, 0.0], [0.0, 10.0]]], dtype=F64).expand(3, 2, 2)
     left = torch.tensor([200.0, 200.0], dtype=F64) - moves

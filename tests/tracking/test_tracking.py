@@ -17,6 +17,7 @@ from magrl.tracking import (
     ELEMENT_SCALES,
     VARIANCE_FLOOR,
     FieldTrack,
+    GradientPrior,
     GradientRelation,
     curl_relation,
     dipole_prior,
@@ -60,7 +61,7 @@ def smallest_eigenvalue(covariance):
 
 def started(reading, noise=NOISE):
     prior = dipole_prior(reading)
-    return start(reading, prior.gradient, prior.std, noise, prior.azimuth)
+    return start(reading, prior, noise)
 
 
 # --- against a textbook filter ----------------------------------------------------------------------------------------
@@ -101,7 +102,7 @@ def test_filter_is_the_textbook_filter():
     readings = randn(31, 4, 4, seed=1) * scale
     gradient, std = randn(4, 4, 2, seed=2) * scale[:, None] / 100, randn(4, 4, 2, seed=3).abs() * scale[:, None] / 100
     azimuth, moves = randn(4, seed=4), 40 * randn(30, 4, 2, seed=5)
-    track = start(readings[0], gradient, std, noise, azimuth, scales)
+    track = start(readings[0], GradientPrior(gradient, std, azimuth), noise, scales)
     expected = {
         (n, e): textbook_start(
             float(readings[0, n, e]),
@@ -157,7 +158,7 @@ def test_elements_and_vehicles_are_independent():
 def test_shapes_and_dtypes(shape, dtype, elements):
     scales, ones = (1.0,) * elements, torch.ones(*shape, elements, 2, dtype=dtype)
     reading = torch.zeros(*shape, elements, dtype=dtype)
-    track = start(reading, ones, ones, scales, scales=scales)
+    track = start(reading, GradientPrior(ones, ones, ones[..., 0, 0]), scales, scales)
     track = update(predict(track, torch.ones(*shape, 2, dtype=dtype), scales, scales), reading, scales, scales)
     way = way_to(track, reading, 300.0, scales)
     wanted = {(*shape, elements, 3): track.mean, (*shape, elements, 3, 3): track.covariance}
@@ -257,7 +258,10 @@ def test_a_straight_track_says_nothing_across_it():
     gradient, std = torch.zeros(3, 2, dtype=F64), f64((0.4, 0.5), (0.3, 0.2), (190.0, 135.0)) / 100
     heading = 0.6
     along, across = f64(math.cos(heading), math.sin(heading)), f64(-math.sin(heading), math.cos(heading))
-    track, slope = start(f64(0.0, 0.0, 0.0), gradient, std, NOISE, torch.tensor(heading, dtype=F64)), 0.01 * SCALES
+    track, slope = (
+        start(f64(0.0, 0.0, 0.0), GradientPrior(gradient, std, torch.tensor(heading, dtype=F64)), NOISE),
+        0.01 * SCALES,
+    )
     before = track.covariance
     for step in range(1, 31):
         track = update(predict(track, 20 * along, (0.0, 0.0, 0.0)), 20 * step * slope, NOISE)
@@ -528,7 +532,7 @@ def test_planets_deviate_from_the_dipole_and_curve_as_assumed():
 def test_prior_is_narrow_along_the_azimuth():
     """Standard deviations 1 along and 3 across an azimuth of 30 deg, worked by hand."""
     std, turn = 0.01 * f64((1.0, 3.0)).expand(1, 2), torch.tensor(math.radians(30), dtype=F64)
-    found = start(f64(0.0), torch.zeros(1, 2, dtype=F64), std, (0.0,), turn, scales=(1.0,)).covariance[0]
+    found = start(f64(0.0), GradientPrior(torch.zeros(1, 2, dtype=F64), std, turn), (0.0,), (1.0,)).covariance[0]
     half, cos2, sin2 = math.sqrt(3) / 4, 0.75, 0.25
     block = f64((cos2 + 9 * sin2, (1 - 9) * half), ((1 - 9) * half, sin2 + 9 * cos2))
     torch.testing.assert_close(found[1:, 1:], block)
@@ -541,7 +545,7 @@ def test_prior_is_narrow_along_the_azimuth():
 def fly(reading, moved, after, target, noise):
     """All functions in a row."""
     prior = dipole_prior(reading)
-    track = start(reading, prior.gradient, prior.std, noise, prior.azimuth)
+    track = start(reading, prior, noise)
     track = update(predict(track, moved), after, NOISE)
     known, shared = relate(track, curl_relation(after))
     return (*track, *way_to(known, target, 300.0, shared=shared), estimated_gradient(known))
@@ -594,21 +598,24 @@ def test_nan_of_an_element_stays_in_it():
 
 TRACK = FieldTrack(torch.zeros(4, 3, 3), torch.eye(3).expand(4, 3, 3, 3))
 READING = torch.zeros(4, 3)
-PRIOR = (torch.zeros(4, 3, 2), torch.ones(4, 3, 2))
+PRIOR = GradientPrior(torch.zeros(4, 3, 2), torch.ones(4, 3, 2), torch.zeros(4))
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: dipole_prior(torch.zeros(4, 2)), r"reading must have the shape \(..., 3\), got \(4, 2\)"),
-        (lambda: start(READING, torch.zeros(4, 2, 2), PRIOR[1], NOISE), r"prior_gradient .* got \(4, 2, 2\)"),
-        (lambda: start(READING, PRIOR[0], torch.zeros(4, 3), NOISE), r"prior_std .* got \(4, 3\)"),
-        (lambda: start(READING, *PRIOR, (0.1, 0.1)), r"noise_std must be 3 finite numbers, got \(0.1, 0.1\)"),
-        (lambda: start(READING, *PRIOR, (0.1, -0.2, 1.0)), "noise_std must be a finite number from 0 on, got -0.2"),
-        (lambda: start(READING, *PRIOR, NOISE, scales=(1.0, 0.0, 1.0)), "scales must be a finite number above 0, got"),
-        (lambda: start(READING, *PRIOR, 0.1), "noise_std must be 3 finite numbers, got 0.1"),
-        (lambda: start(READING, *PRIOR, NOISE, 0.1), "azimuth must be a tensor"),
-        (lambda: start(torch.tensor(1.0), *PRIOR, NOISE), "prior_gradient"),
+        (
+            lambda: start(READING, PRIOR._replace(gradient=torch.zeros(4, 2, 2)), NOISE),
+            r"prior_gradient .*\(4, 2, 2\)",
+        ),
+        (lambda: start(READING, PRIOR._replace(std=torch.zeros(4, 3)), NOISE), r"prior_std .* got \(4, 3\)"),
+        (lambda: start(READING, PRIOR, (0.1, 0.1)), r"sensor_std must be 3 finite numbers, got \(0.1, 0.1\)"),
+        (lambda: start(READING, PRIOR, (0.1, -0.2, 1.0)), "sensor_std must be a finite number from 0 on, got -0.2"),
+        (lambda: start(READING, PRIOR, NOISE, scales=(1.0, 0.0, 1.0)), "scales must be a finite number above 0, got"),
+        (lambda: start(READING, PRIOR, 0.1), "sensor_std must be 3 finite numbers, got 0.1"),
+        (lambda: start(READING, PRIOR._replace(azimuth=0.1), NOISE), "azimuth must be a tensor"),
+        (lambda: start(torch.tensor(1.0), PRIOR, NOISE), "prior_gradient"),
         (lambda: predict(TRACK, torch.zeros(4, 3)), r"displacement must have the shape \(..., 2\), got \(4, 3\)"),
         (lambda: predict(TRACK, torch.zeros(4, 2), (0.1, 0.1, -8.0)), "curvature must be .* got -8.0"),
         (lambda: predict(TRACK, torch.zeros(4, 2), torch.zeros(4, 2)), r"curvature .* got \(4, 2\)"),
@@ -618,9 +625,9 @@ PRIOR = (torch.zeros(4, 3, 2), torch.ones(4, 3, 2))
         (lambda: update(FieldTrack(READING[0], TRACK.covariance), READING, NOISE), "mean and covariance must have"),
         (lambda: update(FieldTrack(TRACK.mean[..., :2], TRACK.covariance), READING, NOISE), "mean must have the shape"),
         (lambda: update(TRACK, torch.zeros(4, 1), NOISE), r"reading must have the shape \(..., 3\), got \(4, 1\)"),
-        (lambda: update(TRACK, READING, (0.1, -0.2, 1.0)), "noise_std must be a finite number from 0 on, got -0.2"),
-        (lambda: update(TRACK, READING, (0.1, NAN, 1.0)), "noise_std must be 3 finite numbers"),
-        (lambda: update(TRACK, READING, torch.zeros(4, 1)), r"noise_std .* got \(4, 1\)"),
+        (lambda: update(TRACK, READING, (0.1, -0.2, 1.0)), "sensor_std must be a finite number from 0 on, got -0.2"),
+        (lambda: update(TRACK, READING, (0.1, NAN, 1.0)), "sensor_std must be 3 finite numbers"),
+        (lambda: update(TRACK, READING, torch.zeros(4, 1)), r"sensor_std .* got \(4, 1\)"),
         (lambda: way_to(TRACK, torch.zeros(2), 300.0), r"target must have the shape \(..., 3\), got \(2,\)"),
         (lambda: way_to(TRACK, READING, 0.0), "range_km must be a finite number above 0, got 0.0"),
         (lambda: estimated_gradient(TRACK, (1.0, 1.0)), "scales must be 3 finite numbers"),

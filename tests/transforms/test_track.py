@@ -54,10 +54,10 @@ def flown(env: TransformedEnv, steps: int = 6) -> TensorDictBase:
 
 
 def test_the_estimates_are_those_of_the_pure_functions() -> None:
-    rollout = flown(tracked(noise_std=NOISE))
+    rollout = flown(tracked(sensor_std=NOISE))
     reading = rollout["field"][:, 0]
     prior = tracking.dipole_prior(reading)
-    track = tracking.start(reading, prior.gradient, prior.std, NOISE, prior.azimuth)
+    track = tracking.start(reading, prior, NOISE)
     for step in rollout["next"].unbind(1):
         heading = step["heading"]
         d = step["move"][:, :1] * torch.cat((heading.cos(), heading.sin()), -1)
@@ -126,8 +126,8 @@ def test_partial_reset_restarts_the_chosen_rows_alone() -> None:
 
 def test_a_step_depends_on_its_tensordict_alone() -> None:
     """As stored data are stepped again, by another transform."""
-    rollout = flown(tracked(noise_std=NOISE))
-    again = TrackGradient(noise_std=NOISE)(rollout.exclude(*(("next", key) for key in (*STATE, *ESTIMATES))))
+    rollout = flown(tracked(sensor_std=NOISE))
+    again = TrackGradient(sensor_std=NOISE)(rollout.exclude(*(("next", key) for key in (*STATE, *ESTIMATES))))
     for key in (*STATE, *ESTIMATES):
         torch.testing.assert_close(again["next", key], rollout["next", key], msg=key)
     env, other = tracked(), tracked()
@@ -139,9 +139,9 @@ def test_a_step_depends_on_its_tensordict_alone() -> None:
 
 def test_nothing_but_its_inputs_is_read() -> None:
     """Privileged keys among them: they may be anything."""
-    rollout = flown(tracked(noise_std=NOISE))
+    rollout = flown(tracked(sensor_std=NOISE))
     public = [*STATE, *(("next", key) for key in ("field", "target_field", "move", "heading"))]
-    again = TrackGradient(noise_std=NOISE)(rollout.select(*public))
+    again = TrackGradient(sensor_std=NOISE)(rollout.select(*public))
     torch.testing.assert_close(again["next", "way"], rollout["next", "way"])
 
 
@@ -210,7 +210,7 @@ def test_the_data_sheet_may_be_a_key() -> None:
     read = TrackGradient(["field", "target_field", "move", "heading", "sensor_std"])
     both = read(read(first.clone()).set("next", after))["next"]
     for row, std in enumerate(rows.tolist()):
-        alone = TrackGradient(noise_std=std)
+        alone = TrackGradient(sensor_std=std)
         expected = alone(alone(first.clone()).set("next", after.clone()))["next"]
         for key in (*STATE, *ESTIMATES):
             torch.testing.assert_close(both[key][row], expected[key][row], msg=key)
@@ -218,8 +218,8 @@ def test_the_data_sheet_may_be_a_key() -> None:
 
 def test_a_step_is_compiled_whole() -> None:
     torch.compiler.reset()
-    transform = TrackGradient(noise_std=NOISE, frame="vehicle")
-    rollout = flown(tracked(noise_std=NOISE)).exclude(*(("next", key) for key in (*STATE, *ESTIMATES)))
+    transform = TrackGradient(sensor_std=NOISE, frame="vehicle")
+    rollout = flown(tracked(sensor_std=NOISE)).exclude(*(("next", key) for key in (*STATE, *ESTIMATES)))
     expected = transform(rollout.clone())
     found = torch.compile(transform, fullgraph=True, backend="aot_eager")(rollout)
     for key in (*STATE, *ESTIMATES):

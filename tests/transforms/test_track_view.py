@@ -21,7 +21,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.field.regional import RegionalField
 from magrl.files import save_tensors
 from magrl.transforms import SensorNoise, TrackGradient, TrackView
-from magrl.transforms.track_view import track_observation
+from magrl.transforms.views import track_observation
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
 VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
@@ -58,7 +58,7 @@ def by_hand(**change: Tensor) -> Tensor:
         "gradient": float64([[0.01, 0.0], [0.0, 0.02], [1.0, 1.0]]),
         "remaining": float64([0.1, -0.2, 3.0]),
         "weights": float64([100.0, 25.0, 0.01]),
-        "noise_std": float64([0.1, 0.0, 5.0]),
+        "sensor_std": float64([0.1, 0.0, 5.0]),
         "time": float64([0.3]),
     }
     return track_observation(**(parts | change))

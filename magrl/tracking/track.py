@@ -1,0 +1,148 @@
+"""The filter from reading to reading: the one loop that transforms, navigators and vehicles share, as pure functions.
+
+A track begins with :func:`~magrl.tracking.start`. :func:`read` takes it over a move to the next reading,
+:func:`related` adds what is known of the gradients at a place, :func:`way_from` gives the way to the target, and
+:func:`aim` the way to where the vehicle has not been. ``periods`` names the elements that are angles in degrees: their
+estimate is continued beyond 180 degrees, and readings and targets are taken within half a turn of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_tensor
+from magrl.tracking.filter import (
+    CURVATURE,
+    ELEMENT_SCALES,
+    FieldTrack,
+    GradientRelation,
+    PerElement,
+    estimated_field,
+    predict,
+    relate,
+    update,
+)
+from magrl.tracking.search import arrival_ellipse, unvisited
+from magrl.tracking.way import Way, way_to
+
+ELEMENT_PERIODS = (360.0, 0.0, 0.0)
+"""Period of D, I [deg], B_H [nT] in readings; 0 for elements that are not wrapped."""
+
+
+def displacement_of(move: Tensor, heading: Tensor) -> Tensor:
+    """Return the displacement ``(..., 2)`` [km] of a move ``(..., K)``, distance [km] first, at a heading ``(..., 1)``.
+
+    Example:
+        >>> displacement_of(torch.tensor([30.0, 0.5]), torch.tensor([0.0]))
+        tensor([30.,  0.])
+    """
+    check_tensor(1, heading=heading)
+    return move[..., :1] * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
+
+
+def continued(
+    values: Tensor, track: FieldTrack, scales: PerElement = ELEMENT_SCALES, periods: PerElement = ELEMENT_PERIODS
+) -> Tensor:
+    """Return values ``(..., E)`` whose angles are within half a turn of the estimate.
+
+    Example:
+        >>> track = FieldTrack(torch.tensor([[200 / 0.3, 0.0, 0.0]]), torch.eye(3).unsqueeze(0))
+        >>> continued(torch.tensor([-170.0]), track, (0.3,), (360.0,))
+        tensor([190.])
+    """
+    period = torch.as_tensor(periods, dtype=values.dtype, device=values.device)
+    return values - period * torch.round((values - estimated_field(track, scales)) / 360)
+
+
+def read(
+    track: FieldTrack,
+    displacement: Tensor,
+    reading: Tensor,
+    sensor_std: PerElement,
+    curvature: PerElement = CURVATURE,
+    scales: PerElement = ELEMENT_SCALES,
+    periods: PerElement = ELEMENT_PERIODS,
+) -> FieldTrack:
+    """Return the state after a move and the reading at its end; arguments as in :func:`predict` and :func:`update`.
+
+    Example:
+        >>> from magrl.tracking import dipole_prior, start
+        >>> here = torch.tensor([8.0, -16.0, 35000.0])
+        >>> track = start(here, dipole_prior(here), (0.05, 0.05, 5.0))
+        >>> track = read(track, torch.tensor([50.0, 0.0]), here + torch.tensor([0.1, 0.5, 90.0]), (0.05, 0.05, 5.0))
+        >>> (estimated_field(track) - here).round(decimals=1)
+        tensor([ 0.1000,  0.5000, 90.0000])
+    """
+    moved = predict(track, displacement, curvature, scales)
+    return update(moved, continued(reading, moved, scales, periods), sensor_std, scales)
+
+
+def related(
+    track: FieldTrack, relation: Callable[[Tensor], GradientRelation], scales: PerElement = ELEMENT_SCALES
+) -> tuple[FieldTrack, Tensor]:
+    """Return the state given a relation of its gradients at the estimated field, as :func:`relate` does.
+
+    Args:
+        track: state.
+        relation: function from the estimated field ``(..., E)`` to a relation.
+        scales: those of :func:`start`.
+
+    Example:
+        >>> from magrl.tracking import curl_relation
+        >>> track = FieldTrack(torch.ones(3, 3), torch.eye(3).expand(3, 3, 3))
+        >>> related(track, curl_relation)[1].shape
+        torch.Size([3, 3])
+    """
+    return relate(track, relation(estimated_field(track, scales)), scales)
+
+
+def way_from(
+    known: FieldTrack,
+    shared: Tensor | None,
+    target: Tensor,
+    range_km: float,
+    bias_std: PerElement | None = None,
+    scales: PerElement = ELEMENT_SCALES,
+    periods: PerElement = ELEMENT_PERIODS,
+) -> Way:
+    """Return the way to the target from what :func:`related` returned; arguments as in :func:`way_to`.
+
+    Example:
+        >>> track = FieldTrack(torch.tensor([[600.0, 0.0, 1.0]]), 1e-6 * torch.eye(3).unsqueeze(0))
+        >>> way_from(track, None, torch.tensor([-177.0]), 1e5, scales=(0.3,), periods=(360.0,)).displacement.round()
+        tensor([   0., 1000.])
+    """
+    return way_to(known, continued(target, known, scales, periods), range_km, scales, shared, bias_std)
+
+
+def aim(
+    track: FieldTrack,
+    way: Way,
+    visited: Tensor,
+    weights: Tensor,
+    scales: PerElement = ELEMENT_SCALES,
+    axes: Tensor | None = None,
+) -> Tensor:
+    """Return the displacement ``(..., 2)`` [km] to the most probable destination where the vehicle has not been.
+
+    Args:
+        track: state, whose gradients give the arrival ellipse.
+        way: estimated way.
+        visited: ``(..., K, 2)`` from :func:`visit`, northward and eastward [km].
+        weights: ``(..., E)`` from :func:`arrival_weights`.
+        scales: those of :func:`start`.
+        axes: ``(..., 2, 2)`` directions, in rows, of the axes in which the way is given; None for north and east.
+
+    Example:
+        >>> from magrl.tracking import unvisited_yet
+        >>> track, way = FieldTrack(torch.ones(3, 3), torch.eye(3).expand(3, 3, 3)), Way(torch.ones(2), torch.eye(2))
+        >>> aim(track, way, unvisited_yet(torch.zeros(3)), torch.ones(3))
+        tensor([1., 1.])
+    """
+    ellipse = arrival_ellipse(track, weights, scales)
+    if axes is not None:
+        ellipse, visited = axes @ ellipse @ axes.mT, visited @ axes.mT
+    return unvisited(way, visited, ellipse)
