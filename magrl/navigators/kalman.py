@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -33,7 +34,7 @@ class Kalman(QuasiNewton):
 
     - the path: the length of the move minus the progress, that is, what it takes off the estimated way times the
       cosine of the typical error of its direction;
-    - ``caution`` times the detour that the remaining uncertainty of the way may cost;
+    - the detour that the remaining uncertainty of the way may cost, times a weight (:func:`trade_off`);
     - the price of the remaining steps, which rises as fewer of them are left.
 
     The way is that to the most probable destination, given that the episode has not ended at the places where the
@@ -45,8 +46,6 @@ class Kalman(QuasiNewton):
         max_turn_rad: largest turn [rad].
         sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
         max_steps: step limit of the episode.
-        caution: weight of the uncertainty; for None that of :func:`trade_off`.
-        step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
         bias_std: standard deviations of constant and slow errors of the readings.
         zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
@@ -75,24 +74,19 @@ class Kalman(QuasiNewton):
         max_turn_rad: float = math.pi / 2,
         sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
         max_steps: int = 50,
-        caution: float | None = None,
-        step_km: float | None = None,
         range_km: float = 300.0,
         bias_std: Sequence[float] = (0.0, 0.0, 0.0),
         zeta: float = 0.01,
         search: bool = True,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std)
-        usual_caution, usual_step_km = trade_off(sensor_std)
-        caution = usual_caution if caution is None else caution
-        step_km = usual_step_km if step_km is None else step_km
         check_number(1, whole=True, max_steps=max_steps)
         check_numbers(3, bias_std=bias_std)
-        check_number(0, bias_std=min(bias_std), caution=caution)
-        check_number(0, above=True, step_km=step_km, range_km=range_km, zeta=zeta)
+        check_number(0, bias_std=min(bias_std))
+        check_number(0, above=True, range_km=range_km, zeta=zeta)
         check_type(bool, search=search)
         self.max_steps, self.range_km, self.search = int(max_steps), float(range_km), search
-        self.caution, self.step_km, self.zeta = float(caution), float(step_km), float(zeta)
+        self.zeta, (self.caution, self.step_km) = float(zeta), trade_off(sensor_std)
         self._register("bias_std", bias_std)
 
     def prior(self, reading: Tensor) -> GradientPrior:
@@ -108,11 +102,12 @@ class Kalman(QuasiNewton):
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         known, shared = tracking.related(track, tracking.curl_relation, self.scales)
-        plain, biased = (self._way(known, shared, seen, bias_std) for bias_std in (None, self.bias_std))
-        way = self._aim(known, biased, seen, memory)
+        estimate = partial(tracking.way_to, known, seen["target_field"].double(), self.range_km, self.scales, shared)
+        covariance = estimate(periods=self.periods).covariance
+        way = self._aim(known, estimate(self.bias_std, self.periods), seen, memory)
         moves = self._moves(way)
         left = way.unsqueeze(1) - moves
-        progress = (way.norm(dim=-1, keepdim=True) - left.norm(dim=-1)) * _certainty(way, plain.covariance)
+        progress = (way.norm(dim=-1, keepdim=True) - left.norm(dim=-1)) * _certainty(way, covariance)
         cost = moves.norm(dim=-1) - progress
         cost = cost + left.norm(dim=-1) * self._price(way, seen["step_count"]) / self.max_move_km
         cost = cost + self.caution * _detour(left, self._covariance_after(track, moves, left))
@@ -120,10 +115,6 @@ class Kalman(QuasiNewton):
         distance = best.norm(dim=-1)
         direction = torch.where((distance > 0).unsqueeze(-1), best, way)  # standing still, face the way
         return self.steer(seen, direction, distance)
-
-    def _way(self, known: FieldTrack, shared: Tensor | None, seen: TensorDictBase, bias_std: Tensor | None) -> Way:
-        target = seen["target_field"].double()
-        return tracking.way_from(known, shared, target, self.range_km, bias_std, self.scales, self.periods)
 
     def _aim(self, known: FieldTrack, way: Way, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
         """Return the way ``(N, 2)`` [km] to the most probable destination; remember the end of the last move."""

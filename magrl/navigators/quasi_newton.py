@@ -105,7 +105,7 @@ class QuasiNewton(Navigator):
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         """Return distance [km] and turn [rad], each ``(N,)``, given the state of the filter."""
         target = seen["target_field"].double()[:, self.elements]
-        way = tracking.way_from(track, None, target, RANGE_KM, None, self.scales, self.periods).displacement
+        way = tracking.way_to(track, target, RANGE_KM, self.scales, periods=self.periods).displacement
         return self.steer(seen, way, way.norm(dim=-1))
 
     def steer(self, seen: TensorDictBase, direction: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,6 +4,7 @@ from magrl.tracking.belief import probability_below, probability_within, steepes
 from magrl.tracking.filter import (
     CURVATURE,
     DISTANCE_SCALE_KM,
+    ELEMENT_PERIODS,
     ELEMENT_SCALES,
     VARIANCE_FLOOR,
     FieldTrack,
@@ -32,7 +33,7 @@ from magrl.tracking.search import (
     unvisited_yet,
     visit,
 )
-from magrl.tracking.track import ELEMENT_PERIODS, aim, continued, displacement_of, read, related, way_from
+from magrl.tracking.track import aim, displacement_of, read, related
 from magrl.tracking.way import Way, way_to
 
 __all__ = [
@@ -52,7 +53,6 @@ __all__ = [
     "aim",
     "arrival_ellipse",
     "arrival_weights",
-    "continued",
     "curl_relation",
     "dipole_prior",
     "displacement_of",
@@ -72,6 +72,5 @@ __all__ = [
     "unvisited_yet",
     "update",
     "visit",
-    "way_from",
     "way_to",
 ]

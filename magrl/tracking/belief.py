@@ -14,11 +14,21 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_numbers, check_tensor
 from magrl.field.elements import element_difference
-from magrl.tracking.filter import ELEMENT_SCALES, FieldTrack, PerElement, _units, _variance
+from magrl.tracking.filter import (
+    ELEMENT_PERIODS,
+    ELEMENT_SCALES,
+    FieldTrack,
+    PerElement,
+    _units,
+    _variance,
+    continued,
+    estimated_field,
+    predict,
+)
+from magrl.tracking.priors import field_curvature
 from magrl.tracking.search import arrival_weights
 
 _POINTS = 1024
-_LEAST_SHARE = 1e-6  # of the noise in the variance of a prediction
 
 
 @cache
@@ -73,32 +83,36 @@ def probability_within(way: Tensor, covariance: Tensor, radius_km: float) -> flo
 
 
 def surprise(
-    track: FieldTrack, reading: Sequence[float], sensor_std: Sequence[float], scales: PerElement = ELEMENT_SCALES
+    track: FieldTrack,
+    displacement: Tensor,
+    reading: Tensor,
+    sensor_std: PerElement,
+    scales: PerElement = ELEMENT_SCALES,
 ) -> float:
-    """Return the mean square of a reading's deviation from its prediction, over the variance of that deviation.
+    """Return the mean over D, I, B_H of the squared innovation of a reading over its variance S.
 
-    It is 1 on average where the filter is right. It follows from the state after the reading: the deviation from it is
-    that from the prediction times the share of the noise in the variance.
+    It is 1 on average where the filter is right. The noise has the floor of :data:`~magrl.tracking.ELEMENT_SCALES`,
+    whatever the scales are.
 
     Args:
-        track: state of one vehicle after the reading.
-        reading: of E elements, in their units; angles within half a turn of the estimate.
+        track: state of one vehicle before the move.
+        displacement: ``(2,)`` northward and eastward [km].
+        reading: ``(3,)`` at its end.
         sensor_std: standard deviations of its noise, as in :func:`~magrl.tracking.update`.
         scales: those of :func:`~magrl.tracking.start`.
 
     Example:
-        >>> from magrl.tracking import update
-        >>> before = FieldTrack(torch.zeros(1, 3), 3.0 * torch.eye(3).unsqueeze(0))
-        >>> after = update(before, torch.tensor([4.0]), sensor_std=(1.0,), scales=(1.0,))
-        >>> surprise(after, (4.0,), (1.0,), (1.0,))  # 4^2 over 3 + 1
-        4.0
+        >>> track = FieldTrack(torch.zeros(3, 3), 3.0 * torch.eye(3).expand(3, 3, 3))
+        >>> surprise(track, torch.zeros(2), torch.tensor([0.0, 6.0, 0.0]), (0.3, 1.5, 100.0))  # 4^2 over 3 + 1, and 0
+        1.3333333333333333
     """
-    unit = _units(FieldTrack(*(tensor.double() for tensor in track)), scales)
-    check_numbers(unit.shape[-1], reading=reading, sensor_std=sensor_std)
-    noise = _variance(sensor_std, unit)
-    share = (1 - track.covariance[:, 0, 0] / noise).clamp_min(_LEAST_SHARE)
-    deviation = unit.new_tensor(reading) / unit - track.mean[:, 0]
-    return (deviation.square() / (share * noise)).mean().item()
+    track = FieldTrack(*(tensor.double() for tensor in track))
+    curvature = field_curvature(estimated_field(track, scales))
+    predicted = predict(track, displacement, curvature, scales)
+    unit, usual = _units(predicted, scales), _units(predicted, ELEMENT_SCALES)
+    innovation = continued(reading, predicted, scales, ELEMENT_PERIODS) / unit - predicted.mean[:, 0]
+    variance = predicted.covariance[:, 0, 0] + _variance(sensor_std, usual) * (usual / unit).square()
+    return (innovation.square() / variance).mean().item()
 
 
 def steepest(track: FieldTrack, element: int, scales: PerElement = ELEMENT_SCALES) -> float:

@@ -10,7 +10,7 @@ Arguments and results are in the element's unit and in kilometers, a :class:`Fie
 B_H, pass ``scales`` and ``curvature``, as tensors where they should stay on an accelerator.
 
 Types, shapes and Python numbers are checked. Values inside tensors are not: NaN or a negative standard deviation gives
-NaN. Differences are not wrapped: a declination that crosses 180 degrees must be continued beyond it.
+NaN. Differences are not wrapped: see :func:`continued`.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ from magrl.checks import check_number, check_numbers, check_tensor, check_type
 
 ELEMENT_SCALES = (0.3, 1.5, 100.0)
 """Units of D [deg], I [deg], B_H [nT] in a :class:`FieldTrack`: about their change over 100 km."""
+
+ELEMENT_PERIODS = (360.0, 0.0, 0.0)
+"""Period of D, I [deg], B_H [nT] in readings; 0 for elements that are not wrapped."""
 
 DISTANCE_SCALE_KM = 100.0  # unit of distance in a FieldTrack
 
@@ -245,6 +248,18 @@ def estimated_gradient(track: FieldTrack, scales: PerElement = ELEMENT_SCALES) -
         tensor([[1., 2.]])
     """
     return track.mean[..., 1:] * (_units(track, scales) / DISTANCE_SCALE_KM).unsqueeze(-1)
+
+
+def continued(values: Tensor, track: FieldTrack, scales: PerElement, periods: PerElement) -> Tensor:
+    """Return values ``(..., E)`` whose angles are within half a turn of the estimate.
+
+    Example:
+        >>> track = FieldTrack(torch.tensor([[200 / 0.3, 0.0, 0.0]]), torch.eye(3).unsqueeze(0))
+        >>> continued(torch.tensor([-170.0]), track, (0.3,), (360.0,))
+        tensor([190.])
+    """
+    period = torch.as_tensor(periods, dtype=values.dtype, device=values.device)
+    return values - period * torch.round((values - estimated_field(track, scales)) / 360)
 
 
 def _units(track: FieldTrack, scales: PerElement) -> Tensor:

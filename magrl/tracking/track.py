@@ -1,9 +1,8 @@
 """The filter from reading to reading: the one loop that transforms, navigators and vehicles share, as pure functions.
 
 A track begins with :func:`~magrl.tracking.start`. :func:`read` takes it over a move to the next reading,
-:func:`related` adds what is known of the gradients at a place, :func:`way_from` gives the way to the target, and
-:func:`aim` the way to where the vehicle has not been. ``periods`` names the elements that are angles in degrees: their
-estimate is continued beyond 180 degrees, and readings and targets are taken within half a turn of it.
+:func:`related` adds what is known of the gradients at a place, :func:`~magrl.tracking.way_to` gives the way to the
+target, and :func:`aim` the way to where the vehicle has not been.
 """
 
 from __future__ import annotations
@@ -16,20 +15,19 @@ from torch import Tensor
 from magrl.checks import check_tensor
 from magrl.tracking.filter import (
     CURVATURE,
+    ELEMENT_PERIODS,
     ELEMENT_SCALES,
     FieldTrack,
     GradientRelation,
     PerElement,
+    continued,
     estimated_field,
     predict,
     relate,
     update,
 )
 from magrl.tracking.search import arrival_ellipse, unvisited
-from magrl.tracking.way import Way, way_to
-
-ELEMENT_PERIODS = (360.0, 0.0, 0.0)
-"""Period of D, I [deg], B_H [nT] in readings; 0 for elements that are not wrapped."""
+from magrl.tracking.way import Way
 
 
 def displacement_of(move: Tensor, heading: Tensor) -> Tensor:
@@ -43,20 +41,6 @@ def displacement_of(move: Tensor, heading: Tensor) -> Tensor:
     return move[..., :1] * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
 
 
-def continued(
-    values: Tensor, track: FieldTrack, scales: PerElement = ELEMENT_SCALES, periods: PerElement = ELEMENT_PERIODS
-) -> Tensor:
-    """Return values ``(..., E)`` whose angles are within half a turn of the estimate.
-
-    Example:
-        >>> track = FieldTrack(torch.tensor([[200 / 0.3, 0.0, 0.0]]), torch.eye(3).unsqueeze(0))
-        >>> continued(torch.tensor([-170.0]), track, (0.3,), (360.0,))
-        tensor([190.])
-    """
-    period = torch.as_tensor(periods, dtype=values.dtype, device=values.device)
-    return values - period * torch.round((values - estimated_field(track, scales)) / 360)
-
-
 def read(
     track: FieldTrack,
     displacement: Tensor,
@@ -66,7 +50,10 @@ def read(
     scales: PerElement = ELEMENT_SCALES,
     periods: PerElement = ELEMENT_PERIODS,
 ) -> FieldTrack:
-    """Return the state after a move and the reading at its end; arguments as in :func:`predict` and :func:`update`.
+    """Return the state after a move and the reading at its end.
+
+    Arguments are those of :func:`~magrl.tracking.predict` and :func:`~magrl.tracking.update`. Angles in the reading are
+    taken within half a turn of the estimate, which is continued beyond 180 degrees.
 
     Example:
         >>> from magrl.tracking import dipole_prior, start
@@ -74,7 +61,7 @@ def read(
         >>> track = start(here, dipole_prior(here), (0.05, 0.05, 5.0))
         >>> track = read(track, torch.tensor([50.0, 0.0]), here + torch.tensor([0.1, 0.5, 90.0]), (0.05, 0.05, 5.0))
         >>> (estimated_field(track) - here).round(decimals=1)
-        tensor([ 0.1000,  0.5000, 90.0000])
+        tensor([ 0.1000,  0.5000, 89.9000])
     """
     moved = predict(track, displacement, curvature, scales)
     return update(moved, continued(reading, moved, scales, periods), sensor_std, scales)
@@ -97,25 +84,6 @@ def related(
         torch.Size([3, 3])
     """
     return relate(track, relation(estimated_field(track, scales)), scales)
-
-
-def way_from(
-    known: FieldTrack,
-    shared: Tensor | None,
-    target: Tensor,
-    range_km: float,
-    bias_std: PerElement | None = None,
-    scales: PerElement = ELEMENT_SCALES,
-    periods: PerElement = ELEMENT_PERIODS,
-) -> Way:
-    """Return the way to the target from what :func:`related` returned; arguments as in :func:`way_to`.
-
-    Example:
-        >>> track = FieldTrack(torch.tensor([[600.0, 0.0, 1.0]]), 1e-6 * torch.eye(3).unsqueeze(0))
-        >>> way_from(track, None, torch.tensor([-177.0]), 1e5, scales=(0.3,), periods=(360.0,)).displacement.round()
-        tensor([   0., 1000.])
-    """
-    return way_to(known, continued(target, known, scales, periods), range_km, scales, shared, bias_std)
 
 
 def aim(

@@ -18,6 +18,7 @@ from magrl.tracking.filter import (
     _entries,
     _nonnegative_or_nan,
     _units,
+    continued,
 )
 
 _LEAST_VARIANCE = 1e-8  # of a remaining difference: keeps the squares of the weights inside float32
@@ -43,6 +44,7 @@ def way_to(
     scales: PerElement = ELEMENT_SCALES,
     shared: Tensor | None = None,
     bias_std: PerElement | None = None,
+    periods: PerElement | None = None,
 ) -> Way:
     """Return the displacement to the place where the field has given values, and its uncertainty.
 
@@ -58,6 +60,8 @@ def way_to(
         shared: ``(..., E, 3)`` from :func:`relate`; without it, the elements are independent.
         bias_std: standard deviation of a constant error of the readings, ``(..., E)`` or E numbers. It is not in the
             state: gradients do not depend on it, but all remaining differences do.
+        periods: of angles, whose remaining differences are wrapped, as :data:`~magrl.tracking.ELEMENT_PERIODS`; None
+            for none.
 
     Raises:
         ValueError: for shapes that do not match, a range that is not above 0, or a negative number in ``bias_std``.
@@ -72,6 +76,7 @@ def way_to(
     count = unit.shape[-1]
     check_tensor(count, target=target)
     check_number(0, above=True, range_km=range_km)
+    target = target if periods is None else continued(target, track, scales, periods)
     target = target.to(unit.dtype) / unit
     bias = _nonnegative_or_nan("bias_std", (0.0,) * count if bias_std is None else bias_std, count, unit) / unit
     shape = _broadcast(track.mean.shape[:-1], target.shape, bias.shape)

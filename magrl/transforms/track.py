@@ -129,39 +129,46 @@ class TrackGradient(StatefulTransform):
         return self.out_keys[:2]
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
-        reading, *_ = values
-        sensor_std, _ = self._std(values)
-        self._write(tensordict, tracking.start(reading, self.prior(reading), sensor_std, self.scales), values)
+        reading, (sensor_std, _) = values[0], self._std(values)
+        self._write(tensordict, values, tracking.start(reading, self.prior(reading), sensor_std, self.scales))
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        reading, _, move, heading, *_ = values
+        (reading, _, move, heading, *_), (sensor_std, _) = values, self._std(values)
         track, displacement = FieldTrack(*state), tracking.displacement_of(move, heading)
-        curvature = self.constant_curvature if self.curvature is None else self.curvature(self._field(track))
-        sensor_std, _ = self._std(values)
+        field = tracking.estimated_field(track, self.scales)
+        curvature = self.constant_curvature if self.curvature is None else self.curvature(field)
         track = tracking.read(track, displacement, reading, sensor_std, curvature, self.scales, self.periods)
-        self._write(tensordict, track, values)
+        self._write(tensordict, values, track)
+
+    def _write(self, tensordict: TensorDictBase, values: list[Tensor], track: FieldTrack) -> None:
+        (_, target, _, heading, *_), (_, bias_std) = values, self._std(values)
+        for key, entry in zip(self.out_keys, (*track, *self.estimates(track, target, heading, bias_std)), strict=True):
+            tensordict.set(key, entry)
 
     def _std(self, values: list[Tensor]) -> tuple[Tensor, Tensor | None]:
         """Return the standard deviations of noise and of constant errors, of the TensorDict or as given."""
         given = len(values)
         return values[4] if given > 4 else self.sensor_std, values[5] if given > 5 else None
 
-    def _field(self, track: FieldTrack) -> Tensor:
-        return tracking.estimated_field(track, self.scales)
+    def estimates(
+        self, track: FieldTrack, target: Tensor, heading: Tensor, bias_std: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the estimates of the field, its gradient, the way to the target and its covariance, as written.
 
-    def _write(self, tensordict: TensorDictBase, track: FieldTrack, values: list[Tensor]) -> None:
-        """Write the state and the estimates."""
-        _, target, _, heading, *_ = values
-        _, bias_std = self._std(values)
+        Args:
+            track: state of the filter.
+            target: ``(..., E)`` values at the target.
+            heading: ``(..., 1)`` [rad].
+            bias_std: ``(..., E)`` standard deviation of a constant error of the readings.
+        """
         known, shared = (track, None) if self.relation is None else tracking.related(track, self.relation, self.scales)
-        field, gradient = self._field(known), tracking.estimated_gradient(known, self.scales)
+        field, gradient = (f(known, self.scales) for f in (tracking.estimated_field, tracking.estimated_gradient))
         field = field - self.periods.to(field.dtype) * torch.round(field / 360)
-        way, covariance = tracking.way_from(known, shared, target, self.range_km, bias_std, self.scales, self.periods)
+        way, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared, bias_std, self.periods)
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)
-        for key, entry in zip(self.out_keys, (*track, field, gradient, way, covariance), strict=True):
-            tensordict.set(key, entry)
+        return field, gradient, way, covariance
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the state and the estimates, unbounded."""

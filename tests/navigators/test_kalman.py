@@ -118,7 +118,8 @@ def test_the_moves_that_are_compared() -> None:
 
 
 def test_the_price_of_a_step_by_hand() -> None:
-    navigator = Kalman(max_steps=50, step_km=2.0)
+    navigator = Kalman(max_steps=50)
+    navigator.step_km = 2.0
     way = torch.tensor([[500.0, 0.0]], dtype=F64)  # 15 steps are reserved for it
     price = [float(navigator._price(way, torch.tensor([[step]]))) for step in (0, 10, 34, 49)]
     assert price == pytest.approx([2 * (50 / 35) ** 2, 2 * 2**2, 2 * 50**2, 2 * 50**2])
