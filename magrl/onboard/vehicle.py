@@ -111,6 +111,9 @@ class Onboard:
         90.0
     """
 
+    target: Any = None
+    """Elements at the destination; None before :meth:`start`."""
+
     def __init__(
         self,
         navigator: str | TensorDictModuleBase = "anywhere",
@@ -141,7 +144,6 @@ class Onboard:
         if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *STD_KEYS, "step_count", "done"}):
             raise ValueError(f"{self.name} reads {', '.join(unknown)}, which a vehicle does not know")
         self._view, self._estimator = view_of(self.navigator), Estimator(self.navigator)
-        self.target: Any = None
 
     def _untrained(self, name: str) -> Navigator:
         """Return a new navigator of a name."""
