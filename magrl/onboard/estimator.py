@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.envs import Compose
 
 from magrl import tracking
@@ -63,18 +62,19 @@ class Estimator:
         else:
             now = seen.copy()
             observed = self.observe(now) if self.state is None else self.observe(self.state.set("next", now))["next"]
-            action = self._trained_action(observed) if self.trained else self.navigator(seen)["action"]
-        self.state = observed.select(*self.state_keys)
+            self.state = observed.select(*self.state_keys)
+            if self.trained:
+                action = self.navigator.act.denormalize("action", self.navigator.actor(observed)["action"])
+            else:
+                action = self.navigator(seen)["action"]
         distance, turn = action[0].tolist()
         return observed, (distance, turn)
-
-    def _trained_action(self, observed: TensorDictBase) -> Tensor:
-        return self.navigator.act.denormalize("action", self.navigator.actor(observed)["action"])
 
     @property
     def track(self) -> FieldTrack:
         """State of the filter after the last reading."""
-        return FieldTrack(*(self.state[key][0] for key in OUT_KEYS[:2]))
+        state, keys = (self.navigator.memory, ("mean", "covariance")) if self.own else (self.state, OUT_KEYS[:2])
+        return FieldTrack(*(state[key][0] for key in keys))
 
     def surprise(self, seen: TensorDictBase) -> float:
         """Return how badly a reading fits the track before it, see :func:`magrl.tracking.surprise`."""

@@ -207,9 +207,9 @@ class Onboard:
         turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
         with torch.inference_mode():
             seen = self._seen(reading, course, (distance, turn))
-            if self._last:
-                self._surprises = (*self._surprises, self._estimator.surprise(seen))[-_SURPRISES:]
+            surprises = (*self._surprises, *((self._estimator.surprise(seen),) if self._last else ()))
             observed, action = self._estimator.act(seen)
+            self._surprises = surprises[-_SURPRISES:]
             self._first = self._first or reading
             self._last, self._step = (*reading, course), self._step + 1
             command = self._command(observed, action, course)
