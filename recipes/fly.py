@@ -51,7 +51,7 @@ from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
 from magrl.training import UsageError, command
 from magrl.transforms import SensorNoise, TrackGradient, conditions_named
-from magrl.transforms.track_view import DATA_SHEET
+from magrl.transforms.track import STD_KEYS
 
 RECIPE = "fly.py"
 ARRIVAL_KM = 400.0
@@ -172,7 +172,7 @@ def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
             drift_km=drift_km,
             seed=config.seed,
         )
-        track = TrackGradient(("field", "target_field", "move", "heading", *DATA_SHEET), range_km=1000.0)
+        track = TrackGradient(("field", "target_field", "move", "heading", *STD_KEYS), range_km=1000.0)
         noise, errors = config.noise, [SensorNoise(config.noise, seed=config.seed)]
         if config.conditions:
             noise, errors = conditions.sensor_std, conditions.transforms(config.seed)

@@ -23,8 +23,7 @@ from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
 from magrl.checks import check_finite, check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.files import DamagedFileError, load_tensors, save_tensors
-from magrl.transforms import ObservationView
-from magrl.transforms.track_view import TrackView
+from magrl.transforms import ObservationView, TrackView
 
 POLICY_FORMAT = 2
 VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}
@@ -135,11 +134,13 @@ class FieldPolicy(TensorDictModuleBase):
         noise = seen["field"].new_tensor(self.noise_std).expand_as(seen["field"])
         seen["sensor_std"] = tensordict.get("sensor_std", noise)
         seen["bias_std"] = tensordict.get("bias_std", torch.zeros_like(noise))
-        observed, starts = self.observe(seen.copy()), seen["step_count"].squeeze(-1) == 0
-        state = self.state
-        if state is not None and state.shape == seen.shape and state.device == seen.device and not starts.all():
-            moved = self.observe(state.copy().set("next", seen))["next"]
-            observed = torch.where(starts, observed, moved)
+        state, starts = self.state, seen["step_count"].squeeze(-1) == 0
+        if state is None or state.shape != seen.shape or state.device != seen.device or starts.all():
+            observed = self.observe(seen)
+        else:
+            observed = self.observe(state.copy().set("next", seen.copy()))["next"]
+            if starts.any():
+                observed = torch.where(starts, self.observe(seen), observed)
         self.state = observed.select(*self.config.view.state_keys)
         return observed
 

@@ -29,7 +29,7 @@ from magrl.envs.tasks import RegionTasks, Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, move, polar, wrap_angle
 from magrl.transforms.errors.motion import DISPLACEMENT
-from magrl.transforms.view import ObservationView
+from magrl.transforms.views import ObservationView
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")
 """Keys that every policy may read, beside ``step_count``."""

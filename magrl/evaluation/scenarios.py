@@ -14,7 +14,7 @@ from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.transforms import DeclareArrival, TrackGradient
-from magrl.transforms.track_view import DATA_SHEET
+from magrl.transforms.track import STD_KEYS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
@@ -134,7 +134,7 @@ def with_declaration(env: EnvBase) -> EnvBase:
     base: GeomagneticNavEnv = getattr(env, "base_env", env)
     if not base.arrival.declared:
         return env
-    told = DATA_SHEET if DATA_SHEET[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
+    told = STD_KEYS if STD_KEYS[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
     furthest = torch.tensor(base.scenario.distance_range_km).max().item()
     track = TrackGradient(("field", "target_field", "move", "heading", *told), range_km=furthest)
     return TransformedEnv(env, Compose(track, DeclareArrival(base.arrival.radius_km)))

@@ -26,14 +26,14 @@ def _parallel(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERF
 
 
 def _secant(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> Secant:  # noqa: ARG001
-    return Secant(env.max_move_km, env.max_turn_rad, noise=noise)
+    return Secant(env.max_move_km, env.max_turn_rad, sensor_std=noise)
 
 
 def _mean_jacobian(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> MeanJacobian:  # noqa: ARG001
     if env.many:
         raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
     places = env.region.grid(21).to(env.device)
-    return MeanJacobian(env.field, places, env.max_move_km, env.max_turn_rad, noise=noise)
+    return MeanJacobian(env.field, places, env.max_move_km, env.max_turn_rad, sensor_std=noise)
 
 
 def _geodesic(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> Geodesic:  # noqa: ARG001
@@ -53,7 +53,7 @@ def _kalman(
     bias: Noise = _PERFECT,
 ) -> Kalman:
     search = env.arrival.rule == "objective"
-    return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps, bias=bias, zeta=env.zeta, search=search)
+    return Kalman(env.max_move_km, env.max_turn_rad, noise, env.max_steps, bias_std=bias, zeta=env.zeta, search=search)
 
 
 def _map_matching(

@@ -19,12 +19,6 @@ from magrl.checks import check_number, check_tensor
 from magrl.field.elements import element_index
 from magrl.geodesy import wrap_angle
 
-CURVATURE = (0.015, 0.018, 12.0)
-"""Change of the gradients of D, I [deg], B_H [nT] along the way, per (100 km)^2, typical of the Earth's field.
-
-The error of a linear step grows with it: least squares divide the elements by these values, and all three together then
-lead to the destination wherever any two do."""
-
 
 def steer(
     heading: Tensor, wanted: Tensor, distance_km: Tensor, max_move_km: float, max_turn_rad: float

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl import guidance, tracking
+from magrl import tracking
 from magrl.checks import check_number, check_numbers, check_type
-from magrl.navigators.base import steer
 from magrl.navigators.quasi_newton import QuasiNewton
-from magrl.navigators.secant import SLOPES
-from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior
+from magrl.navigators.secant import sensor_length
+from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior, Way
 
 NEAR_KM = 30.0
 """Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
@@ -34,24 +34,21 @@ class Kalman(QuasiNewton):
 
     - the path: the length of the move minus the progress, that is, what it takes off the estimated way times the
       cosine of the typical error of its direction;
-    - ``caution`` times the detour that the remaining uncertainty of the way may cost;
+    - the detour that the remaining uncertainty of the way may cost, times a weight (:func:`trade_off`);
     - the price of the remaining steps, which rises as fewer of them are left.
 
     The way is that to the most probable destination, given that the episode has not ended at the places where the
-    vehicle has been (:func:`~magrl.tracking.unvisited`). Constant errors of the readings (``bias``) widen the search,
-    but no move reduces them, so that they count in none of the costs.
+    vehicle has been (:func:`~magrl.tracking.aim`). Constant errors of the readings (``bias_std``) widen the search, but
+    no move reduces them, so that they count in none of the costs.
 
     Args:
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        noise: standard deviations of the sensors, their data sheet: D [deg], I [deg], B_H [nT].
+        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
         max_steps: step limit of the episode.
-        caution: weight of the uncertainty; for None that of :func:`trade_off`.
-        step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
-        bias: standard deviations of constant and slow errors of the readings, like ``noise``.
-        zeta: arrival threshold on the objective. The search takes the objective with the paper's floors
-            (:data:`magrl.guidance.OBJECTIVE_FLOORS`), as :class:`~magrl.transforms.SearchAim` does, in every region.
+        bias_std: standard deviations of constant and slow errors of the readings.
+        zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
         search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
             it, the way is the estimated one.
 
@@ -75,47 +72,39 @@ class Kalman(QuasiNewton):
         self,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        noise: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
         max_steps: int = 50,
-        caution: float | None = None,
-        step_km: float | None = None,
         range_km: float = 300.0,
-        bias: Sequence[float] = (0.0, 0.0, 0.0),
+        bias_std: Sequence[float] = (0.0, 0.0, 0.0),
         zeta: float = 0.01,
         search: bool = True,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, noise=noise)
+        super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std)
         check_number(1, whole=True, max_steps=max_steps)
-        check_numbers(3, bias=bias)
-        check_number(0, bias=min(bias))
-        usual_caution, usual_step_km = trade_off(noise)
-        caution = usual_caution if caution is None else caution
-        step_km = usual_step_km if step_km is None else step_km
-        check_number(0, caution=caution)
-        check_number(0, above=True, step_km=step_km, range_km=range_km, zeta=zeta)
+        check_numbers(3, bias_std=bias_std)
+        check_number(0, bias_std=min(bias_std))
+        check_number(0, above=True, range_km=range_km, zeta=zeta)
         check_type(bool, search=search)
         self.max_steps, self.range_km, self.search = int(max_steps), float(range_km), search
-        self.caution, self.step_km, self.bias, self.zeta = float(caution), float(step_km), tuple(bias), float(zeta)
+        self.zeta, (self.caution, self.step_km) = float(zeta), trade_off(sensor_std)
+        self._register("bias_std", bias_std)
 
     def prior(self, reading: Tensor) -> GradientPrior:
         return tracking.dipole_prior(reading)
 
-    def _drift(self, seen: TensorDictBase) -> Tensor:
-        return tracking.field_curvature(seen["field"].double())
+    def drift(self, reading: Tensor) -> Tensor:
+        return tracking.field_curvature(reading)
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         field = seen["field"].double()
-        floors = field.new_tensor(guidance.OBJECTIVE_FLOORS)
-        weights = guidance.objective_weights(field, seen["target_field"].double(), floors) / self.zeta
+        weights = tracking.arrival_weights(field, seen["target_field"].double(), self.zeta)
         return super().first_memory(seen) | {"visited": tracking.unvisited_yet(field), "weights": weights}
 
-    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        super().decide(seen, memory)  # the filter reads
-        track = FieldTrack(memory["mean"], memory["covariance"])
-        known, shared = self._related(track)
-        target = self._continued(seen["target_field"], known)
-        way = self._searched(known, target, shared, seen, memory)
-        _, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared)
+    def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+        known, shared = tracking.related(track, tracking.curl_relation, self.scales)
+        estimate = partial(tracking.way_to, known, seen["target_field"].double(), self.range_km, self.scales, shared)
+        covariance = estimate(periods=self.periods).covariance
+        way = self._aim(known, estimate(self.bias_std, self.periods), seen, memory)
         moves = self._moves(way)
         left = way.unsqueeze(1) - moves
         progress = (way.norm(dim=-1, keepdim=True) - left.norm(dim=-1)) * _certainty(way, covariance)
@@ -124,24 +113,17 @@ class Kalman(QuasiNewton):
         cost = cost + self.caution * _detour(left, self._covariance_after(track, moves, left))
         best = moves[torch.arange(len(moves), device=moves.device), cost.argmin(-1)]
         distance = best.norm(dim=-1)
-        north, east = torch.where((distance > 0).unsqueeze(-1), best, way).unbind(-1)  # standing still, face the way
-        heading = seen["heading"].squeeze(-1).double()
-        return steer(heading, torch.atan2(east, north), distance, self.max_move_km, self.max_turn_rad)
+        direction = torch.where((distance > 0).unsqueeze(-1), best, way)  # standing still, face the way
+        return self.steer(seen, direction, distance)
 
-    def _searched(
-        self, known: FieldTrack, target: Tensor, shared: Tensor, seen: TensorDictBase, memory: TensorDictBase
-    ) -> Tensor:
+    def _aim(self, known: FieldTrack, way: Way, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
         """Return the way ``(N, 2)`` [km] to the most probable destination; remember the end of the last move."""
-        heading = seen["heading"].squeeze(-1).double()
-        leg = seen["move"][:, :1].double() * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
-        moved = tracking.visit(memory["visited"], leg)
         first = (memory["decisions"] == 1)[:, None, None]
-        memory["visited"] = torch.where(first, memory["visited"], moved)
-        way = tracking.way_to(known, target, self.range_km, self.scales, shared, self.bias)
+        visited = tracking.visit(memory["visited"], self.displacement(seen))
+        memory["visited"] = torch.where(first, memory["visited"], visited)
         if not self.search:
             return way.displacement
-        ellipse = tracking.arrival_ellipse(known, memory["weights"], self.scales)
-        return tracking.unvisited(way, memory["visited"], ellipse)
+        return tracking.aim(known, way, memory["visited"], memory["weights"], self.scales)
 
     def _moves(self, way: Tensor) -> Tensor:
         """Return the displacements ``(N, M, 2)`` [km] that are compared, given the way ``(N, 2)``."""
@@ -157,21 +139,18 @@ class Kalman(QuasiNewton):
         spare = self.max_steps - step.double() - 1.5 * way.norm(dim=-1, keepdim=True) / self.max_move_km
         return self.step_km * (self.max_steps / spare.clamp_min(1.0)).square()
 
-    def _related(self, track: FieldTrack) -> tuple[FieldTrack, Tensor]:
-        """Return the state given that the field has no curl, see :func:`~magrl.tracking.relate`."""
-        elements = track.mean[..., 0] * track.mean.new_tensor(self.scales)
-        return tracking.relate(track, tracking.curl_relation(elements), self.scales)
-
     def _covariance_after(self, track: FieldTrack, moves: Tensor, left: Tensor) -> Tensor:
         """Return the expected covariance ``(N, M, 2, 2)`` [km^2] of the way after moves and readings at their ends.
 
         The gradients that a reading will teach are unknown, but not their mean square: that of the present estimate
         plus what the covariance decreases. The drift of the gradients is left out, as it does not depend on the choice.
         """
-        now, shared = self._related(FieldTrack(track.mean.unsqueeze(1), track.covariance.unsqueeze(1)))
-        moved = tracking.predict(FieldTrack(track.mean.unsqueeze(1), now.covariance), moves, [0.0] * 3, self.scales)
-        expected = moved.mean[..., 0] * moves.new_tensor(self.scales)
-        after, shared_after = self._related(tracking.update(moved, expected, self.noise, self.scales))
+        track = FieldTrack(track.mean.unsqueeze(1), track.covariance.unsqueeze(1))
+        now, shared = tracking.related(track, tracking.curl_relation, self.scales)
+        moved = tracking.predict(track, moves, 0 * self.curvature, self.scales)
+        expected = tracking.estimated_field(moved, self.scales)
+        reading = tracking.update(moved, expected, self.sensor_std, self.scales)
+        after, shared_after = tracking.related(reading, tracking.curl_relation, self.scales)
         weights = _weights(after.covariance, shared_after, left / DISTANCE_SCALE_KM)
         learned = (now.covariance - after.covariance)[..., 1:, 1:]
         normal = (weights.diagonal(dim1=-2, dim2=-1)[..., None, None] * learned).sum(-3)
@@ -193,15 +172,14 @@ def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:
     return torch.diag_embed(weight) + row.unsqueeze(-1) * row.unsqueeze(-2) / rest[..., None, None]
 
 
-def trade_off(noise: Sequence[float]) -> tuple[float, float]:
+def trade_off(sensor_std: Sequence[float]) -> tuple[float, float]:
     """Return the weight of the uncertainty and the price of a step [km] that suit the noise of the sensors.
 
-    As for :func:`~magrl.navigators.secant.probe_length`, the noise of an element is expressed by the way over which the
-    element typically changes as much, and the second smallest of the three counts. The larger it is, the less a reading
-    teaches, and the more path and steps certainty costs. The factors are from a scan over regions of the Earth.
+    The larger the noise is (:func:`~magrl.navigators.secant.sensor_length`), the less a reading teaches, and the more
+    path and steps certainty costs. The factors are from a scan over regions of the Earth.
 
     Args:
-        noise: standard deviations of D [deg], I [deg], B_H [nT].
+        sensor_std: standard deviations of D [deg], I [deg], B_H [nT].
 
     Raises:
         ValueError: for other than three numbers, or a negative one.
@@ -212,9 +190,7 @@ def trade_off(noise: Sequence[float]) -> tuple[float, float]:
         >>> [round(value, 2) for value in trade_off((0.1, 0.1, 10))]
         [0.45, 3.33]
     """
-    check_numbers(3, noise=noise)
-    check_number(0, noise=min(noise))
-    noise_km = sorted(std / slope for std, slope in zip(noise, SLOPES, strict=True))[1]
+    noise_km = sensor_length(sensor_std)
     return min(5.0, 3.0 / max(noise_km, 0.1)), max(0.1, 0.5 * noise_km)
 
 

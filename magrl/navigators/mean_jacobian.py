@@ -27,7 +27,7 @@ class MeanJacobian(QuasiNewton):
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
         elements: two or three of D, I, B_H.
-        noise: standard deviations of the sensors, their data sheet: D [deg], I [deg], B_H [nT].
+        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
 
     Raises:
         ValueError: for a bound out of its range, fewer than two elements or places, or a negative standard deviation.
@@ -48,9 +48,9 @@ class MeanJacobian(QuasiNewton):
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
         elements: Sequence[str] = NAMES,
-        noise: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, elements, noise)
+        super().__init__(max_move_km, max_turn_rad, elements, sensor_std)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_tensor(2, position=position)

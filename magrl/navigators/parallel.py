@@ -13,14 +13,15 @@ from magrl.field.bank import FieldBank
 from magrl.field.elements import NAMES, element_difference
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.guidance import parallel_approach
-from magrl.navigators.base import CURVATURE, Navigator, displacement_to, element_indices, steer
+from magrl.navigators.base import Navigator, displacement_to, element_indices, steer
+from magrl.tracking import CURVATURE
 
 
 class ParallelApproach(Navigator):
     """Newton steps with the true gradient at the vehicle's position: an oracle.
 
     By default, each step closes the errors of all three elements by least squares, weighted by the inverse of
-    :data:`magrl.navigators.base.CURVATURE`. With a pair, it is the paper's parallel approach (Eq. 3-15), which fails
+    :data:`magrl.tracking.CURVATURE`. With a pair, it is the paper's parallel approach (Eq. 3-15), which fails
     where the gradients of the pair are nearly parallel.
 
     Args:

@@ -11,7 +11,8 @@ from torch import Tensor
 from magrl import tracking
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import NAMES
-from magrl.navigators.base import CURVATURE, Navigator, element_indices, steer
+from magrl.navigators.base import Navigator, element_indices, steer
+from magrl.tracking import FieldTrack, GradientPrior
 
 RANGE_KM = 1000.0
 """Prior standard deviation of the way to the destination along each axis [km]."""
@@ -30,7 +31,7 @@ class QuasiNewton(Navigator):
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
         elements: two or three of D, I, B_H.
-        noise: standard deviations of the sensors, their data sheet: D [deg], I [deg], B_H [nT].
+        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
 
     Raises:
         ValueError: for a bound out of its range, fewer than two elements, or a negative standard deviation.
@@ -53,18 +54,22 @@ class QuasiNewton(Navigator):
         max_move_km: float,
         max_turn_rad: float,
         elements: Sequence[str] = NAMES,
-        noise: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
-        check_numbers(3, noise=noise)
-        check_number(0, noise=min(noise))
+        check_numbers(3, sensor_std=sensor_std)
+        check_number(0, sensor_std=min(sensor_std))
         self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
         self.elements = element_indices(elements, 2)
-        self.noise, self.curvature = ([values[i] for i in self.elements] for values in (noise, CURVATURE))
-        self.register_buffer("data_sheet", torch.tensor(noise, dtype=torch.float64), persistent=False)
-        self.scales = [tracking.ELEMENT_SCALES[i] * _FINE for i in self.elements]
+        self._register("sensor_std", sensor_std)
+        self._register("scales", [tracking.ELEMENT_SCALES[i] * _FINE for i in self.elements])
+        self._register("periods", [tracking.ELEMENT_PERIODS[i] for i in self.elements])
+        self._register("curvature", [tracking.CURVATURE[i] for i in self.elements])
 
-    def prior(self, reading: Tensor) -> tracking.GradientPrior:
+    def _register(self, name: str, values: Sequence[float]) -> None:
+        self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
+
+    def prior(self, reading: Tensor) -> GradientPrior:
         """Return the expected gradient of the elements, given the first reading ``(N, E)``.
 
         Raises:
@@ -72,37 +77,44 @@ class QuasiNewton(Navigator):
         """
         raise NotImplementedError(f"{type(self).__name__} must return a GradientPrior in prior(reading)")
 
-    def _drift(self, seen: TensorDictBase) -> Tensor | list[float]:  # noqa: ARG002
+    def drift(self, reading: Tensor) -> Tensor:  # noqa: ARG002
         """Return the standard deviation of the change of the Jacobian, see :func:`magrl.tracking.predict`."""
         return self.curvature
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         reading = seen["field"].double()[:, self.elements]
-        gradient, std, azimuth = self.prior(reading)
-        track = tracking.start(reading, gradient, std, self.noise, azimuth, self.scales)
+        track = tracking.start(reading, self.prior(reading), self.sensor_std[self.elements], self.scales)
         decisions = torch.zeros_like(seen["step_count"].squeeze(-1))
         return {"mean": track.mean, "covariance": track.covariance, "decisions": decisions}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        heading = seen["heading"].squeeze(-1).double()
-        leg = seen["move"][:, :1].double() * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
-        track = tracking.FieldTrack(memory["mean"], memory["covariance"])
-        moved = tracking.predict(track, leg, self._drift(seen), self.scales)
-        noise = self.accuracy(seen, self.data_sheet)[..., self.elements]
-        moved = tracking.update(moved, self._continued(seen["field"], moved), noise, self.scales)
-        began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
-        mean = torch.where(began, track.mean, moved.mean)
-        covariance = torch.where(began.unsqueeze(-1), track.covariance, moved.covariance)
-        memory.update({"mean": mean, "covariance": covariance, "decisions": memory["decisions"] + 1})
-        track = tracking.FieldTrack(mean, covariance)
-        target = self._continued(seen["target_field"], track)
-        way = tracking.way_to(track, target, RANGE_KM, self.scales).displacement
-        wanted = torch.atan2(way[:, 1], way[:, 0])
-        return steer(heading, wanted, way.norm(dim=-1), self.max_move_km, self.max_turn_rad)
+        return self.move(self.read(seen, memory), seen, memory)
 
-    def _continued(self, values: Tensor, track: tracking.FieldTrack) -> Tensor:
-        """Return the elements ``(N, E)`` of readings, with D within half a turn of the estimate."""
-        values = values.double()[:, self.elements]
-        near = track.mean[..., 0] * values.new_tensor(self.scales)
-        period = values.new_tensor([360.0 * (index == 0) for index in self.elements])
-        return values - period * torch.round((values - near) / 360)
+    def read(self, seen: TensorDictBase, memory: TensorDictBase) -> FieldTrack:
+        """Return the state of the filter after the present reading, and keep it in the memory."""
+        before = FieldTrack(memory["mean"], memory["covariance"])
+        reading, displacement = seen["field"].double()[:, self.elements], self.displacement(seen)
+        std = self.accuracy(seen, self.sensor_std)[..., self.elements]
+        after = tracking.read(before, displacement, reading, std, self.drift(reading), self.scales, self.periods)
+        began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
+        mean = torch.where(began, before.mean, after.mean)
+        covariance = torch.where(began.unsqueeze(-1), before.covariance, after.covariance)
+        memory.update({"mean": mean, "covariance": covariance, "decisions": memory["decisions"] + 1})
+        return FieldTrack(mean, covariance)
+
+    def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
+        """Return distance [km] and turn [rad], each ``(N,)``, given the state of the filter."""
+        target = seen["target_field"].double()[:, self.elements]
+        way = tracking.way_to(track, target, RANGE_KM, self.scales, periods=self.periods).displacement
+        return self.steer(seen, way, way.norm(dim=-1))
+
+    def steer(self, seen: TensorDictBase, direction: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distance [km] and turn [rad] of a move in a direction ``(N, 2)`` northward and eastward."""
+        heading = seen["heading"].squeeze(-1).double()
+        wanted = torch.atan2(direction[:, 1], direction[:, 0])
+        return steer(heading, wanted, distance, self.max_move_km, self.max_turn_rad)
+
+    @staticmethod
+    def displacement(seen: TensorDictBase) -> Tensor:
+        """Return the last displacement ``(N, 2)`` northward and eastward [km]."""
+        return tracking.displacement_of(seen["move"].double(), seen["heading"].double())

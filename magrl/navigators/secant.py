@@ -12,7 +12,7 @@ from torch import Tensor
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import NAMES
 from magrl.navigators.quasi_newton import QuasiNewton
-from magrl.tracking import GradientPrior
+from magrl.tracking import FieldTrack, GradientPrior
 
 SLOPES = (0.004, 0.015, 4.0)
 """Typical gradient of D, I [deg/km], B_H [nT/km]: what a quasi-Newton navigator without a map expects, in size."""
@@ -20,28 +20,40 @@ SHORTEST_PROBE_KM = 0.5
 """Length of a probing leg with perfect sensors [km]: the rounding of float32 readings does not matter there."""
 
 
-def probe_length(noise: Sequence[float]) -> float:
-    """Return the length of a probing leg [km]: longer legs lengthen the path, shorter ones suffer more from noise.
+def sensor_length(sensor_std: Sequence[float]) -> float:
+    """Return the way over which the elements typically change as much as the errors of a reading [km].
 
-    The noise of an element is expressed by the way over which the element typically changes as much. A position takes
-    two elements, so that the second smallest of the three counts. The loss by both legs grows with their length p, the
-    loss by the wrong direction with (noise / p)^2; their sum is smallest for p proportional to noise^(2/3). The factor
-    is from ``recipes/tables/probe_sweep.py``.
+    A position takes two elements, so that the second smallest way of the three counts.
 
     Args:
-        noise: standard deviations of D [deg], I [deg], B_H [nT].
+        sensor_std: standard deviations of D [deg], I [deg], B_H [nT].
 
     Raises:
         ValueError: for other than three numbers, or a negative one.
 
     Example:
-        >>> [round(probe_length(noise), 1) for noise in ((0, 0, 0), (0.02, 0.02, 2), (0.05, 0.05, 5), (0.1, 0.1, 10))]
+        >>> sensor_length((0.04, 0.03, 0.4))
+        2.0
+    """
+    check_numbers(3, sensor_std=sensor_std)
+    check_number(0, sensor_std=min(sensor_std))
+    return sorted(std / slope for std, slope in zip(sensor_std, SLOPES, strict=True))[1]
+
+
+def probe_length(sensor_std: Sequence[float]) -> float:
+    """Return the length of a probing leg [km]: longer legs lengthen the path, shorter ones suffer more from noise.
+
+    The loss by both legs grows with their length p, the loss by the wrong direction with (noise / p)^2, the noise as in
+    :func:`sensor_length`; their sum is smallest for p proportional to noise^(2/3). The factor is from simulations.
+
+    Args:
+        sensor_std: standard deviations of D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> [round(probe_length(std), 1) for std in ((0, 0, 0), (0.02, 0.02, 2), (0.05, 0.05, 5), (0.1, 0.1, 10))]
         [0.5, 6.1, 11.2, 17.7]
     """
-    check_numbers(3, noise=noise)
-    check_number(0, noise=min(noise))
-    noise_km = sorted(std / slope for std, slope in zip(noise, SLOPES, strict=True))[1]
-    return max(SHORTEST_PROBE_KM, 5.0 * noise_km ** (2 / 3))
+    return max(SHORTEST_PROBE_KM, 5.0 * sensor_length(sensor_std) ** (2 / 3))
 
 
 class Secant(QuasiNewton):
@@ -55,7 +67,7 @@ class Secant(QuasiNewton):
         max_turn_rad: largest turn [rad].
         probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest move.
         elements: all three by default, each weighted by how well it determines the way; or two of them.
-        noise: standard deviations of the sensors, their data sheet: D [deg], I [deg], B_H [nT].
+        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
 
     Raises:
         ValueError: for a bound or a leg out of its range, fewer than two elements, or a negative standard deviation.
@@ -74,10 +86,10 @@ class Secant(QuasiNewton):
         max_turn_rad: float = math.pi / 2,
         probe_km: float | None = None,
         elements: Sequence[str] = NAMES,
-        noise: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, elements, noise)
-        probe_km = min(probe_length(noise), self.max_move_km) if probe_km is None else probe_km
+        super().__init__(max_move_km, max_turn_rad, elements, sensor_std)
+        probe_km = min(probe_length(sensor_std), self.max_move_km) if probe_km is None else probe_km
         check_number(0, max_move_km, above=True, probe_km=probe_km)
         self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)
 
@@ -85,9 +97,8 @@ class Secant(QuasiNewton):
         std = reading.new_tensor([SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
         return GradientPrior(reading.new_zeros(*reading.shape, 2), std, torch.zeros_like(reading[:, 0]))
 
-    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+        distance, turn = super().move(track, seen, memory)
         decisions = memory["decisions"]
-        distance, turn = super().decide(seen, memory)
-        probe_turn = torch.where(decisions == 1, self.probe_turn, 0.0)
-        probing = decisions < 2
+        probing, probe_turn = decisions <= 2, torch.where(decisions == 2, self.probe_turn, 0.0)
         return torch.where(probing, self.probe_km, distance), torch.where(probing, probe_turn, turn)

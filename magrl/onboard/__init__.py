@@ -2,9 +2,10 @@
 
 from magrl.onboard.readings import check_earth_jump, check_earth_reading
 from magrl.onboard.step import VehicleStep, first_state, write_step
-from magrl.onboard.vehicle import Command, Onboard
+from magrl.onboard.vehicle import NAMED, Command, Onboard
 
 __all__ = [
+    "NAMED",
     "Command",
     "Onboard",
     "VehicleStep",

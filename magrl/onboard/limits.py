@@ -69,8 +69,8 @@ def move_limits(
 def out_of_range(view: View, elements: Sequence[float]) -> str:
     """Return which element is beyond the range that a policy was trained or tested in, as text; empty if none is.
 
-    For a policy of a region, as :meth:`~magrl.transforms.ObservationView.check_covers`: the range of the region and a
-    quarter of it beyond. For one that reads its own track, B_H of at least :data:`LEAST_NT`.
+    For a policy of a region, its :attr:`~magrl.transforms.ObservationView.field_limits`; for one that reads its own
+    track, B_H of at least :data:`LEAST_NT`.
 
     Args:
         view: from :func:`view_of`.
@@ -88,8 +88,7 @@ def out_of_range(view: View, elements: Sequence[float]) -> str:
     if isinstance(view, TrackView):
         low = (-180.0, -90.0, LEAST_NT)
     elif view is not None:
-        ends = list(zip(view.field_low, view.field_high, strict=True))
-        low, high = [b - 1.25 * (b - a) for a, b in ends], [a + 1.25 * (b - a) for a, b in ends]
+        low, high = view.field_limits
     for name, unit, value, least, most in zip(NAMES, UNITS, elements, low, high, strict=True):
         if not least <= value <= most:
             return f"{name} {value:g} {unit} is out of the range of the policy, {least:g} to {most:g} {unit}"

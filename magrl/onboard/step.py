@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from magrl.agents.policy import FieldPolicy
 from magrl.checks import check_type
 from magrl.transforms import TrackView
+from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 
 class StepState(NamedTuple):
@@ -55,8 +56,8 @@ class VehicleStep(nn.Module):
     Example:
         >>> from magrl.agents import load_pretrained
         >>> act = VehicleStep(load_pretrained("anywhere"))
-        >>> here, there, sheet = torch.tensor([3.5, 73, 15000]), torch.tensor([-11.6, 75.4, 13240]), torch.zeros(2, 3)
-        >>> action, way, covariance, *state = act(here, there, torch.zeros(2), sheet, *first_state())
+        >>> here, there, exact = torch.tensor([3.5, 73, 15000]), torch.tensor([-11.6, 75.4, 13240]), torch.zeros(2, 3)
+        >>> action, way, covariance, *state = act(here, there, torch.zeros(2), exact, *first_state())
         >>> action.shape, state[0]
         (torch.Size([2]), tensor(1))
     """
@@ -75,7 +76,7 @@ class VehicleStep(nn.Module):
         field: Tensor,
         target_field: Tensor,
         course: Tensor,
-        data_sheet: Tensor,
+        accuracy: Tensor,
         step: Tensor,
         mean: Tensor,
         covariance: Tensor,
@@ -87,7 +88,7 @@ class VehicleStep(nn.Module):
             field: ``(3,)`` reading of D [deg], I [deg], B_H [nT] after the move.
             target_field: ``(3,)`` the same at the destination.
             course: ``(2,)`` distance [km] and heading [rad] of the move; in the first step 0 and the heading.
-            data_sheet: ``(2, 3)`` standard deviations of noise and of constant errors, in the units of the reading.
+            accuracy: ``(2, 3)`` standard deviations of noise and of constant errors, in the units of the reading.
             step: ``()`` int64, and with the next three the :class:`StepState`.
             mean: ``(3, 3)`` mean of the filter.
             covariance: ``(3, 3, 3)`` covariance of the filter.
@@ -98,8 +99,8 @@ class VehicleStep(nn.Module):
             its covariance ``(2, 2)`` [km^2], and the parts of the next state.
         """
         distance, heading = course.split(1)
-        keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
-        values = (field, target_field, torch.cat((distance, torch.zeros_like(distance))), heading, *data_sheet.unbind())
+        keys = *IN_KEYS, *STD_KEYS
+        values = (field, target_field, torch.cat((distance, torch.zeros_like(distance))), heading, *accuracy.unbind())
         rows = {key: value.unsqueeze(0) for key, value in zip(keys, values, strict=True)}
         seen = TensorDict({**rows, "step_count": step.reshape(1, 1)}, [1])
         state = {"track_mean": mean, "track_covariance": covariance, "first_field": first_field}

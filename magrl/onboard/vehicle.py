@@ -16,18 +16,18 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose
 
 from magrl import tracking
 from magrl.agents import FieldPolicy, load_pretrained
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.files import DamagedFileError, load_tensors, save_tensors
-from magrl.navigators import Kalman, RunAndTumble, Secant
+from magrl.navigators import Kalman, Navigator, RunAndTumble, Secant
+from magrl.onboard.estimator import Estimator
 from magrl.onboard.limits import check_move, move_limits, out_of_range, view_of
 from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_jump, check_earth_reading
-from magrl.transforms import TrackGradient, TrackView
-from magrl.transforms.track_view import DATA_SHEET
+from magrl.transforms import TrackView
+from magrl.transforms.track import STD_KEYS
 
 NAMED = ("anywhere", "secant", "kalman", "run_and_tumble")
 """Navigators by name; any other is given as a module."""
@@ -111,6 +111,9 @@ class Onboard:
         90.0
     """
 
+    target: Any = None
+    """Elements at the destination; None before :meth:`start`."""
+
     def __init__(
         self,
         navigator: str | TensorDictModuleBase = "anywhere",
@@ -133,38 +136,33 @@ class Onboard:
         check_number(0, 1, above=True, confidence=confidence)
         self.sensor_std, self.bias_std = tuple(map(float, sensor_std)), tuple(map(float, bias_std))
         self.max_steps, self.zeta, self.arrival_km, self.confidence = max_steps, zeta, arrival_km, confidence
-        if isinstance(navigator, str) and navigator not in NAMED:
-            raise ValueError(f"unknown navigator {navigator!r}: choose from {', '.join(NAMED)}, or give a policy")
-        made: Any = load_pretrained("anywhere") if navigator == "anywhere" else navigator
-        known = None if isinstance(made, str) else made
-        self.max_move_km, self.max_turn_deg = move_limits(known, max_move_km, max_turn_deg)
-        bounds = self.max_move_km, math.radians(self.max_turn_deg)
-        if made == "secant":
-            made = Secant(*bounds, noise=tuple(map(math.hypot, self.sensor_std, self.bias_std)))
-        elif made == "kalman":
-            made = Kalman(*bounds, self.sensor_std, max_steps, bias=self.bias_std, search=False)
-        elif made == "run_and_tumble":
-            made = RunAndTumble(*bounds)
-        self.navigator: Any = copy.deepcopy(made).cpu()
+        known = load_pretrained("anywhere") if navigator == "anywhere" else navigator
+        policy = None if isinstance(known, str) else known
+        self.max_move_km, self.max_turn_deg = move_limits(policy, max_move_km, max_turn_deg)
+        self.navigator: Any = self._aware(copy.deepcopy(policy or self._untrained(known))).cpu()
         self.name = type(self.navigator).__name__
-        if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *DATA_SHEET, "step_count", "done"}):
+        if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *STD_KEYS, "step_count", "done"}):
             raise ValueError(f"{self.name} reads {', '.join(unknown)}, which a vehicle does not know")
-        self._adopt(zeta)
-        self.target: Any = None
-        self._estimates: Any = None
+        self._view, self._estimator = view_of(self.navigator), Estimator(self.navigator)
 
-    def _adopt(self, zeta: float) -> None:
-        """Take over the filter of an agent that has one, or make one."""
-        self._view = view = view_of(self.navigator)
-        self._track_agent = isinstance(view, TrackView)  # whether the agent makes the estimates
-        if isinstance(view, TrackView):  # it is told what counts as arrived
-            config = replace(self.navigator.config, view=replace(view, zeta=zeta, search=False))
-            self.navigator = FieldPolicy(config, self.navigator.actor)
-            self._observe, self._kept = self.navigator.observe, config.view.state_keys
-        else:
-            keys = ("field", "target_field", "move", "heading", *DATA_SHEET)
-            self._observe = Compose(TrackGradient(keys, range_km=1000.0, frame="vehicle"))
-            self._kept = ("track_mean", "track_covariance")
+    def _untrained(self, name: str) -> Navigator:
+        """Return a new navigator of a name."""
+        bounds = self.max_move_km, math.radians(self.max_turn_deg)
+        if name == "secant":
+            return Secant(*bounds, sensor_std=tuple(map(math.hypot, self.sensor_std, self.bias_std)))
+        if name == "kalman":
+            return Kalman(*bounds, self.sensor_std, self.max_steps, bias_std=self.bias_std, search=False)
+        if name == "run_and_tumble":
+            return RunAndTumble(*bounds)
+        raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(NAMED)}, or give a policy")
+
+    def _aware(self, navigator: TensorDictModuleBase) -> TensorDictModuleBase:
+        """Return a navigator that knows what counts as arrived, and that nobody tells it so."""
+        view = view_of(navigator)
+        if not isinstance(navigator, FieldPolicy) or not isinstance(view, TrackView):
+            return navigator
+        view = replace(view, zeta=self.zeta, search=False)
+        return FieldPolicy(replace(navigator.config, view=view), navigator.actor)
 
     def start(self, target: Sequence[float]) -> None:
         """Begin a way to the place with some elements: D [deg], I [deg], B_H [nT].
@@ -178,7 +176,7 @@ class Onboard:
         if text := out_of_range(self._view, target):
             raise ValueError(f"the target: {text}")
         self.target = tuple(map(float, target))
-        self._step, self._estimates = 0, None
+        self._step, self._estimator.state = 0, None
         self._steer: float | None = None  # heading that the vehicle was to steer [deg]
         self._first, self._last, self._surprises = Values(), Values(), Values()  # readings, the last with its course
         for name in _STATES:
@@ -208,10 +206,11 @@ class Onboard:
         course = math.remainder(math.radians(heading), 2 * math.pi)
         turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
         with torch.inference_mode():
-            observed, action = self._act(self._seen(reading, course, (distance, turn)))
+            seen = self._seen(reading, course, (distance, turn))
+            surprises = (*self._surprises, *((self._estimator.surprise(seen),) if self._last else ()))
+            observed, action = self._estimator.act(seen)
+            self._surprises = surprises[-_SURPRISES:]
             self._first = self._first or reading
-            if self._last:
-                self._surprises = (*self._surprises, self._surprise(reading))[-_SURPRISES:]
             self._last, self._step = (*reading, course), self._step + 1
             command = self._command(observed, action, course)
         self._steer = command.heading_deg
@@ -233,39 +232,17 @@ class Onboard:
     def _seen(self, reading: Sequence[float], course: float, move: tuple[float, float]) -> TensorDict:
         """Return what a policy reads, in a batch of one."""
         rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
-        rows |= dict(zip(DATA_SHEET, (self.sensor_std, self.bias_std), strict=True))
+        rows |= dict(zip(STD_KEYS, (self.sensor_std, self.bias_std), strict=True))
         seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
         seen |= {"step_count": torch.tensor([[self._step]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")
-
-    def _act(self, seen: TensorDict) -> tuple[TensorDictBase, tuple[float, float]]:
-        """Return the estimates, and distance [km] and turn [rad]; keep the state of the filter."""
-        before, now = self._estimates, seen.copy()
-        observed = self._observe(now) if before is None else self._observe(before.set("next", now))["next"]
-        self._estimates = observed.select(*self._kept)
-        if self._track_agent:  # FieldPolicy.forward would run its filter twice, for vehicles whose episode starts
-            action = self.navigator.act.denormalize("action", self.navigator.actor(observed)["action"])
-        else:
-            action = self.navigator(seen)["action"]
-        distance, turn = action[0].tolist()
-        return observed, (distance, turn)
-
-    @property
-    def _track(self) -> tracking.FieldTrack:
-        return tracking.FieldTrack(*(self._estimates[key][0] for key in ("track_mean", "track_covariance")))
-
-    def _surprise(self, reading: Sequence[float]) -> float:
-        """Return how badly the last reading fits the track, see :func:`magrl.tracking.surprise`."""
-        estimate = self._track.mean[0, 0].item() * tracking.ELEMENT_SCALES[0]
-        declination = reading[0] - 360 * round((reading[0] - estimate) / 360)
-        return tracking.surprise(self._track, (declination, *reading[1:]), self.sensor_std)
 
     def _confidence(self, observed: TensorDictBase) -> float:
         """Return the estimated probability that the vehicle is at its destination."""
         if self.arrival_km is not None:
             return tracking.probability_within(observed["way"][0], observed["way_covariance"][0], self.arrival_km)
-        variances = observed["track_covariance"][0, :, 0, 0].tolist()
-        known = zip(variances, tracking.ELEMENT_SCALES, self.sensor_std, self.bias_std, strict=True)
+        variances, scales = self._estimator.track.covariance[:, 0, 0].tolist(), self._estimator.tracker.scales.tolist()
+        known = zip(variances, scales, self.sensor_std, self.bias_std, strict=True)
         # A reading alone tells the field to within the noise of the sensor.
         std = [math.hypot(min(math.sqrt(max(v, 0.0)) * unit, noise), bias) for v, unit, noise, bias in known]
         here = observed["estimated_field"][0].tolist()
@@ -291,11 +268,12 @@ class Onboard:
         level = sum(self._surprises) / max(len(self._surprises), 1)
         if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
             return "lost", f"readings deviate {level**0.5:.0f} times as much as expected: check sensors and compass"
-        if abs(self._last[1]) <= math.pi / 2 and tracking.steepest(self._track, 1) < EQUATOR_SLOPE_DEG:
+        slope = tracking.steepest(self._estimator.track, 1, self._estimator.tracker.scales)
+        if abs(self._last[1]) <= math.pi / 2 and slope < EQUATOR_SLOPE_DEG:
             return "lost", f"inclination {self._last[1]:g} hardly changes: it looks like radians; degrees are expected"
         if text := out_of_range(self._view, self._last[:3]):
             return "out of range", text
-        if self._track_agent and way_km - 2 * error_km > LONGEST_WAY_KM:
+        if self._estimator.trained and way_km - 2 * error_km > LONGEST_WAY_KM:
             return "out of range", f"the way is {way_km:.0f} ± {error_km:.0f} km, the policy's {LONGEST_WAY_KM:g} km"
         if confidence >= self.confidence:
             rule = f"F < {self.zeta:g}" if self.arrival_km is None else f"within {self.arrival_km:g} km"
@@ -316,7 +294,7 @@ class Onboard:
         kept = {name: getattr(self.navigator, name, None) for name in _STATES}
         held = {name: value.to_dict() if isinstance(value, TensorDictBase) else value for name, value in kept.items()}
         state = {name: getattr(self, name) for name in ("target", *_PLAIN)}
-        state["_estimates"] = None if self._estimates is None else self._estimates.to_dict()
+        state["_estimates"] = None if self._estimator.state is None else self._estimator.state.to_dict()
         save_tensors({"format": _FORMAT, "options": self._options(), "state": state, "navigator": held}, Path(path))
 
     def restore(self, path: Path | str) -> None:
@@ -336,7 +314,7 @@ class Onboard:
         for name in _PLAIN:
             setattr(self, name, content["state"][name])
         if content["state"]["_estimates"] is not None:
-            self._estimates = TensorDict(content["state"]["_estimates"], [1], device="cpu")
+            self._estimator.state = TensorDict(content["state"]["_estimates"], [1], device="cpu")
         for name, value in content["navigator"].items():
             held = TensorDict(value, [1], device="cpu") if isinstance(value, dict) else value
             if held is not None:

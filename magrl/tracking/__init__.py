@@ -4,11 +4,13 @@ from magrl.tracking.belief import probability_below, probability_within, steepes
 from magrl.tracking.filter import (
     CURVATURE,
     DISTANCE_SCALE_KM,
+    ELEMENT_PERIODS,
     ELEMENT_SCALES,
     VARIANCE_FLOOR,
     FieldTrack,
     GradientPrior,
     GradientRelation,
+    estimated_field,
     estimated_gradient,
     predict,
     relate,
@@ -22,7 +24,16 @@ from magrl.tracking.priors import (
     dipole_prior,
     field_curvature,
 )
-from magrl.tracking.search import SEARCH_KM, VISITED, arrival_ellipse, unvisited, unvisited_yet, visit
+from magrl.tracking.search import (
+    SEARCH_KM,
+    VISITED,
+    arrival_ellipse,
+    arrival_weights,
+    unvisited,
+    unvisited_yet,
+    visit,
+)
+from magrl.tracking.track import aim, displacement_of, read, related
 from magrl.tracking.way import Way, way_to
 
 __all__ = [
@@ -30,6 +41,7 @@ __all__ = [
     "CURVATURE_NT",
     "DIPOLE_STD_NT",
     "DISTANCE_SCALE_KM",
+    "ELEMENT_PERIODS",
     "ELEMENT_SCALES",
     "SEARCH_KM",
     "VARIANCE_FLOOR",
@@ -38,15 +50,21 @@ __all__ = [
     "GradientPrior",
     "GradientRelation",
     "Way",
+    "aim",
     "arrival_ellipse",
+    "arrival_weights",
     "curl_relation",
     "dipole_prior",
+    "displacement_of",
+    "estimated_field",
     "estimated_gradient",
     "field_curvature",
     "predict",
     "probability_below",
     "probability_within",
+    "read",
     "relate",
+    "related",
     "start",
     "steepest",
     "surprise",

@@ -6,20 +6,29 @@ have equal probabilities.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import cache
 
 import torch
 from torch import Tensor
 
-from magrl import guidance
 from magrl.checks import check_number, check_numbers, check_tensor
-from magrl.tracking.filter import ELEMENT_SCALES, VARIANCE_FLOOR, FieldTrack, check_track
+from magrl.field.elements import element_difference
+from magrl.tracking.filter import (
+    ELEMENT_PERIODS,
+    ELEMENT_SCALES,
+    FieldTrack,
+    PerElement,
+    _units,
+    _variance,
+    continued,
+    estimated_field,
+    predict,
+)
+from magrl.tracking.priors import field_curvature
+from magrl.tracking.search import arrival_weights
 
 _POINTS = 1024
-_FARTHEST = 4.8  # absolute value of a point, at most
-_LEAST_SHARE = 1e-6  # of the noise in the variance of a prediction
 
 
 @cache
@@ -48,15 +57,9 @@ def probability_below(
     """
     check_numbers(3, first=first, target=target, estimate=estimate, std=std)
     check_number(0, above=True, zeta=zeta)
-    at_first, remaining = ([t - e for t, e in zip(target, here, strict=True)] for here in (first, estimate))
-    for difference in (at_first, remaining):
-        difference[0] = math.remainder(difference[0], 360)
-    weights = [max(abs(d), least) ** -2 for d, least in zip(at_first, guidance.OBJECTIVE_FLOORS, strict=True)]
-    nearest = [max(abs(r) - _FARTHEST * s, 0.0) for r, s in zip(remaining, std, strict=True)]
-    if sum(w * r * r for w, r in zip(weights, nearest, strict=True)) >= zeta:
-        return 0.0  # as the points below would say, in a tenth of the time
-    left, deviation, weight = torch.tensor((remaining, std, weights), dtype=torch.float64)
-    return ((left + deviation * _normal()).square() @ weight < zeta).double().mean().item()
+    start, end, here, deviation = torch.tensor((first, target, estimate, std), dtype=torch.float64)
+    ends = element_difference(end, here) + deviation * _normal()
+    return (ends.square() @ arrival_weights(start, end, zeta) < 1).double().mean().item()
 
 
 def probability_within(way: Tensor, covariance: Tensor, radius_km: float) -> float:
@@ -80,38 +83,39 @@ def probability_within(way: Tensor, covariance: Tensor, radius_km: float) -> flo
 
 
 def surprise(
-    track: FieldTrack, reading: Sequence[float], noise_std: Sequence[float], scales: Sequence[float] = ELEMENT_SCALES
+    track: FieldTrack,
+    displacement: Tensor,
+    reading: Tensor,
+    sensor_std: PerElement,
+    scales: PerElement = ELEMENT_SCALES,
 ) -> float:
-    """Return the mean square of a reading's deviation from its prediction, over the variance of that deviation.
+    """Return the mean over D, I, B_H of the squared innovation of a reading over its variance S.
 
-    It is 1 on average where the filter is right. It follows from the state after the reading: the deviation from it is
-    that from the prediction times the share of the noise in the variance.
+    It is 1 on average where the filter is right. The noise has the floor of :data:`~magrl.tracking.ELEMENT_SCALES`,
+    whatever the scales are.
 
     Args:
-        track: state of one vehicle after the reading.
-        reading: of E elements, in their units; angles within half a turn of the estimate.
-        noise_std: standard deviations of its noise, as in :func:`~magrl.tracking.update`.
+        track: state of one vehicle before the move.
+        displacement: ``(2,)`` northward and eastward [km].
+        reading: ``(3,)`` at its end.
+        sensor_std: standard deviations of its noise, as in :func:`~magrl.tracking.update`.
         scales: those of :func:`~magrl.tracking.start`.
 
     Example:
-        >>> from magrl.tracking import update
-        >>> before = FieldTrack(torch.zeros(1, 3), 3.0 * torch.eye(3).unsqueeze(0))
-        >>> after = update(before, torch.tensor([4.0]), noise_std=(1.0,), scales=(1.0,))
-        >>> surprise(after, (4.0,), (1.0,), (1.0,))  # 4^2 over 3 + 1
-        4.0
+        >>> track = FieldTrack(torch.zeros(3, 3), 3.0 * torch.eye(3).expand(3, 3, 3))
+        >>> surprise(track, torch.zeros(2), torch.tensor([0.0, 6.0, 0.0]), (0.3, 1.5, 100.0))  # 4^2 over 3 + 1, and 0
+        1.3333333333333333
     """
-    count = check_track(track)
-    check_numbers(count, reading=reading, noise_std=noise_std, scales=scales)
-    squares = []
-    known = zip(reading, noise_std, scales, track.mean[:, 0].tolist(), track.covariance[:, 0, 0].tolist(), strict=True)
-    for read, std, unit, value, variance in known:
-        noise = max((std / unit) ** 2, VARIANCE_FLOOR)
-        share = max(1 - variance / noise, _LEAST_SHARE)
-        squares.append((read / unit - value) ** 2 / (share * noise))
-    return sum(squares) / count
+    track = FieldTrack(*(tensor.double() for tensor in track))
+    curvature = field_curvature(estimated_field(track, scales))
+    predicted = predict(track, displacement, curvature, scales)
+    unit, usual = _units(predicted, scales), _units(predicted, ELEMENT_SCALES)
+    innovation = continued(reading, predicted, scales, ELEMENT_PERIODS) / unit - predicted.mean[:, 0]
+    variance = predicted.covariance[:, 0, 0] + _variance(sensor_std, usual) * (usual / unit).square()
+    return (innovation.square() / variance).mean().item()
 
 
-def steepest(track: FieldTrack, element: int, scales: Sequence[float] = ELEMENT_SCALES) -> float:
+def steepest(track: FieldTrack, element: int, scales: PerElement = ELEMENT_SCALES) -> float:
     """Return the greatest gradient that an element may have: the estimate and two standard deviations.
 
     Args:
@@ -127,7 +131,5 @@ def steepest(track: FieldTrack, element: int, scales: Sequence[float] = ELEMENT_
         >>> steepest(track, 0, scales=(1.0,))
         7.0
     """
-    check_numbers(check_track(track), scales=scales)
-    covariance = track.covariance[element, 1:, 1:]
-    largest = torch.linalg.eigvalsh(covariance.double())[-1].clamp_min(0).sqrt()
-    return (track.mean[element, 1:].norm() + 2 * largest).item() * scales[element]
+    largest = torch.linalg.eigvalsh(track.covariance[element, 1:, 1:].double())[-1].clamp_min(0).sqrt()
+    return ((track.mean[element, 1:].norm() + 2 * largest) * _units(track, scales)[element]).item()

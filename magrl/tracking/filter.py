@@ -10,7 +10,7 @@ Arguments and results are in the element's unit and in kilometers, a :class:`Fie
 B_H, pass ``scales`` and ``curvature``, as tensors where they should stay on an accelerator.
 
 Types, shapes and Python numbers are checked. Values inside tensors are not: NaN or a negative standard deviation gives
-NaN. Differences are not wrapped: a declination that crosses 180 degrees must be continued beyond it.
+NaN. Differences are not wrapped: see :func:`continued`.
 """
 
 from __future__ import annotations
@@ -27,10 +27,14 @@ from magrl.checks import check_number, check_numbers, check_tensor, check_type
 ELEMENT_SCALES = (0.3, 1.5, 100.0)
 """Units of D [deg], I [deg], B_H [nT] in a :class:`FieldTrack`: about their change over 100 km."""
 
+ELEMENT_PERIODS = (360.0, 0.0, 0.0)
+"""Period of D, I [deg], B_H [nT] in readings; 0 for elements that are not wrapped."""
+
 DISTANCE_SCALE_KM = 100.0  # unit of distance in a FieldTrack
 
-CURVATURE = (0.015, 0.018, 8.0)
-"""Standard deviation of the change of a gradient along the way: D, I [deg], B_H [nT], per (100 km)^2."""
+CURVATURE = (0.015, 0.018, 12.0)
+"""Standard deviation of the change of a gradient along the way: D, I [deg], B_H [nT], per (100 km)^2, typical of the
+Earth's field. The error of a linear step grows with it."""
 
 VARIANCE_FLOOR = 1e-4
 """Smallest variance of a reading, in squared scaled units: a standard deviation of 0.003°, 0.015°, 1 nT."""
@@ -80,57 +84,49 @@ class GradientRelation(NamedTuple):
 
 
 def start(
-    reading: Tensor,
-    prior_gradient: Tensor,
-    prior_std: Tensor,
-    noise_std: PerElement,
-    azimuth: Tensor | None = None,
-    scales: PerElement = ELEMENT_SCALES,
+    reading: Tensor, prior: GradientPrior, sensor_std: PerElement, scales: PerElement = ELEMENT_SCALES
 ) -> FieldTrack:
     """Return the state after the first reading, of its dtype.
 
     Args:
         reading: ``(..., E)`` first reading, in the element's unit.
-        prior_gradient: ``(..., E, 2)`` expected gradient northward and eastward [element unit / km].
-        prior_std: ``(..., E, 2)`` its standard deviations along and across ``azimuth`` [element unit / km].
-        noise_std: standard deviation of its noise, ``(..., E)`` or E numbers; see :data:`VARIANCE_FLOOR`.
-        azimuth: ``(...)`` [rad, clockwise from true north], usually of magnetic north; without it, 0.
+        prior: expected gradient and its standard deviations along and across an azimuth.
+        sensor_std: standard deviation of the noise, ``(..., E)`` or E numbers; see :data:`VARIANCE_FLOOR`.
         scales: units of the elements in the state, ``(..., E)`` or E numbers.
 
     Raises:
-        ValueError: for shapes that do not match, or a negative number in ``noise_std``.
+        ValueError: for shapes that do not match, or a negative number in ``sensor_std``.
 
     Example:
-        >>> reading, noise = torch.tensor([8.0, -16.0, 35000.0]), (0.05, 0.05, 5.0)
         >>> from magrl.tracking import dipole_prior
-        >>> prior = dipole_prior(reading)
-        >>> track = start(reading, prior.gradient, prior.std, noise, prior.azimuth)
+        >>> reading = torch.tensor([8.0, -16.0, 35000.0])
+        >>> track = start(reading, dipole_prior(reading), (0.05, 0.05, 5.0))
         >>> track.mean.shape, track.covariance.shape
         (torch.Size([3, 3]), torch.Size([3, 3, 3]))
     """
     check_tensor(reading=reading)
+    check_type(GradientPrior, prior=prior)
     count = reading.shape[-1] if reading.ndim else 0
-    check_tensor(count, 2, prior_gradient=prior_gradient, prior_std=prior_std)
-    unit = positive("scales", scales, count, reading)
-    azimuth = torch.zeros_like(reading[..., 0]) if azimuth is None else azimuth
-    check_tensor(azimuth=azimuth)
+    check_tensor(count, 2, prior_gradient=prior.gradient, prior_std=prior.std)
+    check_tensor(azimuth=prior.azimuth)
+    unit = _nonnegative_or_nan("scales", scales, count, reading)
     per_unit = (DISTANCE_SCALE_KM / unit).unsqueeze(-1)
-    north, east = (prior_gradient.to(reading.dtype) * per_unit).unbind(-1)
-    along, across = (prior_std.to(reading.dtype).where(prior_std >= 0, math.nan) * per_unit).square().unbind(-1)
-    cos, sin = torch.cos(azimuth).to(along).unsqueeze(-1), torch.sin(azimuth).to(along).unsqueeze(-1)
+    north, east = (prior.gradient.to(reading.dtype) * per_unit).unbind(-1)
+    along, across = (prior.std.to(reading.dtype).where(prior.std >= 0, math.nan) * per_unit).square().unbind(-1)
+    cos, sin = (f(prior.azimuth).to(along).unsqueeze(-1) for f in (torch.cos, torch.sin))
     block = along * cos * cos + across * sin * sin, (along - across) * cos * sin, along * sin * sin + across * cos * cos
-    parts = reading / unit, north, east, _variance(noise_std, count, unit), 0 * along, 0 * along, *block
-    value, north, east, *covariance = (part.movedim(-1, 0) for part in torch.broadcast_tensors(*parts))
+    entries = reading / unit, north, east, _variance(sensor_std, unit), 0 * along, 0 * along, *block
+    value, north, east, *covariance = (entry.movedim(-1, 0) for entry in torch.broadcast_tensors(*entries))
     return _track((value, north, east), covariance)
 
 
 def predict(
     track: FieldTrack, displacement: Tensor, curvature: PerElement = CURVATURE, scales: PerElement = ELEMENT_SCALES
 ) -> FieldTrack:
-    """Return the state after a move, before the reading at its end.
+    """Return the state after a move, before the reading at its end: mean F x and covariance F P F^T + Q.
 
-    The value becomes e + g·d. The gradient drifts with the way, so that cov(g) grows by ``c^2 |d|^2 I``, var(e)
-    by ``c^2 |d|^4 / 4`` and cov(e, g) by ``c^2 |d|^2 d / 2``.
+    F has the rows (1, d_N, d_E), (0, 1, 0), (0, 0, 1). The gradient drifts with the way: Q has ``c^2 |d|^2 I`` for the
+    gradient, ``c^2 |d|^4 / 4`` for the value and ``c^2 |d|^2 d / 2`` between them.
 
     Args:
         track: state before the move.
@@ -146,23 +142,24 @@ def predict(
         >>> predict(track, torch.tensor([50.0, 0.0]), curvature=(1.0,), scales=(1.0,)).mean
         tensor([[0.5000, 1.0000, 0.0000]])
     """
-    count = check_track(track)
+    unit = _units(track, scales)
     check_tensor(2, displacement=displacement)
-    drift = positive("curvature", curvature, count, track.mean) / positive("scales", scales, count, track.mean)
-    shape = common(track.mean.shape[:-1], (*displacement.shape[:-1], count), drift.shape)
-    (value, north, east), (p00, p01, p02, p11, p12, p22) = parts(track, shape)
+    drift = _nonnegative_or_nan("curvature", curvature, unit.shape[-1], unit) / unit
+    shape = _broadcast(track.mean.shape[:-1], (*displacement.shape[:-1], unit.shape[-1]), drift.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = _entries(track, shape)
     dn, de = (displacement.to(value.dtype) / DISTANCE_SCALE_KM).unbind(-1)  # the same for all elements
-    growth = first(drift, shape).square() * (length2 := dn * dn + de * de)
-    moved1, moved2 = p01 + p11 * dn + p12 * de, p02 + p12 * dn + p22 * de
-    top = p00 + (p01 + moved1) * dn + (p02 + moved2) * de + growth * (length2 / 4)
-    cross = moved1 + growth * (dn / 2), moved2 + growth * (de / 2)
-    return _track((value + north * dn + east * de, north, east), (top, *cross, p11 + growth, p12, p22 + growth))
+    length2 = dn * dn + de * de
+    q = _elements_first(drift, shape).square() * length2
+    fp01, fp02 = p01 + p11 * dn + p12 * de, p02 + p12 * dn + p22 * de  # first row of F P; the others are those of P
+    variance = p00 + (p01 + fp01) * dn + (p02 + fp02) * de + q * (length2 / 4)
+    mean = value + north * dn + east * de, north, east
+    return _track(mean, (variance, fp01 + q * (dn / 2), fp02 + q * (de / 2), p11 + q, p12, p22 + q))
 
 
 def update(
-    track: FieldTrack, reading: Tensor, noise_std: PerElement, scales: PerElement = ELEMENT_SCALES
+    track: FieldTrack, reading: Tensor, sensor_std: PerElement, scales: PerElement = ELEMENT_SCALES
 ) -> FieldTrack:
-    """Return the state after a reading, with the covariance in Joseph form.
+    """Return the state after a reading z = H x + noise, H = (1, 0, 0): mean x + K (z - H x), covariance in Joseph form.
 
     In float32, P - K H P loses positive definiteness after long moves. (I - K H) P (I - K H)^T + K R K^T (Bucy and
     Joseph, 1968) loses it only where the variances of g along and across the track differ by a factor of about 1e7.
@@ -170,30 +167,31 @@ def update(
     Args:
         track: state from :func:`predict`.
         reading: ``(..., E)``, in the element's unit.
-        noise_std: standard deviation of its noise, ``(..., E)`` or E numbers; see :data:`VARIANCE_FLOOR`.
+        sensor_std: standard deviation of its noise, ``(..., E)`` or E numbers; see :data:`VARIANCE_FLOOR`.
         scales: those of :func:`start`.
 
     Raises:
-        ValueError: for shapes that do not match, or a negative number in ``noise_std``.
+        ValueError: for shapes that do not match, or a negative number in ``sensor_std``.
 
     Example:
         >>> track = FieldTrack(torch.zeros(1, 3), torch.eye(3).unsqueeze(0))
-        >>> update(track, torch.tensor([2.0]), noise_std=(1.0,), scales=(1.0,)).mean[0, 0]
+        >>> update(track, torch.tensor([2.0]), sensor_std=(1.0,), scales=(1.0,)).mean[0, 0]
         tensor(1.)
     """
-    count = check_track(track)
-    check_tensor(count, reading=reading)
-    unit = positive("scales", scales, count, track.mean)
-    reading, noise = reading.to(track.mean.dtype) / unit, _variance(noise_std, count, unit)
-    shape = common(track.mean.shape[:-1], reading.shape, noise.shape)
-    (value, north, east), (p00, p01, p02, p11, p12, p22) = parts(track, shape)
-    noise, surprise = first(noise, shape), first(reading, shape) - value
-    total = p00 + noise
-    kept, k0, k1, k2 = noise / total, p00 / total, p01 / total, p02 / total  # 1 - k0; the gain
-    spread, rest1, rest2 = k0 * noise, p01 - total * k1, p02 - total * k2  # the rests are 0 but for rounding
-    top = kept * kept * p00 + k0 * spread, kept * (p01 - k1 * p00) + k1 * spread, kept * (p02 - k2 * p00) + k2 * spread
-    block = p11 - k1 * (p01 + rest1), p12 - k1 * p02 - k2 * rest1, p22 - k2 * (p02 + rest2)
-    return _track((value + k0 * surprise, north + k1 * surprise, east + k2 * surprise), (*top, *block))
+    unit = _units(track, scales)
+    check_tensor(unit.shape[-1], reading=reading)
+    reading, variance = reading.to(unit.dtype) / unit, _variance(sensor_std, unit)
+    shape = _broadcast(track.mean.shape[:-1], reading.shape, variance.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = _entries(track, shape)
+    r, innovation = _elements_first(variance, shape), _elements_first(reading, shape) - value  # R, z - H x
+    s = p00 + r  # S = H P H^T + R
+    gain, gain_n, gain_e = p00 / s, p01 / s, p02 / s  # K = P H^T / S
+    mean = value + gain * innovation, north + gain_n * innovation, east + gain_e * innovation
+    rest, noise = r / s, gain * r  # 1 - K_0 and K_0 R, the same number, each rounded as its formula needs it
+    row = rest * (p01 - gain_n * p00) + gain_n * noise, rest * (p02 - gain_e * p00) + gain_e * noise
+    left_n, left_e = p01 - s * gain_n, p02 - s * gain_e  # P H^T - K S: 0 but for rounding
+    block = p11 - gain_n * (p01 + left_n), p12 - gain_n * p02 - gain_e * left_n, p22 - gain_e * (p02 + left_e)
+    return _track(mean, (rest * rest * p00 + gain * noise, *row, *block))
 
 
 def relate(
@@ -221,15 +219,24 @@ def relate(
         >>> relate(track, same, scales=(1.0, 1.0))[0].mean[:, 1]  # two gradients that must be the same
         tensor([0.5000, 0.5000])
     """
-    count = check_track(track)
-    check_tensor(count, 2, weights=relation.weights)
-    unit = positive("scales", scales, count, track.mean)
-    rows = relation.weights.to(track.mean.dtype) * (unit / DISTANCE_SCALE_KM).unsqueeze(-1)
-    gain = (track.covariance[..., 1:] * rows.unsqueeze(-2)).sum(-1)
-    total = (rows * gain[..., 1:]).sum((-2, -1)) + relation.std.to(rows).square()
-    surprise = relation.value.to(rows) - (rows * track.mean[..., 1:]).sum((-2, -1))
-    mean = track.mean + gain * (surprise / total)[..., None, None]
-    return FieldTrack(mean, track.covariance), gain * total.rsqrt()[..., None, None]
+    unit = _units(track, scales)
+    check_tensor(unit.shape[-1], 2, weights=relation.weights)
+    rows = relation.weights.to(unit.dtype) * (unit / DISTANCE_SCALE_KM).unsqueeze(-1)  # H, 0 for the values
+    cross = (track.covariance[..., 1:] * rows.unsqueeze(-2)).sum(-1)  # P H^T
+    s = (rows * cross[..., 1:]).sum((-2, -1)) + relation.std.to(rows).square()  # S = H P H^T + R
+    innovation = relation.value.to(rows) - (rows * track.mean[..., 1:]).sum((-2, -1))
+    mean = track.mean + cross * (innovation / s)[..., None, None]
+    return FieldTrack(mean, track.covariance), cross * s.rsqrt()[..., None, None]
+
+
+def estimated_field(track: FieldTrack, scales: PerElement = ELEMENT_SCALES) -> Tensor:
+    """Return the estimated field ``(..., E)``, in the element's unit; angles are not wrapped.
+
+    Example:
+        >>> estimated_field(FieldTrack(torch.tensor([[2.0, 0.0, 0.0]]), torch.zeros(1, 3, 3)), scales=(100.0,))
+        tensor([200.])
+    """
+    return track.mean[..., 0] * _units(track, scales)
 
 
 def estimated_gradient(track: FieldTrack, scales: PerElement = ELEMENT_SCALES) -> Tensor:
@@ -240,14 +247,36 @@ def estimated_gradient(track: FieldTrack, scales: PerElement = ELEMENT_SCALES) -
         >>> estimated_gradient(track, scales=(100.0,))
         tensor([[1., 2.]])
     """
-    count = check_track(track)
-    return track.mean[..., 1:] * (positive("scales", scales, count, track.mean) / DISTANCE_SCALE_KM).unsqueeze(-1)
+    return track.mean[..., 1:] * (_units(track, scales) / DISTANCE_SCALE_KM).unsqueeze(-1)
 
 
-def parts(track: FieldTrack, shape: torch.Size) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+def continued(values: Tensor, track: FieldTrack, scales: PerElement, periods: PerElement) -> Tensor:
+    """Return values ``(..., E)`` whose angles are within half a turn of the estimate.
+
+    Example:
+        >>> track = FieldTrack(torch.tensor([[200 / 0.3, 0.0, 0.0]]), torch.eye(3).unsqueeze(0))
+        >>> continued(torch.tensor([-170.0]), track, (0.3,), (360.0,))
+        tensor([190.])
+    """
+    period = torch.as_tensor(periods, dtype=values.dtype, device=values.device)
+    return values - period * torch.round((values - estimated_field(track, scales)) / 360)
+
+
+def _units(track: FieldTrack, scales: PerElement) -> Tensor:
+    """Return the units of the elements of a state, ``(..., E)``; raise for anything else than a state."""
+    check_type(FieldTrack, track=track)
+    check_tensor(3, mean=track.mean)
+    check_tensor(3, 3, covariance=track.covariance)
+    if track.mean.ndim < 2 or track.covariance.shape[:-1] != track.mean.shape:
+        wanted = "mean and covariance must have the shapes (..., E, 3) and (..., E, 3, 3)"
+        raise ValueError(f"{wanted}, got {[tuple(tensor.shape) for tensor in track]}")
+    return _nonnegative_or_nan("scales", scales, track.mean.shape[-2], track.mean)
+
+
+def _entries(track: FieldTrack, shape: torch.Size) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
     """Return e, g_N, g_E and the six entries of their covariance by rows, ``(E, ...)`` of a shape ``(..., E)``.
 
-    By parts, as 3 x 3 matrix products are slower, and may round to TF32 or, under autocast, to bfloat16.
+    By entries, as 3 x 3 matrix products are slower, and may round to TF32 or, under autocast, to bfloat16.
     """
     mean, covariance = track.mean.expand(*shape, 3), track.covariance.expand(*shape, 3, 3)
     p0, p1, p2 = covariance.movedim((-2, -1, -3), (0, 1, 2)).contiguous()
@@ -255,40 +284,31 @@ def parts(track: FieldTrack, shape: torch.Size) -> tuple[Sequence[Tensor], Seque
 
 
 def _track(mean: Sequence[Tensor], covariance: Sequence[Tensor]) -> FieldTrack:
-    """Return the state of the parts of :func:`parts`."""
+    """Return the state of the entries of :func:`_entries`."""
     p00, p01, p02, p11, p12, p22 = covariance
     matrix = torch.stack((p00, p01, p02, p01, p11, p12, p02, p12, p22)).unflatten(0, (3, 3))
     return FieldTrack(torch.stack(tuple(mean)).movedim((0, 1), (-1, -2)), matrix.movedim((0, 1, 2), (-2, -1, -3)))
 
 
-def first(values: Tensor, shape: torch.Size) -> Tensor:
+def _elements_first(values: Tensor, shape: torch.Size) -> Tensor:
     """Return a value of each element ``(..., E)`` as ``(E, ...)``, expanded to a shape ``(..., E)``."""
     return values.expand(shape).movedim(-1, 0).contiguous()
 
 
-def common(shape: torch.Size, *others: tuple[int, ...]) -> torch.Size:
+def _broadcast(shape: torch.Size, *others: tuple[int, ...]) -> torch.Size:
     """Return the shape ``(..., E)`` of all; torch.broadcast_shapes takes longer than ten sums of 1024 vehicles."""
     return shape if all(x in (shape, shape[-1:]) for x in others) else torch.broadcast_shapes(shape, *others)
 
 
-def check_track(track: FieldTrack) -> int:
-    """Return the number of elements of a state; raise for anything else than a state."""
-    check_type(FieldTrack, track=track)
-    check_tensor(3, mean=track.mean)
-    check_tensor(3, 3, covariance=track.covariance)
-    if track.mean.ndim < 2 or track.covariance.shape[:-1] != track.mean.shape:
-        wanted = "mean and covariance must have the shapes (..., E, 3) and (..., E, 3, 3)"
-        raise ValueError(f"{wanted}, got {[tuple(tensor.shape) for tensor in track]}")
-    return track.mean.shape[-2]
-
-
-def _variance(noise_std: PerElement, count: int, unit: Tensor) -> Tensor:
+def _variance(sensor_std: PerElement, unit: Tensor) -> Tensor:
     """Return the variance of a reading ``(..., E)`` in squared scaled units, not below the floor."""
-    return (positive("noise_std", noise_std, count, unit) / unit).square().clamp_min(VARIANCE_FLOOR)
+    std = _nonnegative_or_nan("sensor_std", sensor_std, unit.shape[-1], unit)
+    return (std / unit).square().clamp_min(VARIANCE_FLOOR)
 
 
-def positive(name: str, values: PerElement, count: int, like: Tensor) -> Tensor:
-    """Return a value of each element, ``(..., E)``, of another tensor's dtype."""
+def _nonnegative_or_nan(name: str, values: PerElement, count: int, like: Tensor) -> Tensor:
+    """Return a value of each element ``(..., E)``, of another tensor's dtype; raise for a negative Python number, and
+    replace negative entries of a tensor, which must not be read here, by NaN."""
     if isinstance(values, Tensor):
         check_tensor(count, **{name: values})
         return values.to(like.dtype).where(values >= 0, math.nan)

@@ -7,8 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from magrl import guidance
 from magrl.checks import check_number, check_tensor
-from magrl.tracking.filter import DISTANCE_SCALE_KM, ELEMENT_SCALES, FieldTrack, PerElement, check_track, positive
+from magrl.tracking.filter import DISTANCE_SCALE_KM, ELEMENT_SCALES, FieldTrack, PerElement, _units
 from magrl.tracking.way import Way
 
 VISITED = 24
@@ -102,6 +103,27 @@ def visit(visited: Tensor, displacement: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(displacement).unsqueeze(-2), before), -2)
 
 
+def arrival_weights(field: Tensor, target_field: Tensor, zeta: float) -> Tensor:
+    """Return the weights of the objective F (Eq. 2-6) over its threshold: their sum of squares is 1 at arrival.
+
+    They have the paper's floors (:data:`magrl.guidance.OBJECTIVE_FLOORS`) in every region.
+
+    Args:
+        field: ``(..., 3)`` D [deg], I [deg], B_H [nT] where the episode starts.
+        target_field: ``(..., 3)`` the same at the destination.
+        zeta: arrival threshold on F.
+
+    Returns:
+        ``(..., 3)``, per squared unit.
+
+    Example:
+        >>> arrival_weights(torch.tensor([0.0, 60.0, 20000.0]), torch.tensor([2.0, 60.0, 20100.0]), 0.25)
+        tensor([1.0000e+00, 2.5000e+01, 4.0000e-04])
+    """
+    check_number(0, above=True, zeta=zeta)
+    return guidance.objective_weights(field, target_field, field.new_tensor(guidance.OBJECTIVE_FLOORS)) / zeta
+
+
 def arrival_ellipse(track: FieldTrack, weights: Tensor, scales: PerElement = ELEMENT_SCALES) -> Tensor:
     """Return the matrix ``(..., 2, 2)`` [1/km^2] of the ellipse in which the objective F is below its threshold.
 
@@ -109,7 +131,7 @@ def arrival_ellipse(track: FieldTrack, weights: Tensor, scales: PerElement = ELE
 
     Args:
         track: state of the filter.
-        weights: ``(..., E)`` weights of the objective (Eq. 2-6), divided by the arrival threshold.
+        weights: ``(..., E)`` those of :func:`arrival_weights`.
         scales: those of :func:`~magrl.tracking.start`.
 
     Raises:
@@ -121,9 +143,9 @@ def arrival_ellipse(track: FieldTrack, weights: Tensor, scales: PerElement = ELE
         tensor([[0.0400, 0.0000],
                 [0.0000, 0.0000]])
     """
-    count = check_track(track)
-    check_tensor(count, weights=weights)
-    per_km = weights * (positive("scales", scales, count, track.mean) / DISTANCE_SCALE_KM).square()
+    unit = _units(track, scales)
+    check_tensor(unit.shape[-1], weights=weights)
+    per_km = weights * (unit / DISTANCE_SCALE_KM).square()
     gradient = track.mean[..., 1:]
     squares = gradient.unsqueeze(-1) * gradient.unsqueeze(-2) + track.covariance[..., 1:, 1:]
     return (per_km[..., None, None] * squares).sum(-3)

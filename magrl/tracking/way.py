@@ -13,11 +13,12 @@ from magrl.tracking.filter import (
     ELEMENT_SCALES,
     FieldTrack,
     PerElement,
-    check_track,
-    common,
-    first,
-    parts,
-    positive,
+    _broadcast,
+    _elements_first,
+    _entries,
+    _nonnegative_or_nan,
+    _units,
+    continued,
 )
 
 _LEAST_VARIANCE = 1e-8  # of a remaining difference: keeps the squares of the weights inside float32
@@ -43,6 +44,7 @@ def way_to(
     scales: PerElement = ELEMENT_SCALES,
     shared: Tensor | None = None,
     bias_std: PerElement | None = None,
+    periods: PerElement | None = None,
 ) -> Way:
     """Return the displacement to the place where the field has given values, and its uncertainty.
 
@@ -58,6 +60,8 @@ def way_to(
         shared: ``(..., E, 3)`` from :func:`relate`; without it, the elements are independent.
         bias_std: standard deviation of a constant error of the readings, ``(..., E)`` or E numbers. It is not in the
             state: gradients do not depend on it, but all remaining differences do.
+        periods: of angles, whose remaining differences are wrapped, as :data:`~magrl.tracking.ELEMENT_PERIODS`; None
+            for none.
 
     Raises:
         ValueError: for shapes that do not match, a range that is not above 0, or a negative number in ``bias_std``.
@@ -68,17 +72,18 @@ def way_to(
         >>> way_to(track, torch.tensor([3.0, 4.0]), 1000.0, scales=(1.0, 1.0)).displacement.round()
         tensor([300., 200.])
     """
-    count = check_track(track)
+    unit = _units(track, scales)
+    count = unit.shape[-1]
     check_tensor(count, target=target)
     check_number(0, above=True, range_km=range_km)
-    unit = positive("scales", scales, count, track.mean)
-    target = target.to(track.mean.dtype) / unit
-    bias = positive("bias_std", (0.0,) * count if bias_std is None else bias_std, count, track.mean) / unit
-    shape = common(track.mean.shape[:-1], target.shape, bias.shape)
-    (value, north, east), (p00, p01, p02, p11, p12, p22) = parts(track, shape)
-    p00 = p00 + first(bias, shape).square()
+    target = target if periods is None else continued(target, track, scales, periods)
+    target = target.to(unit.dtype) / unit
+    bias = _nonnegative_or_nan("bias_std", (0.0,) * count if bias_std is None else bias_std, count, unit) / unit
+    shape = _broadcast(track.mean.shape[:-1], target.shape, bias.shape)
+    (value, north, east), (p00, p01, p02, p11, p12, p22) = _entries(track, shape)
+    p00 = p00 + _elements_first(bias, shape).square()
     ridge = (DISTANCE_SCALE_KM / range_km) ** 2
-    terms = torch.stack((first(target, shape) - value, north, east))
+    terms = torch.stack((_elements_first(target, shape) - value, north, east))
     expected, twice1, twice2, twice12 = p00 + (p11 + p22) / ridge, 2 * p01, 2 * p02, 2 * p12
     together = None
     for _ in range(3):

@@ -6,7 +6,6 @@ module where that makes sense.
 """
 
 from magrl.transforms.alignment import AlignmentReward, FieldGradient, GradientHeading
-from magrl.transforms.declaration import DeclareArrival
 from magrl.transforms.errors.conditions import CONDITIONS, TRUE_KEYS, Conditions, conditions_named, with_conditions
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.noise import RandomSensorNoise, SensorNoise, sensor_levels, with_sensor_noise
@@ -14,13 +13,10 @@ from magrl.transforms.errors.north import NORTH_REFERENCES, NorthReferenceError,
 from magrl.transforms.errors.sensors import SensorErrors
 from magrl.transforms.errors.vector import VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
-from magrl.transforms.observation import AngleVector, TargetDifference
 from magrl.transforms.rewards import DetourReward, DistanceCost, TrueWay
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.search import SearchAim
-from magrl.transforms.track import TrackGradient
-from magrl.transforms.track_view import TrackObservation, TrackView
-from magrl.transforms.view import ObservationView
+from magrl.transforms.track import DeclareArrival, SearchAim, TrackGradient
+from magrl.transforms.views import AngleVector, ObservationView, TargetDifference, TrackObservation, TrackView
 
 __all__ = [
     "CONDITIONS",

@@ -1,29 +1,43 @@
-"""Transform that estimates a field, its gradient and the way to the target by a Kalman filter along the track."""
+"""Transforms that navigate by the vehicle's own track: estimates of a Kalman filter, search and declared arrival."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import Transform
 
 from magrl import tracking
 from magrl.checks import check_number, check_numbers
-from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, curl_relation, dipole_prior, field_curvature
-from magrl.transforms.base import Keys, ObservationTransform, observed_spec, several_keys, sorted_keys, with_state
+from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, Way
+from magrl.transforms.base import (
+    Keys,
+    StatefulTransform,
+    expect_keys,
+    observed_spec,
+    several_keys,
+    sorted_keys,
+    with_state,
+)
 
+STD_KEYS = ("sensor_std", "bias_std")
+"""Standard deviations of a reading's new errors, and of constant or slow ones: D [deg], I [deg], B_H [nT]."""
 FRAMES = ("world", "vehicle")
+IN_KEYS = ("field", "target_field", "move", "heading")
 OUT_KEYS = ("track_mean", "track_covariance", "estimated_field", "estimated_gradient", "way", "way_covariance")
 
 
-class TrackGradient(ObservationTransform):
+class TrackGradient(StatefulTransform):
     """Estimate the field, its gradient and the way to the target from the readings along the track.
 
-    The filter of :mod:`magrl.tracking`. It starts at a reset from the first reading and a prior of the gradient; each
-    step moves it by the last move and corrects it by the reading at its end. Its state is in the TensorDict: it is
-    reset by row, stored with the data, and resumed with them. Nothing that it writes is privileged unless an input is.
+    The filter of :mod:`magrl.tracking`: it starts at a reset from the first reading and a prior of the gradient; each
+    step moves it by the last move and corrects it by the reading at its end. Its state is in the TensorDict. Nothing
+    that it writes is privileged unless an input is.
 
     Args:
         in_keys: readings ``(..., E)``, values at the target ``(..., E)``, the last move ``(..., K)`` (its first number
@@ -34,7 +48,7 @@ class TrackGradient(ObservationTransform):
             covariance ``(..., E, 3, 3)``, always northward and eastward; then the estimates: the field ``(..., E)``,
             its gradient ``(..., E, 2)`` [element unit / km], the way to the target ``(..., 2)`` [km] and its covariance
             ``(..., 2, 2)`` [km^2].
-        noise_std: standard deviation of the readings' noise, E numbers, where it is not among the ``in_keys``; by
+        sensor_std: standard deviation of the readings' noise, E numbers, where it is not among the ``in_keys``; by
             default 0. The filter has a floor, :data:`~magrl.tracking.VARIANCE_FLOOR`.
         prior: function from a first reading ``(..., E)`` to a :class:`~magrl.tracking.GradientPrior`; for other
             elements than D, I, B_H, give one, and also ``relation``, ``scales``, ``curvature`` and ``angles``.
@@ -61,20 +75,20 @@ class TrackGradient(ObservationTransform):
     """
 
     scales: Tensor
-    noise_std: Tensor
-    period: Tensor
+    sensor_std: Tensor
+    periods: Tensor
     constant_curvature: Tensor
 
     def __init__(
         self,
-        in_keys: Keys = ("field", "target_field", "move", "heading"),
+        in_keys: Keys = IN_KEYS,
         out_keys: Keys = OUT_KEYS,
         *,
-        noise_std: Sequence[float] | None = None,
-        prior: Callable[[Tensor], GradientPrior] = dipole_prior,
-        relation: Callable[[Tensor], GradientRelation] | None = curl_relation,
+        sensor_std: Sequence[float] | None = None,
+        prior: Callable[[Tensor], GradientPrior] = tracking.dipole_prior,
+        relation: Callable[[Tensor], GradientRelation] | None = tracking.curl_relation,
         scales: Sequence[float] = tracking.ELEMENT_SCALES,
-        curvature: Sequence[float] | Callable[[Tensor], Tensor] = field_curvature,
+        curvature: Sequence[float] | Callable[[Tensor], Tensor] = tracking.field_curvature,
         angles: Sequence[int] = (0,),
         range_km: float = 300.0,
         frame: str = "world",
@@ -82,152 +96,251 @@ class TrackGradient(ObservationTransform):
         super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
         if len(self.in_keys) not in (4, 5, 6) or len(self.out_keys) != 6:
             raise ValueError(
-                "TrackGradient takes 4 to 6 in_keys (reading, target, move, heading, standard deviations of the noise "
-                f"and of the constant error) and 6 out_keys (such as {OUT_KEYS}), got {self.in_keys} and "
-                f"{self.out_keys}"
+                f"TrackGradient takes 4 to 6 in_keys (such as {(*IN_KEYS, *STD_KEYS)}) and 6 out_keys (such as "
+                f"{OUT_KEYS}), got {self.in_keys} and {self.out_keys}"
             )
-        if noise_std is not None and len(self.in_keys) > 4:
-            raise ValueError(f"give noise_std or its key {self.in_keys[4]!r}, not both: got noise_std {noise_std}")
+        if sensor_std is not None and len(self.in_keys) > 4:
+            raise ValueError(f"give sensor_std or its key {self.in_keys[4]!r}, not both: got sensor_std {sensor_std}")
         check_number(0, above=True, range_km=range_km)
-        if frame not in FRAMES or not callable(prior):
-            raise ValueError(f"frame must be one of {FRAMES} and prior a function, got {frame!r} and {prior!r}")
-        if relation is not None and not callable(relation):
-            raise ValueError(f"relation must be a function or None, got {relation!r}")
+        _check_frame(frame)
+        if not callable(prior) or not (relation is None or callable(relation)):
+            raise ValueError(f"prior must be a function, and relation one or None, got {prior!r} and {relation!r}")
         self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
-        self._register(scales, curvature, noise_std, angles)
-
-    def _register(
-        self,
-        scales: Sequence[float],
-        curvature: Sequence[float] | Callable[[Tensor], Tensor],
-        noise_std: Sequence[float] | None,
-        angles: Sequence[int],
-    ) -> None:
-        """Check and keep the numbers of each element; float64, as a 0.3 of float32 is another in float64."""
-        count = len(scales) if isinstance(scales, (tuple, list)) else 0
-        if not count or not isinstance(angles, (tuple, list)) or not set(angles) <= set(range(count)):
-            raise ValueError(f"scales must be numbers and angles among their indices, got {scales!r} and {angles!r}")
-        numbers = {"noise_std": (0.0,) * count if noise_std is None else noise_std}
         self.curvature = curvature if callable(curvature) else None
+        count = len(scales)
+        if not set(angles) <= set(range(count)):
+            raise ValueError(f"angles must be indices of the {count} elements, got {angles!r}")
+        self._register(count, scales=scales, sensor_std=(0.0,) * count if sensor_std is None else sensor_std)
+        self._register(count, periods=[360.0 * (index in angles) for index in range(count)])
         if not callable(curvature):
-            numbers["constant_curvature"] = curvature
-        for name, values in ({"scales": scales} | numbers).items():
+            self._register(count, constant_curvature=curvature)
+
+    def _register(self, count: int, **numbers: Sequence[float]) -> None:
+        """Check and keep the numbers of each element; float64, as a 0.3 of float32 is another in float64."""
+        for name, values in numbers.items():
             check_numbers(count, **{name: values})
-            if min(values) < 0 or (name == "scales" and min(values) == 0):
-                raise ValueError(f"{name} must not be negative, nor scales zero, got {values!r}")
+            smallest: dict[str, Any] = {name: min(values, default=0.0)}
+            check_number(0, above=name == "scales", **smallest)
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
-        period = torch.tensor([360.0 * (index in angles) for index in range(count)], dtype=torch.float64)
-        self.register_buffer("period", period, persistent=False)
 
-    # Data
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Mean and covariance of the filter."""
+        return self.out_keys[:2]
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
-        return self._start(tensordict_reset)
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        reading, (sensor_std, _) = values[0], self._std(values)
+        self._write(tensordict, values, tracking.start(reading, self.prior(reading), sensor_std, self.scales))
 
-    def _start(self, first: TensorDictBase) -> TensorDictBase:
-        """Write the state after a first reading, and the estimates."""
-        values = self._read(first)
-        if values is None:
-            return first
-        reading, target, _, heading, *std = values
-        prior = self.prior(reading)
-        noise = std[0] if std else self.noise_std
-        track = tracking.start(reading, prior.gradient, prior.std, noise, prior.azimuth, self.scales)
-        return self._write(first, track, target, heading, *std[1:])
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        (reading, _, move, heading, *_), (sensor_std, _) = values, self._std(values)
+        track, displacement = FieldTrack(*state), tracking.displacement_of(move, heading)
+        field = tracking.estimated_field(track, self.scales)
+        curvature = self.constant_curvature if self.curvature is None else self.curvature(field)
+        track = tracking.read(track, displacement, reading, sensor_std, curvature, self.scales, self.periods)
+        self._write(tensordict, values, track)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is None:
-            return next_tensordict
-        reading, target, move, heading, *std = values
-        displacement = move[..., :1] * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
-        track = self._state(tensordict)
-        track = tracking.predict(track, displacement, self._curvature_at(track), self.scales)
-        noise = std[0] if std else self.noise_std
-        track = tracking.update(track, self._continued(reading, track), noise, self.scales)
-        return self._write(next_tensordict, track, target, heading, *std[1:])
+    def _write(self, tensordict: TensorDictBase, values: list[Tensor], track: FieldTrack) -> None:
+        (_, target, _, heading, *_), (_, bias_std) = values, self._std(values)
+        for key, entry in zip(self.out_keys, (*track, *self.estimates(track, target, heading, bias_std)), strict=True):
+            tensordict.set(key, entry)
 
-    def _state(self, tensordict: TensorDictBase) -> FieldTrack:
-        missing = [key for key in self.out_keys[:2] if tensordict.get(key, None) is None]
-        if missing:
-            raise KeyError(
-                f"TrackGradient reads its state {missing}, which a reset writes: step from what reset() or step_mdp() "
-                f"returned; got {sorted_keys(tensordict)}"
-            )
-        return FieldTrack(*(tensordict.get(key) for key in self.out_keys[:2]))
+    def _std(self, values: list[Tensor]) -> tuple[Tensor, Tensor | None]:
+        """Return the standard deviations of noise and of constant errors, of the TensorDict or as given."""
+        given = len(values)
+        return values[4] if given > 4 else self.sensor_std, values[5] if given > 5 else None
 
-    def _curvature_at(self, track: FieldTrack) -> Tensor:
-        if self.curvature is None:
-            return self.constant_curvature
-        return self.curvature(track.mean[..., 0] * self.scales.to(track.mean.dtype))
+    def estimates(
+        self, track: FieldTrack, target: Tensor, heading: Tensor, bias_std: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the estimates of the field, its gradient, the way to the target and its covariance, as written.
 
-    def _continued(self, values: Tensor, track: FieldTrack) -> Tensor:
-        """Return values whose angles are within half a turn of the estimate."""
-        near, period = track.mean[..., 0] * self.scales.to(values.dtype), self.period.to(values.dtype)
-        return values - period * torch.round((values - near) / 360)
-
-    def _write(
-        self,
-        tensordict: TensorDictBase,
-        track: FieldTrack,
-        target: Tensor,
-        heading: Tensor,
-        bias_std: Tensor | None = None,
-    ) -> TensorDictBase:
-        """Write the state and the estimates."""
-        scales = self.scales.to(target.dtype)
-        known, shared = track, None
-        if self.relation is not None:
-            known, shared = tracking.relate(track, self.relation(track.mean[..., 0] * scales), scales)
-        value, gradient = known.mean[..., 0] * scales, tracking.estimated_gradient(known, scales)
-        target = self._continued(target, known)
-        way, covariance = tracking.way_to(known, target, self.range_km, scales, shared, bias_std)
+        Args:
+            track: state of the filter.
+            target: ``(..., E)`` values at the target.
+            heading: ``(..., 1)`` [rad].
+            bias_std: ``(..., E)`` standard deviation of a constant error of the readings.
+        """
+        known, shared = (track, None) if self.relation is None else tracking.related(track, self.relation, self.scales)
+        field, gradient = (f(known, self.scales) for f in (tracking.estimated_field, tracking.estimated_gradient))
+        field = field - self.periods.to(field.dtype) * torch.round(field / 360)
+        way, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared, bias_std, self.periods)
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)
-        value = value - self.period.to(value.dtype) * torch.round(value / 360)
-        for key, entry in zip(self.out_keys, (*track, value, gradient, way, covariance), strict=True):
-            tensordict.set(key, entry)
-        return tensordict
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Start the filter from a first reading; on transitions, compute the step from the state at the root."""
-        if tensordict.get("next", None) is None:
-            return self._start(tensordict)
-        self._step(tensordict, tensordict["next"])
-        return tensordict
-
-    # Specs
+        return field, gradient, way, covariance
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the state and the estimates, unbounded."""
-        leaves = [self._leaf(observation_spec, key) for key in self.in_keys]
-        shape, count = leaves[0].shape, len(self.scales)
-        if shape[-1:] != (count,) or any(leaf.shape != shape for leaf in (leaves[1], *leaves[4:])):
+        reading, target, _, heading, *std = (self._leaf(observation_spec, key) for key in self.in_keys)
+        count, shapes = len(self.scales), [tuple(leaf.shape) for leaf in (reading, target, *std)]
+        if shapes[0][-1:] != (count,) or len(set(shapes)) > 1:
             raise ValueError(
                 f"TrackGradient needs readings, targets and standard deviations of the same shape (..., {count}), with "
-                f"an element for each of its scales, got {[tuple(leaf.shape) for leaf in leaves]}"
+                f"an element for each of its scales, got {shapes}"
             )
-        if leaves[3].shape != (*shape[:-1], 1):
-            raise ValueError(f"TrackGradient needs a heading {(*shape[:-1], 1)}, got {tuple(leaves[3].shape)}")
-        for key, last in zip(self.out_keys, self._sizes(count), strict=True):
-            spec = Unbounded((*shape[:-1], *last), device=leaves[0].device, dtype=leaves[0].dtype)
-            observation_spec[key] = spec
+        if heading.shape != (*shapes[0][:-1], 1):
+            raise ValueError(f"TrackGradient needs a heading {(*shapes[0][:-1], 1)}, got {tuple(heading.shape)}")
+        sizes = (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
+        self._add(observation_spec, reading, dict(zip(self.out_keys, sizes, strict=True)))
         return observation_spec
 
-    @staticmethod
-    def _sizes(count: int) -> tuple[tuple[int, ...], ...]:
-        """Return the last dimensions of what is written."""
-        return (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
+
+class SearchAim(StatefulTransform):
+    """Write the way to the most probable destination that the vehicle has not visited.
+
+    The episode has not ended where the vehicle was, so the destination is not there: see
+    :func:`magrl.tracking.unvisited`. This matters where the readings have a constant error, since the estimate alone
+    then leads to a place beside the destination, and stays there. For environments that end the episode at arrival; a
+    vehicle that must declare its arrival does not know that it has not arrived.
+
+    It stands after :class:`TrackGradient`. Its state is in the TensorDict.
+
+    Args:
+        in_keys: reading and target ``(..., 3)``, last move ``(..., K)`` (distance [km] first), heading ``(..., 1)``
+            [rad], mean ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the filter, estimated way ``(..., 2)`` [km]
+            and its covariance ``(..., 2, 2)`` [km^2].
+        out_keys: the way to aim at ``(..., 2)`` [km], and the state: displacements to the last visited
+            places ``(..., 24, 2)`` northward and eastward [km], and weights of the objective ``(..., 3)``.
+        zeta: arrival threshold on the objective.
+        frame: axes of the way, as in :class:`TrackGradient`.
+
+    Raises:
+        ValueError: for a threshold that is not above 0, an unknown frame, or another number of keys.
+        KeyError: for a step from a TensorDict without the state.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> steps = Compose(TrackGradient(), SearchAim(zeta=0.01))
+        >>> TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), steps).rollout(3)["visited"].shape
+        torch.Size([2, 3, 24, 2])
+    """
+
+    def __init__(
+        self,
+        in_keys: Keys = (*IN_KEYS, "track_mean", "track_covariance", "way", "way_covariance"),
+        out_keys: Keys = ("aim", "visited", "arrival_weights"),
+        *,
+        zeta: float,
+        frame: str = "world",
+    ) -> None:
+        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
+        expect_keys(self, 8, 3)
+        check_number(0, above=True, zeta=zeta)
+        _check_frame(frame)
+        self.zeta, self.frame = float(zeta), frame
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Visited places and weights of the objective."""
+        return self.out_keys[1:]
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        weights = tracking.arrival_weights(values[0], values[1], self.zeta)
+        self._write(tensordict, values, tracking.unvisited_yet(values[0]), weights)
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        (visited, weights), displacement = state, tracking.displacement_of(values[2], values[3])
+        self._write(tensordict, values, tracking.visit(visited, displacement), weights)
+
+    def _write(self, tensordict: TensorDictBase, values: list[Tensor], visited: Tensor, weights: Tensor) -> None:
+        _, _, _, heading, mean, covariance, *way = values
+        axes = None
+        if self.frame == "vehicle":
+            cos, sin = torch.cos(heading), torch.sin(heading)
+            axes = torch.stack((torch.cat((cos, sin), -1), torch.cat((-sin, cos), -1)), -2)
+        aim = tracking.aim(FieldTrack(mean, covariance), Way(*way), visited, weights, axes=axes)
+        for key, value in zip(self.out_keys, (aim, visited, weights), strict=True):
+            tensordict.set(key, value)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the way and the state, unbounded."""
+        sizes = (2,), (tracking.VISITED, 2), (3,)
+        reading = self._leaf(observation_spec, self.in_keys[0])
+        self._add(observation_spec, reading, dict(zip(self.out_keys, sizes, strict=True)))
+        return observation_spec
+
+
+class DeclareArrival(Transform):
+    """Declare the arrival of vehicles that estimate to be near their target; so any navigator can be flown.
+
+    For an environment whose action has a third number that declares the arrival. To the policy, the action has the
+    first two. Where the root of the mean square distance to the target, ``sqrt(|way|^2 + trace(covariance))``, is at
+    most ``within_km``, the vehicle stays where it is and declares; elsewhere it moves as the policy wants.
+
+    In ``Compose``, it stands behind :class:`TrackGradient`, whose estimates it reads. It reads
+    nothing privileged.
+
+    Args:
+        within_km: largest root mean square of the estimated distance at which a vehicle declares [km].
+        way_keys: estimated way ``(..., 2)`` [km] and its covariance ``(..., 2, 2)`` [km^2].
+        action_key: action, ``(..., 2)`` to the policy and ``(..., 3)`` to the environment.
+
+    Raises:
+        ValueError: for a distance that is not positive, other than two keys, or an environment whose action has no
+            third number.
+        KeyError: for a missing estimate.
+
+    Example:
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from magrl.navigators import Kalman
+        >>> base = GeomagneticNavEnv(num_envs=20, arrival="declared", arrival_radius_km=25.0, seed=0)
+        >>> env = TransformedEnv(base, Compose(TrackGradient(), DeclareArrival(within_km=20.0)))
+        >>> flown = env.rollout(50, Kalman(), break_when_any_done=False)
+        >>> flown["next", "declared"].any(1).sum(), flown["next", "success"].any(1).sum()
+        (tensor(20), tensor(20))
+    """
+
+    invertible = True
+
+    def __init__(
+        self,
+        within_km: float,
+        *,
+        way_keys: Keys = ("way", "way_covariance"),
+        action_key: NestedKey = "action",
+    ) -> None:
+        check_number(0, above=True, within_km=within_km)
+        super().__init__(in_keys_inv=[action_key], out_keys_inv=[action_key])
+        self.within_km, self.way_keys = float(within_km), several_keys(way_keys)
+        if len(self.way_keys) != 2:
+            raise ValueError(f"way_keys must be those of the way and its covariance, got {self.way_keys}")
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        missing = [key for key in (*self.way_keys, *self.in_keys_inv) if tensordict.get(key, None) is None]
+        if missing:
+            raise KeyError(
+                f"DeclareArrival reads {missing}, which are not among {sorted_keys(tensordict)}: it stands behind "
+                "TrackGradient"
+            )
+        way, covariance = (tensordict.get(key) for key in self.way_keys)
+        square = way.square().sum(-1, keepdim=True) + covariance.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+        declare = square <= self.within_km**2
+        action = tensordict.get(self.in_keys_inv[0])
+        action = torch.cat((action.masked_fill(declare, 0.0), 2.0 * declare - 1), -1)
+        return tensordict.set(self.in_keys_inv[0], action)
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make the filter part of the state, so that batched and parallel environments pass it to the next step."""
-        input_spec = super().transform_input_spec(input_spec)
-        reading = self._leaf(observed_spec(self), self.in_keys[0])
-        sizes = zip(self.out_keys[:2], self._sizes(len(self.scales)), strict=False)
-        shapes = {key: (*reading.shape[:-1], *last) for key, last in sizes}
-        state = {key: Unbounded(shape, device=reading.device, dtype=reading.dtype) for key, shape in shapes.items()}
-        return with_state(input_spec, state)
+        """Leave the third number out of the action, and make the estimates part of the state for other processes."""
+        key, action = self.in_keys_inv[0], input_spec["full_action_spec"][self.in_keys_inv[0]]
+        if action.shape[-1] != 3:
+            raise ValueError(
+                "DeclareArrival needs an environment whose action has a third number that declares the arrival, such "
+                f"as GeomagneticNavEnv(arrival='declared'); {key!r} is {tuple(action.shape)}"
+            )
+        observed = observed_spec(self)
+        estimates = {key: observed[key] for key in self.way_keys if key in observed.keys(True, True)}
+        input_spec = with_state(input_spec, estimates)
+        low, high = action.space.low[..., :2], action.space.high[..., :2]
+        input_spec["full_action_spec"][key] = Bounded(low, high, low.shape, device=action.device, dtype=action.dtype)
+        return input_spec
+
+
+def _check_frame(frame: str) -> None:
+    if frame not in FRAMES:
+        raise ValueError(f"frame must be one of {FRAMES}, got {frame!r}")
 
 
 def _turned(vectors: Tensor, heading: Tensor) -> Tensor:

@@ -107,7 +107,7 @@ def test_two_probing_legs_give_the_jacobian(turn: float) -> None:
         seen = {"field": reading, "target_field": start + 1, "heading": torch.tensor([turn * (step == 2)])}
         seen |= {"move": torch.tensor([10.0 * (step > 0), 0.0]), "step_count": torch.tensor([step])}
         navigator(TensorDict(seen).unsqueeze(0))
-        per_km = torch.tensor(navigator.scales, dtype=torch.float64).unsqueeze(-1) / 100
+        per_km = navigator.scales.unsqueeze(-1) / 100
         found.append(navigator.memory["mean"][0, :, 1:] * per_km)
     size = torch.tensor([0.004, 0.015, 4.0], dtype=torch.float64)
     assert (found[0] == 0).all()
@@ -160,7 +160,7 @@ def test_secant_on_two_elements_and_narrow_turns() -> None:
 
 
 def test_secant_weighs_its_readings_by_the_noise(env) -> None:
-    aware, unaware = (flown(env, noisy(Secant(noise=known), NOISE)) for known in (NOISE, (0.0, 0.0, 0.0)))
+    aware, unaware = (flown(env, noisy(Secant(sensor_std=known), NOISE)) for known in (NOISE, (0.0, 0.0, 0.0)))
     assert aware["success_rate"] >= 99.5
     assert aware["spl"] > 82
     assert unaware["spl"] < 70
@@ -171,12 +171,12 @@ def test_probes_are_longer_where_the_sensors_err() -> None:
     assert Secant().probe_km == probe_length((0.3, 0.0, 0.0)) == 0.5
     assert probe_length(NOISE) == pytest.approx(5 * (0.05 / 0.015) ** (2 / 3), rel=1e-12)
     assert probe_length((9.0, 0.05, 5.0)) == probe_length(NOISE)
-    assert Secant(noise=NOISE, probe_km=3.0).probe_km == 3.0
-    assert Secant(8.0, noise=NOISE).probe_km == 8.0  # no longer than the longest move
+    assert Secant(sensor_std=NOISE, probe_km=3.0).probe_km == 3.0
+    assert Secant(8.0, sensor_std=NOISE).probe_km == 8.0  # no longer than the longest move
 
 
 def test_mean_jacobian_needs_no_probes(env) -> None:
-    navigator = MeanJacobian(env.field, env.region.grid(21), noise=NOISE)
+    navigator = MeanJacobian(env.field, env.region.grid(21), sensor_std=NOISE)
     gradient = elements_gradient_at(env.field, env.region.grid(21)).reshape(-1, 3, 2)
     prior = navigator.prior(torch.zeros(5, 3, dtype=torch.float64))
     torch.testing.assert_close(prior.gradient, gradient.mean(0).expand(5, 3, 2))
@@ -241,7 +241,7 @@ def test_navigators_are_made_for_their_environment_and_noise(env) -> None:
         assert type(navigator) is kind
         assert navigator.max_move_km == 30
     assert make_navigator("secant", env, noise=NOISE).probe_km == probe_length(NOISE)
-    assert make_navigator("mean_jacobian", env, noise=NOISE).noise == list(NOISE)
+    assert make_navigator("mean_jacobian", env, noise=NOISE).sensor_std.tolist() == list(NOISE)
 
 
 @pytest.mark.parametrize("name", BLIND)
@@ -344,8 +344,8 @@ def test_bad_options_are_refused_with_their_value() -> None:
         ({"elements": ("D",)}, "'D'"),
         ({"elements": ("D", "D")}, "'D', 'D'"),
         ({"elements": ("D", "X")}, "'X'"),
-        ({"noise": (0.05, 0.05)}, r"noise.*\(0.05, 0.05\)"),
-        ({"noise": (0.05, -0.05, 5.0)}, r"noise.*-0\.05"),
+        ({"sensor_std": (0.05, 0.05)}, r"sensor_std.*\(0.05, 0.05\)"),
+        ({"sensor_std": (0.05, -0.05, 5.0)}, r"sensor_std.*-0\.05"),
     ):
         with pytest.raises(ValueError, match=message):
             Secant(**options)

@@ -23,7 +23,6 @@ from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Kalman, Secant
 from magrl.onboard import Onboard, VehicleStep, check_earth_jump, check_earth_reading, write_step
 from magrl.onboard.vehicle import LOST_SURPRISE
-from magrl.tracking import probability_below, probability_within
 from magrl.transforms import with_sensor_noise
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
@@ -66,8 +65,7 @@ def without_search(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """A navigator that is not told that it has not arrived, as on board."""
     if isinstance(policy, FieldPolicy):
         view = replace(policy.config.view, search=False)
-        noise, policy = policy.noise_std, FieldPolicy(replace(policy.config, view=view), policy.actor)
-        policy.noise_std = noise
+        policy = FieldPolicy(replace(policy.config, view=view), policy.actor)
     elif isinstance(policy, Kalman):
         policy.search = False
     return policy
@@ -76,9 +74,7 @@ def without_search(policy: TensorDictModuleBase) -> TensorDictModuleBase:
 # The same commands as in the environment
 
 
-@pytest.mark.parametrize(
-    ("name", "noise"), [("anywhere", NONE), ("secant", NONE), ("kalman", NONE), ("anywhere", NOISE), ("secant", NOISE)]
-)
+@pytest.mark.parametrize(("name", "noise"), [("anywhere", NONE), ("kalman", NONE), ("secant", NOISE)])
 def test_commands_are_those_of_the_environment(name: str, noise: tuple[float, float, float]) -> None:
     """Over a whole episode; with perfect sensors, the vehicle knows at its end, and not before, that it has arrived."""
     env = environment(noise)
@@ -122,10 +118,6 @@ def test_the_estimated_way_is_northward_and_eastward(navigator: str) -> None:
     again, turned = (v.step(*known[5][:3], known[5][3] + turn, 0.0) for v, turn in ((vehicle, 0.0), (other, 77.0)))
     assert turned.way_km == pytest.approx(again.way_km, abs=0.01)
     assert turned.way_covariance_km2[0] == pytest.approx(again.way_covariance_km2[0], rel=1e-3, abs=0.01)
-    (nn, ne), (en, ee) = turned.way_covariance_km2
-    assert ne == en
-    assert nn * ee > ne * ne
-    assert turned.error_km == pytest.approx(math.sqrt(nn + ee))
     restart(env)
     state = env.reset()
     for step in known[1:6]:
@@ -190,17 +182,11 @@ def test_a_refused_call_changes_nothing() -> None:
     ("values", "message"),
     [
         ((math.nan, 73.0, 15000.0, 0.0), r"declination \[deg\] must be a finite number from -180 up to 180, got nan"),
-        ((3.5, math.inf, 15000.0, 0.0), r"inclination \[deg\] must be a finite number from -90 up to 90, got inf"),
-        ((3.5, 73.0, "15000", 0.0), r"horizontal_intensity \[nT\] must be a finite number"),
         ((3.5, 73.0, 15000.0, math.nan), r"heading \[deg\] must be a finite number from -360 up to 360, got nan"),
-        ((3.5, 73.0, 15000.0, 0.0, math.inf), "distance must be 0"),
         ((3.5, 73.0, 15000.0, 0.0, 1.0), "distance must be 0"),
         ((3.5, 73.0, 15.0, 0.0), "looks like microtesla, and nanotesla are expected"),
-        ((3.5, 0.0, 31.0, 0.0), "looks like microtesla"),
         ((3.5, 73.0, 0.15, 0.0), "looks like gauss"),
-        ((3.5, 73.0, 60000.0, 0.0), "horizontal_intensity 60000 at an inclination of 73 deg is not possible"),
         ((0.061, 1.274, 15000.0, 0.0), "the inclination looks like radians, and degrees are expected"),
-        ((-0.2, -1.2, 18000.0, 0.0), "the inclination looks like radians"),
         ((3.5, 88.5, 1500.0, 0.0), "B_H 1500 nT is out of the range of the policy, 2000 to inf nT"),
     ],
 )
@@ -216,14 +202,10 @@ def test_first_readings_that_are_refused(values: tuple, message: str) -> None:
     ("values", "message"),
     [
         ((*HERE, 290.0, 30000.0), "distance 30000 km is longer than the longest move of this vehicle, 50 km"),
-        ((*HERE, 290.0, 56.0), "distance 56 km is longer"),
         ((*HERE, 290.0, -1.0), r"distance \[km\] must be a finite number from 0 on, got -1"),
-        ((*HERE, 400.0, 1.0), r"heading \[deg\] must be a finite number from -360 up to 360, got 400"),
         ((*HERE, math.radians(290.0), 1.0), "looks like radians: the vehicle was to steer 290.0 deg"),
-        ((*HERE, math.radians(-70.0), 1.0), "looks like radians"),
         ((3.5, 73.0, 21000.0, 290.0, 40.0), r"B_H changed from 15000 to 21000 nT over 40 km.*at most 4400 nT"),
         ((40.0, 73.0, 15000.0, 290.0, 20.0), "declination changed from 3.5 to 40 deg over 20 km"),
-        ((3.5, 60.0, 15000.0, 290.0, 20.0), "inclination changed from 73 to 60 deg over 20 km"),
     ],
 )
 def test_later_readings_that_are_refused(values: tuple, message: str) -> None:
@@ -271,20 +253,21 @@ def test_readings_all_over_the_earth_are_taken() -> None:
 @pytest.mark.parametrize("navigator", ["anywhere", "secant"])
 def test_a_log_in_radians_at_middle_latitudes_is_never_an_arrival(navigator: str) -> None:
     """A reading of 0.66 is possible at the magnetic equator; that it hardly changes along the way is not."""
-    field, vehicle = IGRF("2025-01-01"), Onboard(navigator)
-    place, target = torch.tensor([[26.0, 30.0]]), torch.tensor([[28.5, 32.0]])
+    field, vehicle, place, heading = IGRF("2025-01-01"), Onboard(navigator), [26.0, 30.0], 0.0
 
-    def reading(where: torch.Tensor) -> list[float]:
-        d, i, h = elements_at(field, where.double())[0].tolist()
+    def reading(place: list[float]) -> list[float]:
+        d, i, h = elements_at(field, torch.tensor(place, dtype=torch.float64)).tolist()
         return [math.radians(d), math.radians(i), h]
 
-    vehicle.start(reading(target))
-    command, moves = vehicle.step(*reading(place), 0.0), 0
-    while command.stop is None and moves < 12:
+    vehicle.start(reading([28.5, 32.0]))
+    command = vehicle.step(*reading(place), heading)
+    for _ in range(12):
         distance, heading = command.distance_km or 20.0, math.radians(command.heading_deg)
-        north, east = math.cos(heading), math.sin(heading) / math.cos(math.radians(place[0, 0].item()))
-        place, moves = place + distance / 111.2 * torch.tensor([[north, east]]), moves + 1
+        place[0] += distance / 111.2 * math.cos(heading)
+        place[1] += distance / 111.2 * math.sin(heading) / math.cos(math.radians(place[0]))
         command = vehicle.step(*reading(place), command.heading_deg, distance)
+        if command.stop:
+            break
     assert command.stop == "lost"
     assert "looks like radians" in command.reason
 
@@ -363,32 +346,14 @@ def test_out_of_range_on_the_way() -> None:
 # Confidence
 
 
-def test_probabilities_are_those_of_normal_errors() -> None:
-    generator = torch.Generator().manual_seed(0)
-    normal = torch.randn(200_000, 3, generator=generator, dtype=torch.float64)
-    first, target, estimate, std = (0.0, 60.0, 20000.0), (2.0, 58.0, 20500.0), (1.9, 58.1, 20480.0), (0.1, 0.1, 20.0)
-    errors = (torch.tensor(target) - torch.tensor(estimate)).double() + torch.tensor(std) * normal
-    share = ((errors / torch.tensor([2.0, 2.0, 500.0])).square().sum(-1) < 0.01).double().mean().item()
-    assert 0.3 < share < 0.9
-    assert probability_below(first, target, estimate, std, 0.01) == pytest.approx(share, abs=0.01)
-    covariance = torch.tensor([[100.0, 40.0], [40.0, 60.0]], dtype=torch.float64)
-    way = torch.tensor([15.0, -5.0], dtype=torch.float64)
-    ends = way + normal[:, :2] @ torch.linalg.cholesky(covariance).mT
-    share = (ends.norm(dim=-1) <= 20).double().mean().item()
-    assert probability_within(way, covariance, 20.0) == pytest.approx(share, abs=0.01)
-    across = (179.0, 60.0, 20000.0), (-179.0, 60.0, 20000.0)  # D through 180 degrees
-    near = {d: probability_below(*across, (d, 60.0, 20000.0), (1e-3, 0.0, 0.0), 0.01) for d in (-179.1, -179.5, 179.9)}
-    assert near == {-179.1: 1.0, -179.5: 0.0, 179.9: 0.0}
-
-
 @pytest.mark.parametrize(("arrival_km", "stop"), [(None, None), (25.0, None), (200.0, "arrived")])
 def test_the_rule_of_arrival(arrival_km: float | None, stop: str | None) -> None:
-    """At about 100 km from the destination, as flown before."""
+    """At about 150 km from the destination, as flown before."""
     target, known, _ = episode(Secant(), environment())
     vehicle = Onboard("secant", arrival_km=arrival_km)
     vehicle.start(target)
     command = [vehicle.step(*step) for step in known[:-3]][-1]
-    assert 40 < math.hypot(*command.way_km) < 150
+    assert 100 < math.hypot(*command.way_km) < 200
     assert command.stop == stop
 
 
@@ -398,40 +363,35 @@ def test_the_rule_of_arrival(arrival_km: float | None, stop: str | None) -> None
 def test_the_exported_step_is_the_vehicle_without_torchrl(tmp_path: Path) -> None:
     """Bit for bit over an episode, in a process that can import neither TorchRL nor tensordict nor magrl."""
     policy = load_pretrained("anywhere")
-    policy = FieldPolicy(replace(policy.config, view=replace(policy.config.view, zeta=0.02)), policy.actor)
     write_step(tmp_path / "step.pt2", policy)
-    vehicle = Onboard(policy, sensor_std=NOISE, zeta=0.02, confidence=1.0)
+    vehicle = Onboard(policy, sensor_std=NOISE, confidence=1.0)
     target, known, _ = episode(Secant(), environment(), limit=9)
     vehicle.start(target)
     commands = [vehicle.step(*step) for step in known]
-    assert not any(command.stop for command in commands)
     actions = [(command.distance_km, math.radians(command.turn_deg)) for command in commands]
-    content = {"known": known, "target": target, "sheet": (NOISE, NONE), "actions": actions}
-    content |= {"mean": vehicle._estimates["track_mean"][0], "way": [command.way_km for command in commands]}
-    torch.save(content, tmp_path / "episode.pt")
+    mean = vehicle._estimator.track.mean
+    torch.save({"known": known, "target": target, "actions": actions, "mean": mean}, tmp_path / "episode.pt")
     code = """
 import math, sys, torch
 for name in ("torchrl", "tensordict", "magrl"):
     sys.modules[name] = None
 module, episode = torch.export.load(sys.argv[1]).module(), torch.load(sys.argv[2])
-target, sheet = torch.tensor(episode["target"]), torch.tensor(episode["sheet"])
+target, accuracy = torch.tensor(episode["target"]), torch.tensor(((0.02, 0.02, 2.0), (0.0, 0.0, 0.0)))
 state = torch.tensor(0), torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3).clone(), torch.zeros(3)
-for (d, i, h, heading, distance), action, way in zip(episode["known"], episode["actions"], episode["way"]):
-    course = math.remainder(math.radians(heading), 2 * math.pi)
-    moved, ahead, _, *state = module(torch.tensor([d, i, h]), target, torch.tensor([distance, course]), sheet, *state)
+for (*reading, heading, distance), action in zip(episode["known"], episode["actions"]):
+    course = torch.tensor([distance, math.remainder(math.radians(heading), 2 * math.pi)])
+    moved, _, _, *state = module(torch.tensor(reading), target, course, accuracy, *state)
     assert torch.equal(moved, torch.tensor(action)), (moved, action)
-    north, east = (math.cos(course) * ahead[0] - math.sin(course) * ahead[1],
-                   math.sin(course) * ahead[0] + math.cos(course) * ahead[1])
-    assert abs(north - way[0]) < 1e-3 and abs(east - way[1]) < 1e-3
 assert torch.equal(state[1], episode["mean"])
 print(len(episode["actions"]), "equal")
 """
-    files = [str(tmp_path / name) for name in ("step.pt2", "episode.pt")]
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code, *files], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-W", "ignore", "-c", code, str(tmp_path / "step.pt2"), str(tmp_path / "episode.pt")]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.stdout.strip() == "10 equal", run.stderr
+
+
+def test_only_a_policy_that_reads_its_own_track_is_exported() -> None:
     with pytest.raises(ValueError, match=r"must read its own track \(TrackView\)"):
         VehicleStep(region_policy())
     with pytest.raises(ValueError, match=r"must end with \.pt2, got 'step\.onnx'"):
-        write_step("step.onnx", policy)
+        write_step("step.onnx", region_policy())

@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
-import pytest
 import torch
-from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
-from magrl.envs import GeomagneticNavEnv
-from magrl.tracking import VISITED, FieldTrack, Way, arrival_ellipse, unvisited, unvisited_yet, visit
-from magrl.transforms import SearchAim, SensorErrors, TrackGradient
+from magrl.tracking import VISITED, FieldTrack, Way, aim, arrival_ellipse, unvisited, unvisited_yet, visit
 
 LONG = torch.tensor([[36.0, 200.0], [200.0, 2500.0]])  # [km^2]: 6 km northward, 50 km eastward, correlated
 ELLIPSE = torch.diag(torch.tensor([1 / 20.0**2, 1 / 12.0**2]))
@@ -63,34 +56,11 @@ def test_the_ellipse_shrinks_with_the_uncertainty_of_the_gradient() -> None:
     torch.testing.assert_close(arrival_ellipse(track, torch.tensor([4.0]), (1.0,)), expected)
 
 
-def make_env(frame: str) -> TransformedEnv:
-    base = GeomagneticNavEnv(num_envs=64, seed=3, start_heading="random")
-    keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
-    errors = SensorErrors((0.02, 0.02, 2.0), bias=(0.3, 0.0, 0.0), seed=1)
-    return TransformedEnv(base, Compose(errors, TrackGradient(keys, frame=frame), SearchAim(zeta=0.01, frame=frame)))
-
-
-def test_specs() -> None:
-    check_env_specs(make_env("vehicle"), check_dtype=True)
-
-
-def test_both_frames_give_the_same_way() -> None:
-    torch.manual_seed(0)
-    actions = [make_env("world").rand_action()["action"] for _ in range(4)]
-    ways = {}
-    for frame in ("world", "vehicle"):
-        env = make_env(frame)
-        state = env.reset()
-        for action in actions:
-            state = env.step_mdp(env.step(state.set("action", action)))
-        ways[frame], heading = state["aim"], state["heading"].squeeze(-1)
-    cos, sin = torch.cos(heading), torch.sin(heading)
-    (north, east), turned = ways["world"].unbind(-1), ways["vehicle"]
-    expected = torch.stack((cos * north + sin * east, cos * east - sin * north), -1)
-    torch.testing.assert_close(turned, expected, rtol=1e-3, atol=0.1)
-
-
-@pytest.mark.parametrize("zeta", [0.0, -1.0, math.nan])
-def test_a_threshold_must_be_positive(zeta: float) -> None:
-    with pytest.raises(ValueError, match="zeta"):
-        SearchAim(zeta=zeta)
+def test_the_aim_is_searched_in_the_axes_of_the_way() -> None:
+    """Heading east, arrival within 20 km northward and 2 km eastward: a place 10 km north of the mean excludes it."""
+    track = FieldTrack(torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), torch.zeros(2, 3, 3))
+    axes, mean = torch.tensor([[0.0, 1.0], [-1.0, 0.0]]), torch.tensor([0.0, -30.0])  # forward, to the right
+    for north, expected in ((40.0, False), (51.0, True)):
+        visited = torch.tensor([[north, 0.0]])
+        found = aim(track, Way(mean, LONG), visited, torch.tensor([25.0, 2500.0]), (1.0, 1.0), axes)
+        assert torch.equal(found, mean) == expected

@@ -1,11 +1,10 @@
-"""TrackGradient: the filter in the TensorDict, against the pure functions, by row, in both frames, and elsewhere."""
+"""Transforms of a track: the filter in the TensorDict against the pure functions, by row, in both frames; search."""
 
 from __future__ import annotations
 
 import importlib
 import math
 import sys
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -17,35 +16,34 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from magrl import tracking
-from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario
+from magrl.envs import GeomagneticNavEnv, earth_scenario
 from magrl.field import elements_gradient_at
-from magrl.field.regional import RegionalField
 from magrl.geodesy import geodesic, wrap_angle
 from magrl.guidance import parallel_approach
 from magrl.tracking import FieldTrack, GradientPrior, curl_relation
-from magrl.transforms import FieldGradient, GradientHeading, SensorNoise, TrackGradient, TrueWay
+from magrl.transforms import (
+    DeclareArrival,
+    FieldGradient,
+    GradientHeading,
+    SearchAim,
+    SensorErrors,
+    SensorNoise,
+    TrackGradient,
+    TrueWay,
+)
+from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS
 
 sys.path.append(str(Path(__file__).parent.parent.parent / "docs" / "examples"))
 plume_env = importlib.import_module("plume_env")
 
-STATE = ("track_mean", "track_covariance")
+STATE = OUT_KEYS[:2]
 SCALES = torch.tensor(tracking.ELEMENT_SCALES)
-ESTIMATES = ("estimated_field", "estimated_gradient", "way", "way_covariance")
-NOISE = (0.02, 0.05, 3.0)
+STD = (0.02, 0.05, 3.0)
+NEXT = [("next", key) for key in OUT_KEYS]
 
 
-@cache
-def field() -> RegionalField:
-    return Scenario().build_field()
-
-
-def nav(num_envs: int = 3, **options: object) -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0} | options))
-
-
-def tracked(num_envs: int = 3, *, keys: tuple[str, ...] = (), **options: object) -> TransformedEnv:
-    names = ["field", "target_field", "move", "heading", *keys]
-    return TransformedEnv(nav(num_envs), TrackGradient(names, **options))
+def tracked(num_envs: int = 3, **options: object) -> TransformedEnv:
+    return TransformedEnv(GeomagneticNavEnv(num_envs=num_envs, seed=0), TrackGradient(**options))
 
 
 def flown(env: TransformedEnv, steps: int = 6) -> TensorDictBase:
@@ -53,16 +51,20 @@ def flown(env: TransformedEnv, steps: int = 6) -> TensorDictBase:
     return env.rollout(steps, break_when_any_done=False)
 
 
+def stepped(track: TrackGradient, first: TensorDict, after: TensorDict) -> TensorDictBase:
+    """The estimates after a first reading and one move."""
+    return track(track(first.clone()).set("next", after.clone()))["next"]
+
+
 def test_the_estimates_are_those_of_the_pure_functions() -> None:
-    rollout = flown(tracked(noise_std=NOISE))
+    rollout = flown(tracked(sensor_std=STD))
     reading = rollout["field"][:, 0]
-    prior = tracking.dipole_prior(reading)
-    track = tracking.start(reading, prior.gradient, prior.std, NOISE, prior.azimuth)
+    track = tracking.start(reading, tracking.dipole_prior(reading), STD)
     for step in rollout["next"].unbind(1):
-        heading = step["heading"]
-        d = step["move"][:, :1] * torch.cat((heading.cos(), heading.sin()), -1)
+        north, east = torch.cos(step["heading"]), torch.sin(step["heading"])
+        leg = step["move"][:, :1] * torch.cat((north, east), -1)
         curvature = tracking.field_curvature(track.mean[..., 0] * SCALES)
-        track = tracking.update(tracking.predict(track, d, curvature), step["field"], NOISE)
+        track = tracking.update(tracking.predict(track, leg, curvature), step["field"], STD)
         known, shared = tracking.relate(track, tracking.curl_relation(track.mean[..., 0] * SCALES))
         way = tracking.way_to(known, step["target_field"], 300.0, shared=shared)
         torch.testing.assert_close(FieldTrack(*(step[key] for key in STATE)), track)
@@ -71,23 +73,22 @@ def test_the_estimates_are_those_of_the_pure_functions() -> None:
         torch.testing.assert_close((step["way"], step["way_covariance"]), tuple(way), rtol=1e-4, atol=1e-3)
 
 
-def test_a_constant_error_is_a_key() -> None:
-    keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
-    first = first_reading()
-    first["sensor_std"] = torch.tensor(NOISE, dtype=first["field"].dtype).expand_as(first["field"])
-    first["bias_std"] = 10 * first["sensor_std"]
-    biased, plain = TrackGradient(keys)(first.clone()), TrackGradient(keys[:5])(first.clone())
+@pytest.mark.parametrize("row", [0, 1])
+def test_standard_deviations_may_be_keys(row: int) -> None:
+    """Each row has its own; a constant error widens the way and leaves the rest as it is."""
+    rows = torch.tensor(STD, dtype=torch.float64) * torch.tensor([[1.0], [4.0]], dtype=torch.float64)
+    first = first_reading(2).update({"sensor_std": rows, "bias_std": 10 * rows})
+    after = moved(first, 40.0, 0.3, torch.tensor((0.3, 0.5, 60.0), dtype=torch.float64))
+    after.update({"sensor_std": rows, "bias_std": 10 * rows})
+    plain, biased = (stepped(TrackGradient((*IN_KEYS, *STD_KEYS[:count])), first, after)[row] for count in (1, 2))
+    alone = stepped(TrackGradient(sensor_std=rows[row].tolist()), first, after)[row]
+    for key in OUT_KEYS:
+        torch.testing.assert_close(plain[key], alone[key], msg=key)
     for key in (*STATE, "estimated_gradient"):
         assert torch.equal(biased[key], plain[key])
-    known, shared = tracking.relate(FieldTrack(*(plain[key] for key in STATE)), tracking.curl_relation(first["field"]))
-    way = tracking.way_to(known, first["target_field"], 300.0, shared=shared, bias_std=first["bias_std"])
+    known, shared = tracking.related(FieldTrack(*(plain[key] for key in STATE)), curl_relation)
+    way = tracking.way_to(known, after["target_field"][row], 300.0, shared=shared, bias_std=10 * rows[row])
     torch.testing.assert_close((biased["way"], biased["way_covariance"]), tuple(way))
-
-
-def test_the_first_estimate_is_the_reading_and_the_prior() -> None:
-    first = TrackGradient(relation=None)(first_reading())
-    torch.testing.assert_close(first["estimated_field"], first["field"])
-    torch.testing.assert_close(first["estimated_gradient"], tracking.dipole_prior(first["field"]).gradient)
 
 
 def test_the_estimated_gradient_obeys_the_relation() -> None:
@@ -104,7 +105,7 @@ def test_without_noise_it_finds_gradient_and_target() -> None:
     env = tracked(64, range_km=1000.0)
     start = flown(env, 12)[:, -1]
     after = start["next"]
-    true = elements_gradient_at(field(), after["position"]).float()
+    true = elements_gradient_at(env.base_env.field, after["position"]).float()
     scale = SCALES.unsqueeze(-1) / tracking.DISTANCE_SCALE_KM
     assert ((after["estimated_gradient"] - true) / scale).norm(dim=(-2, -1)).median() < 0.1
     way_km, bearing = geodesic(*after["position"].T, *after["target_position"].T)
@@ -117,32 +118,25 @@ def test_partial_reset_restarts_the_chosen_rows_alone() -> None:
     td = flown(env, 3)[:, -1]["next"]
     chosen = torch.tensor([True, False, False, True])
     after = env.reset(td.clone().set("_reset", chosen.unsqueeze(-1)))
-    expected = TrackGradient()(after.select("field", "target_field", "move", "heading"))
-    for key in (*STATE, *ESTIMATES):
+    expected = TrackGradient()(after.select(*IN_KEYS))
+    for key in OUT_KEYS:
         assert torch.equal(after[key][~chosen], td[key][~chosen]), key
         torch.testing.assert_close(after[key][chosen], expected[key][chosen], msg=key)
         assert not torch.equal(after[key][chosen], td[key][chosen]), key
 
 
-def test_a_step_depends_on_its_tensordict_alone() -> None:
-    """As stored data are stepped again, by another transform."""
-    rollout = flown(tracked(noise_std=NOISE))
-    again = TrackGradient(noise_std=NOISE)(rollout.exclude(*(("next", key) for key in (*STATE, *ESTIMATES))))
-    for key in (*STATE, *ESTIMATES):
-        torch.testing.assert_close(again["next", key], rollout["next", key], msg=key)
-    env, other = tracked(), tracked()
-    state = step_mdp(flown(env)[:, -1].clone())
-    state["action"] = torch.tensor([30.0, 0.5]).expand(3, 2)
-    for key in (*STATE, *ESTIMATES):
-        assert torch.equal(env.step(state.clone())["next", key], other.step(state.clone())["next", key]), key
-
-
-def test_nothing_but_its_inputs_is_read() -> None:
-    """Privileged keys among them: they may be anything."""
-    rollout = flown(tracked(noise_std=NOISE))
-    public = [*STATE, *(("next", key) for key in ("field", "target_field", "move", "heading"))]
-    again = TrackGradient(noise_std=NOISE)(rollout.select(*public))
-    torch.testing.assert_close(again["next", "way"], rollout["next", "way"])
+def test_a_step_depends_on_its_state_and_public_keys_alone() -> None:
+    """As stored data are stepped again, by another transform; compiled as one graph, too."""
+    rollout, transform = flown(tracked(sensor_std=STD, frame="vehicle")), TrackGradient(sensor_std=STD, frame="vehicle")
+    known = rollout.select(*STATE, *(("next", key) for key in IN_KEYS))
+    torch.compiler.reset()
+    compiled = torch.compile(transform, fullgraph=True, backend="aot_eager")
+    for again, tolerance in ((transform(known.clone()), 1e-5), (compiled(known.clone()), 1e-4)):
+        for key in NEXT:
+            torch.testing.assert_close(again[key], rollout[key], rtol=tolerance, atol=tolerance, msg=str(key))
+    state = step_mdp(rollout[:, -1].clone()).set("action", torch.tensor([30.0, 0.5]).expand(3, 2))
+    one, two = (tracked(frame="vehicle").step(state.clone()) for _ in range(2))
+    assert all(torch.equal(one[key], two[key]) for key in NEXT)
 
 
 def test_the_frame_of_the_vehicle_by_hand() -> None:
@@ -156,16 +150,7 @@ def test_the_frame_of_the_vehicle_by_hand() -> None:
     torch.testing.assert_close(vehicle["estimated_gradient"], torch.stack((slope[..., 1], -slope[..., 0]), -1))
 
 
-def test_the_frame_of_the_vehicle_turns_nothing_else() -> None:
-    world, vehicle = (flown(tracked(frame=frame))["next"] for frame in ("world", "vehicle"))
-    for key in (*STATE, "estimated_field"):
-        assert torch.equal(world[key], vehicle[key]), key
-    torch.testing.assert_close(world["way"].norm(dim=-1), vehicle["way"].norm(dim=-1))
-    torch.testing.assert_close(*(torch.linalg.det(td["way_covariance"]) for td in (world, vehicle)))
-    assert not torch.allclose(world["way"], vehicle["way"])
-
-
-@pytest.mark.parametrize("turn", [171.5, -188.0, 360.0])
+@pytest.mark.parametrize("turn", [171.5, 360.0])
 def test_a_declination_that_crosses_180_degrees_is_continued(turn: float) -> None:
     """The zero of D does not matter: only the prior follows it, which is turned back here."""
 
@@ -181,8 +166,7 @@ def test_a_declination_that_crosses_180_degrees_is_continued(turn: float) -> Non
     first = first_reading(64)
     after = moved(first, 40.0, 0.3, torch.tensor((-0.8, 0.5, 60.0), dtype=torch.float64))
     one, two = TrackGradient(relation=None), TrackGradient(relation=None, prior=turned_back)
-    steps = TensorDict(one(first.clone()), batch_size=64).set("next", after)
-    plain, other = one(steps)["next"], two(two(shifted(first)).set("next", shifted(after)))["next"]
+    plain, other = stepped(one, first, after), stepped(two, shifted(first), shifted(after))
     for key in ("estimated_gradient", "way", "way_covariance"):
         torch.testing.assert_close(other[key], plain[key], rtol=1e-8, atol=1e-8, msg=key)
     torch.testing.assert_close(
@@ -196,60 +180,29 @@ def test_a_declination_that_crosses_180_degrees_is_continued(turn: float) -> Non
 
 
 def test_other_elements_are_not_wrapped() -> None:
-    plain = TrackGradient(angles=())
-    steps = plain(first_reading()).set(
-        "next", moved(first_reading(), 1.0, 0.0, torch.tensor((0.0, 400.0, 0.0)).double())
-    )
-    assert (plain(steps)["next", "estimated_field"][:, 1] > 180).all()
+    after = moved(first_reading(), 1.0, 0.0, torch.tensor((0.0, 400.0, 0.0)).double())
+    assert (stepped(TrackGradient(angles=()), first_reading(), after)["estimated_field"][:, 1] > 180).all()
 
 
-def test_the_data_sheet_may_be_a_key() -> None:
-    rows = torch.tensor(NOISE, dtype=torch.float64) * torch.tensor([[1.0], [4.0]], dtype=torch.float64)
-    first = first_reading(2).set("sensor_std", rows)
-    after = moved(first, 40.0, 0.3, torch.tensor((0.3, 0.5, 60.0), dtype=torch.float64)).set("sensor_std", rows)
-    read = TrackGradient(["field", "target_field", "move", "heading", "sensor_std"])
-    both = read(read(first.clone()).set("next", after))["next"]
-    for row, std in enumerate(rows.tolist()):
-        alone = TrackGradient(noise_std=std)
-        expected = alone(alone(first.clone()).set("next", after.clone()))["next"]
-        for key in (*STATE, *ESTIMATES):
-            torch.testing.assert_close(both[key][row], expected[key][row], msg=key)
-
-
-def test_a_step_is_compiled_whole() -> None:
-    torch.compiler.reset()
-    transform = TrackGradient(noise_std=NOISE, frame="vehicle")
-    rollout = flown(tracked(noise_std=NOISE)).exclude(*(("next", key) for key in (*STATE, *ESTIMATES)))
-    expected = transform(rollout.clone())
-    found = torch.compile(transform, fullgraph=True, backend="aot_eager")(rollout)
-    for key in (*STATE, *ESTIMATES):
-        torch.testing.assert_close(found["next", key], expected["next", key], rtol=1e-4, atol=1e-4, msg=key)
-
-
-def test_a_step_without_its_state_is_refused() -> None:
-    first = first_reading()
-    with pytest.raises(KeyError, match=r"track_mean.*track_covariance.*reset\(\) or step_mdp\(\)"):
-        TrackGradient()(first.set("next", first.clone()))
-
-
-def test_shapes_that_do_not_match_are_refused() -> None:
-    for keys, message in (
-        (("move", "target_field", "move", "heading"), r"same shape.*\(3, 2\)"),
-        (("field", "target_field", "move", "move"), r"heading \(3, 1\), got \(3, 2\)"),
-        (("field", "target_field", "move", "heading", "position"), r"same shape"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            _ = TransformedEnv(nav(), TrackGradient(keys)).specs
-    with pytest.raises(ValueError, match=r"an element for each of its scales"):
-        _ = TransformedEnv(nav(), TrackGradient(scales=(1.0, 1.0), curvature=(1.0, 1.0))).specs
-
-
-@pytest.mark.parametrize("frame", ["world", "vehicle"])
-def test_specs_in_a_chain(frame: str) -> None:
-    env = TransformedEnv(nav(), Compose(TrackGradient(frame=frame)))
-    check_env_specs(env, break_when_any_done="both")
-    assert set(STATE) <= set(env.full_state_spec.keys())
-    assert not set(ESTIMATES) & set(env.full_state_spec.keys())
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"in_keys": ("move", "target_field", "move", "heading")}, r"same shape.*\(3, 2\)"),
+        ({"in_keys": ("field", "target_field", "move", "move")}, r"heading \(3, 1\), got \(3, 2\)"),
+        ({"in_keys": (*IN_KEYS, "position")}, "same shape"),
+        ({"scales": (1.0, 1.0), "curvature": (1.0, 1.0)}, "an element for each of its scales"),
+        ({"in_keys": IN_KEYS[:3]}, "4 to 6 in_keys"),
+        ({"in_keys": (*IN_KEYS, "sensor_std"), "sensor_std": STD}, "give sensor_std or its key"),
+        ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std must be a finite number from 0 on, got -0.1"),
+        ({"scales": (1.0, 0.0, 1.0)}, "scales must be a finite number above 0, got 0.0"),
+        ({"angles": (3,)}, r"angles must be indices of the 3 elements, got \(3,\)"),
+        ({"frame": "ship"}, r"frame must be one of .* got 'ship'"),
+        ({"relation": 1.0}, "relation one or None"),
+    ],
+)
+def test_bad_options_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _ = tracked(**options).specs
 
 
 def tracer_prior(reading: Tensor) -> GradientPrior:
@@ -286,7 +239,7 @@ def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
     docs/theory.md quotes these numbers.
     """
     scenario = earth_scenario(16, seed=5, max_latitude=70)
-    keys = ("field", "target_field", "move", "heading", "sensor_std")
+    keys = (*IN_KEYS, "sensor_std")
     medians = []
     for std in ((0.0, 0.0, 0.0), (0.05, 0.05, 5.0)):
         for relation in (None, curl_relation):
@@ -300,3 +253,44 @@ def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
             angles = [torch.atan2(after[key][:, 1], after[key][:, 0]) for key in ("way", "true_way")]
             medians.append(wrap_angle(angles[0] - angles[1]).abs().rad2deg().median().item())
     assert medians == pytest.approx([48.0, 19.0, 49.0, 33.0], abs=1.0)  # of chance, 90
+
+
+# The search
+
+
+def searching(frame: str) -> TransformedEnv:
+    base = GeomagneticNavEnv(num_envs=64, seed=3, start_heading="random")
+    errors = SensorErrors((0.02, 0.02, 2.0), bias=(0.3, 0.0, 0.0), seed=1)
+    track = TrackGradient((*IN_KEYS, *STD_KEYS), frame=frame)
+    return TransformedEnv(base, Compose(errors, track, SearchAim(zeta=0.01, frame=frame)))
+
+
+def test_specs() -> None:
+    env = searching("vehicle")
+    check_env_specs(env, break_when_any_done="both")
+    state = {*STATE, "visited", "arrival_weights"}
+    assert state == {*OUT_KEYS, "aim", "visited", "arrival_weights"} & set(env.full_state_spec.keys())
+
+
+def test_both_frames_give_the_same_way() -> None:
+    torch.manual_seed(0)
+    actions = [searching("world").rand_action()["action"] for _ in range(4)]
+    ways = {}
+    for frame in ("world", "vehicle"):
+        env = searching(frame)
+        state = env.reset()
+        for action in actions:
+            state = env.step_mdp(env.step(state.set("action", action)))
+        ways[frame], heading = state["aim"], state["heading"].squeeze(-1)
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    (north, east), turned = ways["world"].unbind(-1), ways["vehicle"]
+    expected = torch.stack((cos * north + sin * east, cos * east - sin * north), -1)
+    torch.testing.assert_close(turned, expected, rtol=1e-3, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: SearchAim(zeta=0.0), lambda: SearchAim(zeta=0.01, frame="ship"), lambda: DeclareArrival(-1.0)]
+)
+def test_bad_thresholds_and_frames_are_refused(make) -> None:
+    with pytest.raises(ValueError, match="must be"):
+        make()

@@ -1,0 +1,177 @@
+"""The observation of an agent without a map: its 15 numbers, its frame, its state, and the policy that reads it."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from support.environments import parallel
+from support.readings import first_reading, moved
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
+from magrl.envs import GeomagneticNavEnv
+from magrl.files import save_tensors
+from magrl.guidance import OBJECTIVE_FLOORS
+from magrl.transforms import ObservationView, SensorNoise, TrackGradient, TrackView
+from magrl.transforms.track import IN_KEYS, STD_KEYS
+from magrl.transforms.views import track_observation
+
+VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
+STD = (0.05, 0.1, 5.0)
+float64 = partial(torch.tensor, dtype=torch.float64)
+nav = partial(GeomagneticNavEnv, num_envs=4, seed=0)
+
+
+def observing(base: GeomagneticNavEnv | None = None) -> TransformedEnv:
+    """The environment that an agent is trained in, without what is for training alone."""
+    steps = (SensorNoise(STD, seed=1), *VIEW.observation_transforms(), VIEW.action_transform())
+    return TransformedEnv(base or nav(), Compose(*steps))
+
+
+def policy() -> FieldPolicy:
+    torch.manual_seed(0)
+    return FieldPolicy(PolicyConfig(VIEW, (16, 16)))
+
+
+def by_hand(**change: Tensor) -> Tensor:
+    values = {
+        "way": float64([30.0, 40.0]),
+        "way_covariance": float64([[400.0, 100.0], [100.0, 1600.0]]),
+        "gradient": float64([[0.01, 0.0], [0.0, 0.02], [1.0, 1.0]]),
+        "remaining": float64([0.1, -0.2, 3.0]),
+        "weights": float64([100.0, 25.0, 0.01]),
+        "sensor_std": float64([0.1, 0.0, 5.0]),
+        "time": float64([0.3]),
+    }
+    return track_observation(**(values | change))
+
+
+def test_the_numbers_by_hand() -> None:
+    """A way of 50 km; standard deviations of 20 and 40 km; the ellipse [[.02, .01], [.01, .02]]; F of 2.09."""
+    expected = [
+        *(0.6, 0.8),  # direction
+        *(math.log(3.5) - 2, 50 / 400 - 0.5),  # length
+        *(0.0, math.log(2) / 2, 100 / 800),  # standard deviations over 20 km, and their correlation
+        *[math.log(20 * math.sqrt(0.02)) / 2] * 2,  # axes of the ellipse
+        0.5,  # their correlation
+        math.log(2.1) / 3 - 0.5,  # F over the threshold
+        0.3,  # time
+        *(math.log(0.1) / 2 + 2, math.log(0.002) / 2 + 2, math.log(0.05) / 2 + 2),  # noise
+    ]
+    torch.testing.assert_close(by_hand(), float64(expected))
+    assert len(expected) == VIEW.size
+
+
+def test_numbers_at_the_extremes() -> None:
+    """No way, no uncertainty, no gradient; and a way beyond all measure, whose direction is still seen."""
+    flat = by_hand(way=torch.zeros(2), way_covariance=torch.zeros(2, 2), gradient=torch.zeros(3, 2))
+    assert flat.isfinite().all()
+    assert flat[:2].tolist() == [0.0, 0.0]
+    far = by_hand(way=float64([0.0, -1e6]))
+    assert (far[1], far[3]) == (-1.0, 2500 / 400 - 0.5)
+
+
+def observed_track(turn: float) -> Tensor:
+    """The observations of three readings, with world and vehicle turned by an angle [rad] to the right.
+
+    Without the relation of the gradients, in which true north has a meaning: the meridians converge there.
+    """
+    track = TrackGradient((*IN_KEYS, "sensor_std"), relation=None, range_km=VIEW.range_km, frame="vehicle")
+    observe = Compose(track, *VIEW.observation_transforms()[1:])
+    state, seen, observations = None, first_reading(), []
+    seen["heading"] += turn
+    for key in ("field", "target_field"):
+        seen[key][:, 0] += math.degrees(turn)
+    for step in range(3):
+        for key in ("field", "target_field"):
+            seen[key][:, 0] = torch.remainder(seen[key][:, 0] + 180, 360) - 180
+        seen["sensor_std"], seen["step_count"] = float64(STD).expand(4, 3), torch.full((4, 1), step)
+        state = observe(seen.clone()) if state is None else observe(state.copy().set("next", seen.clone()))["next"]
+        observations.append(state["observation"])
+        seen = moved(seen, 40.0, 0.7, float64([0.3, 0.4, -60.0]) / (1 + step))
+    return torch.stack(observations)
+
+
+@pytest.mark.parametrize("turn", [0.5, 3.0])
+def test_a_turn_of_world_and_vehicle_is_not_observed(turn: float) -> None:
+    """D turns with the world, and for the last angle passes 180 degrees."""
+    plain = observed_track(0.0)
+    torch.testing.assert_close(observed_track(turn), plain, rtol=1e-9, atol=1e-9)
+    assert (plain[1:] - plain[:-1]).abs().amax(-1).min() > 0.01
+
+
+def test_weights_are_those_of_the_first_reading_of_each_row() -> None:
+    env = observing()
+    td = env.rollout(3, break_when_any_done=False)[:, -1]["next"]
+    chosen = torch.tensor([True, False, False, True])
+    after = env.reset(td.clone().set("_reset", chosen.unsqueeze(-1)))
+    first = Compose(*VIEW.observation_transforms())(after.select(*VIEW.in_keys, *STD_KEYS))
+    for key in ("observation", "first_field"):
+        assert torch.equal(after[key][~chosen], td[key][~chosen]), key
+        torch.testing.assert_close(after[key][chosen], first[key][chosen], rtol=1e-5, atol=1e-4, msg=key)
+    nexts = env.step(env.rand_action(after))["next"]
+    assert torch.equal(nexts["first_field"], torch.where(chosen.unsqueeze(-1), after["field"], td["first_field"]))
+    least, remaining = torch.tensor(OBJECTIVE_FLOORS), nexts["target_field"] - nexts["estimated_field"]
+    weights = (nexts["first_field"] - nexts["target_field"]).abs().maximum(least).square().reciprocal() / VIEW.zeta
+    expected = torch.log((weights * remaining.square()).sum(-1) + 1e-2) / 3 - 0.5
+    torch.testing.assert_close(nexts["observation"][:, 10], expected, rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(nexts["observation"][:, 11], torch.where(chosen, 1, 4) / 50)
+
+
+@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
+def test_specs_in_other_processes() -> None:
+    env = parallel(observing)
+    try:
+        check_env_specs(env)
+        assert {"first_field", "observation"} & set(env.full_state_spec.keys()) == {"first_field"}
+    finally:
+        env.close()
+
+
+def test_policy_acts_alike_in_the_plain_and_in_the_training_environment() -> None:
+    """Over episodes of different lengths, whose vehicles start again at different steps."""
+    agent, make = policy(), partial(nav, num_envs=16, zeta=2.5, max_steps=9, start_heading="random")
+    with torch.no_grad():
+        one = TransformedEnv(make(), SensorNoise(STD, seed=1)).rollout(20, agent, break_when_any_done=False)
+        other = observing(make()).rollout(20, agent.actor, break_when_any_done=False)
+    ended = one["next", "done"].squeeze(-1)
+    assert ended.any(0).sum() > 5
+    assert not ended.all(0).any()
+    assert torch.equal(one["next", "done"], other["next", "done"])
+    torch.testing.assert_close(one["next", "position"], other["next", "position"], rtol=0, atol=1e-9)
+
+
+def test_policy_starts_again_where_the_batch_is_another(tmp_path: Path) -> None:
+    """In the middle of an episode, too: what it kept is of other vehicles. So does one from a file."""
+    agent, middle = policy(), nav(num_envs=2).rollout(3)[:, -1]
+    save_policy(tmp_path / "policy.pt", agent)
+    nav(num_envs=5).rollout(3, agent)
+    expected = policy()(middle.clone())["action"]
+    for found in (agent, load_policy(tmp_path / "policy.pt")):
+        found.check_fits(nav())
+        assert torch.equal(found(middle.clone())["action"], expected)
+
+
+@pytest.mark.parametrize("change", [{"kind": "region"}, {"kind": "map"}, {"memory_size": 4}, {"view": {"zeta": 0.01}}])
+def test_a_file_of_another_kind_is_refused(tmp_path: Path, change: dict) -> None:
+    path = tmp_path / "policy.pt"
+    save_policy(path, policy())
+    content: TensorDictBase = torch.load(path, weights_only=True)
+    save_tensors(content | {"config": content["config"] | change}, path)
+    with pytest.raises(ValueError, match="does not hold a valid policy"):
+        load_policy(path)
+
+
+def test_bad_bounds_of_a_view_are_refused() -> None:
+    options = {"observe_heading": True, "observe_difference": True, "max_move_km": 50.0, "max_turn_rad": 1.5}
+    with pytest.raises(ValueError, match=r"field_low \(1.0, 0.0, 0.0\) must lie below field_high"):
+        ObservationView(**options, field_low=(1.0, 0.0, 0.0), field_high=(1.0, 1.0, 1.0))
+    with pytest.raises(ValueError, match="max_turn_rad must be"):
+        ObservationView(**(options | {"max_turn_rad": 4.0}), field_low=(0.0,) * 3, field_high=(1.0,) * 3)
