@@ -66,8 +66,7 @@ def without_search(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """A navigator that is not told that it has not arrived, as on board."""
     if isinstance(policy, FieldPolicy):
         view = replace(policy.config.view, search=False)
-        noise, policy = policy.noise_std, FieldPolicy(replace(policy.config, view=view), policy.actor)
-        policy.noise_std = noise
+        policy = FieldPolicy(replace(policy.config, view=view), policy.actor)
     elif isinstance(policy, Kalman):
         policy.search = False
     return policy
