@@ -24,6 +24,7 @@ from magrl.field import FieldBank
 from magrl.transforms import ObservationView
 from magrl.transforms.errors.base import EpisodeErrors
 
+Keys = set[NestedKey]
 _EXAMPLES = {key: torch.zeros(1, size) for key, size in zip(PUBLIC_KEYS, (3, 3, 2, 1), strict=True)}
 _EXAMPLES["step_count"] = torch.zeros(1, 1, dtype=torch.int64)
 READ_KEYS = tuple(_EXAMPLES)
@@ -132,7 +133,6 @@ def rebuild(content: Any) -> ExportedPolicy:
     parts = {"in_keys", "program", "view"}
     if not isinstance(content, dict) or set(content) != parts:
         raise ValueError(f"an exported policy must hold exactly {', '.join(sorted(parts))}")
-    check_type(dict, program=content["program"])
     view = content["view"] and ObservationView(**content["view"])
     return ExportedPolicy(content["in_keys"], TensorProgram(**content["program"]), view)
 
@@ -198,18 +198,14 @@ class _Pipeline(nn.Module):
 
     def __init__(self, actor: TensorDictModuleBase, parts: Sequence[Transform], start: TensorDictBase) -> None:
         super().__init__()
-        needed, before = set(_keys(actor.in_keys)), list[Transform]()
-        for part in reversed(parts):
-            if needed & set(_keys(part.out_keys)):
-                needed = needed - set(_keys(part.out_keys)) | set(_keys(part.in_keys))
-                before.insert(0, part.to_observation_norm() if hasattr(part, "to_observation_norm") else part)
+        before, needed = _leading_to(_keys(actor.in_keys), reversed(parts), "out_keys", "in_keys")
         for key in sorted(needed - set(READ_KEYS), key=str):
-            reason = _reason(key, set(_keys(actor.out_keys)), set(start.keys(True, True)))
+            reason = _reason(key, _keys(actor.out_keys), set(start.keys(True, True)))
             raise ValueError(f"it reads {key!r}, {reason}; it may read {', '.join(READ_KEYS)}")
-        if not needed:
-            raise ValueError("it reads nothing")
         self.in_keys = [key for key in READ_KEYS if key in needed]
-        self.before, self.actor, self.after = nn.ModuleList(before), actor, nn.ModuleList(_of_action(parts))
+        fixed = (part.to_observation_norm() if hasattr(part, "to_observation_norm") else part for part in before)
+        self.before, self.actor = nn.ModuleList(fixed), actor
+        self.after = nn.ModuleList(_leading_to({"action"}, parts, "in_keys_inv", "out_keys_inv")[0])
         for module in self.modules():  # a switch in a buffer, as that of ObservationNorm, is no constant to a trace
             for name, switch in list(module.named_buffers(recurse=False)):
                 if switch.dtype == torch.bool and not switch.ndim:
@@ -223,14 +219,22 @@ class _Pipeline(nn.Module):
         return (_physical_action(seen, self.after),)
 
 
-def _of_action(parts: Sequence[Transform]) -> list[Transform]:
-    """Return the transforms that lead from the action of a policy to that of the environment, in their order."""
-    needed, found = set[NestedKey](["action"]), list[Transform]()
+def _leading_to(needed: Keys, parts: Iterable[Transform], written: str, read: str) -> tuple[list[Transform], Keys]:
+    """Return the transforms that compute some keys, in the order in which they act, and the keys that they start from.
+
+    Args:
+        needed: keys to compute.
+        parts: transforms, from the last to act to the first.
+        written: attribute that holds the keys that a transform writes.
+        read: attribute that holds the keys that it reads.
+    """
+    chain: list[Transform] = []
     for part in parts:
-        if needed & set(_keys(part.in_keys_inv)):
-            needed = needed - set(_keys(part.in_keys_inv)) | set(_keys(part.out_keys_inv))
-            found.insert(0, part)
-    return found
+        writes = _keys(getattr(part, written))
+        if needed & writes:
+            needed = needed - writes | _keys(getattr(part, read))
+            chain.insert(0, part)
+    return chain, needed
 
 
 def _physical_action(acted: TensorDictBase, transforms: Iterable[Any]) -> Tensor:
@@ -240,7 +244,7 @@ def _physical_action(acted: TensorDictBase, transforms: Iterable[Any]) -> Tensor
     return acted["action"]
 
 
-def _reason(key: NestedKey, written: set[NestedKey], known: set[NestedKey]) -> str:
+def _reason(key: NestedKey, written: Keys, known: Keys) -> str:
     """Return why a policy cannot read a key."""
     if key == "is_init" or unravel_key(("next", key)) in written:
         return "so it keeps a state from step to step"
@@ -249,8 +253,8 @@ def _reason(key: NestedKey, written: set[NestedKey], known: set[NestedKey]) -> s
     return "which the plain environment does not have" if key in known else "which no transform writes"
 
 
-def _keys(keys: Any) -> list[NestedKey]:
-    return [unravel_key(key) for key in keys or ()]
+def _keys(keys: Any) -> Keys:
+    return {unravel_key(key) for key in keys or ()}
 
 
 def _compare(policy: ExportedPolicy, steps: TensorDictBase, after: Iterable[Any]) -> None:

@@ -56,9 +56,7 @@ class PolicyConfig:
     memory_size: int = 0
 
     def __post_init__(self) -> None:
-        check_type((ObservationView, TrackView), view=self.view)
-        if self.memory_size:
-            check_type(ObservationView, **{"view of a policy with a memory": self.view})
+        check_type(ObservationView if self.memory_size else (ObservationView, TrackView), view=self.view)
         self.make_actor("meta")  # checks the sizes
 
     def make_actor(self, device: Device = None) -> TensorDictSequential:

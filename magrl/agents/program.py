@@ -119,7 +119,6 @@ def export_module(module: nn.Module, inputs: Sequence[Tensor]) -> torch.export.E
         (tensor([[-1.],
                 [-1.]]),)
     """
-    check_type(nn.Module, module=module)
     examples = tuple(value[:1].expand(_EXAMPLES, *value.shape[1:]).clone() for value in inputs)
     batch = torch.export.Dim("batch")
     validated = Distribution._validate_args  # which reads values, and a trace has none

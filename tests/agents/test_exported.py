@@ -228,7 +228,7 @@ class Touch:
         (lambda c: c["program"]["tensors"].__setitem__(0, 5), "tensor 0 must be a Tensor, got 5"),
         (lambda c: c["program"].update(outputs=[10**6]), "outputs must be numbers of values"),
         (lambda c: c["program"].update(more=1), "more"),
-        (lambda c: c.update(program=None), "program must be a dict, got None"),
+        (lambda c: c.update(program=None), "must be a mapping, not NoneType"),
         (lambda c: c.update(in_keys=["position"]), "in_keys must be among field, target_field"),
         (lambda c: c.update(in_keys=["field"]), "a program for 1 keys must take that many inputs"),
         (lambda c: c.update(view={"field_low": 1}), "does not hold a valid policy"),

@@ -264,7 +264,7 @@ def test_save_and_load_give_the_same_actions(tmp_path: Path) -> None:
         ({"kind": "region"}, "does not hold a valid policy"),
         ({"kind": "map"}, r"a kind of \['region', 'track'\]"),
         ({"kind": None}, r"a kind of \['region', 'track'\]"),
-        ({"memory_size": 4}, "view of a policy with a memory must be a ObservationView"),
+        ({"memory_size": 4}, "view must be a ObservationView"),
         ({"view": {"zeta": 0.01}}, "does not hold a valid policy"),
     ],
 )
