@@ -1,6 +1,7 @@
 """Trained policies as navigators of the plain environment, and their files."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -75,7 +76,7 @@ def test_save_and_load_give_the_same_actions(env, tmp_path: Path, layer_norm: bo
         assert torch.equal(loaded(state.clone())["action"], policy(state.clone())["action"])
 
 
-def config(**change) -> dict:
+def config(**change) -> Callable:
     return lambda content: content | {"config": content["config"] | change}
 
 
