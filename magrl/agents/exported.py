@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,26 +14,46 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from magrl.agents.program import TensorProgram, export_module, trace_program
 from magrl.checks import check_finite, check_type
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
+from magrl.field import FieldBank
 from magrl.transforms import ObservationView
 from magrl.transforms.errors.base import EpisodeErrors
 
-READ_KEYS = (*PUBLIC_KEYS, "step_count")
+Keys = set[NestedKey]
+_EXAMPLES = {key: torch.zeros(1, size) for key, size in zip(PUBLIC_KEYS, (3, 3, 2, 1), strict=True)}
+_EXAMPLES["step_count"] = torch.zeros(1, 1, dtype=torch.int64)
+READ_KEYS = tuple(_EXAMPLES)
 """Keys of the plain environment that an exported policy may read."""
-_DTYPES = {"step_count": torch.int64}
-_SIZES = {"field": 3, "target_field": 3, "move": 2, "heading": 1, "step_count": 1}
 CHECKED_STEPS = 6
 """Steps of the flight on which an export is compared with the policy."""
 TOLERANCE = 1e-4
 """Largest difference of their actions, relative or in km and rad: float32 operations in another order."""
 
 
-class ExportedPolicy(TensorDictModuleBase):
+class TrainedPolicy(TensorDictModuleBase):
+    """Base class of trained policies: from public keys of the plain environment to an action in km and rad."""
+
+    out_keys: ClassVar[list[str]] = ["action"]
+    view: Any
+    """What the policy observes, with the range of the field where it was trained, if it was trained in one region."""
+
+    def check_fits(self, env: GeomagneticNavEnv) -> None:
+        """Raise unless the field of an environment is within what the policy was trained in.
+
+        Raises:
+            ValueError: naming the element and both ranges.
+        """
+        check_type(GeomagneticNavEnv, env=env)
+        if isinstance(self.view, ObservationView):
+            self.view.check_covers(env.field, env.region.grid(81).to(env.device))
+
+
+class ExportedPolicy(TrainedPolicy):
     """A trained policy of any algorithm, from the keys of the plain environment to an action in km and rad.
 
     :func:`export_policy` makes one. It acts without exploration and keeps no state from step to step.
@@ -53,8 +73,6 @@ class ExportedPolicy(TensorDictModuleBase):
         >>> env.rollout(3, ExportedPolicy(["move"], halves))["action"].shape
         torch.Size([2, 3, 2])
     """
-
-    out_keys: ClassVar[list[str]] = ["action"]
 
     def __init__(self, in_keys: Sequence[str], program: TensorProgram, view: ObservationView | None = None) -> None:
         super().__init__()
@@ -76,14 +94,6 @@ class ExportedPolicy(TensorDictModuleBase):
         (action,) = self.program(*(seen[key] for key in self.in_keys))
         return tensordict.set("action", action.reshape(*tensordict.shape, -1))
 
-    def check_fits(self, env: GeomagneticNavEnv) -> None:
-        """Raise unless the field of an environment is within what the policy was trained in.
-
-        Raises:
-            ValueError: naming the element and both ranges.
-        """
-        check_fits(self.view, env)
-
     def write_torch(self, path: Path | str) -> None:
         """Write a file for :func:`torch.export.load`, which acts without magrl and TorchRL.
 
@@ -99,8 +109,7 @@ class ExportedPolicy(TensorDictModuleBase):
         """
         if Path(path).suffix != ".pt2":
             raise ValueError(f"a file for torch.export.load must end with .pt2, got {str(path)!r}")
-        examples = [torch.zeros(1, _SIZES[key], dtype=_DTYPES.get(key, torch.float32)) for key in self.in_keys]
-        file = io.BytesIO()
+        file, examples = io.BytesIO(), [_EXAMPLES[key] for key in self.in_keys]
         torch.export.save(export_module(copy.deepcopy(self.program).cpu(), examples), file)
         Path(path).write_bytes(file.getvalue())
 
@@ -124,30 +133,8 @@ def rebuild(content: Any) -> ExportedPolicy:
     parts = {"in_keys", "program", "view"}
     if not isinstance(content, dict) or set(content) != parts:
         raise ValueError(f"an exported policy must hold exactly {', '.join(sorted(parts))}")
-    check_type(dict, program=content["program"])
     view = content["view"] and ObservationView(**content["view"])
     return ExportedPolicy(content["in_keys"], TensorProgram(**content["program"]), view)
-
-
-def check_fits(view: ObservationView | None, env: GeomagneticNavEnv) -> None:
-    """Raise unless the field of an environment is within the range of the region that an agent was trained in.
-
-    Args:
-        view: range of that region; None for an agent of no region.
-        env: environment to fly in.
-
-    Raises:
-        ValueError: naming the element and both ranges.
-
-    Example:
-        >>> env = GeomagneticNavEnv(seed=0)
-        >>> check_fits(env.observation_view(), env)
-    """
-    check_type(GeomagneticNavEnv, env=env)
-    if view is not None:
-        if env.many:
-            raise ValueError(f"the policy was trained in one region, and cannot fly in {len(env.region)} regions")
-        view.check_covers(env.field, env.region.grid(81).to(env.device))
 
 
 def export_policy(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
@@ -185,7 +172,7 @@ def export_policy(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
 
 def _exported(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
     """Return an export that acts like the policy in the environment, both of which may change."""
-    parts = list(_transforms(env))
+    parts = _transforms(env)
     for part in parts:
         if hasattr(part, "to_observation_norm"):  # running statistics
             part.freeze()
@@ -193,26 +180,17 @@ def _exported(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
         start, base = env.reset(), getattr(env, "base_env", env)
         pipeline = _Pipeline(actor, parts, start)
         program = trace_program(pipeline, [start[key] for key in pipeline.in_keys])
-        view = None if base.many else base.observation_view()
-        policy = _reloaded(ExportedPolicy(pipeline.in_keys, program, view))
+        view = None if isinstance(base.field, FieldBank) else base.observation_view()
+        policy = ExportedPolicy(pipeline.in_keys, program, view)
         steps = env.rollout(min(base.max_steps, CHECKED_STEPS), actor, break_when_any_done=False)
-        _compare(policy, steps, parts)
+        _compare(policy, steps, pipeline.after)
     return policy
 
 
-def _transforms(env: EnvBase) -> Iterator[Transform]:
-    """Yield the transforms of an environment, from the plain environment outward."""
-    if isinstance(env, TransformedEnv):
-        yield from _transforms(env.base_env)
-        yield from _flat(env.transform)
-
-
-def _flat(transform: Transform) -> Iterator[Transform]:
-    if isinstance(transform, Compose):
-        for part in transform:
-            yield from _flat(part)
-    else:
-        yield transform
+def _transforms(env: EnvBase) -> list[Transform]:
+    """Return the transforms from the plain environment outward, without errors, which are of the world."""
+    skipped = (Compose, EpisodeErrors, InitTracker, TensorDictPrimer)
+    return [part for part in env.modules() if isinstance(part, Transform) and not isinstance(part, skipped)]
 
 
 class _Pipeline(nn.Module):
@@ -220,20 +198,14 @@ class _Pipeline(nn.Module):
 
     def __init__(self, actor: TensorDictModuleBase, parts: Sequence[Transform], start: TensorDictBase) -> None:
         super().__init__()
-        own = [part for part in parts if not isinstance(part, EpisodeErrors)]  # errors are of the world
-        needed, before = set(_keys(actor.in_keys)), list[Transform]()
-        for part in reversed(own):
-            if not isinstance(part, (InitTracker, TensorDictPrimer)) and needed & set(_keys(part.out_keys)):
-                needed = needed - set(_keys(part.out_keys)) | set(_keys(part.in_keys))
-                before.insert(0, part.to_observation_norm() if hasattr(part, "to_observation_norm") else part)
+        before, needed = _leading_to(_keys(actor.in_keys), reversed(parts), "out_keys", "in_keys")
         for key in sorted(needed - set(READ_KEYS), key=str):
-            reason = _reason(key, set(_keys(actor.out_keys)), set(start.keys(True, True)))
+            reason = _reason(key, _keys(actor.out_keys), set(start.keys(True, True)))
             raise ValueError(f"it reads {key!r}, {reason}; it may read {', '.join(READ_KEYS)}")
-        if not needed:
-            raise ValueError("it reads nothing")
         self.in_keys = [key for key in READ_KEYS if key in needed]
-        self.before, self.actor = nn.ModuleList(before), actor
-        self.after = nn.ModuleList(_of_action(own))
+        fixed = (part.to_observation_norm() if hasattr(part, "to_observation_norm") else part for part in before)
+        self.before, self.actor = nn.ModuleList(fixed), actor
+        self.after = nn.ModuleList(_leading_to({"action"}, parts, "in_keys_inv", "out_keys_inv")[0])
         for module in self.modules():  # a switch in a buffer, as that of ObservationNorm, is no constant to a trace
             for name, switch in list(module.named_buffers(recurse=False)):
                 if switch.dtype == torch.bool and not switch.ndim:
@@ -244,22 +216,35 @@ class _Pipeline(nn.Module):
         seen = TensorDict(dict(zip(self.in_keys, inputs, strict=True)), batch_size=inputs[0].shape[:1])
         for part in (*self.before, self.actor):
             seen = part(seen)
-        for part in self.after:
-            seen = part.inv(seen)  # type: ignore[operator]
-        return (seen["action"],)
+        return (_physical_action(seen, self.after),)
 
 
-def _of_action(parts: Sequence[Transform]) -> list[Transform]:
-    """Return the transforms that lead from the action of a policy to that of the environment, in their order."""
-    needed, found = set[NestedKey](["action"]), list[Transform]()
+def _leading_to(needed: Keys, parts: Iterable[Transform], written: str, read: str) -> tuple[list[Transform], Keys]:
+    """Return the transforms that compute some keys, in the order in which they act, and the keys that they start from.
+
+    Args:
+        needed: keys to compute.
+        parts: transforms, from the last to act to the first.
+        written: attribute that holds the keys that a transform writes.
+        read: attribute that holds the keys that it reads.
+    """
+    chain: list[Transform] = []
     for part in parts:
-        if needed & set(_keys(part.in_keys_inv)):
-            needed = needed - set(_keys(part.in_keys_inv)) | set(_keys(part.out_keys_inv))
-            found.insert(0, part)
-    return found
+        writes = _keys(getattr(part, written))
+        if needed & writes:
+            needed = needed - writes | _keys(getattr(part, read))
+            chain.insert(0, part)
+    return chain, needed
 
 
-def _reason(key: NestedKey, written: set[NestedKey], known: set[NestedKey]) -> str:
+def _physical_action(acted: TensorDictBase, transforms: Iterable[Any]) -> Tensor:
+    """Return the action of the environment that transforms make of the action of a policy."""
+    for part in transforms:
+        acted = part.inv(acted)
+    return acted["action"]
+
+
+def _reason(key: NestedKey, written: Keys, known: Keys) -> str:
     """Return why a policy cannot read a key."""
     if key == "is_init" or unravel_key(("next", key)) in written:
         return "so it keeps a state from step to step"
@@ -268,39 +253,28 @@ def _reason(key: NestedKey, written: set[NestedKey], known: set[NestedKey]) -> s
     return "which the plain environment does not have" if key in known else "which no transform writes"
 
 
-def _keys(keys: Any) -> list[NestedKey]:
-    return [unravel_key(key) for key in keys or ()]
+def _keys(keys: Any) -> Keys:
+    return {unravel_key(key) for key in keys or ()}
 
 
-def _reloaded(policy: ExportedPolicy) -> ExportedPolicy:
-    """Return a policy as a file would give it back."""
-    file = io.BytesIO()
-    torch.save(policy.content(), file)
-    file.seek(0)
-    return rebuild(torch.load(file, weights_only=True))
-
-
-def _compare(policy: ExportedPolicy, steps: TensorDictBase, parts: Sequence[Transform]) -> None:
+def _compare(policy: ExportedPolicy, steps: TensorDictBase, after: Iterable[Any]) -> None:
     """Raise unless a policy acts as in a rollout of the environment with its transforms.
+
+    The policy acts on one step of one vehicle at a time, so that its action depends on nothing else.
 
     Args:
         policy: exported policy.
         steps: ``(N, T)`` from the first step of an episode on.
-        parts: transforms of the environment.
+        after: transforms of the action.
     """
     check_finite([("action", steps["action"])], "the policy")
-    inverse = _of_action([part for part in parts if not isinstance(part, EpisodeErrors)])
-    for step in range(steps.shape[1]):
-        state = steps[:, step].clone()
-        for part in inverse:
-            state = part.inv(state)
-        wanted = state["action"]
-        for count in (len(wanted), 1):
-            got = policy(steps[:count, step].select(*policy.in_keys))["action"]
-            if not torch.allclose(got, wanted[:count].to(got.dtype), TOLERANCE, TOLERANCE):
-                worst = (got - wanted[:count]).abs().amax(0).tolist()
-                raise ValueError(
-                    f"its export acts otherwise than itself: at step {step} of {count} vehicles the "
-                    f"actions differ by up to {worst} (km, rad). The policy and its transforms must depend on their "
-                    "in_keys at one step and of one vehicle only"
-                )
+    wanted = _physical_action(steps.clone(), after)
+    singles = steps.select(*policy.in_keys).reshape(-1).split(1)
+    got = torch.cat([policy(single)["action"] for single in singles]).view_as(wanted)
+    differ = ~torch.isclose(got, wanted.to(got.dtype), TOLERANCE, TOLERANCE)
+    if differ.any():
+        raise ValueError(
+            f"its export acts otherwise than itself: from step {differ.any(-1).any(0).int().argmax()} on the actions "
+            f"differ by up to {(got - wanted).abs().flatten(0, 1).amax(0).tolist()} (km, rad). The policy and its "
+            "transforms must depend on their in_keys at one step and of one vehicle only"
+        )

@@ -101,23 +101,22 @@ def make_actor(
         >>> make_actor(13, (32, 32))(obs)["action"].shape
         torch.Size([5, 2])
     """
-    check_number(1, 65534, whole=True, observation_size=observation_size)
     network = make_mlp(observation_size, 2, num_cells, layer_norm=layer_norm, device=device)
-    return TensorDictSequential(TensorDictModule(network, ["observation"], ["logits"]), make_squash(network))
+    return TensorDictSequential(*action_modules(network, ["observation"]))
 
 
-def make_squash(network: MLP) -> TanhModule:
-    """Return the output stage of an actor, ``logits`` to ``action``, and set the output bias of its network to zero.
+def action_modules(network: MLP, in_keys: Sequence[str]) -> list[TensorDictModule | TanhModule]:
+    """Return the modules of a policy network, which writes ``logits``, and of their tanh, ``action``.
+
+    The output bias of the network is set to zero.
 
     Example:
-        >>> squash = make_squash(make_mlp(4, 2, (8,), layer_norm=False))
-        >>> squash.in_keys, squash.out_keys
-        (['logits'], ['action'])
+        >>> [module.out_keys for module in action_modules(make_mlp(4, 2, (8,), layer_norm=False), ["observation"])]
+        [['logits'], ['action']]
     """
-    nn.init.zeros_(network[-1].bias)
-    device = network[-1].bias.device
-    squash = TanhModule(in_keys=["logits"], out_keys=["action"])
-    return squash if device.type == "meta" else squash.to(device)
+    bias = nn.init.zeros_(network[-1].bias)
+    squash = TanhModule(in_keys=["logits"], out_keys=["action"]).to(bias.device)
+    return [TensorDictModule(network, in_keys, ["logits"]), squash]
 
 
 def make_critic(
@@ -146,6 +145,5 @@ def make_critic(
         >>> make_critic(13, (32, 32))(batch)["state_action_value"].shape
         torch.Size([5, 1])
     """
-    check_number(1, 65534, whole=True, observation_size=observation_size)
     network = make_mlp(observation_size + 2, 1, num_cells, layer_norm=layer_norm, device=device)
     return ValueOperator(network, in_keys=[*observation_keys, "action"])

@@ -6,10 +6,9 @@ transforms and is used like every other navigator.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,13 +16,13 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
-from magrl.agents.exported import ExportedPolicy, check_fits, export_policy, rebuild
+from magrl.agents.exported import ExportedPolicy, TrainedPolicy, export_policy, rebuild
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
-from magrl.checks import check_finite, check_number, check_numbers, check_type
-from magrl.envs import GeomagneticNavEnv
+from magrl.checks import check_finite, check_type
 from magrl.files import DamagedFileError, load_tensors, save_tensors
 from magrl.transforms import ObservationView, TrackView
+from magrl.transforms.track import STD_KEYS
 
 POLICY_FORMAT = 2
 VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}
@@ -45,6 +44,7 @@ class PolicyConfig:
         ValueError: for widths that are not positive whole numbers.
 
     Example:
+        >>> from magrl.envs import GeomagneticNavEnv
         >>> view = GeomagneticNavEnv(seed=0).observation_view()
         >>> PolicyConfig(view, (32, 32)).memory_size
         0
@@ -56,29 +56,24 @@ class PolicyConfig:
     memory_size: int = 0
 
     def __post_init__(self) -> None:
-        check_type((ObservationView, TrackView), view=self.view)
-        check_type(bool, layer_norm=self.layer_norm)
-        check_number(0, 65536, whole=True, memory_size=self.memory_size)
-        if not self.num_cells or not all(isinstance(n, int) and 1 <= n <= 65536 for n in self.num_cells):
-            raise ValueError(f"num_cells must be whole numbers from 1 to 65536, got {self.num_cells}")
+        check_type(ObservationView if self.memory_size else (ObservationView, TrackView), view=self.view)
+        self.make_actor("meta")  # checks the sizes
 
     def make_actor(self, device: Device = None) -> TensorDictSequential:
         """Return an actor of this shape, with new weights."""
-        if self.memory_size:
-            if not isinstance(self.view, ObservationView):
-                raise TypeError(f"an agent with a memory needs an ObservationView, got {self.view}")
-            shape = (self.view, self.num_cells, self.memory_size)
+        if isinstance(self.view, ObservationView) and self.memory_size:
+            shape = self.view, self.num_cells, self.memory_size
             return make_recurrent_actor(*shape, layer_norm=self.layer_norm, device=device)
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
 
 
-class FieldPolicy(TensorDictModuleBase):
+class FieldPolicy(TrainedPolicy):
     """A trained agent as a navigator of the plain environment, in physical units.
 
     A recurrent policy, and one that reads its own track (:class:`~magrl.transforms.TrackView`), keeps its own state for
     each vehicle from the start of an episode (``step_count`` 0) on: call it once per step. The latter reads the
-    standard deviations of the sensors from ``sensor_std``, or from its attribute ``noise_std`` without this key, and
-    those of their constant and slow errors from ``bias_std``, or takes 0.
+    standard deviations of new errors of the sensors from ``sensor_std``, and those of constant and slow errors from
+    ``bias_std``; without these keys they are 0.
 
     Args:
         config: what the policy observes, and the shape of its network.
@@ -88,35 +83,22 @@ class FieldPolicy(TensorDictModuleBase):
         TypeError: for a configuration of another type.
 
     Example:
+        >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
         >>> policy = FieldPolicy(PolicyConfig(env.observation_view(), (32, 32)))
         >>> env.rollout(2, policy)["action"].shape
         torch.Size([2, 2, 2])
     """
 
-    out_keys: ClassVar[list[str]] = ["action"]
-
     def __init__(self, config: PolicyConfig, actor: TensorDictSequential | None = None) -> None:
         super().__init__()
         check_type(PolicyConfig, config=config)
-        self.config = config
+        self.config, self.view = config, config.view
         self.in_keys = [*config.view.in_keys, *(["step_count"] if config.memory_size else [])]
         self.observe = Compose(*config.view.observation_transforms())
         self.act = config.view.action_transform()
         self.actor = config.make_actor() if actor is None else actor
         self.state: TensorDictBase | None = None
-        self.noise_std = (0.0, 0.0, 0.0)
-
-    @property
-    def noise_std(self) -> tuple[float, ...]:
-        """Standard deviations of the noise on D [deg], I [deg], B_H [nT], of readings without ``sensor_std``."""
-        return self._noise_std
-
-    @noise_std.setter
-    def noise_std(self, values: Sequence[float]) -> None:
-        check_numbers(3, noise_std=values)
-        check_number(0, noise_std=min(values))
-        self._noise_std = tuple(values)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""
@@ -131,9 +113,8 @@ class FieldPolicy(TensorDictModuleBase):
 
     def _track(self, seen: TensorDictBase, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the observation after the last move, and keep the state of the track for the next."""
-        noise = seen["field"].new_tensor(self.noise_std).expand_as(seen["field"])
-        seen["sensor_std"] = tensordict.get("sensor_std", noise)
-        seen["bias_std"] = tensordict.get("bias_std", torch.zeros_like(noise))
+        for key in STD_KEYS:
+            seen[key] = tensordict.get(key, torch.zeros_like(seen["field"]))
         state, starts = self.state, seen["step_count"].squeeze(-1) == 0
         if state is None or state.shape != seen.shape or state.device != seen.device or starts.all():
             observed = self.observe(seen)
@@ -151,15 +132,6 @@ class FieldPolicy(TensorDictModuleBase):
             zeros = observed["observation"].new_zeros(*observed.shape, 1, self.config.memory_size)
             self.state = TensorDict(dict.fromkeys(STATE_KEYS, zeros), observed.shape, device=observed.device)
         observed.update(self.state)
-
-    def check_fits(self, env: GeomagneticNavEnv) -> None:
-        """Raise unless the field of an environment is within what the policy was trained in.
-
-        Raises:
-            ValueError: naming the element and both ranges.
-        """
-        # an agent that reads its own track is of no region
-        check_fits(self.config.view if isinstance(self.config.view, ObservationView) else None, env)
 
 
 def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | None = None) -> None:
@@ -181,8 +153,10 @@ def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | N
 
     Example:
         >>> import tempfile
+        >>> from magrl.envs import GeomagneticNavEnv
         >>> policy = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
-        >>> save_policy(Path(tempfile.mkdtemp()) / "policy.pt", policy)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_policy(Path(folder) / "policy.pt", policy)
     """
     check_type(TensorDictModuleBase, policy=policy)
     if not isinstance(policy, (FieldPolicy, ExportedPolicy)):
@@ -213,11 +187,9 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
         ValueError: for a file that is not a policy, of another format, or with weights of other shapes.
 
     Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "policy.pt"
-        >>> save_policy(path, FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,))))
-        >>> load_policy(path).config.num_cells
-        (8,)
+        >>> from magrl.agents import pretrained
+        >>> load_policy(Path(pretrained.__file__).parent / "anywhere.pt").config.num_cells
+        (128, 128, 128)
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no policy file at {path}")
@@ -226,8 +198,8 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
     except DamagedFileError as error:
         raise ValueError(f"{path} is not a policy file: {error}") from error
     content = content if isinstance(content, dict) else {}
-    version = content.get("format", content.get("recurrent_format"))
-    if version is not None and version != POLICY_FORMAT:
+    version = content.get("format", POLICY_FORMAT)
+    if version != POLICY_FORMAT:
         raise ValueError(
             f"{path} is a policy of format {version!r}; this version reads format {POLICY_FORMAT}: train it again"
         )
@@ -249,7 +221,7 @@ def _rebuild(config: Any, weights: Any, name: str) -> FieldPolicy:
         raise ValueError(f"the configuration of a policy must hold exactly {sorted(names)} and a kind of {list(VIEWS)}")
     rebuilt = PolicyConfig(**{**config, "view": VIEWS[kind](**config["view"])})
     check_finite(weights.items(), name)
-    # Before anything is allocated: a few bytes may ask for any number of cells.
+    # Before anything is allocated: a few bytes may ask for any number of cells
     shapes = {key: tuple(value.shape) for key, value in rebuilt.make_actor("meta").state_dict().items()}
     if {key: tuple(value.shape) for key, value in weights.items()} != shapes:
         raise ValueError(f"its weights do not have the shapes of {rebuilt}")

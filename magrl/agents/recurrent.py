@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.envs import InitTracker, Transform
 from torchrl.modules import LSTMModule, set_recurrent_mode
 
-from magrl.agents.networks import Device, make_mlp, make_squash
+from magrl.agents.networks import Device, action_modules, make_mlp
 from magrl.agents.td3 import TD3Loss
 from magrl.checks import check_number
 from magrl.transforms import AngleVector, ObservationView
@@ -95,13 +95,11 @@ def make_recurrent_actor(
     with torch.no_grad():  # the forget gate starts open, since the memory is to learn a sum
         memory.lstm.bias_ih_l0[memory_size : 2 * memory_size] += 1
     network = make_mlp(view.size + 2, 2, num_cells, layer_norm=layer_norm, device=device)
-    squash = make_squash(network)
     return TensorDictSequential(
         TensorDictModule(LastMove(view.max_turn_rad), ["move_scaled"], ["last_move"]),
         memory,
         TensorDictModule(nn.Linear(memory_size, 2, device=device), ["memory"], ["heading_estimate"]),
-        TensorDictModule(network, ["observation", "heading_estimate"], ["logits"]),
-        squash,
+        *action_modules(network, ["observation", "heading_estimate"]),
     )
 
 
@@ -162,13 +160,7 @@ class RecurrentTD3Loss(TD3Loss):
         for key in STATE_KEYS:
             following[key] = following[key].clone()
             following[key][begins] = first["next", key]
-        with set_recurrent_mode(True):
-            return super().value_loss(tensordict)
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of the actor, unrolled over each slice, and all its outputs."""
-        with set_recurrent_mode(True):
-            return super().actor_loss(tensordict)
+        return super().value_loss(tensordict)
 
     def memory_parameters(self) -> list[Tensor]:
         """Return the parameters of the LSTM."""

@@ -106,7 +106,8 @@ class TD3Loss(TorchRLTD3Loss):
             target_actor=_holding(self.actor_network, self.target_actor_network_params.data),
             critics=[_holding(self.qvalue_network, params).module.requires_grad_() for params in critics],
             target_critics=[_holding(self.qvalue_network, params).module for params in targets],
-            frozen_critic=_holding(self.qvalue_network, critics[0]).module,
+            # Without this, the loss of the actor would compute gradients of the critic's weights, too
+            frozen_critic=_holding(self.qvalue_network, critics[0]).module.requires_grad_(False),
         )
 
     def actor_parameters(self) -> list[Tensor]:
@@ -189,23 +190,14 @@ class SoftUpdate(TorchRLSoftUpdate):
 
     def step(self) -> None:
         """Move each target parameter by the share ``tau`` towards its source."""
-        self._average(self._target_weights, self._source_weights, 0)
+        get_ema_multi_avg_fn(self.eps)(*self._weights, 0)
 
     @cached_property
-    def _average(self) -> Any:
-        return get_ema_multi_avg_fn(self.eps)
-
-    @cached_property
-    def _target_weights(self) -> list[Tensor]:
-        return _leaves(self.loss_module.target_actor_network_params, self.loss_module.target_qvalue_network_params)
-
-    @cached_property
-    def _source_weights(self) -> list[Tensor]:
-        return _leaves(self.loss_module.actor_network_params, self.loss_module.qvalue_network_params)
-
-
-def _leaves(*params: Any) -> list[Tensor]:
-    return [leaf for group in params for leaf in group.data.values(True, True)]
+    def _weights(self) -> list[list[Tensor]]:
+        """Target parameters, and their sources in the same order."""
+        names = ("actor_network_params", "qvalue_network_params")
+        groups = [[getattr(self.loss_module, prefix + name) for name in names] for prefix in ("target_", "")]
+        return [[leaf for group in each for leaf in group.data.values(True, True)] for each in groups]
 
 
 def saturation_penalty(logits: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ give the same bits.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -24,11 +25,13 @@ from torchrl.envs import CatTensors, TransformedEnv
 
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.envs.measures import path_measures
-from magrl.envs.navigation import check_choice, navigation_env
+from magrl.envs.navigation import navigation_env
 from magrl.transforms.errors.base import EpisodeErrors
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+VectorStep = tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
+_NAMED: dict[str, tuple[str, ...]] = {"flat": ("observation",), "dict": PUBLIC_KEYS}
 
 
 def _box(*specs: TensorSpec) -> spaces.Space[Any]:
@@ -61,111 +64,130 @@ def _array(tensor: Tensor) -> NDArray[Any]:
     return np.array(tensor.detach().cpu().numpy())
 
 
-class _Batch:
-    """A batch of vehicles, with arrays in and arrays out.
+class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+    """A batch of vehicles: ``gymnasium.make_vec("magrl/GeomagneticNavigation-v0", num_envs=N, **options)``.
+
+    All move in one batched step. A vehicle whose episode ends starts the next in the same step
+    (``AutoresetMode.SAME_STEP``): the observation returned is the first of the new episode, ``info["final_obs"]`` the
+    last of the old one and ``info["final_info"]`` its measures, each with its mask ``_final_obs``, ``_final_info``.
+    ``reset(seed=s)`` is the first reset of the TorchRL environment of ``N`` vehicles and seed ``s``: each row has
+    episodes of its own, those of row 0 are the single environment's.
 
     Args:
         num_envs: vehicles in the batch.
-        render_mode: None or ``"rgb_array"``.
+        render_mode: None, or ``"rgb_array"``: an image of each vehicle.
         **options: of :func:`navigation_env`.
+
+    Raises:
+        TypeError, ValueError: for a bad option, as :func:`navigation_env`.
+
+    Example:
+        >>> envs = gymnasium.make_vec(ENV_ID, num_envs=4, vectorization_mode="vector_entry_point")
+        >>> observations, info = envs.reset(seed=0)
+        >>> observations, rewards, terminations, truncations, info = envs.step(envs.action_space.sample())
+        >>> observations.shape, rewards.shape
+        ((4, 13), (4,))
     """
 
-    def __init__(self, num_envs: int, render_mode: str | None, options: dict[str, Any]) -> None:
-        if render_mode is not None:
-            check_choice("render_mode", render_mode, ("rgb_array",))
-        self.render_mode = render_mode
-        if "num_envs" in options:
-            raise TypeError(f"one vehicle has no num_envs, got {options['num_envs']}: use gymnasium.make_vec")
-        self.env = navigation_env(num_envs, render_mode=render_mode, **options)
-        observation = options.get("observation", "flat")
-        named = {"flat": ("observation",), "dict": PUBLIC_KEYS}
-        self.keys = named[observation] if isinstance(observation, str) else tuple(observation)
-        self.flat = observation == "flat"
-        self.observation_space = _observation_space(self.env, self.keys, flat=self.flat)
-        self.action_space = _box(self.env.action_spec)
-        self._state: TensorDictBase | None = None
-        self._length_km = torch.zeros(num_envs, dtype=torch.float64, device=self.env.device)
+    metadata: dict[str, Any] = {  # noqa: RUF012 as Gymnasium declares it
+        "render_modes": ["rgb_array"],
+        "render_fps": 4,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
 
-    def reset(self, seed: int | None, options: dict[str, Any] | None) -> Observation:
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        render_mode: str | None = None,
+        observation: str | Sequence[str] = "flat",
+        **options: Any,
+    ) -> None:
+        self.num_envs, self.render_mode, self._flat = num_envs, render_mode, observation == "flat"
+        self.torchrl_env = navigation_env(num_envs, render_mode=render_mode, observation=observation, **options)
+        self._keys = _NAMED[observation] if isinstance(observation, str) else tuple(observation)
+        self.single_observation_space = _observation_space(self.torchrl_env, self._keys, flat=self._flat)
+        self.single_action_space = _box(self.torchrl_env.action_spec)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._state: TensorDictBase | None = None
+        self._length_km = torch.zeros(num_envs, dtype=torch.float64, device=self.torchrl_env.device)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
         """Start the next episode of every vehicle, or with a seed the first."""
+        super().reset(seed=seed)
         if options:
             raise ValueError(f"reset() of {ENV_ID} takes no options, got {options}")
         if seed is not None:
-            self.env.set_seed(seed)
-            for part in self.env.modules():
+            self.torchrl_env.set_seed(seed)
+            for part in self.torchrl_env.modules():
                 if isinstance(part, EpisodeErrors):
                     part.restart()
-        self._state = self.env.reset()
+        self._state = self.torchrl_env.reset()
         self._length_km = torch.zeros_like(self._length_km)
-        return self.observe(self._state)
+        return self._observe(self._state), {}
 
-    def observe(self, state: TensorDictBase) -> Observation:
-        """Return the observations of all vehicles, ``(N, ...)``."""
-        arrays = {key: _array(state[key]).astype(np.float32, copy=False) for key in self.keys}
-        return arrays["observation"] if self.flat else arrays
-
-    def step(self, actions: Any, *, autoreset: bool) -> tuple[TensorDictBase, dict[str, NDArray[Any]]]:
+    def step(self, actions: NDArray[np.float32]) -> VectorStep:
         """Move every vehicle.
 
+        Args:
+            actions: ``(N, 2)`` distance and turn, in [-1, 1] or in km and rad.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            ValueError: for actions of another shape, not finite, or out of their bounds.
+        """
+        observation, reward, terminated, truncated, measures = self._move(actions)
+        ended = terminated | truncated
+        info = _final(observation, measures, ended) if measures else {}
+        self._state = self.torchrl_env.maybe_reset(self._state)
+        return self._observe(self._state), reward, terminated, truncated, info
+
+    def _move(self, actions: Any) -> VectorStep:
+        """Move every vehicle, without the start of the next episodes.
+
         Returns:
-            The entry ``next`` after a step of TorchRL, and the measures of the ``P`` episodes that ended.
+            Observations, rewards, ``terminated``, ``truncated``, and the measures of the ``P`` episodes that ended.
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before step(): no episode is running")
-        state = self._state.set("action", self._action(actions))
-        if autoreset:
-            state, self._state = self.env.step_and_maybe_reset(state)
-        else:
-            state = self.env.step(state)
-            self._state = None if state["next", "done"].all() else self.env.step_mdp(state)
-        after = state["next"]
-        done = after["done"].squeeze(-1)
+        state = self.torchrl_env.step(self._state.set("action", self._action(actions)))
+        self._state, after = self.torchrl_env.step_mdp(state), state["next"]
         self._length_km = self._length_km + after.get("true_move", after["move"])[:, 0].double()
+        done = after["done"].squeeze(-1)
         measures = _measures(after[done], self._length_km[done]) if done.any() else {}
         self._length_km = self._length_km.masked_fill(done, 0.0)
-        return after, measures
+        reward, terminated, truncated = (_array(after[k].squeeze(-1)) for k in ("reward", "terminated", "truncated"))
+        return self._observe(after), reward, terminated, truncated, measures
+
+    def _observe(self, state: TensorDictBase) -> Observation:
+        """Return the observations of all vehicles, ``(N, ...)``."""
+        arrays = {key: _array(state[key]).astype(np.float32, copy=False) for key in self._keys}
+        return arrays["observation"] if self._flat else arrays
 
     def _action(self, actions: Any) -> Tensor:
-        array = np.array(actions, dtype=np.float32)
-        shape = tuple(self.env.action_spec.shape)
-        if array.shape != shape:
-            kinds = "distance, turn and declaration" if shape[-1] == 3 else "distance and turn"
-            raise ValueError(f"actions must have shape {shape}, {kinds}, got shape {array.shape}")
-        space = self.action_space
+        array, space = np.array(actions, dtype=np.float32), self.action_space
         assert isinstance(space, spaces.Box)
+        if array.shape != space.shape:
+            raise ValueError(f"actions must have shape {space.shape}, a vehicle per row, got shape {array.shape}")
         slack = 1e-5 * (space.high - space.low)
-        if (bad := ~((array >= space.low - slack) & (array <= space.high + slack)).all(-1)).any():
-            first = int(bad.argmax())
-            limits = ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(space.low, space.high, strict=True))
+        inside = ((array >= space.low - slack) & (array <= space.high + slack)).all(-1)
+        if not inside.all():
+            vehicle = int(inside.argmin())
+            limits = ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(space.low[0], space.high[0], strict=True))
             raise ValueError(
-                f"action {array[first].tolist()} of vehicle {first} is not finite or out of bounds, {limits}"
+                f"action {array[vehicle].tolist()} of vehicle {vehicle} is not finite or out of bounds, {limits}"
             )
-        return torch.from_numpy(array).to(self.env.device)
-
-    def current(self) -> Observation:
-        """Return the observations of the running episodes."""
-        assert self._state is not None
-        return self.observe(self._state)
+        return torch.from_numpy(array).to(self.torchrl_env.device)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return an image of each vehicle's episode, ``(H, W, 3)``, or None without a render mode."""
+        """Return an image of each vehicle's episode, ``(H, W, 3)``, or None without a ``render_mode``."""
         if self.render_mode is None:
             gymnasium.logger.warn(f"render() needs gymnasium.make({ENV_ID!r}, render_mode='rgb_array')")
             return None
-        return tuple(self.env.base_env.render([vehicle]) for vehicle in range(self.env.base_env.num_envs))
-
-
-def _measures(end: TensorDictBase, length_km: Tensor) -> dict[str, NDArray[Any]]:
-    """Return the measures of episodes from their last states, named as in ``magrl.evaluation.episode_measures``."""
-    success = end["success"].squeeze(-1)
-    measures = {
-        "success": success,
-        "is_success": success,  # the name that stable-baselines3 and Gymnasium-Robotics read
-        "steps": end["step_count"].squeeze(-1),
-        **({"false_arrival": end["declared"].squeeze(-1) & ~success} if "declared" in end.keys() else {}),  # noqa: SIM118
-        **path_measures(success, end["start_position"], end["position"], end["target_position"], length_km),
-    }
-    return {name: _array(value) for name, value in measures.items()}
+        return tuple(self.torchrl_env.base_env.render([vehicle]) for vehicle in range(self.num_envs))
 
 
 class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -194,22 +216,18 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 as Gymnasium declares it
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
-        self._batch = _Batch(1, render_mode, options)
-        self.render_mode = render_mode
-        self.observation_space = self._batch.observation_space
-        self.action_space = self._batch.action_space
-
-    @property
-    def torchrl_env(self) -> TransformedEnv:
-        """TorchRL environment, a batch of one."""
-        return self._batch.env
+        self._envs = GeomagneticNavVectorEnv(1, render_mode=render_mode, **options)
+        self.torchrl_env, self.render_mode = self._envs.torchrl_env, render_mode
+        self.observation_space = self._envs.single_observation_space
+        self.action_space = self._envs.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; the class describes the meaning of a seed."""
         super().reset(seed=seed)
-        return _row(self._batch.reset(seed, options), 0), {}
+        observation, info = self._envs.reset(seed=seed, options=options)
+        return _row(observation, 0), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move the vehicle.
@@ -221,85 +239,29 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             gymnasium.error.ResetNeeded: if no episode is running.
             ValueError: for an action of another shape, not finite, or out of its bounds.
         """
-        after, measures = self._batch.step(np.asarray(action)[None], autoreset=False)
-        reward, terminated, truncated = (after[key].item() for key in ("reward", "terminated", "truncated"))
-        info = {name: value.item() for name, value in measures.items()}
-        return _row(self._batch.observe(after), 0), reward, terminated, truncated, info
+        observation, *results, measures = self._envs._move(np.asarray(action)[None])
+        reward, terminated, truncated = (value.item() for value in results)
+        if terminated or truncated:
+            self._envs._state = None
+        return _row(observation, 0), reward, terminated, truncated, {name: x.item() for name, x in measures.items()}
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the running episode over the field's contours, or None without a ``render_mode``."""
-        images = self._batch.render()
+        images = self._envs.render()
         return images[0] if images else None
 
 
-class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
-    """A batch of vehicles: ``gymnasium.make_vec("magrl/GeomagneticNavigation-v0", num_envs=N, **options)``.
-
-    All move in one batched step. A vehicle whose episode ends starts the next in the same step
-    (``AutoresetMode.SAME_STEP``): the observation returned is the first of the new episode, ``info["final_obs"]`` the
-    last of the old one and ``info["final_info"]`` its measures, each with its mask ``_final_obs``, ``_final_info``.
-    ``reset(seed=s)`` is the first reset of the TorchRL environment of ``N`` vehicles and seed ``s``: each row has
-    episodes of its own, those of row 0 are the single environment's.
-
-    Args:
-        num_envs: vehicles in the batch.
-        render_mode: None, or ``"rgb_array"``: an image of each vehicle.
-        **options: of :func:`navigation_env`.
-
-    Raises:
-        TypeError, ValueError: for a bad option, as :func:`navigation_env`.
-
-    Example:
-        >>> envs = gymnasium.make_vec(ENV_ID, num_envs=4, vectorization_mode="vector_entry_point")
-        >>> observations, info = envs.reset(seed=0)
-        >>> observations, rewards, terminations, truncations, info = envs.step(envs.action_space.sample())
-        >>> observations.shape, rewards.shape
-        ((4, 13), (4,))
-    """
-
-    metadata: dict[str, Any] = {**GeomagneticNavGymEnv.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
-
-    def __init__(self, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
-        self._batch = _Batch(num_envs, render_mode, options)
-        self.num_envs, self.render_mode = num_envs, render_mode
-        self.single_observation_space = self._batch.observation_space
-        self.single_action_space = self._batch.action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-
-    @property
-    def torchrl_env(self) -> TransformedEnv:
-        """TorchRL environment of the whole batch."""
-        return self._batch.env
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode of every vehicle; the class describes the meaning of a seed."""
-        super().reset(seed=seed)
-        return self._batch.reset(seed, options), {}
-
-    def step(
-        self, actions: NDArray[np.float32]
-    ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Move every vehicle.
-
-        Args:
-            actions: ``(N, 2)`` distance and turn, in [-1, 1] or in km and rad.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-            ValueError: for actions of another shape, not finite, or out of their bounds.
-        """
-        after, measures = self._batch.step(actions, autoreset=True)
-        reward, terminated, truncated = (_array(after[k].squeeze(-1)) for k in ("reward", "terminated", "truncated"))
-        ended = terminated | truncated
-        info = _final(self._batch.observe(after), measures, ended) if measures else {}
-        return self._batch.current(), reward, terminated, truncated, info
-
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return an image of each vehicle's episode, or None without a ``render_mode``."""
-        return self._batch.render()
+def _measures(end: TensorDictBase, length_km: Tensor) -> dict[str, NDArray[Any]]:
+    """Return the measures of episodes from their last states, named as in ``magrl.evaluation.episode_measures``."""
+    success = end["success"].squeeze(-1)
+    measures = {
+        "success": success,
+        "is_success": success,  # the name that stable-baselines3 and Gymnasium-Robotics read
+        "steps": end["step_count"].squeeze(-1),
+        **({"false_arrival": end["declared"].squeeze(-1) & ~success} if "declared" in end.keys() else {}),  # noqa: SIM118
+        **path_measures(success, end["start_position"], end["position"], end["target_position"], length_km),
+    }
+    return {name: _array(value) for name, value in measures.items()}
 
 
 def _row(observation: Observation, index: int) -> Observation:
@@ -313,14 +275,8 @@ def _final(observation: Observation, measures: dict[str, NDArray[Any]], ended: N
     final_obs = np.full(len(ended), None, dtype=object)
     for index in np.flatnonzero(ended):
         final_obs[index] = _row(observation, int(index))
-    final_info: dict[str, Any] = {}
+    final_info = {}
     for name, values in measures.items():
-        final_info[name] = np.zeros(len(ended), dtype=values.dtype)
+        final_info[name], final_info[f"_{name}"] = np.zeros(len(ended), dtype=values.dtype), ended.copy()
         final_info[name][ended] = values
-        final_info[f"_{name}"] = ended.copy()
-    return {
-        "final_obs": final_obs,
-        "_final_obs": ended.copy(),
-        "final_info": final_info,
-        "_final_info": ended.copy(),
-    }
+    return {"final_obs": final_obs, "_final_obs": ended.copy(), "final_info": final_info, "_final_info": ended.copy()}

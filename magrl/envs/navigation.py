@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -55,23 +54,18 @@ def navigation_env(
         check_choice("observation", observation, OBSERVATIONS)
     check_choice("reward", reward, REWARDS)
     check_type(bool, scale_actions=scale_actions)
-    known = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "num_envs"}
-    if unknown := sorted(options.keys() - known):
-        every = known | (inspect.signature(navigation_env).parameters.keys() - {"num_envs", "options"})
-        # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
-        raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {sorted(every)}")
     check_type(Transform, **{f"transforms[{number}]": each for number, each in enumerate(transforms)})
     base = GeomagneticNavEnv(num_envs=num_envs, **options)
-    view = base.observation_view()
+    view, own = base.observation_view(), [each.clone() for each in _parts(transforms)]
     steps: list[Transform] = []
     if reward == "guided":  # before errors of the sensors
         alignment = AlignmentReward(weight=alignment_weight, offset=alignment_offset)
         steps += [FieldGradient(base.field), GradientHeading(), alignment]
-    steps += [each.clone() for each in _parts(transforms)]
+    steps += own
     if observation == "flat":
         steps += view.observation_transforms()
     if scale_actions:
-        declared = base.arrival.declared and not any(isinstance(each, DeclareArrival) for each in steps)
+        declared = base.arrival.declared and not any(isinstance(each, DeclareArrival) for each in own)
         steps.append(view.action_transform(declared=declared))
     return TransformedEnv(base, Compose(*steps))
 
@@ -79,7 +73,7 @@ def navigation_env(
 def _parts(transforms: Iterable[Transform]) -> Iterator[Transform]:
     """Yield transforms, those of a ``Compose`` one by one."""
     for each in transforms:
-        yield from _parts(each.transforms) if isinstance(each, Compose) else (each,)
+        yield from _parts(each) if isinstance(each, Compose) else (each,)
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

@@ -105,7 +105,6 @@ def make_navigator(
         if isinstance(policy, FieldPolicy) and isinstance(view := policy.config.view, TrackView):
             view = replace(view, zeta=env.zeta, search=env.arrival.rule == "objective")
             policy = FieldPolicy(replace(policy.config, view=view), policy.actor).to(env.device)
-            policy.noise_std = noise
         try:
             policy.check_fits(env)
         except ValueError as error:

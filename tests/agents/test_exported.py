@@ -1,6 +1,6 @@
 """Policies of any algorithm: exported with the transforms that they need, compared, saved, loaded and refused."""
 
-import subprocess
+import copy
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
 from magrl.agents import ExportedPolicy, export_policy, load_policy, save_policy
-from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.envs import GeomagneticNavEnv
 from magrl.files import save_tensors
 from magrl.transforms import (
     AlignmentReward,
@@ -61,10 +61,16 @@ def stochastic_actor(env: TransformedEnv) -> ProbabilisticActor:
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory) -> Path:
-    """The file of a stochastic actor."""
+    """The file of a stochastic actor, whose export changes neither the actor nor random numbers nor the environment."""
     path = tmp_path_factory.mktemp("policies") / "own.pt"
-    env = training_env()
-    save_policy(path, stochastic_actor(env), env)
+    env, other = training_env(), training_env()
+    actor = stochastic_actor(env)
+    state, weights = torch.get_rng_state(), copy.deepcopy(actor.state_dict())
+    save_policy(path, actor, env)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert actor.training
+    assert all(torch.equal(value, weights[key]) for key, value in actor.state_dict().items())
+    assert torch.equal(env.reset()["field"], other.reset()["field"])
     return path
 
 
@@ -76,61 +82,41 @@ def test_a_policy_acts_alike_after_saving(saved: Path) -> None:
     env, policy = training_env(), load_policy(saved)
     assert isinstance(policy, ExportedPolicy)
     assert policy.in_keys == ["field", "target_field", "move", "heading"]
+    assert policy.view == env.base_env.observation_view()
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         flown = env.rollout(12, stochastic_actor(env), break_when_any_done=False)
     wanted = env.transform[-1].inv(flown)["action"]
     seen = flown.select(*policy.in_keys)
     torch.testing.assert_close(policy(seen)["action"], wanted, rtol=1e-5, atol=1e-5)
     assert wanted.std(0).min() > 1e-3
-    plain = GeomagneticNavEnv(num_envs=1, seed=3)
-    assert plain.rollout(3, policy)["action"].shape == (1, 3, 2)
     assert torch.equal(policy(seen[0, 0])["action"], policy(seen[:1, 0])["action"][0])
 
 
-def test_an_export_changes_neither_the_environment_nor_the_random_numbers() -> None:
-    env, other = training_env(), training_env()
-    actor = stochastic_actor(env)
-    weights = {key: value.clone() for key, value in actor.state_dict().items()}
-    state = torch.get_rng_state()
-    policy = export_policy(actor, env)
-    assert torch.equal(torch.get_rng_state(), state)
-    assert actor.training
-    assert all(torch.equal(value, weights[key]) for key, value in actor.state_dict().items())
-    assert torch.equal(env.reset()["field"], other.reset()["field"])
-    readings = env.reset().select(*policy.in_keys)
-    action = policy(readings.clone())["action"]
+def test_an_export_keeps_its_weights_where_the_training_goes_on() -> None:
+    base = GeomagneticNavEnv(num_envs=2, seed=3)
+    actor = TensorDictModule(nn.Sequential(nn.Linear(2, 2), nn.Sigmoid()), ["move"], ["action"])
+    policy, state = export_policy(actor, base), base.reset().select("move")
+    wanted = actor(state.clone())["action"]
     with torch.no_grad():
-        for weight in actor.parameters():
-            weight += 1  # the training goes on
-    assert torch.equal(policy(readings)["action"], action)
+        actor.module[0].bias += 1
+    torch.testing.assert_close(policy(state)["action"], wanted)
 
 
-def test_an_export_acts_with_torch_alone(saved: Path, tmp_path: Path) -> None:
-    """The same bits, in a process that cannot import this library or TorchRL."""
+def test_an_export_acts_with_torch_alone(saved: Path, tmp_path: Path, monkeypatch) -> None:
+    """The same bits, where neither this library nor TorchRL can be imported."""
     policy, state = load_policy(saved), GeomagneticNavEnv(num_envs=7, seed=1).reset()
     policy.write_torch(tmp_path / "own.pt2")
-    torch.save([state[key] for key in policy.in_keys], tmp_path / "inputs.pt")
-    code = f"""
-import sys
-sys.modules.update(dict.fromkeys(("magrl", "torchrl", "tensordict")))
-import torch
-inputs = torch.load({str(tmp_path / "inputs.pt")!r})
-act = torch.export.load({str(tmp_path / "own.pt2")!r}).module()
-torch.save([act(*inputs)[0], act(*(value[:1] for value in inputs))[0]], {str(tmp_path / "actions.pt")!r})
-"""
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=False)
-    assert not done.returncode, done.stderr
-    actions, single = torch.load(tmp_path / "actions.pt")
-    assert torch.equal(actions, policy(state.clone())["action"])
-    assert torch.equal(single, policy(state[:1].clone())["action"])
+    with monkeypatch.context() as patch:
+        for name in [name for name in sys.modules if name.startswith(("magrl", "torchrl", "tensordict"))]:
+            patch.setitem(sys.modules, name, None)
+        act = torch.export.load(tmp_path / "own.pt2").module()
+    for count in (7, 1):
+        (actions,) = act(*(state[key][:count] for key in policy.in_keys))
+        assert torch.equal(actions, policy(state[:count].clone())["action"])
     with pytest.raises(ValueError, match=r"must end with \.pt2, got .*own\.pt'"):
         policy.write_torch(tmp_path / "own.pt")
-
-
-def test_an_exported_policy_is_of_its_region(saved: Path) -> None:
-    azores = Scenario(region={"latitude": (33.0, 43.0), "longitude": (-33.0, -23.0)})
-    with pytest.raises(ValueError, match="the policy was trained where D is"):
-        load_policy(saved).check_fits(GeomagneticNavEnv(azores, seed=0))
+    with pytest.raises(ValueError, match=r"own\.pt2 is not a policy file"):  # which runs no code
+        load_policy(tmp_path / "own.pt2")
 
 
 # Refusals at save time
@@ -165,16 +151,15 @@ def squashed(x: torch.Tensor) -> torch.Tensor:
     ("actor", "transforms", "message"),
     [
         (acting(squashed, "position"), [], "'position', which a vehicle that navigates by the field does not know"),
-        (acting(squashed, "sensor_std"), [], "'sensor_std', which the plain environment does not have"),
         (acting(squashed, "sonar"), [], "'sonar', which no transform writes; it may read field, target_field, move"),
         (acting(lambda x: squashed(torch.cat((x, x), -1)), "is_init"), [InitTracker()], "'is_init', so it keeps a sta"),
         (acting(lambda x: squashed(x + torch.rand_like(x)), "field"), [], "rand.* draws random numbers"),
-        (acting(lambda x: squashed(x.sort(0)[0] / 9), "field"), [], "at step 0 of 1 vehicles the actions differ by up"),
-        (acting(lambda x: squashed(x / 99), "sum"), [Stateful(["move"], ["sum"])], "at step 2 of 5 vehicles .* differ"),
+        (acting(lambda x: squashed(x.sort(0)[0] / 9), "field"), [], "from step 0 on the actions differ by up"),
+        (acting(lambda x: squashed(x / 99), "sum"), [Stateful(["move"], ["sum"])], "from step 2 on the actions differ"),
         (acting(lambda x: squashed(x) if x.sum() > 0 else squashed(-x), "field"), [], "PyTorch cannot export it: "),
         (acting(lambda x: torch.linalg.inv(x.unsqueeze(-1) @ x.unsqueeze(-2))[..., :2, 0], "field"), [], "linalg_inv"),
     ],
-    ids=["privileged", "sensors", "unknown", "state", "random", "batch", "stateful", "branch", "operation"],
+    ids=["privileged", "unknown", "state", "random", "batch", "stateful", "branch", "operation"],
 )
 def test_what_cannot_be_saved_is_refused_with_its_reason(actor, transforms, message: str, tmp_path: Path) -> None:
     base = GeomagneticNavEnv(num_envs=5, seed=3)
@@ -213,22 +198,18 @@ class Touch:
     ("change", "message"),
     [
         (step("from_file.default", 1), "'from_file.default' is not one of PyTorch's core operations"),
-        (step("save.default", {"value": 0}, 1), "'save"),
         (step("add_.Tensor", {"value": 0}, 1), "'add_.Tensor' is not one of"),
         (step("rand.default", [2]), "rand.default draws random numbers"),
-        (step("eval.default", 1), "'eval.default' is no operation of PyTorch"),
         (step("__class__.mro"), "is no operation of PyTorch"),
         (step(7), "7 is no operation of PyTorch"),
         (step("neg.default", {"value": 9999}), "a known value or a list of these, got {'value': 9999}"),
-        (step("neg.default", {"value": -1}), "got {'value': -1}"),
         (step("neg.default", "/etc/passwd"), "got '/etc/passwd'"),
         (step("neg.default", {"value": 0}, dtype={"dtype": "load"}), "got {'dtype': 'load'}"),
         (lambda c: c["program"]["steps"].append("neg"), "must be a name, arguments and named arguments, got 'neg'"),
         (lambda c: c["program"]["tensors"].__setitem__(0, torch.tensor(torch.nan)), "tensor 0 is not finite"),
         (lambda c: c["program"]["tensors"].__setitem__(0, 5), "tensor 0 must be a Tensor, got 5"),
         (lambda c: c["program"].update(outputs=[10**6]), "outputs must be numbers of values"),
-        (lambda c: c["program"].update(more=1), "more"),
-        (lambda c: c.update(program=None), "program must be a dict, got None"),
+        (lambda c: c.update(program=None), "must be a mapping, not NoneType"),
         (lambda c: c.update(in_keys=["position"]), "in_keys must be among field, target_field"),
         (lambda c: c.update(in_keys=["field"]), "a program for 1 keys must take that many inputs"),
         (lambda c: c.update(view={"field_low": 1}), "does not hold a valid policy"),
@@ -245,12 +226,9 @@ def test_damaged_and_foreign_content_is_refused(saved: Path, tmp_path: Path, cha
 
 
 def test_loading_runs_no_code(saved: Path, tmp_path: Path) -> None:
-    """Neither of a file with pickled objects nor of one for torch.export.load."""
     content = torch.load(saved, weights_only=True)
     content["exported"]["view"] = Touch(tmp_path / "touched")
     save_tensors(content, tmp_path / "own.pt")
-    load_policy(saved).write_torch(tmp_path / "own.pt2")
-    for name in ("own.pt", "own.pt2"):
-        with pytest.raises(ValueError, match=rf"{name} is not a policy file"):
-            load_policy(tmp_path / name)
+    with pytest.raises(ValueError, match=r"own\.pt is not a policy file"):
+        load_policy(tmp_path / "own.pt")
     assert not (tmp_path / "touched").exists()

@@ -1,0 +1,47 @@
+"""Networks of actors and critics."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from magrl.agents import make_actor, make_critic, make_recurrent_actor
+from magrl.agents.networks import make_mlp
+from magrl.envs import GeomagneticNavEnv
+
+
+def test_new_actor_is_not_saturated() -> None:
+    """Half the longest move and no turn, give or take what the weights add."""
+    torch.manual_seed(0)
+    actions = make_actor(13, (16, 16))(TensorDict(observation=2 * torch.rand(50, 13) - 1, batch_size=[50]))["action"]
+    assert actions.abs().max() < 0.95
+    assert actions.std(0).min() > 0.01
+
+
+def test_critic_reads_its_observations_before_the_action() -> None:
+    critic = make_critic(3, (8,), observation_keys=("observation", "heading_vector"))
+    data = TensorDict(observation=torch.rand(5, 1), heading_vector=torch.rand(5, 2), action=torch.rand(5, 2))
+    joined = torch.cat((data["observation"], data["heading_vector"], data["action"]), -1)
+    assert torch.equal(critic(data)["state_action_value"], critic.module(joined))
+
+
+def test_first_and_last_layer_keep_float32() -> None:
+    """A difference of inputs that bfloat16 rounds off, and outputs between two of its numbers."""
+    network = make_mlp(1, 1, (1,), layer_norm=False)
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.copy_(torch.ones_like(weight))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        outputs = network(torch.tensor([[1.0], [1.0 + 2**-12]]))
+    assert outputs.dtype == torch.float32
+    assert (outputs[1] - outputs[0]).item() == pytest.approx(2**-12)
+
+
+@pytest.mark.parametrize(("size", "cells"), [(0, (8,)), (13, (0,)), (13, (1.5,)), (13, (10**9,))])
+def test_bad_sizes_are_refused(size: int, cells: tuple) -> None:
+    with pytest.raises(ValueError, match="must be a whole number from 1 up to 65536"):
+        make_actor(size, cells)
+
+
+def test_a_memory_has_a_size() -> None:
+    with pytest.raises(ValueError, match="memory_size"):
+        make_recurrent_actor(GeomagneticNavEnv(seed=0).observation_view(), (8,), 0)

@@ -1,0 +1,169 @@
+"""TD3: the loss beside TorchRL's and by hand, target networks and gradient steps."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+from torchrl.objectives import TD3Loss as StockTD3Loss
+
+from magrl.agents import SoftUpdate, TD3Loss, make_actor, make_critic, optimize
+
+CELLS = (16, 16)
+
+
+def make_loss(size: int = 13, *, policy_noise: float = 0.1) -> TD3Loss:
+    actor, critic = make_actor(size, CELLS), make_critic(size, CELLS)
+    return TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=0.5)
+
+
+def transitions(size: int = 13, count: int = 32) -> TensorDict:
+    """Return random transitions, of which every fourth ends its episode."""
+    ended = (torch.arange(count) % 4 == 0).unsqueeze(-1)
+    following = {"observation": torch.randn(count, size), "reward": torch.randn(count, 1), "done": ended}
+    return TensorDict(
+        observation=torch.randn(count, size),
+        action=torch.rand(count, 2) * 2 - 1,
+        next=TensorDict(following | {"terminated": ended.clone()}, [count]),
+        batch_size=[count],
+    )
+
+
+def test_target_policy_smoothing_is_clipped() -> None:
+    """With a large noise of a small clip, the target is that of the smallest and largest clipped noise."""
+    torch.manual_seed(0)
+    actor, critic, batch = make_actor(13, CELLS), make_critic(13, CELLS), transitions()
+    exact = TD3Loss(actor, critic, gamma=0.9, policy_noise=0.0, noise_clip=0.5)
+    near = TD3Loss(actor, critic, gamma=0.9, policy_noise=100.0, noise_clip=1e-4)
+    near.load_state_dict(exact.state_dict())
+    target, noisy = (loss.value_loss(batch.clone())[1]["target_value"] for loss in (exact, near))
+    assert not torch.equal(target, noisy)
+    torch.testing.assert_close(target, noisy, rtol=0, atol=1e-3)
+
+
+def test_loss_is_that_of_torchrl() -> None:
+    """Values and gradients of both losses, to rounding, after updates of weights and targets."""
+    torch.manual_seed(0)
+    ours = make_loss()
+    update = SoftUpdate(ours, tau=0.1)
+    optimizer = torch.optim.Adam([*ours.actor_parameters(), *ours.critic_parameters()], lr=1e-2)
+    for _ in range(3):
+        batch = transitions()
+        optimize(ours.value_loss(batch)[0] + ours.actor_loss(batch)[0], optimizer)
+        update.step()
+    spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 0.1, "noise_clip": 0.5}
+    stock = StockTD3Loss(make_actor(13, CELLS), make_critic(13, CELLS), deactivate_vmap=True, **spec)
+    stock.make_value_estimator(gamma=0.9)
+    stock.load_state_dict(ours.state_dict())
+    batch, computed = transitions(), []
+    for loss in (ours, stock):
+        torch.manual_seed(1)
+        value, actor = loss.value_loss(batch.clone())[0], loss.actor_loss(batch.clone())[0]
+        policy = [p for p in loss.actor_network_params.parameters() if p.requires_grad]
+        if loss is ours:
+            gradients = torch.autograd.grad(value, loss.critic_parameters())
+            critics = [torch.stack(pair) for pair in zip(gradients[:10], gradients[10:], strict=True)]
+        else:
+            critics = torch.autograd.grad(value, list(loss.qvalue_network_params.parameters()))
+        computed.append([value, actor, *critics, *torch.autograd.grad(actor, policy)])
+    assert len(computed[0]) == 2 + 10 + 10  # two hidden layers with their normalization, and the last
+    for mine, theirs in zip(*computed, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-6, atol=1e-8)
+
+
+def test_actor_loss_has_no_gradient_of_the_critics() -> None:
+    loss = make_loss()
+    loss.actor_loss(transitions())[0].backward()
+    assert all(p.grad.abs().sum() > 0 for p in loss.actor_parameters() if p.requires_grad)
+    critics = (loss.networks.frozen_critic, *loss.networks.critics, *loss.networks.target_critics)
+    assert all(p.grad is None for critic in critics for p in critic.parameters())
+
+
+def test_bfloat16_rounds_the_hidden_layers_alone() -> None:
+    """Losses agree to the three digits of the type. Both have gradients in float32, and the loss is not rounded."""
+    torch.manual_seed(0)
+    actor, critic, batch = make_actor(13, (64, 64)), make_critic(13, (64, 64)), transitions()
+    options = {"gamma": 0.9, "policy_noise": 0.0, "noise_clip": 0.5}
+    exact, rounded = (TD3Loss(actor, critic, **options, precision=kind) for kind in ("float32", "bfloat16"))
+    rounded.load_state_dict(exact.state_dict())
+    for name, weights in (("value_loss", "critic_parameters"), ("actor_loss", "actor_parameters")):
+        losses = [getattr(loss, name)(batch.clone())[0] for loss in (exact, rounded)]
+        assert losses[0].dtype == losses[1].dtype == torch.float32
+        assert losses[0] != losses[1]
+        torch.testing.assert_close(*losses, rtol=0.01, atol=0.01)
+        gradients = [
+            torch.autograd.grad(value, getattr(loss, weights)())
+            for value, loss in zip(losses, (exact, rounded), strict=True)
+        ]
+        for one, other in zip(*gradients, strict=True):
+            assert one.dtype == other.dtype == torch.float32
+            assert (one - other).norm() < 0.1 * one.norm()
+
+
+def test_the_key_of_the_end_can_be_chosen() -> None:
+    """With ``done`` in its place, a step limit counts as the end: no value after it."""
+    torch.manual_seed(0)
+    loss, batch = make_loss(policy_noise=0.0), transitions()
+    batch["next", "terminated"] = torch.zeros(32, 1, dtype=torch.bool)
+    batch["next", "done"] = torch.ones(32, 1, dtype=torch.bool)
+    assert not torch.equal(loss.value_loss(batch)[1]["target_value"], batch["next", "reward"])
+    loss.set_keys(terminated="done")
+    assert torch.equal(loss.value_loss(batch)[1]["target_value"], batch["next", "reward"])
+
+
+def test_optimizers_train_the_parameters_of_the_loss() -> None:
+    """The parameters share the memory of the stock class's, so that targets and checkpoints follow the updates."""
+    loss = make_loss()
+    names = {name: value.clone() for name, value in loss.state_dict().items() if isinstance(value, torch.Tensor)}
+    for weight in (*loss.critic_parameters(), *loss.actor_parameters()):
+        weight.data += 1
+    changed = {name for name, value in loss.state_dict().items() if name in names and not names[name].equal(value)}
+    trained = {name for name in names if not name.startswith("target_") and "action_" not in name}
+    assert changed == {name for name in trained if "weight" in name or "bias" in name}
+    assert changed
+
+
+def test_soft_update_moves_the_targets_by_tau() -> None:
+    loss = make_loss()
+    update = SoftUpdate(loss, tau=0.25)  # which makes targets equal to the weights
+    before = loss.target_qvalue_network_params.clone()
+    with torch.no_grad():
+        for weight in (*loss.critic_parameters(), *loss.actor_parameters()):
+            weight += 1
+    update.step()
+    for key, target in loss.target_qvalue_network_params.items(True, True):
+        torch.testing.assert_close(target, before[key] + 0.25)
+    batch = transitions()
+    seen = loss.networks.target_critics[0](torch.cat((batch["observation"], batch["action"]), -1))
+    with loss.target_qvalue_network_params[0].to_module(loss.qvalue_network):
+        expected = loss.qvalue_network(batch)["state_action_value"]
+    torch.testing.assert_close(seen, expected)
+
+
+def test_optimize_clips_the_gradient_of_some_parameters() -> None:
+    clipped, free = (torch.nn.Parameter(torch.zeros(2)) for _ in range(2))
+    optimizers = [torch.optim.SGD([weight], lr=1.0) for weight in (clipped, free)]
+    optimize((torch.tensor([30.0, 40.0]) * (clipped + free)).sum(), *optimizers, clip=[clipped], max_norm=5.0)
+    torch.testing.assert_close(clipped.detach(), torch.tensor([-3.0, -4.0]))
+    torch.testing.assert_close(free.detach(), torch.tensor([-30.0, -40.0]))
+    assert clipped.grad is None
+    assert free.grad is None
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"gamma": 1.5}, ValueError, "gamma must be a finite number from 0 up to 1, got 1.5"),
+        ({"policy_noise": -1.0}, ValueError, "policy_noise"),
+        ({"noise_clip": math.nan}, ValueError, "noise_clip"),
+        ({"actor": None}, TypeError, "actor must be a TensorDictSequential"),
+        ({"critic": None}, TypeError, "critic must be a ValueOperator"),
+    ],
+)
+def test_bad_options_of_the_loss_are_refused(change: dict, error: type, message: str) -> None:
+    options = {"actor": make_actor(3, (4,)), "critic": make_critic(3, (4,)), "gamma": 0.9}
+    options |= {"policy_noise": 0.1, "noise_clip": 0.5} | change
+    actor, critic = options.pop("actor"), options.pop("critic")
+    with pytest.raises(error, match=message):
+        TD3Loss(actor, critic, **options)

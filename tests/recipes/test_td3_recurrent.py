@@ -1,0 +1,110 @@
+"""The recipe of the recurrent agent: its run folder, resuming, settings, and that it learns."""
+
+import csv
+import json
+import math
+import signal
+from pathlib import Path
+
+import pytest
+import td3_recurrent as recipe
+import torch
+
+from magrl.agents import RecurrentTD3Loss, load_policy
+from magrl.training import Run, parse_config
+
+SMALL = {
+    "num_envs": 16,
+    "total_frames": 448,
+    "num_cells": (16, 16),
+    "memory_size": 8,
+    "num_slices": 4,
+    "updates_per_step": 1,
+    "eval_every": 5,
+    "eval_tasks_small": 4,
+    "eval_tasks": 6,
+    "wandb_mode": "disabled",
+}
+
+
+def settings(out: Path, **options) -> recipe.Config:
+    return recipe.Config(out=out, **SMALL | options)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_interrupted_training_resumes_exactly(tmp_path: Path, signalled, same_outcome, capsys) -> None:
+    """Episodes of 24 moves, 4 per batch: recurrent states and running episodes are those of the checkpoint."""
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    result = recipe.train(settings(whole))
+    with signalled(4, signal.SIGINT), pytest.raises(SystemExit) as stop:
+        recipe.train(settings(run))
+    assert stop.value.code == 130
+    assert "Stopped after 256 frames" in capsys.readouterr().err
+    recipe.train(parse_config(recipe.Config, {"default": recipe.Config()}, recipe.RECIPE, "", ["--resume", str(run)]))
+    assert same_outcome(run, whole)
+    written = json.loads((whole / "eval.json").read_text())
+    assert (written["num_tasks"], written["frames"], written["updates"]) == (6, 448, 28)
+    assert written["spl"] == result["spl"]
+    rows = list(csv.DictReader((whole / "train.csv").open()))
+    assert all(math.isfinite(float(row[key])) for row in rows for key in ("loss_critic", "loss_actor", "loss_heading"))
+    assert load_policy(whole / "policy.pt").config.memory_size == 8
+
+
+def test_non_finite_weight_stops_the_training(tmp_path: Path, monkeypatch) -> None:
+    """After the last update of a batch, so that no loss is computed with it."""
+
+    class Poisoned(recipe.SoftUpdate):
+        def __init__(self, loss: RecurrentTD3Loss, *, tau: float) -> None:
+            super().__init__(loss, tau=tau)
+            self.weight, self.steps = loss.memory_parameters()[0], 0
+
+        def step(self) -> None:
+            super().step()
+            self.steps += 1
+            if self.steps == 4:  # two updates of the targets a batch
+                with torch.no_grad():
+                    self.weight[0] = float("nan")
+
+    monkeypatch.setattr(recipe, "SoftUpdate", Poisoned)
+    with pytest.raises(FloatingPointError, match=r"after update 8: .*lstm.* is not finite in rows \[0"):
+        recipe.train(settings(tmp_path / "run"))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"num_envs": 1},
+        {"memory_size": 0},
+        {"steps_per_batch": 1},
+        {"buffer_size": 63},
+        {"shortest_task_km": 500.0},
+        {"noise_share": 0.0},
+        {"random_share": 1.5},
+    ],
+    ids=str,
+)
+def test_bad_settings_are_refused_by_name(tmp_path: Path, bad: dict) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        settings(tmp_path / "run", **bad)
+
+
+def test_a_scenario_has_distances_and_steps_of_its_own(tmp_path: Path) -> None:
+    """The shortest training task is below its longest one; its step limit is that of the evaluations alone."""
+    content = {"region": {"latitude": [40, 50], "longitude": [-30, -20]}, "date": "2026-07-01", "max_steps": 80}
+    near, far = tmp_path / "near.json", tmp_path / "far.json"
+    near.write_text(json.dumps(content | {"distance_range_km": [50, 90]}))
+    far.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="shortest_task_km must be below 90, got 100"):
+        settings(tmp_path / "run", scenario=near)
+    config = settings(tmp_path / "run", scenario=far)
+    with Run(config, recipe="mine.py", name="mine") as run:
+        assert recipe.make_base(run, config).max_steps == config.train_steps != 80
+        assert [env.max_steps for env in run.evaluation_envs()] == [80, 80]
+
+
+@pytest.mark.slow
+def test_the_eight_numbers_suffice_with_a_memory(tmp_path: Path) -> None:
+    """On a seed that was not used for tuning."""
+    result = recipe.train(recipe.Config(seed=5, out=tmp_path / "run", wandb_mode="disabled"))
+    assert result["success_rate"] >= 90
+    assert result["num_tasks"] == 1000
