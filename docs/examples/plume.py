@@ -33,7 +33,7 @@ from torchrl.modules import AdditiveGaussianModule, TanhModule
 from magrl.agents import SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.agents.networks import make_mlp
 from magrl.envs.rendering import PATH, START, TARGET
-from magrl.evaluation import plots
+from magrl.evaluation import figures
 from magrl.evaluation.navigators import NAVIGATOR_NAMES
 from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
 
@@ -228,7 +228,7 @@ def main(config: Config) -> dict[str, list[Training]]:
         (config.out / folder).mkdir(parents=True, exist_ok=True)
     (config.out / "results" / "plume.md").write_text(table(trainings))
     curves = {name: [(run.frames, run.success) for run in runs] for name, runs in trainings.items()}
-    plots.learning_curves(curves, "episodes that arrive [%]").savefig(config.out / "figures" / "plume.png", dpi=80)
+    figures.learning_curves(curves, "episodes that arrive [%]").savefig(config.out / "figures" / "plume.png", dpi=80)
     tracks = tracks_figure(config, trainings["gg_td3"][0].actor)
     tracks.savefig(config.out / "figures" / "plume-tracks.png", dpi=80)
     print(table(trainings), end="")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl import guidance, tracking
 from magrl.checks import check_number, check_numbers, check_type
-from magrl.navigators.base import steer
+from magrl.envs import GeomagneticNavEnv
+from magrl.navigators.base import PERFECT, Std, steer
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.navigators.secant import SLOPES
 from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior
@@ -181,6 +184,17 @@ class Kalman(QuasiNewton):
         inverse, info = torch.linalg.inv_ex(normal + torch.diag(1 / unknown.diagonal()))
         # Where rounding leaves a singular matrix, the way is as unknown as before.
         return torch.where((info == 0)[..., None, None], inverse, unknown) * DISTANCE_SCALE_KM**2
+
+    name, label = "kalman", "Kalman"
+    description = "Kalman (dual control)"
+
+    @classmethod
+    def for_env(
+        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
+    ) -> Self:
+        bounds = env.max_move_km, env.max_turn_rad, sensor_std, env.max_steps
+        search = env.arrival.rule == "objective"  # else, an episode does not end where the objective is low
+        return cls(*bounds, bias=bias_std, zeta=env.zeta, search=search, **options)
 
 
 def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:

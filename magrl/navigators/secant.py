@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl.checks import check_number, check_numbers
+from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
+from magrl.navigators.base import PERFECT, Std, total_std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.tracking import GradientPrior
 
@@ -91,3 +95,12 @@ class Secant(QuasiNewton):
         probe_turn = torch.where(decisions == 1, self.probe_turn, 0.0)
         probing = decisions < 2
         return torch.where(probing, self.probe_km, distance), torch.where(probing, probe_turn, turn)
+
+    name = label = "secant"
+    description = "secant (quasi-Newton)"
+
+    @classmethod
+    def for_env(
+        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
+    ) -> Self:
+        return cls(env.max_move_km, env.max_turn_rad, noise=total_std(sensor_std, bias_std), **options)

@@ -29,8 +29,7 @@ from tqdm import tqdm
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, earth_scenario
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
-from magrl.evaluation.navigators import check_distinct, label, make_navigator, needs
-from magrl.evaluation.plots import NAVIGATOR_COLORS
+from magrl.evaluation.navigators import NAVIGATOR_COLORS, check_distinct, label, make_navigator, needs
 from magrl.evaluation.tables import markdown_table
 from magrl.field.records import WeatherRecord, weather_record
 from magrl.files import check_writable
@@ -121,7 +120,7 @@ def make_env(tasks: int, regions: int, seed: int) -> GeomagneticNavEnv:
 def measure(text: str, base: GeomagneticNavEnv, conditions: Conditions) -> dict[str, float]:
     """Return the summary of a navigator under conditions."""
     env = with_conditions(base, conditions, base.seed)
-    navigator = make_navigator(text, base, noise=conditions.sensor_std, bias=conditions.bias_std)
+    navigator = make_navigator(text, base, sensor_std=conditions.sensor_std, bias_std=conditions.bias_std)
     return summarize(episode_measures(evaluation_rollout(env, navigator)))
 
 

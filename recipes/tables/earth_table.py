@@ -91,7 +91,7 @@ def earth(config: Config, date: str) -> Scenario:
 def measure(text: str, base: GeomagneticNavEnv, noise: Noise, map_date: str | None = None) -> Result:
     """Return the measures of a navigator at a level of noise."""
     env = with_sensor_noise(base, noise, base.seed)
-    navigator = make_navigator(text, base, noise=noise, map_date=map_date)
+    navigator = make_navigator(text, base, sensor_std=noise, map_date=map_date)
     summary = summarize(episode_measures(evaluation_rollout(env, navigator)))
     far = base.scenario.distance_range_km[1] > FAR_KM
     return tuple(summary[name] for name in ([NEAR] * far + [*MEASURES]))

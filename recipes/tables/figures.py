@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from magrl.envs import PAPER_REGION, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
-from magrl.evaluation import plots
+from magrl.evaluation import figures as plots
 from magrl.training import UsageError, command
 
 RECIPE = "figures.py"

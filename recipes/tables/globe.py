@@ -37,7 +37,7 @@ from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks
 from magrl.envs.specs import state_spec
 from magrl.envs.tasks import task_set
 from magrl.evaluation import episode_measures, evaluation_rollout
-from magrl.evaluation.flight import coastlines
+from magrl.evaluation.maps import coastlines
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.tables import markdown_table
 from magrl.field import IGRF, elements_at, elements_gradient_at
@@ -124,7 +124,7 @@ def flown(config: Config, field: IGRF, tasks: Tasks, noise: tuple[float, float, 
             start_heading="random",
             seed=config.seed + first,  # other headings and noise than in other chunks
         )
-        navigator = make_navigator(config.navigator, env, seed=config.seed, noise=noise)
+        navigator = make_navigator(config.navigator, env, seed=config.seed, sensor_std=noise)
         parts.append(episode_measures(evaluation_rollout(with_sensor_noise(env, noise, env.seed), navigator)))
         bar.update(len(part.start))
     return {key: torch.cat([part[key] for part in parts]) for key in ("success", "spl", "steps")}

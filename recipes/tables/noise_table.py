@@ -16,8 +16,8 @@ from typing import Any
 
 import tyro
 
+from magrl.evaluation.figures import noise_figure
 from magrl.evaluation.navigators import label, needs
-from magrl.evaluation.plots import noise_figure
 from magrl.evaluation.tables import Summaries, markdown_table, mean_of_runs
 from magrl.files import check_writable
 from magrl.training import UsageError, command

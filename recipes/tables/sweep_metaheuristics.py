@@ -24,7 +24,8 @@ from magrl import paper
 from magrl.envs import GeomagneticNavEnv, Scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.tables import markdown_table
-from magrl.navigators.metaheuristics import ALGORITHMS, MODES, build
+from magrl.navigators import NAVIGATORS
+from magrl.navigators.metaheuristics import MODES
 from magrl.training import UsageError, command
 
 RECIPE = "sweep_metaheuristics.py"
@@ -72,7 +73,7 @@ def settings(name: str, mode: str) -> list[dict[str, Any]]:
 
 def measure(env: GeomagneticNavEnv, name: str, mode: str, seed: int, options: dict[str, Any]) -> tuple[float, ...]:
     """Return SR [%], SPL [%], TNT and readings per move on the tasks of an environment."""
-    navigator = build(name, env, mode, seed, **options)
+    navigator = NAVIGATORS[name].for_env(env, mode=mode, seed=seed, **options)
     env.set_seed(0)  # back to each vehicle's first task
     episodes = episode_measures(evaluation_rollout(env, navigator))
     summary = summarize(episodes)
@@ -91,7 +92,7 @@ def sweep(config: Config) -> str:
         env = GeomagneticNavEnv(Scenario(tasks=tasks), num_envs=config.tasks, zeta=config.zeta, seed=0)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    names = list(ALGORITHMS) if config.algorithm == "all" else [config.algorithm]
+    names = ["ga", "pso", "afsa"] if config.algorithm == "all" else [config.algorithm]
     modes = MODES if config.mode == "both" else (config.mode,)
     runs = [(name, mode, options) for name, mode in product(names, modes) for options in settings(name, mode)]
     rows = [(measure(env, *run[:2], config.seed, run[2]), run) for run in tqdm(runs, unit="setting")]

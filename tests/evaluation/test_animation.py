@@ -6,12 +6,12 @@ import fly as recipe
 import numpy as np
 import pytest
 import torch
+from magrl.evaluation.animation import way_ellipse, write_flight_gif
 from PIL import Image
 from tensordict import TensorDictBase
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import animation
-from magrl.evaluation.animation import way_ellipse, write_flight_gif
 from magrl.evaluation.replay import save_gif
 from magrl.geodesy import geodesic
 from magrl.training import UsageError

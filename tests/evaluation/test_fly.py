@@ -8,11 +8,11 @@ import fly as recipe
 import numpy as np
 import pytest
 import torch
+from magrl.evaluation.flight import coastlines, flight_figure, frame, shortest_path
 from tensordict import TensorDict
 
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region
-from magrl.evaluation.flight import coastlines, flight_figure, frame, shortest_path
 from magrl.evaluation.places import (
     check_declination,
     find_elements,
