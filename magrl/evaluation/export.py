@@ -94,22 +94,17 @@ def to_geojson(tracks: Sequence[Track]) -> str:
         >>> feature["geometry"]["coordinates"]
         [[[179.0, 0.0], [180.0, 0.0]], [[-180.0, 0.0], [-179.0, 0.0]]]
     """
-    features = [
-        {
-            "type": "Feature",
-            "geometry": _geometry(track),
-            "properties": {"name": track.name, **json_ready(track.properties)},
-        }
-        for track in tracks
-    ]
+    features = []
+    for track in tracks:
+        properties = {"name": track.name, **json_ready(track.properties)}
+        features.append({"type": "Feature", "geometry": _geometry(track), "properties": properties})
     return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
 
 
 def _geometry(track: Track) -> dict[str, Any]:
     lines = [[[longitude, latitude] for latitude, longitude in line] for line in cut(track.positions)]
-    if len(lines) == 1:
-        return {"type": "LineString", "coordinates": lines[0]}
-    return {"type": "MultiLineString", "coordinates": lines}
+    kind, coordinates = ("LineString", lines[0]) if len(lines) == 1 else ("MultiLineString", lines)
+    return {"type": kind, "coordinates": coordinates}
 
 
 def to_gpx(tracks: Sequence[Track]) -> str:
@@ -186,15 +181,9 @@ def _line_placemark(track: Track, style: str) -> Element:
 
 def _end_placemarks(name: str, *places: Position) -> list[Element]:
     """Return the placemarks of start and destination of a task."""
-    return [
-        _tag(
-            "Placemark",
-            _tag("name", f"{name}: {end}"),
-            _tag("styleUrl", f"#{end}"),
-            _tag("Point", _coordinates([place])),
-        )
-        for end, place in zip(_ENDS, _checked(places), strict=True)
-    ]
+    points = [_tag("Point", _coordinates([place])) for place in _checked(places)]
+    texts = [(_tag("name", f"{name}: {end}"), _tag("styleUrl", f"#{end}")) for end in _ENDS]
+    return [_tag("Placemark", *text, point) for text, point in zip(texts, points, strict=True)]
 
 
 WRITERS: dict[str, Callable[[Sequence[Track]], str]] = {".geojson": to_geojson, ".gpx": to_gpx, ".kml": to_kml}

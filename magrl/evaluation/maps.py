@@ -145,7 +145,7 @@ def trajectories_figure(
             guesses = region.unwrapped(estimates(shown["next"].reshape(-1), 5000.0))
             axes.plot(guesses[:, 1], guesses[:, 0], ".", color=ESTIMATE, ms=4, label="destination, estimated")
         _write_names(axes, names, region.unwrapped(shown["target_position"][:, 0]))
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=4, fontsize=8, frameon=False)
+    _draw_legend(figure)
     return figure
 
 
@@ -180,6 +180,11 @@ def _draw_map(
     axes.xaxis.set_major_formatter(lambda degrees, _: f"{math.remainder(degrees, 360):g}")
     width = (box.longitude[1] - box.longitude[0]) * math.cos(math.radians(sum(box.latitude) / 2))
     return tracks, 1.6 + 7 * min((box.latitude[1] - box.latitude[0]) / width, 1.3)
+
+
+def _draw_legend(figure: Figure) -> None:
+    labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
 
 
 def _write_names(axes: Axes, names: Sequence[str], places: Tensor) -> None:
@@ -304,7 +309,7 @@ def _frames(
     estimate = axes.plot([], [], color=ESTIMATE, lw=1.5, marker="x", ms=8, mew=2.5, markevery=[0])[0]
     estimate.set_label("destination, estimated: 2 standard deviations" if estimated else "")
     lines = [axes.plot([], [], lw=2, marker="o", ms=6, markevery=[-1])[0] for _ in tracks]
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=4, fontsize=8, frameon=False)
+    _draw_legend(figure)
     canvas.draw()
     figure.set_layout_engine("none")  # a fixed layout in all frames
     for piece in range(0, max(map(len, tracks)), _DRAWN):

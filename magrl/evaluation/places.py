@@ -113,9 +113,10 @@ def find_elements(field: FieldModel, elements: Tensor, near: Tensor) -> Tensor:
     distance, _ = geodesic(*near.double().expand_as(place).unbind(-1), *place.unbind(-1))
     if misfit.min() > 1:
         closest = elements_at(field, place[misfit.argmin()])
+        wanted, least, found = (elements_text(each) for each in (elements, scale, closest))
         raise ValueError(
-            f"no place has {elements_text(elements)} within {elements_text(scale)}: the most similar field found is "
-            f"{elements_text(closest)}; take the elements of one place and date, or give the destination by its coordinates"
+            f"no place has {wanted} within {least}: the most similar field found is {found}; take the elements of one "
+            "place and date, or give the destination by its coordinates"
         )
     return place[torch.where(misfit <= 1, distance.nan_to_num(nan=1e5), torch.inf).argmin()]
 
