@@ -54,15 +54,15 @@ def coastlines() -> np.ndarray:
 
 
 def shortest_path(start: Tensor, target: Tensor, points: int = 41) -> Tensor:
-    """Return points of the geodesic between two places, both ends included.
+    """Return points of geodesics, both ends included.
 
     Args:
-        start: ``(2,)`` latitude, longitude [deg].
-        target: ``(2,)`` latitude, longitude [deg].
+        start: ``(..., 2)`` latitude, longitude [deg].
+        target: ``(..., 2)`` latitude, longitude [deg].
         points: number of points.
 
     Returns:
-        ``(points, 2)`` [deg], float64.
+        ``(..., points, 2)`` [deg], float64.
 
     Raises:
         ValueError: for fewer than two points.
@@ -75,9 +75,10 @@ def shortest_path(start: Tensor, target: Tensor, points: int = 41) -> Tensor:
     check_number(2, whole=True, points=points)
     path, target = [start.double()], target.double()
     for left in range(points - 1, 1, -1):
-        distance, bearing = geodesic(*path[-1], *target)
-        path.append(torch.stack(move(path[-1][0], path[-1][1], bearing, distance / left)))
-    return torch.stack((*path, target))
+        here = path[-1].unbind(-1)
+        distance, bearing = geodesic(*here, *target.unbind(-1))
+        path.append(torch.stack(move(*here, bearing, distance / left), -1))
+    return torch.stack((*path, target), -2)
 
 
 def frame(positions: Tensor) -> Region:
@@ -165,7 +166,7 @@ def _draw_map(
         The tracks (:func:`~magrl.evaluation.replay.episode_tracks`), and the height of a figure of 8 inches.
     """
     tracks, ends = episode_tracks(rollout, region), [rollout[f"{end}_position"][:, 0] for end in ("start", "target")]
-    shortest = [region.unwrapped(shortest_path(*each)) for each in zip(*ends, strict=True)]
+    shortest = region.unwrapped(shortest_path(*ends))
     box = frame(torch.cat([*tracks, *shortest, region.unwrapped(ends[0][:0] if shown is None else shown)]))
     draw_contours(axes, field, box)
     for turn in (-360, 0, 360):

@@ -145,10 +145,11 @@ def agreed(runs: Sequence[TrainedRun], setting: str, chosen: Any, default: Any) 
     """
     name, trained = setting.replace("_", " "), [(run.folder, getattr(run, setting)) for run in runs]
     if chosen is None:
-        examples = {_content(value): (folder, value) for folder, value in reversed(trained)}
+        examples: dict[object, str] = {}
+        for folder, value in trained:
+            examples.setdefault(_content(value), f"{_text(value)} ({folder})")
         if len(examples) > 1:
-            listed = ", ".join(f"{_text(value)} ({folder})" for folder, value in reversed(examples.values()))
-            option = f"--{setting.replace('_', '-')}"
+            listed, option = ", ".join(examples.values()), f"--{setting.replace('_', '-')}"
             raise ValueError(f"the runs were trained with different {name}, {listed}: choose with {option}")
         chosen = trained[0][1] if trained else default
     return chosen, [
