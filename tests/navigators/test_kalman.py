@@ -134,7 +134,7 @@ def test_more_noise_means_less_caution_and_dearer_steps() -> None:
 
 def test_by_name_it_takes_bounds_noise_and_step_limit_from_the_environment() -> None:
     base = GeomagneticNavEnv(num_envs=2, seed=0, max_steps=30, max_move_km=40.0, max_turn_rad=1.0)
-    navigator = make_navigator("kalman", base, "paper", 0, noise=NOISE)
+    navigator = make_navigator("kalman", base, sensor_std=NOISE)
     assert "kalman" in NAVIGATORS
     assert isinstance(navigator, Kalman)
     assert (navigator.max_steps, navigator.max_move_km, navigator.max_turn_rad) == (30, 40.0, 1.0)
