@@ -75,9 +75,9 @@ def shortest_path(start: Tensor, target: Tensor, points: int = 41) -> Tensor:
     check_number(2, whole=True, points=points)
     path, target = [start.double()], target.double()
     for left in range(points - 1, 1, -1):
-        here = path[-1].unbind(-1)
-        distance, bearing = geodesic(*here, *target.unbind(-1))
-        path.append(torch.stack(move(*here, bearing, distance / left), -1))
+        latitude, longitude = path[-1].unbind(-1)
+        distance, bearing = geodesic(latitude, longitude, *target.unbind(-1))
+        path.append(torch.stack(move(latitude, longitude, bearing, distance / left), -1))
     return torch.stack((*path, target), -2)
 
 
