@@ -193,13 +193,13 @@ def test_damaged_data_is_refused(data: dict[str, Any], tmp_path: Path) -> None:
 
 
 def test_the_recipe_flies_the_run_first(env: GeomagneticNavEnv, tmp_path: Path) -> None:
-    """With the settings of the training; a run without guidance is TD3, and a declaration elsewhere fails."""
+    """With the settings of the training; a run without guidance is TD3."""
     recipe, run = load("replay"), tmp_path / "agent"
     run.mkdir()
     torch.manual_seed(0)
     save_policy(run / "policy.pt", FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False)))
     box = {"latitude": [-10.0, 0.0], "longitude": [160.0, 170.0]}
-    scenario = {"region": box, "date": "2022-01-01", "generation": 13, "arrival": "declared"}
+    scenario = {"region": box, "date": "2022-01-01", "generation": 13, "max_steps": 12}
     tasks = [{"start": [-2.0, 162.0], "target": [-8.0, 164.0]}, {"start": [-3.0, 163.0], "target": [-6.0, 165.0]}]
     (run / "scenario.json").write_text(json.dumps(scenario | {"tasks": tasks}))
     settings = {"guided": False, "zeta": 0.5, "scenario": "elsewhere/scenario.json"}
@@ -211,8 +211,6 @@ def test_the_recipe_flies_the_run_first(env: GeomagneticNavEnv, tmp_path: Path) 
     assert labels == ["TD3", "TD3 (agent)", "geodesic (both positions, an oracle)", "PSO, flown"]
     assert [task["start"] for task in data["tasks"]] == [task["start"] for task in tasks]
     assert (data["zeta"], data["title"]) == (0.5, "agent, tasks of scenario.json")
-    outcomes = {episode["outcome"] for navigator in data["navigators"] for episode in navigator["episodes"]}
-    assert outcomes <= {"arrived", "false arrival", "out of steps", "lost"}
     assert Image.open(tmp_path / "a.gif").n_frames > 1
     (run / "config.json").write_text(json.dumps({"recipe": "sac.py"}))
     options = {"run": run, "navigators": (), "tasks": "figure-4-1", "out": tmp_path / "page.html"}
