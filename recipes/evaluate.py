@@ -44,11 +44,11 @@ from tqdm import tqdm
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize
-from magrl.evaluation.maps import flights_figure
+from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import arrival_threshold, check_distinct, check_map_date, label, make_navigator
+from magrl.evaluation.navigators import check_distinct, check_map_date, label, make_navigator
 from magrl.evaluation.rollout import with_true_field
-from magrl.evaluation.runs import NO_NOISE, Noise, agreed, common_scenario, trained_runs
+from magrl.evaluation.runs import NO_NOISE, Noise, agreed, trained_runs, unfinished
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names, with_declaration
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
@@ -140,21 +140,20 @@ def settle(config: Config) -> tuple[Config, list[str]]:
         check_number(0, noise=level)
     if config.conditions and config.noise:
         raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
+    every = trained_runs(config.navigators)
     # Agents that train anywhere have seen every heading, many levels of noise, and no region in particular.
-    runs = [run for run in trained_runs(config.navigators) if run.kind != "anywhere"]
+    runs = [run for run in every if run.kind != "anywhere"]
     path, places = config.scenario, list[str]()
     if config.tasks != "figure-4-1":  # which lies in the paper's region
-        path, places = common_scenario(runs, config.scenario)
+        path, places = agreed(runs, "scenario", config.scenario, None)
     own = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
-    zeta, warnings = arrival_threshold(config.navigators, own.zeta)
-    named = {"name": "start heading", "option": "--start-heading"}
-    heading, others = agreed(runs, lambda run: run.start_heading, own.start_heading, "north", **named)
+    zeta, thresholds = agreed(every, "zeta", own.zeta, 0.01)
+    heading, headings = agreed(runs, "start_heading", own.start_heading, "north")
     noise, noisy = NO_NOISE, list[str]()
     if not config.conditions:
-        named = {"name": "sensor noise", "option": "--noise"}
-        noise, noisy = agreed(runs, lambda run: run.noise, config.noise, NO_NOISE, **named)
+        noise, noisy = agreed(runs, "noise", config.noise, NO_NOISE)
     settled = replace(config, scenario=path, zeta=zeta, start_heading=heading, noise=noise)
-    return settled, [*warnings, *others, *noisy, *places]
+    return settled, [*thresholds, *unfinished(config.navigators), *headings, *noisy, *places]
 
 
 def prepare(config: Config) -> tuple[Config, list[EnvBase], list[Pair], list[str]]:
@@ -199,8 +198,9 @@ def make_fleet(config: Config, scenarios: Sequence[Scenario]) -> tuple[list[EnvB
         sensor_std, envs = conditions.sensor_std, [with_conditions(base, conditions, config.seed) for base in bases]
     else:
         sensor_std, envs = config.noise, [with_sensor_noise(base, config.noise, config.seed) for base in bases]
-    options = config.mode, config.seed, sensor_std, config.map_date, conditions.bias_std
-    navigators = [tuple(make_navigator(text, base, *options) for base in bases) for text in config.navigators]
+    options = {"mode": config.mode, "seed": config.seed, "map_date": config.map_date}
+    options |= {"sensor_std": sensor_std, "bias_std": conditions.bias_std}
+    navigators = [tuple(make_navigator(text, base, **options) for base in bases) for text in config.navigators]
     return [with_declaration(env) for env in envs], navigators
 
 
@@ -278,7 +278,7 @@ def write(config: Config, env: EnvBase, results: Results) -> None:
     whole = comparison_table(results.summaries, config.mode, published=not config.scenario, kilometers=ahead)
     (config.out / "table.md").write_text(whole + notes)
     (config.out / "short.md").write_text(short_table(results.summaries, config.mode, kilometers=ahead) + notes)
-    figure = flights_figure(results.rollouts, env.field, env.region, env.scenario.names)
+    figure = trajectories_figure(results.rollouts, env.field, env.region, names=env.scenario.names)
     figure.savefig(config.out / "trajectories.png", dpi=120)
     if config.export:
         export.write_tracks(config.export, results.tracks)

@@ -35,16 +35,15 @@ from tqdm import tqdm
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation import episode_measures, export
-from magrl.evaluation.animation import write_flight_gif
-from magrl.evaluation.flight import flight_figure
+from magrl.evaluation.maps import trajectories_figure, write_gif
 from magrl.evaluation.navigators import make_navigator, needs
 from magrl.evaluation.places import (
     check_declination,
+    elements_text,
     find_elements,
     parse_coordinates,
     parse_elements,
     region_around,
-    said,
 )
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json
@@ -177,8 +176,8 @@ def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
         if config.conditions:
             noise, errors = conditions.sensor_std, conditions.transforms(config.seed)
         env = TransformedEnv(base, Compose(*errors, track))
-        told = {"noise": noise, "bias": conditions.bias_std}
-        navigator = make_navigator(config.navigator, base, seed=config.seed, **told)
+        std = {"sensor_std": noise, "bias_std": conditions.bias_std}
+        navigator = make_navigator(config.navigator, base, seed=config.seed, **std)
         check_files(config)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
@@ -224,11 +223,11 @@ def fly(config: Config) -> dict[str, Any]:
     }
     write_json(config.out / "flight.json", result)
     title = f"{config.start} to {config.destination}: {name}, {outcome}, {measures['length_km']:.0f} km"
-    flight_figure(steps, base.field, base.region, title).savefig(config.out / "flight.png", dpi=120)
+    trajectories_figure({title: steps}, base.field, base.region).savefig(config.out / "flight.png", dpi=120)
     if config.export:
         export.write_tracks(config.export, export.tracks(steps, [title], navigator=name))
     if config.animate:
-        write_flight_gif(config.animate, steps, base.field, base.region, title)
+        write_gif(config.animate, steps, base.field, base.region, title)
     return result
 
 
@@ -242,7 +241,7 @@ def summary(result: dict[str, Any]) -> str:
         "navigator": f"{result['navigator']}, which needs {result['needs']} beside its readings",
         "noise": noise,
         "start": ends[0],
-        "destination": f"{ends[1]}, {said(torch.tensor(result['target_field']))}",
+        "destination": f"{ends[1]}, {elements_text(torch.tensor(result['target_field']))}",
         "steps": f"{result['steps']} of at most {result['max_steps']}",
         "path": f"{result['length_km']:.0f} km; the shortest is {result['shortest_km']:.0f} km",
         "efficiency": f"{100 * result['path_efficiency']:.1f} %",

@@ -24,10 +24,11 @@ from torchrl.envs import EnvBase
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
-from magrl.evaluation.navigators import DEFAULT_ZETA, label, make_navigator
-from magrl.evaluation.replay import replay_data, write_gif, write_replay
+from magrl.evaluation.maps import write_gif
+from magrl.evaluation.navigators import label, make_navigator
+from magrl.evaluation.replay import replay_data, write_replay
 from magrl.evaluation.rollout import with_true_field
-from magrl.evaluation.runs import read_run, run_config
+from magrl.evaluation.runs import read_run
 from magrl.evaluation.scenarios import TaskSet, choose_tasks, first_tasks, with_declaration
 from magrl.files import check_writable
 from magrl.training import UsageError, command
@@ -87,7 +88,7 @@ def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], s
     try:
         run = read_run(config.run)
         path = config.scenario or run.scenario
-        zeta = run_config(config.run).get("zeta", DEFAULT_ZETA) if config.zeta is None else config.zeta
+        zeta = run.zeta if config.zeta is None else config.zeta
         scenario = choose_tasks(path, config.tasks, zeta=zeta, start_heading=run.start_heading)
         assert scenario.tasks is not None
         available = len(scenario.tasks.start)
@@ -95,7 +96,7 @@ def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], s
         base = GeomagneticNavEnv(first_tasks(scenario, count), num_envs=count, seed=config.seed)
         env = with_declaration(with_sensor_noise(base, run.noise, config.seed))
         texts = (f"{run.kind or f'policy:{config.run.name}'}={config.run}", *config.navigators)
-        made = {text: make_navigator(text, base, seed=config.seed, noise=run.noise) for text in texts}
+        made = {text: make_navigator(text, base, seed=config.seed, sensor_std=run.noise) for text in texts}
         navigators = {name: made[text] for name, text in labeled(texts).items()}
         out = config.out or config.run / "replay.html"
         for file in filter(None, (out, config.gif)):

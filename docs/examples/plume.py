@@ -31,7 +31,7 @@ from torchrl.modules import AdditiveGaussianModule, TanhModule
 
 from magrl.agents import SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.agents.networks import make_mlp
-from magrl.evaluation import plots
+from magrl.evaluation import figures
 from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
 
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
@@ -206,7 +206,7 @@ def main(config: Config) -> dict[str, list[Training]]:
         (config.out / folder).mkdir(parents=True, exist_ok=True)
     (config.out / "results" / "plume.md").write_text(table(trainings))
     curves = {name: [(run.frames, run.success) for run in runs] for name, runs in trainings.items()}
-    plots.learning_curves(curves, "episodes that arrive [%]").savefig(config.out / "figures" / "plume.png", dpi=80)
+    figures.learning_curves(curves, "episodes that arrive [%]").savefig(config.out / "figures" / "plume.png", dpi=80)
     print(table(trainings), end="")
     return trainings
 

@@ -13,14 +13,14 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, indent, tostring
 
 from tensordict import TensorDictBase
 
 from magrl.checks import check_numbers, check_type
 from magrl.envs.rendering import START, TARGET
-from magrl.evaluation.colors import NAVIGATOR_COLORS
 from magrl.evaluation.metrics import episode_measures
+from magrl.evaluation.navigators import NAVIGATOR_COLORS, parse_navigator
 from magrl.files import json_ready
 
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
@@ -96,16 +96,15 @@ def to_geojson(tracks: Sequence[Track]) -> str:
     """
     features = []
     for track in tracks:
-        lines = [[[longitude, latitude] for latitude, longitude in line] for line in cut(track.positions)]
-        kind, coordinates = ("LineString", lines[0]) if len(lines) == 1 else ("MultiLineString", lines)
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": kind, "coordinates": coordinates},
-                "properties": {"name": track.name, **json_ready(track.properties)},
-            }
-        )
+        properties = {"name": track.name, **json_ready(track.properties)}
+        features.append({"type": "Feature", "geometry": _geometry(track), "properties": properties})
     return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+
+
+def _geometry(track: Track) -> dict[str, Any]:
+    lines = [[[longitude, latitude] for latitude, longitude in line] for line in cut(track.positions)]
+    kind, coordinates = ("LineString", lines[0]) if len(lines) == 1 else ("MultiLineString", lines)
+    return {"type": kind, "coordinates": coordinates}
 
 
 def to_gpx(tracks: Sequence[Track]) -> str:
@@ -118,16 +117,16 @@ def to_gpx(tracks: Sequence[Track]) -> str:
         >>> print(to_gpx([Track("home", [(-2, 162), (-2.4, 162.1)], {"steps": 1})]).splitlines()[7].strip())
         <trkpt lat="-2.400000000" lon="162.100000000" />
     """
-    root = ElementTree.Element("gpx", version="1.1", creator="magrl", xmlns="http://www.topografix.com/GPX/1/1")
-    for track in tracks:
-        element = ElementTree.SubElement(root, "trk")
-        _add_text(element, "name", track.name)
-        _add_text(element, "desc", _description(track))
-        segment = ElementTree.SubElement(element, "trkseg")
-        for latitude, longitude in _checked(track.positions):
-            west = -180.0 if longitude == 180 else longitude  # longitudes of GPX are below 180
-            ElementTree.SubElement(segment, "trkpt", lat=_number(latitude), lon=_number(west))
-    return _xml(root)
+    texts = [(_tag("name", track.name), _tag("desc", _description(track))) for track in tracks]
+    segments = (_tag("trkseg", *map(_track_point, _checked(track.positions))) for track in tracks)
+    lines = [_tag("trk", *text, segment) for text, segment in zip(texts, segments, strict=True)]
+    return _xml(_tag("gpx", *lines, version="1.1", creator="magrl", xmlns="http://www.topografix.com/GPX/1/1"))
+
+
+def _track_point(position: Position) -> Element:
+    """Return a point of a GPX track, whose longitudes are below 180."""
+    latitude, longitude = position
+    return _tag("trkpt", lat=_number(latitude), lon=_number(-180.0 if longitude == 180 else longitude))
 
 
 def to_kml(tracks: Sequence[Track]) -> str:
@@ -144,78 +143,47 @@ def to_kml(tracks: Sequence[Track]) -> str:
         >>> "162.000000000,-2.000000000,0 162.500000000,-2.500000000,0" in text
         True
     """
-    root = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
-    document = ElementTree.SubElement(root, "Document")
-    groups = _by_navigator(tracks)
-    for name, color in _ENDS.items():
-        _add_style(document, name, "IconStyle", color)
-    for number, group in enumerate(groups.values()):  # all styles stand before the first folder
-        navigator = str(group[0].properties.get("navigator", "")).partition(":")[0]
-        _add_style(document, f"track{number}", "LineStyle", NAVIGATOR_COLORS.get(navigator, "#000000"))
-    for number, (navigator, group) in enumerate(groups.items()):
-        folder = _add_folder(document, navigator) if navigator else document
-        for track in group:
-            _add_track(folder, track, f"#track{number}")
-    _add_ends(document, tracks)
-    return _xml(root)
+    groups: dict[tuple[str, int], list[Track]] = {}
+    for track in tracks:
+        key = str(track.properties.get("navigator", "")), track.properties.get("run", 0)
+        groups.setdefault(key, []).append(track)
+    names = [name for name, _ in groups]
+    styles = [_tag("Style", _tag("IconStyle", _color(color)), id=end) for end, color in _ENDS.items()]
+    parts = list[Element]()
+    for number, ((name, run), group) in enumerate(groups.items()):
+        color = NAVIGATOR_COLORS.get(parse_navigator(name).name, "#000000")
+        styles.append(_tag("Style", _tag("LineStyle", _color(color), _tag("width", "2")), id=f"track{number}"))
+        lines = [_line_placemark(track, f"#track{number}") for track in group]
+        label = f"{name}, run {run}" if names.count(name) > 1 else name
+        parts += [_tag("Folder", _tag("name", label), *lines)] if name else lines
+    tasks = dict.fromkeys((track.name, track.positions[0], track.target) for track in tracks if track.target)
+    if tasks:
+        ends = [placemark for task in tasks for placemark in _end_placemarks(*task)]
+        parts.append(_tag("Folder", _tag("name", "starts and destinations"), *ends))
+    # All styles stand before the first folder.
+    return _xml(_tag("kml", _tag("Document", *styles, *parts), xmlns="http://www.opengis.net/kml/2.2"))
 
 
 _ENDS = {"start": START, "destination": TARGET}
 """Colors of the ends of tasks."""
 
 
-def _by_navigator(tracks: Sequence[Track]) -> dict[str, list[Track]]:
-    """Return tracks by their navigator, with its run where it has several."""
-    runs = {(track.properties.get("navigator"), track.properties.get("run", 0)) for track in tracks}
-    groups: dict[str, list[Track]] = {}
-    for track in tracks:
-        name, run = track.properties.get("navigator", ""), track.properties.get("run", 0)
-        several = sum(other == name for other, _ in runs) > 1
-        groups.setdefault(f"{name}, run {run}" if several else str(name), []).append(track)
-    return groups
+def _color(color: str) -> Element:
+    """Return a color, which KML writes as opacity, blue, green, red."""
+    return _tag("color", f"ff{color[5:7]}{color[3:5]}{color[1:3]}".lower())
 
 
-def _add_style(document: ElementTree.Element, name: str, kind: str, color: str) -> None:
-    """Add a style; KML writes colors as opacity, blue, green, red."""
-    style = ElementTree.SubElement(ElementTree.SubElement(document, "Style", id=name), kind)
-    _add_text(style, "color", f"ff{color[5:7]}{color[3:5]}{color[1:3]}".lower())
-    if kind == "LineStyle":
-        _add_text(style, "width", "2")
+def _line_placemark(track: Track, style: str) -> Element:
+    texts = _tag("name", track.name), _tag("description", _description(track)), _tag("styleUrl", style)
+    lines = [_tag("LineString", _tag("tessellate", "1"), _coordinates(line)) for line in cut(track.positions)]
+    return _tag("Placemark", *texts, _tag("MultiGeometry", *lines))
 
 
-def _add_folder(document: ElementTree.Element, name: str) -> ElementTree.Element:
-    folder = ElementTree.SubElement(document, "Folder")
-    _add_text(folder, "name", name)
-    return folder
-
-
-def _add_track(parent: ElementTree.Element, track: Track, style: str) -> None:
-    placemark = ElementTree.SubElement(parent, "Placemark")
-    _add_text(placemark, "name", track.name)
-    _add_text(placemark, "description", _description(track))
-    _add_text(placemark, "styleUrl", style)
-    shape = ElementTree.SubElement(placemark, "MultiGeometry")
-    for line in cut(track.positions):
-        drawn = ElementTree.SubElement(shape, "LineString")
-        _add_text(drawn, "tessellate", "1")
-        _add_text(drawn, "coordinates", " ".join(f"{_number(lon)},{_number(lat)},0" for lat, lon in line))
-
-
-def _add_ends(document: ElementTree.Element, tracks: Sequence[Track]) -> None:
-    """Add a folder with the start and the destination of each task, once for all navigators."""
-    tasks = {(track.name, track.positions[0], track.target) for track in tracks if track.target is not None}
-    if not tasks:
-        return
-    folder = _add_folder(document, "starts and destinations")
-    order = {track.name: number for number, track in enumerate(tracks)}
-    for name, *places in sorted(tasks, key=lambda task: order[task[0]]):
-        for end, place in zip(_ENDS, places, strict=True):
-            (latitude, longitude), _ = _checked([place, place])
-            placemark = ElementTree.SubElement(folder, "Placemark")
-            _add_text(placemark, "name", f"{name}: {end}")
-            _add_text(placemark, "styleUrl", f"#{end}")
-            point = ElementTree.SubElement(placemark, "Point")
-            _add_text(point, "coordinates", f"{_number(longitude)},{_number(latitude)},0")
+def _end_placemarks(name: str, *places: Position) -> list[Element]:
+    """Return the placemarks of start and destination of a task."""
+    points = [_tag("Point", _coordinates([place])) for place in _checked(places)]
+    texts = [(_tag("name", f"{name}: {end}"), _tag("styleUrl", f"#{end}")) for end in _ENDS]
+    return [_tag("Placemark", *text, point) for text, point in zip(texts, points, strict=True)]
 
 
 WRITERS: dict[str, Callable[[Sequence[Track]], str]] = {".geojson": to_geojson, ".gpx": to_gpx, ".kml": to_kml}
@@ -317,11 +285,22 @@ def _description(track: Track) -> str:
     return ", ".join(f"{key} {value}" for key, value in pairs)
 
 
-def _add_text(parent: ElementTree.Element, tag: str, text: str) -> None:
-    """Add an element with a text; characters that XML does not allow become question marks."""
-    ElementTree.SubElement(parent, tag).text = re.sub(r"[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
+def _coordinates(positions: Sequence[Position]) -> Element:
+    places = (f"{_number(longitude)},{_number(latitude)},0" for latitude, longitude in positions)
+    return _tag("coordinates", " ".join(places))
 
 
-def _xml(root: ElementTree.Element) -> str:
-    ElementTree.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+def _tag(name: str, *content: Element | str, **attributes: str) -> Element:
+    """Return an element; characters that XML does not allow in its text become question marks."""
+    element = Element(name, attributes)
+    for part in content:
+        if isinstance(part, str):
+            element.text = re.sub(r"[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", part)
+        else:
+            element.append(part)
+    return element
+
+
+def _xml(root: Element) -> str:
+    indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"

@@ -1,93 +1,332 @@
-"""Maps of episodes over the field's contours."""
+"""Maps of episodes over contours of the field: figures, and an animated GIF.
+
+The coastlines are those of Natural Earth 4.1.0, physical vectors "Land" at 1:50 million, which are in the public domain
+(https://www.naturalearthdata.com). They were taken from ``land-50m.json`` of the npm package world-atlas 2.0.2, cut at
+the antimeridian, simplified to 0.04 degree (Douglas and Peucker), and rounded to 0.01 degree; islands smaller than 0.2
+degree are left out.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
 
+import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 from tensordict import TensorDictBase
+from torch import Tensor
 
-from magrl.checks import check_number, check_type
-from magrl.envs.region import Region
-from magrl.envs.rendering import draw_tracks
-from magrl.evaluation.metrics import first_episode_mask
-from magrl.field.model import FieldModel
+from magrl.checks import check_number, check_tensor, check_type
+from magrl.envs import Region
+from magrl.envs.rendering import PATH, START, TARGET, draw_contours
+from magrl.evaluation.metrics import episode_measures
+from magrl.evaluation.replay import PIECES, episode_tracks
+from magrl.field import FieldModel
+from magrl.geodesy import geodesic, move, polar
+
+LAND, ESTIMATE = "#8c6d46", "#56B4E9"
+"""Colors of coastlines, and of estimates of the destination."""
+FRAME_MS, LAST_FRAME_MS, GIF_COLORS = 150, 1280, 256
+_DRAWN = PIECES // 2  # a frame at every second piece of a move
+_FARTHEST = 1.3  # distance of an estimate, over that of the task, up to which the map of an animation holds it
 
 
-def flights_figure(
-    rollouts: Mapping[str, TensorDictBase],
-    field: FieldModel,
-    region: Region,
-    names: Sequence[str] = (),
-    episodes: int = 24,
-) -> Figure:
-    """Return a map of the first episodes of each navigator, beside each other.
+@cache
+def coastlines() -> np.ndarray:
+    """Return the coastlines of the Earth.
 
-    Args:
-        rollouts: by title, ``(M, T)`` from the environment.
-        field: any model of :mod:`magrl.field`.
-        region: region of the tasks.
-        names: names of the tasks, which are written at their destinations.
-        episodes: number of episodes to show.
-
-    Raises:
-        ValueError: for no rollout.
+    Returns:
+        ``(P, 2)`` latitude, longitude [deg], float64: lines that do not cross the antimeridian, with NaN between them.
 
     Example:
-        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
+        >>> np.nanmin(coastlines(), axis=0), np.nanmax(coastlines(), axis=0)
+        (array([ -85.19, -180.  ]), array([  83.6, 180. ]))
+    """
+    with np.load(Path(__file__).parent / "coastlines.npz") as file:
+        points, lengths = file["points"] / 100, file["lengths"]
+    return np.insert(points, np.cumsum(lengths)[:-1], np.nan, axis=0)
+
+
+def shortest_path(start: Tensor, target: Tensor, points: int = 41) -> Tensor:
+    """Return points of geodesics, both ends included.
+
+    Args:
+        start: ``(..., 2)`` latitude, longitude [deg].
+        target: ``(..., 2)`` latitude, longitude [deg].
+        points: number of points.
+
+    Returns:
+        ``(..., points, 2)`` [deg], float64.
+
+    Raises:
+        ValueError: for fewer than two points.
+
+    Example:
+        >>> shortest_path(torch.tensor([50.0, 0.0]), torch.tensor([50.0, 90.0]), points=3)[1].round(decimals=2)
+        tensor([59.3400, 45.0000], dtype=torch.float64)
+    """
+    check_tensor(2, start=start, target=target)
+    check_number(2, whole=True, points=points)
+    path, target = [start.double()], target.double()
+    for left in range(points - 1, 1, -1):
+        latitude, longitude = path[-1].unbind(-1)
+        distance, bearing = geodesic(latitude, longitude, *target.unbind(-1))
+        path.append(torch.stack(move(latitude, longitude, bearing, distance / left), -1))
+    return torch.stack((*path, target), -2)
+
+
+def frame(positions: Tensor) -> Region:
+    """Return the box of a map that shows some positions with room around them, neither very flat nor very narrow.
+
+    Args:
+        positions: ``(P, 2)`` latitude, longitude [deg], unwrapped.
+
+    Example:
+        >>> frame(torch.tensor([[0.0, 10.0], [0.0, 20.0]]))
+        Region(latitude=(-3.5, 3.5), longitude=(8.5, 21.5))
+    """
+    low, high = positions.amin(0), positions.amax(0)
+    (north, east), (half_north, half_east) = ((high + low) / 2).tolist(), ((high - low) / 2).tolist()
+    narrow = math.cos(math.radians(min(abs(north), 80.0)))
+    least = 0.5 * max(half_north, half_east * narrow)
+    half_north = 1.2 * max(half_north, least) + 0.5
+    half_east = min(1.2 * max(half_east, least / narrow) + 0.5, 180.0)
+    return Region((max(north - half_north, -88.0), min(north + half_north, 88.0)), (east - half_east, east + half_east))
+
+
+def trajectories_figure(
+    rollouts: TensorDictBase | Mapping[str, TensorDictBase],
+    field: FieldModel,
+    region: Region,
+    episodes: int = 24,
+    names: Sequence[str] = (),
+) -> Figure:
+    """Return maps of the first episodes of one or several navigators, beside each other.
+
+    A map has the tracks, the shortest paths, contours of the field and coastlines; for an episode with the key ``way``
+    ``(..., 2)`` [km] northward and eastward (:class:`~magrl.transforms.TrackGradient`) also where its destination was
+    estimated.
+
+    Args:
+        rollouts: ``(M, T)`` from the environment, or several of them by title.
+        field: any model of :mod:`magrl.field`.
+        region: region of the tasks.
+        episodes: number of episodes to show.
+        names: names of the tasks, which are written at their destinations.
+
+    Raises:
+        ValueError: for no rollout or no episode.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> [axes.get_title() for axes in flights_figure({"random": env.rollout(3)}, env.field, env.region).axes]
+        >>> [axes.get_title() for axes in trajectories_figure({"random": env.rollout(3)}, env.field, env.region).axes]
         ['random']
     """
     check_number(1, whole=True, episodes=episodes)
-    if not rollouts:
-        raise ValueError("rollouts must hold the flights of at least one navigator, got {}")
-    columns = min(len(rollouts), 3)
-    rows = math.ceil(len(rollouts) / columns)
-    figure = Figure(figsize=(6.4 * columns, 6.9 * rows), layout="constrained")
-    places = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for axes, (title, rollout) in zip(places, rollouts.items(), strict=False):
-        draw_episodes(axes, rollout, field, region, episodes, names)
-        axes.set_title(title)
-    for axes in places[len(rollouts) :]:
-        axes.remove()
+    titled = {"": rollouts} if isinstance(rollouts, TensorDictBase) else rollouts
+    if not titled:
+        raise ValueError("rollouts must hold the episodes of at least one navigator, got {}")
+    columns, rows = min(len(titled), 3), math.ceil(len(titled) / 3)
+    figure = Figure(layout="constrained")
+    for place, (title, rollout) in enumerate(titled.items(), 1):
+        axes, shown = figure.add_subplot(rows, columns, place, title=title), rollout[:episodes].cpu()
+        tracks, height = _draw_map(axes, shown, field, region)
+        figure.set_size_inches(8 * columns, max(figure.get_figheight(), height * rows))
+        for track in tracks:
+            axes.plot(track[::PIECES, 1], track[::PIECES, 0], "-", color=PATH, lw=1.5, marker=".", ms=4)
+        axes.lines[-1].set_label("track")
+        if "way" in shown["next"].keys():  # noqa: SIM118 - a TensorDict is no mapping
+            guesses = region.unwrapped(estimates(shown["next"].reshape(-1), 5000.0))
+            axes.plot(guesses[:, 1], guesses[:, 0], ".", color=ESTIMATE, ms=4, label="destination, estimated")
+        _write_names(axes, names, region.unwrapped(shown["target_position"][:, 0]))
+    _draw_legend(figure)
     return figure
 
 
-def draw_episodes(
-    axes: Axes, rollout: TensorDictBase, field: FieldModel, region: Region, episodes: int, names: Sequence[str]
-) -> None:
-    """Draw the first episodes of a rollout over the field's contours.
+def _draw_map(
+    axes: Axes, rollout: TensorDictBase, field: FieldModel, region: Region, shown: Tensor | None = None
+) -> tuple[list[Tensor], float]:
+    """Draw a map of episodes without their tracks.
 
     Args:
         axes: axes to draw on.
         rollout: ``(M, T)`` from the environment.
         field: any model of :mod:`magrl.field`.
         region: region of the tasks.
-        episodes: number of episodes to draw.
-        names: names of the tasks, which are written at their destinations.
+        shown: ``(P, 2)`` positions that the map must hold beside the tracks and the shortest paths [deg].
 
-    Example:
-        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
-        >>> env, axes = GeomagneticNavEnv(num_envs=2, seed=0), Figure().subplots()
-        >>> draw_episodes(axes, env.rollout(3), env.field, env.region, 2, ["home", "port"])
-        >>> [text.get_text() for text in axes.texts if text.get_text() in ("home", "port")]
-        ['home', 'port']
+    Returns:
+        The tracks (:func:`~magrl.evaluation.replay.episode_tracks`), and the height of a figure of 8 inches.
     """
-    check_type(TensorDictBase, rollout=rollout)
-    shown = rollout[:episodes].cpu()
-    steps = first_episode_mask(shown["next", "done"]).sum(1)
-    paths = [
-        torch.cat((row["position"][:1], row["next", "position"][:count]))
-        for row, count in zip(shown, steps.tolist(), strict=True)
-    ]
-    targets = shown["target_position"][:, 0]
-    draw_tracks(axes, field, region, paths, targets)
-    for name, (latitude, longitude) in zip(names, region.unwrapped(targets).tolist(), strict=False):
-        east = longitude > sum(region.longitude) / 2  # the text ends at the destination
+    tracks, ends = episode_tracks(rollout, region), [rollout[f"{end}_position"][:, 0] for end in ("start", "target")]
+    shortest = region.unwrapped(shortest_path(*ends))
+    box = frame(torch.cat([*tracks, *shortest, region.unwrapped(ends[0][:0] if shown is None else shown)]))
+    draw_contours(axes, field, box)
+    for turn in (-360, 0, 360):
+        axes.plot(coastlines()[:, 1] + turn, coastlines()[:, 0], color=LAND, lw=1)
+    for path in shortest:
+        axes.plot(path[:, 1], path[:, 0], "--", color=PATH, lw=1)
+    axes.lines[-1].set_label("shortest path")
+    (south, west), (north, east) = (region.unwrapped(end).T for end in ends)
+    axes.plot(west, south, "s", color=START, ms=7, zorder=3, label="start")
+    axes.plot(east, north, "^", color=TARGET, ms=8, zorder=3, label="destination")
+    axes.set(xlim=box.longitude, ylim=box.latitude)
+    axes.xaxis.set_major_formatter(lambda degrees, _: f"{math.remainder(degrees, 360):g}")
+    width = (box.longitude[1] - box.longitude[0]) * math.cos(math.radians(sum(box.latitude) / 2))
+    return tracks, 1.6 + 7 * min((box.latitude[1] - box.latitude[0]) / width, 1.3)
+
+
+def _draw_legend(figure: Figure) -> None:
+    labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+
+
+def _write_names(axes: Axes, names: Sequence[str], places: Tensor) -> None:
+    """Write names beside places ``(M, 2)``, toward the middle of a map."""
+    for name, (latitude, longitude) in zip(names, places.tolist(), strict=False):
+        east = longitude > sum(axes.get_xlim()) / 2
         side, shift = ("right", -8) if east else ("left", 8)
         text = axes.annotate(name, (longitude, latitude), (shift, 4), textcoords="offset points", parse_math=False)
         text.set(ha=side, fontsize=8, bbox={"facecolor": "white", "alpha": 0.7, "lw": 0, "pad": 1})
+
+
+def estimates(states: TensorDictBase, farthest_km: float) -> Tensor:
+    """Return where a vehicle estimated its destination to be.
+
+    Args:
+        states: ``(T,)`` of one vehicle, with ``position`` and ``way``.
+        farthest_km: distance from the vehicle beyond which an estimate is left out [km].
+
+    Returns:
+        ``(P, 2)`` latitude, longitude [deg], P at most T.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> ways = torch.tensor([[111.2, 0.0], [9000.0, 0.0]])
+        >>> states = TensorDict(position=torch.zeros(2, 2), way=ways, batch_size=[2])
+        >>> estimates(states, 5000.0).round(decimals=1)
+        tensor([[1., 0.]], dtype=torch.float64)
+    """
+    return _ends(states["position"], states["way"])[states["way"].norm(dim=-1) < farthest_km]
+
+
+def _ends(position: Tensor, way: Tensor) -> Tensor:
+    """Return where ways ``(..., 2)`` northward and eastward [km] lead from positions ``(..., 2)`` [deg]."""
+    distance, heading = polar(way.double())
+    latitude, longitude = position.double().expand_as(way).unbind(-1)
+    return torch.stack(move(latitude, longitude, heading, distance), -1)
+
+
+def way_ellipse(position: Tensor, way: Tensor, covariance: Tensor, deviations: float = 2.0, points: int = 49) -> Tensor:
+    """Return the ellipse of the estimated destination of a vehicle, as a closed line on the globe.
+
+    Args:
+        position: ``(2,)`` latitude, longitude of the vehicle [deg].
+        way: ``(2,)`` estimated way to the destination, northward and eastward [km].
+        covariance: ``(2, 2)`` its covariance [km^2].
+        deviations: size of the ellipse in standard deviations.
+        points: number of points.
+
+    Returns:
+        ``(points, 2)`` latitude, longitude [deg], float64.
+
+    Example:
+        >>> pole = torch.zeros(2)  # a degree is 111 km there
+        >>> way_ellipse(pole, torch.zeros(2), 111.2**2 * torch.eye(2), deviations=1, points=5).round(decimals=1).abs()
+        tensor([[1., 0.],
+                [0., 1.],
+                [1., 0.],
+                [0., 1.],
+                [1., 0.]], dtype=torch.float64)
+    """
+    angle = torch.linspace(0, 2 * math.pi, points, dtype=torch.float64)
+    values, axes = torch.linalg.eigh(covariance.double())
+    circle = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    return _ends(position, way.double() + deviations * (circle * values.clamp_min(0).sqrt()) @ axes.mT)
+
+
+def write_gif(
+    path: Path | str,
+    rollout: TensorDictBase,
+    field: FieldModel,
+    region: Region,
+    title: str = "",
+    *,
+    width_px: int = 720,
+) -> None:
+    """Write episodes as an animated GIF that loops: their tracks, and the estimate of the destination of a single one.
+
+    Args:
+        path: path of the image; an existing file is replaced.
+        rollout: ``(M, T)`` from the environment; of one vehicle with the keys ``way`` ``(..., 2)`` [km] northward and
+            eastward and ``way_covariance`` ``(..., 2, 2)`` [km^2] (:class:`~magrl.transforms.TrackGradient`), the
+            ellipse of two standard deviations around the estimated destination is drawn.
+        field: any model of :mod:`magrl.field`.
+        region: region of the episodes.
+        title: title of the map.
+        width_px: width [pixels].
+
+    Raises:
+        ValueError: for a rollout of other dimensions, or a width below 1.
+
+    Example:
+        >>> import tempfile
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env, path = GeomagneticNavEnv(seed=0), Path(tempfile.mkdtemp()) / "episodes.gif"
+        >>> write_gif(path, env.rollout(1), env.field, env.region, width_px=200)
+        >>> path.read_bytes()[:3]
+        b'GIF'
+    """
+    check_type((Path, str), path=path)
+    check_number(1, whole=True, width_px=width_px)
+    frames = list(_frames(rollout.cpu(), field, region, title, width_px))
+    sample = np.hstack([np.asarray(image) for image in (frames[0], frames[len(frames) // 2], frames[-1])])
+    palette = Image.fromarray(sample).quantize(GIF_COLORS)  # one for all frames: unchanged pixels compress well
+    start, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames)
+    durations = [FRAME_MS] * len(others) + [LAST_FRAME_MS]
+    start.save(Path(path), "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def _frames(
+    rollout: TensorDictBase, field: FieldModel, region: Region, title: str, width_px: int
+) -> Iterator[Image.Image]:
+    """Yield the frames; a vehicle that has arrived takes the color of destinations."""
+    success, states = episode_measures(rollout)["success"].tolist(), rollout[0]
+    estimated = len(rollout) == 1 and "way_covariance" in rollout.keys()  # noqa: SIM118 - a TensorDict is no mapping
+    distance = geodesic(*states["start_position"][0], *states["target_position"][0])[0].item()
+    figure = Figure(layout="constrained")
+    canvas, axes = FigureCanvasAgg(figure), figure.add_subplot(title=title)
+    shown = estimates(states, _FARTHEST * distance) if estimated else None
+    tracks, height = _draw_map(axes, rollout, field, region, shown)
+    figure.set_size_inches(8, height)
+    figure.set_dpi((width_px + 0.01) / 8)
+    estimate = axes.plot([], [], color=ESTIMATE, lw=1.5, marker="x", ms=8, mew=2.5, markevery=[0])[0]
+    estimate.set_label("destination, estimated: 2 standard deviations" if estimated else "")
+    lines = [axes.plot([], [], lw=2, marker="o", ms=6, markevery=[-1])[0] for _ in tracks]
+    _draw_legend(figure)
+    canvas.draw()
+    figure.set_layout_engine("none")  # a fixed layout in all frames
+    for piece in range(0, max(map(len, tracks)), _DRAWN):
+        for line, track, arrives in zip(lines, tracks, success, strict=True):
+            line.set_data(*track[: piece + 1].T.flip(0).numpy())
+            line.set_color(TARGET if arrives and piece >= len(track) - 1 else PATH)
+        if estimated:
+            state = states[piece // PIECES] if piece < len(tracks[0]) - 1 else states["next"][-1]
+            estimate.set_data(*_estimate(state, region).T[::-1])
+        canvas.draw()
+        yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+
+
+def _estimate(state: TensorDictBase, region: Region) -> np.ndarray:
+    """Return the estimated destination and, after a gap, its ellipse, with gaps at the edge of the map: ``(P, 2)``."""
+    position, way, covariance = (state[key].double() for key in ("position", "way", "way_covariance"))
+    line = region.unwrapped(torch.cat((_ends(position, way[None]), way_ellipse(position, way, covariance)))).numpy()
+    jumps = np.flatnonzero(np.abs(np.diff(line[:, 1])) > 180)
+    return np.insert(line, [1, *jumps[jumps > 0] + 1], np.nan, axis=0)

@@ -120,7 +120,6 @@ def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
         >>> moved(TensorDict(move=move, heading=heading, true_move=1.5 * move))[0]
         tensor([45.], dtype=torch.float64)
     """
-    check_type(TensorDictBase, steps=steps)
     move = steps.get("true_move", steps["move"])
     course = steps.get("true_course", steps.get("true_heading", steps["heading"]))
     return move[..., 0].double(), course.squeeze(-1).double()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
+from typing import NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 
@@ -15,59 +15,79 @@ from magrl.agents.pretrained import load_pretrained
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field import Date
-from magrl.navigators import METAHEURISTICS, NAVIGATOR_CLASSES, NAVIGATORS, Navigator
+from magrl.navigators import NAVIGATORS, Navigator
+from magrl.navigators.base import PERFECT, Std
 from magrl.transforms import TrackView
 
-TRAINED = ("gg_td3", "gg_td3_noise", "td3", "recurrent", "anywhere", "policy")
-"""Names of trained agents, which take a run folder; ``anywhere`` without one is the pretrained policy."""
+
+class TrainedAgent(NamedTuple):
+    """Labels of a kind of trained agent in figures and tables, and what it needs, as of a :class:`Navigator`."""
+
+    label: str
+    description: str
+    needs: str = "training in the region"
+    options: tuple[str, ...] = ()
+
+
 OWN = "policy"
 """Name of a policy of any algorithm, which takes its file or a folder with ``policy.pt``, and after ``:`` a label."""
 PRETRAINED = ("anywhere",)
-"""Names of trained agents that come with the library."""
-DEFAULT_ZETA = 0.01
-"""Arrival threshold of an evaluation without runs."""
-
-NAVIGATOR_NAMES = {
-    "gg_td3": "Gradient-Guided TD3",
-    "gg_td3_noise": "Gradient-Guided TD3, trained with noise",
-    "td3": "TD3",
-    "recurrent": "recurrent TD3",
-    "anywhere": "anywhere",
-    "policy": "own policy",
-    "ga": "GA",
-    "pso": "PSO",
-    "afsa": "AFSA",
-    "secant": "secant",
-    "parallel": "parallel",
-    "kalman": "Kalman",
-    "mean_jacobian": "mean Jacobian",
-    "geodesic": "geodesic",
-    "run_and_tumble": "run and tumble",
-    "map_matching": "map matching",
+"""Names of trained agents that come with the library; its training planets share only the spectrum of the field."""
+TRAINED = {
+    "gg_td3": TrainedAgent("Gradient-Guided TD3", "Gradient-Guided TD3"),
+    "gg_td3_noise": TrainedAgent("Gradient-Guided TD3, trained with noise", "Gradient-Guided TD3, trained with noise"),
+    "td3": TrainedAgent("TD3", "TD3"),
+    "recurrent": TrainedAgent("recurrent TD3", "recurrent TD3 (the paper's eight numbers)"),
+    "anywhere": TrainedAgent("anywhere", "anywhere (TD3 on random planets)", Navigator.needs),
+    OWN: TrainedAgent("own policy", "own policy", "training"),
 }
+"""Trained agents, which take a run folder; ``anywhere`` without one is the pretrained policy."""
+
+KINDS: dict[str, TrainedAgent | type[Navigator]] = {**TRAINED, **NAVIGATORS}
+NAVIGATOR_NAMES = {name: kind.label for name, kind in KINDS.items()}
 """Label of each navigator in figures."""
+_COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
+_COLORS += ["#882255", "#332288", "#44AA99", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
+NAVIGATOR_COLORS = dict(zip(KINDS, cycle(_COLORS), strict=False))
+"""Color of each navigator in every figure, and in files for maps."""
 
-_DETAILED_NAMES = NAVIGATOR_NAMES | {
-    "recurrent": "recurrent TD3 (the paper's eight numbers)",
-    "anywhere": "anywhere (TD3 on random planets)",
-    "secant": "secant (quasi-Newton)",
-    "parallel": "parallel (true gradient, an oracle)",
-    "kalman": "Kalman (dual control)",
-    "mean_jacobian": "mean Jacobian (quasi-Newton)",
-    "map_matching": "map matching (Kalman filter)",
-    "geodesic": "geodesic (both positions, an oracle)",
-}
-"""Label of each navigator in tables."""
+
+class NavigatorText(NamedTuple):
+    """Parts of a text that names a navigator: ``name``, ``name:option``, ``name=source`` or ``name:option=source``.
+
+    Args:
+        name: name of the navigator.
+        option: mode of a metaheuristic, or label of an own policy.
+        source: run folder of a trained agent, or file of a policy.
+    """
+
+    name: str
+    option: str
+    source: str
+
+
+def parse_navigator(text: str) -> NavigatorText:
+    """Return the parts of a text that names a navigator; empty where it has none.
+
+    Example:
+        >>> parse_navigator("policy:SAC=sac.pt")
+        NavigatorText(name='policy', option='SAC', source='sac.pt')
+    """
+    check_type(str, text=text)
+    named, _, source = text.partition("=")
+    name, _, option = named.partition(":")
+    return NavigatorText(name, option, source)
 
 
 def make_navigator(
     text: str,
     env: GeomagneticNavEnv,
+    *,
+    sensor_std: Std = PERFECT,
+    bias_std: Std = PERFECT,
     mode: str = "look-ahead",
     seed: int = 0,
-    noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
     map_date: Date | None = None,
-    bias: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> TensorDictModuleBase:
     """Return the navigator that a text such as ``secant``, ``pso:flown`` or ``gg_td3=RUN`` names.
 
@@ -75,12 +95,12 @@ def make_navigator(
         text: name; after ``=`` the run folder of a trained agent, or the file of a policy; after ``:`` the mode of a
             metaheuristic, or the label of a policy, as in ``policy:SAC=sac.pt``.
         env: environment that it navigates in.
+        sensor_std: standard deviations of the sensors' noise, D [deg], I [deg], B_H [nT], for navigators that weigh
+            their readings. Agents read it from the TensorDict.
+        bias_std: standard deviations of constant and slow errors of the sensors.
         mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
-        noise: standard deviations of the sensors, D [deg], I [deg], B_H [nT], for navigators that weigh their readings.
         map_date: date of the map of ``map_matching``, from IGRF; None for the environment's own field.
-        bias: standard deviations of constant and slow errors of the sensors, for navigators that tell them from noise.
-            Agents read both from the TensorDict, and all others are told the root of the sum of the squares as noise.
 
     Raises:
         ValueError: for an unknown name, a trained agent without a run or trained in another field, a run or a mode for
@@ -92,38 +112,47 @@ def make_navigator(
         >>> make_navigator("pso:flown", env).oracle, make_navigator("parallel", env).oracle
         (False, True)
     """
-    check_type(str, text=text)
-    name, _, run = text.partition("=")
-    name, _, own_mode = name.partition(":")
-    if name in TRAINED and (not own_mode or name == OWN):
-        if not run and name not in PRETRAINED:
-            file = " or the file of a policy" if name == OWN else ""
-            raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
-        path = Path(run) if name == OWN and not Path(run).is_dir() else Path(run) / "policy.pt"
-        policy = load_policy(path, env.device) if run else load_pretrained(name, env.device)
-        # one that reads its own track is told what counts as arrived
-        if isinstance(policy, FieldPolicy) and isinstance(view := policy.config.view, TrackView):
-            view = replace(view, zeta=env.zeta, search=env.arrival.rule == "objective")
-            policy = FieldPolicy(replace(policy.config, view=view), policy.actor).to(env.device)
-        try:
-            policy.check_fits(env)
-        except ValueError as error:
-            raise ValueError(f"{text}: {error}") from error
-        return policy
-    if name in METAHEURISTICS and not run:
-        return METAHEURISTICS[name](env, own_mode or mode, seed)
-    if name in NAVIGATORS and not run and not own_mode:
-        if name == "kalman":
-            return NAVIGATORS[name](env, mode, seed, noise, bias=bias).to(env.device)
-        options = {"map_date": map_date} if name == "map_matching" else {}
-        return NAVIGATORS[name](env, mode, seed, tuple(map(math.hypot, noise, bias)), **options).to(env.device)
-    trained_names = [f"{trained}=RUN" for trained in TRAINED if trained != OWN]
-    known = ", ".join([*PRETRAINED, *trained_names, "policy:NAME=FILE", *NAVIGATORS, *METAHEURISTICS])
-    raise ValueError(f"unknown navigator {text!r}: choose from {known}")
+    name, option, source = parse_navigator(text)
+    if name in TRAINED and (not option or name == OWN):
+        return _load(text, env)
+    kind = NAVIGATORS.get(name)
+    if kind is None or source or (option and "mode" not in kind.options):
+        trained = [f"{agent}=RUN" for agent in TRAINED if agent != OWN]
+        raise ValueError(
+            f"unknown navigator {text!r}: choose from "
+            + ", ".join([*PRETRAINED, *trained, "policy:NAME=FILE", *NAVIGATORS])
+        )
+    options = {"mode": option or mode, "seed": seed, "map_date": map_date}
+    own = {key: value for key, value in options.items() if key in kind.options}
+    return kind.for_env(env, sensor_std=sensor_std, bias_std=bias_std, **own).to(env.device)
+
+
+def _load(text: str, env: GeomagneticNavEnv) -> TensorDictModuleBase:
+    """Return a trained agent; raise unless it fits the environment."""
+    name, _, source = parse_navigator(text)
+    if not source and name not in PRETRAINED:
+        file = " or the file of a policy" if name == OWN else ""
+        raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
+    path = Path(source) if name == OWN and not Path(source).is_dir() else Path(source) / "policy.pt"
+    policy = load_policy(path, env.device) if source else load_pretrained(name, env.device)
+    if isinstance(policy, FieldPolicy) and isinstance(view := policy.config.view, TrackView):
+        view = replace(view, zeta=env.zeta, search=env.arrival.rule == "objective")  # what counts as arrived here
+        policy = FieldPolicy(replace(policy.config, view=view), policy.actor).to(env.device)
+    try:
+        policy.check_fits(env)
+    except ValueError as error:
+        raise ValueError(f"{text}: {error}") from error
+    return policy
+
+
+def _kind(name: str) -> TrainedAgent | type[Navigator]:
+    if name not in KINDS:
+        raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(KINDS)}")
+    return KINDS[name]
 
 
 def needs(name: str, default_mode: str = "look-ahead") -> str:
-    """Return what a navigator needs beside its readings and the sensors' data sheet, for a column of a table.
+    """Return what a navigator needs beside its readings and their standard deviations, for a column of a table.
 
     Args:
         name: name without a run, for example ``pso`` or ``pso:flown``.
@@ -138,19 +167,14 @@ def needs(name: str, default_mode: str = "look-ahead") -> str:
         >>> needs("pso"), needs("pso:flown"), needs("policy:SAC")
         ('the field at other places', 'nothing', 'training')
     """
-    base, _, mode = name.partition(":")
-    label(base)  # raises for an unknown name
-    if base in METAHEURISTICS:
-        return "the field at other places" if (mode or default_mode) == "look-ahead" else Navigator.needs
-    if base == OWN:
-        return "training"
-    if base in PRETRAINED:  # trained on planets that share only the spectrum of the field
-        return Navigator.needs
-    return "training in the region" if base in TRAINED else NAVIGATOR_CLASSES[base].needs
+    base, option, _ = parse_navigator(name)
+    kind = _kind(base)
+    flown = "mode" in kind.options and (option or default_mode) == "flown"
+    return Navigator.needs if flown else kind.needs
 
 
 def label(name: str, default_mode: str = "look-ahead") -> str:
-    """Return the label of a navigator in tables, which says how a metaheuristic reads the field.
+    """Return the label of a navigator in tables, which states how a metaheuristic reads the field.
 
     Args:
         name: name without a run, for example ``pso``, ``pso:flown`` or ``policy:SAC``.
@@ -163,13 +187,12 @@ def label(name: str, default_mode: str = "look-ahead") -> str:
         >>> label("pso"), label("ga:flown"), label("policy:SAC")
         ('PSO, look-ahead (an oracle)', 'GA, flown', 'SAC')
     """
-    base, _, mode = name.partition(":")
-    if base not in _DETAILED_NAMES:
-        raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(_DETAILED_NAMES)}")
-    if base not in METAHEURISTICS:
-        return mode if base == OWN and mode else _DETAILED_NAMES[base]
-    look_ahead = (mode or default_mode) == "look-ahead"
-    return _DETAILED_NAMES[base] + (", look-ahead (an oracle)" if look_ahead else ", flown")
+    base, option, _ = parse_navigator(name)
+    kind = _kind(base)
+    if "mode" not in kind.options:
+        return option if base == OWN and option else kind.description
+    flown = (option or default_mode) == "flown"
+    return kind.description + (", flown" if flown else ", look-ahead (an oracle)")
 
 
 def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> None:
@@ -192,13 +215,12 @@ def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> No
     """
     seen: set[object] = set()
     for text in texts:
-        name, _, run = text.partition("=")
-        base, _, mode = name.partition(":")
-        key = Path(run).resolve() if run else (base, mode or (default_mode if base in METAHEURISTICS else ""))
+        name, option, source = parse_navigator(text)
+        key = Path(source).resolve() if source else (name, option or default_mode)
         if key in seen:
             raise ValueError(f"{text} is given twice: the same episodes again are no spread over runs")
-        if run and base in PRETRAINED and base in texts:
-            raise ValueError(f"{text} has the name of the pretrained {base}: write policy:LABEL={run}")
+        if source and name in PRETRAINED and name in texts:
+            raise ValueError(f"{text} has the name of the pretrained {name}: write policy:LABEL={source}")
         seen.add(key)
 
 
@@ -222,51 +244,3 @@ def check_map_date(texts: Sequence[str], map_date: Date | None) -> None:
         raise ValueError(
             f"--map-date {map_date} is the date of the map of map_matching: add that navigator, or omit the date"
         )
-
-
-def arrival_threshold(texts: Sequence[str], zeta: float | None = None) -> tuple[float, list[str]]:
-    """Return the arrival threshold of an evaluation, and what a reader of its results must know about the runs.
-
-    Args:
-        texts: navigators, as :func:`make_navigator` takes them.
-        zeta: threshold that was chosen; None for that of the runs, or 0.01 where none of them states one.
-
-    Returns:
-        The threshold, and a sentence for each run that was trained with another threshold or is not finished.
-
-    Raises:
-        ValueError: for runs with different thresholds if none was chosen, or a damaged ``config.json``.
-
-    Example:
-        >>> arrival_threshold(["secant", "td3=runs/nowhere"])
-        (0.01, ['runs/nowhere is not a finished training: it holds no eval.json'])
-    """
-    named = (text.partition("=") for text in texts)
-    runs = [Path(run) for name, _, run in named if name.partition(":")[0] in TRAINED and run]
-    runs = [run for run in runs if not run.is_file()]  # the file of a policy belongs to no run
-    trained = {run: known for run in runs if (known := _trained_zeta(run)) is not None}
-    if zeta is None:
-        examples = {known: run for run, known in trained.items()}
-        if len(examples) > 1:
-            listed = ", ".join(f"{known:g} ({run})" for known, run in examples.items())
-            raise ValueError(f"the runs were trained with different arrival thresholds, {listed}: choose with --zeta")
-        zeta = next(iter(examples), DEFAULT_ZETA)
-    warnings = [
-        f"{run} was trained with zeta {known:g} and is evaluated with zeta {zeta:g}"
-        for run, known in trained.items()
-        if known != zeta
-    ]
-    unfinished = [run for run in runs if not (run / "eval.json").is_file()]
-    return zeta, warnings + [f"{run} is not a finished training: it holds no eval.json" for run in unfinished]
-
-
-def _trained_zeta(run: Path) -> float | None:
-    """Return the arrival threshold with which a run was trained, or None where its folder does not state it."""
-    path = run / "config.json"
-    if not path.is_file():
-        return None
-    try:
-        zeta = json.loads(path.read_text()).get("zeta")
-        return None if zeta is None else float(zeta)
-    except (ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is not the configuration of a run: {error}") from error

@@ -8,7 +8,7 @@ import re
 import torch
 from torch import Tensor
 
-from magrl.checks import check_tensor, check_type
+from magrl.checks import check_type
 from magrl.envs import Region
 from magrl.envs.specs import field_bounds
 from magrl.field import FieldModel, elements_at, elements_gradient_at
@@ -101,8 +101,6 @@ def find_elements(field: FieldModel, elements: Tensor, near: Tensor) -> Tensor:
         >>> find_elements(field, elements_at(field, bergen), near=bergen + 10).round(decimals=3)
         tensor([60.4000,  5.3000], dtype=torch.float64)
     """
-    check_tensor(3, elements=elements)
-    check_tensor(2, near=near)
     scale = torch.tensor(ELEMENT_TOLERANCE, dtype=torch.float64)
     place = Region((-80, 80), (-180, 176)).grid(45).reshape(-1, 2)
     for _ in range(16):
@@ -115,9 +113,10 @@ def find_elements(field: FieldModel, elements: Tensor, near: Tensor) -> Tensor:
     distance, _ = geodesic(*near.double().expand_as(place).unbind(-1), *place.unbind(-1))
     if misfit.min() > 1:
         closest = elements_at(field, place[misfit.argmin()])
+        wanted, least, found = (elements_text(each) for each in (elements, scale, closest))
         raise ValueError(
-            f"no place has {said(elements)} within {said(scale)}: the most similar field found is {said(closest)}; "
-            "take the elements of one place and date, or give the destination by its coordinates"
+            f"no place has {wanted} within {least}: the most similar field found is {found}; take the elements of one "
+            "place and date, or give the destination by its coordinates"
         )
     return place[torch.where(misfit <= 1, distance.nan_to_num(nan=1e5), torch.inf).argmin()]
 
@@ -137,7 +136,6 @@ def check_declination(text: str, place: Tensor, field: FieldModel) -> None:
         >>> from magrl.field import IGRF
         >>> check_declination("Bergen", torch.tensor([60.4, 5.3]), IGRF("2025-01-01"))
     """
-    check_tensor(2, place=place)
     intensity = elements_at(field, place)[2].item()
     if abs(place[0].item()) > 89 or not intensity >= LEAST_INTENSITY_NT:
         raise ValueError(
@@ -164,7 +162,6 @@ def region_around(start: Tensor, target: Tensor, field: FieldModel, max_move_km:
         >>> region_around(honolulu, tokyo, IGRF("2025-01-01")).contains(torch.tensor([30.0, 180.0]))
         tensor([True])
     """
-    check_tensor(2, start=start, target=target)
     distance_km = geodesic(*start, *target)[0].item()
     (south, north), west = sorted((start[0].item(), target[0].item())), start[1].item()
     west, east = sorted((west, west + wrap_longitude(target[1] - start[1]).item()))
@@ -183,11 +180,11 @@ def region_around(start: Tensor, target: Tensor, field: FieldModel, max_move_km:
     )
 
 
-def said(elements: Tensor) -> str:
+def elements_text(elements: Tensor) -> str:
     """Return magnetic elements as :func:`parse_elements` reads them.
 
     Example:
-        >>> said(torch.tensor([-3.2, 71.5, 15000.0]))
+        >>> elements_text(torch.tensor([-3.2, 71.5, 15000.0]))
         'D=-3.20 I=71.50 BH=15000'
     """
     return "D={:.2f} I={:.2f} BH={:.0f}".format(*elements.tolist())

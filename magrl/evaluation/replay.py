@@ -1,4 +1,4 @@
-"""Replay of episodes: a web page in a single file without dependencies, and an animated GIF.
+"""Replay of episodes: a web page in a single file without dependencies.
 
 The page is ``templates/replay.html`` with the data embedded as JSON, escaped so that no name can inject markup.
 """
@@ -6,22 +6,20 @@ The page is ``templates/replay.html`` with the data embedded as JSON, escaped so
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_type
+from magrl.checks import check_number
 from magrl.envs.region import Region
-from magrl.envs.rendering import PATH, START, TARGET, contour_lines, draw_contours
+from magrl.envs.rendering import contour_lines
 from magrl.evaluation.metrics import episode_measures, moved
 from magrl.field.model import FieldModel
 from magrl.geodesy import geodesic, move
@@ -31,7 +29,6 @@ PIECES = 4
 
 PLACEHOLDER = "{{replay-data}}"
 _SEEN = ("position", "field", "objective", "heading", "move")
-GIF_COLORS, STEP_MS = 96, 320
 
 
 def replay_data(
@@ -69,11 +66,7 @@ def replay_data(
         >>> len(data["navigators"][0]["episodes"])
         2
     """
-    check_type(Mapping, rollouts=rollouts)
-    check_type(Region, region=region)
-    check_type(str, title=title)
     check_number(0, above=True, zeta=zeta)
-    check_type(TensorDictBase, **{f"the rollout {name!r}": rollout for name, rollout in rollouts.items()})
     if not rollouts:
         raise ValueError("rollouts must hold at least one rollout, got {}")
     first = next(iter(rollouts.values()))
@@ -120,8 +113,6 @@ def episode_tracks(rollout: TensorDictBase, region: Region) -> list[Tensor]:
         >>> len(track) == 3 * PIECES + 1
         True
     """
-    check_type(TensorDictBase, rollout=rollout)
-    check_type(Region, region=region)
     rollout = rollout.cpu()
     steps = episode_measures(rollout)["steps"].tolist()
     latitude, longitude = rollout["position"].unsqueeze(-2).unbind(-1)
@@ -207,8 +198,6 @@ def write_replay(path: Path | str, data: Mapping[str, Any]) -> None:
         >>> path.read_text()[:15]
         '<!doctype html>'
     """
-    check_type((Path, str), path=path)
-    check_type(Mapping, data=data)
     missing = {"title", "contours", "tasks", "navigators"} - data.keys()
     if missing:
         raise KeyError(f"data must come from replay_data; it lacks {', '.join(sorted(missing))}")
@@ -216,101 +205,3 @@ def write_replay(path: Path | str, data: Mapping[str, Any]) -> None:
     # Without "<", no text can end the script element that holds the data.
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     Path(path).write_text(template.replace(PLACEHOLDER, text), encoding="utf-8")
-
-
-def write_gif(
-    path: Path | str,
-    rollout: TensorDictBase,
-    field: FieldModel,
-    region: Region,
-    *,
-    frames_per_step: int = 3,
-    size_px: int = 640,
-) -> None:
-    """Write the episodes of a rollout over the field's contours as an animated GIF that loops.
-
-    Args:
-        path: path of the image; an existing file is replaced.
-        rollout: ``(M, T)`` from the environment; all episodes are shown.
-        field: field model of the environment.
-        region: region of the tasks.
-        frames_per_step: frames per move.
-        size_px: height and width [pixels].
-
-    Raises:
-        ValueError: for ``frames_per_step`` or ``size_px`` below 1, or a rollout of other dimensions.
-
-    Example:
-        >>> import tempfile
-        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
-        >>> env, path = GeomagneticNavEnv(seed=0), Path(tempfile.mkdtemp()) / "episodes.gif"
-        >>> write_gif(path, env.rollout(1), env.field, env.region, frames_per_step=1, size_px=200)
-        >>> path.read_bytes()[:3]
-        b'GIF'
-    """
-    check_type((Path, str), path=path)
-    check_number(1, whole=True, frames_per_step=frames_per_step, size_px=size_px)
-    save_gif(path, list(_frames(rollout, field, region, frames_per_step, size_px)), STEP_MS // frames_per_step)
-
-
-def save_gif(path: Path | str, frames: Sequence[Image.Image], frame_ms: int, colors: int = GIF_COLORS) -> None:
-    """Write frames as an animated GIF that loops and shows its last frame for longer.
-
-    Args:
-        path: path of the image; an existing file is replaced.
-        frames: RGB images of one size.
-        frame_ms: time that each frame is shown [ms].
-        colors: number of colors, at most 256.
-
-    Raises:
-        ValueError: for no frame, a time below 1 ms, or another number of colors.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "colors.gif"
-        >>> save_gif(path, [Image.new("RGB", (8, 8), color) for color in ("red", "blue")], frame_ms=100)
-        >>> Image.open(path).n_frames
-        2
-    """
-    check_number(1, whole=True, frame_ms=frame_ms)
-    check_number(1, 256, whole=True, colors=colors)
-    if not frames:
-        raise ValueError("frames must hold at least one image, got none")
-    sample = np.hstack([np.asarray(frame) for frame in (frames[0], frames[len(frames) // 2], frames[-1])])
-    palette = Image.fromarray(sample).quantize(colors)  # one for all frames, so that unchanged pixels compress well
-    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    durations = [frame_ms] * len(others) + [4 * STEP_MS]
-    first.save(Path(path), "GIF", save_all=True, append_images=others, duration=durations, loop=0)
-
-
-def _frames(
-    rollout: TensorDictBase, field: FieldModel, region: Region, frames_per_step: int, size_px: int
-) -> Iterator[Image.Image]:
-    """Yield the frames; vehicles that have arrived take the color of destinations."""
-    tracks = [track.numpy() for track in episode_tracks(rollout, region)]
-    success = episode_measures(rollout)["success"].tolist()
-    targets = region.unwrapped(rollout["target_position"][:, 0]).cpu()
-    figure = Figure(figsize=(6.4, 6.4), dpi=(size_px + 0.01) / 6.4, layout="constrained")
-    canvas, axes = FigureCanvasAgg(figure), figure.subplots()
-    draw_contours(axes, field, region.holding(torch.cat([targets, *map(torch.from_numpy, tracks)])))
-    axes.plot(*np.array([track[0] for track in tracks]).T[::-1], "s", color=START, ms=4)
-    axes.plot(*targets.T.flip(0), "^", color=TARGET, ms=7)
-    lines = [axes.plot([], [], lw=1.8, marker="o", ms=6, markevery=[-1])[0] for _ in tracks]
-    last = max(len(track) for track in tracks) - 1
-    times = np.linspace(0, last, last // PIECES * frames_per_step + 1)
-    canvas.draw()
-    figure.set_layout_engine("none")  # a fixed layout in all frames
-    for time in times:
-        for line, track, arrives in zip(lines, tracks, success, strict=True):
-            line.set_data(*_until(track, time).T[::-1])
-            line.set_color(TARGET if arrives and time >= len(track) - 1 else PATH)
-        canvas.draw()
-        yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-
-
-def _until(track: np.ndarray, time: float) -> np.ndarray:
-    """Return a track up to a time in pieces, with an interpolated last point."""
-    knots = np.arange(len(track))
-    now = min(time, len(track) - 1)
-    end = [np.interp(now, knots, column) for column in track.T]
-    return np.vstack((track[: int(now) + 1], end))

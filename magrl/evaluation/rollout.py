@@ -75,8 +75,8 @@ def evaluate(
     drift = {"drift_km": flown.drift_km(options.get("max_move_km") or scenario.max_move_km or 50.0)}
     base = GeomagneticNavEnv(scenario, num_envs=num_envs, seed=seed, device=device, **(drift | options))
     if isinstance(policy, str):
-        told = tuple(noise) if conditions is None else flown.sensor_std
-        policy = make_navigator(policy, base, seed=seed, noise=told, bias=flown.bias_std)  # type: ignore[arg-type]
+        std = tuple(noise) if conditions is None else flown.sensor_std
+        policy = make_navigator(policy, base, seed=seed, sensor_std=std, bias_std=flown.bias_std)
     elif hasattr(policy, "check_fits"):
         policy.check_fits(base)
     env = with_sensor_noise(base, noise, seed) if conditions is None else with_conditions(base, flown, seed)
@@ -89,14 +89,11 @@ def evaluate(
 
 def _with_tasks(tasks: Scenario | Tasks | str) -> Scenario:
     """Return a scenario with tasks; raise if it has none."""
-    if isinstance(tasks, str):
-        tasks = named_tasks(tasks)
-    if isinstance(tasks, Tasks):
-        return Scenario().with_tasks(tasks)
-    check_type((Scenario, Tasks, str), tasks=tasks)
-    if tasks.tasks is None:
+    tasks = named_tasks(tasks) if isinstance(tasks, str) else tasks
+    scenario = tasks if isinstance(tasks, Scenario) else Scenario().with_tasks(tasks)
+    if scenario.tasks is None:
         raise ValueError("the scenario has no tasks to fly: scenario.with_tasks(scenario.random_tasks(300, seed=0))")
-    return tasks
+    return scenario
 
 
 def _next_episodes(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
@@ -182,7 +179,6 @@ def with_true_field(rollout: TensorDictBase) -> TensorDictBase:
         >>> bool((with_true_field(rollout)["next", "field"] == rollout["next", "true_field"]).all())
         True
     """
-    check_type(TensorDictBase, rollout=rollout)
     shown = rollout.copy()
     for state in (shown, shown["next"]):
         state["field"] = state.get("true_field", state["field"])

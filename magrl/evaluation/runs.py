@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from magrl.checks import check_type
-from magrl.evaluation.navigators import OWN, TRAINED
+from magrl.evaluation.navigators import OWN, TRAINED, parse_navigator
 
-Value = TypeVar("Value")
 Noise = tuple[float, float, float]
 NO_NOISE: Noise = (0.0, 0.0, 0.0)
 
@@ -33,6 +32,8 @@ class TrainedRun:
     """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT]."""
     scenario: Path | None = None
     """Scenario file in the folder, or None for the paper's."""
+    zeta: float = 0.01
+    """Arrival threshold on the objective."""
 
 
 def run_config(folder: Path) -> dict[str, Any]:
@@ -81,11 +82,13 @@ def read_run(folder: Path) -> TrainedRun:
         kind = {"td3_recurrent.py": "recurrent", "td3_anywhere.py": "anywhere"}.get(settings.get("recipe", ""), guided)
         first, second, third = (float(level) for level in settings.get("noise", NO_NOISE))
         scenario = folder / Path(settings["scenario"]).name if settings.get("scenario") else None
+        zeta = float(settings.get("zeta", 0.01))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{folder / 'config.json'} is not the configuration of a run: {error}") from error
     if scenario is not None and not scenario.is_file():
         raise FileNotFoundError(f"{folder} was trained in its scenario file {scenario.name}, which is missing there")
-    return TrainedRun(folder, kind, str(settings.get("start_heading", "north")), (first, second, third), scenario)
+    heading, noise = str(settings.get("start_heading", "north")), (first, second, third)
+    return TrainedRun(folder, kind, heading, noise, scenario, zeta)
 
 
 def trained_runs(texts: Sequence[str]) -> list[TrainedRun]:
@@ -100,9 +103,7 @@ def trained_runs(texts: Sequence[str]) -> list[TrainedRun]:
         []
     """
     runs = []
-    for text in texts:
-        name, _, folder = text.partition("=")
-        name = name.partition(":")[0]
+    for name, _, folder in map(parse_navigator, texts):
         if name in TRAINED and (Path(folder) / "config.json").is_file():
             run = read_run(Path(folder))
             if name != OWN and run.kind in TRAINED and run.kind != name.removesuffix("_noise"):
@@ -111,84 +112,58 @@ def trained_runs(texts: Sequence[str]) -> list[TrainedRun]:
     return runs
 
 
-def agreed(
-    runs: Sequence[TrainedRun],
-    setting: Callable[[TrainedRun], Value],
-    chosen: Value | None,
-    default: Value,
-    *,
-    name: str,
-    option: str,
-) -> tuple[Value, list[str]]:
-    """Return the value of a setting in an evaluation, and what a reader of its results must know about the runs.
+def unfinished(texts: Sequence[str]) -> list[str]:
+    """Return a sentence for each run folder among navigators such as ``td3=RUN`` whose training is not finished.
+
+    Example:
+        >>> unfinished(["secant", "td3=runs/nowhere"])
+        ['runs/nowhere is not a finished training: it holds no eval.json']
+    """
+    folders = (Path(source) for name, _, source in map(parse_navigator, texts) if name in TRAINED and source)
+    open_runs = (folder for folder in folders if not folder.is_file() and not (folder / "eval.json").is_file())
+    return [f"{folder} is not a finished training: it holds no eval.json" for folder in open_runs]
+
+
+def agreed(runs: Sequence[TrainedRun], setting: str, chosen: Any, default: Any) -> tuple[Any, list[str]]:
+    """Return the value of a setting in an evaluation, and a sentence for each run that was trained with another.
+
+    Scenario files agree if their content does.
 
     Args:
         runs: trained agents.
-        setting: function that returns the setting of a run.
+        setting: attribute of :class:`TrainedRun`, whose option on the command line has the same name.
         chosen: value that was chosen; None for that of the runs.
         default: value without runs.
-        name: what the setting is, in messages.
-        option: option that chooses it.
-
-    Returns:
-        The value, and a sentence for each run that was trained with another.
 
     Raises:
         ValueError: for runs that differ if none was chosen.
 
     Example:
         >>> runs = [TrainedRun(Path("a"), "td3"), TrainedRun(Path("b"), "td3", "random")]
-        >>> agreed(runs, lambda run: run.start_heading, "north", "north", name="heading", option="--start-heading")
-        ('north', ['b was trained with heading random and is evaluated with north'])
+        >>> agreed(runs, "start_heading", "north", "north")
+        ('north', ['b was trained with start heading random and is evaluated with north'])
     """
-    trained = [(run.folder, setting(run)) for run in runs]
+    name, trained = setting.replace("_", " "), [(run.folder, getattr(run, setting)) for run in runs]
     if chosen is None:
-        examples: dict[Value, Path] = {}
+        examples: dict[object, str] = {}
         for folder, value in trained:
-            examples.setdefault(value, folder)
+            examples.setdefault(_content(value), f"{_text(value)} ({folder})")
         if len(examples) > 1:
-            listed = ", ".join(f"{_said(value)} ({folder})" for value, folder in examples.items())
+            listed, option = ", ".join(examples.values()), f"--{setting.replace('_', '-')}"
             raise ValueError(f"the runs were trained with different {name}, {listed}: choose with {option}")
-        chosen = next(iter(examples), default)
+        chosen = trained[0][1] if trained else default
     return chosen, [
-        f"{folder} was trained with {name} {_said(value)} and is evaluated with {_said(chosen)}"
+        f"{folder} was trained with {name} {_text(value)} and is evaluated with {_text(chosen)}"
         for folder, value in trained
-        if value != chosen
+        if _content(value) != _content(chosen)
     ]
 
 
-def common_scenario(runs: Sequence[TrainedRun], chosen: Path | None = None) -> tuple[Path | None, list[str]]:
-    """Return the scenario file of an evaluation, or None for the paper's scenario, and notes as :func:`agreed`.
-
-    Args:
-        runs: trained agents.
-        chosen: file that was chosen; None for that of the runs.
-
-    Raises:
-        ValueError: for runs of different scenarios if none was chosen.
-
-    Example:
-        >>> common_scenario([TrainedRun(Path("a"), "td3")])
-        (None, [])
-    """
-    content = {run.scenario: run.scenario.read_text() if run.scenario else "" for run in runs}
-    if chosen is not None:
-        wanted = chosen.read_text() if chosen.is_file() else None  # who reads the scenario reports a missing file
-        return chosen, [
-            f"{run.folder} was trained in {_place(run)}, and is evaluated in that of {chosen.name}"
-            for run in runs
-            if wanted is not None and content[run.scenario] != wanted
-        ]
-    examples = {content[run.scenario]: run for run in runs}
-    if len(examples) > 1:
-        listed = ", ".join(f"{run.folder} in {_place(run)}" for run in examples.values())
-        raise ValueError(f"the runs were trained in different scenarios, {listed}: choose with --scenario")
-    return (runs[0].scenario if runs else None), []
+def _content(value: object) -> object:
+    return value.read_text() if isinstance(value, Path) and value.is_file() else value
 
 
-def _place(run: TrainedRun) -> str:
-    return f"the scenario {run.scenario.name} of its folder" if run.scenario else "the paper's scenario"
-
-
-def _said(value: object) -> str:
-    return " ".join(f"{x:g}" for x in value) if isinstance(value, tuple) else str(value)
+def _text(value: object) -> str:
+    if isinstance(value, tuple):
+        return " ".join(f"{x:g}" for x in value)
+    return "of the paper" if value is None else value.name if isinstance(value, Path) else str(value)

@@ -14,7 +14,7 @@ import torch
 
 from magrl import paper
 from magrl.evaluation.intervals import interquartile_mean, stratified_bootstrap
-from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, needs
+from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, needs, parse_navigator
 
 Summary = Mapping[str, float | None]
 """From :func:`magrl.evaluation.summarize`; a measure without a value is NaN, or None where it was read from a file."""
@@ -39,7 +39,7 @@ COLUMNS = {
     "MAE °": ("heading_mae_deg", ".1f"),
     "readings": ("field_readings", ".0f"),
 }
-"""Heading, measure (or :func:`worst`) and number format of :func:`comparison_table`; the first four are the paper's."""
+"""Heading, measure of :func:`cell` and number format of :func:`comparison_table`; the first four are the paper's."""
 
 SHORT_COLUMNS = {
     "SR %": ("success_rate", ".1f"),
@@ -145,14 +145,14 @@ def comparison_table(
         >>> print(comparison_table({"td3": [measures]}).splitlines()[2])
         | TD3, paper | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — |
     """
-    rows: list[list[object]] = []
-    shown = set[str]()
+    rows, shown = list[list[object]](), set[str]()
     columns = _kilometers(summaries, kilometers) | COLUMNS
     for name, results in summaries.items():
-        base = name.partition(":")[0]
+        base = parse_navigator(name).name
         if published and base in paper.TABLE_2 and base not in shown:
             shown.add(base)
-            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", 1, *_published(base, columns)])
+            published_row = [paper.TABLE_2[base]._asdict()]
+            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", 1, *_cells(published_row, columns)])
         rows.append([label(name, mode), needs(name, mode), len(results), *_cells(results, columns)])
     return markdown_table(["navigator", "needs", "runs", *columns], rows) + "\n"
 
@@ -160,20 +160,12 @@ def comparison_table(
 def _kilometers(summaries: Summaries, wanted: bool) -> dict[str, tuple[str, str]]:
     """Return the columns of :data:`KILOMETERS`, as far as they are wanted and known."""
     declared = any("false_arrival_rate" in run for runs in summaries.values() for run in runs)
-    return {
-        head: column
-        for head, column in KILOMETERS.items()
-        if wanted and (declared or column[0] != "false_arrival_rate")
-    }
-
-
-def _published(name: str, columns: Mapping[str, tuple[str, str]]) -> list[str]:
-    values = paper.TABLE_2[name]._asdict()
-    return [format(values[key], form) if key in values else "—" for key, form in columns.values()]
+    shown = KILOMETERS if wanted else {}
+    return {head: column for head, column in shown.items() if declared or column[0] != "false_arrival_rate"}
 
 
 def _cells(results: Sequence[Summary], columns: Mapping[str, tuple[str, str]]) -> list[str]:
-    return [(worst(results, form) if key == "worst" else cell(results, key, form)) for key, form in columns.values()]
+    return [cell(results, key, form) for key, form in columns.values()]
 
 
 def cell(results: Sequence[Summary], key: str, form: str) -> str:
@@ -181,27 +173,21 @@ def cell(results: Sequence[Summary], key: str, form: str) -> str:
 
     Args:
         results: summary of each run.
-        key: measure; a run without it has no value.
+        key: measure, which a run may lack; or ``"worst"``, the smallest SPL of several runs.
         form: number format.
 
     Example:
         >>> cell([{"spl": 98.0, "spl_low": 97.5, "spl_high": 98.5}], "spl", ".1f")
         '98.0 (97.5–98.5)'
+        >>> cell([{"spl": 99.0}, {"spl": 98.5}], "worst", ".2f"), cell([{"spl": 99.0}], "worst", ".2f")
+        ('98.50', '—')
     """
+    if key == "worst":
+        values = known_values(result.get("spl") for result in results)
+        return format(min(values), form) if len(values) > 1 else "—"
     text = mean_of_runs([result.get(key) for result in results], form=form, interval=key in INTERVALS)
     ends = known_values(result.get(f"{key}_{end}") for result in results[:1] for end in ("low", "high"))
     return f"{text} ({ends[0]:{form}}–{ends[1]:{form}})" if len(results) == 1 and ends else text
-
-
-def worst(results: Sequence[Summary], form: str) -> str:
-    """Return the smallest SPL of several runs; a dash for a single one.
-
-    Example:
-        >>> worst([{"spl": 99.0}, {"spl": 98.5}], ".2f"), worst([{"spl": 99.0}], ".2f")
-        ('98.50', '—')
-    """
-    values = known_values(result.get("spl") for result in results)
-    return format(min(values), form) if len(values) > 1 else "—"
 
 
 def short_table(summaries: Summaries, mode: str = "look-ahead", *, kilometers: bool = False) -> str:

@@ -9,15 +9,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from typing_extensions import Self
 
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number
+from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import element_index
 from magrl.geodesy import wrap_angle
+
+Std = Sequence[float]
+"""Standard deviations of the sensors: D [deg], I [deg], B_H [nT]."""
+PERFECT: Std = (0.0, 0.0, 0.0)
 
 
 def steer(
@@ -37,15 +44,10 @@ def steer(
     Returns:
         Distance [km] and turn [rad], each ``(...)``, within their bounds; a NaN heading gives a NaN turn.
 
-    Raises:
-        ValueError: for a bound that is not positive and finite.
-
     Example:
         >>> steer(torch.zeros(2), torch.tensor([-1.0, 2.0]), torch.tensor([70.0, 70.0]), 50.0, 1.5)
         (tensor([50.,  0.]), tensor([-1.0000,  1.5000]))
     """
-    check_tensor(heading=heading, wanted=wanted, distance_km=distance_km)
-    check_number(0, above=True, max_move_km=max_move_km, max_turn_rad=max_turn_rad)
     turn = wrap_angle(wanted - heading)
     within = turn.abs() <= max_turn_rad + 1e-6  # a right angle in float32 is still a right angle
     distance = torch.where(within, distance_km.clamp(0, max_move_km), 0.0)
@@ -62,15 +64,10 @@ def displacement_to(error: Tensor, jacobian: Tensor) -> Tensor:
     Returns:
         ``(..., 2)`` north, east [km]; finite for singular equations. NaN in gives NaN out.
 
-    Raises:
-        ValueError: for shapes that do not match.
-
     Example:
         >>> displacement_to(torch.tensor([2.0, 1.0]), torch.tensor([[0.0, 0.1], [0.5, 0.0]]))
         tensor([ 2., 20.])
     """
-    check_tensor(error=error)
-    check_tensor(*error.shape[-1:], 2, jacobian=jacobian)
     wide, sides = jacobian.double(), error.double().unsqueeze(-1)  # the normal equations halve the digits
     normal, right = wide.mT @ wide, (wide.mT @ sides).squeeze(-1)
     ridge = 1e-12 * normal.diagonal(dim1=-2, dim2=-1).sum(-1) + 1e-30
@@ -90,11 +87,19 @@ def element_indices(elements: Sequence[str], least: int) -> list[int]:
         >>> element_indices(("D", "B_H"), least=2)
         [0, 2]
     """
-    if isinstance(elements, str) or not isinstance(elements, Sequence):
-        raise ValueError(f"elements must be a sequence of D, I, B_H, got {elements!r}")
-    if len(set(elements)) != len(elements) or len(elements) < least:
-        raise ValueError(f"elements must be at least {least} different names of D, I, B_H, got {tuple(elements)}")
+    if isinstance(elements, str) or len(set(elements)) != len(elements) or len(elements) < least:
+        raise ValueError(f"elements must be at least {least} different names of D, I, B_H, got {elements!r}")
     return [element_index(name) for name in elements]
+
+
+def total_std(sensor_std: Sequence[float], bias_std: Sequence[float]) -> tuple[float, ...]:
+    """Return the standard deviations of all errors of the sensors, for a navigator that does not tell them apart.
+
+    Example:
+        >>> total_std((0.3, 0.0, 0.0), (0.4, 0.0, 5.0))
+        (0.5, 0.0, 5.0)
+    """
+    return tuple(map(math.hypot, sensor_std, bias_std))
 
 
 class Navigator(TensorDictModuleBase):
@@ -103,7 +108,8 @@ class Navigator(TensorDictModuleBase):
     A subclass sets its ``in_keys``, returns the memory at the start of an episode (``step_count`` 0) in
     :meth:`first_memory`, and chooses the next move in :meth:`decide`. :meth:`decide` is called once for each step of a
     vehicle, so that calling the navigator twice on one state changes nothing; if ``done`` is among the ``in_keys``, it
-    is not called after the end of an episode.
+    is not called after the end of an episode. With the class attributes below, and a place in the list of
+    :data:`magrl.navigators.NAVIGATORS`, commands, tables and figures know it by its name.
 
     Args:
         max_move_km: longest move [km].
@@ -119,9 +125,6 @@ class Navigator(TensorDictModuleBase):
         ...         super().__init__(max_move_km=50.0, max_turn_rad=math.pi / 2)
         ...         self.in_keys = ["heading", "step_count"]
         ...
-        ...     def first_memory(self, seen):
-        ...         return {}
-        ...
         ...     def decide(self, seen, memory):
         ...         heading = seen["heading"].squeeze(-1)
         ...         east, way = torch.full_like(heading, math.pi / 2), torch.full_like(heading, 30.0)
@@ -131,14 +134,20 @@ class Navigator(TensorDictModuleBase):
                  [30.0000,  0.0000]]])
     """
 
+    name: str
+    """Name in commands."""
+    label: str
+    """Label in figures."""
+    description: str
+    """Label in tables."""
     oracle: bool = False
     """Whether the navigator reads privileged keys, or the field where the vehicle has not been."""
     needs: str = "nothing"
-    """What it needs beside its readings and the sensors' data sheet: ``"nothing"``, ``"a map of the region"``,
-    ``"a map and the region"``,
-    ``"the gradient"``, ``"the position"`` or ``"the field at other places"``."""
+    """What it needs beside its readings and the standard deviations of the sensors, such as ``"the position"``."""
+    options: tuple[str, ...] = ()
+    """Further options of :meth:`for_env` that a command has: ``mode``, ``seed``, ``map_date``."""
 
-    def __init__(self, max_move_km: float, max_turn_rad: float) -> None:
+    def __init__(self, max_move_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
         super().__init__()
         check_number(0, above=True, max_move_km=max_move_km)
         check_number(0, math.pi, above=True, max_turn_rad=max_turn_rad)
@@ -146,9 +155,27 @@ class Navigator(TensorDictModuleBase):
         self.out_keys = ["action"]
         self.memory: TensorDictBase | None = None
 
-    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
-        """Return the memory of vehicles at the start of an episode: tensors ``(N, ...)``."""
-        raise NotImplementedError
+    @classmethod
+    def for_env(
+        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
+    ) -> Self:
+        """Return the navigator of an environment.
+
+        Args:
+            env: environment to navigate in.
+            sensor_std: standard deviations of the noise of the sensors: D [deg], I [deg], B_H [nT].
+            bias_std: standard deviations of their constant and slow errors.
+            options: further options of the class.
+
+        Raises:
+            ValueError: for an option out of its range, or an environment that the navigator cannot navigate in.
+        """
+        del sensor_std, bias_std  # only a navigator that weighs its readings uses them
+        return cls(max_move_km=env.max_move_km, max_turn_rad=env.max_turn_rad, **options)
+
+    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:  # noqa: ARG002
+        """Return the memory of vehicles at the start of an episode: tensors ``(N, ...)``; none by default."""
+        return {}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad], each ``(P,)``, of vehicles in a new state, and update their memory."""
@@ -165,8 +192,8 @@ class Navigator(TensorDictModuleBase):
         Returns:
             ``std``, or ``(P, 3)`` the larger of both: during an outage, a reading is worse than the data sheet.
         """
-        told = seen.get("sensor_std", None)
-        return std if told is None else torch.maximum(std, told.to(std))
+        own = seen.get("sensor_std", None)
+        return std if own is None else torch.maximum(std, own.to(std))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from typing import ClassVar
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -28,15 +28,10 @@ class Geodesic(Navigator):
         tensor(True)
     """
 
-    oracle = True
-    needs = "the position"
-
-    def __init__(self, max_move_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
-        super().__init__(max_move_km, max_turn_rad)
-        self.in_keys = ["position", "target_position", "heading", "step_count"]
-
-    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:  # noqa: ARG002 - no memory
-        return {}
+    name = label = "geodesic"
+    description = "geodesic (both positions, an oracle)"
+    oracle, needs = True, "the position"
+    in_keys: ClassVar[list[str]] = ["position", "target_position", "heading", "step_count"]
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         distance, bearing = geodesy.geodesic(*seen["position"].unbind(-1), *seen["target_position"].unbind(-1))

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl import tracking
 from magrl.checks import check_number, check_numbers, check_type
+from magrl.envs import GeomagneticNavEnv
+from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.navigators.secant import sensor_length
 from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior, Way
@@ -46,6 +50,8 @@ class Kalman(QuasiNewton):
         max_turn_rad: largest turn [rad].
         sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
         max_steps: step limit of the episode.
+        caution: weight of the uncertainty; for None that of :func:`trade_off`.
+        step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
         bias_std: standard deviations of constant and slow errors of the readings.
         zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
@@ -74,6 +80,8 @@ class Kalman(QuasiNewton):
         max_turn_rad: float = math.pi / 2,
         sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
         max_steps: int = 50,
+        caution: float | None = None,
+        step_km: float | None = None,
         range_km: float = 300.0,
         bias_std: Sequence[float] = (0.0, 0.0, 0.0),
         zeta: float = 0.01,
@@ -86,7 +94,11 @@ class Kalman(QuasiNewton):
         check_number(0, above=True, range_km=range_km, zeta=zeta)
         check_type(bool, search=search)
         self.max_steps, self.range_km, self.search = int(max_steps), float(range_km), search
-        self.zeta, (self.caution, self.step_km) = float(zeta), trade_off(sensor_std)
+        usual_caution, usual_step_km = trade_off(sensor_std)
+        self.zeta, self.caution = float(zeta), usual_caution if caution is None else caution
+        self.step_km = usual_step_km if step_km is None else step_km
+        check_number(0, caution=self.caution)
+        check_number(0, above=True, step_km=self.step_km)
         self._register("bias_std", bias_std)
 
     def prior(self, reading: Tensor) -> GradientPrior:
@@ -160,6 +172,17 @@ class Kalman(QuasiNewton):
         inverse, info = torch.linalg.inv_ex(normal + torch.diag(1 / unknown.diagonal()))
         # Where rounding leaves a singular matrix, the way is as unknown as before.
         return torch.where((info == 0)[..., None, None], inverse, unknown) * DISTANCE_SCALE_KM**2
+
+    name, label = "kalman", "Kalman"
+    description = "Kalman (dual control)"
+
+    @classmethod
+    def for_env(
+        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
+    ) -> Self:
+        bounds = env.max_move_km, env.max_turn_rad, sensor_std, env.max_steps
+        search = env.arrival.rule == "objective"  # else, an episode does not end where the objective is low
+        return cls(*bounds, bias_std=bias_std, zeta=env.zeta, search=search, **options)
 
 
 def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:

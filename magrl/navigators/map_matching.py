@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from magrl import geodesy
 from magrl.checks import check_number, check_numbers, check_type
-from magrl.envs import Region, Regions, Scenario
+from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario
 from magrl.field import Date, FieldBank, FieldModel, RegionalField, elements_at, igrf_coefficients, parse_date
 from magrl.field.elements import element_difference, elements_gradient, measured_elements
-from magrl.navigators.base import Navigator, displacement_to, steer
+from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to, steer, total_std
 from magrl.navigators.secant import SLOPES
 
 FLOOR = (1e-3, 1e-3, 0.1)
@@ -51,7 +52,7 @@ class MapMatching(Navigator):
         region: where vehicle and destination may be, usually ``env.edge``; the map must hold all of it.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        noise: standard deviations of the sensors, their data sheet: D [deg], I [deg], B_H [nT].
+        sensor_std: standard deviations of the sensors: D [deg], I [deg], B_H [nT].
         map_error: standard deviations of the map.
         hypotheses: number of positions that are tracked.
 
@@ -72,7 +73,10 @@ class MapMatching(Navigator):
         tensor([True, True])
     """
 
+    name, label = "map_matching", "map matching"
+    description = "map matching (Kalman filter)"
     needs = "a map and the region"
+    options = ("map_date",)
 
     grid: Tensor
     grid_elements: Tensor
@@ -84,27 +88,45 @@ class MapMatching(Navigator):
         region: Region | Regions,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        noise: Sequence[float] = (0.0, 0.0, 0.0),
-        map_error: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Std = PERFECT,
+        map_error: Std = PERFECT,
         hypotheses: int = 4,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_type((Region, Regions), region=region)
-        check_numbers(3, noise=noise, map_error=map_error)
-        check_number(0, noise=min(noise), map_error=min(map_error))
+        check_numbers(3, sensor_std=sensor_std, map_error=map_error)
+        check_number(0, sensor_std=min(sensor_std), map_error=min(map_error))
         check_number(1, GRID_POINTS**2, whole=True, hypotheses=hypotheses)
         self.many, self.hypotheses = isinstance(region, Regions), int(hypotheses)
         self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if self.many else [])]
         self.map = field
         self._place(region if isinstance(region, Regions) else Regions.of([region]).to(_device(field)))
-        squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, noise))
+        squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, sensor_std))
         floor, error, sensors = (x.to(self.grid.device) for x in squares)
         self.register_buffer("target_std", (floor + error).sqrt())
         self.register_buffer("std", (floor + error + sensors).sqrt())
         # Two elements give a position, so that the second smallest of the three counts.
         self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
+
+    @classmethod
+    def for_env(
+        cls,
+        env: GeomagneticNavEnv,
+        *,
+        sensor_std: Std = PERFECT,
+        bias_std: Std = PERFECT,
+        map_date: Date | None = None,
+        **options: Any,
+    ) -> Self:
+        """Return the navigator of an environment, with its field as the map, or IGRF at ``map_date``."""
+        field = env.field
+        if map_date is not None:
+            field = dated_map(env.scenario, map_date, env.max_move_km).to(env.device)
+            options = {"map_error": aged_error(env.scenario, map_date)} | options
+        std = total_std(sensor_std, bias_std)
+        return cls(field, env.edge, env.max_move_km, env.max_turn_rad, std, **options)
 
     def _place(self, region: Regions) -> None:
         """Keep the region, and the elements on a grid of it."""
@@ -126,11 +148,11 @@ class MapMatching(Navigator):
         self.register_buffer("box", torch.stack((region.latitude, region.longitude), -1))
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
-        positions = self.grid.new_zeros(len(seen["heading"]), self.hypotheses, 2)
-        covariance, misfit = torch.diag_embed(positions), positions[..., 0].clone()
-        known = torch.zeros(len(positions), dtype=torch.bool, device=positions.device)
-        hypotheses = {"position": positions, "covariance": covariance, "misfit": misfit}
-        return {**hypotheses, "target": positions[:, 0].clone(), "known": known}
+        position = self.grid.new_zeros(len(seen["heading"]), self.hypotheses, 2)
+        covariance, misfit = torch.diag_embed(position), position[..., 0].clone()
+        known = torch.zeros_like(position[:, 0, 0], dtype=torch.bool)
+        hypotheses = {"position": position, "covariance": covariance, "misfit": misfit}
+        return {**hypotheses, "target": position[:, 0].clone(), "known": known}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         known = memory["known"].clone()
@@ -158,17 +180,15 @@ class MapMatching(Navigator):
         covariance = memory["covariance"] + torch.diag_embed(growth.unsqueeze(-1).expand_as(position))
         std = self.accuracy(seen, self.std)
         position, covariance, more = self._corrected(position, covariance, seen["field"].double(), std, region)
-        found = {"position": position, "covariance": covariance, "misfit": memory["misfit"] + more}
-        return memory.update(found)
+        return memory.update({"position": position, "covariance": covariance, "misfit": memory["misfit"] + more})
 
     def _located(self, elements: Tensor, std: Tensor, region: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Invert the map: positions ``(P, H, 2)`` for elements ``(P, 3)``, their covariances and misfits."""
         position = self._lowest(elements, std, region)
         for _ in range(NEWTON_STEPS):
             residual, jacobian = self._residual(position, elements, std, region)
-            north, east = displacement_to(residual, jacobian).unbind(-1)
-            length = torch.hypot(north, east).clamp_max(LONGEST_STEP_KM)
-            position = self._moved(position, torch.atan2(east, north), length, region)
+            length, heading = geodesy.polar(displacement_to(residual, jacobian))
+            position = self._moved(position, heading, length.clamp_max(LONGEST_STEP_KM), region)
         prior = torch.diag_embed(torch.full_like(position, PRIOR_KM**2))
         return self._corrected(position, prior, elements, std, region)
 
@@ -190,8 +210,7 @@ class MapMatching(Navigator):
         """Return positions, covariances and misfits after a reading ``(P, 3)`` of each vehicle."""
         residual, jacobian = self._residual(position, elements, std, region)
         displacement, covariance, misfit = update(covariance, jacobian, residual)
-        north, east = displacement.unbind(-1)
-        heading, length = torch.atan2(east, north), torch.hypot(north, east)
+        length, heading = geodesy.polar(displacement)
         return self._moved(position, heading, length, region), covariance, misfit
 
     def _residual(self, position: Tensor, elements: Tensor, std: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:

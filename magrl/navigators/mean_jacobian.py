@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl.checks import check_tensor
+from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
 from magrl.field.model import FieldModel, elements_gradient_at
+from magrl.navigators.base import PERFECT, Std, total_std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.tracking import GradientPrior
 
@@ -62,3 +66,15 @@ class MeanJacobian(QuasiNewton):
 
     def prior(self, reading: Tensor) -> GradientPrior:
         return GradientPrior(self.mean.expand(*reading.shape, 2), self.std, torch.zeros_like(reading[:, 0]))
+
+    name, label = "mean_jacobian", "mean Jacobian"
+    description = "mean Jacobian (quasi-Newton)"
+
+    @classmethod
+    def for_env(
+        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
+    ) -> Self:
+        if env.many:
+            raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
+        places, std = env.region.grid(21).to(env.device), total_std(sensor_std, bias_std)
+        return cls(env.field, places, env.max_move_km, env.max_turn_rad, sensor_std=std, **options)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import Self
 
+from magrl.envs import GeomagneticNavEnv
 from magrl.field.bank import FieldBank
 from magrl.field.elements import NAMES, element_difference
 from magrl.field.model import FieldModel, elements_gradient_at
@@ -40,8 +43,9 @@ class ParallelApproach(Navigator):
         tensor(True)
     """
 
-    oracle = True
-    needs = "the gradient"
+    name = label = "parallel"
+    description = "parallel (true gradient, an oracle)"
+    oracle, needs = True, "the gradient"
 
     def __init__(
         self,
@@ -59,8 +63,9 @@ class ParallelApproach(Navigator):
         if pair is not None and len(pair) != 2:
             raise ValueError(f"pair must be two of D, I, B_H, got {tuple(pair)}")
 
-    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:  # noqa: ARG002 - no memory
-        return {}
+    @classmethod
+    def for_env(cls, env: GeomagneticNavEnv, **options: Any) -> Self:
+        return super().for_env(env, field=env.field, **options)
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         here, there = (seen[key].double() for key in ("field", "target_field"))

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl import guidance
 from magrl.checks import check_number, check_numbers
+from magrl.envs import GeomagneticNavEnv
 from magrl.navigators.base import Navigator
 
 
@@ -38,6 +41,9 @@ class RunAndTumble(Navigator):
         tensor([25.,  0.])
     """
 
+    name, label = "run_and_tumble", "run and tumble"
+    description = label
+
     def __init__(
         self,
         max_move_km: float = 50.0,
@@ -49,6 +55,10 @@ class RunAndTumble(Navigator):
         check_number(0, above=True, objective_floors=min(objective_floors))
         self.in_keys = ["field", "target_field", "heading", "step_count"]
         self.turn, self.objective_floors = min(math.pi / 2, self.max_turn_rad), tuple(objective_floors)
+
+    @classmethod
+    def for_env(cls, env: GeomagneticNavEnv, **options: Any) -> Self:
+        return super().for_env(env, objective_floors=tuple(env.objective_floors.tolist()), **options)
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         here, there = seen["field"].double(), seen["target_field"].double()

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl.checks import check_number, check_numbers
+from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
+from magrl.navigators.base import PERFECT, Std, total_std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.tracking import FieldTrack, GradientPrior
 
@@ -102,3 +106,12 @@ class Secant(QuasiNewton):
         decisions = memory["decisions"]
         probing, probe_turn = decisions <= 2, torch.where(decisions == 2, self.probe_turn, 0.0)
         return torch.where(probing, self.probe_km, distance), torch.where(probing, probe_turn, turn)
+
+    name = label = "secant"
+    description = "secant (quasi-Newton)"
+
+    @classmethod
+    def for_env(
+        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
+    ) -> Self:
+        return cls(env.max_move_km, env.max_turn_rad, sensor_std=total_std(sensor_std, bias_std), **options)

@@ -278,13 +278,13 @@ class Run:
         Raises:
             SystemExit: after a signal, with its exit code; the policy so far is saved.
         """
-        from magrl.evaluation import plots  # matplotlib is slow to import, and collecting processes do without
+        from magrl.evaluation import figures, maps  # matplotlib is slow to import, and collecting processes do without
 
         seconds = self.log.seconds
         self.policy.actor.load_state_dict(self.best.weights or self.policy.actor.state_dict())
         save_policy(self.folder / "policy.pt", self.policy)
         if self.log.rows:
-            self.log.figure("training", plots.training_figure(self.log.rows))
+            self.log.figure("training", figures.training_figure(self.log.rows))
         if not self.complete:
             self._report_stop()
         rollout = evaluation_rollout(test, self.policy)
@@ -294,7 +294,7 @@ class Run:
         result |= {"training_seconds": seconds, "seconds_to_97_sr_88_spl": reached}
         if isinstance(test.region, Region):
             shown = rollout if self._own is None else evaluation_rollout(self._own, self.policy)
-            figure = plots.trajectories_figure(shown, test.field, test.region, names=self.scenario.names)
+            figure = maps.trajectories_figure(shown, test.field, test.region, names=self.scenario.names)
             self.log.figure("trajectories", figure)
         self.log.result(result, navigator=self.name)
         self.checkpoints.clear()

@@ -31,8 +31,9 @@ from tqdm import tqdm
 
 from magrl.envs import PAPER_REGION, Scenario, Tasks, named_tasks
 from magrl.envs.rendering import draw_tracks
-from magrl.evaluation import plots, summarize
-from magrl.evaluation.flight import coastlines
+from magrl.evaluation import figures as plots
+from magrl.evaluation import summarize
+from magrl.evaluation.maps import coastlines
 from magrl.evaluation.navigators import label
 from magrl.evaluation.runs import NO_NOISE
 from magrl.field import IGRF, elements_at

@@ -37,7 +37,7 @@ def flown(
         navigator = {"name": navigator}
     if isinstance(navigator, Mapping):
         options = {key: value for key, value in navigator.items() if key != "name"}
-        navigator = make_navigator(navigator["name"], base, noise=std, bias=bias, **options)
+        navigator = make_navigator(navigator["name"], base, sensor_std=std, bias_std=bias, **options)
     return episode_measures(evaluation_rollout(env, navigator))
 
 

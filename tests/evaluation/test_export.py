@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
-from magrl.evaluation.colors import NAVIGATOR_COLORS
 from magrl.evaluation.export import Track, check_suffix, cut, to_geojson, to_gpx, to_kml, tracks, write_tracks
+from magrl.evaluation.navigators import NAVIGATOR_COLORS
 
 GPX, KML = "{http://www.topografix.com/GPX/1/1}", "{http://www.opengis.net/kml/2.2}"
 AWKWARD = 'a <b> & "c" \x00\x1f ]]> Ñandú'

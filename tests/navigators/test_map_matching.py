@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from scipy.optimize import least_squares
@@ -11,9 +9,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from magrl import geodesy
-from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region, Scenario, earth_scenario, task_set
+from magrl.envs import GeomagneticNavEnv, Region, Scenario, earth_scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
-from magrl.evaluation.navigators import check_map_date, make_navigator, needs
 from magrl.field import elements_at
 from magrl.navigators import MapMatching
 from magrl.navigators.map_matching import aged_error, best, dated_map, update
@@ -55,7 +52,7 @@ def scipy_inversion(env: GeomagneticNavEnv, start: Tensor, reading: Tensor, std:
 
 def test_the_first_reading_is_inverted_as_by_scipy(box: GeomagneticNavEnv) -> None:
     """The weighted least squares of a reading with noise, and the destination exactly."""
-    navigator = MapMatching(box.field, box.edge, noise=NOISE)
+    navigator = MapMatching(box.field, box.edge, sensor_std=NOISE)
     env = with_sensor_noise(box, NOISE)
     state = env.reset()
     navigator(state)
@@ -70,7 +67,7 @@ def test_the_first_reading_is_inverted_as_by_scipy(box: GeomagneticNavEnv) -> No
 def test_it_finds_its_position_as_well_as_the_noise_allows(box: GeomagneticNavEnv, scale: float, within_km) -> None:
     """At the first reading; the error grows with the noise, and the covariance says how large it is."""
     noise = tuple(scale * std for std in NOISE)
-    navigator = MapMatching(box.field, box.edge, noise=noise)
+    navigator = MapMatching(box.field, box.edge, sensor_std=noise)
     state = with_sensor_noise(box, noise).reset()
     navigator(state)
     memory = navigator.memory
@@ -83,7 +80,7 @@ def test_it_finds_its_position_as_well_as_the_noise_allows(box: GeomagneticNavEn
 
 
 def test_readings_along_the_track_improve_the_position(box: GeomagneticNavEnv) -> None:
-    navigator = MapMatching(box.field, box.edge, noise=NOISE)
+    navigator = MapMatching(box.field, box.edge, sensor_std=NOISE)
     env = with_sensor_noise(box, NOISE)
     state, errors = env.reset(), []
     for _ in range(6):
@@ -110,7 +107,7 @@ def test_the_update_is_that_of_the_textbook() -> None:
 
 def test_a_step_forgets_corrects_and_adds_to_the_misfit(box: GeomagneticNavEnv) -> None:
     """One step against the information form; a map error of 97 km moves the position as much in 30 km."""
-    navigator = make_navigator("map_matching", box, noise=NOISE, map_date="2012-01-01")
+    navigator = MapMatching.for_env(box, sensor_std=NOISE, map_date="2012-01-01")
     assert navigator.map_error_km == pytest.approx(97.5, rel=1e-3)
     state = box.step(navigator(box.reset()))["next"]
     before = navigator.memory.clone()
@@ -127,10 +124,10 @@ def test_a_step_forgets_corrects_and_adds_to_the_misfit(box: GeomagneticNavEnv) 
 
 def test_it_flies_the_shortest_path(box: GeomagneticNavEnv, earth: GeomagneticNavEnv) -> None:
     for env in (box, earth):
-        clean = flown(env, make_navigator("map_matching", env))
+        clean = flown(env, MapMatching.for_env(env))
         assert clean["success_rate"] == 100
         assert clean["spl"] > 99.8
-        noisy = flown(env, make_navigator("map_matching", env, noise=NOISE), NOISE)
+        noisy = flown(env, MapMatching.for_env(env, sensor_std=NOISE), NOISE)
         assert noisy["success_rate"] >= 99.5
         assert noisy["spl"] > 99
 
@@ -150,12 +147,12 @@ def test_one_hypothesis_is_not_enough(earth: GeomagneticNavEnv) -> None:
 
 def test_the_error_of_an_old_map_partly_cancels(earth: GeomagneticNavEnv) -> None:
     """Both positions on the map are wrong by hundreds of kilometers; the way between them is not."""
-    navigator = make_navigator("map_matching", earth, map_date="2015-01-01")
+    navigator = MapMatching.for_env(earth, map_date="2015-01-01")
     state = navigator(earth.reset())
     here = best(navigator.memory["position"], navigator.memory["misfit"])
     there = navigator.memory["target"]
     assert away_km(here, state["position"]).median() > 150
-    summary = flown(earth, make_navigator("map_matching", earth, map_date="2015-01-01"))
+    summary = flown(earth, MapMatching.for_env(earth, map_date="2015-01-01"))
     assert summary["success_rate"] > 85
     exact = MapMatching(dated_map(earth.scenario, "2015-01-01"), earth.edge)
     assert flown(earth, exact)["success_rate"] < summary["success_rate"] - 4  # a map that is taken for exact
@@ -171,49 +168,19 @@ def test_an_old_map_is_that_of_its_date(box: GeomagneticNavEnv) -> None:
     assert change[..., 2].abs().max() > 50
     assert aged_error(box.scenario, box.scenario.date) == (0, 0, 0)
     assert aged_error(box.scenario, "2012-01-01") == pytest.approx((1.0, 1.0, 390.0), rel=1e-3)
-    navigator = make_navigator("map_matching", box, map_date="2012-01-01")
+    navigator = MapMatching.for_env(box, map_date="2012-01-01")
     assert navigator.target_std.tolist() == pytest.approx([1.0, 1.0, 390.0], rel=1e-3)
-
-
-@pytest.mark.parametrize("map_date", [None, "2015-01-01"])
-def test_nothing_privileged_is_read(earth: GeomagneticNavEnv, map_date: str | None) -> None:
-    navigator, blind = (make_navigator("map_matching", earth, noise=NOISE, map_date=map_date) for _ in range(2))
-    privileged = {*PRIVILEGED_KEYS, "true_field"}
-    assert not set(navigator.in_keys) & privileged
-    env = with_sensor_noise(earth, NOISE)
-    state = env.reset()
-    for _ in range(4):
-        scrambled = state.clone()
-        for key in privileged:
-            value = state[key]
-            scrambled[key] = ~value if value.dtype == torch.bool else torch.full_like(value, math.nan)
-        action = navigator(state.clone())["action"]
-        assert torch.equal(blind(scrambled)["action"], action)
-        state = env.step(state.set("action", action))["next"]
-
-
-def test_it_says_that_it_has_a_map() -> None:
-    assert needs("map_matching") == MapMatching.needs == "a map and the region"
-    assert not MapMatching.oracle
 
 
 def test_it_matches_across_the_antimeridian() -> None:
     scenario = Scenario(region=Region((-10, 0), (175, 185)), objective_floors=None)
     scenario = scenario.with_tasks(scenario.random_tasks(20, seed=1))
     env = GeomagneticNavEnv(scenario, num_envs=20, seed=0)
-    assert flown(env, make_navigator("map_matching", env))["spl"] > 99.8
-
-
-def test_a_reading_that_is_nan_is_not_flown(box: GeomagneticNavEnv) -> None:
-    state = box.reset()
-    state["field"][3] = math.nan
-    action = make_navigator("map_matching", box)(state)["action"]
-    assert not action[3].isfinite().all()
-    assert action[[0, 1, 2, 4]].isfinite().all()
+    assert flown(env, MapMatching.for_env(env))["spl"] > 99.8
 
 
 def test_a_new_episode_is_located_anew(box: GeomagneticNavEnv) -> None:
-    navigator, fresh = (make_navigator("map_matching", box) for _ in range(2))
+    navigator, fresh = (MapMatching.for_env(box) for _ in range(2))
     state = box.reset()
     for _ in range(3):
         state = box.step(navigator(state))["next"]
@@ -228,9 +195,9 @@ def test_a_new_episode_is_located_anew(box: GeomagneticNavEnv) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"noise": (0.05, -0.05, 5.0)}, "noise.*-0.05"),
+        ({"sensor_std": (0.05, -0.05, 5.0)}, "sensor_std.*-0.05"),
         ({"map_error": (-1.0, 1.0, 5.0)}, "map_error.*-1"),
-        ({"noise": (0.05, 0.05)}, r"noise.*\(0.05, 0.05\)"),
+        ({"sensor_std": (0.05, 0.05)}, r"sensor_std.*\(0.05, 0.05\)"),
         ({"hypotheses": 0}, "hypotheses.*0"),
         ({"field": None}, "field.*None"),
         ({"region": Region((0, 20), (150, 160))}, "not defined on all of Region.*larger box"),
@@ -249,6 +216,4 @@ def test_a_map_must_be_given_with_its_regions(box: GeomagneticNavEnv, earth: Geo
     with pytest.raises(ValueError, match="1 maps and region 16 boxes"):
         MapMatching(box.field, earth.edge)
     with pytest.raises(ValueError, match=r"2040.*outside IGRF"):
-        make_navigator("map_matching", box, map_date="2040-01-01")
-    with pytest.raises(ValueError, match=r"2015-01-01.*map_matching"):
-        check_map_date(["secant"], "2015-01-01")
+        MapMatching.for_env(box, map_date="2040-01-01")

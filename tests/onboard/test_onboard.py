@@ -78,7 +78,7 @@ def without_search(policy: TensorDictModuleBase) -> TensorDictModuleBase:
 def test_commands_are_those_of_the_environment(name: str, noise: tuple[float, float, float]) -> None:
     """Over a whole episode; with perfect sensors, the vehicle knows at its end, and not before, that it has arrived."""
     env = environment(noise)
-    policy = without_search(make_navigator(name, getattr(env, "base_env", env), noise=noise))
+    policy = without_search(make_navigator(name, getattr(env, "base_env", env), sensor_std=noise))
     vehicle = Onboard(name, sensor_std=noise, max_steps=50, confidence=0.8 if noise == NONE else 1.0)
     target, known, actions = episode(policy, env)
     assert len(actions) > 5

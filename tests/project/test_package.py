@@ -31,8 +31,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from magrl import guidance, navigators
 from magrl.envs.navigation import navigation_env
-from magrl.evaluation import plots, replay
-from magrl.navigators import metaheuristics
+from magrl.evaluation import maps, replay
 
 assert Path(magrl.__file__).is_relative_to(sys.prefix), magrl.__file__
 assert version("magrl") == magrl.__version__, (version("magrl"), magrl.__version__)
@@ -45,10 +44,10 @@ base = magrl.GeomagneticNavEnv(num_envs=4, seed=0)
 guided = [magrl.FieldGradient(base.field), magrl.GradientHeading(), magrl.AlignmentReward()]
 assert TransformedEnv(base, Compose(*guided)).rollout(3)["next", "reward"].shape == (4, 3, 1)
 plain = magrl.GeomagneticNavEnv(num_envs=4, seed=0, render_mode="rgb_array")
-for pilot in (navigators.Secant(), metaheuristics.build("pso", plain, "flown", seed=0)):
+for pilot in (navigators.Secant(), navigators.NAVIGATORS["pso"].for_env(plain, mode="flown")):
     rollout = plain.rollout(12, pilot, break_when_any_done=False)
     print(magrl.summarize(magrl.episode_measures(rollout))["success_rate"])
-plots.trajectories_figure(rollout, plain.field, plain.region).savefig("episodes.png")
+maps.trajectories_figure(rollout, plain.field, plain.region).savefig("episodes.png")
 assert plain.render().shape == (700, 700, 3)
 replay.write_replay("page.html", replay.replay_data({"pso": rollout}, plain.field, plain.region, zeta=0.01))
 assert navigation_env(2, seed=0).reset()["observation"].shape == (2, 13)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl import guidance
-from magrl.checks import check_number, check_numbers, check_tensor
+from magrl.checks import check_number, check_numbers
+from magrl.envs import GeomagneticNavEnv
 from magrl.field.model import FieldModel, elements_at
 from magrl.geodesy import move, wrap_angle
 from magrl.navigators.base import Navigator
@@ -36,9 +38,6 @@ def reachable(candidate: Tensor, heading: Tensor, max_turn_rad: float) -> tuple[
         >>> reachable(torch.tensor([[0.0, 2.0], [-0.3, 0.0]]), torch.zeros(2), 1.0)
         (tensor([1.0000, 0.3000]), tensor([1., 1.]))
     """
-    check_tensor(2, candidate=candidate)
-    check_tensor(heading=heading)
-    check_number(0, above=True, max_turn_rad=max_turn_rad)
     turn = wrap_angle(torch.atan2(candidate[..., 1], candidate[..., 0]) - heading)
     return candidate.norm(dim=-1).clamp_max(1), turn.clamp(-max_turn_rad, max_turn_rad)
 
@@ -51,7 +50,6 @@ def displacement(distance: Tensor, heading: Tensor) -> Tensor:
         tensor([[1., 0.],
                 [0., 2.]])
     """
-    check_tensor(distance=distance, heading=heading)
     return torch.stack((distance * torch.cos(heading), distance * torch.sin(heading)), -1)
 
 
@@ -63,9 +61,6 @@ def take(values: Tensor, index: Tensor) -> Tensor:
         tensor([[12],
                 [20]])
     """
-    check_tensor(index=index)
-    if index.ndim != 2 or len(index) != len(values):
-        raise ValueError(f"index must be of shape ({len(values)}, K), got {tuple(index.shape)}")
     return values[torch.arange(len(values), device=values.device).unsqueeze(-1), index]
 
 
@@ -77,27 +72,7 @@ def in_disc(candidate: Tensor) -> Tensor:
         tensor([[0.6000, 0.8000],
                 [0.3000, 0.4000]])
     """
-    check_tensor(2, candidate=candidate)
     return candidate / candidate.norm(dim=-1, keepdim=True).clamp_min(1)
-
-
-def checked(name: str, value: float, low: float, high: float, whole: bool = False) -> Any:
-    """Return an option as an int or a float; raise unless it is in its range.
-
-    Raises:
-        ValueError: naming the option and its value.
-
-    Example:
-        >>> checked("population_size", 8, 2, 100, whole=True)
-        8
-        >>> checked("blend", -1, 0, 10)
-        Traceback (most recent call last):
-            ...
-        ValueError: blend must be a finite number from 0 up to 10, got -1
-    """
-    option: dict[str, Any] = {name: value}
-    check_number(low, high, whole=whole, **option)
-    return int(value) if whole else float(value)
 
 
 class Metaheuristic(Navigator):
@@ -121,15 +96,17 @@ class Metaheuristic(Navigator):
 
     Example:
         >>> class RandomSearch(Metaheuristic):
-        ...     def begin(self, population):
-        ...         return {}
-        ...
         ...     def evolve(self, state, fitness, evaluate):
         ...         return {"population": self.first_state(fitness)["population"]}
         >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
         >>> GeomagneticNavEnv(num_envs=2, seed=0).rollout(3, RandomSearch(mode="flown"))["action"].shape
         torch.Size([2, 3, 2])
     """
+
+    oracle, needs = True, "the field at other places"  # in mode "flown", an instance has False and "nothing"
+    options = ("mode", "seed")
+    settings: ClassVar[Mapping[str, Mapping[str, float]]]
+    """Options by mode, from a sweep: those of the highest SPL, or with a third of the readings for 0.1 % less."""
 
     def __init__(
         self,
@@ -149,27 +126,34 @@ class Metaheuristic(Navigator):
             raise ValueError(f"mode must be one of {MODES}, got {mode!r}")
         if (field is not None) != (mode == "look-ahead"):
             raise ValueError(f"field must be given in mode 'look-ahead' and in no other, got {field} in mode {mode!r}")
-        if field is not None and not callable(field):
-            raise TypeError(f"field must be called as field(latitude, longitude), got {field!r}")
         check_numbers(3, objective_floors=objective_floors)
-        if min(objective_floors) <= 0:
-            raise ValueError(f"objective_floors must be three positive numbers (deg, deg, nT), got {objective_floors}")
-        self.mode, self.field, self.oracle = mode, field, mode == "look-ahead"
-        self.needs = "the field at other places" if self.oracle else "nothing"
-        self.population_size = checked("population_size", population_size, 2, 10_000, whole=True)
-        self.generations = checked("generations", generations, 1, 10_000, whole=True)
-        self.spread = checked("spread", spread, 1e-3, 1)
-        self.objective_floors = tuple(objective_floors)
+        check_number(0, above=True, objective_floors=min(objective_floors))
+        check_number(2, 10_000, whole=True, population_size=population_size)
+        check_number(1, 10_000, whole=True, generations=generations)
+        check_number(1e-3, 1, spread=spread)
         check_number(whole=True, seed=seed)
+        self.field, self.oracle = field, mode == "look-ahead"
+        self.needs = Metaheuristic.needs if self.oracle else Navigator.needs
+        self.population_size, self.generations, self.spread = population_size, generations, spread
+        self.objective_floors = tuple(objective_floors)
         self.generator = torch.Generator().manual_seed(seed)
         private = ["position", "objective_weights", "done"] if self.oracle else ["field"]
         self.in_keys = ["target_field", "heading", "step_count", *private]
 
+    @classmethod
+    def for_env(cls, env: GeomagneticNavEnv, *, mode: str = "look-ahead", **options: Any) -> Self:
+        """Return the navigator of an environment, with its :attr:`settings` where no options are given."""
+        if env.many:
+            raise ValueError(f"metaheuristics navigate in one region, and the scenario has {len(env.region)}")
+        own = {"field": env.field if mode == "look-ahead" else None, "mode": mode}
+        own["objective_floors"] = tuple(env.objective_floors.tolist())
+        return super().for_env(env, **{**own, **cls.settings.get(mode, {}), **options})
+
     # Methods of a subclass
 
-    def begin(self, population: Tensor) -> dict[str, Tensor]:
-        """Return the state of an algorithm beside its first population ``(N, P, 2)``: tensors ``(N, ...)``."""
-        raise NotImplementedError
+    def begin(self, population: Tensor) -> dict[str, Tensor]:  # noqa: ARG002
+        """Return the state of an algorithm beside its first population ``(N, P, 2)``: tensors ``(N, ...)``, or none."""
+        return {}
 
     def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate | None) -> dict[str, Tensor]:
         """Return the next generation.
@@ -206,12 +190,9 @@ class Metaheuristic(Navigator):
         here, there = seen["field"].double(), seen["target_field"].double()
         weights = guidance.objective_weights(here, there, here.new_tensor(self.objective_floors))
         state = self.first_state(here)
-        first = {
-            "weights": weights,
-            "objective": torch.ones_like(here[:, 0]),
-            "fitness": torch.zeros_like(state["population"][..., 0]),
-        }
-        return {**first, "moves": torch.zeros_like(seen["step_count"].squeeze(-1)), "state": state}
+        fitness, moves = torch.zeros_like(state["population"][..., 0]), torch.zeros_like(seen["step_count"].squeeze(-1))
+        objective = torch.ones_like(here[:, 0])
+        return {"weights": weights, "objective": objective, "fitness": fitness, "moves": moves, "state": state}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         distance, turn = self._look_ahead(seen, memory) if self.oracle else self._next_individual(seen, memory)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.navigators.metaheuristics.base import Evaluate, Metaheuristic, checked, in_disc, take
+from magrl.checks import check_number
+from magrl.navigators.metaheuristics.base import Evaluate, Metaheuristic, in_disc, take
 
 
 class ArtificialFishSwarm(Metaheuristic):
@@ -38,16 +39,21 @@ class ArtificialFishSwarm(Metaheuristic):
         tensor(True)
     """
 
+    name, label = "afsa", "AFSA"
+    description = label
+    settings: ClassVar = {
+        "look-ahead": {"population_size": 8, "generations": 6, "visual": 0.5, "step": 1.0},
+        "flown": {"population_size": 2, "spread": 0.2, "visual": 2.0, "step": 1.0},
+    }
+
     def __init__(
         self, *, visual: float = 0.5, step: float = 0.3, crowding: float = 0.6, tries: int = 3, **options: Any
     ) -> None:
         super().__init__(**options)
-        self.visual, self.step = checked("visual", visual, 1e-6, 10), checked("step", step, 1e-6, 10)
-        self.crowding = checked("crowding", crowding, 0, 1)
-        self.tries = checked("tries", tries, 1, 1000, whole=True)
-
-    def begin(self, population: Tensor) -> dict[str, Tensor]:  # noqa: ARG002 - no state beside the population
-        return {}
+        check_number(1e-6, 10, visual=visual, step=step)
+        check_number(0, 1, crowding=crowding)
+        check_number(1, 1000, whole=True, tries=tries)
+        self.visual, self.step, self.crowding, self.tries = visual, step, crowding, tries
 
     def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate | None) -> dict[str, Tensor]:
         fish = state["population"]

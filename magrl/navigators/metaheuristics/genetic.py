@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.navigators.metaheuristics.base import Evaluate, Metaheuristic, checked, in_disc, take
+from magrl.checks import check_number
+from magrl.navigators.metaheuristics.base import Evaluate, Metaheuristic, in_disc, take
 
 
 class GeneticAlgorithm(Metaheuristic):
@@ -35,6 +36,13 @@ class GeneticAlgorithm(Metaheuristic):
         tensor(True)
     """
 
+    name, label = "ga", "GA"
+    description = label
+    settings: ClassVar = {
+        "look-ahead": {"population_size": 16, "generations": 10, "mutation_rate": 0.3, "mutation_scale": 0.2},
+        "flown": {"population_size": 4, "spread": 0.2, "mutation_rate": 0.3, "mutation_scale": 0.1},
+    }
+
     def __init__(
         self,
         *,
@@ -47,15 +55,13 @@ class GeneticAlgorithm(Metaheuristic):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        self.tournament_size = checked("tournament_size", tournament_size, 1, 10_000, whole=True)
-        self.crossover_rate = checked("crossover_rate", crossover_rate, 0, 1)
-        self.blend = checked("blend", blend, 0, 10)
-        self.mutation_rate = checked("mutation_rate", mutation_rate, 0, 1)
-        self.mutation_scale = checked("mutation_scale", mutation_scale, 0, 10)
-        self.elites = checked("elites", elites, 0, self.population_size - 1, whole=True)
-
-    def begin(self, population: Tensor) -> dict[str, Tensor]:  # noqa: ARG002 - no state beside the population
-        return {}
+        check_number(1, 10_000, whole=True, tournament_size=tournament_size)
+        check_number(0, 1, crossover_rate=crossover_rate, mutation_rate=mutation_rate)
+        check_number(0, 10, blend=blend, mutation_scale=mutation_scale)
+        check_number(0, self.population_size - 1, whole=True, elites=elites)
+        self.tournament_size, self.elites = tournament_size, elites
+        self.crossover_rate, self.blend = crossover_rate, blend
+        self.mutation_rate, self.mutation_scale = mutation_rate, mutation_scale
 
     def evolve(self, state: TensorDictBase, fitness: Tensor, evaluate: Evaluate | None) -> dict[str, Tensor]:  # noqa: ARG002
         population = state["population"]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.navigators.metaheuristics.base import Evaluate, Metaheuristic, checked, in_disc, take
+from magrl.checks import check_number
+from magrl.navigators.metaheuristics.base import Evaluate, Metaheuristic, in_disc, take
 
 
 class ParticleSwarm(Metaheuristic):
@@ -34,6 +35,13 @@ class ParticleSwarm(Metaheuristic):
         tensor(True)
     """
 
+    name, label = "pso", "PSO"
+    description = label
+    settings: ClassVar = {
+        "look-ahead": {"population_size": 16, "generations": 10, "inertia": 0.7, "cognitive": 1.5, "social": 1.5},
+        "flown": {"population_size": 8, "spread": 0.2, "inertia": 0.4, "cognitive": 1.5, "social": 1.5},
+    }
+
     def __init__(
         self,
         *,
@@ -44,9 +52,10 @@ class ParticleSwarm(Metaheuristic):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        self.inertia = checked("inertia", inertia, 0, 2)
-        self.cognitive, self.social = checked("cognitive", cognitive, 0, 10), checked("social", social, 0, 10)
-        self.max_velocity = checked("max_velocity", max_velocity, 1e-6, 10)
+        check_number(0, 2, inertia=inertia)
+        check_number(0, 10, cognitive=cognitive, social=social)
+        check_number(1e-6, 10, max_velocity=max_velocity)
+        self.inertia, self.cognitive, self.social, self.max_velocity = inertia, cognitive, social, max_velocity
 
     def begin(self, population: Tensor) -> dict[str, Tensor]:
         lowest = torch.full_like(population[..., 0], math.inf)

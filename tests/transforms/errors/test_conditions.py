@@ -126,7 +126,7 @@ def test_evaluations_repeat_and_seeds_differ() -> None:
 
 
 def test_navigators_are_told_what_they_can_tell_apart() -> None:
-    env, told = nav(2), {"noise": (0.3, 0.0, 3.0), "bias": (0.4, 0.1, 4.0)}
+    env, told = nav(2), {"sensor_std": (0.3, 0.0, 3.0), "bias_std": (0.4, 0.1, 4.0)}
     kalman, secant = make_navigator("kalman", env, **told), make_navigator("secant", env, **told)
     assert [kalman.sensor_std.tolist(), kalman.bias_std.tolist()] == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0]]
     assert secant.sensor_std.tolist() == pytest.approx([0.5, 0.1, 5.0])
@@ -189,7 +189,7 @@ def test_a_navigator_does_not_rely_on_the_reading_of_an_outage(name: str) -> Non
     env = with_conditions(
         GeomagneticNavEnv(num_envs=20, seed=0), Conditions("noise", sensors={"sensor_std": noise}), seed=0
     )
-    navigator = make_navigator(name, env.base_env, noise=noise)
+    navigator = make_navigator(name, env.base_env, sensor_std=noise)
     state = env.rollout(4, navigator, break_when_any_done=False)[:, -1]["next"]
 
     def turns(std: float, shift: float) -> torch.Tensor:

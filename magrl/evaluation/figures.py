@@ -10,25 +10,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
-from tensordict import TensorDictBase
 
-from magrl.checks import check_number, check_type
-from magrl.envs.region import Region
+from magrl.checks import check_number
+from magrl.envs import Region, Tasks
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
-from magrl.envs.tasks import Tasks
-from magrl.evaluation.colors import NAVIGATOR_COLORS
 from magrl.evaluation.intervals import interquartile_mean
-from magrl.evaluation.maps import draw_episodes
-from magrl.evaluation.navigators import NAVIGATOR_NAMES
+from magrl.evaluation.navigators import NAVIGATOR_COLORS, NAVIGATOR_NAMES, parse_navigator
 from magrl.evaluation.navigators import label as navigator_label
 from magrl.evaluation.tables import Summaries, known_values
+from magrl.field import FieldModel, elements_at
 from magrl.field.elements import NAMES, UNITS
-from magrl.field.model import FieldModel, elements_at
 
 LINES = ("#0072B2", "#D55E00", "#009E73")
-
 TRAINING_PANELS = {
     "return": {"return": "return"},
     "return by term": {f"return_{term}": term for term in ("destination", "proximity", "alignment")},
@@ -75,35 +71,20 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
     return figure
 
 
-def trajectories_figure(
-    rollout: TensorDictBase, field: FieldModel, region: Region, episodes: int = 24, names: Sequence[str] = ()
-) -> Figure:
-    """Return a map of the first episodes of a rollout over the field's contours.
-
-    Args:
-        rollout: ``(M, T)`` from the environment.
-        field: any model of :mod:`magrl.field`.
-        region: region of the tasks.
-        episodes: number of episodes to show.
-        names: names of the tasks, which are written at their destinations.
-
-    Example:
-        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
-        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> figure = trajectories_figure(env.rollout(3), env.field, env.region)
-        >>> figure.axes[0].get_ylabel()
-        'latitude [° N]'
-    """
-    check_number(1, whole=True, episodes=episodes)
-    figure = Figure(figsize=(8, 8.4), layout="constrained")
-    draw_episodes(figure.subplots(), rollout, field, region, episodes, names)
-    return figure
+def _look(name: str) -> dict[str, Any]:
+    """Return color and label of a navigator."""
+    navigator_label(name)  # raises for an unknown name
+    return {"color": NAVIGATOR_COLORS[name], "label": NAVIGATOR_NAMES[name]}
 
 
-def _check_navigators(named: Mapping[str, Any]) -> None:
-    unknown = [name for name in named if name not in NAVIGATOR_NAMES]
-    if unknown or not named:
-        raise ValueError(f"navigators must be among {', '.join(NAVIGATOR_NAMES)}, got {unknown or dict(named)}")
+def _four_panels(labels: Mapping[str, str]) -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure of panels (a) to (d), and its axes by the keys of their vertical labels."""
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    panels = dict(zip(labels, figure.subplots(2, 2).flat, strict=True))
+    for letter, (key, axes) in zip("abcd", panels.items(), strict=True):
+        axes.set(ylabel=labels[key], title=f"({letter})")
+        axes.grid(alpha=0.3)
+    return figure, panels
 
 
 def learning_curves(
@@ -124,21 +105,20 @@ def learning_curves(
         >>> figure.axes[0].get_legend().get_texts()[0].get_text()
         'TD3, 2 seeds'
     """
-    _check_navigators(curves)
     check_number(2, whole=True, points=points)
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     for name, runs in curves.items():
-        known = [np.array(run)[:, np.isfinite(run[1])] for run in runs]
+        look, known = _look(name), [np.array(run)[:, np.isfinite(run[1])] for run in runs]
         known = [run for run in known if run.shape[1]]
         if not known:
             continue
         grid = np.linspace(max(run[0, 0] for run in known), min(run[0, -1] for run in known), points)
         values = np.array([np.interp(grid, *run) for run in known])
-        axes.plot(grid, values.T, color=NAVIGATOR_COLORS[name], lw=0.5, alpha=0.5)
-        axes.fill_between(grid, values.min(0), values.max(0), color=NAVIGATOR_COLORS[name], alpha=0.15, lw=0)
-        label_text = f"{NAVIGATOR_NAMES[name]}, {len(known)} seed{'s' if len(known) > 1 else ''}"
-        axes.plot(grid, values.mean(0), color=NAVIGATOR_COLORS[name], lw=2, label=label_text)
+        axes.plot(grid, values.T, color=look["color"], lw=0.5, alpha=0.5)
+        axes.fill_between(grid, values.min(0), values.max(0), color=look["color"], alpha=0.15, lw=0)
+        text = f"{look['label']}, {len(known)} seed{'s' if len(known) > 1 else ''}"
+        axes.plot(grid, values.mean(0), color=look["color"], lw=2, label=text)
     axes.set(xlabel="frames (vehicle-steps)", ylabel=label)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
@@ -167,8 +147,6 @@ def compared_trajectories(
         >>> figure.axes[0].lines[-1].get_label()
         'destination'
     """
-    _check_navigators(tracks)
-    check_type(Tasks, task=task)
     figure = Figure(figsize=(8, 8.4), layout="constrained")
     axes = figure.subplots()
     points = torch.tensor([[lat, lon] for track in tracks.values() for lat, lon in zip(*track, strict=True)])
@@ -176,7 +154,7 @@ def compared_trajectories(
     low, high = (points.amin(0) - 0.5).tolist(), (points.amax(0) + 0.5).tolist()
     draw_contours(axes, field, Region((low[0], high[0]), (low[1], high[1])))
     for name, (latitude, longitude) in tracks.items():
-        axes.plot(longitude, latitude, "o-", color=NAVIGATOR_COLORS[name], ms=3, lw=1.5, label=NAVIGATOR_NAMES[name])
+        axes.plot(longitude, latitude, "o-", ms=3, lw=1.5, **_look(name))
     axes.plot(*task.start.flip(-1).T, "s", color=START, ms=8, label="start")
     axes.plot(*task.target.flip(-1).T, "^", color=TARGET, ms=9, label="destination")
     axes.legend(fontsize=8, loc="best")
@@ -202,20 +180,17 @@ def convergence(series: Mapping[str, Mapping[str, Sequence[float]]], field: Fiel
         >>> [axes.get_title() for axes in figure.axes]
         ['(a)', '(b)', '(c)', '(d)']
     """
-    _check_navigators(series)
-    check_type(Tasks, task=task)
     targets = dict(zip(NAMES, elements_at(field, task.target[0]).tolist(), strict=True))
     labels = {name: f"{SYMBOLS[name]} [{unit}]" for name, unit in zip(NAMES, UNITS, strict=True)}
     labels["L"] = "length of the move [km]"
-    figure = Figure(figsize=(11, 8), layout="constrained")
-    for letter, axes, (key, label) in zip("abcd", figure.subplots(2, 2).flat, labels.items(), strict=True):
+    figure, panels = _four_panels(labels)
+    for key, axes in panels.items():
         for name, values in series.items():
             shown = list(enumerate(values[key]))[key == "L" :]
-            axes.plot(*zip(*shown, strict=True), color=NAVIGATOR_COLORS[name], lw=1.5, label=NAVIGATOR_NAMES[name])
+            axes.plot(*zip(*shown, strict=True), lw=1.5, **_look(name))
         if key in targets:
             axes.axhline(targets[key], color="#404040", ls="--", lw=1, label="at the destination")
-        axes.set(xlabel="step", ylabel=label, title=f"({letter})")
-        axes.grid(alpha=0.3)
+        axes.set_xlabel("step")
     figure.axes[0].legend(fontsize=8)
     return figure
 
@@ -228,7 +203,7 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
             ``smoothness_deg`` and ``navigation_error_km``; NaN is left out.
 
     Raises:
-        ValueError: for an unknown navigator, or none.
+        ValueError: for an unknown navigator.
 
     Example:
         >>> measures = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
@@ -236,24 +211,21 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
         >>> figure.axes[3].get_ylabel()
         'navigation error [km]'
     """
-    _check_navigators(measures)
     labels = {
         "heading_mae_deg": "MAE of heading deviation [°]",
         "heading_rmse_deg": "RMSE of heading deviation [°]",
         "smoothness_deg": "path smoothness [°]",
         "navigation_error_km": "navigation error [km]",
     }
-    figure = Figure(figsize=(11, 8), layout="constrained")
-    for letter, axes, (key, label) in zip("abcd", figure.subplots(2, 2).flat, labels.items(), strict=True):
+    short = {"gg_td3": "GG TD3", "recurrent": "recurrent"}  # the full names would overlap
+    names = [short.get(name, _look(name)["label"]) for name in measures]
+    figure, panels = _four_panels(labels)
+    for key, axes in panels.items():
         values = [np.array(m[key])[np.isfinite(m[key])] for m in measures.values()]
         boxes = axes.boxplot(values, patch_artist=True, showmeans=True, flierprops={"ms": 2, "alpha": 0.4})
         for box, name in zip(boxes["boxes"], measures, strict=True):
             box.set(facecolor=NAVIGATOR_COLORS[name], alpha=0.6)
-        short = {"gg_td3": "GG TD3", "recurrent": "recurrent"}  # the full names would overlap
-        names = [short.get(name, NAVIGATOR_NAMES[name]) for name in measures]
         axes.set_xticks(range(1, len(names) + 1), names)
-        axes.set(ylabel=label, title=f"({letter})")
-        axes.grid(alpha=0.3, axis="y")
     return figure
 
 
@@ -282,7 +254,7 @@ def noise_figure(levels: Mapping[str, Summaries], mode: str = "look-ahead") -> F
     axes, shown = figure.subplots(), list[float]()
     for name in names:
         text = navigator_label(name, mode).partition(" (")[0]
-        color, line = NAVIGATOR_COLORS[name.partition(":")[0]], "--" if text.endswith("flown") else "-"
+        color, line = NAVIGATOR_COLORS[parse_navigator(name).name], "--" if text.endswith("flown") else "-"
         runs = [known_values(run.get("spl") for run in summaries.get(name, ())) for summaries in levels.values()]
         middle = [interquartile_mean(torch.tensor(values)).item() if values else np.nan for values in runs]
         low, high = ([end(values, default=np.nan) for values in runs] for end in (min, max))

@@ -1,0 +1,168 @@
+"""The command that compares navigators: its files, its settings, and what it refuses."""
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import evaluate
+import pytest
+import torch
+
+from magrl.agents import FieldPolicy, PolicyConfig, save_policy
+from magrl.envs import GeomagneticNavEnv, Scenario, named_tasks
+from magrl.training import UsageError
+
+NOISE = (0.05, 0.05, 5.0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run with noise, whose agent has learned nothing."""
+    folder = tmp_path_factory.mktemp("runs") / "noisy"
+    folder.mkdir()
+    torch.manual_seed(0)
+    view = GeomagneticNavEnv(seed=0).observation_view()
+    save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(view, (8,), layer_norm=False)))
+    settings = {"guided": True, "zeta": 0.02, "noise": NOISE, "start_heading": "random"}
+    (folder / "config.json").write_text(json.dumps(settings))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("results") / "comparison"
+    texts = [f"gg_td3={run}", "secant", "pso", "afsa:flown"]
+    evaluate.main([*texts, "--tasks", "8", "--out", str(out), "--wandb-mode", "disabled"])
+    return out
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_summary_is_that_of_the_episodes_of_the_same_tasks(results: Path) -> None:
+    summary = json.loads((results / "summary.json").read_text(), parse_constant=pytest.fail)
+    episodes = rows(results / "episodes.csv")
+    assert len(episodes) == 4 * 8
+    ahead, secant = ([r for r in episodes if r["navigator"] == name] for name in ("pso", "secant"))
+    assert [r["shortest_km"] for r in ahead] == [r["shortest_km"] for r in secant]
+    assert summary["secant"][0]["spl"] == pytest.approx(12.5 * sum(float(r["spl"]) for r in secant))
+    assert summary["secant"][0]["field_readings"] == 0 < summary["pso"][0]["field_readings"]
+    assert summary["gg_td3"][0]["steps"] is None  # no success
+    assert [r["source"] for r in rows(results / "runs.csv")][:2] == ["noisy", ""]
+
+
+def test_tables_have_the_papers_row_and_notes(results: Path, run: Path) -> None:
+    lines = (results / "table.md").read_text().splitlines()
+    labels = [line.split("|")[1].strip() for line in lines[2:9]]
+    assert labels[:2] == ["Gradient-Guided TD3, paper", "Gradient-Guided TD3"]
+    assert lines[2].split("|")[4:8] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
+    short = (results / "short.md").read_text().splitlines()
+    assert [line.split("|")[1].strip() for line in short[2:6]] == [name for name in labels if ", paper" not in name]
+    assert short[-1] == f"Warning: {run} is not a finished training: it holds no eval.json."
+    assert "Standard deviations of the noise on D, I and B_H: 0.05 deg, 0.05 deg, 5 nT." in lines
+    assert (results / "trajectories.png").stat().st_size > 10_000
+
+
+def test_paths_are_those_of_the_papers_example_with_the_true_field(results: Path) -> None:
+    starts = [r for r in rows(results / "paths.csv") if r["step"] == "0"]
+    state = GeomagneticNavEnv(Scenario().with_tasks(named_tasks("figure-4-1")), seed=0).reset()
+    assert len(starts) == 4
+    for row in starts:
+        assert (float(row["latitude"]), float(row["longitude"])) == (-2.0, 162.0)
+        assert [float(row[name]) for name in ("D", "I", "B_H")] == state["field"][0].tolist()
+
+
+def test_settings_state_what_was_flown(results: Path) -> None:
+    """A run is flown as it was trained."""
+    assert json.loads((results / "settings.json").read_text()) == {
+        "navigators": ["gg_td3=noisy", "secant", "pso", "afsa:flown"],
+        "tasks": 8,
+        "num_tasks": 8,
+        "tasks_seed": 0,
+        "scenario": None,
+        "zeta": 0.02,
+        "arrival": "objective",
+        "arrival_radius_km": 25,
+        "max_steps": 50,
+        "max_move_km": 50,
+        "max_turn_deg": 90,
+        "altitude_km": 0,
+        "margin_deg": 5,
+        "noise": list(NOISE),
+        "start_heading": "random",
+        "mode": "look-ahead",
+        "map_date": None,
+        "conditions": None,
+        "seed": 0,
+    }
+
+
+OWN = """date = 2026-07-01
+zeta = 0.02
+arrival = "distance"
+region = {latitude = [36, 46], longitude = [-32, -22]}
+tasks = [{name = "far off", start = [37.74, -25.67], target = [53.5, -31.13]}]
+"""
+
+
+def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Path) -> None:
+    """The destination, seven degrees north of the region, needs a wider margin than the five of the default."""
+    path, out, tracks = tmp_path / "own.toml", tmp_path / "out", tmp_path / "tracks.kml"
+    path.write_text(OWN)
+    config = {"scenario": path, "out": out, "wandb_mode": "disabled", "export": tracks}
+    with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5 to at least 7\.5$"):
+        evaluate.evaluate(evaluate.Config(("secant",), **config))
+    options = {"margin_deg": 8.0, "max_steps": 90, "max_turn_deg": 120.0, "start_heading": "random"}
+    evaluate.evaluate(evaluate.Config(("secant", "map_matching"), map_date="2020-01-01", **config, **options))
+    settings = json.loads((out / "settings.json").read_text())
+    assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 1}).items()
+    arrived = [row for row in rows(out / "episodes.csv") if row["success"] == "True"]
+    assert max(float(row["navigation_error_km"]) for row in arrived) <= 25
+    text = (out / "table.md").read_text()
+    assert "paper" not in text
+    assert "Arrival: distance, within 25 km." in text
+    assert "Date of the map of map matching: 2020-01-01." in text
+    assert "far off" in tracks.read_text()
+
+
+@pytest.mark.parametrize(
+    ("navigators", "options", "message"),
+    [
+        ((), {}, "at least one navigator"),
+        (("dowsing",), {}, "unknown navigator 'dowsing'"),
+        (("secant", "secant"), {}, "^secant is given twice"),
+        (("secant",), {"map_date": "2020-01-01"}, "add that navigator, or omit the date"),
+        (("secant",), {"zeta": 3.0}, "zeta must be below 3, got 3.0"),
+        (("secant",), {"max_steps": 0}, "max_steps must be .*got 0"),
+        (("secant",), {"start_heading": "south"}, "start_heading must be 'north' or 'random', got 'south'"),
+        (("secant",), {"noise": (0.05, -1.0, 5.0)}, "noise must be a finite number from 0 on, got -1.0"),
+        (("secant",), {"noise": (0.05, math.nan, 5.0)}, "noise .*nan"),
+        (("secant",), {"noise": NOISE, "conditions": "ship"}, "omit --noise"),
+        (("secant",), {"tasks": 0}, "num_tasks must be a whole number from 1 on, got 0"),
+        (("secant",), {"tasks": 3, "tasks_seed": -1}, "tasks_seed .*-1"),
+        (("secant",), {"tasks_seed": 7}, "--tasks-seed 7 needs a number of random tasks, such as --tasks 300"),
+        (("ga",), {"seed": -1}, "seed"),
+        (("secant",), {"wandb_mode": "sometimes"}, "wandb_mode"),
+        (("secant",), {"scenario": Path("missing.toml")}, "no scenario file at"),
+        (("secant",), {"export": Path("tracks.shp")}, r"\.geojson, \.gpx, \.kml"),
+    ],
+)
+def test_bad_usage_is_refused_before_anything_is_flown(navigators, options, message, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(evaluate, "evaluation_rollout", lambda *_: pytest.fail("something was flown"))
+    given = {"tasks": "figure-4-1", "out": tmp_path / "out", "wandb_mode": "disabled"} | options
+    if "scenario" in options:
+        given["tasks"] = None
+    with pytest.raises(UsageError, match=message):
+        evaluate.evaluate(evaluate.Config(navigators, **given))
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_go_to_the_first_folder_that_is_free(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert evaluate.Config(("secant",)).out == Path("runs/evaluation")
+    for name in ("evaluation", "evaluation-2"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+    assert evaluate.Config(("secant",)).out == Path("runs/evaluation-3")

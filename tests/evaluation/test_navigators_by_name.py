@@ -1,0 +1,134 @@
+"""Navigators by the texts that commands take: labels, needs, options, and trained agents of every kind."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.envs import StepCounter, TransformedEnv
+
+from magrl.agents import ExportedPolicy, FieldPolicy, PolicyConfig, save_policy
+from magrl.agents.program import TensorProgram
+from magrl.envs import GeomagneticNavEnv, Region, Scenario
+from magrl.evaluation.navigators import (
+    NAVIGATOR_COLORS,
+    NAVIGATOR_NAMES,
+    PRETRAINED,
+    TRAINED,
+    check_distinct,
+    check_map_date,
+    label,
+    make_navigator,
+    needs,
+    parse_navigator,
+)
+from magrl.navigators import NAVIGATORS
+from magrl.navigators.secant import probe_length
+
+STD, BIAS = (0.3, 0.0, 3.0), (0.4, 0.1, 4.0)
+
+
+@pytest.fixture(scope="module")
+def env() -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(num_envs=2, seed=0, max_move_km=30.0)
+
+
+@pytest.fixture(scope="module")
+def run(env: GeomagneticNavEnv, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run whose agent has learned nothing."""
+    folder = tmp_path_factory.mktemp("run")
+    save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False)))
+    return folder
+
+
+def test_texts_are_parsed() -> None:
+    assert parse_navigator("secant") == ("secant", "", "")
+    assert parse_navigator("pso:flown") == ("pso", "flown", "")
+    assert parse_navigator("policy:SAC=a=b.pt") == ("policy", "SAC", "a=b.pt")
+
+
+def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv, run: Path) -> None:
+    assert NAVIGATOR_COLORS.keys() == NAVIGATOR_NAMES.keys() == {*TRAINED, *NAVIGATORS}
+    assert len(set(NAVIGATOR_COLORS.values())) == len(NAVIGATOR_COLORS)
+    for name in NAVIGATOR_NAMES:
+        navigator = make_navigator(f"{name}={run}" if name in TRAINED and name not in PRETRAINED else name, env)
+        assert navigator(env.reset())["action"].shape == (2, 2)
+        assert NAVIGATOR_NAMES[name] in label(name)
+        assert needs(name) == getattr(navigator, "needs", needs(name))
+
+
+def test_labels_and_needs_of_a_metaheuristic_depend_on_its_mode(env: GeomagneticNavEnv) -> None:
+    cases = (("pso", "look-ahead", False), ("pso", "flown", True), ("pso:flown", "look-ahead", True))
+    for name, default, flown in cases:
+        navigator = make_navigator(name, env, mode=default)
+        assert navigator.oracle is not flown
+        assert label(name, default) == ("PSO, flown" if flown else "PSO, look-ahead (an oracle)")
+        assert needs(name, default) == navigator.needs == ("nothing" if flown else "the field at other places")
+    assert label("ga:look-ahead", "flown") == "GA, look-ahead (an oracle)"
+    assert needs("policy:flown") == "training"
+    for function in (label, needs):
+        with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
+            function("dowsing")
+
+
+def test_navigators_are_made_for_their_environment_and_sensors(env: GeomagneticNavEnv) -> None:
+    """One that does not tell noise from constant errors has the root of the sum of the squares."""
+    wrapped = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0, max_move_km=30.0), StepCounter())
+    for name, kind in NAVIGATORS.items():
+        navigator = make_navigator(name, wrapped, sensor_std=STD, bias_std=BIAS)
+        assert type(navigator) is kind
+        assert navigator.max_move_km == 30
+    assert make_navigator("secant", env, sensor_std=STD, bias_std=BIAS).probe_km == probe_length((0.5, 0.1, 5.0))
+    first, second = (make_navigator("ga", env, seed=seed).generator.initial_seed() for seed in (3, 4))
+    assert (first, second) == (3, 4)
+
+
+def test_navigators_are_on_the_device_of_their_environment(monkeypatch) -> None:
+    env = GeomagneticNavEnv(num_envs=2, seed=0)
+    monkeypatch.setattr(GeomagneticNavEnv, "device", torch.device("meta"))
+    for name in ("anywhere", "secant", "kalman", "map_matching"):
+        navigator = make_navigator(name, env)
+        assert {x.device.type for x in (*navigator.parameters(), *navigator.buffers())} == {"meta"}
+
+
+def test_a_policy_of_any_algorithm_is_a_file_or_a_folder(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:
+    """Its network may be none of the library: this one moves by 25 km, straight on."""
+    steps = [["mul.Tensor", [{"value": 0}, 0.0], {}], ["add.Tensor", [{"value": 2}, {"value": 1}], {}]]
+    program = TensorProgram(1, steps, [torch.tensor([25.0, 0.0])], [3])
+    save_policy(tmp_path / "own.pt", ExportedPolicy(["move"], program))
+    action = make_navigator(f"policy:straight={tmp_path / 'own.pt'}", env)(env.reset())["action"]
+    assert action.tolist() == [[25, 0]] * 2
+    assert isinstance(make_navigator(f"policy={run}", env), FieldPolicy)
+    assert (label("policy:SAC"), label("policy"), needs("policy:SAC")) == ("SAC", "own policy", "training")
+
+
+def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:
+    for text in ("dowsing", "secant=runs/a", "secant:flown", f"td3:flown={run}"):
+        with pytest.raises(ValueError, match=f"unknown navigator '{text}': choose from anywhere, gg_td3=RUN, "):
+            make_navigator(text, env)
+    for text, error, message in (
+        ("gg_td3", ValueError, "gg_td3 needs the folder of a finished run: gg_td3=RUN"),
+        ("policy:SAC", ValueError, "policy needs the folder of a finished run or the file of a policy"),
+        ("policy=nowhere.pt", FileNotFoundError, r"there is no policy file at .*nowhere\.pt"),
+        (f"td3={tmp_path}", FileNotFoundError, "there is no policy file at"),
+        ("ga:dreamt", ValueError, "mode must be one of .*dreamt"),
+    ):
+        with pytest.raises(error, match=message):
+            make_navigator(text, env)
+    elsewhere = GeomagneticNavEnv(Scenario(region=Region((40, 50), (0, 10)), objective_floors=None), seed=0)
+    with pytest.raises(ValueError, match=rf"td3={run}: .*trained"):
+        make_navigator(f"td3={run}", elsewhere)
+
+
+def test_navigators_that_are_given_twice(run: Path) -> None:
+    check_distinct(["secant", "ga", "ga:flown", f"td3={run}", "policy:A=a.pt", "policy:B=b.pt"])
+    for texts, mode, message in (
+        (("secant", "ga", "secant"), "look-ahead", "^secant is given twice: the same episodes again are no spread"),
+        (("ga", "pso", "ga:look-ahead"), "look-ahead", "^ga:look-ahead is given twice"),
+        (("ga:flown", "ga"), "flown", "^ga is given twice"),
+        ((f"gg_td3={run}", f"td3={run.parent / 'x' / '..' / run.name}"), "look-ahead", "^td3=.* is given twice"),
+        (("anywhere", f"anywhere={run}"), "look-ahead", "has the name of the pretrained anywhere: write policy:LABEL="),
+    ):
+        with pytest.raises(ValueError, match=message):
+            check_distinct(texts, mode)
+    with pytest.raises(ValueError, match=r"2015-01-01.*map_matching"):
+        check_map_date(["secant"], "2015-01-01")

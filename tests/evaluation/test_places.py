@@ -1,0 +1,89 @@
+"""Places on Earth, from coordinates as people write them or from magnetic elements."""
+
+import pytest
+import torch
+
+from magrl.evaluation.places import (
+    check_declination,
+    elements_text,
+    find_elements,
+    parse_coordinates,
+    parse_elements,
+    region_around,
+)
+from magrl.field import IGRF, elements_at
+from magrl.geodesy import geodesic
+
+
+@pytest.fixture(scope="module")
+def field() -> IGRF:
+    return IGRF("2025-01-01")
+
+
+def place(*degrees: float) -> torch.Tensor:
+    return torch.tensor(degrees, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("60.4N 5.3E", (60.4, 5.3)),
+        ("60.4, 5.3", (60.4, 5.3)),
+        ("-33.9 18.4", (-33.9, 18.4)),
+        (" 33.9s,18.4w ", (-33.9, -18.4)),
+        ("60.4° N, 5.3° E", (60.4, 5.3)),
+        ("0 200", (0, -160)),
+        ("1N,181E", (1, -179)),
+    ],
+)
+def test_coordinates(text: str, expected: tuple[float, float]) -> None:
+    assert parse_coordinates(text).tolist() == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text", ["Bergen", "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361"]
+)
+def test_coordinates_that_are_none(text: str) -> None:
+    with pytest.raises(ValueError, match=r"must (be|have)"):
+        parse_coordinates(text)
+
+
+def test_elements_that_no_field_has() -> None:
+    assert parse_elements("60.4N 5.3E") is None
+    for text in ("D=181 I=0 BH=1", "D=0 I=91 BH=1", "D=0 I=0 BH=0"):
+        with pytest.raises(ValueError, match=f"got '{text}'"):
+            parse_elements(text)
+
+
+def test_the_nearest_place_with_some_elements(field) -> None:
+    """Rounded elements are found within 25 km; of two places with nearly the same elements, the nearest is taken."""
+    for there, near in (((64.1, -21.9), (60.4, 5.3)), ((-33.9, 151.2), (51.5, -0.1)), ((35.7, 139.7), (21.3, -157.9))):
+        elements = parse_elements(elements_text(elements_at(field, place(*there))))
+        assert geodesic(*find_elements(field, elements, place(*near)), *place(*there))[0] < 25
+    canada, russia = place(57.3, -123.4), place(60.0, 54.6)
+    elements = elements_at(field, canada)
+    assert geodesic(*find_elements(field, elements, place(50, -100)), *canada)[0] < 0.1
+    assert geodesic(*find_elements(field, elements, place(50, 30)), *russia)[0] < 300
+
+
+def test_elements_of_no_place(field) -> None:
+    with pytest.raises(ValueError, match=r"no place has D=-3.20 I=71.50 BH=60000 within .* most similar field found"):
+        find_elements(field, place(-3.2, 71.5, 60000), place(60, 5))
+
+
+def test_region_around_two_places(field) -> None:
+    honolulu, tokyo = place(21.3, -157.9), place(35.7, 139.7)
+    box = region_around(honolulu, tokyo, field)
+    assert box.longitude[1] - box.longitude[0] < 150  # across the antimeridian, not around the Earth
+    assert box.contains(torch.stack((honolulu, tokyo, place(28, 180)))).all()
+    assert not box.contains(place(28, 0))
+    # The margin is reduced where D jumps: that of half the distance, 9.9 degrees, would hold the pole of the field.
+    assert 76 < region_around(place(76, 100), place(60, 140), field).latitude[1] < 85
+    with pytest.raises(ValueError, match="the declination jumps"):
+        region_around(place(85, 120), place(87, 160), field)
+
+
+def test_declination_near_the_poles(field) -> None:
+    for there in ((86.0, 140.0), (-64.0, 136.0), (89.5, 0.0)):
+        with pytest.raises(ValueError, match="the declination is hardly defined at 'there', where BH is"):
+            check_declination("there", place(*there), field)

@@ -1,0 +1,84 @@
+"""Evaluation rollouts: every task once, errors that repeat, and policies without exploration."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import ProbabilisticActor, TanhNormal
+
+from magrl.agents import FieldPolicy, PolicyConfig
+from magrl.envs import GeomagneticNavEnv, Scenario, named_tasks
+from magrl.evaluation import evaluate, evaluation_rollout, summarize
+
+
+def test_every_task_is_flown_once_however_many_vehicles_fly() -> None:
+    tasks = named_tasks("paper-100")
+    together, batches = (evaluate("secant", tasks, num_envs=number) for number in (None, 30))
+    assert together.shape == batches.shape == (100,)
+    for key in ("shortest_km", "length_km", "spl"):
+        torch.testing.assert_close(together[key], batches[key])
+    assert torch.equal(together["steps"], batches["steps"])
+    assert together["shortest_km"].unique().numel() == 100
+    recipe = summarize(together)
+    assert recipe["num_tasks"] == 100
+    assert recipe["success_rate"] > 98
+
+
+def test_batches_have_errors_of_their_own_that_repeat() -> None:
+    """The same task in three batches has other noise and another start heading; the same call has the same."""
+    tasks = named_tasks("figure-4-1")
+    thrice = Scenario().with_tasks(type(tasks)(*(values.repeat(3, 1) for values in tasks)))
+    for errors in ({"noise": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
+        one, again = (evaluate("secant", thrice, num_envs=1, **errors)["smoothness_deg"] for _ in range(2))
+        assert torch.equal(one, again)
+        assert one.unique().numel() == 3
+    perfect = evaluate("secant", thrice, num_envs=1)
+    torch.testing.assert_close(perfect["length_km"], perfect["length_km"][:1].expand(3))
+    ship = evaluate("secant", thrice, conditions="ship", max_steps=5)
+    assert (ship["steps"] <= 5).all()
+
+
+def test_navigators_declare_their_arrival_where_it_must_be_declared() -> None:
+    episodes = evaluate("secant", "paper-100", arrival="declared", arrival_radius_km=40.0)
+    assert summarize(episodes)["success_rate"] > 80
+
+
+def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:
+    """Twice with the same actions, those of the mode of its distribution."""
+    network = TensorDictModule(lambda move: (0 * move, 0 * move + 2.0), ["move"], ["loc", "scale"])
+    policy = ProbabilisticActor(
+        network,
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        default_interaction_type=ExplorationType.RANDOM,
+        distribution_kwargs={"low": torch.tensor([0.0, -1.0]), "high": torch.tensor([50.0, 1.0])},
+    )
+    env = GeomagneticNavEnv(num_envs=3, seed=0, max_steps=4)
+    assert env.rollout(4, policy)["action"].unique().numel() > 4
+    actions = evaluation_rollout(env, policy)["action"]
+    assert torch.equal(actions, torch.tensor([25.0, 0.0]).expand_as(actions))
+    episodes = [evaluate(policy, "figure-4-1", max_steps=4)["length_km"] for _ in range(2)]
+    assert torch.equal(*episodes)
+
+
+def test_episodes_are_a_data_frame() -> None:
+    pandas = pytest.importorskip("pandas")
+    episodes = evaluate("geodesic", "figure-4-1")
+    frame = pandas.DataFrame(episodes.to_dict(convert_tensors="numpy"))
+    assert len(frame) == 1
+    assert frame["success"].dtype == bool
+    assert set(frame) == set(episodes.keys()) > {"spl", "spl_to_arrival", "navigation_error_km"}
+
+
+def test_what_cannot_be_evaluated_is_refused() -> None:
+    agent = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
+    elsewhere = Scenario(region={"latitude": (40, 50), "longitude": (0, 10)}, objective_floors=None)
+    elsewhere = elsewhere.with_tasks(elsewhere.random_tasks(2, seed=0))
+    for call, error, message in (
+        (lambda: evaluate("secant", Scenario()), ValueError, "the scenario has no tasks to fly"),
+        (lambda: evaluate("secant", "figure-4-1", noise=(1, 1, 1), conditions="ship"), ValueError, "omit the noise"),
+        (lambda: evaluate(agent, elsewhere), ValueError, "trained"),
+        (lambda: evaluate(5, "figure-4-1"), TypeError, "policy must be callable"),
+    ):
+        with pytest.raises(error, match=message):
+            call()
