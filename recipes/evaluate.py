@@ -161,9 +161,14 @@ def settle(config: Config) -> tuple[Config, list[str]]:
     if config.tasks != "figure-4-1":  # which lies in the paper's region
         path, places = common_scenario(runs, config.scenario)
     own = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
-    zeta, warnings = arrival_threshold(config.navigators, own.zeta)
+    zeta, warnings = arrival_threshold(config.navigators, own.given("zeta"))
     heading, others = agreed(
-        runs, lambda run: run.start_heading, own.start_heading, "north", name="start heading", option="--start-heading"
+        runs,
+        lambda run: run.start_heading,
+        own.given("start_heading"),
+        "north",
+        name="start heading",
+        option="--start-heading",
     )
     noise, noisy = NO_NOISE, list[str]()
     if not config.conditions:
@@ -203,7 +208,7 @@ def prepare(config: Config) -> Prepared:
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
         flown = conditions_named(config.conditions or "laboratory")
-        drift_km = flown.drift_km(scenario.max_move_km or 50.0)
+        drift_km = flown.drift_km(scenario.max_move_km)
         bases = [
             GeomagneticNavEnv(place, num_envs=len(task_names(place)), drift_km=drift_km, seed=config.seed)
             for place in (scenario, example)

@@ -145,7 +145,7 @@ def check_fits(view: ObservationView | None, env: GeomagneticNavEnv) -> None:
     """
     check_type(GeomagneticNavEnv, env=env)
     if view is not None:
-        if env.many:
+        if len(env.region) > 1:
             raise ValueError(f"the policy was trained in one region, and cannot fly in {len(env.region)} regions")
         view.check_covers(env.field, env.region.grid(81).to(env.device))
 
@@ -193,7 +193,7 @@ def _exported(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
         start, base = env.reset(), getattr(env, "base_env", env)
         pipeline = _Pipeline(actor, parts, start)
         program = trace_program(pipeline, [start[key] for key in pipeline.in_keys])
-        view = None if base.many else base.observation_view()
+        view = None if len(base.region) > 1 else base.observation_view()
         policy = _reloaded(ExportedPolicy(pipeline.in_keys, program, view))
         steps = env.rollout(min(base.max_steps, CHECKED_STEPS), actor, break_when_any_done=False)
         _compare(policy, steps, parts)

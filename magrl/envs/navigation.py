@@ -10,7 +10,7 @@ from typing import Any
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from magrl.checks import check_type
-from magrl.envs.geomagnetic import GeomagneticNavEnv
+from magrl.envs.geomagnetic import GeomagneticNavEnv, option_names
 from magrl.transforms import AlignmentReward, DeclareArrival, FieldGradient, GradientHeading
 
 OBSERVATIONS = ("flat", "dict")
@@ -55,7 +55,7 @@ def navigation_env(
         check_choice("observation", observation, OBSERVATIONS)
     check_choice("reward", reward, REWARDS)
     check_type(bool, scale_actions=scale_actions)
-    known = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "num_envs"}
+    known = set(option_names()) - {"num_envs"}
     if unknown := sorted(options.keys() - known):
         every = known | (inspect.signature(navigation_env).parameters.keys() - {"num_envs", "options"})
         # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.

@@ -161,8 +161,8 @@ def _placed_regions(
         box = drawn.expanded(around[0]).reachable(around[1])
         planets, count = gauss[planet_index[waiting]], torch.arange(len(waiting))
         bank = FieldBank.build(planets, count, box.latitude, box.longitude, degree=degree, tolerance_nt=_ANY_ERROR)
-        declination = region_elements(bank, box)[..., 0]
-        strong = region_elements(bank, drawn)[..., 2].amin(1) >= min_intensity_nt
+        declination = region_elements(bank, box, points=11)[..., 0]
+        strong = region_elements(bank, drawn, points=11)[..., 2].amin(1) >= min_intensity_nt
         good = strong & (declination.amax(1) - declination.amin(1) <= 180)
         edges[waiting[good]] = torch.cat((drawn.latitude, drawn.longitude), -1)[good]
         waiting = waiting[~good]

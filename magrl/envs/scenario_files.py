@@ -13,8 +13,7 @@ from pydantic import BeforeValidator
 from typing_extensions import Self
 
 from magrl.checks import CheckedModel, check_type, short
-from magrl.envs.scenario import Scenario
-from magrl.envs.task_checks import numbers_validator, without_way
+from magrl.envs.scenario import Scenario, numbers_validator
 from magrl.envs.tasks import Tasks
 
 if sys.version_info >= (3, 11):
@@ -36,8 +35,8 @@ def _name(value: object) -> object:
 class TaskEntry(CheckedModel):
     """A task in a file."""
 
-    start: Annotated[tuple[float, float], BeforeValidator(numbers_validator("start", 2, _DEGREES))]
-    target: Annotated[tuple[float, float], BeforeValidator(numbers_validator("target", 2, _DEGREES))]
+    start: Annotated[tuple[float, float], numbers_validator("start", 2, _DEGREES)]
+    target: Annotated[tuple[float, float], numbers_validator("target", 2, _DEGREES)]
     name: Annotated[str, BeforeValidator(_name)]
 
     @classmethod
@@ -72,7 +71,7 @@ def load_scenario(path: Path | str, **changes: Any) -> Scenario:
         >>> lines = "date = 2026-07-01", "region = {latitude = [40, 50], longitude = [-30, -20]}"
         >>> _ = path.write_text(chr(10).join(lines))
         >>> load_scenario(path).region
-        Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0))
+        Regions(Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0)))
     """
     check_type((Path, str), path=path)
     path = Path(path)
@@ -89,15 +88,9 @@ def load_scenario(path: Path | str, **changes: Any) -> Scenario:
 def _scenario(content: Any, changes: dict[str, Any]) -> Scenario:
     if not isinstance(content, dict):
         raise ValueError(f"a scenario file must hold a table, got {short(content)}")
-    if "journeys" in content or "field" in content:
-        raise ValueError(
-            "the tables [field] and [journeys] are of an earlier version: write their keys (date, generation, "
-            "altitude_km, distance_range_km, objective_floors) at the top of the file, above [region]"
-        )
     known = [name for name in Scenario.model_fields if name not in ("field", "names")]
     if unknown := [key for key in content if key not in known]:
-        where = ": write name = ... in each of the tasks" if unknown[0] == "names" else ""
-        raise ValueError(f"unknown key {short(unknown[0])}{where or ': choose from ' + ', '.join(known)}")
+        raise ValueError(f"unknown key {short(unknown[0])}: choose from {', '.join(known)}")
     if missing := [name for name in ("region", "date") if name not in content]:
         raise ValueError(f"{missing[0]} is missing: a scenario file must hold region and date")
     values: dict[str, Any] = {"generation": 14, "objective_floors": None} | content
@@ -114,13 +107,6 @@ def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
         return (), None
     entries = [TaskEntry.read(number, entry) for number, entry in enumerate(listed, start=1)]
     start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
-    on_earth = (torch.maximum(start[:, 0].abs(), target[:, 0].abs()) <= 90).nonzero().squeeze(-1)
-    if len(nowhere := on_earth[without_way(start[on_earth], target[on_earth])]):
-        number = int(nowhere[0])
-        raise ValueError(
-            f"tasks, entry {number + 1}: start and target are the same place, {list(entries[number].start)}: "
-            "move one of them, or remove the entry"
-        )
     return tuple(e.name for e in entries), Tasks(start, target)
 
 

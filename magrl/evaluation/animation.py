@@ -14,7 +14,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.envs import Region
+from magrl.envs import Region, Regions
+from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH
 from magrl.evaluation.flight import ESTIMATE, draw_legend, estimates, flight_map
 from magrl.evaluation.replay import PIECES, episode_tracks, save_gif
@@ -67,7 +68,7 @@ def write_flight_gif(
     path: Path | str,
     rollout: TensorDictBase,
     field: FieldModel,
-    region: Region,
+    region: Region | Regions,
     title: str = "",
     *,
     width_px: int = 720,
@@ -108,10 +109,10 @@ def write_flight_gif(
 
 
 def _frames(
-    rollout: TensorDictBase, field: FieldModel, region: Region, title: str, width_px: int
+    rollout: TensorDictBase, field: FieldModel, region: Region | Regions, title: str, width_px: int
 ) -> Iterator[Image.Image]:
     """Yield the frames; the estimate is that at the last reading."""
-    states = rollout[0].cpu()
+    states, region = rollout[0].cpu(), one_region(region)
     distance = geodesic(*states["start_position"][0], *states["target_position"][0])[0].item()
     figure, _ = flight_map(rollout, field, region, title, estimates(states, SHOWN * distance))
     track = episode_tracks(rollout, region)[0].numpy()

@@ -19,7 +19,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.envs import Region
+from magrl.envs import Region, Regions
+from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
 from magrl.field import FieldModel
 from magrl.geodesy import geodesic, move
@@ -92,7 +93,7 @@ def frame(positions: Tensor) -> Region:
     return Region((max(north - half_north, -88.0), min(north + half_north, 88.0)), (east - half_east, east + half_east))
 
 
-def flight_figure(rollout: TensorDictBase, field: FieldModel, region: Region, title: str = "") -> Figure:
+def flight_figure(rollout: TensorDictBase, field: FieldModel, region: Region | Regions, title: str = "") -> Figure:
     """Return a map of an episode: track, shortest path, contours, coastlines, and where the destination was estimated.
 
     Args:
@@ -115,7 +116,7 @@ def flight_figure(rollout: TensorDictBase, field: FieldModel, region: Region, ti
     figure, path = flight_map(rollout, field, region, title)
     axes, states = figure.axes[0], rollout[0, 1:]
     if "way" in states.keys():  # noqa: SIM118 - a TensorDict is no mapping
-        guesses = region.unwrapped(estimates(states, 5000.0))
+        guesses = one_region(region).unwrapped(estimates(states, 5000.0))
         axes.plot(guesses[:, 1], guesses[:, 0], ".", color=ESTIMATE, ms=4, label="destination, estimated")
     axes.plot(path[:, 1], path[:, 0], "-", color=PATH, lw=2, marker=".", ms=4, label="track")
     draw_legend(figure)
@@ -123,7 +124,7 @@ def flight_figure(rollout: TensorDictBase, field: FieldModel, region: Region, ti
 
 
 def flight_map(
-    rollout: TensorDictBase, field: FieldModel, region: Region, title: str = "", shown: Tensor | None = None
+    rollout: TensorDictBase, field: FieldModel, region: Region | Regions, title: str = "", shown: Tensor | None = None
 ) -> tuple[Figure, Tensor]:
     """Return the map of an episode without its track: contours, coastlines, shortest path, start and destination.
 
@@ -149,7 +150,7 @@ def flight_map(
     check_type(TensorDictBase, rollout=rollout)
     if rollout.ndim != 2 or len(rollout) != 1:
         raise ValueError(f"a rollout must be of one vehicle, (1, T), got {tuple(rollout.shape)}")
-    rollout = rollout.cpu()
+    rollout, region = rollout.cpu(), one_region(region)
     start, target = rollout["start_position"][0, 0], rollout["target_position"][0, 0]
     path = region.unwrapped(torch.cat((start[None], rollout["next", "position"][0])))
     way, ends = region.unwrapped(shortest_path(start, target)), region.unwrapped(torch.stack((start, target)))

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from tensordict import TensorDictBase
 
 from magrl.checks import check_number, check_type
-from magrl.envs.region import Region
+from magrl.envs.regions import Region, Regions, one_region
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.field.model import FieldModel
@@ -20,7 +20,7 @@ from magrl.field.model import FieldModel
 def flights_figure(
     rollouts: Mapping[str, TensorDictBase],
     field: FieldModel,
-    region: Region,
+    region: Region | Regions,
     names: Sequence[str] = (),
     episodes: int = 24,
 ) -> Figure:
@@ -58,7 +58,12 @@ def flights_figure(
 
 
 def draw_episodes(
-    axes: Axes, rollout: TensorDictBase, field: FieldModel, region: Region, episodes: int, names: Sequence[str]
+    axes: Axes,
+    rollout: TensorDictBase,
+    field: FieldModel,
+    region: Region | Regions,
+    episodes: int,
+    names: Sequence[str],
 ) -> None:
     """Draw the first episodes of a rollout over the field's contours.
 
@@ -78,6 +83,7 @@ def draw_episodes(
         ['home', 'port']
     """
     check_type(TensorDictBase, rollout=rollout)
+    region = one_region(region)
     shown = rollout[:episodes].cpu()
     steps = first_episode_mask(shown["next", "done"]).sum(1)
     paths = [

@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter
 from tensordict import TensorDictBase
 
 from magrl.checks import check_number, check_type
-from magrl.envs.region import Region
+from magrl.envs.regions import Region, Regions
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
 from magrl.envs.tasks import Tasks
 from magrl.evaluation.colors import NAVIGATOR_COLORS
@@ -76,7 +76,7 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
 
 
 def trajectories_figure(
-    rollout: TensorDictBase, field: FieldModel, region: Region, episodes: int = 24, names: Sequence[str] = ()
+    rollout: TensorDictBase, field: FieldModel, region: Region | Regions, episodes: int = 24, names: Sequence[str] = ()
 ) -> Figure:
     """Return a map of the first episodes of a rollout over the field's contours.
 

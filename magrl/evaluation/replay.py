@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number, check_type
-from magrl.envs.region import Region
+from magrl.envs.regions import Region, Regions, one_region
 from magrl.envs.rendering import PATH, START, TARGET, contour_lines, draw_contours
 from magrl.evaluation.metrics import episode_measures, moved
 from magrl.field.model import FieldModel
@@ -37,7 +37,7 @@ GIF_COLORS, STEP_MS = 96, 320
 def replay_data(
     rollouts: Mapping[str, TensorDictBase],
     field: FieldModel,
-    region: Region,
+    region: Region | Regions,
     *,
     zeta: float,
     title: str = "",
@@ -70,7 +70,7 @@ def replay_data(
         2
     """
     check_type(Mapping, rollouts=rollouts)
-    check_type(Region, region=region)
+    region = one_region(region)
     check_type(str, title=title)
     check_number(0, above=True, zeta=zeta)
     check_type(TensorDictBase, **{f"the rollout {name!r}": rollout for name, rollout in rollouts.items()})
@@ -99,7 +99,7 @@ def replay_data(
     }
 
 
-def episode_tracks(rollout: TensorDictBase, region: Region) -> list[Tensor]:
+def episode_tracks(rollout: TensorDictBase, region: Region | Regions) -> list[Tensor]:
     """Return the track of the first episode of each vehicle, each move in :data:`PIECES` pieces of its geodesic.
 
     Args:
@@ -121,7 +121,7 @@ def episode_tracks(rollout: TensorDictBase, region: Region) -> list[Tensor]:
         True
     """
     check_type(TensorDictBase, rollout=rollout)
-    check_type(Region, region=region)
+    region = one_region(region)
     rollout = rollout.cpu()
     steps = episode_measures(rollout)["steps"].tolist()
     latitude, longitude = rollout["position"].unsqueeze(-2).unbind(-1)
@@ -222,7 +222,7 @@ def write_gif(
     path: Path | str,
     rollout: TensorDictBase,
     field: FieldModel,
-    region: Region,
+    region: Region | Regions,
     *,
     frames_per_step: int = 3,
     size_px: int = 640,
@@ -250,7 +250,9 @@ def write_gif(
     """
     check_type((Path, str), path=path)
     check_number(1, whole=True, frames_per_step=frames_per_step, size_px=size_px)
-    save_gif(path, list(_frames(rollout, field, region, frames_per_step, size_px)), STEP_MS // frames_per_step)
+    save_gif(
+        path, list(_frames(rollout, field, one_region(region), frames_per_step, size_px)), STEP_MS // frames_per_step
+    )
 
 
 def save_gif(path: Path | str, frames: Sequence[Image.Image], frame_ms: int, colors: int = GIF_COLORS) -> None:

@@ -30,7 +30,7 @@ def _secant(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFEC
 
 
 def _mean_jacobian(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> MeanJacobian:  # noqa: ARG001
-    if env.many:
+    if len(env.region) > 1:
         raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
     places = env.region.grid(21).to(env.device)
     return MeanJacobian(env.field, places, env.max_move_km, env.max_turn_rad, noise=noise)
@@ -41,7 +41,7 @@ def _geodesic(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERF
 
 
 def _run_and_tumble(env: GeomagneticNavEnv, mode: str, seed: int, noise: Noise = _PERFECT) -> RunAndTumble:  # noqa: ARG001
-    floors = tuple(env.objective_floors.tolist())
+    floors = tuple(env.objective_floors.mean(0).tolist())
     return RunAndTumble(env.max_move_km, env.max_turn_rad, objective_floors=floors)
 
 

@@ -114,7 +114,7 @@ def test_last_move_is_that_of_the_environment(env, view) -> None:
 def scrambled(state: TensorDict) -> TensorDict:
     """Return a state with noise in everything that a policy on the eight numbers must not read."""
     state = state.clone()
-    for key in ("heading", *PRIVILEGED_KEYS):
+    for key in {"heading", *PRIVILEGED_KEYS} - {"region"}:
         value = state[key]
         state[key] = ~value if value.dtype == torch.bool else torch.full_like(value, math.nan)
     extra = {"field_gradient": (3, 2), "gradient_heading": (1,), "heading_vector": (2,)}

@@ -354,7 +354,7 @@ def test_bad_options() -> None:
         ({"alignment_weight": math.nan}, ValueError, "weight .*finite.*, got nan"),
         ({"zetta": 1.0}, TypeError, "unexpected keyword argument 'zetta'.*'zeta'"),
         ({"num_envs": 3}, TypeError, "num_envs, got 3: use gymnasium.make_vec"),
-        ({"region": 3}, TypeError, "unexpected keyword argument 'region'.*'scenario'"),
+        ({"regions": 3}, TypeError, "unexpected keyword argument 'regions'.*'scenario'"),
         ({"scenario": 3}, TypeError, "scenario must be a Scenario, got 3"),
         ({"scale_actions": 1}, TypeError, "scale_actions must be a bool, got 1"),
     ):

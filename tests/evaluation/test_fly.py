@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
-from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region
+from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region, Regions
 from magrl.evaluation.flight import coastlines, flight_figure, frame, shortest_path
 from magrl.evaluation.places import (
     check_declination,
@@ -102,8 +102,8 @@ def test_region_around_two_places(field) -> None:
     honolulu, tokyo = place(21.3, -157.9), place(35.7, 139.7)
     box = region_around(honolulu, tokyo, field)
     assert box.longitude[1] - box.longitude[0] < 150  # across the antimeridian, not around the Earth
-    assert box.contains(torch.stack((honolulu, tokyo, place(28, 180)))).all()
-    assert not box.contains(place(28, 0))
+    assert Regions.of(box).contains(torch.stack((honolulu, tokyo, place(28, 180)))).all()
+    assert not Regions.of(box).contains(place(28, 0))
     # The margin is reduced where D jumps: that of half the distance, 9.9 degrees, would hold the pole of the field.
     assert 76 < region_around(place(76, 100), place(60, 140), field).latitude[1] < 85
     with pytest.raises(ValueError, match="the declination jumps"):
@@ -239,7 +239,7 @@ def test_frame_has_room_on_each_side() -> None:
         height = box.latitude[1] - box.latitude[0]
         width = (box.longitude[1] - box.longitude[0]) * math.cos(math.radians(sum(box.latitude) / 2))
         assert 0.4 < height / width < 2.6
-        assert Region(box.latitude, box.longitude).contains(torch.tensor(positions)).all()
+        assert Regions.of(Region(box.latitude, box.longitude)).contains(torch.tensor(positions)).all()
 
 
 def test_figure_across_the_antimeridian(tmp_path: Path) -> None:

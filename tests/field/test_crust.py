@@ -226,7 +226,7 @@ def test_random_crust_ends_with_its_box() -> None:
 def test_crusted_field_in_the_environment() -> None:
     """The vehicles measure the sum."""
     scenario = Scenario()
-    box = scenario.reachable(50.0)
+    box = scenario.reachable()[0]
     smooth, crust = scenario.build_field(), RandomCrust(box.latitude, box.longitude, seed=0, strength=0.1)
     both = CrustedField(smooth, crust)
     env = GeomagneticNavEnv(Scenario(field=both), num_envs=3, seed=0)

@@ -352,7 +352,7 @@ OPTIONS = st.fixed_dictionaries(
         "num_envs": st.integers(1, 40),
         "max_steps": st.sampled_from((50, 7, 3)),
         "max_move_km": between(0.1, 300),
-        "max_turn_rad": between(0.01, math.pi, math.pi),
+        "max_turn_deg": between(0.6, 180, 180),
         "zeta": between(1e-4, 1),
         "start_heading": st.sampled_from(("north", "random")),
         "destination_weight": between(0, 1000),

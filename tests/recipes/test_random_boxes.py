@@ -34,8 +34,8 @@ def test_boxes_follow_the_seed_and_lie_where_they_should(boxes) -> None:
     regions = [scenario.region for scenario in boxes.random_boxes(4, seed=1)]
     assert regions == [scenario.region for scenario in boxes.random_boxes(5, seed=1)][:4]
     assert regions != [scenario.region for scenario in boxes.random_boxes(4, seed=2)]
-    assert regions[0] == Region((-51, -41), (-99, -89))
-    for region in regions:
+    assert regions[0][0] == Region((-51, -41), (-99, -89))
+    for region, *_ in regions:
         (south, north), (west, east) = region.latitude, region.longitude
         assert (north - south, east - west) == (10, 10)
         assert max(abs(south), abs(north)) <= 60

@@ -34,7 +34,7 @@ from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 from magrl import guidance
 from magrl.envs.geomagnetic import GeomagneticNavEnv
-from magrl.envs.region import Region
+from magrl.envs.regions import Region
 from magrl.envs.scenario import Scenario
 from magrl.field.model import elements_at
 from magrl.field.regional import RegionalField

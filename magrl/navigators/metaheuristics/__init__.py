@@ -87,11 +87,11 @@ def build(name: str, env: GeomagneticNavEnv, mode: str, seed: int, **options: An
         raise ValueError(f"unknown metaheuristic {name!r}: choose from {', '.join(ALGORITHMS)}")
     if mode not in MODES:
         raise ValueError(f"mode must be one of {MODES}, got {mode!r}")
-    if env.many:
+    if len(env.region) > 1:
         raise ValueError(f"metaheuristics navigate in one region, and the scenario has {len(env.region)}")
     bounds = {"max_move_km": env.max_move_km, "max_turn_rad": env.max_turn_rad, "seed": seed, "mode": mode}
     bounds["field"] = env.field if mode == "look-ahead" else None
-    bounds["objective_floors"] = tuple(env.objective_floors.tolist())
+    bounds["objective_floors"] = tuple(env.objective_floors[0].tolist())
     return ALGORITHMS[name](**{**bounds, **SETTINGS[name, mode], **options})
 
 

@@ -44,7 +44,7 @@ F64 = torch.float64
 
 @cache
 def field() -> FieldModel:
-    return Scenario().build_field(80.0)
+    return Scenario().build_field(drift_km=30.0)
 
 
 def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
