@@ -44,6 +44,8 @@ PRIVILEGED_KEYS = (
     "region",
 )
 """Keys that a policy may not read if it navigates by the field alone."""
+CONSTANT_KEYS = ("target_field", "target_position", "start_position", "objective_weights", "region")
+"""Keys that keep their values throughout an episode."""
 
 
 class GeomagneticNavEnv(EnvBase):
@@ -169,11 +171,7 @@ class GeomagneticNavEnv(EnvBase):
             >>> GeomagneticNavEnv(seed=0).observation_view().size
             13
         """
-        if len(self.region) > 1:
-            raise ValueError(
-                f"the observation view is scaled to the field of one region, this environment has {len(self.region)}: "
-                "give it a scenario with one region, or an agent that needs no map"
-            )
+        one_region(self.region)
         low, high = elements_range(self.field, self.region.grid(81))
         return ObservationView(
             observe_heading=observe_heading,
@@ -293,18 +291,14 @@ class GeomagneticNavEnv(EnvBase):
         destination = guidance.destination_reward(arrived, self.destination_weight)
         after = TensorDict(
             {
+                **{key: tensordict[key] for key in (*CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
                 "field": field.float(),
-                "target_field": tensordict["target_field"],
                 "move": action[:, :2].float(),
                 "heading": heading.float().unsqueeze(-1),
                 "step_count": step,
                 "position": position,
-                "target_position": tensordict["target_position"],
-                "start_position": tensordict["start_position"],
                 "objective": objective.float(),
-                "objective_weights": tensordict["objective_weights"],
                 "success": arrived,
-                "region": tensordict["region"],
                 "reward": (destination + proximity).float(),
                 "reward_destination": destination.float(),
                 "reward_proximity": proximity.float(),
@@ -312,7 +306,6 @@ class GeomagneticNavEnv(EnvBase):
                 "terminated": terminated,
                 "truncated": truncated,
                 **({specs.DECLARED: ended} if self.arrival.declared else {}),
-                **({DISPLACEMENT: tensordict[DISPLACEMENT]} if self.drift_km else {}),
             },
             batch_size=tensordict.batch_size,
             device=self.device,

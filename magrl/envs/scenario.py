@@ -56,7 +56,7 @@ def numbers_validator(name: str, count: int, meaning: str) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-def _tuple(value: object) -> object:
+def _tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
@@ -68,7 +68,7 @@ def _region(value: object) -> object:
             f"region must be a Region, or a table of latitude and longitude, each [low, high] in degrees, "
             f"got {short(value)}"
         )
-    region = Region(_tuple(value["latitude"]), _tuple(value["longitude"]))  # type: ignore[arg-type]
+    region = Region(_tuple(value["latitude"]), _tuple(value["longitude"]))
     if max(map(abs, region.longitude)) > 360:
         raise ValueError(f"region: longitudes must lie between -360 and 360 degrees, got {region.longitude}")
     return Regions.of(region)
@@ -247,19 +247,20 @@ class Scenario(CheckedModel):
         """
         if self.field is not None:
             return self.field
+        boxes, region = self.reachable(drift_km), self.region[0]
         try:
-            return self._expanded_igrf(drift_km)
+            return self._expanded_igrf(boxes)
         except ValueError as error:
-            box, region = self.reachable(drift_km)[0], self.region[0]
             reason = f"region.latitude, region.longitude: {str(error).rpartition(': ')[0]}"  # without its advice
-            if max(map(abs, box.latitude)) == 90:
+            if boxes.latitude.abs().max() == 90:
                 place = f"region.latitude {region.latitude}: with margin_deg {self.margin_deg:g}, vehicles reach"
-                reason = f"{place} a pole in {box}, where all longitudes meet and the declination takes every value"
+                reason = (
+                    f"{place} a pole in {boxes[0]}, where all longitudes meet and the declination takes every value"
+                )
             raise ValueError(f"{reason}: {self._remedy(drift_km)}") from error
 
-    def _expanded_igrf(self, drift_km: float) -> RegionalField:
-        """Return IGRF expanded over every place that a vehicle can reach, with a declination that does not jump."""
-        boxes = self.reachable(drift_km)
+    def _expanded_igrf(self, boxes: Regions) -> RegionalField:
+        """Return IGRF expanded over the only box, with a declination that does not jump."""
         igrf = IGRF(self.date, self.generation, altitude_km=self.altitude_km)
         field = RegionalField(igrf, boxes[0].latitude, boxes[0].longitude)
         field_bounds(field, boxes)
@@ -268,21 +269,21 @@ class Scenario(CheckedModel):
     def _remedy(self, drift_km: float) -> str:
         """Return the smallest changes that give a usable field; each of them was tried."""
 
-        def usable(**changes: Any) -> bool:
+        def usable(region: Region, margin_deg: float) -> bool:
             try:
-                near = {"distance_range_km": (0.0, 1.0), "distance_law": "area"}
-                self.replace(tasks=None, names=(), **near, **changes)._expanded_igrf(drift_km)
+                self._expanded_igrf(Regions.of(region).expanded(margin_deg).reachable(self.max_move_km + drift_km))
             except ValueError:
                 return False
             return True
 
-        (south, north), longitude = self.region[0].latitude, self.region[0].longitude
+        region = self.region[0]
+        south, north = region.latitude
         margins = (step / 2 for step in range(min(math.ceil(2 * self.margin_deg), 20) - 1, -1, -1))
-        margin = next((margin for margin in margins if usable(margin_deg=margin)), None)
+        margin = next((margin for margin in margins if usable(region, margin)), None)
         side = math.copysign(1, south + north)
         shifts = range(1, min(30, int(abs(south + north) / 2)) + 1)
-        regions = ((shift, Region((south - side * shift, north - side * shift), longitude)) for shift in shifts)
-        shift = next((shift for shift, region in regions if usable(region=region)), None)
+        moved = ((shift, Region((south - side * shift, north - side * shift), region.longitude)) for shift in shifts)
+        shift = next((shift for shift, region in moved if usable(region, self.margin_deg)), None)
         ways = [f"reduce margin_deg to {margin:g}"] if margin is not None else []
         ways += [f"move the region {shift}° toward the equator"] if shift is not None else []
         return ", or ".join(ways) or "choose a smaller region away from the poles"

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import torch
 from pydantic import BeforeValidator
-from typing_extensions import Self
 
 from magrl.checks import CheckedModel, check_type, short
 from magrl.envs.scenario import Scenario, numbers_validator
@@ -39,17 +38,6 @@ class TaskEntry(CheckedModel):
     target: Annotated[tuple[float, float], numbers_validator("target", 2, _DEGREES)]
     name: Annotated[str, BeforeValidator(_name)]
 
-    @classmethod
-    def read(cls, number: int, entry: Any) -> Self:
-        """Return an entry of a file, counted from 1."""
-        if not isinstance(entry, dict):
-            raise ValueError(f"tasks, entry {number}, must be a table with start and target, got {short(entry)}")
-        values: dict[str, Any] = {"name": f"task {number}"} | entry
-        try:
-            return cls(**values)
-        except ValueError as error:
-            raise ValueError(f"tasks, entry {number}: {error}") from error
-
 
 def load_scenario(path: Path | str, **changes: Any) -> Scenario:
     """Read a scenario from a TOML or JSON file, whose keys are the fields of :class:`Scenario`.
@@ -67,10 +55,10 @@ def load_scenario(path: Path | str, **changes: Any) -> Scenario:
 
     Example:
         >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "azores.toml"
         >>> lines = "date = 2026-07-01", "region = {latitude = [40, 50], longitude = [-30, -20]}"
-        >>> _ = path.write_text(chr(10).join(lines))
-        >>> load_scenario(path).region
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "azores.toml").write_text(chr(10).join(lines))
+        ...     load_scenario(Path(folder) / "azores.toml").region
         Regions(Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0)))
     """
     check_type((Path, str), path=path)
@@ -105,7 +93,15 @@ def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
         raise ValueError(f"tasks must be a list of tables with start and target, got {short(listed)}")
     if not listed:
         return (), None
-    entries = [TaskEntry.read(number, entry) for number, entry in enumerate(listed, start=1)]
+    entries = []
+    for number, entry in enumerate(listed, start=1):
+        if not isinstance(entry, dict):
+            raise ValueError(f"tasks, entry {number}, must be a table with start and target, got {short(entry)}")
+        try:
+            values: dict[str, Any] = {"name": f"task {number}"} | entry
+            entries.append(TaskEntry(**values))
+        except ValueError as error:
+            raise ValueError(f"tasks, entry {number}: {error}") from error
     start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
     return tuple(e.name for e in entries), Tasks(start, target)
 

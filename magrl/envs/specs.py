@@ -69,13 +69,13 @@ def field_bounds(field: FieldModel | FieldBank, boxes: Regions) -> tuple[Tensor,
     undefined, turning = ~torch.isfinite(lowest + highest).all(-1), highest[:, 0] - lowest[:, 0] > 180
     if undefined.any():
         raise ValueError(
-            f"the field is not defined on all of {_described(undefined, boxes)}, which a vehicle can reach: take a "
-            "field of a larger box, or a smaller region, margin_deg or max_move_km"
+            f"the field is not defined on all of {boxes[int(undefined.nonzero()[0])]}, which a vehicle can reach: take "
+            "a field of a larger box, or a smaller region, margin_deg or max_move_km"
         )
     if turning.any():
         raise ValueError(
-            f"the declination turns through south in {_described(turning, boxes)}: D jumps from 180 to -180 degrees "
-            "there; take a region farther from the magnetic pole"
+            f"the declination turns through south in {boxes[int(turning.nonzero()[0])]}: D jumps from 180 to -180 "
+            "degrees there; take a region farther from the magnetic pole"
         )
     low, high = lowest.amin(0), highest.amax(0)
     slack = 0.05 * (high - low)
@@ -87,12 +87,6 @@ def region_elements(field: FieldModel | FieldBank, regions: Regions, points: int
     """Return the elements on an even grid of each region: ``(K, points², 3)``, D [deg], I [deg], B_H [nT]."""
     index = torch.arange(len(regions), device=regions.latitude.device)
     return elements_at(field, regions.grid(points).flatten(1, 2), index.unsqueeze(-1))
-
-
-def _described(bad: Tensor, boxes: Regions) -> str:
-    """Return the first bad box as text."""
-    number = int(bad.nonzero()[0])
-    return f"region {number} with its margin, {boxes[number]}" if len(boxes) > 1 else f"{boxes[0]}"
 
 
 def observation_spec(
