@@ -44,8 +44,6 @@ PRIVILEGED_KEYS = (
     "region",
 )
 """Keys that a policy may not read if it navigates by the field alone."""
-CONSTANT_KEYS = ("target_field", "target_position", "start_position", "objective_weights", "region")
-"""Keys that keep their values throughout an episode."""
 
 
 class GeomagneticNavEnv(EnvBase):
@@ -291,7 +289,7 @@ class GeomagneticNavEnv(EnvBase):
         destination = guidance.destination_reward(arrived, self.destination_weight)
         after = TensorDict(
             {
-                **{key: tensordict[key] for key in (*CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
+                **{key: tensordict[key] for key in (*specs.CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
                 "field": field.float(),
                 "move": action[:, :2].float(),
                 "heading": heading.float().unsqueeze(-1),

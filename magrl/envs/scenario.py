@@ -31,26 +31,18 @@ FLOOR_KM = 25.0
 """Distance of travel whose mean change of each element is the default floor of Eq. 2-6 away from the paper's box."""
 
 
-def numbers_validator(name: str, count: int, meaning: str) -> BeforeValidator:
+def numbers_validator(name: str, count: int) -> BeforeValidator:
     """Return a pydantic validator that turns ``count`` finite numbers into a tuple of floats.
 
-    Args:
-        name: name of the value in messages.
-        count: how many numbers.
-        meaning: what they are, in messages.
-
     Example:
-        >>> numbers_validator("start", 2, "latitude and longitude in degrees").func([40, -30])
+        >>> numbers_validator("start", 2).func([40, -30])
         (40.0, -30.0)
     """
 
     def check(value: Any) -> tuple[float, ...] | None:
         if value is None:
             return None
-        try:
-            check_numbers(count, **{name: value})
-        except (ValueError, OverflowError):
-            raise ValueError(f"{name} must be {count} finite numbers, {meaning}, got {short(value)}") from None
+        check_numbers(count, **{name: value})
         return tuple(float(number) for number in value)
 
     return BeforeValidator(check)
@@ -91,20 +83,6 @@ def _field(value: object) -> object:
     return value
 
 
-def _altitude(value: float) -> float:
-    lowest, highest = IGRF.altitude_range_km
-    if not lowest <= value <= highest:
-        raise ValueError(
-            f"altitude_km must be from {lowest:g} to {highest:g} km, negative for a depth, got {value}: is it in "
-            "meters?"
-        )
-    return value
-
-
-_DISTANCES = numbers_validator("distance_range_km", 2, "shortest and longest in km")
-_FLOORS = numbers_validator("objective_floors", 3, "of D [deg], I [deg] and B_H [nT]")
-
-
 class Scenario(CheckedModel):
     """Where tasks lie, the field there, and how far apart their ends are; by default those of the paper.
 
@@ -123,7 +101,7 @@ class Scenario(CheckedModel):
     region: Annotated[Any, BeforeValidator(_region)] = PAPER_REGION
     """Box of starts and destinations, given as a :class:`Region`, kept as :class:`Regions`; or several boxes, of which
     every random task draws one, with a bank as ``field``."""
-    distance_range_km: Annotated[tuple[float, float], _DISTANCES] = paper.DISTANCE_KM
+    distance_range_km: Annotated[tuple[float, float], numbers_validator("distance_range_km", 2)] = paper.DISTANCE_KM
     """Shortest and longest distance from start to destination of random tasks [km]."""
     distance_law: Literal["area", "log"] = "area"
     """Law of the distances of random tasks: both ends uniform over the region given that their distance is in the range
@@ -132,12 +110,14 @@ class Scenario(CheckedModel):
     """Date of the field: ``datetime``, ``date``, ISO text or decimal year; kept as a ``datetime``."""
     generation: Literal[13, 14] = paper.GENERATION  # type: ignore[assignment]
     """Generation of IGRF."""
-    altitude_km: Annotated[float, AfterValidator(_altitude)] = 0.0
-    """Altitude over the ellipsoid at which the field is measured, negative for a depth [km]; distances are those over
-    the ground."""
+    altitude_km: float = 0.0
+    """Altitude over the ellipsoid at which the field is measured, negative for a depth [km], -15 to 1000; distances
+    are those over the ground."""
     margin_deg: Annotated[float, Field(ge=0)] = 5.0
     """How far beyond the region a vehicle may stray before it is lost [deg]."""
-    objective_floors: Annotated[tuple[float, float, float] | None, _FLOORS] = guidance.OBJECTIVE_FLOORS
+    objective_floors: Annotated[tuple[float, float, float] | None, numbers_validator("objective_floors", 3)] = (
+        guidance.OBJECTIVE_FLOORS
+    )
     """Least differences of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by, or None for the mean change of each over
     :data:`FLOOR_KM` in the region. Where the field is steep, floors that are too low make every detour very costly."""
     field: Annotated[Any, BeforeValidator(_field)] = None
@@ -167,6 +147,7 @@ class Scenario(CheckedModel):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         self._check_bank()
+        check_number(*IGRF.altitude_range_km, altitude_km=self.altitude_km)
         if self.objective_floors is not None:
             check_number(0, above=True, objective_floors=min(self.objective_floors))
         if self.field is None:

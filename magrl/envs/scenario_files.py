@@ -22,7 +22,6 @@ else:
 
 MAX_FILE_BYTES = 10_000_000
 """Largest scenario file: about fifty thousand tasks."""
-_DEGREES = "latitude and longitude in degrees"
 
 
 def _name(value: object) -> object:
@@ -34,8 +33,8 @@ def _name(value: object) -> object:
 class TaskEntry(CheckedModel):
     """A task in a file."""
 
-    start: Annotated[tuple[float, float], numbers_validator("start", 2, _DEGREES)]
-    target: Annotated[tuple[float, float], numbers_validator("target", 2, _DEGREES)]
+    start: Annotated[tuple[float, float], numbers_validator("start", 2)]
+    target: Annotated[tuple[float, float], numbers_validator("target", 2)]
     name: Annotated[str, BeforeValidator(_name)]
 
 

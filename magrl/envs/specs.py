@@ -14,22 +14,11 @@ from magrl.transforms.errors.motion import DISPLACEMENT
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Terms whose sum is ``reward``."""
-REGION = "region"
-"""Index of the region of each vehicle."""
 DECLARED = "declared"
 """Flag that the vehicle has declared its arrival, where it must."""
-STATE_KEYS = (
-    "target_field",
-    "heading",
-    "step_count",
-    "position",
-    "target_position",
-    "start_position",
-    "objective",
-    "objective_weights",
-    REGION,
-    DISPLACEMENT,
-)
+CONSTANT_KEYS = ("target_field", "target_position", "start_position", "objective_weights", "region")
+"""Keys that keep their values throughout an episode."""
+STATE_KEYS = (*CONSTANT_KEYS, "heading", "step_count", "position", "objective", DISPLACEMENT)
 """Keys that a step reads: the state of an episode."""
 
 

@@ -86,10 +86,9 @@ def check_distance_range(regions: Regions, distance_range_km: tuple[float, float
     if distance_law not in DISTANCE_LAWS:
         raise ValueError(f"distance_law must be one of {', '.join(map(repr, DISTANCE_LAWS))}, got {distance_law!r}")
     shortest, longest = distance_range_km
-    if not 0 <= shortest < longest:
-        raise ValueError(f"distance_range_km {distance_range_km} must be two rising numbers from 0 on")
-    if distance_law == "log" and shortest == 0:
-        raise ValueError(f"distance_range_km {distance_range_km} must start above 0 with distance_law 'log'")
+    if not 0 <= shortest < longest or (distance_law == "log" and shortest == 0):
+        start = "above 0 with distance_law 'log'" if distance_law == "log" else "from 0 on"
+        raise ValueError(f"distance_range_km {distance_range_km} must be two rising numbers {start}")
     held, smallest = regions.longest_km.min(0)
     if (shortest if distance_law == "area" else longest) >= held:
         raise ValueError(

@@ -194,7 +194,7 @@ def test_log_uniform_distances():
         ((500, 300), "area", r"\(500, 300\) must be two rising numbers"),
         ((-1, 300), "area", r"\(-1, 300\) must be two rising numbers"),
         ((0, math.inf), "area", r"distance_range_km .*inf"),
-        ((0, 300), "log", r"\(0, 300\) must start above 0 with distance_law 'log'"),
+        ((0, 300), "log", r"\(0, 300\) must be two rising numbers above 0 with distance_law 'log'"),
         ((300, 500), "even", r"distance_law must be one of 'area', 'log', got 'even'"),
         ((1600, 1700), "area", r"\(1600, 1700\): no two points of Region.*160.*170.*more than 1565 km"),
         ((300, 1700), "log", r"\(300, 1700\): no two points of Region.*more than 1565 km"),

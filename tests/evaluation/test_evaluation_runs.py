@@ -94,7 +94,7 @@ def test_random_tasks_are_not_those_of_a_training_or_a_frozen_set() -> None:
         ({"noise": (0.05, -1.0, 5.0)}, "noise must be a finite number from 0 on, got -1.0"),
         ({"noise": (0.05, math.nan, 5.0)}, "noise .*nan"),
         ({"max_steps": 0}, "max_steps must be greater than or equal to 1, got 0"),
-        ({"altitude_km": 5000.0}, "altitude_km must be from -15 to 1000 km, negative for a depth, got 5000"),
+        ({"altitude_km": 5000.0}, "altitude_km must be a finite number from -15 up to 1000, got 5000"),
         ({"start_heading": "south"}, "start_heading must be 'north' or 'random', got 'south'"),
     ],
     ids=str,
