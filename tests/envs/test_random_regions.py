@@ -13,7 +13,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
-from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import (
     GeomagneticNavEnv,
     Region,
@@ -24,8 +23,6 @@ from magrl.envs import (
     planet_scenario,
     task_set,
 )
-from magrl.evaluation import episode_measures, evaluation_rollout
-from magrl.evaluation.navigators import make_navigator
 from magrl.field import IGRF, FieldBank, RegionalField, SphericalHarmonicField, elements_at, random_planets
 from magrl.field.elements import measured_elements
 
@@ -152,26 +149,6 @@ def test_regions_of_the_earth() -> None:
     exact = igrf(*middle.unbind(-1))
     torch.testing.assert_close(scenario.field(*middle.unbind(-1), torch.arange(40)), exact, rtol=0, atol=1e-3)
     assert (str(scenario.date.date()), scenario.generation) == ("2015-07-01", 14)
-
-
-def test_navigators_with_a_map_of_one_region_refuse_a_bank() -> None:
-    env = make(2)
-    trained = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
-    for navigate in (
-        lambda: make_navigator("mean_jacobian", env),
-        lambda: make_navigator("ga", env),
-        lambda: trained.check_fits(env),
-    ):
-        with pytest.raises(ValueError, match=rf"one region.*{COUNT}"):
-            navigate()
-
-
-def test_navigators_fly_over_a_bank() -> None:
-    env = make(64)
-    for name, least in (("parallel", 0.9), ("geodesic", 1.0), ("secant", 0.9), ("kalman", 0.9)):
-        measured = episode_measures(evaluation_rollout(env, make_navigator(name, env)))
-        assert measured["success"].double().mean() >= least, name
-        assert measured["spl"].mean() > 0.8, name
 
 
 def test_specs_and_seeds() -> None:

@@ -195,11 +195,6 @@ def test_what_was_given_stays_given() -> None:
     assert [scenario.given(name) for name in ("zeta", "max_steps", "margin_deg", "max_move_km")] == [0.01, 80, 4, None]
 
 
-def test_every_bad_value_of_a_scenario_is_named() -> None:
-    with pytest.raises(ValueError, match=r"margin_deg must .*, got -2; max_steps must .*, got 0"):
-        Scenario(max_steps=0, margin_deg=-2)
-
-
 def test_an_own_field_needs_no_date_of_igrf() -> None:
     def field(latitude: Tensor, longitude: Tensor) -> Tensor:
         return torch.stack((latitude, longitude, latitude), -1)
