@@ -204,8 +204,8 @@ class CheckedModel(BaseModel):
             raise ValueError(self._message(error)) from None
 
     def replace(self, **values: Any) -> Self:
-        """Return a copy with other values, validated again."""
-        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | values)
+        """Return a copy with other values, validated again; what was not given keeps its default."""
+        return type(self)(**{name: getattr(self, name) for name in self.model_fields_set} | values)
 
     @classmethod
     def _message(cls, error: ValidationError) -> str:

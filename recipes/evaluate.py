@@ -147,8 +147,8 @@ def settle(config: Config) -> tuple[Config, list[str]]:
     if config.tasks != "figure-4-1":  # which lies in the paper's region
         path, places = agreed(runs, "scenario", config.scenario, None)
     own = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
-    zeta, thresholds = agreed(every, "zeta", own.zeta, 0.01)
-    heading, headings = agreed(runs, "start_heading", own.start_heading, "north")
+    zeta, thresholds = agreed(every, "zeta", own.given("zeta"), 0.01)
+    heading, headings = agreed(runs, "start_heading", own.given("start_heading"), "north")
     noise, noisy = NO_NOISE, list[str]()
     if not config.conditions:
         noise, noisy = agreed(runs, "noise", config.noise, NO_NOISE)
@@ -189,7 +189,7 @@ def prepare(config: Config) -> tuple[Config, list[EnvBase], list[Pair], list[str
 def make_fleet(config: Config, scenarios: Sequence[Scenario]) -> tuple[list[EnvBase], list[Pair]]:
     """Return the environment of each scenario with its errors, and each navigator for all of them."""
     conditions = conditions_named(config.conditions or "laboratory")
-    drift_km = conditions.drift_km(scenarios[0].max_move_km or 50.0)
+    drift_km = conditions.drift_km(scenarios[0].max_move_km)
     bases = [
         GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), drift_km=drift_km, seed=config.seed)
         for scenario in scenarios

@@ -145,7 +145,7 @@ def make_collection(
 def make_base(run: Run, config: Config) -> GeomagneticNavEnv:
     """Return the environment of training: nearer destinations and shorter episodes than in the evaluations."""
     distances = (config.shortest_task_km, run.scenario.distance_range_km[1])
-    near = run.scenario.with_tasks(None).replace(distance_range_km=distances, max_steps=None)
+    near = run.scenario.with_tasks(None).replace(distance_range_km=distances)
     options = {"zeta": config.zeta, "max_steps": config.train_steps, "seed": config.seed, "device": config.device}
     return GeomagneticNavEnv(near, num_envs=config.num_envs, **options)
 

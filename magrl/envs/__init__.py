@@ -2,11 +2,10 @@
 
 from magrl.envs.geomagnetic import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.envs.random_regions import earth_scenario, planet_scenario
-from magrl.envs.region import PAPER_REGION, Region
-from magrl.envs.regions import Regions
+from magrl.envs.regions import PAPER_REGION, Region, Regions
 from magrl.envs.scenario import Scenario
 from magrl.envs.scenario_files import load_scenario
-from magrl.envs.tasks import TASK_SETS, RegionTasks, Tasks, named_tasks, task_set
+from magrl.envs.tasks import TASK_SETS, Tasks, named_tasks, task_set
 
 __all__ = [
     "PAPER_REGION",
@@ -15,7 +14,6 @@ __all__ = [
     "TASK_SETS",
     "GeomagneticNavEnv",
     "Region",
-    "RegionTasks",
     "Regions",
     "Scenario",
     "Tasks",

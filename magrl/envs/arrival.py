@@ -2,64 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch import Tensor
 
-from magrl.checks import check_number
-from magrl.envs.measures import check_zeta
 from magrl.geodesy import geodesic
 
-ARRIVALS = ("objective", "distance", "declared")
-"""Rules by name."""
 
-
-@dataclass(frozen=True)
-class Arrival:
-    """When an episode ends at a destination, and whether that is a success.
-
-    By ``"objective"``, an episode ends where the objective F is below ``zeta``, which is a success. By ``"distance"``,
-    it ends within ``radius_km`` of the destination, which is a success. By ``"declared"``, the action has a third
-    number, and an episode ends with a move of which it is above 0: the vehicle declares that it has arrived. That is a
-    success within ``radius_km`` of the destination, and a false arrival elsewhere.
+class Arrival(NamedTuple):
+    """When an episode ends at a destination, and whether that is a success; see ``Scenario.arrival``.
 
     Args:
-        rule: ``"objective"``, ``"distance"`` or ``"declared"``.
+        rule: ``"objective"``: an episode ends where the objective F is below ``zeta``, which is a success.
+            ``"distance"``: it ends within ``radius_km`` of the destination, which is a success. ``"declared"``: it ends
+            with a move whose third number is above 0, by which the vehicle declares that it has arrived. That is a
+            success within ``radius_km`` of the destination, and a false arrival elsewhere.
         zeta: arrival threshold on the objective.
         radius_km: largest distance from the destination of an arrival, or of a right declaration [km].
 
-    Raises:
-        ValueError: for another rule, or a number out of its range.
-
     Example:
-        >>> Arrival("declared", zeta=0.01, radius_km=25.0).low
-        (-1.0,)
+        >>> Arrival("declared", zeta=0.01, radius_km=25.0).declared
+        True
     """
 
     rule: str
     zeta: float
     radius_km: float
 
-    def __post_init__(self) -> None:
-        if self.rule not in ARRIVALS:
-            raise ValueError(f"arrival must be one of {', '.join(map(repr, ARRIVALS))}, got {self.rule!r}")
-        check_zeta(self.zeta)
-        check_number(0, above=True, arrival_radius_km=self.radius_km)
-
     @property
     def declared(self) -> bool:
         """Whether the vehicle declares its arrival."""
         return self.rule == "declared"
-
-    @property
-    def low(self) -> tuple[float, ...]:
-        """Lowest values of what the action has beside distance and turn."""
-        return (-1.0,) if self.declared else ()
-
-    @property
-    def high(self) -> tuple[float, ...]:
-        """Highest values of what the action has beside distance and turn."""
-        return (1.0,) if self.declared else ()
 
     def __call__(self, action: Tensor, objective: Tensor, place: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Return whether episodes end with an arrival, and whether an arrival is right there.

@@ -8,6 +8,8 @@ and the number of the episode that each vehicle is in.
 from __future__ import annotations
 
 import copy
+import inspect
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,12 +22,11 @@ from torchrl.envs import EnvBase
 from magrl import guidance
 from magrl.checks import check_number, check_type
 from magrl.envs import specs
-from magrl.envs.episodes import episode_options
-from magrl.envs.region import Region
-from magrl.envs.regions import Regions
-from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array, track_recorder
+from magrl.envs.arrival import Arrival
+from magrl.envs.regions import Regions, one_region
+from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
 from magrl.envs.scenario import Scenario
-from magrl.envs.tasks import RegionTasks, Tasks, random_headings, sample_tasks
+from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, move, polar, wrap_angle
 from magrl.transforms.errors.motion import DISPLACEMENT
@@ -33,8 +34,16 @@ from magrl.transforms.views import ObservationView
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")
 """Keys that every policy may read, beside ``step_count``."""
-PRIVILEGED_KEYS = ("position", "target_position", "start_position", "objective", "objective_weights", "success")
-"""Keys that a policy may not read if it navigates by the field alone; nor ``region``, where there are many."""
+PRIVILEGED_KEYS = (
+    "position",
+    "target_position",
+    "start_position",
+    "objective",
+    "objective_weights",
+    "success",
+    "region",
+)
+"""Keys that a policy may not read if it navigates by the field alone."""
 
 
 class GeomagneticNavEnv(EnvBase):
@@ -43,113 +52,107 @@ class GeomagneticNavEnv(EnvBase):
     Each vehicle measures D, I, B_H; it knows those of its destination, its heading from true north and its last move.
     It chooses how far to turn and then how far to go. It has arrived when the objective F (Eq. 2-6) is below ``zeta``.
     A vehicle that leaves the region by more than the scenario's margin is lost: the episode ends as a failure. Where
-    the scenario has many regions, each episode draws its own.
+    the scenario has several regions, each episode draws its own.
 
     Args:
-        scenario: region, field, distances and frozen tasks; by default the paper's. Where it has tasks, vehicle i flies
-            task ``i + k * num_envs`` in episode k, counted around the set.
+        scenario: region, field, tasks, and rules of an episode; by default the paper's. Where it has frozen tasks,
+            vehicle i flies task ``i + k * num_envs`` in episode k, counted around the set.
         num_envs: number of vehicles in the batch.
-        max_steps: moves after which an episode is truncated; by default that of the scenario, or 50.
-        max_move_km: longest move [km]; by default that of the scenario, or 50. Likewise the options with a value below:
         drift_km: how much farther than its command a :class:`~magrl.transforms.MotionError` may carry a vehicle [km].
             Above 0, the key ``displacement`` ``(N, 2)`` holds what such an error adds to a move, northward and eastward
             [km].
-        max_turn_rad: largest turn to either side before a move [rad], pi / 2.
-        zeta: arrival threshold on the objective, below 3, its largest value at the start; 0.01.
-        arrival: ``"objective"`` for the paper's rule; ``"distance"`` for arrival within ``arrival_radius_km``; or
-            ``"declared"``: the action has a third number, in [-1, 1], and above 0 the vehicle declares that it has
-            arrived with this move, which ends the episode.
-        arrival_radius_km: distance from the destination of an arrival, or of a right declaration [km], 25.
-        start_heading: ``"north"``, the default, or ``"random"`` for a uniform heading.
         destination_weight: reward at arrival, zeta_1.
         proximity_weight: reward per unit of the objective, zeta_2.
         objective_limit: upper bound on the objective in that reward; None, as in the paper.
         render_mode: ``"rgb_array"`` to keep the tracks that :meth:`render` draws, or None.
         seed: seed of tasks and start headings; random if None.
         device: device of the batch.
+        **changes: fields of :class:`Scenario` that replace those of the scenario, such as ``max_steps``,
+            ``max_move_km``, ``max_turn_deg``, ``zeta``, ``arrival``, ``arrival_radius_km`` or ``start_heading``.
 
     Raises:
+        TypeError: for an unknown option, with the list of options.
         ValueError: for an option out of its range, naming it and its value.
 
     Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
     move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
     ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
-    ``objective_weights`` ``(N, 3)``, and over many regions their index ``region`` ``(N, 1)``. Action ``(N, 2)``:
-    distance [km], turn [rad]. Rewards ``(N, 1)``: ``reward``, and its terms ``reward_destination`` and
-    ``reward_proximity``.
+    ``objective_weights`` ``(N, 3)``, and the index of the region, ``region`` ``(N, 1)``. Action ``(N, 2)``: distance
+    [km], turn [rad]. Rewards ``(N, 1)``: ``reward``, and its terms ``reward_destination`` and ``reward_proximity``.
 
     Example:
-        >>> env = GeomagneticNavEnv(num_envs=4, seed=0)
+        >>> env = GeomagneticNavEnv(num_envs=4, seed=0, max_steps=80)
         >>> env.rollout(3)["next", "field"].shape
         torch.Size([4, 3, 3])
     """
 
     batch_locked = True
+    action_low: Tensor
+    action_high: Tensor
+    objective_floors: Tensor
+    vehicle: Tensor
     episode: Tensor
-    field: Any  # a field model, or over many regions a bank
-    region: Any  # a Region, or many as Regions
-    edge: Any  # the same with its margin
+    field: Any  # a field model, or a bank of them
 
     def __init__(
         self,
         scenario: Scenario | None = None,
         *,
         num_envs: int = 1,
-        max_steps: int | None = None,
-        max_move_km: float | None = None,
         drift_km: float = 0.0,
-        max_turn_rad: float | None = None,
-        zeta: float | None = None,
-        arrival: str | None = None,
-        arrival_radius_km: float | None = None,
-        start_heading: str | None = None,
         destination_weight: float = 200.0,
         proximity_weight: float = 10.0,
         objective_limit: float | None = None,
         render_mode: str | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
+        **changes: Any,
     ) -> None:
         scenario = Scenario() if scenario is None else scenario
         check_type(Scenario, scenario=scenario)
         check_number(1, whole=True, num_envs=num_envs)
-        check_number(0, 2**64 - 1, whole=True, seed=0 if seed is None else seed)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
-        check_number(0, above=True, objective_limit=1.0 if objective_limit is None else objective_limit)
-        given = {"max_steps": max_steps, "max_move_km": max_move_km, "max_turn_rad": max_turn_rad, "zeta": zeta}
-        rules = {"arrival": arrival, "arrival_radius_km": arrival_radius_km, "start_heading": start_heading}
-        options = episode_options(scenario, **given, **rules)
-        tracks = track_recorder(render_mode, scenario.region, options.max_steps + 1)
+        if objective_limit is not None:
+            check_number(0, above=True, objective_limit=objective_limit)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        if unknown := sorted(changes.keys() - Scenario.model_fields.keys()):
+            # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
+            raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {option_names()}")
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
-        self.num_envs, self.max_steps, self.drift_km = num_envs, options.max_steps, float(drift_km)
-        self.max_move_km, self.max_turn_rad = options.max_move_km, options.max_turn_rad
-        self.arrival, self.zeta = options.arrival, float(options.arrival.zeta)
-        self.start_heading, self.render_mode, self._tracks = options.start_heading, render_mode, tracks
+        self.num_envs, self.drift_km, self.objective_limit = num_envs, float(drift_km), objective_limit
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
-        self.objective_limit = objective_limit
-        self._place(scenario)
-        self.register_buffer("action_low", self._float64((0.0, -self.max_turn_rad, *self.arrival.low)))
-        self.register_buffer("action_high", self._float64((self.max_move_km, self.max_turn_rad, *self.arrival.high)))
+        self._place(scenario.replace(**changes))
+        self.render_mode, self._tracks = render_mode, None
+        if render_mode:
+            one_region(self.region)
+            self._tracks = TrackRecorder(self.max_steps + 1)
         self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
         self._make_specs(self.edge.reachable(self.max_move_km + self.drift_km))
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
     def _place(self, scenario: Scenario) -> None:
-        """Build what the scenario describes, on the device of the batch."""
-        self.scenario, self.many, tasks = scenario, isinstance(scenario.region, Regions), scenario.tasks
-        self.region, self.edge = scenario.region, scenario.edge
-        if self.many:  # tensors, which move to the device; those of the scenario stay where they are
-            self.region, self.edge = (copy.deepcopy(boxes).to(self.device) for boxes in (self.region, self.edge))
-        self.tasks = None if tasks is None else type(tasks)(*(values.to(self.device) for values in tasks))
-        field = scenario.build_field(self.max_move_km + self.drift_km)
+        """Keep the rules of a scenario, and its regions, tasks and field on the device of the batch."""
+        self.scenario = scenario
+        self.max_steps, self.max_move_km = scenario.max_steps, float(scenario.max_move_km)
+        self.max_turn_rad = math.radians(scenario.max_turn_deg)
+        self.arrival = Arrival(scenario.arrival, float(scenario.zeta), float(scenario.arrival_radius_km))
+        self.zeta, self.start_heading = self.arrival.zeta, scenario.start_heading
+        declare = [1.0] if self.arrival.declared else []
+        self.register_buffer("action_low", self._float64(0.0, -self.max_turn_rad, *(-x for x in declare)))
+        self.register_buffer("action_high", self._float64(self.max_move_km, self.max_turn_rad, *declare))
+        # Modules of the scenario stay where they are.
+        self.region, self.edge = copy.deepcopy(scenario.region).to(self.device), scenario.edge.to(self.device)
+        self.tasks = scenario.tasks and Tasks(*(values.to(self.device) for values in scenario.tasks))
+        field = scenario.build_field(self.drift_km)
         self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
         self.field = field
-        if isinstance(field, torch.nn.Module):  # that of the scenario stays where it is
+        if isinstance(field, torch.nn.Module):
             held = (*field.parameters(), *field.buffers())
             self.field = copy.deepcopy(field).to(self.device) if any(x.device != self.device for x in held) else field
 
-    def _float64(self, values: Sequence[float]) -> Tensor:
+    def _float64(self, *values: float) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
 
     def observation_view(self, *, observe_heading: bool = True, observe_difference: bool = True) -> ObservationView:
@@ -160,18 +163,14 @@ class GeomagneticNavEnv(EnvBase):
             observe_difference: whether target elements minus measured elements are observed.
 
         Raises:
-            ValueError: over many regions, which have no range in common.
+            ValueError: over several regions, which have no range in common.
 
         Example:
             >>> GeomagneticNavEnv(seed=0).observation_view().size
             13
         """
-        if self.many:
-            raise ValueError(
-                f"the observation view is scaled to the field of one region, this environment has {len(self.region)}: "
-                "give it a scenario with one region, or an agent that needs no map"
-            )
-        low, high = elements_range(self.field, self.region.grid(81).to(self.device))
+        one_region(self.region)
+        low, high = elements_range(self.field, self.region.grid(81))
         return ObservationView(
             observe_heading=observe_heading,
             observe_difference=observe_difference,
@@ -183,13 +182,10 @@ class GeomagneticNavEnv(EnvBase):
 
     # Specs
 
-    def _make_specs(self, box: Region | Regions) -> None:
-        bounds = specs.field_bounds(self.field, box, self.device)
-        many = len(self.region) if self.many else None
-        limits = self.max_move_km, self.max_turn_rad
-        declared, drift = self.arrival.declared, self.drift_km
-        observation = specs.observation_spec(self.num_envs, bounds, *limits, many, declared, drift)
-        self.observation_spec = observation.to(self.device)
+    def _make_specs(self, boxes: Regions) -> None:
+        bounds = specs.field_bounds(self.field, boxes)
+        options = self.max_move_km, self.max_turn_rad, len(self.region), self.arrival.declared, self.drift_km
+        self.observation_spec = specs.observation_spec(self.num_envs, bounds, *options).to(self.device)
         self.state_spec = specs.state_spec(self.observation_spec)
         self.action_spec = specs.bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
         self.full_reward_spec = specs.reward_spec(self.num_envs).to(self.device)
@@ -197,9 +193,8 @@ class GeomagneticNavEnv(EnvBase):
 
     # Reset
 
-    def _set_seed(self, seed: int | None) -> None:
+    def _set_seed(self, seed: Any) -> None:
         check_number(0, 2**64 - 1, whole=True, seed=seed)
-        assert seed is not None  # check_number raised above
         self.seed = int(seed)
         self.episode = torch.zeros_like(self.episode)
 
@@ -223,12 +218,11 @@ class GeomagneticNavEnv(EnvBase):
     def _start_of(self, vehicle: Tensor) -> TensorDict:
         """Return the first observation of the next episode of some vehicles, ``(P,)``."""
         episode = self.episode[vehicle]
-        start, target, *index = self._tasks(vehicle, episode)
-        field, target_field = elements_at(self.field, torch.stack((start, target)), *index)
+        start, target, region = self._tasks(vehicle, episode)
+        field, target_field = elements_at(self.field, torch.stack((start, target)), region)
         # Rounded as the vehicle observes it: a move of length 0 must not change the objective.
         field, target_field = field.float().double(), target_field.float().double()
-        floors = self.objective_floors[index[0]] if index else self.objective_floors
-        weights = guidance.objective_weights(field, target_field, floors).float().double()
+        weights = guidance.objective_weights(field, target_field, self.objective_floors[region]).float().double()
         zeros = field.new_zeros(len(vehicle), 2)
         flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         return TensorDict(
@@ -244,8 +238,8 @@ class GeomagneticNavEnv(EnvBase):
                 "objective": guidance.objective(field, target_field, weights).float(),
                 "objective_weights": weights.float(),
                 "success": flags["done"].clone(),
+                "region": region.unsqueeze(-1),
                 **flags,
-                **({specs.REGION: index[0].unsqueeze(-1)} if index else {}),
                 **({specs.DECLARED: flags["done"].clone()} if self.arrival.declared else {}),
                 **({DISPLACEMENT: zeros} if self.drift_km else {}),
             },
@@ -253,12 +247,12 @@ class GeomagneticNavEnv(EnvBase):
             device=self.device,
         )
 
-    def _tasks(self, vehicle: Tensor, episode: Tensor) -> Tasks | RegionTasks:
+    def _tasks(self, vehicle: Tensor, episode: Tensor) -> Tasks:
         if self.tasks is None:
             distances, law = self.scenario.distance_range_km, self.scenario.distance_law
             return sample_tasks(self.region, distances, self.seed, vehicle, episode, law)
         rows = (vehicle + episode * self.num_envs) % len(self.tasks.start)
-        return type(self.tasks)(*(values.to(self.device)[rows] for values in self.tasks))  # the batch may have moved
+        return Tasks(*(values.to(self.device)[rows] for values in self.tasks))  # the batch may have moved
 
     def _start_heading(self, vehicle: Tensor, episode: Tensor) -> Tensor:
         if self.start_heading == "north":
@@ -272,16 +266,16 @@ class GeomagneticNavEnv(EnvBase):
         distance, turn = action[:, :2].unbind(-1)
         before = tensordict["position"]
         heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
-        index = (tensordict[specs.REGION].squeeze(-1),) if self.many else ()
+        region = tensordict["region"].squeeze(-1)
         course = heading
         if self.drift_km:
             distance, course = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
         moved = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
-        was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), *index).unbind(0)
+        was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), region).unbind(0)
         position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
         lost = ~(was_inside & is_inside)
 
-        field = elements_at(self.field, position, *index).float().double()
+        field = elements_at(self.field, position, region).float().double()
         weights = tensordict["objective_weights"].double()
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
         ended, right = self.arrival(action, objective, position, tensordict["target_position"])
@@ -295,16 +289,13 @@ class GeomagneticNavEnv(EnvBase):
         destination = guidance.destination_reward(arrived, self.destination_weight)
         after = TensorDict(
             {
+                **{key: tensordict[key] for key in (*specs.CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
                 "field": field.float(),
-                "target_field": tensordict["target_field"],
                 "move": action[:, :2].float(),
                 "heading": heading.float().unsqueeze(-1),
                 "step_count": step,
                 "position": position,
-                "target_position": tensordict["target_position"],
-                "start_position": tensordict["start_position"],
                 "objective": objective.float(),
-                "objective_weights": tensordict["objective_weights"],
                 "success": arrived,
                 "reward": (destination + proximity).float(),
                 "reward_destination": destination.float(),
@@ -312,9 +303,7 @@ class GeomagneticNavEnv(EnvBase):
                 "done": terminated | truncated,
                 "terminated": terminated,
                 "truncated": truncated,
-                **({specs.REGION: tensordict[specs.REGION]} if index else {}),
                 **({specs.DECLARED: ended} if self.arrival.declared else {}),
-                **({DISPLACEMENT: tensordict[DISPLACEMENT]} if self.drift_km else {}),
             },
             batch_size=tensordict.batch_size,
             device=self.device,
@@ -357,3 +346,14 @@ class GeomagneticNavEnv(EnvBase):
         if self._tracks is None:
             raise RuntimeError("no track is kept: create the environment with render_mode='rgb_array'")
         return self._tracks
+
+
+def option_names() -> list[str]:
+    """Return the names of all options of :class:`GeomagneticNavEnv`, those of its scenario included.
+
+    Example:
+        >>> "seed" in option_names(), "max_steps" in option_names()
+        (True, True)
+    """
+    own = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "changes"}
+    return sorted(own | Scenario.model_fields.keys())

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from magrl.checks import check_number, check_tensor, check_type
+from magrl.envs.regions import Regions
 from magrl.field import elements_at, elements_gradient_at
 from magrl.geodesy import geodesic, move
 from magrl.guidance import objective
@@ -124,7 +125,7 @@ def path_measures(success: Tensor, start: Tensor, end: Tensor, target: Tensor, l
 
 
 def distance_to_arrival(
-    start: Tensor, target: Tensor, weights: Tensor, field: Any, zeta: float, box: Any, region: Tensor | None = None
+    start: Tensor, target: Tensor, weights: Tensor, field: Any, zeta: float, boxes: Regions, region: Tensor
 ) -> Tensor:
     """Return the distance from each start to the nearest place where a vehicle has arrived.
 
@@ -138,10 +139,10 @@ def distance_to_arrival(
         start: ``(N, 2)`` latitude, longitude [deg].
         target: ``(N, 2)`` destination [deg].
         weights: ``(N, 3)`` of the objective, from :func:`magrl.guidance.objective_weights` at the start.
-        field: field model, or over many regions a bank of them.
+        field: field model, or a bank of them.
         zeta: arrival threshold on the objective.
-        box: places where a vehicle is not lost, a region or many.
-        region: ``(N,)`` int64, the region of each task where there are many.
+        boxes: places where a vehicle is not lost, in each region.
+        region: ``(N,)`` int64, the region of each task.
 
     Returns:
         ``(N,)`` [km]: 0 where the start itself is such a place, or is the destination.
@@ -154,14 +155,14 @@ def distance_to_arrival(
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
         >>> state = env.reset()
         >>> start, target, weights = (state[key] for key in ("start_position", "target_position", "objective_weights"))
-        >>> near_km = distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge)
+        >>> near_km = distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, state["region"][:, 0])
         >>> far_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
         >>> (far_km - near_km).round()
         tensor([23., 32.], dtype=torch.float64)
     """
     check_tensor(2, start=start, target=target)
     check_tensor(3, weights=weights)
-    arrival = _ArrivalSet(target, weights, field, check_zeta(zeta), box, region)
+    arrival = _ArrivalSet(target, weights, field, check_zeta(zeta), boxes, region)
     farthest_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
     ellipse = arrival.ellipse(farthest_km)
     best_km, best, width = farthest_km, torch.zeros_like(farthest_km), math.pi
@@ -178,24 +179,24 @@ class _ArrivalSet:
     """The places where the vehicles of ``N`` tasks have arrived."""
 
     def __init__(
-        self, target: Tensor, weights: Tensor, field: Any, zeta: float, box: Any, region: Tensor | None
+        self, target: Tensor, weights: Tensor, field: Any, zeta: float, boxes: Regions, region: Tensor
     ) -> None:
-        self.target, self.weights, self.field, self.zeta, self.box = target.double(), weights.double(), field, zeta, box
-        self.region = () if region is None else (region.unsqueeze(-1),)
-        self.target_field = elements_at(field, self.target.unsqueeze(-2), *self.region)
+        self.target, self.weights, self.field, self.zeta = target.double(), weights.double(), field, zeta
+        self.boxes, self.region = boxes, region.unsqueeze(-1)
+        self.target_field = elements_at(field, self.target.unsqueeze(-2), self.region)
 
     def holds(self, position: Tensor) -> Tensor:
         """Return whether positions ``(N, K, 2)`` belong to the set: ``(N, K)``; False where there is no field."""
-        values = elements_at(self.field, position, *self.region)
+        values = elements_at(self.field, position, self.region)
         arrived = objective(values, self.target_field, self.weights.unsqueeze(-2)) < self.zeta
-        return arrived.logical_and(self.box.contains(position, *self.region)).squeeze(-1)
+        return arrived.logical_and(self.boxes.contains(position, self.region)).squeeze(-1)
 
     def ellipse(self, longest_km: Tensor) -> Tensor:
         """Return ``(N, 2, 2)`` [km]: maps the unit circle to the edge where the field is linear, north and east.
 
         Axes along which the field hardly changes are cut at ``longest_km``, ``(N,)``.
         """
-        gradient = elements_gradient_at(self.field, self.target.unsqueeze(-2), *self.region).squeeze(-3)
+        gradient = elements_gradient_at(self.field, self.target.unsqueeze(-2), self.region).squeeze(-3)
         curvature, axes = torch.linalg.eigh(gradient.mT @ (self.weights.unsqueeze(-1) * gradient))
         return axes * (self.zeta / curvature.clamp_min(1e-300)).sqrt().minimum(longest_km.unsqueeze(-1)).unsqueeze(-2)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -40,9 +41,8 @@ def planet_scenario(count: int, seed: int, **options: Any) -> Scenario:
         torch.Size([3, 1])
     """
     check_number(1, whole=True, count=count)
-    check_number(0, 2**63 - 1, whole=True, seed=seed)
     planets = random_planets(-(-count // REGIONS_PER_PLANET), seed)
-    return region_scenario(planets, torch.arange(count) // REGIONS_PER_PLANET, seed, **options)
+    return region_scenario(planets, count, seed, **options)
 
 
 def earth_scenario(
@@ -69,19 +69,15 @@ def earth_scenario(
         >>> tasks.start.shape, tasks.region.shape
         (torch.Size([20, 2]), torch.Size([20]))
     """
-    check_number(1, whole=True, count=count)
-    check_number(0, 2**63 - 1, whole=True, seed=seed)
     check_type(bool, crust=crust)
-    if crust:
-        options = {"degree": 52, **options}
-    earth = (wmmhr_coefficients(date) if crust else igrf_coefficients(date, generation)).unsqueeze(0)
-    scenario = region_scenario(earth, torch.zeros(count, dtype=torch.int64), seed, **options)
+    earth = wmmhr_coefficients(date) if crust else igrf_coefficients(date, generation)
+    scenario = region_scenario(earth.unsqueeze(0), count, seed, **({"degree": 52} if crust else {}) | options)
     return scenario.replace(date=parse_date(date), generation=generation)
 
 
 def region_scenario(
     gauss: Tensor,
-    planet_index: Tensor,
+    count: int,
     seed: int,
     *,
     half_size_deg: float = 10.0,
@@ -101,7 +97,7 @@ def region_scenario(
 
     Args:
         gauss: complex ``(P, N + 1, N + 1)`` tables ``g - i h`` [nT].
-        planet_index: ``(K,)`` int64, the planet of each region.
+        count: number of regions, two on each planet, or all on the only one.
         seed: random seed of the places.
         half_size_deg: half of the height of a region [degrees of arc].
         max_latitude: latitude that no region crosses, north or south [deg].
@@ -121,22 +117,30 @@ def region_scenario(
             field by more than the tolerance, or distances that a region cannot hold; naming it.
 
     Example:
-        >>> far = region_scenario(random_planets(1, seed=0), torch.zeros(2, dtype=torch.int64), seed=0,
+        >>> far = region_scenario(random_planets(1, seed=0), count=2, seed=0,
         ...                       half_size_deg=20, degree=16, distance_range_km=(150, 1800), distance_law="log")
         >>> len(far.region)
         2
     """
+    check_number(1, whole=True, count=count)
+    check_number(0, 2**63 - 1, whole=True, seed=seed)
     check_number(0, 90, above=True, max_latitude=max_latitude)
     check_number(0, max_latitude, above=True, half_size_deg=half_size_deg)
     check_number(0, min_intensity_nt=min_intensity_nt, margin_deg=margin_deg, max_move_km=max_move_km)
-    region = _placed_regions(
-        gauss, planet_index, seed, (half_size_deg, max_latitude), min_intensity_nt, (margin_deg, max_move_km), degree
-    )
-    box = region.expanded(margin_deg).reachable(max_move_km)
-    bank = FieldBank.build(gauss, planet_index, box.latitude, box.longitude, degree=degree, tolerance_nt=tolerance_nt)
+    planet = torch.arange(count) // REGIONS_PER_PLANET % len(gauss)
+
+    def draw(number: Tensor, attempt: int) -> Regions:
+        return _drawn_regions(seed, number, attempt, half_size_deg, max_latitude)
+
+    def expand(regions: Regions, planet: Tensor, tolerance_nt: float) -> tuple[Regions, FieldBank]:
+        boxes = regions.expanded(margin_deg).reachable(max_move_km)
+        edges = boxes.latitude, boxes.longitude
+        return boxes, FieldBank.build(gauss, planet, *edges, degree=degree, tolerance_nt=tolerance_nt)
+
+    regions = _placed_regions(draw, expand, planet, min_intensity_nt)
     return Scenario(
-        region=region,
-        field=bank,
+        region=regions,
+        field=expand(regions, planet, tolerance_nt)[1],
         margin_deg=margin_deg,
         objective_floors=None,
         distance_range_km=distance_range_km,
@@ -145,33 +149,26 @@ def region_scenario(
 
 
 def _placed_regions(
-    gauss: Tensor,
-    planet_index: Tensor,
-    seed: int,
-    size: tuple[float, float],
+    draw: Callable[[Tensor, int], Regions],
+    expand: Callable[[Regions, Tensor, float], tuple[Regions, FieldBank]],
+    planet: Tensor,
     min_intensity_nt: float,
-    around: tuple[float, float],
-    degree: int,
 ) -> Regions:
-    """Draw a place for each region until it meets the conditions; ``around`` are the margin and the longest move."""
-    edges = torch.empty(len(planet_index), 4, dtype=torch.float64)
-    waiting = torch.arange(len(planet_index))
+    """Draw a place for each region until it meets the conditions."""
+    edges, waiting = torch.empty(len(planet), 4, dtype=torch.float64), torch.arange(len(planet))
     for attempt in range(MAX_TRIES):
-        drawn = _drawn_regions(seed, waiting, attempt, *size)
-        box = drawn.expanded(around[0]).reachable(around[1])
-        planets, count = gauss[planet_index[waiting]], torch.arange(len(waiting))
-        bank = FieldBank.build(planets, count, box.latitude, box.longitude, degree=degree, tolerance_nt=_ANY_ERROR)
-        declination = region_elements(bank, box)[..., 0]
-        strong = region_elements(bank, drawn)[..., 2].amin(1) >= min_intensity_nt
+        regions = draw(waiting, attempt)
+        boxes, bank = expand(regions, planet[waiting], _ANY_ERROR)
+        declination = region_elements(bank, boxes, points=11)[..., 0]
+        strong = region_elements(bank, regions, points=11)[..., 2].amin(1) >= min_intensity_nt
         good = strong & (declination.amax(1) - declination.amin(1) <= 180)
-        edges[waiting[good]] = torch.cat((drawn.latitude, drawn.longitude), -1)[good]
+        edges[waiting[good]] = torch.cat((regions.latitude, regions.longitude), -1)[good]
         waiting = waiting[~good]
         if not len(waiting):
             return Regions(edges[:, :2], edges[:, 2:])
     raise ValueError(
-        f"no place was found in {MAX_TRIES} tries for region {int(waiting[0])} on planet "
-        f"{int(planet_index[waiting[0]])} with half_size_deg {size[0]:g}, max_latitude {size[1]:g}, min_intensity_nt "
-        f"{min_intensity_nt:g} and margin_deg {around[0]:g}: take smaller regions or a lower limit of the intensity"
+        f"no place was found in {MAX_TRIES} tries for region {int(waiting[0])} on planet {int(planet[waiting[0]])} "
+        f"with min_intensity_nt {min_intensity_nt:g}: take smaller regions or a lower limit of the intensity"
     )
 
 

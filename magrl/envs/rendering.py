@@ -15,9 +15,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor, check_type
-from magrl.envs.region import Region
-from magrl.envs.regions import Regions
+from magrl.checks import check_number, check_tensor
+from magrl.envs.regions import Region, Regions, one_region
 from magrl.field.elements import NAMES, UNITS
 from magrl.field.model import FieldModel, elements_at
 
@@ -59,7 +58,7 @@ def rgb_array(draw: Callable[..., None], size_px: int, *args: Any) -> np.ndarray
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def contour_lines(axes: Axes, field: FieldModel, region: Region) -> dict[str, ContourSet]:
+def contour_lines(axes: Axes, field: FieldModel, region: Region | Regions) -> dict[str, ContourSet]:
     """Draw lines of equal D (isogonics), I (isoclines) and B_H (isodynamics) over a region, without labels.
 
     Args:
@@ -76,8 +75,7 @@ def contour_lines(axes: Axes, field: FieldModel, region: Region) -> dict[str, Co
         >>> list(contour_lines(Figure().subplots(), IGRF("2022-01-01"), Region((-10, 0), (160, 170))))
         ['D', 'I', 'B_H']
     """
-    check_type(Region, region=region)
-    grid = region.grid(61)
+    grid = Regions.of(one_region(region)).grid(61)[0]
     values = elements_at(field, grid.to(_device(field))).cpu().numpy()
     longitude, latitude = grid[0, :, 1].numpy(), grid[:, 0, 0].numpy()
     contours: dict[str, ContourSet] = {}
@@ -110,7 +108,9 @@ def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
     axes.set_aspect(1 / np.cos(np.radians(sum(region.latitude) / 2)))
 
 
-def draw_tracks(axes: Axes, field: FieldModel, region: Region, paths: Sequence[Tensor], targets: Tensor) -> None:
+def draw_tracks(
+    axes: Axes, field: FieldModel, region: Region | Regions, paths: Sequence[Tensor], targets: Tensor
+) -> None:
     """Draw episodes over the field's contours, each from its start (square) to its target (triangle).
 
     Args:
@@ -132,7 +132,7 @@ def draw_tracks(axes: Axes, field: FieldModel, region: Region, paths: Sequence[T
         >>> axes.get_xlabel()
         'longitude [° E]'
     """
-    check_type(Region, region=region)
+    region = one_region(region)
     check_tensor(2, targets=targets)
     if not len(paths) or targets.shape != (len(paths), 2):
         raise ValueError(f"there must be one target for each path, got {len(paths)} and {tuple(targets.shape)}")
@@ -150,28 +150,6 @@ def draw_tracks(axes: Axes, field: FieldModel, region: Region, paths: Sequence[T
 def _device(field: FieldModel) -> torch.device:
     buffers = field.buffers() if isinstance(field, torch.nn.Module) else iter(())
     return next((b.device for b in buffers), torch.device("cpu"))
-
-
-def track_recorder(render_mode: str | None, region: Region | Regions, length: int) -> TrackRecorder | None:
-    """Return what keeps the tracks for rendering, or None without a render mode.
-
-    Args:
-        render_mode: ``"rgb_array"`` or None.
-        region: region of the scenario.
-        length: states kept.
-
-    Raises:
-        ValueError: for another render mode, or many regions, which are no one map.
-
-    Example:
-        >>> track_recorder(None, Region((-10, 0), (160, 170)), 51) is None
-        True
-    """
-    if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-    if render_mode and isinstance(region, Regions):
-        raise ValueError(f"render_mode {render_mode!r} draws one region, the scenario has {len(region)}: take None")
-    return TrackRecorder(length) if render_mode else None
 
 
 class TrackRecorder:

@@ -11,13 +11,11 @@ from torch import Tensor
 from typing_extensions import Self
 
 from magrl import guidance, paper
-from magrl.checks import CheckedModel, short
+from magrl.checks import CheckedModel, check_number, check_numbers, short
 from magrl.envs.measures import check_zeta
-from magrl.envs.region import PAPER_REGION, Region
-from magrl.envs.regions import Regions
+from magrl.envs.regions import PAPER_REGION, Region, Regions
 from magrl.envs.specs import field_bounds
-from magrl.envs.task_checks import check_tasks, numbers_validator
-from magrl.envs.tasks import RegionTasks, Tasks, check_distance_range, task_set
+from magrl.envs.tasks import Tasks, check_distance_range, check_tasks, task_set
 from magrl.field import (
     IGRF,
     Date,
@@ -33,43 +31,49 @@ FLOOR_KM = 25.0
 """Distance of travel whose mean change of each element is the default floor of Eq. 2-6 away from the paper's box."""
 
 
-def _tuple(value: object) -> object:
+def numbers_validator(name: str, count: int) -> BeforeValidator:
+    """Return a pydantic validator that turns ``count`` finite numbers into a tuple of floats.
+
+    Example:
+        >>> numbers_validator("start", 2).func([40, -30])
+        (40.0, -30.0)
+    """
+
+    def check(value: Any) -> tuple[float, ...] | None:
+        if value is None:
+            return None
+        check_numbers(count, **{name: value})
+        return tuple(float(number) for number in value)
+
+    return BeforeValidator(check)
+
+
+def _tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
 def _region(value: object) -> object:
-    if isinstance(value, (Region, Regions)):
-        return value
+    if isinstance(value, Region | Regions):
+        return Regions.of(value)
     if not isinstance(value, dict) or value.keys() != {"latitude", "longitude"}:
         raise ValueError(
             f"region must be a Region, or a table of latitude and longitude, each [low, high] in degrees, "
             f"got {short(value)}"
         )
-    region = Region(_tuple(value["latitude"]), _tuple(value["longitude"]))  # type: ignore[arg-type]
+    region = Region(_tuple(value["latitude"]), _tuple(value["longitude"]))
     if max(map(abs, region.longitude)) > 360:
         raise ValueError(f"region: longitudes must lie between -360 and 360 degrees, got {region.longitude}")
-    return region
-
-
-def _floors(value: object) -> object:
-    if value is None:
-        return None
-    floors = _FLOORS(value)
-    if min(floors) <= 0:
-        raise ValueError(f"objective_floors must be above 0, got {short(value)}")
-    return floors
+    return Regions.of(region)
 
 
 def _tasks(value: object) -> object:
-    if value is None:
-        return None
-    if isinstance(value, (tuple, list)) and len(value) == 2:
-        value = Tasks(*value)
-    if not isinstance(value, (Tasks, RegionTasks)):
-        raise ValueError(f"tasks must be Tasks, or over many regions RegionTasks, got {short(value)}")
-    for name, values in value._asdict().items():
-        if not isinstance(values, torch.Tensor):
-            raise ValueError(f"tasks.{name} must be an instance of Tensor, got {short(values)}")
+    if isinstance(value, tuple | list) and len(value) == 2:
+        try:
+            return Tasks(*value)
+        except TypeError as error:
+            raise ValueError(str(error)) from error
+    if value is not None and not isinstance(value, Tasks):
+        raise ValueError(f"tasks must be Tasks, got {short(value)}")
     return value
 
 
@@ -79,24 +83,10 @@ def _field(value: object) -> object:
     return value
 
 
-def _altitude(value: float) -> float:
-    lowest, highest = IGRF.altitude_range_km
-    if not lowest <= value <= highest:
-        raise ValueError(
-            f"altitude_km must be from {lowest:g} to {highest:g} km, negative for a depth, got {value}: is it in "
-            "meters?"
-        )
-    return value
-
-
-_DISTANCES = numbers_validator("distance_range_km", 2, "shortest and longest in km")
-_FLOORS = numbers_validator("objective_floors", 3, "of D [deg], I [deg] and B_H [nT]")
-
-
 class Scenario(CheckedModel):
     """Where tasks lie, the field there, and how far apart their ends are; by default those of the paper.
 
-    The last fields are options of the environment, each None for the environment's own default.
+    From ``max_steps`` on, the fields are the rules of an episode.
 
     Raises:
         ValueError: naming the value: for distances that the region cannot hold, a date outside the field model, an
@@ -108,9 +98,10 @@ class Scenario(CheckedModel):
         (29.5, 50.5)
     """
 
-    region: Annotated[Region | Regions, BeforeValidator(_region)] = PAPER_REGION
-    """Box of starts and destinations; or many boxes, of which every random task draws one, with a bank as ``field``."""
-    distance_range_km: Annotated[tuple[float, float], BeforeValidator(_DISTANCES)] = paper.DISTANCE_KM
+    region: Annotated[Any, BeforeValidator(_region)] = PAPER_REGION
+    """Box of starts and destinations, given as a :class:`Region`, kept as :class:`Regions`; or several boxes, of which
+    every random task draws one, with a bank as ``field``."""
+    distance_range_km: Annotated[tuple[float, float], numbers_validator("distance_range_km", 2)] = paper.DISTANCE_KM
     """Shortest and longest distance from start to destination of random tasks [km]."""
     distance_law: Literal["area", "log"] = "area"
     """Law of the distances of random tasks: both ends uniform over the region given that their distance is in the range
@@ -119,39 +110,46 @@ class Scenario(CheckedModel):
     """Date of the field: ``datetime``, ``date``, ISO text or decimal year; kept as a ``datetime``."""
     generation: Literal[13, 14] = paper.GENERATION  # type: ignore[assignment]
     """Generation of IGRF."""
-    altitude_km: Annotated[float, AfterValidator(_altitude)] = 0.0
-    """Altitude over the ellipsoid at which the field is measured, negative for a depth [km]; distances are those over
-    the ground."""
+    altitude_km: float = 0.0
+    """Altitude over the ellipsoid at which the field is measured, negative for a depth [km], -15 to 1000; distances
+    are those over the ground."""
     margin_deg: Annotated[float, Field(ge=0)] = 5.0
     """How far beyond the region a vehicle may stray before it is lost [deg]."""
-    objective_floors: Annotated[tuple[float, float, float] | None, BeforeValidator(_floors)] = guidance.OBJECTIVE_FLOORS
+    objective_floors: Annotated[tuple[float, float, float] | None, numbers_validator("objective_floors", 3)] = (
+        guidance.OBJECTIVE_FLOORS
+    )
     """Least differences of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by, or None for the mean change of each over
     :data:`FLOOR_KM` in the region. Where the field is steep, floors that are too low make every detour very costly."""
     field: Annotated[Any, BeforeValidator(_field)] = None
     """Own field model (:class:`magrl.field.FieldModel`) in place of IGRF; over many regions a
     :class:`magrl.field.FieldBank` with an expansion for each, of every place that a vehicle can reach."""
-    tasks: Annotated[Tasks | RegionTasks | None, BeforeValidator(_tasks)] = None
-    """Frozen tasks to fly in place of random ones; over many regions with the region of each."""
+    tasks: Annotated[Tasks | None, BeforeValidator(_tasks)] = None
+    """Frozen tasks to fly in place of random ones; by default in region 0."""
     names: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
     """Names of the frozen tasks, or none."""
-    max_steps: Annotated[int, Field(ge=1)] | None = None
+    max_steps: Annotated[int, Field(ge=1)] = 50
     """Moves after which an episode is truncated."""
-    max_move_km: Annotated[float, Field(gt=0, le=1000)] | None = None
+    max_move_km: Annotated[float, Field(gt=0, le=1000)] = 50.0
     """Longest move [km]."""
-    max_turn_deg: Annotated[float, Field(gt=0, le=180)] | None = None
+    max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
     """Largest turn to either side before a move [deg]."""
-    zeta: Annotated[float, AfterValidator(check_zeta)] | None = None
-    """Arrival threshold on the objective."""
-    arrival: Literal["objective", "distance", "declared"] | None = None
-    """Rule of arrival: F below ``zeta``, the distance to the destination, or what the vehicle declares."""
-    arrival_radius_km: Annotated[float, Field(gt=0)] | None = None
+    zeta: Annotated[float, AfterValidator(check_zeta)] = 0.01
+    """Arrival threshold on the objective, below 3, its largest value at the start."""
+    arrival: Literal["objective", "distance", "declared"] = "objective"
+    """Rule of arrival: the paper's, F below ``zeta``; a distance to the destination below ``arrival_radius_km``; or
+    ``"declared"``: the action has a third number, in [-1, 1], and above 0 the vehicle declares that it has arrived with
+    this move, which ends the episode."""
+    arrival_radius_km: Annotated[float, Field(gt=0)] = 25.0
     """Distance from the destination of an arrival by distance, or of a right declaration [km]."""
-    start_heading: Literal["north", "random"] | None = None
-    """Heading at the start of an episode."""
+    start_heading: Literal["north", "random"] = "north"
+    """Heading at the start of an episode; ``"random"`` is uniform."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         self._check_bank()
+        check_number(*IGRF.altitude_range_km, altitude_km=self.altitude_km)
+        if self.objective_floors is not None:
+            check_number(0, above=True, objective_floors=min(self.objective_floors))
         if self.field is None:
             igrf_coefficients(self.date, self.generation)
         if self.tasks is None:
@@ -164,54 +162,65 @@ class Scenario(CheckedModel):
         return self
 
     def _check_bank(self) -> None:
-        """Raise unless many regions come with a bank, and each with an expansion of its own."""
-        regions = len(self.region) if isinstance(self.region, Regions) else 0
-        expansions = len(self.field) if isinstance(self.field, FieldBank) else 0
-        if regions != expansions:
+        """Raise unless there is an expansion for each region."""
+        expansions = len(self.field) if isinstance(self.field, FieldBank) else 1
+        if len(self.region) != expansions:
             raise ValueError(
-                f"region holds {regions or 'no'} boxes of Regions, and field {expansions or 'no'} expansions of a "
-                "FieldBank: give many regions a bank with one for each, and a single Region a field model or None"
+                f"region holds {len(self.region)} boxes, and field {expansions} expansions: give several regions a "
+                "FieldBank with one for each, and a single Region a field model or None"
             )
 
-    def _checked_tasks(self, tasks: Tasks | RegionTasks) -> Tasks | RegionTasks:
+    def _checked_tasks(self, tasks: Tasks) -> Tasks:
         try:
             return check_tasks(tasks, self.edge)
         except ValueError as error:
             text = str(error) if str(error).startswith("tasks") else f"tasks: {error}"
-            if "lies outside" in text and isinstance(self.region, Region):
+            if "lies outside" in text and len(self.region) == 1:
                 text += f": raise margin_deg from {self.margin_deg:g} to at least {self._margin_to(tasks):g}"
             raise ValueError(text) from error
 
-    def _margin_to(self, tasks: Tasks | RegionTasks) -> float:
+    def _margin_to(self, tasks: Tasks) -> float:
         """Return the margin that would hold all tasks, rounded up to half a degree."""
-        assert isinstance(self.region, Region)
-        ends = torch.cat([torch.as_tensor(end, dtype=torch.float64) for end in tasks[:2]])
-        (low, high) = torch.tensor((self.region.latitude, self.region.longitude), dtype=torch.float64).T
-        beyond = (self.region.unwrapped(ends) - (low + high) / 2).abs() - (high - low) / 2
+        ends, region = torch.cat(tasks[:2]).double(), self.region[0]
+        (low, high) = torch.tensor((region.latitude, region.longitude), dtype=torch.float64).T
+        beyond = (region.unwrapped(ends) - (low + high) / 2).abs() - (high - low) / 2
         return math.ceil(2 * beyond.max().item()) / 2
 
-    @property
-    def edge(self) -> Region | Regions:
-        """Region with its margin: a vehicle beyond it is lost."""
-        return self.region.expanded(self.margin_deg)
-
-    def reachable(self, max_move_km: float) -> Region | Regions:
-        """Return every place that a vehicle can reach: one move beyond the edge, rounded up to half a degree.
-
-        Raises:
-            ValueError: for a move that is negative or not finite.
+    def given(self, name: str) -> Any:
+        """Return a field, or None where it was not given and has its default.
 
         Example:
-            >>> Scenario().reachable(50)
-            Region(latitude=(-15.5, 5.5), longitude=(154.5, 175.5))
+            >>> Scenario(zeta=0.1).given("zeta"), Scenario().given("zeta")
+            (0.1, None)
         """
-        return self.edge.reachable(max_move_km)
+        return getattr(self, name) if name in self.model_fields_set else None
 
-    def build_field(self, max_move_km: float | None = None) -> FieldModel:
+    @property
+    def edge(self) -> Regions:
+        """Regions with their margin: a vehicle beyond it is lost."""
+        return self.region.expanded(self.margin_deg)
+
+    def reachable(self, drift_km: float = 0.0) -> Regions:
+        """Return every place that a vehicle can reach: one move beyond the edge, rounded up to half a degree.
+
+        Args:
+            drift_km: how much farther than its command an error of motion may carry a vehicle [km].
+
+        Raises:
+            ValueError: for a drift that is negative or not finite.
+
+        Example:
+            >>> Scenario().reachable()
+            Regions(Region(latitude=(-15.5, 5.5), longitude=(154.5, 175.5)))
+        """
+        check_number(0, drift_km=drift_km)
+        return self.edge.reachable(self.max_move_km + drift_km)
+
+    def build_field(self, drift_km: float = 0.0) -> FieldModel:
         """Return the own field model or bank, or IGRF expanded over every place that a vehicle can reach.
 
         Args:
-            max_move_km: longest move [km]; by default that of the scenario, or 50.
+            drift_km: as in :meth:`reachable`.
 
         Raises:
             ValueError: for a region too large for the expansion, or too near to a pole of the Earth or of the field;
@@ -219,45 +228,43 @@ class Scenario(CheckedModel):
         """
         if self.field is not None:
             return self.field
-        max_move_km = (self.max_move_km or 50.0) if max_move_km is None else max_move_km
+        boxes, region = self.reachable(drift_km), self.region[0]
         try:
-            return self._expanded_igrf(max_move_km)
+            return self._expanded_igrf(boxes)
         except ValueError as error:
-            box = self.reachable(max_move_km)
             reason = f"region.latitude, region.longitude: {str(error).rpartition(': ')[0]}"  # without its advice
-            if max(map(abs, box.latitude)) == 90:
-                place = f"region.latitude {self.region.latitude}: with margin_deg {self.margin_deg:g}, vehicles reach"
-                reason = f"{place} a pole in {box}, where all longitudes meet and the declination takes every value"
-            raise ValueError(f"{reason}: {self._remedy(max_move_km)}") from error
+            if boxes.latitude.abs().max() == 90:
+                place = f"region.latitude {region.latitude}: with margin_deg {self.margin_deg:g}, vehicles reach"
+                reason = (
+                    f"{place} a pole in {boxes[0]}, where all longitudes meet and the declination takes every value"
+                )
+            raise ValueError(f"{reason}: {self._remedy(drift_km)}") from error
 
-    def _expanded_igrf(self, max_move_km: float) -> RegionalField:
-        """Return IGRF expanded over every place that a vehicle can reach, with a declination that does not jump."""
-        box = self.reachable(max_move_km)
-        assert isinstance(box, Region)  # many regions have a bank
+    def _expanded_igrf(self, boxes: Regions) -> RegionalField:
+        """Return IGRF expanded over the only box, with a declination that does not jump."""
         igrf = IGRF(self.date, self.generation, altitude_km=self.altitude_km)
-        field = RegionalField(igrf, box.latitude, box.longitude)
-        field_bounds(field, box, torch.device("cpu"))
+        field = RegionalField(igrf, boxes[0].latitude, boxes[0].longitude)
+        field_bounds(field, boxes)
         return field
 
-    def _remedy(self, max_move_km: float) -> str:
+    def _remedy(self, drift_km: float) -> str:
         """Return the smallest changes that give a usable field; each of them was tried."""
 
-        def usable(**changes: Any) -> bool:
+        def usable(region: Region, margin_deg: float) -> bool:
             try:
-                near = {"distance_range_km": (0.0, 1.0), "distance_law": "area"}
-                self.replace(tasks=None, names=(), **near, **changes)._expanded_igrf(max_move_km)
+                self._expanded_igrf(Regions.of(region).expanded(margin_deg).reachable(self.max_move_km + drift_km))
             except ValueError:
                 return False
             return True
 
-        assert isinstance(self.region, Region)
-        (south, north), longitude = self.region.latitude, self.region.longitude
+        region = self.region[0]
+        south, north = region.latitude
         margins = (step / 2 for step in range(min(math.ceil(2 * self.margin_deg), 20) - 1, -1, -1))
-        margin = next((margin for margin in margins if usable(margin_deg=margin)), None)
+        margin = next((margin for margin in margins if usable(region, margin)), None)
         side = math.copysign(1, south + north)
         shifts = range(1, min(30, int(abs(south + north) / 2)) + 1)
-        regions = ((shift, Region((south - side * shift, north - side * shift), longitude)) for shift in shifts)
-        shift = next((shift for shift, region in regions if usable(region=region)), None)
+        moved = ((shift, Region((south - side * shift, north - side * shift), region.longitude)) for shift in shifts)
+        shift = next((shift for shift, region in moved if usable(region, self.margin_deg)), None)
         ways = [f"reduce margin_deg to {margin:g}"] if margin is not None else []
         ways += [f"move the region {shift}° toward the equator"] if shift is not None else []
         return ", or ".join(ways) or "choose a smaller region away from the poles"
@@ -266,25 +273,25 @@ class Scenario(CheckedModel):
         """Return the floors of Eq. 2-6, D [deg], I [deg], B_H [nT], from ``field`` where none are given.
 
         Returns:
-            ``(3,)`` float64; over many regions ``(K, 3)``, each from its own field.
+            ``(K, 3)`` float64, for each region.
 
         Example:
             >>> scenario = Scenario(objective_floors=None)
             >>> scenario.floors(scenario.build_field()).round(decimals=2)
-            tensor([ 0.0500,  0.4400, 21.1100], dtype=torch.float64)
+            tensor([[ 0.0500,  0.4400, 21.1100]], dtype=torch.float64)
         """
+        count = len(self.region)
         if self.objective_floors is not None:
-            floors = torch.tensor(self.objective_floors, dtype=torch.float64)
-            return floors.repeat(len(self.region), 1) if isinstance(self.region, Regions) else floors
-        index = (torch.arange(len(self.region)).reshape(-1, 1, 1),) if isinstance(self.region, Regions) else ()
-        slopes = elements_gradient_at(field, self.region.grid(21), *index).norm(dim=-1)
-        return FLOOR_KM * slopes.flatten(-3, -2).mean(-2)
+            return torch.tensor(self.objective_floors, dtype=torch.float64).repeat(count, 1)
+        index = torch.arange(count).reshape(-1, 1, 1)
+        slopes = elements_gradient_at(field, self.region.grid(21), index).norm(dim=-1)
+        return FLOOR_KM * slopes.flatten(1, 2).mean(1)
 
-    def random_tasks(self, num_tasks: int, seed: int) -> Tasks | RegionTasks:
+    def random_tasks(self, num_tasks: int, seed: int) -> Tasks:
         """Return a frozen set of random tasks, see :func:`magrl.envs.tasks.task_set`."""
         return task_set(num_tasks, seed, self.region, self.distance_range_km, self.distance_law)
 
-    def with_tasks(self, tasks: Tasks | RegionTasks | None) -> Scenario:
+    def with_tasks(self, tasks: Tasks | None) -> Scenario:
         """Return the same scenario with other frozen tasks, or with random ones for None.
 
         Example:

@@ -10,11 +10,9 @@ from typing import Annotated, Any
 
 import torch
 from pydantic import BeforeValidator
-from typing_extensions import Self
 
 from magrl.checks import CheckedModel, check_type, short
-from magrl.envs.scenario import Scenario
-from magrl.envs.task_checks import numbers_validator, without_way
+from magrl.envs.scenario import Scenario, numbers_validator
 from magrl.envs.tasks import Tasks
 
 if sys.version_info >= (3, 11):
@@ -24,7 +22,6 @@ else:
 
 MAX_FILE_BYTES = 10_000_000
 """Largest scenario file: about fifty thousand tasks."""
-_DEGREES = "latitude and longitude in degrees"
 
 
 def _name(value: object) -> object:
@@ -36,20 +33,9 @@ def _name(value: object) -> object:
 class TaskEntry(CheckedModel):
     """A task in a file."""
 
-    start: Annotated[tuple[float, float], BeforeValidator(numbers_validator("start", 2, _DEGREES))]
-    target: Annotated[tuple[float, float], BeforeValidator(numbers_validator("target", 2, _DEGREES))]
+    start: Annotated[tuple[float, float], numbers_validator("start", 2)]
+    target: Annotated[tuple[float, float], numbers_validator("target", 2)]
     name: Annotated[str, BeforeValidator(_name)]
-
-    @classmethod
-    def read(cls, number: int, entry: Any) -> Self:
-        """Return an entry of a file, counted from 1."""
-        if not isinstance(entry, dict):
-            raise ValueError(f"tasks, entry {number}, must be a table with start and target, got {short(entry)}")
-        values: dict[str, Any] = {"name": f"task {number}"} | entry
-        try:
-            return cls(**values)
-        except ValueError as error:
-            raise ValueError(f"tasks, entry {number}: {error}") from error
 
 
 def load_scenario(path: Path | str, **changes: Any) -> Scenario:
@@ -68,11 +54,11 @@ def load_scenario(path: Path | str, **changes: Any) -> Scenario:
 
     Example:
         >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "azores.toml"
         >>> lines = "date = 2026-07-01", "region = {latitude = [40, 50], longitude = [-30, -20]}"
-        >>> _ = path.write_text(chr(10).join(lines))
-        >>> load_scenario(path).region
-        Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "azores.toml").write_text(chr(10).join(lines))
+        ...     load_scenario(Path(folder) / "azores.toml").region
+        Regions(Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0)))
     """
     check_type((Path, str), path=path)
     path = Path(path)
@@ -89,15 +75,9 @@ def load_scenario(path: Path | str, **changes: Any) -> Scenario:
 def _scenario(content: Any, changes: dict[str, Any]) -> Scenario:
     if not isinstance(content, dict):
         raise ValueError(f"a scenario file must hold a table, got {short(content)}")
-    if "journeys" in content or "field" in content:
-        raise ValueError(
-            "the tables [field] and [journeys] are of an earlier version: write their keys (date, generation, "
-            "altitude_km, distance_range_km, objective_floors) at the top of the file, above [region]"
-        )
     known = [name for name in Scenario.model_fields if name not in ("field", "names")]
     if unknown := [key for key in content if key not in known]:
-        where = ": write name = ... in each of the tasks" if unknown[0] == "names" else ""
-        raise ValueError(f"unknown key {short(unknown[0])}{where or ': choose from ' + ', '.join(known)}")
+        raise ValueError(f"unknown key {short(unknown[0])}: choose from {', '.join(known)}")
     if missing := [name for name in ("region", "date") if name not in content]:
         raise ValueError(f"{missing[0]} is missing: a scenario file must hold region and date")
     values: dict[str, Any] = {"generation": 14, "objective_floors": None} | content
@@ -112,15 +92,16 @@ def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
         raise ValueError(f"tasks must be a list of tables with start and target, got {short(listed)}")
     if not listed:
         return (), None
-    entries = [TaskEntry.read(number, entry) for number, entry in enumerate(listed, start=1)]
+    entries = []
+    for number, entry in enumerate(listed, start=1):
+        if not isinstance(entry, dict):
+            raise ValueError(f"tasks, entry {number}, must be a table with start and target, got {short(entry)}")
+        try:
+            values: dict[str, Any] = {"name": f"task {number}"} | entry
+            entries.append(TaskEntry(**values))
+        except ValueError as error:
+            raise ValueError(f"tasks, entry {number}: {error}") from error
     start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
-    on_earth = (torch.maximum(start[:, 0].abs(), target[:, 0].abs()) <= 90).nonzero().squeeze(-1)
-    if len(nowhere := on_earth[without_way(start[on_earth], target[on_earth])]):
-        number = int(nowhere[0])
-        raise ValueError(
-            f"tasks, entry {number + 1}: start and target are the same place, {list(entries[number].start)}: "
-            "move one of them, or remove the entry"
-        )
     return tuple(e.name for e in entries), Tasks(start, target)
 
 

@@ -8,29 +8,17 @@ import torch
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
-from magrl.envs.region import Region
 from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
 from magrl.transforms.errors.motion import DISPLACEMENT
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Terms whose sum is ``reward``."""
-REGION = "region"
-"""Index of the region of each vehicle, where there are many."""
 DECLARED = "declared"
 """Flag that the vehicle has declared its arrival, where it must."""
-STATE_KEYS = (
-    "target_field",
-    "heading",
-    "step_count",
-    "position",
-    "target_position",
-    "start_position",
-    "objective",
-    "objective_weights",
-    REGION,
-    DISPLACEMENT,
-)
+CONSTANT_KEYS = ("target_field", "target_position", "start_position", "objective_weights", "region")
+"""Keys that keep their values throughout an episode."""
+STATE_KEYS = (*CONSTANT_KEYS, "heading", "step_count", "position", "objective", DISPLACEMENT)
 """Keys that a step reads: the state of an episode."""
 
 
@@ -45,58 +33,49 @@ def bounded(num_envs: int, low: Tensor, high: Tensor) -> Bounded:
     return Bounded(low.float().expand(shape), high.float().expand(shape), shape)
 
 
-def field_bounds(field: FieldModel | FieldBank, box: Region | Regions, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return bounds of the elements over every place in a box, from a grid and 5 % of slack.
+def field_bounds(field: FieldModel | FieldBank, boxes: Regions) -> tuple[Tensor, Tensor]:
+    """Return bounds of the elements over every place in boxes, from a grid and 5 % of slack.
 
     Args:
-        field: field model, or a bank of them.
-        box: every place that a vehicle can reach, or that in each region of the bank.
-        device: device of the field model.
+        field: field model, or a bank of them, on the device of the boxes.
+        boxes: every place that a vehicle can reach, in each region.
 
     Returns:
         Lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
 
     Raises:
-        ValueError: for a field that is not defined on all of the box, or whose declination is not continuous there.
+        ValueError: for a field that is not defined on all of a box, or whose declination is not continuous there.
 
     Example:
+        >>> from magrl.envs import Region
         >>> from magrl.field import IGRF
-        >>> low, high = field_bounds(IGRF("2022-01-01"), Region((-10, 0), (160, 170)), torch.device("cpu"))
+        >>> low, high = field_bounds(IGRF("2022-01-01"), Regions.of(Region((-10, 0), (160, 170))))
         >>> [round(bound) for bound in high.tolist()]
         [11, -8, 35670]
     """
-    if isinstance(box, Regions):
-        values = region_elements(field, box)
-    else:
-        values = elements_at(field, box.grid(81).to(device)).reshape(1, -1, 3)
+    values = region_elements(field, boxes, points=81 if len(boxes) == 1 else 11)
     lowest, highest = values.amin(1), values.amax(1)
     undefined, turning = ~torch.isfinite(lowest + highest).all(-1), highest[:, 0] - lowest[:, 0] > 180
     if undefined.any():
         raise ValueError(
-            f"the field is not defined on all of {_first(undefined, box)}, which a vehicle can reach: take a field of "
-            "a larger box, or a smaller region, margin_deg or max_move_km"
+            f"the field is not defined on all of {boxes[int(undefined.nonzero()[0])]}, which a vehicle can reach: take "
+            "a field of a larger box, or a smaller region, margin_deg or max_move_km"
         )
     if turning.any():
         raise ValueError(
-            f"the declination turns through south in {_first(turning, box)}: D jumps from 180 to -180 degrees there; "
-            "take a region farther from the magnetic pole"
+            f"the declination turns through south in {boxes[int(turning.nonzero()[0])]}: D jumps from 180 to -180 "
+            "degrees there; take a region farther from the magnetic pole"
         )
     low, high = lowest.amin(0), highest.amax(0)
     slack = 0.05 * (high - low)
-    limit = torch.tensor((180.0, 90.0, math.inf), dtype=torch.float64, device=device)
+    limit = torch.tensor((180.0, 90.0, math.inf), dtype=torch.float64, device=values.device)
     return (low - slack).maximum(-limit), (high + slack).minimum(limit)
 
 
-def region_elements(field: FieldModel | FieldBank, regions: Regions, points: int = 11) -> Tensor:
-    """Return the elements of a bank on an even grid of each region: ``(K, points², 3)``, D [deg], I [deg], B_H [nT]."""
+def region_elements(field: FieldModel | FieldBank, regions: Regions, points: int) -> Tensor:
+    """Return the elements on an even grid of each region: ``(K, points², 3)``, D [deg], I [deg], B_H [nT]."""
     index = torch.arange(len(regions), device=regions.latitude.device)
     return elements_at(field, regions.grid(points).flatten(1, 2), index.unsqueeze(-1))
-
-
-def _first(bad: Tensor, box: Region | Regions) -> str:
-    """Return the first bad box as text."""
-    number = int(bad.nonzero()[0])
-    return f"region {number} with its margin, {box[number]}" if isinstance(box, Regions) else f"{box}"
 
 
 def observation_spec(
@@ -104,7 +83,7 @@ def observation_spec(
     field_bounds: tuple[Tensor, Tensor],
     max_move_km: float,
     max_turn_rad: float,
-    num_regions: int | None = None,
+    num_regions: int = 1,
     declared: bool = False,
     drift_km: float = 0.0,
 ) -> Composite:
@@ -115,7 +94,7 @@ def observation_spec(
         field_bounds: lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        num_regions: number of regions, of which ``region`` is the index; None without that key.
+        num_regions: number of regions.
         declared: whether there is the flag ``declared``.
         drift_km: how much farther than its command errors of motion may carry a vehicle [km]; above 0, there is the key
             ``displacement``.
@@ -126,8 +105,7 @@ def observation_spec(
     """
     low, high = (bound.cpu() for bound in field_bounds)
     highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
-    more = {} if num_regions is None else {REGION: Bounded(0, num_regions - 1, (num_envs, 1), dtype=torch.int64)}
-    more |= {DECLARED: _flag(num_envs)} if declared else {}
+    more = {DECLARED: _flag(num_envs)} if declared else {}
     reach = 2 * max_move_km + drift_km  # from the end of a commanded move to that of a true one
     more |= {DISPLACEMENT: Bounded(-reach, reach, (num_envs, 2), dtype=torch.float64)} if drift_km else {}
     return Composite(
@@ -142,6 +120,7 @@ def observation_spec(
         objective=Unbounded((num_envs, 1)),
         objective_weights=Unbounded((num_envs, 3)),
         success=_flag(num_envs),
+        region=Bounded(0, num_regions - 1, (num_envs, 1), dtype=torch.int64),
         **more,
         shape=(num_envs,),
     )

@@ -8,50 +8,57 @@ saved to repeat them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple, overload
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from magrl import paper
 from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.counters import counter_uniform
-from magrl.envs.region import PAPER_REGION, Region
-from magrl.envs.regions import Regions
-from magrl.geodesy import MEAN_RADIUS_KM, geodesic, move, wrap_angle, wrap_longitude
+from magrl.envs.regions import PAPER_REGION, Region, Regions
+from magrl.field.bank import check_index
+from magrl.geodesy import MEAN_RADIUS_KM, check_positions, geodesic, move, wrap_angle, wrap_longitude
 
 TRIES_PER_ROUND = 8
 MAX_ROUNDS = 1000
 """Rounds of rejection sampling after which a region counts as too small for its distances."""
+SHORTEST_KM = 0.001
+"""Shortest distance from start to destination of a frozen task [km]."""
 
 
-class Tasks(NamedTuple):
-    """Start and destination of episodes, each ``(..., 2)`` latitude, longitude [deg], float64.
-
-    Example:
-        >>> ends = torch.tensor([[-2.0, 162.0]]), torch.tensor([[-8.0, 164.0]])
-        >>> Tasks(*ends).target
-        tensor([[ -8., 164.]])
-    """
-
-    start: Tensor
-    target: Tensor
-
-
-class RegionTasks(NamedTuple):
-    """Tasks over many regions: start and destination as in :class:`Tasks`, and the index of their region.
-
-    Example:
-        >>> ends = torch.tensor([[-2.0, 162.0]]), torch.tensor([[-8.0, 164.0]])
-        >>> RegionTasks(*ends, region=torch.tensor([3])).region
-        tensor([3])
-    """
-
+class _Columns(NamedTuple):
     start: Tensor
     target: Tensor
     region: Tensor
-    """``(...)`` int64."""
+
+
+class Tasks(_Columns):
+    """Start and destination of episodes, and the index of their region.
+
+    Args:
+        start: ``(..., 2)`` latitude, longitude [deg], float64.
+        target: ``(..., 2)`` latitude, longitude [deg], float64.
+        region: ``(...)`` int64; 0 by default.
+
+    Raises:
+        TypeError: for positions that are not tensors.
+        ValueError: for positions of another shape.
+
+    Example:
+        >>> Tasks(torch.tensor([[-2.0, 162.0]]), torch.tensor([[-8.0, 164.0]])).region
+        tensor([0])
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, start: Tensor, target: Tensor, region: Tensor | None = None) -> Self:
+        """Return tasks, by default in region 0."""
+        check_tensor(2, **{"tasks.start": start, "tasks.target": target})
+        if region is None:
+            region = torch.zeros(start.shape[:-1], dtype=torch.int64, device=start.device)
+        return super().__new__(cls, start, target, region)
 
 
 DISTANCE_LAWS = ("area", "log")
@@ -60,52 +67,48 @@ DISTANCE_LAWS = ("area", "log")
 _HEADING_STREAM, _REGION_STREAM, _DISTANCE_STREAM = -1, -2, -3
 
 
-def check_distance_range(
-    region: Region | Regions, distance_range_km: tuple[float, float], distance_law: str = "area"
-) -> None:
-    """Raise unless distances are a range that the region, or each of many, can hold.
+def check_distance_range(regions: Regions, distance_range_km: tuple[float, float], distance_law: str = "area") -> None:
+    """Raise unless distances are a range that each region can hold.
 
     With the law ``"area"``, distances that do not fit into a region are not drawn there. With ``"log"`` the law of the
     distances is the same in every region, so each must hold the longest.
 
     Raises:
-        ValueError: naming the values, and of many regions the smallest.
+        ValueError: naming the values, and the smallest region.
 
     Example:
-        >>> check_distance_range(PAPER_REGION, (500, 300))
+        >>> check_distance_range(Regions.of(PAPER_REGION), (500, 300))
         Traceback (most recent call last):
             ...
         ValueError: distance_range_km (500, 300) must be two rising numbers from 0 on
     """
-    check_type((Region, Regions), region=region)
     check_numbers(2, distance_range_km=distance_range_km)
     if distance_law not in DISTANCE_LAWS:
         raise ValueError(f"distance_law must be one of {', '.join(map(repr, DISTANCE_LAWS))}, got {distance_law!r}")
     shortest, longest = distance_range_km
-    if not 0 <= shortest < longest:
-        raise ValueError(f"distance_range_km {distance_range_km} must be two rising numbers from 0 on")
-    if distance_law == "log" and shortest == 0:
-        raise ValueError(f"distance_range_km {distance_range_km} must start above 0 with distance_law 'log'")
-    held = float(region.longest_km.min()) if isinstance(region, Regions) else region.longest_km()
+    if not 0 <= shortest < longest or (distance_law == "log" and shortest == 0):
+        start = "above 0 with distance_law 'log'" if distance_law == "log" else "from 0 on"
+        raise ValueError(f"distance_range_km {distance_range_km} must be two rising numbers {start}")
+    held, smallest = regions.longest_km.min(0)
     if (shortest if distance_law == "area" else longest) >= held:
-        where = region[int(region.longest_km.argmin())] if isinstance(region, Regions) else region
         raise ValueError(
-            f"distance_range_km {distance_range_km}: no two points of {where} are more than {held:.0f} km apart"
+            f"distance_range_km {distance_range_km}: no two points of {regions[int(smallest)]} are more than "
+            f"{held:.0f} km apart"
         )
 
 
 def sample_tasks(
-    region: Region | Regions,
+    regions: Regions,
     distance_range_km: tuple[float, float],
     seed: int,
     vehicle: Tensor,
     episode: Tensor,
     distance_law: str = "area",
-) -> Tasks | RegionTasks:
-    """Return random tasks: start and end uniform over the region, given that their distance is in the range.
+) -> Tasks:
+    """Return random tasks: start and end uniform over a region, given that their distance is in the range.
 
     Args:
-        region: the box that holds both ends, or many, of which each task draws one.
+        regions: boxes, of which each task draws the one that holds both of its ends.
         distance_range_km: shortest and longest geodesic distance [km].
         seed: seed of the whole family of tasks.
         vehicle: ``(P,)`` int64, number of the vehicle.
@@ -114,55 +117,82 @@ def sample_tasks(
             their distance, which is met to within 30 m up to 2000 km.
 
     Returns:
-        ``P`` tasks, each a function of (seed, vehicle, episode) alone; with their region where there are many.
+        ``P`` tasks, each a function of (seed, vehicle, episode) alone.
 
     Raises:
-        ValueError: for an invalid range, one that the region cannot hold, a seed that is not a whole number, or
+        ValueError: for an invalid range, one that a region cannot hold, a seed that is not a whole number, or
             vehicles and episodes of different shapes.
-        RuntimeError: if no task is found because the region can hardly hold the distances.
+        RuntimeError: if no task is found because a region can hardly hold the distances.
 
     Example:
-        >>> tasks = sample_tasks(PAPER_REGION, (300, 500), 0, torch.arange(4), torch.zeros(4, dtype=torch.int64))
+        >>> number = torch.arange(4)
+        >>> tasks = sample_tasks(Regions.of(PAPER_REGION), (300, 500), 0, number, torch.zeros_like(number))
         >>> d = geodesic(*tasks.start.unbind(-1), *tasks.target.unbind(-1))[0]
         >>> bool(((d >= 300) & (d <= 500)).all())
         True
     """
-    check_distance_range(region, distance_range_km, distance_law)
+    check_distance_range(regions, distance_range_km, distance_law)
     check_tensor(vehicle=vehicle, episode=episode)
     if vehicle.ndim != 1 or vehicle.shape != episode.shape or {vehicle.dtype, episode.dtype} != {torch.int64}:
         raise ValueError(f"vehicle and episode must be int64 of one shape (P,), got {vehicle!r} and {episode!r}")
-    one_each = torch.stack((vehicle, episode), -1)
-    index, ring = None, None
-    if isinstance(region, Regions):
-        index = (_draw(seed, one_each, _REGION_STREAM) * len(region)).long().squeeze(-1)
+    counters = torch.stack((vehicle, episode), -1)
+    region = (_draw(seed, counters, _REGION_STREAM) * len(regions)).long().squeeze(-1)
+    radii_km = torch.tensor(distance_range_km, dtype=torch.float64, device=vehicle.device).expand(len(vehicle), 2)
     if distance_law == "log":
         shortest, longest = distance_range_km
-        ring = shortest * (longest / shortest) ** _draw(seed, one_each, _DISTANCE_STREAM)
+        radii_km = (shortest * (longest / shortest) ** _draw(seed, counters, _DISTANCE_STREAM)).expand_as(radii_km)
     start = torch.empty(len(vehicle), 2, dtype=torch.float64, device=vehicle.device)
     target = torch.empty_like(start)
     waiting = torch.arange(len(vehicle), device=vehicle.device)
     for attempt in range(MAX_ROUNDS):
-        tries = torch.arange(TRIES_PER_ROUND, device=vehicle.device) + attempt * TRIES_PER_ROUND
-        rows = torch.broadcast_tensors(vehicle[waiting].unsqueeze(-1), episode[waiting].unsqueeze(-1), tries)
-        uniform = counter_uniform(seed, torch.stack(rows, -1), 4)
-        place = () if index is None else (index[waiting].unsqueeze(-1),)
-        distances = distance_range_km if ring is None else (ring[waiting], ring[waiting])
-        candidate = _candidates(_limits(region, distances, *place), uniform)
-        fits = region.contains(candidate.target, *place).squeeze(-1)
-        if ring is None:
-            distance, _ = geodesic(*candidate.start.unbind(-1), *candidate.target.unbind(-1))
-            fits = (distance >= distance_range_km[0]) & (distance <= distance_range_km[1]) & fits
-        placed, first = fits.max(-1)
-        chosen = (placed.nonzero().squeeze(-1), first[placed])
-        start[waiting[placed]], target[waiting[placed]] = candidate.start[chosen], candidate.target[chosen]
+        uniform = _attempts(seed, counters[waiting], attempt)
+        starts, ends = _candidates(regions, region[waiting], radii_km[waiting], uniform)
+        fits = regions.contains(ends, region[waiting, None]).squeeze(-1)
+        if distance_law == "area":
+            distance_km, _ = geodesic(*starts.unbind(-1), *ends.unbind(-1))
+            fits = (distance_km >= distance_range_km[0]) & (distance_km <= distance_range_km[1]) & fits
+        placed, number = fits.max(-1)
+        chosen = (placed.nonzero().squeeze(-1), number[placed])
+        start[waiting[placed]], target[waiting[placed]] = starts[chosen], ends[chosen]
         waiting = waiting[~placed]
         if not len(waiting):
-            return Tasks(start, target) if index is None else RegionTasks(start, target, index)
-    where = region[int(index[waiting[0]])] if isinstance(region, Regions) and index is not None else region
+            return Tasks(start, target, region)
     raise RuntimeError(
-        f"no task was found in {MAX_ROUNDS * TRIES_PER_ROUND} tries: {where} can hardly hold distances of "
-        f"{distance_range_km} km"
+        f"no task was found in {MAX_ROUNDS * TRIES_PER_ROUND} tries: {regions[int(region[waiting[0]])]} can hardly "
+        f"hold distances of {distance_range_km} km"
     )
+
+
+def _draw(seed: int, counters: Tensor, stream: int) -> Tensor:
+    """Return one uniform number for each vehicle and episode, ``(P, 1)``."""
+    return counter_uniform(seed, torch.nn.functional.pad(counters, (0, 1), value=stream), 1)
+
+
+def _attempts(seed: int, counters: Tensor, attempt: int) -> Tensor:
+    """Return the uniform numbers of the tries ``R`` of a round, ``(P, R, 4)``, for vehicles and episodes ``(P, 2)``."""
+    tries = torch.arange(TRIES_PER_ROUND, device=counters.device) + attempt * TRIES_PER_ROUND
+    rows = torch.broadcast_tensors(*counters.unsqueeze(1).unbind(-1), tries)
+    return counter_uniform(seed, torch.stack(rows, -1), 4)
+
+
+def _candidates(regions: Regions, region: Tensor, radii_km: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+    """Return starts uniform over boxes, and ends uniform over rings about them, both ``(P, R, 2)`` [deg].
+
+    Args:
+        regions: boxes.
+        region: ``(P,)`` box of each task.
+        radii_km: ``(P, 2)`` inner and outer radius of the ring.
+        uniform: ``(P, R, 4)`` in [0, 1).
+    """
+    south, north = torch.sin(torch.deg2rad(regions.latitude[region])).unsqueeze(1).unbind(-1)
+    west, east = regions.longitude[region].unsqueeze(1).unbind(-1)
+    held_km = 1.01 * regions.longest_km[region]  # beyond, no point of the ring lies in the box
+    near, far = torch.cos(radii_km.minimum(held_km.unsqueeze(-1)) / MEAN_RADIUS_KM).unsqueeze(1).unbind(-1)
+    latitude = torch.rad2deg(torch.asin(south + (north - south) * uniform[..., 0]))
+    longitude = wrap_longitude(west + (east - west) * uniform[..., 1])
+    distance = MEAN_RADIUS_KM * torch.acos(near + (far - near) * uniform[..., 2])
+    end = move(latitude, longitude, 2 * math.pi * uniform[..., 3], distance)
+    return torch.stack((latitude, longitude), -1), torch.stack(end, -1)
 
 
 def random_headings(seed: int, vehicle: Tensor, episode: Tensor) -> Tensor:
@@ -175,63 +205,13 @@ def random_headings(seed: int, vehicle: Tensor, episode: Tensor) -> Tensor:
     return wrap_angle(2 * math.pi * _draw(seed, torch.stack((vehicle, episode), -1), _HEADING_STREAM))
 
 
-def _draw(seed: int, counters: Tensor, stream: int) -> Tensor:
-    """Return one uniform number for each vehicle and episode, ``(P, 1)``."""
-    return counter_uniform(seed, torch.nn.functional.pad(counters, (0, 1), value=stream), 1)
-
-
-def _limits(region: Region | Regions, distances: Sequence[Any], index: Tensor | None = None) -> tuple[Any, ...]:
-    """Return where to draw tasks, as numbers, or as ``(P, 1)`` from the region of each.
-
-    Sines of the southern and northern edge, western and eastern edge [deg], cosines of the shortest and longest
-    distance. Beyond 1.01 times the longest distance in a region, no point of the ring lies in it.
-    """
-    if isinstance(region, Regions):
-        sines = torch.sin(torch.deg2rad(region.latitude[index]))
-        held = 1.01 * region.longest_km[index]
-        cosines = (torch.cos(torch.as_tensor(x).to(held).minimum(held) / MEAN_RADIUS_KM) for x in distances)
-        return *sines.unbind(-1), *region.longitude[index].unbind(-1), *cosines
-    longest = 1.01 * region.longest_km()
-    ring = (
-        torch.cos(x / MEAN_RADIUS_KM) if isinstance(x, Tensor) else math.cos(min(x, longest) / MEAN_RADIUS_KM)
-        for x in distances
-    )
-    return *(math.sin(math.radians(x)) for x in region.latitude), *region.longitude, *ring
-
-
-def _candidates(limits: tuple[Any, ...], uniform: Tensor) -> Tasks:
-    """Return starts uniform over the box and ends uniform over the ring about them; ``uniform`` is ``(..., 4)``."""
-    south, north, west, east, near, far = limits
-    latitude = torch.rad2deg(torch.asin(south + (north - south) * uniform[..., 0]))
-    longitude = wrap_longitude(west + (east - west) * uniform[..., 1])
-    distance = MEAN_RADIUS_KM * torch.acos(near + (far - near) * uniform[..., 2])
-    end = move(latitude, longitude, 2 * math.pi * uniform[..., 3], distance)
-    return Tasks(torch.stack((latitude, longitude), -1), torch.stack(end, -1))
-
-
-@overload
-def task_set(
-    num_tasks: int,
-    seed: int,
-    region: Region = PAPER_REGION,
-    distance_range_km: tuple[float, float] = paper.DISTANCE_KM,
-    distance_law: str = "area",
-) -> Tasks: ...
-
-
-@overload
-def task_set(
-    num_tasks: int, seed: int, region: Regions, distance_range_km: tuple[float, float], distance_law: str = "area"
-) -> RegionTasks: ...
-
-
 def task_set(
     num_tasks: int,
     seed: int,
     region: Region | Regions = PAPER_REGION,
     distance_range_km: tuple[float, float] = paper.DISTANCE_KM,
     distance_law: str = "area",
-) -> Tasks | RegionTasks:
+) -> Tasks:
     """Return a frozen set of tasks: the first episode of each of ``num_tasks`` vehicles; see :func:`sample_tasks`.
 
     Raises:
@@ -242,8 +222,54 @@ def task_set(
         torch.Size([100, 2])
     """
     check_number(1, whole=True, num_tasks=num_tasks)
+    check_type((Region, Regions), region=region)
     vehicle = torch.arange(num_tasks)
-    return sample_tasks(region, distance_range_km, seed, vehicle, torch.zeros_like(vehicle), distance_law)
+    return sample_tasks(Regions.of(region), distance_range_km, seed, vehicle, torch.zeros_like(vehicle), distance_law)
+
+
+def check_tasks(tasks: Tasks, within: Regions) -> Tasks:
+    """Return a copy of tasks in float64 with wrapped longitudes; raise unless all are valid.
+
+    Args:
+        tasks: ``M`` tasks.
+        within: boxes, of which that of a task must hold its start and target.
+
+    Raises:
+        TypeError: for a region index that is not int64.
+        ValueError: for other shapes, an empty set, positions that are not on Earth or outside ``within``, an index
+            without a region, or a task that starts at its destination.
+
+    Example:
+        >>> tasks = Tasks(torch.tensor([[-2.0, 522.0]]), torch.tensor([[-8.0, 164.0]]))
+        >>> check_tasks(tasks, within=Regions.of(PAPER_REGION)).start
+        tensor([[ -2., 162.]], dtype=torch.float64)
+    """
+    start, target, region = tasks.start.double(), tasks.target.double(), tasks.region
+    if start.shape != target.shape or start.ndim != 2 or not len(start):
+        raise ValueError(
+            f"tasks must be two (M, 2) tensors with M >= 1, got {tuple(start.shape)} and {tuple(target.shape)}"
+        )
+    check_index(region, len(within), "tasks.region")
+    if region.shape != start.shape[:1]:
+        raise ValueError(f"tasks.region must hold {len(start)} indices, one a task, got {tuple(region.shape)}")
+    for name, position in (("start", start), ("target", target)):
+        check_positions(*position.unbind(-1))
+        inside = within.contains(position, region).squeeze(-1)
+        if not inside.all():
+            number = int((~inside).nonzero()[0])
+            raise ValueError(
+                f"the {name} of task {number} (the first is task 0), {position[number].tolist()}, lies outside "
+                f"{within[int(region[number])]}"
+            )
+    distance_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
+    if (distance_km < SHORTEST_KM).any():
+        number = int((distance_km < SHORTEST_KM).nonzero()[0])
+        raise ValueError(
+            f"task {number} (the first is task 0) starts at its destination, {start[number].tolist()}: move one of "
+            "them, or remove the task"
+        )
+    start, target = (torch.stack((x[:, 0], wrap_longitude(x[:, 1])), -1) for x in (start, target))
+    return Tasks(start, target, region)
 
 
 TASK_SETS = ("test-1000", "paper-100", "figure-4-1")

@@ -23,7 +23,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.envs import Region
+from magrl.envs import Region, Regions
+from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
 from magrl.evaluation.metrics import episode_measures
 from magrl.evaluation.replay import PIECES, episode_tracks
@@ -103,7 +104,7 @@ def frame(positions: Tensor) -> Region:
 def trajectories_figure(
     rollouts: TensorDictBase | Mapping[str, TensorDictBase],
     field: FieldModel,
-    region: Region,
+    region: Region | Regions,
     episodes: int = 24,
     names: Sequence[str] = (),
 ) -> Figure:
@@ -130,6 +131,7 @@ def trajectories_figure(
         ['random']
     """
     check_number(1, whole=True, episodes=episodes)
+    region = one_region(region)
     titled = {"": rollouts} if isinstance(rollouts, TensorDictBase) else rollouts
     if not titled:
         raise ValueError("rollouts must hold the episodes of at least one navigator, got {}")
@@ -256,7 +258,7 @@ def write_gif(
     path: Path | str,
     rollout: TensorDictBase,
     field: FieldModel,
-    region: Region,
+    region: Region | Regions,
     title: str = "",
     *,
     width_px: int = 720,
@@ -286,7 +288,7 @@ def write_gif(
     """
     check_type((Path, str), path=path)
     check_number(1, whole=True, width_px=width_px)
-    frames = list(_frames(rollout.cpu(), field, region, title, width_px))
+    frames = list(_frames(rollout.cpu(), field, one_region(region), title, width_px))
     sample = np.hstack([np.asarray(image) for image in (frames[0], frames[len(frames) // 2], frames[-1])])
     palette = Image.fromarray(sample).quantize(GIF_COLORS)  # one for all frames: unchanged pixels compress well
     start, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames)

@@ -130,8 +130,7 @@ def _nearest_arrival(rollout: TensorDictBase, env: GeomagneticNavEnv, shortest_k
     if env.arrival.rule != "objective":
         return (shortest_km - env.arrival.radius_km).clamp_min(0)
     start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
-    weights, region = rollout["objective_weights"][:, 0], rollout.get("region", None)
-    region = None if region is None else region[:, 0, 0]
+    weights, region = rollout["objective_weights"][:, 0], rollout["region"][:, 0, 0]
     return distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region)
 
 

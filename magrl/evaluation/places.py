@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from magrl.checks import check_type
-from magrl.envs import Region
+from magrl.envs import Region, Regions
 from magrl.envs.specs import field_bounds
 from magrl.field import FieldModel, elements_at, elements_gradient_at
 from magrl.field.elements import element_difference
@@ -102,7 +102,7 @@ def find_elements(field: FieldModel, elements: Tensor, near: Tensor) -> Tensor:
         tensor([60.4000,  5.3000], dtype=torch.float64)
     """
     scale = torch.tensor(ELEMENT_TOLERANCE, dtype=torch.float64)
-    place = Region((-80, 80), (-180, 176)).grid(45).reshape(-1, 2)
+    place = Regions.of(Region((-80, 80), (-180, 176))).grid(45).reshape(-1, 2)
     for _ in range(16):
         slopes = elements_gradient_at(field, place) / scale.unsqueeze(-1)
         north, east = displacement_to(_difference(field, elements, place) / scale, slopes).unbind(-1)
@@ -159,7 +159,8 @@ def region_around(start: Tensor, target: Tensor, field: FieldModel, max_move_km:
     Example:
         >>> from magrl.field import IGRF
         >>> tokyo, honolulu = torch.tensor([[35.7, 139.7], [21.3, -157.9]], dtype=torch.float64)
-        >>> region_around(honolulu, tokyo, IGRF("2025-01-01")).contains(torch.tensor([30.0, 180.0]))
+        >>> box = region_around(honolulu, tokyo, IGRF("2025-01-01"))
+        >>> Regions.of(box).contains(torch.tensor([30.0, 180.0]))
         tensor([True])
     """
     distance_km = geodesic(*start, *target)[0].item()
@@ -170,7 +171,7 @@ def region_around(start: Tensor, target: Tensor, field: FieldModel, max_move_km:
         aside = min(margin / math.cos(math.radians((south + north) / 2)), (360 - (east - west)) / 2)
         box = Region((max(south - margin, -89.0), min(north + margin, 89.0)), (west - aside, east + aside))
         try:
-            field_bounds(field, box.reachable(max_move_km), torch.device("cpu"))
+            field_bounds(field, Regions.of(box).reachable(max_move_km))
         except ValueError:
             continue
         return box

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number
-from magrl.envs.region import Region
+from magrl.envs.regions import Region, Regions, one_region
 from magrl.envs.rendering import contour_lines
 from magrl.evaluation.metrics import episode_measures, moved
 from magrl.field.model import FieldModel
@@ -34,7 +34,7 @@ _SEEN = ("position", "field", "objective", "heading", "move")
 def replay_data(
     rollouts: Mapping[str, TensorDictBase],
     field: FieldModel,
-    region: Region,
+    region: Region | Regions,
     *,
     zeta: float,
     title: str = "",
@@ -69,7 +69,7 @@ def replay_data(
     check_number(0, above=True, zeta=zeta)
     if not rollouts:
         raise ValueError("rollouts must hold at least one rollout, got {}")
-    first = next(iter(rollouts.values()))
+    region, first = one_region(region), next(iter(rollouts.values()))
     names = [*names] or [str(number) for number in range(1, len(first) + 1)]
     if len(names) != len(first):
         raise ValueError(f"names must hold one name for each of {len(first)} tasks, got {names}")
@@ -92,7 +92,7 @@ def replay_data(
     }
 
 
-def episode_tracks(rollout: TensorDictBase, region: Region) -> list[Tensor]:
+def episode_tracks(rollout: TensorDictBase, region: Region | Regions) -> list[Tensor]:
     """Return the track of the first episode of each vehicle, each move in :data:`PIECES` pieces of its geodesic.
 
     Args:
@@ -113,7 +113,7 @@ def episode_tracks(rollout: TensorDictBase, region: Region) -> list[Tensor]:
         >>> len(track) == 3 * PIECES + 1
         True
     """
-    rollout = rollout.cpu()
+    rollout, region = rollout.cpu(), one_region(region)
     steps = episode_measures(rollout)["steps"].tolist()
     latitude, longitude = rollout["position"].unsqueeze(-2).unbind(-1)
     share = torch.arange(PIECES, dtype=torch.float64) / PIECES

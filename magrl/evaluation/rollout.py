@@ -72,7 +72,7 @@ def evaluate(
     if conditions is not None and any(noise):
         raise ValueError(f"conditions {conditions!r} hold the noise of the sensors: omit the noise {noise}")
     flown = conditions_named(conditions or "laboratory")
-    drift = {"drift_km": flown.drift_km(options.get("max_move_km") or scenario.max_move_km or 50.0)}
+    drift = {"drift_km": flown.drift_km(options.get("max_move_km", scenario.max_move_km))}
     base = GeomagneticNavEnv(scenario, num_envs=num_envs, seed=seed, device=device, **(drift | options))
     if isinstance(policy, str):
         std = tuple(noise) if conditions is None else flown.sensor_std

@@ -11,7 +11,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from magrl import paper
 from magrl.checks import check_number
-from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.transforms import DeclareArrival, TrackGradient
 from magrl.transforms.track import STD_KEYS
@@ -77,8 +77,9 @@ def choose_tasks(path: Path | None, tasks: str | int | None, tasks_seed: int | N
     """
     scenario = Scenario(**changes) if path is None else load_scenario(path, **changes)
     if isinstance(tasks, int):
-        check_number(0, 2**62, whole=True, tasks_seed=0 if tasks_seed is None else tasks_seed)
-        return scenario.with_tasks(scenario.random_tasks(tasks, FIRST_TASKS_SEED + (tasks_seed or 0)))
+        tasks_seed = 0 if tasks_seed is None else tasks_seed
+        check_number(0, 2**62, whole=True, tasks_seed=tasks_seed)
+        return scenario.with_tasks(scenario.random_tasks(tasks, FIRST_TASKS_SEED + tasks_seed))
     if tasks_seed is not None:
         raise ValueError(f"--tasks-seed {tasks_seed} needs a number of random tasks, such as --tasks 300")
     if path is None:
@@ -102,7 +103,7 @@ def first_tasks(scenario: Scenario, num_tasks: int) -> Scenario:
     """
     assert scenario.tasks is not None
     check_number(1, len(scenario.tasks.start), whole=True, num_tasks=num_tasks)
-    tasks = type(scenario.tasks)(*(values[:num_tasks] for values in scenario.tasks))
+    tasks = Tasks(*(values[:num_tasks] for values in scenario.tasks))
     return scenario.replace(tasks=tasks, names=scenario.names[:num_tasks])
 
 

@@ -42,6 +42,8 @@ class FieldBank(Float64Module):
         torch.Size([2, 3])
     """
 
+    indexed = True
+    """Whether an evaluation takes an index."""
     CHUNK = 10240
     """Positions evaluated at a time; temporary memory is about 3 kB per position."""
     coefficients: Tensor

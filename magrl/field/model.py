@@ -98,7 +98,7 @@ def elements_at(field: FieldModel | FieldBankModel, position: Tensor, index: Ten
     Args:
         field: field model, or a bank of them.
         position: ``(..., 2)`` latitude, longitude [deg].
-        index: ``(...)`` int64, the field of each position in a bank.
+        index: ``(...)`` int64, the field of each position in a bank; a single model ignores it.
 
     Returns:
         ``(..., 3)``: D [deg], I [deg], B_H [nT].
@@ -111,7 +111,7 @@ def elements_at(field: FieldModel | FieldBankModel, position: Tensor, index: Ten
         [8.02, -16.15, 35466.61]
     """
     check_tensor(2, position=position)
-    return measured_elements(field(*_place(position, index)))
+    return measured_elements(field(*_place(field, position, index)))
 
 
 def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]:
@@ -147,7 +147,7 @@ def elements_gradient_at(field: FieldModel | FieldBankModel, position: Tensor, i
     Args:
         field: field model, or a bank of them.
         position: ``(..., 2)`` latitude, longitude [deg].
-        index: ``(...)`` int64, the field of each position in a bank.
+        index: ``(...)`` int64, the field of each position in a bank; a single model ignores it.
 
     Returns:
         ``(..., 3, 2)``: element unit per km, northward and eastward.
@@ -161,9 +161,10 @@ def elements_gradient_at(field: FieldModel | FieldBankModel, position: Tensor, i
                 [ 0.1423, -0.4990]], dtype=torch.float64)
     """
     check_tensor(2, position=position)
-    return elements_gradient(*field.value_and_gradient(*_place(position, index)))
+    return elements_gradient(*field.value_and_gradient(*_place(field, position, index)))
 
 
-def _place(position: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:
-    """Return the arguments of a field model, or of a bank."""
-    return (position[..., 0], position[..., 1], *(() if index is None else (index,)))
+def _place(field: FieldModel | FieldBankModel, position: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:
+    """Return the arguments of a field model, or of a bank, which alone takes the index."""
+    place = (position[..., 0], position[..., 1])
+    return (*place, index) if index is not None and getattr(field, "indexed", False) else place

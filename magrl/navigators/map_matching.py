@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -99,10 +100,10 @@ class MapMatching(Navigator):
         check_numbers(3, sensor_std=sensor_std, map_error=map_error)
         check_number(0, sensor_std=min(sensor_std), map_error=min(map_error))
         check_number(1, GRID_POINTS**2, whole=True, hypotheses=hypotheses)
-        self.many, self.hypotheses = isinstance(region, Regions), int(hypotheses)
-        self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if self.many else [])]
+        self.hypotheses, bank = int(hypotheses), isinstance(field, FieldBank)
+        self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if bank else [])]
         self.map = field
-        self._place(region if isinstance(region, Regions) else Regions.of([region]).to(_device(field)))
+        self._place(copy.deepcopy(Regions.of(region)).to(_device(field)))
         squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, sensor_std))
         floor, error, sensors = (x.to(self.grid.device) for x in squares)
         self.register_buffer("target_std", (floor + error).sqrt())
@@ -131,14 +132,14 @@ class MapMatching(Navigator):
     def _place(self, region: Regions) -> None:
         """Keep the region, and the elements on a grid of it."""
         expansions = len(self.map) if isinstance(self.map, FieldBank) else 1
-        if isinstance(self.map, FieldBank) != self.many or expansions != len(region):
+        if expansions != len(region):
             raise ValueError(
                 f"field holds {expansions} maps and region {len(region)} boxes: give many regions a FieldBank with one "
                 "expansion for each, and a single Region a field model"
             )
         grid = region.grid(GRID_POINTS)
         index = torch.arange(len(region), device=grid.device).reshape(-1, 1, 1)
-        elements = elements_at(self.map, grid, index if self.many else None)
+        elements = elements_at(self.map, grid, index)
         missing = ~elements.isfinite().flatten(1).all(1)
         if missing.any():
             box = region[int(missing.nonzero()[0])]
@@ -215,7 +216,7 @@ class MapMatching(Navigator):
 
     def _residual(self, position: Tensor, elements: Tensor, std: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:
         """Return elements minus those of the map ``(P, H, 3)`` and its gradient ``(P, H, 3, 2)``, both over ``std``."""
-        index = (region.unsqueeze(-1).expand(position.shape[:-1]),) if self.many else ()
+        index = (region.unsqueeze(-1).expand(position.shape[:-1]),) if isinstance(self.map, FieldBank) else ()
         value, gradient = self.map.value_and_gradient(*position.unbind(-1), *index)
         residual = element_difference(elements.unsqueeze(1), measured_elements(value))
         std = std.expand(len(position), 3).unsqueeze(1)
@@ -231,7 +232,9 @@ class MapMatching(Navigator):
 
     def _region(self, seen: TensorDictBase) -> Tensor:
         """Return the number of the region of each vehicle ``(P,)``."""
-        return seen["region"].squeeze(-1) if self.many else torch.zeros_like(seen["step_count"].squeeze(-1))
+        return (
+            seen["region"].squeeze(-1) if "region" in self.in_keys else torch.zeros_like(seen["step_count"].squeeze(-1))
+        )
 
 
 def _device(field: FieldModel | FieldBank) -> torch.device:
@@ -290,12 +293,12 @@ def dated_map(scenario: Scenario, date: Date, max_move_km: float = 50.0) -> Regi
         >>> dated_map(Scenario(), "2015-01-01").latitude
         (-15.5, 5.5)
     """
-    if isinstance(scenario.region, Region):
-        dated = scenario.replace(date=date, field=None, tasks=None, names=()).build_field(max_move_km)
+    scenario = scenario.replace(tasks=None, names=(), max_move_km=max_move_km)
+    if not isinstance(scenario.field, FieldBank):
+        dated = scenario.replace(date=date, field=None).build_field()
         assert isinstance(dated, RegionalField)
         return dated
-    box, gauss = scenario.reachable(max_move_km), igrf_coefficients(date, scenario.generation).unsqueeze(0)
-    assert isinstance(box, Regions)
+    box, gauss = scenario.reachable(), igrf_coefficients(date, scenario.generation).unsqueeze(0)
     planet = torch.zeros(len(box), dtype=torch.int64)
     return FieldBank.build(gauss, planet, box.latitude, box.longitude, degree=scenario.field.degree, tolerance_nt=0.1)
 

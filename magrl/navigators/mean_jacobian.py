@@ -74,7 +74,7 @@ class MeanJacobian(QuasiNewton):
     def for_env(
         cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
     ) -> Self:
-        if env.many:
+        if len(env.region) > 1:
             raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
         places, std = env.region.grid(21).to(env.device), total_std(sensor_std, bias_std)
         return cls(env.field, places, env.max_move_km, env.max_turn_rad, sensor_std=std, **options)

@@ -57,8 +57,7 @@ class ParallelApproach(Navigator):
         super().__init__(max_move_km, max_turn_rad)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
-        self.in_keys = ["field", "target_field", "heading", "position", "step_count"]
-        self.in_keys += ["region"] if isinstance(field, FieldBank) else []
+        self.in_keys = ["field", "target_field", "heading", "position", "step_count", "region"]
         self.field, self.elements = field, element_indices(NAMES if pair is None else pair, 2)
         if pair is not None and len(pair) != 2:
             raise ValueError(f"pair must be two of D, I, B_H, got {tuple(pair)}")
@@ -70,8 +69,7 @@ class ParallelApproach(Navigator):
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         here, there = (seen[key].double() for key in ("field", "target_field"))
         error = element_difference(there, here)[:, self.elements]
-        index = seen["region"].squeeze(-1) if "region" in self.in_keys else None
-        gradient = elements_gradient_at(self.field, seen["position"], index)[:, self.elements]
+        gradient = elements_gradient_at(self.field, seen["position"], seen["region"].squeeze(-1))[:, self.elements]
         scale = gradient.new_tensor(CURVATURE)[self.elements]
         way = displacement_to(error / scale, gradient / scale.unsqueeze(-1))
         wanted = torch.atan2(way[:, 1], way[:, 0])

@@ -58,7 +58,7 @@ class RunAndTumble(Navigator):
 
     @classmethod
     def for_env(cls, env: GeomagneticNavEnv, **options: Any) -> Self:
-        return super().for_env(env, objective_floors=tuple(env.objective_floors.tolist()), **options)
+        return super().for_env(env, objective_floors=tuple(env.objective_floors.mean(0).tolist()), **options)
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         here, there = seen["field"].double(), seen["target_field"].double()

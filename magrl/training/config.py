@@ -111,7 +111,7 @@ class RunConfig(CheckedModel):
         except OSError as error:
             raise ValueError(str(error)) from None
         for name in ("zeta", "start_heading", "max_steps"):
-            said, own = getattr(scenario, name), getattr(self, name, None)
+            said, own = scenario.given(name), getattr(self, name, None)
             if None not in (said, own) and said != own:
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"the scenario says {name} = {said!r}, the training {own!r}: add {option} {said}")

@@ -26,7 +26,7 @@ from typing_extensions import Self
 from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import check_finite
-from magrl.envs import GeomagneticNavEnv, Region, Scenario
+from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
 from magrl.evaluation.scenarios import task_names
@@ -292,7 +292,7 @@ class Run:
         result |= {key: getattr(self.statistics, key) for key in ("frames", "episodes", "updates")}
         reached = next((row["seconds"] for row in self.log.rows if passes_paper(row)), math.nan)
         result |= {"training_seconds": seconds, "seconds_to_97_sr_88_spl": reached}
-        if isinstance(test.region, Region):
+        if len(test.region) == 1:
             shown = rollout if self._own is None else evaluation_rollout(self._own, self.policy)
             figure = maps.trajectories_figure(shown, test.field, test.region, names=self.scenario.names)
             self.log.figure("trajectories", figure)

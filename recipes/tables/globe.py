@@ -59,8 +59,8 @@ Measures = Mapping[str, Tensor]
 class GlobeEnv(GeomagneticNavEnv):
     """The environment over the whole Earth, where D takes every value, so that readings have no bounds to check."""
 
-    def _make_specs(self, box: Region | Regions) -> None:  # noqa: ARG002 - D is bounded in no box that holds a pole
-        super()._make_specs(Region((-1, 1), (0, 1)))  # of any ordinary place; what differs follows
+    def _make_specs(self, boxes: Regions) -> None:  # noqa: ARG002 - D is bounded in no box that holds a pole
+        super()._make_specs(Regions.of(Region((-1, 1), (0, 1))))  # of any ordinary place; what differs follows
         for key in ("field", "target_field"):
             self.observation_spec[key] = Unbounded((self.num_envs, 3))
         self.state_spec = state_spec(self.observation_spec)

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import RewardSum, TransformedEnv
 
-from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks, planet_scenario
+from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks, planet_scenario
 from magrl.envs.measures import distance_to_arrival, path_efficiency, path_measures, spl
 from magrl.evaluation.intervals import wilson_interval
 from magrl.evaluation.metrics import episode_measures, first_episode_mask, summarize
@@ -216,7 +216,7 @@ def nearest_on_grids(env: GeomagneticNavEnv, state: TensorDict, task: int, half_
 
 def arrival_km(env: GeomagneticNavEnv, state: TensorDict) -> Tensor:
     keys = ("start_position", "target_position", "objective_weights")
-    return distance_to_arrival(*(state[key] for key in keys), env.field, env.zeta, env.edge)
+    return distance_to_arrival(*(state[key] for key in keys), env.field, env.zeta, env.edge, state["region"][:, 0])
 
 
 @pytest.mark.parametrize(("zeta", "half_km"), [(0.001, 30.0), (0.01, 90.0), (0.1, 200.0)])
@@ -233,7 +233,7 @@ def test_places_outside_the_region_are_no_arrival() -> None:
     env = GeomagneticNavEnv(Scenario(tasks=tasks), seed=0)
     state = env.reset()
     free_km = arrival_km(env, state).item()
-    env.edge = Region((-12.0, -6.0), (158.0, 172.0))
+    env.edge = Regions.of(Region((-12.0, -6.0), (158.0, 172.0)))
     meridian_km, _ = geodesic(*tasks.start.T, *tasks.target.T)
     assert arrival_km(env, state).item() == pytest.approx(meridian_km.item(), abs=0.01)
     assert free_km < meridian_km.item() - 10
@@ -266,7 +266,8 @@ def test_each_of_many_regions_has_its_own_field() -> None:
         alone = partial(env.field, index=torch.tensor(index))
         alone.value_and_gradient = partial(env.field.value_and_gradient, index=torch.tensor(index))
         row = (x[task : task + 1] for x in (start, target, weights))
-        expected = distance_to_arrival(*row, alone, env.zeta, env.edge[index])
+        box, zero = Regions.of(env.edge[index]), torch.zeros(1, dtype=torch.int64)
+        expected = distance_to_arrival(*row, alone, env.zeta, box, zero)
         assert got[task].item() == pytest.approx(expected.item(), abs=1e-6)
     assert episode_measures(rollout, env)["spl_to_arrival"].isfinite().all()
 

@@ -13,7 +13,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, PendulumEnv, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Scenario
-from magrl.envs.region import Region
+from magrl.envs.regions import Region
 from magrl.transforms import AngleVector, FieldGradient, GradientHeading, MinMaxNorm
 
 DTYPES = [torch.float32, torch.float64]

@@ -243,7 +243,7 @@ def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
     medians = []
     for std in ((0.0, 0.0, 0.0), (0.05, 0.05, 5.0)):
         for relation in (None, curl_relation):
-            base = GeomagneticNavEnv(scenario, num_envs=1000, seed=0, start_heading="random", max_turn_rad=math.pi)
+            base = GeomagneticNavEnv(scenario, num_envs=1000, seed=0, start_heading="random", max_turn_deg=180.0)
             track = TrackGradient(keys, relation=relation, frame="vehicle")
             env = TransformedEnv(base, Compose(SensorNoise(std, seed=1), track, TrueWay()))
             state = env.reset()

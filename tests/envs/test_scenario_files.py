@@ -1,0 +1,197 @@
+"""Scenario files: their content, and what is wrong with it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from magrl.envs import GeomagneticNavEnv, Region, Regions, load_scenario
+from magrl.envs.scenario_files import MAX_FILE_BYTES
+from magrl.field import IGRF
+
+ROOT = Path(__file__).parent.parent.parent
+AZORES = Regions.of(Region((36, 46), (-32, -22)))
+TOML = """
+date = 2026-07-01
+generation = 14
+altitude_km = 10.0
+margin_deg = 4
+distance_range_km = [200, 400]
+objective_floors = [0.1, 0.3, 100]
+
+[region]
+latitude = [36, 46]
+longitude = [-32, -22]
+
+[[tasks]]
+name = "Ponta Delgada to Flores"
+start = [37.74, -25.67]
+target = [39.45, -31.13]
+
+[[tasks]]
+start = [40, -30]
+target = [42, 332]
+"""
+
+
+def sound() -> dict[str, Any]:
+    """Return the content of the same file, as tables."""
+    return {
+        "region": {"latitude": [36, 46], "longitude": [-32, -22]},
+        "date": "2026-07-01",
+        "generation": 14,
+        "altitude_km": 10.0,
+        "margin_deg": 4,
+        "distance_range_km": [200, 400],
+        "objective_floors": [0.1, 0.3, 100],
+        "tasks": [
+            {"name": "Ponta Delgada to Flores", "start": [37.74, -25.67], "target": [39.45, -31.13]},
+            {"start": [40, -30], "target": [42, 332]},
+        ],
+    }
+
+
+def test_a_file_holds_all_of_a_scenario(tmp_path: Path) -> None:
+    for name, content in (
+        ("azores.toml", TOML),
+        ("azores.json", json.dumps(sound())),
+        ("AZORES.JSON", json.dumps(sound())),
+    ):
+        (tmp_path / name).write_text(content)
+        scenario = load_scenario(tmp_path / name)
+        assert scenario.region == AZORES
+        assert (str(scenario.date)[:10], scenario.generation, scenario.altitude_km) == ("2026-07-01", 14, 10.0)
+        assert (scenario.distance_range_km, scenario.margin_deg) == ((200, 400), 4)
+        assert scenario.objective_floors == (0.1, 0.3, 100)
+        assert scenario.names == ("Ponta Delgada to Flores", "task 2")
+        assert scenario.tasks is not None
+        assert scenario.tasks.start.flatten().tolist() == pytest.approx([37.74, -25.67, 40, -30], abs=1e-12)
+        assert scenario.tasks.target.flatten().tolist() == pytest.approx([39.45, -31.13, 42, -28], abs=1e-12)
+
+
+def test_defaults_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "small.json"
+    path.write_text(json.dumps({"region": sound()["region"], "date": 2026.5}))
+    scenario = load_scenario(str(path))
+    assert (scenario.generation, scenario.altitude_km, scenario.margin_deg) == (14, 0.0, 5.0)
+    assert scenario.distance_range_km == (300, 500)
+    assert (scenario.tasks, scenario.names, scenario.objective_floors) == (None, (), None)
+
+
+def test_the_example_file_loads() -> None:
+    scenario = load_scenario(ROOT / "docs" / "examples" / "azores.toml")
+    assert scenario.region == AZORES
+    assert len(scenario.names) == len(scenario.tasks.start) == 3
+    assert scenario.floors(scenario.build_field())[0].tolist() == pytest.approx((0.113, 0.268, 110.4), rel=1e-3)
+
+
+DELETE = object()
+HERE = {"start": [40, -30], "target": [41, -22]}
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no scenario file at .*nowhere\.toml"):
+        load_scenario(tmp_path / "nowhere.toml")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(ValueError, match=r"folder\.toml"):
+        load_scenario(tmp_path / "folder.toml")
+    with pytest.raises(TypeError, match="path must be a Path or str, got 5"):
+        load_scenario(5)
+
+
+def test_a_scenario_holds_the_options_of_its_episodes(tmp_path) -> None:
+    path = tmp_path / "long.toml"
+    path.write_text(
+        """date = 2022-01-01
+altitude_km = -3
+max_steps = 80
+max_move_km = 20
+max_turn_deg = 45
+zeta = 0.02
+arrival = "distance"
+arrival_radius_km = 30
+start_heading = "random"
+region = {latitude = [-10, 0], longitude = [160, 170]}
+"""
+    )
+    env = GeomagneticNavEnv(load_scenario(path), num_envs=3, seed=0)
+    assert (env.max_steps, env.max_move_km, env.zeta, env.start_heading) == (80, 20.0, 0.02, "random")
+    assert (env.max_turn_rad, env.arrival.rule, env.arrival.radius_km) == (math.pi / 4, "distance", 30.0)
+    assert env.action_spec.space.high[0].tolist() == pytest.approx([20.0, math.pi / 4])
+    assert env.reset()["heading"].abs().min() > 0
+    deep = IGRF("2022-01-01")(torch.tensor(-5.0), torch.tensor(165.0), -3.0)
+    torch.testing.assert_close(env.field(torch.tensor(-5.0), torch.tensor(165.0)), deep, rtol=0, atol=1e-4)
+
+
+BAD_CONTENT: list[tuple[str, object, str]] = [
+    ("wings", 2, "unknown key 'wings': choose from region, distance_range_km, distance_law, date"),
+    ("field", 2, "unknown key 'field': choose from"),
+    ("names", ["a", "b"], "unknown key 'names': choose from"),
+    ("region", [1], "a table of latitude and longitude, each [low, high] in degrees, got [1]"),
+    ("region", DELETE, "region is missing: a scenario file must hold region and date"),
+    ("region.latitude", DELETE, "got {'longitude': [-32, -22]}"),
+    ("region.latitude", [36, "46"], "region: latitudes must be 2 finite numbers, got (36, '46')"),
+    ("region.latitude", [46, 36], "region: latitudes (46, 36) must rise"),
+    ("region.longitude", [3600, 3610], "region: longitudes must lie between -360 and 360 degrees"),
+    ("date", DELETE, "date is missing: a scenario file must hold region and date"),
+    ("date", 10**400, "000... is not a year between 1 and 9999"),
+    ("max_steps", 2.5, "max_steps must be a valid integer, got 2.5"),
+    ("altitude_km", 5000, "altitude_km must be a finite number from -15 up to 1000, got 5000.0"),
+    ("objective_floors", [0.05, 0.4, 0], "objective_floors must be a finite number above 0, got 0"),
+    ("tasks", {"start": [1, 2]}, "tasks must be a list of tables with start and target, got {'start': [1, 2]}"),
+    ("tasks", [5], "tasks, entry 1, must be a table with start and target, got 5"),
+    ("tasks", [HERE, {"start": [40, -30]}], "tasks, entry 2: target is missing"),
+    ("tasks", [HERE | {"color": "red"}], "tasks, entry 1: unknown key 'color': choose from start, target, name"),
+    ("tasks", [HERE | {"target": [41, -15]}], "the target of task 0 (the first is task 0), [41.0, -15.0], lies"),
+    ("tasks", [HERE, HERE | {"target": [40, 330]}], "task 1 (the first is task 0) starts at its destination"),
+    ("tasks", [HERE | {"start": [140, -30]}], "tasks: latitude 140.0 is not between -90 and 90 degrees"),
+    ("tasks", [HERE | {"start": [40]}], "tasks, entry 1: start must be 2 finite numbers, got [40]"),
+    ("tasks", [HERE | {"name": ""}], "tasks, entry 1: name must be a text of 1 to 200 printable characters, got ''"),
+    ("tasks", [HERE | {"name": "a\nb"}], "printable characters, got 'a\\nb'"),
+    ("tasks", [HERE | {"name": 5}], "got 5"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "says"), BAD_CONTENT)
+def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, value: object, says: str) -> None:
+    path, content = tmp_path / "mine.json", sound()
+    *tables, last = key.split(".")
+    table = content
+    for name in tables:
+        table = table[name]
+    if value is DELETE:
+        del table[last]
+    else:
+        table[last] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"mine\.json: ") as error:
+        load_scenario(path)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value).removeprefix(str(path))) < 300
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("a.yaml", b"", "a scenario file must end in .toml or .json, got '.yaml'"),
+        ("a.toml", b"[region", "the file is not valid TOML"),
+        ("a.json", b"{", "the file is not valid JSON"),
+        ("a.json", b'{"region": 1, "region": 2}', "the key 'region' is repeated"),
+        ("a.json", b"\xff\xfe\x00", "the file is not UTF-8"),
+        ("a.json", b"[" * 100_000, "JSON"),
+        ("a.json", b" " * (MAX_FILE_BYTES + 1), f"the file holds more than {MAX_FILE_BYTES} bytes"),
+        ("a.json", b"[]", "a scenario file must hold a table, got []"),
+    ],
+    ids=range(8),
+)
+def test_unreadable_files(tmp_path: Path, name: str, content: bytes, says: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=name) as error:
+        load_scenario(tmp_path / name)
+    assert says in str(error.value)

@@ -1,0 +1,185 @@
+"""The transform that declares an arrival, and the measures of declared arrivals."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import pytest
+import torch
+from support.environments import parallel
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region, Scenario, Tasks
+from magrl.evaluation import episode_measures, evaluation_rollout, summarize
+from magrl.field import FieldModel
+from magrl.geodesy import move
+from magrl.navigators import Kalman, Secant
+from magrl.transforms import DeclareArrival, MagneticWeather, SensorNoise, TrackGradient
+
+STD = (0.05, 0.05, 5.0)
+
+
+@cache
+def field() -> FieldModel:
+    return Scenario().build_field()
+
+
+def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0} | options))
+
+
+def declared(num_envs: int = 2, radius_km: float = 25.0, **options: object) -> GeomagneticNavEnv:
+    return nav(num_envs, arrival="declared", arrival_radius_km=radius_km, **options)
+
+
+def declaring(num_envs: int = 2, within_km: float = 20.0, **options: object) -> TransformedEnv:
+    return TransformedEnv(declared(num_envs, **options), Compose(TrackGradient(), DeclareArrival(within_km)))
+
+
+def near(*distances_km: float, rule: str = "declared") -> GeomagneticNavEnv:
+    """Vehicles whose targets are some distances northward; a radius of 10 km."""
+    start = torch.tensor([[-5.0, 165.0]], dtype=torch.float64).expand(len(distances_km), 2)
+    reach = torch.tensor(distances_km, dtype=torch.float64)
+    target = torch.stack(move(*start.unbind(-1), torch.zeros_like(reach), reach), -1)
+    scenario = Scenario(field=field(), tasks=Tasks(start, target))
+    return GeomagneticNavEnv(scenario, num_envs=len(reach), arrival=rule, arrival_radius_km=10.0, seed=0)
+
+
+def test_on_a_long_way_the_distance_tells_what_the_objective_hides() -> None:
+    """At 1000 to 1800 km, F < 0.01 holds up to 100 km from the destination: SR is 100 %, and few end within 25 km."""
+    region = Region((30.0, 50.0), (-45.0, -20.0))
+    scenario = Scenario(region=region, date="2025-01-01", generation=14, distance_range_km=(1000.0, 1800.0))
+    frozen = scenario.replace(max_steps=120).with_tasks(scenario.random_tasks(30, seed=1))
+    by_objective, by_distance = (
+        summarize(episode_measures(evaluation_rollout(env, Secant()), env))
+        for env in (GeomagneticNavEnv(frozen, num_envs=30, arrival=rule, seed=0) for rule in ("objective", "distance"))
+    )
+    assert by_objective["success_rate"] == by_distance["success_rate"] == 100
+    assert by_objective["success_rate_within_25km"] < 30
+    assert by_objective["final_distance_km_median"] > 35
+    assert by_distance["success_rate_within_25km"] == 100
+    assert by_distance["final_distance_km_median"] < 25
+    assert by_distance["spl_to_arrival"] < by_distance["spl"]
+
+
+# The transform
+
+
+def test_it_declares_by_the_mean_square_of_the_estimated_distance() -> None:
+    """3-4-5 triangles: a way of 12 km with standard deviations of 3 and 4 km is 13 km in the root mean square."""
+    way = torch.tensor([[12.0, 0.0], [0.0, 12.0], [12.0, 0.0]])
+    covariance = torch.diag_embed(torch.tensor([[9.0, 16.0], [9.0, 16.1], [0.0, 0.0]]))
+    action = torch.tensor([[50.0, 1.0]]).repeat(3, 1)
+    td = TensorDict(way=way, way_covariance=covariance, action=action, batch_size=3)
+    sent = DeclareArrival(within_km=13.0).inv(td)["action"]
+    assert sent.tolist() == [[0.0, 0.0, 1.0], [50.0, 1.0, -1.0], [0.0, 0.0, 1.0]]
+    assert td["action"].shape == (3, 2)  # what the policy wrote stays
+
+
+@pytest.mark.parametrize(
+    "make",
+    [declaring, partial(SerialEnv, 2, declaring), lambda: parallel(declaring)],
+    ids=["one", "serial", "parallel"],
+)
+def test_conformance(make) -> None:
+    env = make()
+    try:
+        assert env.action_spec.shape[-1] == 2
+        check_env_specs(env)
+    finally:
+        env.close()
+
+
+def test_it_does_not_change_the_environment_s_specs() -> None:
+    base = declared()
+    before = base.specs.clone()
+    _ = TransformedEnv(base, Compose(TrackGradient(), DeclareArrival(20.0))).rollout(2)
+    assert base.specs == before
+
+
+@pytest.mark.parametrize("navigator", [Kalman, Secant])
+def test_every_navigator_can_be_flown(navigator) -> None:
+    env = declaring(100)
+    summary = summarize(episode_measures(evaluation_rollout(env, navigator()), env))
+    assert summary["success_rate"] >= 97
+    assert summary["success_rate"] + summary["false_arrival_rate"] <= 100
+    assert 80 < summary["spl_to_arrival"] < summary["spl"]
+    assert summary["navigation_error_km_declared"] < 15
+
+
+def test_errors_of_the_sensors_cause_false_arrivals_and_caution_prevents_them() -> None:
+    """The measured field and its accuracy alone decide: weather that is not on the data sheet is believed."""
+
+    def measured(within_km: float, *errors: object) -> dict[str, float]:
+        track = TrackGradient(("field", "target_field", "move", "heading", "sensor_std"))
+        steps = Compose(*errors, SensorNoise(STD, seed=1), track, DeclareArrival(within_km))
+        env = TransformedEnv(declared(200), steps)
+        return summarize(episode_measures(evaluation_rollout(env, Secant(noise=STD))))
+
+    bold, careful = measured(35.0), measured(12.0)
+    assert bold["false_arrival_rate"] > careful["false_arrival_rate"] + 5
+    assert careful["navigation_error_km_declared"] < bold["navigation_error_km_declared"]
+    stormy = measured(12.0, MagneticWeather("college", speed_km_h=341.0, seed=1))
+    assert stormy["false_arrival_rate"] > careful["false_arrival_rate"]
+
+
+def test_nothing_privileged_decides() -> None:
+    env = declaring(20)
+    state = env.rollout(6, Secant(), break_when_any_done=False)[:, -1].exclude("next")
+    sent = env.transform.inv(state)["action"]
+    for key in (*PRIVILEGED_KEYS, "declared"):
+        state[key] = torch.full_like(state[key], 1)
+    assert torch.equal(env.transform.inv(state)["action"], sent)
+
+
+# Measures
+
+
+def test_measures_by_hand() -> None:
+    """Four vehicles that stay 5, 9, 20 and 30 km from their targets; the third declares falsely, the fourth never."""
+    env = near(5.0, 9.0, 20.0, 30.0)
+    declare = torch.tensor([1.0, 1.0, 1.0, -1.0]).unsqueeze(-1)
+
+    def act(heading: Tensor) -> Tensor:
+        return torch.cat((torch.zeros(4, 2), declare.expand_as(heading)), -1)
+
+    policy = TensorDictModule(act, in_keys=["heading"], out_keys=["action"])
+    episodes = episode_measures(evaluation_rollout(env, policy), env)
+    assert episodes["success"].tolist() == [True, True, False, False]
+    assert episodes["false_arrival"].tolist() == [False, False, True, False]
+    assert episodes["spl_to_arrival"].tolist() == [1, 1, 0, 0]
+    summary = summarize(episodes)
+    assert summary["success_rate"] == 50
+    assert summary["false_arrival_rate"] == 25
+    assert summary["false_arrival_rate_low"] == pytest.approx(4.56, abs=0.01)
+    assert summary["navigation_error_km"] == pytest.approx(7.0, abs=1e-4)
+    assert summary["navigation_error_km_declared"] == pytest.approx((5 + 9 + 20) / 3, abs=1e-4)
+    plain = episode_measures(evaluation_rollout(nav(), Secant()))
+    assert "false_arrival" not in plain
+    assert "false_arrival_rate" not in summarize(plain)
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: DeclareArrival(0), "within_km .*0"),
+        (lambda: DeclareArrival(5.0, way_keys=["way"]), r"way_keys .*\['way'\]"),
+        (lambda: TransformedEnv(nav(), DeclareArrival(5.0)).specs, r"third number .*\(2, 2\)"),
+    ],
+)
+def test_errors(make, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        make()
+
+
+def test_it_needs_an_estimate() -> None:
+    env = TransformedEnv(declared(), DeclareArrival(5.0))
+    with pytest.raises(KeyError, match=r"\['way', 'way_covariance'\].*TrackGradient"):
+        env.step(env.reset().set("action", torch.zeros(2, 2)))
