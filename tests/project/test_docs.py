@@ -101,6 +101,7 @@ def help_text(script: str) -> str:
         patch.setattr(sys, "argv", [script, "--help"])
         patch.syspath_prepend(ROOT / "recipes")
         patch.setenv("COLUMNS", "200")
+        patch.delitem(sys.modules, f"{name}.__main__", raising=False)  # runpy warns of a module that is loaded already
         run(name, run_name="__main__")
     return shown.getvalue()
 
