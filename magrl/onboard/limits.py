@@ -13,7 +13,7 @@ from magrl.field.elements import NAMES, UNITS
 from magrl.transforms import ObservationView, TrackView
 
 LEAST_NT = 2000.0
-"""Least B_H for an agent without a map: below, it fails more often (docs/anywhere.md, the whole globe) [nT]."""
+"""Least B_H for an agent without a map: below, it fails more often (docs/earth.md, the whole globe) [nT]."""
 
 _LONGER = 1.1  # than the longest move
 
