@@ -34,7 +34,9 @@ def errors_by_name(names: Sequence[str]) -> dict[str, Conditions]:
     """Return the conditions of some names, or the levels of noise where none are given."""
     if names:
         return {name: conditions_named(name) for name in names}
-    noise = {f"{d:g}°, {i:g}°, {h:g} nT": Conditions("noise", 100.0, sensors={"std": (d, i, h)}) for d, i, h in NOISE}
+    noise = {
+        f"{d:g}°, {i:g}°, {h:g} nT": Conditions("noise", 100.0, sensors={"sensor_std": (d, i, h)}) for d, i, h in NOISE
+    }
     return {"none": conditions_named("laboratory"), **noise}
 
 

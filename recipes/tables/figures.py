@@ -157,24 +157,24 @@ def paper_run(_: int | None) -> Figures:
 
 def sensors(**errors: object) -> Conditions:
     """Return conditions with errors of the sensors beside the noise."""
-    return Conditions("sensors", sensors={"std": STD, **errors})
+    return Conditions("sensors", sensors={"sensor_std": STD, **errors})
 
 
 def motion(**errors: float) -> Conditions:
     """Return conditions with errors of motion."""
-    return Conditions("motion", SPEED_KM_H, sensors={"std": STD}, motion=errors)
+    return Conditions("motion", SPEED_KM_H, sensors={"sensor_std": STD}, motion=errors)
 
 
 def weather(factor: float) -> Conditions:
     """Return conditions with a multiple of the weather of a month."""
     month = weather_record("boulder-2016")
     record = WeatherRecord(factor * month.variation, month.first, month.last, f"{factor:g} x {month.name}")
-    return Conditions("weather", SPEED_KM_H, sensors={"std": STD}, weather={"record": record})
+    return Conditions("weather", SPEED_KM_H, sensors={"sensor_std": STD}, weather={"record": record})
 
 
 def north(size: float) -> Conditions:
     """Return conditions with a constant error of the north reference."""
-    return Conditions("north", sensors={"std": STD}, north={"constant_deg": size, "fixed": True})
+    return Conditions("north", sensors={"sensor_std": STD}, north={"constant_deg": size, "fixed": True})
 
 
 PANELS: Mapping[str, tuple[Callable[[float], Conditions], tuple[float, ...]]] = {

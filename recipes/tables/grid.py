@@ -129,7 +129,7 @@ def random_boxes(count: int, seed: int) -> list[Scenario]:
 
 def place(scenario: Scenario) -> str:
     """Return a box as text, such as ``10°S to 0°, 175°E to 185°E``."""
-    (south, _), (west, _) = scenario.region.latitude, scenario.region.longitude
+    (south, _), (west, _) = scenario.region[0].latitude, scenario.region[0].longitude
     west = (west + 180) % 360 - 180
     edges = [f"{abs(x):g}°" + ("S" if x < 0 else "N" if x > 0 else "") for x in (south, south + 10)]
     edges += [f"{abs(x):g}°" + ("W" if x < 0 else "E" if x > 0 else "") for x in (west, west + 10)]

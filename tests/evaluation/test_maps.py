@@ -13,7 +13,7 @@ from PIL import Image
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
+from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks
 from magrl.evaluation import episode_measures, evaluation_rollout, maps
 from magrl.evaluation.maps import coastlines, frame, shortest_path, trajectories_figure, way_ellipse, write_gif
 from magrl.geodesy import geodesic
@@ -62,7 +62,7 @@ def test_frame_has_room_on_each_side() -> None:
         height = box.latitude[1] - box.latitude[0]
         width = (box.longitude[1] - box.longitude[0]) * math.cos(math.radians(sum(box.latitude) / 2))
         assert 0.4 < height / width < 2.6
-        assert Region(box.latitude, box.longitude).contains(torch.tensor(positions)).all()
+        assert Regions.of(box).contains(torch.tensor(positions)).all()
 
 
 def test_tracks_end_where_the_episode_did(env: GeomagneticNavEnv) -> None:
@@ -130,7 +130,7 @@ def test_gif_of_one_vehicle_holds_the_estimates_and_ends_with_the_last(flight, m
     rollout["next", "way"][0, -1] = torch.tensor([-300.0, 0.0])
     keep = maps._draw_legend
     monkeypatch.setattr(maps, "_draw_legend", lambda figure: (drawn.append(figure.axes[0]), keep(figure)))
-    assert len(list(maps._frames(rollout, env.field, env.region, "", 200))) == 7
+    assert len(list(maps._frames(rollout, env.field, env.region[0], "", 200))) == 7
     low, high = drawn[0].get_ylim()
     assert -17 + 4.5 < high < 20  # 500 km to the north, but not 9000 km
     assert low < -17

@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from magrl.agents import FieldPolicy, PolicyConfig
-from magrl.envs import GeomagneticNavEnv, Scenario, named_tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation import evaluate, evaluation_rollout, summarize
 
 
@@ -27,7 +27,7 @@ def test_every_task_is_flown_once_however_many_vehicles_fly() -> None:
 def test_batches_have_errors_of_their_own_that_repeat() -> None:
     """The same task in three batches has other noise and another start heading; the same call has the same."""
     tasks = named_tasks("figure-4-1")
-    thrice = Scenario().with_tasks(type(tasks)(*(values.repeat(3, 1) for values in tasks)))
+    thrice = Scenario().with_tasks(Tasks(tasks.start.repeat(3, 1), tasks.target.repeat(3, 1)))
     for errors in ({"noise": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
         one, again = (evaluate("secant", thrice, num_envs=1, **errors)["smoothness_deg"] for _ in range(2))
         assert torch.equal(one, again)

@@ -199,7 +199,7 @@ def test_reward_is_created_when_missing() -> None:
 
 
 def test_in_the_env_the_second_out_key_is_what_the_first_one_gained() -> None:
-    env = TransformedEnv(guided(), AlignmentReward(out_keys=["reward", "reward_alignment"]))
+    env = guided().append_transform(AlignmentReward(out_keys=["reward", "reward_alignment"]))
     td = env.rollout(5)["next"]
     base = td["reward_destination"] + td["reward_proximity"]
     assert td["reward_alignment"].std() > 0.5

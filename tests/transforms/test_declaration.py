@@ -118,7 +118,7 @@ def test_errors_of_the_sensors_cause_false_arrivals_and_caution_prevents_them() 
         track = TrackGradient(("field", "target_field", "move", "heading", "sensor_std"))
         steps = Compose(*errors, SensorNoise(STD, seed=1), track, DeclareArrival(within_km))
         env = TransformedEnv(declared(200), steps)
-        return summarize(episode_measures(evaluation_rollout(env, Secant(noise=STD))))
+        return summarize(episode_measures(evaluation_rollout(env, Secant(sensor_std=STD))))
 
     bold, careful = measured(35.0), measured(12.0)
     assert bold["false_arrival_rate"] > careful["false_arrival_rate"] + 5

@@ -147,10 +147,10 @@ def test_the_agent_heeds_constant_errors() -> None:
 def test_evaluate_under_conditions(tmp_path: Path) -> None:
     out = tmp_path / "results"
     config = evaluate.Config(("kalman",), tasks=5, conditions="ship", out=out, wandb_mode="disabled")
-    prepared = evaluate.prepare(config)
-    assert {type(part) for part in prepared.env.transform} >= {MotionError, NorthReferenceError}
-    assert prepared.navigators[0][0].bias_std.tolist() == list(CONDITIONS["ship"].bias_std)
-    assert evaluate.settings(prepared.config, prepared.env)["conditions"] == "ship"
+    config, (env, _), navigators, _ = evaluate.prepare(config)
+    assert {type(part) for part in env.transform} >= {MotionError, NorthReferenceError}
+    assert navigators[0][0].bias_std.tolist() == list(CONDITIONS["ship"].bias_std)
+    assert evaluate.settings(config, env)["conditions"] == "ship"
 
 
 @pytest.mark.parametrize(
