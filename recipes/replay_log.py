@@ -107,8 +107,7 @@ def read_log(config: Config) -> pd.DataFrame:
     for option in wanted:
         name = getattr(config, option)
         if name not in raw:
-            known = ", ".join(map(repr, raw.columns))
-            raise UsageError(f"{config.log} has no column {name!r} but {known}: name it by --{option}")
+            raise UsageError(f"no column of {config.log} is {name!r}: name one of {[*raw]} by --{option}")
         log[option] = pd.to_numeric(raw[name], errors="coerce")
         bad = ~np.isfinite(log[option])
         if bad.any():
@@ -272,8 +271,7 @@ def notes(table: pd.DataFrame) -> list[str]:
     if len(stops):
         found.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")
     if "miss_km" in table:
-        last = table.iloc[-1]
-        miss, stated = last["miss_km"], last["error_km"]
+        miss, stated = table[["miss_km", "error_km"]].iloc[-1]
         found.append(f"Error of the estimated way at the end: {miss:.1f} km; stated {stated:.1f} km.")
     return found
 

@@ -211,9 +211,7 @@ class GeomagneticNavEnv(EnvBase):
             start = rows[(mask.cumsum(0) - 1).clamp_min(0)]
         # Counted out of place: a rollout or a checkpoint may hold the old tensor.
         self.episode = self.episode.index_add(0, chosen, torch.ones_like(chosen))
-        if self._tracks is not None:
-            self._tracks.add(start, mask)
-        return start
+        return self._recorded_state(start, mask)
 
     def _start_of(self, vehicle: Tensor) -> TensorDict:
         """Return the first observation of the next episode of some vehicles, ``(P,)``."""
@@ -263,19 +261,9 @@ class GeomagneticNavEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = specs.checked_action(tensordict["action"], self.action_low, self.action_high)
-        distance, turn = action[:, :2].unbind(-1)
-        before = tensordict["position"]
-        heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
-        region = tensordict["region"].squeeze(-1)
-        course = heading
-        if self.drift_km:
-            distance, course = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
-        moved = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
-        was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), region).unbind(0)
-        position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
-        lost = ~(was_inside & is_inside)
-
-        field = elements_at(self.field, position, region).float().double()
+        heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + action[:, 1])
+        position, lost = self._moved(tensordict, action[:, 0], heading)
+        field = elements_at(self.field, position, tensordict["region"].squeeze(-1)).float().double()
         weights = tensordict["objective_weights"].double()
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
         ended, right = self.arrival(action, objective, position, tensordict["target_position"])
@@ -283,36 +271,48 @@ class GeomagneticNavEnv(EnvBase):
         step = tensordict["step_count"] + 1
         terminated = ended | lost
         truncated = (step >= self.max_steps) & ~terminated
-        objectives = tensordict["objective"].double(), objective
-        proximity = guidance.proximity_reward(*objectives, self.proximity_weight, self.objective_limit)
+        after = {
+            **{key: tensordict[key] for key in (*specs.CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
+            "field": field.float(),
+            "move": action[:, :2].float(),
+            "heading": heading.float().unsqueeze(-1),
+            "step_count": step,
+            "position": position,
+            "objective": objective.float(),
+            "success": arrived,
+            **self._rewards(tensordict["objective"].double(), objective, arrived, step),
+            "done": terminated | truncated,
+            "terminated": terminated,
+            "truncated": truncated,
+            **({specs.DECLARED: ended} if self.arrival.declared else {}),
+        }
+        return self._recorded_state(TensorDict(after, tensordict.batch_size, device=self.device))
+
+    def _moved(self, tensordict: TensorDictBase, distance: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions after a move, and which vehicles are lost."""
+        before, region = tensordict["position"], tensordict["region"].squeeze(-1)
+        if self.drift_km:
+            distance, heading = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
+        moved = torch.stack(move(before[:, 0], before[:, 1], heading, distance), -1)
+        was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), region).unbind(0)
+        position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
+        return position, ~(was_inside & is_inside)
+
+    def _rewards(self, before: Tensor, after: Tensor, arrived: Tensor, step: Tensor) -> dict[str, Tensor]:
+        """Return the reward and its terms, given the objective before and after a step."""
+        proximity = guidance.proximity_reward(before, after, self.proximity_weight, self.objective_limit)
         proximity = guidance.late_decay(proximity, step, self.max_steps)
         destination = guidance.destination_reward(arrived, self.destination_weight)
-        after = TensorDict(
-            {
-                **{key: tensordict[key] for key in (*specs.CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
-                "field": field.float(),
-                "move": action[:, :2].float(),
-                "heading": heading.float().unsqueeze(-1),
-                "step_count": step,
-                "position": position,
-                "objective": objective.float(),
-                "success": arrived,
-                "reward": (destination + proximity).float(),
-                "reward_destination": destination.float(),
-                "reward_proximity": proximity.float(),
-                "done": terminated | truncated,
-                "terminated": terminated,
-                "truncated": truncated,
-                **({specs.DECLARED: ended} if self.arrival.declared else {}),
-            },
-            batch_size=tensordict.batch_size,
-            device=self.device,
-        )
-        if self._tracks is not None:
-            self._tracks.add(after)
-        return after
+        terms = {"reward_destination": destination, "reward_proximity": proximity}
+        return {"reward": (destination + proximity).float()} | {key: term.float() for key, term in terms.items()}
 
     # Rendering
+
+    def _recorded_state(self, state: TensorDict, mask: Tensor | None = None) -> TensorDict:
+        """Add a state to the tracks, if any are kept; ``mask`` names the vehicles whose episodes start with it."""
+        if self._tracks is not None:
+            self._tracks.add(state, mask)
+        return state
 
     def track(self, vehicle: int) -> Tensor:
         """Return the positions of a vehicle in its running episode, start first: ``(T, 2)`` latitude, longitude [deg].

@@ -86,16 +86,15 @@ class Config:
 # Section 4 of the paper
 
 
-def columns_by_navigator(path: Path, only_successes: bool = False) -> dict[str, dict[str, list[float]]]:
-    """Return the columns of a file of recipes/evaluate.py for each navigator of :data:`SHOWN`."""
+def columns_by_navigator(path: Path) -> dict[str, dict[str, list[float]]]:
+    """Return the columns of a file of recipes/evaluate.py for each navigator of :data:`SHOWN`, without failures."""
     found: dict[str, dict[str, list[float]]] = {}
     with path.open() as file:
         for row in csv.DictReader(file):
             name = row.pop("navigator")
-            if name in SHOWN and not (only_successes and row["success"] != "True"):
+            if name in SHOWN and row.pop("success", "True") == "True":
                 for key, value in row.items():
-                    number = float({"True": 1, "False": 0, "": "nan"}.get(value, value))
-                    found.setdefault(name, {}).setdefault(key, []).append(number)
+                    found.setdefault(name, {}).setdefault(key, []).append(float(value or "nan"))
     return found
 
 
@@ -105,8 +104,7 @@ def section_4(_: int | None) -> Figures:
     field, task = Scenario().build_field(), named_tasks("figure-4-1")
     draw_tracks(contours.subplots(), field, PAPER_REGION, [task.start], task.target)
     folder = Path(declarations()["comparison"]["folder"])
-    paths = columns_by_navigator(folder / "paths.csv")
-    episodes = columns_by_navigator(folder / "episodes.csv", only_successes=True)
+    paths, episodes = (columns_by_navigator(folder / f"{name}.csv") for name in ("paths", "episodes"))
     tracks = {name: (columns["latitude"], columns["longitude"]) for name, columns in paths.items()}
     boxes = {name: {key: columns[key] for key in BOXES} for name, columns in episodes.items()}
     return {

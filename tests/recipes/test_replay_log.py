@@ -68,7 +68,7 @@ def test_short_moves_are_joined(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "arguments", "message"),
     [
-        (("B_H", "H"), (), "has no column 'B_H' but 'time', 'D', 'I', 'H'.*name it by --horizontal"),
+        (("B_H", "H"), (), "is 'B_H': name one of \\['time', 'D', 'I', 'H'.*by --horizontal"),
         (("longitude", "lon"), (), "has no column 'longitude'.*name it by --longitude"),
         (("1.310", "x"), (), r"row 2 of .*: D is 'x', which is not a number"),
         (("1.310", ""), (), r"row 2 of .*: D is nan, which is not a number"),
