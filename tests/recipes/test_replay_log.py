@@ -69,7 +69,7 @@ def test_short_moves_are_joined(tmp_path: Path) -> None:
     ("change", "arguments", "message"),
     [
         (("B_H", "H"), (), "is 'B_H': name one of \\['time', 'D', 'I', 'H'.*by --horizontal"),
-        (("longitude", "lon"), (), "has no column 'longitude'.*name it by --longitude"),
+        (("longitude", "lon"), (), "is 'longitude': name one of .*by --longitude"),
         (("1.310", "x"), (), r"row 2 of .*: D is 'x', which is not a number"),
         (("1.310", ""), (), r"row 2 of .*: D is nan, which is not a number"),
         (("14271.7", "14.27"), (), r"row 2 of .*microtesla"),
