@@ -128,9 +128,10 @@ def write_step(path: Path | str, policy: FieldPolicy) -> None:
         OSError: if the file cannot be written.
 
     Example:
-        >>> import tempfile
         >>> from magrl.agents import load_pretrained
-        >>> write_step(Path(tempfile.mkdtemp()) / "anywhere.pt2", load_pretrained("anywhere"))
+        >>> write_step("anywhere.onnx", load_pretrained("anywhere"))
+        Traceback (most recent call last):
+        ValueError: a file for torch.export.load must end with .pt2, got 'anywhere.onnx'
     """
     if Path(path).suffix != ".pt2":
         raise ValueError(f"a file for torch.export.load must end with .pt2, got {str(path)!r}")

@@ -360,6 +360,7 @@ def test_the_rule_of_arrival(arrival_km: float | None, stop: str | None) -> None
 # The exported step
 
 
+@pytest.mark.slow
 def test_the_exported_step_is_the_vehicle_without_torchrl(tmp_path: Path) -> None:
     """Bit for bit over an episode, in a process that can import neither TorchRL nor tensordict nor magrl."""
     policy = load_pretrained("anywhere")

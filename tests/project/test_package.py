@@ -123,6 +123,7 @@ def test_wheel_works_without_the_tree(python: Path, tmp_path: Path) -> None:
     assert (tmp_path / "episodes.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_user_s_code_is_typed(python: Path, tmp_path: Path) -> None:
     """Under mypy --strict: a script that is right passes, one that is wrong does not, and no public name is Any."""
     (tmp_path / "mypy.ini").write_text(MYPY.format(cache=tmp_path / "cache"))

@@ -55,7 +55,9 @@ def names(module) -> str:
 
 
 @pytest.mark.usefixtures("without_figures")
-@pytest.mark.parametrize("module", RECIPES, ids=names)
+@pytest.mark.parametrize(
+    "module", [*RECIPES[:1], *(pytest.param(m, marks=pytest.mark.slow) for m in RECIPES[1:])], ids=names
+)
 def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled, same_outcome, outcome, capsys) -> None:
     """With networks, optimizers, running episodes and the noise of their sensors; the run folder is complete."""
     whole, run = tmp_path / "whole", tmp_path / "run"
@@ -85,6 +87,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     assert all(weight.isfinite().all() for weight in weights.values())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_figures")
 def test_options_reach_the_training(tmp_path: Path, outcome) -> None:
     """60 steps, so that episodes reach their limit of 50; the return is the unscaled sum of its terms."""
