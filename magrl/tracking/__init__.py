@@ -18,16 +18,12 @@ from magrl.tracking.filter import (
     update,
 )
 from magrl.tracking.priors import (
-    CURVATURE_NT,
-    DIPOLE_STD_NT,
     curl_relation,
     dipole_prior,
     field_curvature,
 )
 from magrl.tracking.search import (
-    SEARCH_KM,
     VISITED,
-    arrival_ellipse,
     arrival_weights,
     unvisited,
     unvisited_yet,
@@ -38,12 +34,9 @@ from magrl.tracking.way import Way, way_to
 
 __all__ = [
     "CURVATURE",
-    "CURVATURE_NT",
-    "DIPOLE_STD_NT",
     "DISTANCE_SCALE_KM",
     "ELEMENT_PERIODS",
     "ELEMENT_SCALES",
-    "SEARCH_KM",
     "VARIANCE_FLOOR",
     "VISITED",
     "FieldTrack",
@@ -51,7 +44,6 @@ __all__ = [
     "GradientRelation",
     "Way",
     "aim",
-    "arrival_ellipse",
     "arrival_weights",
     "curl_relation",
     "dipole_prior",

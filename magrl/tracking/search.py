@@ -24,25 +24,24 @@ _FAR_KM = 1e5  # of places that are not there yet
 _LEAST_KM2 = 1e-12
 
 
-def unvisited(way: Way, visited: Tensor, ellipse: Tensor, search_km: float = SEARCH_KM) -> Tensor:
+def unvisited(way: Way, visited: Tensor, ellipse: Tensor) -> Tensor:
     """Return the displacement to the most probable destination, given where the vehicle did not arrive.
 
     The density of the destination is that of the estimated way, times the probability of not arriving at the nearest
     visited place: near 0 at that place, half on the border of the arrival ellipse around it, 1 far from it. The
     displacement is the best of 32 quasi-random samples of the estimate, one of which is its mean: the largest
-    logarithm of the density minus the distance over ``search_km``. Without visited places near it, it is the mean.
+    logarithm of the density minus the distance over :data:`SEARCH_KM`. Without visited places near it, it is the mean.
 
     Args:
         way: estimated way and its covariance.
         visited: ``(..., K, 2)`` displacements to the visited places, northward and eastward [km].
         ellipse: ``(..., 2, 2)`` arrival ellipse, where ``d^T E d = 1`` for displacements d [km].
-        search_km: difference of distance that outweighs a factor e of probability [km].
 
     Returns:
         ``(..., 2)`` [km].
 
     Raises:
-        ValueError: for shapes that do not match, or a distance that is not above 0.
+        ValueError: for shapes that do not match.
 
     Source:
         L. D. Stone, Theory of Optimal Search, Academic Press (1975): the posterior of a target after unsuccessful
@@ -58,14 +57,13 @@ def unvisited(way: Way, visited: Tensor, ellipse: Tensor, search_km: float = SEA
     """
     check_tensor(2, displacement=way.displacement, visited=visited)
     check_tensor(2, 2, covariance=way.covariance, ellipse=ellipse)
-    check_number(0, above=True, search_km=search_km)
     samples = _SAMPLES.to(way.displacement)
     ways = way.displacement.unsqueeze(-2) + samples @ _root(way.covariance).mT
     north, east = (ways.unsqueeze(-2) - visited.unsqueeze(-3)).unbind(-1)  # (..., S, K)
     nn, ne, ee = (ellipse[..., i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     nearest = (nn * north * north + 2 * ne * north * east + ee * east * east).amin(-1)
     missed = torch.log1p((_UNNOTICED - 1) * torch.exp2(-nearest))
-    score = missed - samples.square().sum(-1) / 2 - ways.norm(dim=-1) / search_km
+    score = missed - samples.square().sum(-1) / 2 - ways.norm(dim=-1) / SEARCH_KM
     best = torch.where(nearest[..., 0] < 1, score.argmax(-1), 0)[..., None, None]
     return ways.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 

@@ -94,11 +94,7 @@ class TrackGradient(StatefulTransform):
         frame: str = "world",
     ) -> None:
         super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        if len(self.in_keys) not in (4, 5, 6) or len(self.out_keys) != 6:
-            raise ValueError(
-                f"TrackGradient takes 4 to 6 in_keys (such as {(*IN_KEYS, *STD_KEYS)}) and 6 out_keys (such as "
-                f"{OUT_KEYS}), got {self.in_keys} and {self.out_keys}"
-            )
+        expect_keys(self, (4, 5, 6), 6)
         if sensor_std is not None and len(self.in_keys) > 4:
             raise ValueError(f"give sensor_std or its key {self.in_keys[4]!r}, not both: got sensor_std {sensor_std}")
         check_number(0, above=True, range_km=range_km)

@@ -9,7 +9,8 @@ from support.tracks import F64, f64
 from magrl.field import SphericalHarmonicField, elements_at, elements_gradient_at, random_planets
 from magrl.field.elements import measured_elements
 from magrl.geodesy import REFERENCE_RADIUS_KM, curvature_radii, local_frame, move, to_ecef
-from magrl.tracking import CURVATURE_NT, DIPOLE_STD_NT, curl_relation, dipole_prior, field_curvature
+from magrl.tracking import curl_relation, dipole_prior, field_curvature
+from magrl.tracking.priors import CURVATURE_NT, DIPOLE_STD_NT
 
 
 def places(count, most_latitude):

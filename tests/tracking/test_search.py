@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from magrl.tracking import VISITED, FieldTrack, Way, aim, arrival_ellipse, unvisited, unvisited_yet, visit
+from magrl.tracking import VISITED, FieldTrack, Way, aim, unvisited, unvisited_yet, visit
+from magrl.tracking.search import arrival_ellipse
 
 LONG = torch.tensor([[36.0, 200.0], [200.0, 2500.0]])  # [km^2]: 6 km northward, 50 km eastward, correlated
 ELLIPSE = torch.diag(torch.tensor([1 / 20.0**2, 1 / 12.0**2]))

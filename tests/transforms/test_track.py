@@ -22,7 +22,6 @@ from magrl.geodesy import geodesic, wrap_angle
 from magrl.guidance import parallel_approach
 from magrl.tracking import FieldTrack, GradientPrior, curl_relation
 from magrl.transforms import (
-    DeclareArrival,
     FieldGradient,
     GradientHeading,
     SearchAim,
@@ -191,7 +190,7 @@ def test_other_elements_are_not_wrapped() -> None:
         ({"in_keys": ("field", "target_field", "move", "move")}, r"heading \(3, 1\), got \(3, 2\)"),
         ({"in_keys": (*IN_KEYS, "position")}, "same shape"),
         ({"scales": (1.0, 1.0), "curvature": (1.0, 1.0)}, "an element for each of its scales"),
-        ({"in_keys": IN_KEYS[:3]}, "4 to 6 in_keys"),
+        ({"in_keys": IN_KEYS[:3]}, "4 or 5 or 6 in_keys"),
         ({"in_keys": (*IN_KEYS, "sensor_std"), "sensor_std": STD}, "give sensor_std or its key"),
         ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std must be a finite number from 0 on, got -0.1"),
         ({"scales": (1.0, 0.0, 1.0)}, "scales must be a finite number above 0, got 0.0"),
@@ -288,9 +287,7 @@ def test_both_frames_give_the_same_way() -> None:
     torch.testing.assert_close(turned, expected, rtol=1e-3, atol=0.1)
 
 
-@pytest.mark.parametrize(
-    "make", [lambda: SearchAim(zeta=0.0), lambda: SearchAim(zeta=0.01, frame="ship"), lambda: DeclareArrival(-1.0)]
-)
-def test_bad_thresholds_and_frames_are_refused(make) -> None:
+@pytest.mark.parametrize("options", [{"zeta": 0.0}, {"zeta": 0.01, "frame": "ship"}])
+def test_bad_thresholds_and_frames_are_refused(options: dict) -> None:
     with pytest.raises(ValueError, match="must be"):
-        make()
+        SearchAim(**options)
