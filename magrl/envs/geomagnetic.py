@@ -112,8 +112,7 @@ class GeomagneticNavEnv(EnvBase):
         check_type(Scenario, scenario=scenario)
         check_number(1, whole=True, num_envs=num_envs)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
-        if objective_limit is not None:
-            check_number(0, above=True, objective_limit=objective_limit)
+        check_number(0, above=True, optional=True, objective_limit=objective_limit)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         if unknown := sorted(changes.keys() - Scenario.model_fields.keys()):
@@ -263,30 +262,13 @@ class GeomagneticNavEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = specs.checked_action(tensordict["action"], self.action_low, self.action_high)
-        distance, turn = action[:, :2].unbind(-1)
-        before = tensordict["position"]
-        heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
-        region = tensordict["region"].squeeze(-1)
-        course = heading
-        if self.drift_km:
-            distance, course = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
-        moved = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
-        was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), region).unbind(0)
-        position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
-        lost = ~(was_inside & is_inside)
-
-        field = elements_at(self.field, position, region).float().double()
+        heading, position, field, lost = self._moved(tensordict, action)
         weights = tensordict["objective_weights"].double()
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
-        ended, right = self.arrival(action, objective, position, tensordict["target_position"])
-        arrived = right & ended & ~lost
         step = tensordict["step_count"] + 1
-        terminated = ended | lost
+        ended, right = self.arrival(action, objective, position, tensordict["target_position"])
+        arrived, terminated = right & ended & ~lost, ended | lost
         truncated = (step >= self.max_steps) & ~terminated
-        objectives = tensordict["objective"].double(), objective
-        proximity = guidance.proximity_reward(*objectives, self.proximity_weight, self.objective_limit)
-        proximity = guidance.late_decay(proximity, step, self.max_steps)
-        destination = guidance.destination_reward(arrived, self.destination_weight)
         after = TensorDict(
             {
                 **{key: tensordict[key] for key in (*specs.CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
@@ -297,9 +279,7 @@ class GeomagneticNavEnv(EnvBase):
                 "position": position,
                 "objective": objective.float(),
                 "success": arrived,
-                "reward": (destination + proximity).float(),
-                "reward_destination": destination.float(),
-                "reward_proximity": proximity.float(),
+                **self._rewards(tensordict["objective"].double(), objective, step, arrived),
                 "done": terminated | truncated,
                 "terminated": terminated,
                 "truncated": truncated,
@@ -311,6 +291,27 @@ class GeomagneticNavEnv(EnvBase):
         if self._tracks is not None:
             self._tracks.add(after)
         return after
+
+    def _moved(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, ...]:
+        """Return heading ``(N,)`` [rad], position ``(N, 2)`` [deg], field there ``(N, 3)`` and who is lost ``(N, 1)``."""
+        distance, turn = action[:, :2].unbind(-1)
+        before, region = tensordict["position"], tensordict["region"].squeeze(-1)
+        heading = course = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
+        if self.drift_km:
+            distance, course = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
+        moved = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
+        was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), region).unbind(0)
+        position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
+        field = elements_at(self.field, position, region).float().double()
+        return heading, position, field, ~(was_inside & is_inside)
+
+    def _rewards(self, before: Tensor, objective: Tensor, step: Tensor, arrived: Tensor) -> dict[str, Tensor]:
+        """Return the reward and its terms, ``(N, 1)``, from the objective before and after a move."""
+        proximity = guidance.proximity_reward(before, objective, self.proximity_weight, self.objective_limit)
+        proximity = guidance.late_decay(proximity, step, self.max_steps)
+        destination = guidance.destination_reward(arrived, self.destination_weight)
+        rewards = destination + proximity, destination, proximity
+        return dict(zip(("reward", *specs.REWARD_TERMS), (x.float() for x in rewards), strict=True))
 
     # Rendering
 

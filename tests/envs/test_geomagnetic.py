@@ -430,10 +430,6 @@ class TestFrozenTasks:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Other regions
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 # What is refused
 
 
@@ -454,9 +450,6 @@ def test_rounding_beyond_the_bounds_is_forgiven_and_cut() -> None:
     assert env.observation_spec.is_in(after.select(*ENTRIES))
 
 
-NAN, INF = float("nan"), float("inf")
-
-
 @pytest.mark.parametrize(
     ("option", "value"),
     [
@@ -464,12 +457,6 @@ NAN, INF = float("nan"), float("inf")
         ("num_envs", 1.5),
         ("drift_km", -1.0),
         ("max_steps", 0),
-        ("max_move_km", float("nan")),
-        ("max_turn_deg", 181.0),
-        ("zeta", 3.0),
-        ("arrival", "said"),
-        ("arrival_radius_km", 0.0),
-        ("start_heading", "south"),
         ("destination_weight", -1.0),
         ("proximity_weight", float("inf")),
         ("objective_limit", 0.0),
