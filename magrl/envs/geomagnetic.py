@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
@@ -187,8 +188,10 @@ class GeomagneticNavEnv(EnvBase):
         self.observation_spec = specs.observation_spec(self.num_envs, bounds, *options).to(self.device)
         self.state_spec = specs.state_spec(self.observation_spec)
         self.action_spec = specs.bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
-        self.full_reward_spec = specs.reward_spec(self.num_envs).to(self.device)
-        self.full_done_spec = specs.done_spec(self.num_envs).to(self.device)
+        rewards = {key: Unbounded((self.num_envs, 1)) for key in ("reward", *specs.REWARD_TERMS)}
+        flags = {key: specs.flag(self.num_envs) for key in ("done", "terminated", "truncated")}
+        self.full_reward_spec = Composite(rewards, shape=self.batch_size).to(self.device)
+        self.full_done_spec = Composite(flags, shape=self.batch_size).to(self.device)
 
     # Reset
 
@@ -293,7 +296,7 @@ class GeomagneticNavEnv(EnvBase):
         return after
 
     def _moved(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, ...]:
-        """Return heading ``(N,)`` [rad], position ``(N, 2)`` [deg], field there ``(N, 3)`` and who is lost ``(N, 1)``."""
+        """Return headings ``(N,)`` [rad], positions ``(N, 2)`` [deg], the field there, and who is lost ``(N, 1)``."""
         distance, turn = action[:, :2].unbind(-1)
         before, region = tensordict["position"], tensordict["region"].squeeze(-1)
         heading = course = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)

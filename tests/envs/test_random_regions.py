@@ -141,6 +141,12 @@ def test_regions_of_planets_meet_their_conditions() -> None:
     torch.testing.assert_close(width, torch.full_like(width, 10.0))
 
 
+def test_declination_is_continuous_even_where_the_field_may_be_weak() -> None:
+    scenario = planet_scenario(20, seed=1, min_intensity_nt=0.0, max_latitude=75.0, tolerance_nt=10.0)
+    gauss = random_planets(10, 1)
+    checked(scenario, lambda k: SphericalHarmonicField(gauss[k // 2]), 0.0, 75.0)
+
+
 def test_regions_of_the_earth() -> None:
     """IGRF-14 at the date; and the regions leave out the places of weak horizontal field, as south of Australia."""
     scenario = earth_scenario(40, seed=0, date="2015-07-01", max_latitude=70.0)
