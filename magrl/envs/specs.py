@@ -105,7 +105,7 @@ def observation_spec(
     """
     low, high = (bound.cpu() for bound in field_bounds)
     highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
-    more = {DECLARED: _flag(num_envs)} if declared else {}
+    more = {DECLARED: flag(num_envs)} if declared else {}
     reach = 2 * max_move_km + drift_km  # from the end of a commanded move to that of a true one
     more |= {DISPLACEMENT: Bounded(-reach, reach, (num_envs, 2), dtype=torch.float64)} if drift_km else {}
     return Composite(
@@ -119,7 +119,7 @@ def observation_spec(
         start_position=_position_spec(num_envs),
         objective=Unbounded((num_envs, 1)),
         objective_weights=Unbounded((num_envs, 3)),
-        success=_flag(num_envs),
+        success=flag(num_envs),
         region=Bounded(0, num_regions - 1, (num_envs, 1), dtype=torch.int64),
         **more,
         shape=(num_envs,),
@@ -168,30 +168,16 @@ def state_spec(observation: Composite) -> Composite:
     return Composite({key: observation[key].clone() for key in held}, shape=observation.shape)
 
 
-def reward_spec(num_envs: int) -> Composite:
-    """Return the spec of the reward and its terms.
-
-    Example:
-        >>> sorted(reward_spec(4).keys())
-        ['reward', 'reward_destination', 'reward_proximity']
-    """
-    return Composite({key: Unbounded((num_envs, 1)) for key in ("reward", *REWARD_TERMS)}, shape=(num_envs,))
-
-
-def done_spec(num_envs: int) -> Composite:
-    """Return the spec of the three end-of-episode flags.
-
-    Example:
-        >>> sorted(done_spec(4).keys())
-        ['done', 'terminated', 'truncated']
-    """
-    return Composite({key: _flag(num_envs) for key in ("done", "terminated", "truncated")}, shape=(num_envs,))
-
-
 def _position_spec(num_envs: int) -> Bounded:
     high = torch.tensor((90.0, 180.0), dtype=torch.float64).expand(num_envs, 2)
     return Bounded(-high, high, high.shape, dtype=torch.float64)
 
 
-def _flag(num_envs: int) -> Binary:
+def flag(num_envs: int) -> Binary:
+    """Return the spec of a flag, ``(N, 1)`` bool.
+
+    Example:
+        >>> flag(4).shape
+        torch.Size([4, 1])
+    """
     return Binary(1, (num_envs, 1), dtype=torch.bool)

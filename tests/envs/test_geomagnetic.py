@@ -288,14 +288,6 @@ class TestLost:
         tasks = Tasks(places((-0.1, 165.0), (-5.0, 165.0)), places((-3.0, 166.0), (-8.0, 165.0)))
         return make(2, tasks=tasks, margin_deg=0.0, max_turn_deg=180.0)
 
-    def test_ends_in_failure(self, env: GeomagneticNavEnv) -> None:
-        after = fly(env, (50.0, 0.0))[0]["next"]
-        assert after["terminated"].flatten().tolist() == [True, False]
-        assert after["done"].flatten().tolist() == [True, False]
-        assert not after["success"].any()
-        assert not after["truncated"].any()
-        assert after["reward"][0] < 100
-
     def test_stays_where_it_was_lost(self, env: GeomagneticNavEnv) -> None:
         """Whatever it does next: the way back is closed."""
         steps = fly(env, (50.0, 0.0), (50.0, math.pi), (50.0, 0.0), (50.0, 0.5))
@@ -305,7 +297,8 @@ class TestLost:
             assert after["position"][0].tolist() == pytest.approx(lost, abs=1e-12)
             assert after["terminated"][0]
             assert not after["success"].any()
-            assert not after["truncated"][0]
+            assert after["done"].flatten().tolist() == [True, False]
+            assert not after["truncated"].any()
             assert env.observation_spec.is_in(after.select(*ENTRIES))
             assert torch.isfinite(after["reward"]).all()
         assert all(torch.equal(step["next", "field"][0], steps[0]["next", "field"][0]) for step in steps)
@@ -430,10 +423,6 @@ class TestFrozenTasks:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Other regions
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 # What is refused
 
 
@@ -454,9 +443,6 @@ def test_rounding_beyond_the_bounds_is_forgiven_and_cut() -> None:
     assert env.observation_spec.is_in(after.select(*ENTRIES))
 
 
-NAN, INF = float("nan"), float("inf")
-
-
 @pytest.mark.parametrize(
     ("option", "value"),
     [
@@ -464,12 +450,6 @@ NAN, INF = float("nan"), float("inf")
         ("num_envs", 1.5),
         ("drift_km", -1.0),
         ("max_steps", 0),
-        ("max_move_km", float("nan")),
-        ("max_turn_deg", 181.0),
-        ("zeta", 3.0),
-        ("arrival", "said"),
-        ("arrival_radius_km", 0.0),
-        ("start_heading", "south"),
         ("destination_weight", -1.0),
         ("proximity_weight", float("inf")),
         ("objective_limit", 0.0),
