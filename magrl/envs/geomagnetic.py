@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
@@ -112,8 +113,7 @@ class GeomagneticNavEnv(EnvBase):
         check_type(Scenario, scenario=scenario)
         check_number(1, whole=True, num_envs=num_envs)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
-        if objective_limit is not None:
-            check_number(0, above=True, objective_limit=objective_limit)
+        check_number(0, above=True, optional=True, objective_limit=objective_limit)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         if unknown := sorted(changes.keys() - Scenario.model_fields.keys()):
@@ -188,8 +188,10 @@ class GeomagneticNavEnv(EnvBase):
         self.observation_spec = specs.observation_spec(self.num_envs, bounds, *options).to(self.device)
         self.state_spec = specs.state_spec(self.observation_spec)
         self.action_spec = specs.bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
-        self.full_reward_spec = specs.reward_spec(self.num_envs).to(self.device)
-        self.full_done_spec = specs.done_spec(self.num_envs).to(self.device)
+        rewards = {key: Unbounded((self.num_envs, 1)) for key in ("reward", *specs.REWARD_TERMS)}
+        flags = {key: specs.flag(self.num_envs) for key in ("done", "terminated", "truncated")}
+        self.full_reward_spec = Composite(rewards, shape=self.batch_size).to(self.device)
+        self.full_done_spec = Composite(flags, shape=self.batch_size).to(self.device)
 
     # Reset
 
@@ -211,7 +213,9 @@ class GeomagneticNavEnv(EnvBase):
             start = rows[(mask.cumsum(0) - 1).clamp_min(0)]
         # Counted out of place: a rollout or a checkpoint may hold the old tensor.
         self.episode = self.episode.index_add(0, chosen, torch.ones_like(chosen))
-        return self._recorded_state(start, mask)
+        if self._tracks is not None:
+            self._tracks.add(start, mask)
+        return start
 
     def _start_of(self, vehicle: Tensor) -> TensorDict:
         """Return the first observation of the next episode of some vehicles, ``(P,)``."""
@@ -261,58 +265,58 @@ class GeomagneticNavEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = specs.checked_action(tensordict["action"], self.action_low, self.action_high)
-        heading = wrap_angle(tensordict["heading"].squeeze(-1).double() + action[:, 1])
-        position, lost = self._moved(tensordict, action[:, 0], heading)
-        field = elements_at(self.field, position, tensordict["region"].squeeze(-1)).float().double()
+        heading, position, field, lost = self._moved(tensordict, action)
         weights = tensordict["objective_weights"].double()
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
-        ended, right = self.arrival(action, objective, position, tensordict["target_position"])
-        arrived = right & ended & ~lost
         step = tensordict["step_count"] + 1
-        terminated = ended | lost
+        ended, right = self.arrival(action, objective, position, tensordict["target_position"])
+        arrived, terminated = right & ended & ~lost, ended | lost
         truncated = (step >= self.max_steps) & ~terminated
-        after = {
-            **{key: tensordict[key] for key in (*specs.CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
-            "field": field.float(),
-            "move": action[:, :2].float(),
-            "heading": heading.float().unsqueeze(-1),
-            "step_count": step,
-            "position": position,
-            "objective": objective.float(),
-            "success": arrived,
-            **self._rewards(tensordict["objective"].double(), objective, arrived, step),
-            "done": terminated | truncated,
-            "terminated": terminated,
-            "truncated": truncated,
-            **({specs.DECLARED: ended} if self.arrival.declared else {}),
-        }
-        return self._recorded_state(TensorDict(after, tensordict.batch_size, device=self.device))
+        after = TensorDict(
+            {
+                **{key: tensordict[key] for key in (*specs.CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
+                "field": field.float(),
+                "move": action[:, :2].float(),
+                "heading": heading.float().unsqueeze(-1),
+                "step_count": step,
+                "position": position,
+                "objective": objective.float(),
+                "success": arrived,
+                **self._rewards(tensordict["objective"].double(), objective, step, arrived),
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+                **({specs.DECLARED: ended} if self.arrival.declared else {}),
+            },
+            batch_size=tensordict.batch_size,
+            device=self.device,
+        )
+        if self._tracks is not None:
+            self._tracks.add(after)
+        return after
 
-    def _moved(self, tensordict: TensorDictBase, distance: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions after a move, and which vehicles are lost."""
+    def _moved(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, ...]:
+        """Return headings ``(N,)`` [rad], positions ``(N, 2)`` [deg], the field there, and who is lost ``(N, 1)``."""
+        distance, turn = action[:, :2].unbind(-1)
         before, region = tensordict["position"], tensordict["region"].squeeze(-1)
+        heading = course = wrap_angle(tensordict["heading"].squeeze(-1).double() + turn)
         if self.drift_km:
-            distance, heading = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
-        moved = torch.stack(move(before[:, 0], before[:, 1], heading, distance), -1)
+            distance, course = polar(displaced(distance, heading, tensordict[DISPLACEMENT]))
+        moved = torch.stack(move(before[:, 0], before[:, 1], course, distance), -1)
         was_inside, is_inside = self.edge.contains(torch.stack((before, moved)), region).unbind(0)
         position = torch.where(was_inside, moved, before)  # a lost vehicle stays where it was lost
-        return position, ~(was_inside & is_inside)
+        field = elements_at(self.field, position, region).float().double()
+        return heading, position, field, ~(was_inside & is_inside)
 
-    def _rewards(self, before: Tensor, after: Tensor, arrived: Tensor, step: Tensor) -> dict[str, Tensor]:
-        """Return the reward and its terms, given the objective before and after a step."""
-        proximity = guidance.proximity_reward(before, after, self.proximity_weight, self.objective_limit)
+    def _rewards(self, before: Tensor, objective: Tensor, step: Tensor, arrived: Tensor) -> dict[str, Tensor]:
+        """Return the reward and its terms, ``(N, 1)``, from the objective before and after a move."""
+        proximity = guidance.proximity_reward(before, objective, self.proximity_weight, self.objective_limit)
         proximity = guidance.late_decay(proximity, step, self.max_steps)
         destination = guidance.destination_reward(arrived, self.destination_weight)
-        terms = {"reward_destination": destination, "reward_proximity": proximity}
-        return {"reward": (destination + proximity).float()} | {key: term.float() for key, term in terms.items()}
+        rewards = destination + proximity, destination, proximity
+        return dict(zip(("reward", *specs.REWARD_TERMS), (x.float() for x in rewards), strict=True))
 
     # Rendering
-
-    def _recorded_state(self, state: TensorDict, mask: Tensor | None = None) -> TensorDict:
-        """Add a state to the tracks, if any are kept; ``mask`` names the vehicles whose episodes start with it."""
-        if self._tracks is not None:
-            self._tracks.add(state, mask)
-        return state
 
     def track(self, vehicle: int) -> Tensor:
         """Return the positions of a vehicle in its running episode, start first: ``(T, 2)`` latitude, longitude [deg].
