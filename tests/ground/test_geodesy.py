@@ -298,3 +298,22 @@ def test_positions_off_the_earth_raise(latitude, longitude, message):
     check_positions(f64(90.0), f64(540.0))
     with pytest.raises(ValueError, match=message):
         check_positions(f64(0.0, latitude), f64(0.0, longitude))
+
+
+def test_displacements_by_hand() -> None:
+    """3-4-5 triangles, and errors that undo a move or turn it around."""
+    distance, heading = torch.tensor([3.0, 5.0, 2.0]), torch.tensor([0.0, math.pi / 2, math.pi])
+    error = torch.tensor([[0.0, 4.0], [0.0, -5.0], [3.0, 0.0]])
+    moved = displaced(distance, heading, error)
+    torch.testing.assert_close(moved, torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]]), rtol=0, atol=1e-6)
+    length, course = polar(torch.tensor([[3.0, 4.0], [0.0, -2.0], [-1.0, 0.0]]))
+    torch.testing.assert_close(length, torch.tensor([5.0, 2.0, 1.0]))
+    torch.testing.assert_close(course, torch.tensor([math.atan2(4, 3), -math.pi / 2, math.pi]))
+    for call, name in (
+        (lambda: displaced(5.0, heading, error), "distance"),
+        (lambda: displaced(distance, 5.0, error), "heading"),
+        (lambda: displaced(distance, heading, error[:, :1]), "error"),
+        (lambda: polar(error[:, :1]), "displacement"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=name):
+            call()

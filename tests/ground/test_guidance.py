@@ -1,6 +1,7 @@
 """The paper's equations, each against a case worked by hand and in its limits."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -267,3 +268,33 @@ def test_bad_arguments_raise():
         parallel_approach(torch.zeros(2), torch.zeros(2), torch.eye(2), -1)
     with pytest.raises(ValueError, match=r"at least two elements \(\.\.\., E, 2\), got \(1, 2\)"):
         best_pair(torch.zeros(1, 2))
+
+
+def test_approach_depends_on_the_difference_alone() -> None:
+    here, there, gradient = (
+        torch.tensor([3.0, -20.0]),
+        torch.tensor([3.5, -19.0]),
+        torch.tensor([[0.2, 0.1], [0.0, 1.5]]),
+    )
+    moved = parallel_approach(here + 7, there + 7, gradient)
+    torch.testing.assert_close(parallel_approach(here, there, gradient), moved, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: parallel_approach(torch.zeros(3), torch.zeros(2), torch.eye(2)), "field"),
+        (lambda: parallel_approach(torch.zeros(2), torch.zeros(3), torch.eye(2)), "target_field"),
+        (lambda: parallel_approach(torch.zeros(2), torch.zeros(2), torch.ones(3, 2)), "gradient"),
+        (lambda: parallel_approach(torch.zeros(2), torch.zeros(2), torch.ones(2, 3)), "gradient"),
+        (lambda: best_pair(torch.ones(3, 3)), "gradient"),
+        (lambda: best_pair(torch.ones(1, 2)), "gradient"),
+    ],
+)
+def test_a_wrong_size_is_named(call: Callable[[], object], name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        call()
+
+
+def test_two_elements_have_one_pair() -> None:
+    assert best_pair(torch.eye(2)).tolist() == [0, 1]
