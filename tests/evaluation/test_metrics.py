@@ -15,7 +15,7 @@ from magrl.envs.measures import distance_to_arrival, path_efficiency, path_measu
 from magrl.evaluation.intervals import wilson_interval
 from magrl.evaluation.metrics import episode_measures, first_episode_mask, summarize
 from magrl.evaluation.rollout import evaluation_rollout
-from magrl.field import elements_at
+from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move
 from magrl.guidance import objective
 from magrl.navigators import Secant
@@ -284,11 +284,16 @@ def test_an_episode_without_a_way_is_measured_without_nan() -> None:
 
 
 def test_bad_values_are_named() -> None:
+    places, index = torch.zeros(2, 2), torch.zeros(2, dtype=torch.int64)
+    ones = torch.ones(2, 3), IGRF("2022-01-01"), 0.01, Regions.of(Region((-10, 0), (160, 170))), index
     for call, message in (
         (lambda: first_episode_mask(torch.zeros(2, 3)), "done must be bool of shape"),
         (lambda: first_episode_mask(torch.ones(1, 3, 2, dtype=torch.bool)), r"done must be .*\(1, 3, 2\)"),
         (lambda: episode_measures(TensorDict(batch_size=[2, 0])), r"each at least 1, got \(2, 0\)"),
         (lambda: summarize({"success": torch.ones(2)}), "success must be bool"),
+        (lambda: distance_to_arrival(places[:, :1], places, *ones), r"start .*\(2, 1\)"),
+        (lambda: distance_to_arrival(places, places[:, :1], *ones), r"target .*\(2, 1\)"),
+        (lambda: distance_to_arrival(places, places, ones[0][:, :2], *ones[1:]), r"weights .*\(2, 2\)"),
     ):
         with pytest.raises(ValueError, match=message):
             call()
