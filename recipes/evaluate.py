@@ -84,7 +84,7 @@ class Config(ScenarioOptions):
     tasks_seed: int | None = None
     """Seed of random tasks, 0 by default; no training and no frozen set has the same tasks."""
     scenario: Path | None = None
-    """TOML or JSON file of an own region, date and tasks (docs/own_data.md); by default that of the runs, or the
+    """TOML or JSON file of an own region, date and tasks (docs/data.md); by default that of the runs, or the
     paper's."""
     export: Path | None = None
     """File for the tracks of all episodes: .geojson, .gpx or .kml."""

@@ -3,7 +3,7 @@
     python recipes/ppo.py                     # minutes on one core
     python recipes/ppo.py --seed 1 --out runs/my-ppo
     python recipes/ppo.py --resume RUN        # resume an interrupted run exactly
-See docs/algorithms.md.
+See docs/training.md.
 """
 
 from __future__ import annotations

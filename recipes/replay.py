@@ -51,7 +51,7 @@ class Config:
     tasks: TaskSet | None = None
     """Frozen task set; the scenario's own tasks by default, or test-1000 where it has none."""
     scenario: Path | None = None
-    """TOML or JSON file of an own region (docs/own_data.md); the scenario of the run by default."""
+    """TOML or JSON file of an own region (docs/data.md); the scenario of the run by default."""
     zeta: float | None = None
     """Arrival threshold on the objective; that of the training by default."""
     seed: int = 0

@@ -74,13 +74,13 @@ class RunConfig(CheckedModel):
     device: str = "cpu"
     """Device of all tensors: cpu, cuda, cuda:0, ..."""
     logger: Logger = "wandb"
-    """Logger of the curves, beside train.csv (docs/logging.md); tensorboard is an extra."""
+    """Logger of the curves, beside train.csv (docs/training.md); tensorboard is an extra."""
     wandb_mode: WandbMode = "offline"
     """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
     checkpoint_every: NonNegative = 30.0
     """Time between checkpoints [s]."""
     scenario: Path | None = None
-    """TOML or JSON file of an own region, date and altitude (docs/own_data.md); the paper's by default."""
+    """TOML or JSON file of an own region, date and altitude (docs/data.md); the paper's by default."""
     num_envs: Count = 512
     """Number of vehicles."""
     zeta: Threshold = 0.01
