@@ -18,7 +18,7 @@ from magrl.checks import check_number, check_tensor
 from magrl.field.elements import element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import wrap_angle
-from magrl.transforms.base import Keys, ObservationTransform, StepReward, expect_keys, key_list, several_keys
+from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward
 
 
 class FieldGradient(ObservationTransform):
@@ -46,14 +46,17 @@ class FieldGradient(ObservationTransform):
                 [0., 6.]])
     """
 
+    default_in_keys = ("position",)
+    default_out_keys = ("field_gradient",)
+    in_sizes = (2,)
+
     def __init__(
         self,
         field: FieldModel | Callable[[Tensor], Tensor],
-        in_keys: NestedKey | Keys = ("position",),
-        out_keys: NestedKey | Keys = ("field_gradient",),
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
     ) -> None:
-        super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
-        expect_keys(self, 1, 1)
+        super().__init__(in_keys, out_keys)
         self.elements = hasattr(field, "value_and_gradient")
         if not self.elements and not callable(field):
             raise ValueError(
@@ -74,9 +77,7 @@ class FieldGradient(ObservationTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the gradient, unbounded."""
-        leaf = self._leaf(observation_spec, self.in_keys[0])
-        if leaf.shape[-1:] != (2,):
-            raise ValueError(f"FieldGradient reads positions of shape (..., 2), got {tuple(leaf.shape)}")
+        leaf = super().transform_observation_spec(observation_spec)[self.in_keys[0]]
         count, dtype = 3, torch.get_default_dtype()
         if not self.elements:
             (like,) = self._compute([leaf.zero()])
@@ -130,17 +131,18 @@ class GradientHeading(ObservationTransform):
         tensor([3.1416])
     """
 
+    default_in_keys = ("field", "target_field", "field_gradient")
+    default_out_keys = ("gradient_heading", "gradient_heading_valid")
+
     def __init__(
         self,
-        in_keys: Keys = ("field", "target_field", "field_gradient"),
-        out_keys: Keys = ("gradient_heading", "gradient_heading_valid"),
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
         *,
         pair: tuple[str | int, str | int] | str = ("D", "I"),
         min_crossing_deg: float = 2.0,
     ) -> None:
-        # A sequence of strings is several keys here, never one nested key.
-        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        expect_keys(self, 3, 2)
+        super().__init__(in_keys, out_keys)
         check_number(0, 90, min_crossing_deg=min_crossing_deg)
         if min_crossing_deg == 90:
             raise ValueError(f"min_crossing_deg must be in [0, 90), got {min_crossing_deg}")
@@ -200,16 +202,18 @@ class AlignmentReward(StepReward):
         tensor([2.])
     """
 
+    default_in_keys = ("heading", "gradient_heading", "gradient_heading_valid")
+    in_counts, out_counts = (2, 3), (1, 2)
+
     def __init__(
         self,
-        in_keys: Keys = ("heading", "gradient_heading", "gradient_heading_valid"),
-        out_keys: NestedKey | Keys = ("reward",),
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
         *,
         weight: float = 3.0,
         offset: float = math.pi / 4,
     ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
-        expect_keys(self, (2, 3), (1, 2))
+        super().__init__(in_keys, out_keys)
         check_number(weight=weight, offset=offset)
         self.weight, self.offset = float(weight), float(offset)
 

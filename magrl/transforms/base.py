@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import ClassVar, TypeAlias, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -14,12 +15,23 @@ from torchrl.envs import Transform
 from magrl.checks import check_type
 
 Keys = Sequence[NestedKey]
+GivenKeys: TypeAlias = NestedKey | Keys | None
+"""Keys as a user gives them; None for the default ones."""
 
 
 class ObservationTransform(Transform):
     """Base class of transforms that write observations: they also run at reset, and on plain TensorDicts.
 
-    A subclass computes the values at ``out_keys`` from those at ``in_keys`` in :meth:`_compute`.
+    A subclass computes the values at ``out_keys`` from those at ``in_keys`` in :meth:`_compute`, and names its default
+    keys in class attributes.
+
+    Args:
+        in_keys: keys that are read; :attr:`default_in_keys` by default.
+        out_keys: keys that are written; :attr:`default_out_keys` by default.
+        **inverse: ``in_keys_inv`` and ``out_keys_inv`` of an invertible transform.
+
+    Raises:
+        ValueError: for another number of keys than a class with default keys takes.
 
     Example:
         >>> import torch
@@ -31,6 +43,23 @@ class ObservationTransform(Transform):
         >>> Kilometers(in_keys=["depth_m"], out_keys=["depth_km"])(depth)["depth_km"]
         tensor([0.5000])
     """
+
+    default_in_keys: ClassVar[Keys] = ()
+    default_out_keys: ClassVar[Keys] = ()
+    in_counts: ClassVar[Sequence[int]] = ()
+    """Numbers of ``in_keys`` that are allowed; by default that of :attr:`default_in_keys`."""
+    out_counts: ClassVar[Sequence[int]] = ()
+    """Numbers of ``out_keys`` that are allowed; by default that of :attr:`default_out_keys`."""
+    in_sizes: Sequence[int | None] = ()
+    """Last dimensions of the values at ``in_keys``; None for any."""
+    out_sizes: Sequence[tuple[int, ...]] = ()
+    """Last dimensions of the values at ``out_keys``, unbounded ones."""
+
+    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, **inverse: Keys) -> None:
+        ins, outs = self.default_in_keys, self.default_out_keys
+        super().__init__(in_keys=_chosen(in_keys, ins), out_keys=_chosen(out_keys, outs), **inverse)
+        if ins:
+            expect_keys(self, self.in_counts or len(ins), self.out_counts or len(outs))
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
         """Return the values at ``out_keys``, given those at ``in_keys``."""
@@ -84,6 +113,22 @@ class ObservationTransform(Transform):
                 )
         return input_spec
 
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Check the shapes that are read, and add what is written.
+
+        Raises:
+            KeyError: for a key that is missing.
+            ValueError: for a value of another shape.
+        """
+        for key, size in zip(self.in_keys, self.in_sizes, strict=False):
+            shape = self._leaf(observation_spec, key).shape
+            if size is not None and shape[-1:] != (size,):
+                raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(shape)}")
+        if self.out_sizes:
+            like = self._leaf(observation_spec, self.in_keys[0])
+            self._add(observation_spec, like, dict(zip(self.out_keys, self.out_sizes, strict=True)))
+        return observation_spec
+
     def _leaf(self, spec: Composite, key: NestedKey) -> TensorSpec:
         if key not in spec.keys(True, True):
             raise KeyError(f"{type(self).__name__} reads {key!r}, which is not among {sorted_keys(spec)}")
@@ -107,8 +152,7 @@ class StatefulTransform(ObservationTransform):
 
     The state is in the TensorDict: it is reset by row, stored with the data, and resumed with them. A reset begins it,
     and each step reads it from the TensorDict before the step. A subclass names its keys in :attr:`state_keys`, writes
-    it with everything else in :meth:`_begin` and :meth:`_advance`, and adds its specs in
-    ``transform_observation_spec``.
+    it with everything else in :meth:`_begin` and :meth:`_advance`, and adds its specs, as in :attr:`out_sizes`.
 
     Example:
         >>> import torch
@@ -125,9 +169,9 @@ class StatefulTransform(ObservationTransform):
     """
 
     @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it."""
-        raise NotImplementedError
+    def state_keys(self) -> Keys:
+        """Keys that a step reads from the TensorDict before it: ``out_keys`` but the first, unless there are others."""
+        return self.out_keys[1:]
 
     @property
     def step_keys(self) -> Keys:
@@ -191,6 +235,8 @@ class StepReward(StatefulTransform):
         >>> Climb(in_keys=["height"], out_keys=["reward"])(step)["next", "reward"]
         tensor([2.])
     """
+
+    default_out_keys = ("reward",)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
         return tensordict_reset
@@ -280,6 +326,13 @@ def several_keys(keys: Keys) -> list[NestedKey]:
     if isinstance(keys, str) or not isinstance(keys, Iterable) or not all(isinstance(k, (str, tuple)) for k in keys):
         raise TypeError(f"keys must be a sequence of names or of nested names, got {keys!r}")
     return [unravel_key(key) for key in keys]
+
+
+def _chosen(keys: GivenKeys, default: Keys) -> list[NestedKey]:
+    """Return the keys that a user gives, or the default ones; a tuple is one nested key where one key is usual."""
+    if keys is None:
+        return list(default)
+    return several_keys(cast(Keys, keys)) if len(default) > 1 else key_list(keys)
 
 
 def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int | Sequence[int]) -> None:

@@ -16,9 +16,9 @@ from magrl import tracking
 from magrl.checks import check_number, check_numbers
 from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, Way
 from magrl.transforms.base import (
+    GivenKeys,
     Keys,
     StatefulTransform,
-    expect_keys,
     observed_spec,
     several_keys,
     sorted_keys,
@@ -74,6 +74,9 @@ class TrackGradient(StatefulTransform):
         torch.Size([2, 5, 3, 2])
     """
 
+    default_in_keys = IN_KEYS
+    default_out_keys = OUT_KEYS
+    in_counts = (4, 5, 6)
     scales: Tensor
     sensor_std: Tensor
     periods: Tensor
@@ -81,8 +84,8 @@ class TrackGradient(StatefulTransform):
 
     def __init__(
         self,
-        in_keys: Keys = IN_KEYS,
-        out_keys: Keys = OUT_KEYS,
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
         *,
         sensor_std: Sequence[float] | None = None,
         prior: Callable[[Tensor], GradientPrior] = tracking.dipole_prior,
@@ -93,8 +96,7 @@ class TrackGradient(StatefulTransform):
         range_km: float = 300.0,
         frame: str = "world",
     ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        expect_keys(self, (4, 5, 6), 6)
+        super().__init__(in_keys, out_keys)
         if sensor_std is not None and len(self.in_keys) > 4:
             raise ValueError(f"give sensor_std or its key {self.in_keys[4]!r}, not both: got sensor_std {sensor_std}")
         check_number(0, above=True, range_km=range_km)
@@ -104,6 +106,7 @@ class TrackGradient(StatefulTransform):
         self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
         self.curvature = curvature if callable(curvature) else None
         count = len(scales)
+        self.out_sizes = (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
         if not set(angles) <= set(range(count)):
             raise ValueError(f"angles must be indices of the {count} elements, got {angles!r}")
         self._register(count, scales=scales, sensor_std=(0.0,) * count if sensor_std is None else sensor_std)
@@ -177,9 +180,7 @@ class TrackGradient(StatefulTransform):
             )
         if heading.shape != (*shapes[0][:-1], 1):
             raise ValueError(f"TrackGradient needs a heading {(*shapes[0][:-1], 1)}, got {tuple(heading.shape)}")
-        sizes = (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
-        self._add(observation_spec, reading, dict(zip(self.out_keys, sizes, strict=True)))
-        return observation_spec
+        return super().transform_observation_spec(observation_spec)
 
 
 class SearchAim(StatefulTransform):
@@ -213,24 +214,17 @@ class SearchAim(StatefulTransform):
         torch.Size([2, 3, 24, 2])
     """
 
+    default_in_keys = (*IN_KEYS, "track_mean", "track_covariance", "way", "way_covariance")
+    default_out_keys = ("aim", "visited", "arrival_weights")
+    out_sizes = (2,), (tracking.VISITED, 2), (3,)
+
     def __init__(
-        self,
-        in_keys: Keys = (*IN_KEYS, "track_mean", "track_covariance", "way", "way_covariance"),
-        out_keys: Keys = ("aim", "visited", "arrival_weights"),
-        *,
-        zeta: float,
-        frame: str = "world",
+        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, zeta: float, frame: str = "world"
     ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        expect_keys(self, 8, 3)
+        super().__init__(in_keys, out_keys)
         check_number(0, above=True, zeta=zeta)
         _check_frame(frame)
         self.zeta, self.frame = float(zeta), frame
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Visited places and weights of the objective."""
-        return self.out_keys[1:]
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         weights = tracking.arrival_weights(values[0], values[1], self.zeta)
@@ -249,13 +243,6 @@ class SearchAim(StatefulTransform):
         aim = tracking.aim(FieldTrack(mean, covariance), Way(*way), visited, weights, axes=axes)
         for key, value in zip(self.out_keys, (aim, visited, weights), strict=True):
             tensordict.set(key, value)
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the way and the state, unbounded."""
-        sizes = (2,), (tracking.VISITED, 2), (3,)
-        reading = self._leaf(observation_spec, self.in_keys[0])
-        self._add(observation_spec, reading, dict(zip(self.out_keys, sizes, strict=True)))
-        return observation_spec
 
 
 class DeclareArrival(Transform):

@@ -18,7 +18,7 @@ from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number, check_numbers
 from magrl.counters import advanced, counter_stream, split
-from magrl.transforms.base import Keys, StatefulTransform
+from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 """D [deg], I [deg], B_H [nT] at middle latitudes, for which data sheets state the errors that depend on the field.
@@ -65,8 +65,6 @@ class EpisodeErrors(StatefulTransform):
     """Default keys of true values, which are privileged."""
     error_key: NestedKey = "error"
     stream_key: NestedKey = "stream"
-    in_sizes: tuple[int | None, ...] = ()
-    """Last dimensions of the values at ``in_keys``; None for any."""
     size: int
     """Numbers that hold the errors of an episode."""
     error_dtype: ClassVar[torch.dtype | None] = None
@@ -79,14 +77,14 @@ class EpisodeErrors(StatefulTransform):
 
     def __init__(
         self,
-        in_keys: Keys,
-        out_keys: Keys,
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
         *,
         error_key: NestedKey | None = None,
         stream_key: NestedKey | None = None,
         seed: int = 0,
     ) -> None:
-        super().__init__(in_keys=in_keys, out_keys=out_keys)
+        super().__init__(in_keys, out_keys)
         check_number(whole=True, seed=seed)
         self.seed = int(seed)
         self.error_key, self.stream_key = error_key or self.error_key, stream_key or self.stream_key
@@ -168,18 +166,11 @@ class EpisodeErrors(StatefulTransform):
     # Specs
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Check the shapes that are read, and add the errors and the state of the random numbers.
-
-        Raises:
-            KeyError: for a key that is missing.
-            ValueError: for a value of another shape.
-        """
-        leaves = [self._leaf(observation_spec, key) for key in self.in_keys]
-        for key, leaf, size in zip(self.in_keys, leaves, self.in_sizes, strict=False):
-            if size is not None and leaf.shape[-1:] != (size,):
-                raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(leaf.shape)}")
-        self._add(observation_spec, leaves[0], {self.error_key: (self.size,)}, self.error_dtype)
-        self._add(observation_spec, leaves[0], {self.stream_key: (1,)}, torch.int64)
+        """Check the shapes that are read, and add what is written, the errors and the state of the random numbers."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        leaf = self._leaf(observation_spec, self.in_keys[0])
+        self._add(observation_spec, leaf, {self.error_key: (self.size,)}, self.error_dtype)
+        self._add(observation_spec, leaf, {self.stream_key: (1,)}, torch.int64)
         return observation_spec
 
 
@@ -202,6 +193,7 @@ class ReadingErrors(EpisodeErrors):
         'true_field'
     """
 
+    default_out_keys: ClassVar[Keys] = ("field",)
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
     reading: ClassVar[int] = 0
     """Index of the reading among ``in_keys`` and ``out_keys``."""
@@ -209,8 +201,8 @@ class ReadingErrors(EpisodeErrors):
 
     def __init__(
         self,
-        in_keys: Keys,
-        out_keys: Keys,
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
         *,
         true_key: NestedKey | None = "true_field",
         std_key: NestedKey = "sensor_std",

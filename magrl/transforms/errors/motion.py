@@ -14,7 +14,7 @@ from torchrl.data import Composite, TensorSpec
 from magrl.checks import check_number
 from magrl.counters import NORMAL_LIMIT, counter_stream, normal_of, stream_normal, stream_uniform
 from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
-from magrl.transforms.base import Keys, expect_keys, observed_spec, several_keys
+from magrl.transforms.base import observed_spec
 from magrl.transforms.errors.base import Episode, EpisodeErrors
 
 DISPLACEMENT = "displacement"
@@ -69,7 +69,8 @@ class MotionError(EpisodeErrors):
     """
 
     channel = 4
-    true_keys = ("true_move", "true_course")
+    default_in_keys = ("move", "heading", "position")
+    default_out_keys = true_keys = ("true_move", "true_course")
     error_key, stream_key = "motion_error", "motion_stream"
     in_sizes = (2, 1, 2)
     size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2
@@ -86,13 +87,10 @@ class MotionError(EpisodeErrors):
         eddy_km: float = 200.0,
         speed_km_h: float | None = None,
         fixed: bool = False,
-        in_keys: Keys = ("move", "heading", "position"),
-        out_keys: Keys = ("true_move", "true_course"),
         action_key: NestedKey = "action",
         **options: Any,
     ) -> None:
-        super().__init__(several_keys(in_keys), several_keys(out_keys), **options)
-        expect_keys(self, 3, 2)
+        super().__init__(**options)
         self.in_keys_inv = self.out_keys_inv = [action_key, self.in_keys[1]]
         check_number(-math.inf if fixed else 0, log_scale=log_scale, compass_deg=compass_deg)
         check_number(0, log_noise=log_noise, heading_noise_deg=heading_noise_deg)

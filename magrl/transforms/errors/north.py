@@ -16,7 +16,7 @@ from torchrl.data import Composite
 from magrl.checks import check_number
 from magrl.counters import stream_normal
 from magrl.geodesy import wrap_angle, wrap_longitude
-from magrl.transforms.base import Keys, expect_keys, several_keys
+from magrl.transforms.base import Keys
 from magrl.transforms.errors.base import Episode, ReadingErrors, gauss_markov
 
 SCHULER_HOURS = 1.407
@@ -80,6 +80,9 @@ class NorthReferenceError(ReadingErrors):
 
     channel = 3
     true_keys = ("true_field", "true_heading")
+    default_in_keys = ("heading", "field", "move")
+    default_out_keys = ("heading", "field")
+    in_counts = (3, 4)
     error_key, stream_key = "north_error", "north_stream"
     reading = 1
     in_sizes = (1, 3, None, 2)
@@ -93,14 +96,12 @@ class NorthReferenceError(ReadingErrors):
         *,
         drift_length_km: float | None = None,
         fixed: bool = False,
-        in_keys: Keys = ("heading", "field", "move"),
+        in_keys: Keys = default_in_keys,
         true_heading_key: NestedKey = "true_heading",
         **options: Any,
     ) -> None:
-        keys = several_keys(in_keys)
-        super().__init__(keys, keys[:2], **options)
-        expect_keys(self, (3, 4), 2)
-        self.in_keys_inv, self.out_keys_inv = keys[:1], [true_heading_key]
+        super().__init__(in_keys, in_keys[:2], **options)
+        self.in_keys_inv, self.out_keys_inv = self.in_keys[:1], [true_heading_key]
         check_number(-math.inf if fixed else 0, constant_deg=constant_deg)
         check_number(0, drift_deg=drift_deg, random_deg=random_deg)
         if drift_deg:
