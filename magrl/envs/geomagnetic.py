@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
@@ -185,13 +185,16 @@ class GeomagneticNavEnv(EnvBase):
     def _make_specs(self, boxes: Regions) -> None:
         bounds = specs.field_bounds(self.field, boxes)
         options = self.max_move_km, self.max_turn_rad, len(self.region), self.arrival.declared, self.drift_km
-        self.observation_spec = specs.observation_spec(self.num_envs, bounds, *options).to(self.device)
+        self.observation_spec = self._batched(specs.observation_spec(bounds, *options))
         self.state_spec = specs.state_spec(self.observation_spec)
-        self.action_spec = specs.bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
-        rewards = {key: Unbounded((self.num_envs, 1)) for key in ("reward", *specs.REWARD_TERMS)}
-        flags = {key: specs.flag(self.num_envs) for key in ("done", "terminated", "truncated")}
-        self.full_reward_spec = Composite(rewards, shape=self.batch_size).to(self.device)
-        self.full_done_spec = Composite(flags, shape=self.batch_size).to(self.device)
+        self.action_spec = self._batched(Bounded(self.action_low.cpu().float(), self.action_high.cpu().float()))
+        self.full_reward_spec = self._batched(
+            Composite(dict.fromkeys(("reward", *specs.REWARD_TERMS), Unbounded((1,))))
+        )
+        self.full_done_spec = self._batched(Composite(dict.fromkeys(("done", "terminated", "truncated"), specs.FLAG)))
+
+    def _batched(self, spec: TensorSpec) -> TensorSpec:
+        return spec.expand(self.num_envs, *spec.shape).to(self.device)
 
     # Reset
 

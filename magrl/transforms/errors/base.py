@@ -45,11 +45,12 @@ class EpisodeErrors(StatefulTransform):
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
-        error_key: key of the errors of an episode ``(..., size)``. Privileged: a policy must not read it.
-        stream_key: key of the state of the random numbers ``(..., 1)``, int64. Privileged.
         seed: seed of the errors. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
+        **keys: of values beside those: ``error_key``, of the errors of an episode ``(..., size)``, and ``stream_key``,
+            of the state of the random numbers ``(..., 1)``, int64. Both are privileged: a policy must not read them.
 
     Raises:
+        TypeError: for the name of a key that the class does not have.
         ValueError: for a seed that is not a whole number.
         KeyError: for a step from a TensorDict without the state.
 
@@ -76,18 +77,15 @@ class EpisodeErrors(StatefulTransform):
     streams: Tensor | None
 
     def __init__(
-        self,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
-        *,
-        error_key: NestedKey | None = None,
-        stream_key: NestedKey | None = None,
-        seed: int = 0,
+        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, seed: int = 0, **keys: NestedKey | None
     ) -> None:
         super().__init__(in_keys, out_keys)
         check_number(whole=True, seed=seed)
         self.seed = int(seed)
-        self.error_key, self.stream_key = error_key or self.error_key, stream_key or self.stream_key
+        for name, key in keys.items():
+            if not name.endswith("_key") or not hasattr(type(self), name):
+                raise TypeError(f"{type(self).__name__} has no option {name!r}")
+            setattr(self, name, key)
         self.register_buffer("streams", None)
 
     # Episodes
@@ -183,10 +181,10 @@ class ReadingErrors(EpisodeErrors):
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
-        true_key: key of the true value, or None to leave it out. Privileged.
-        std_key: key of the standard deviations of the errors that are new in each reading ``(..., E)``.
-        bias_key: key of those of constant and slow errors ``(..., E)``.
-        **options: of :class:`EpisodeErrors`.
+        seed: seed of the errors.
+        **keys: of :class:`EpisodeErrors`; ``true_key``, of the true value, or None to leave it out, privileged; and
+            ``std_key`` and ``bias_key``, of the standard deviations of the errors that are new in each reading, and of
+            those of constant and slow ones, both ``(..., E)``.
 
     Example:
         >>> ReadingErrors(["field"], ["measured"]).true_key
@@ -197,20 +195,10 @@ class ReadingErrors(EpisodeErrors):
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
     reading: ClassVar[int] = 0
     """Index of the reading among ``in_keys`` and ``out_keys``."""
+    true_key: NestedKey | None = "true_field"
+    std_key: NestedKey = "sensor_std"
+    bias_key: NestedKey = "bias_std"
     _accuracy: Tensor
-
-    def __init__(
-        self,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
-        *,
-        true_key: NestedKey | None = "true_field",
-        std_key: NestedKey = "sensor_std",
-        bias_key: NestedKey = "bias_std",
-        **options: Any,
-    ) -> None:
-        super().__init__(in_keys, out_keys, **options)
-        self.true_key, self.std_key, self.bias_key = true_key, std_key, bias_key
 
     def _set_accuracy(self) -> None:
         """Compute the standard deviations that the vehicle knows, when all sizes are set."""

@@ -72,6 +72,7 @@ class MotionError(EpisodeErrors):
     default_in_keys = ("move", "heading", "position")
     default_out_keys = true_keys = ("true_move", "true_course")
     error_key, stream_key = "motion_error", "motion_stream"
+    action_key: NestedKey = "action"
     in_sizes = (2, 1, 2)
     size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2
 
@@ -87,11 +88,10 @@ class MotionError(EpisodeErrors):
         eddy_km: float = 200.0,
         speed_km_h: float | None = None,
         fixed: bool = False,
-        action_key: NestedKey = "action",
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        self.in_keys_inv = self.out_keys_inv = [action_key, self.in_keys[1]]
+        self.in_keys_inv = self.out_keys_inv = [self.action_key, self.in_keys[1]]
         check_number(-math.inf if fixed else 0, log_scale=log_scale, compass_deg=compass_deg)
         check_number(0, log_noise=log_noise, heading_noise_deg=heading_noise_deg)
         check_number(0, current_km_h=current_km_h, eddies_km_h=eddies_km_h)
@@ -186,14 +186,11 @@ class MotionError(EpisodeErrors):
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
-        observed, commanded = (
-            observed_spec(self),
-            float(input_spec["full_action_spec"][self.in_keys_inv[0]].space.high[..., 0].max()),
-        )
-        known = DISPLACEMENT in observed.keys()  # noqa: SIM118 - a Composite is no mapping
-        allowed = float(observed[DISPLACEMENT].space.high.max()) - 2 * commanded if known else 0.0
+        commanded = float(input_spec["full_action_spec"][self.action_key].space.high[..., 0].max())
+        known = observed_spec(self).get(DISPLACEMENT, None)
+        allowed = 0.0 if known is None else float(known.space.high.max()) - 2 * commanded
         drift = self.farthest_km(commanded) - commanded
-        if not known or drift > allowed + 1e-6 * commanded:
+        if known is None or drift > allowed + 1e-6 * commanded:
             raise ValueError(
                 f"MotionError carries a vehicle up to {drift:.6g} km farther than its command, the environment allows "
                 f"{allowed:.6g} km: create it with drift_km={math.ceil(100 * drift) / 100}"
