@@ -7,7 +7,7 @@ for an accelerator. :func:`check_finite` and :func:`require` do read values.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from numbers import Integral, Real
 from typing import Any
 
@@ -169,6 +169,22 @@ def check_type(kind: type | tuple[type, ...], **values: object) -> None:
         if not isinstance(value, kind):
             kinds = kind if isinstance(kind, tuple) else (kind,)
             raise TypeError(f"{name} must be a {' or '.join(k.__name__ for k in kinds)}, got {value!r}")
+
+
+def check_choice(choices: Collection[object], **values: object) -> None:
+    """Raise unless each value is one of some choices.
+
+    Raises:
+        ValueError: with the name, the choices and the value.
+
+    Example:
+        >>> check_choice(("guided", "base"), reward="sparse")
+        Traceback (most recent call last):
+        ValueError: reward must be one of 'guided', 'base', got 'sparse'
+    """
+    for name, value in values.items():
+        if value not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
 
 
 class CheckedModel(BaseModel):

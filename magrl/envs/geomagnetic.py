@@ -21,7 +21,7 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
-from magrl.checks import check_number, check_type
+from magrl.checks import check_choice, check_number, check_type
 from magrl.envs import specs
 from magrl.envs.arrival import Arrival
 from magrl.envs.regions import Regions, one_region
@@ -114,8 +114,7 @@ class GeomagneticNavEnv(EnvBase):
         check_number(1, whole=True, num_envs=num_envs)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
         check_number(0, above=True, optional=True, objective_limit=objective_limit)
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        check_choice((None, "rgb_array"), render_mode=render_mode)
         if unknown := sorted(changes.keys() - Scenario.model_fields.keys()):
             # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
             raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {option_names()}")
@@ -229,13 +228,14 @@ class GeomagneticNavEnv(EnvBase):
         field, target_field = field.float().double(), target_field.float().double()
         weights = guidance.objective_weights(field, target_field, self.objective_floors[region]).float().double()
         zeros = field.new_zeros(len(vehicle), 2)
+        heading = zeros[:, :1] if self.start_heading == "north" else random_headings(self.seed, vehicle, episode)
         flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         return TensorDict(
             {
                 "field": field.float(),
                 "target_field": target_field.float(),
                 "move": zeros.float(),
-                "heading": self._start_heading(vehicle, episode).float(),
+                "heading": heading.float(),
                 "step_count": torch.zeros_like(vehicle).unsqueeze(-1),
                 "position": start,
                 "target_position": target,
@@ -258,11 +258,6 @@ class GeomagneticNavEnv(EnvBase):
             return sample_tasks(self.region, distances, self.seed, vehicle, episode, law)
         rows = (vehicle + episode * self.num_envs) % len(self.tasks.start)
         return Tasks(*(values.to(self.device)[rows] for values in self.tasks))  # the batch may have moved
-
-    def _start_heading(self, vehicle: Tensor, episode: Tensor) -> Tensor:
-        if self.start_heading == "north":
-            return torch.zeros(len(vehicle), 1, dtype=torch.float64, device=self.device)
-        return random_headings(self.seed, vehicle, episode)
 
     # Step
 

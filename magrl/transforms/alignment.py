@@ -51,10 +51,7 @@ class FieldGradient(ObservationTransform):
     in_sizes = (2,)
 
     def __init__(
-        self,
-        field: FieldModel | Callable[[Tensor], Tensor],
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
+        self, field: FieldModel | Callable[[Tensor], Tensor], in_keys: GivenKeys = None, out_keys: GivenKeys = None
     ) -> None:
         super().__init__(in_keys, out_keys)
         self.elements = hasattr(field, "value_and_gradient")
@@ -82,7 +79,7 @@ class FieldGradient(ObservationTransform):
         if not self.elements:
             (like,) = self._compute([leaf.zero()])
             count, dtype = like.shape[-2], like.dtype
-        self._add(observation_spec, leaf, {self.out_keys[0]: (count, 2)}, dtype)
+        self._add(observation_spec, leaf, self.out_keys[0], count, 2, dtype=dtype)
         return observation_spec
 
 
@@ -206,12 +203,7 @@ class AlignmentReward(StepReward):
     in_counts, out_counts = (2, 3), (1, 2)
 
     def __init__(
-        self,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
-        *,
-        weight: float = 3.0,
-        offset: float = math.pi / 4,
+        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, weight: float = 3.0, offset: float = math.pi / 4
     ) -> None:
         super().__init__(in_keys, out_keys)
         check_number(weight=weight, offset=offset)

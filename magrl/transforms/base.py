@@ -12,8 +12,6 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from magrl.checks import check_type
-
 Keys = Sequence[NestedKey]
 GivenKeys: TypeAlias = NestedKey | Keys | None
 """Keys as a user gives them; None for the default ones."""
@@ -126,7 +124,8 @@ class ObservationTransform(Transform):
                 raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(shape)}")
         if self.out_sizes:
             like = self._leaf(observation_spec, self.in_keys[0])
-            self._add(observation_spec, like, dict(zip(self.out_keys, self.out_sizes, strict=True)))
+            for key, last in zip(self.out_keys, self.out_sizes, strict=True):
+                self._add(observation_spec, like, key, *last)
         return observation_spec
 
     def _leaf(self, spec: Composite, key: NestedKey) -> TensorSpec:
@@ -135,16 +134,9 @@ class ObservationTransform(Transform):
         return spec[key]
 
     @staticmethod
-    def _add(
-        spec: Composite,
-        like: TensorSpec,
-        sizes: Mapping[NestedKey, tuple[int, ...]],
-        dtype: torch.dtype | None = None,
-    ) -> None:
-        """Add unbounded keys to a spec: their last dimensions follow the batch of another leaf."""
-        for key, size in sizes.items():
-            shape = (*like.shape[:-1], *size)
-            spec[key] = Unbounded(shape, device=like.device, dtype=dtype or like.dtype)
+    def _add(spec: Composite, like: TensorSpec, key: NestedKey, *size: int, dtype: torch.dtype | None = None) -> None:
+        """Add an unbounded key to a spec: its last dimensions follow the batch of another leaf."""
+        spec[key] = Unbounded((*like.shape[:-1], *size), device=like.device, dtype=dtype or like.dtype)
 
 
 class StatefulTransform(ObservationTransform):
@@ -252,7 +244,7 @@ class StepReward(StatefulTransform):
         like = self._leaf(observed_spec(self), self.in_keys[0])
         for key in self.out_keys:
             known = key in reward_spec.keys(True, True)
-            self._add(reward_spec, reward_spec[key] if known else like, {key: (1,)})
+            self._add(reward_spec, reward_spec[key] if known else like, key, 1)
         return reward_spec
 
 
@@ -294,7 +286,6 @@ def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
         >>> sorted_keys(TensorDict(move=torch.zeros(2), next=TensorDict(heading=torch.zeros(1))))
         ["('next', 'heading')", 'move']
     """
-    check_type((TensorDictBase, Composite), container=container)
     return sorted(str(key) for key in container.keys(True, True))
 
 
@@ -350,7 +341,6 @@ def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int 
             ...
         ValueError: CatTensors takes 3 in_keys and 1 out_keys, got ['field', 'move'] and ['observation']
     """
-    check_type(Transform, transform=transform)
     counts = [(count,) if isinstance(count, int) else count for count in (num_in, num_out)]
     if len(transform.in_keys) not in counts[0] or len(transform.out_keys) not in counts[1]:
         ins, outs = (" or ".join(map(str, count)) for count in counts)

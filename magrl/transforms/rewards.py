@@ -46,7 +46,7 @@ class TrueWay(ObservationTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the way, unbounded."""
-        self._add(observation_spec, self._leaf(observation_spec, self.in_keys[2]), {self.out_keys[0]: (2,)})
+        self._add(observation_spec, self._leaf(observation_spec, self.in_keys[2]), self.out_keys[0], 2)
         return observation_spec
 
 

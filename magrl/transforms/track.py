@@ -13,7 +13,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import Transform
 
 from magrl import tracking
-from magrl.checks import check_number, check_numbers
+from magrl.checks import check_choice, check_number, check_numbers
 from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, Way
 from magrl.transforms.base import (
     GivenKeys,
@@ -100,12 +100,13 @@ class TrackGradient(StatefulTransform):
         if sensor_std is not None and len(self.in_keys) > 4:
             raise ValueError(f"give sensor_std or its key {self.in_keys[4]!r}, not both: got sensor_std {sensor_std}")
         check_number(0, above=True, range_km=range_km)
-        _check_frame(frame)
+        check_choice(FRAMES, frame=frame)
         if not callable(prior) or not (relation is None or callable(relation)):
             raise ValueError(f"prior must be a function, and relation one or None, got {prior!r} and {relation!r}")
         self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
         self.curvature = curvature if callable(curvature) else None
         count = len(scales)
+        self.in_sizes = (count, count, None, 1, count, count)
         self.out_sizes = (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
         if not set(angles) <= set(range(count)):
             raise ValueError(f"angles must be indices of the {count} elements, got {angles!r}")
@@ -169,19 +170,6 @@ class TrackGradient(StatefulTransform):
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)
         return field, gradient, way, covariance
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the state and the estimates, unbounded."""
-        reading, target, _, heading, *std = (self._leaf(observation_spec, key) for key in self.in_keys)
-        count, shapes = len(self.scales), [tuple(leaf.shape) for leaf in (reading, target, *std)]
-        if shapes[0][-1:] != (count,) or len(set(shapes)) > 1:
-            raise ValueError(
-                f"TrackGradient needs readings, targets and standard deviations of the same shape (..., {count}), with "
-                f"an element for each of its scales, got {shapes}"
-            )
-        if heading.shape != (*shapes[0][:-1], 1):
-            raise ValueError(f"TrackGradient needs a heading {(*shapes[0][:-1], 1)}, got {tuple(heading.shape)}")
-        return super().transform_observation_spec(observation_spec)
-
 
 class SearchAim(StatefulTransform):
     """Write the way to the most probable destination that the vehicle has not visited.
@@ -223,7 +211,7 @@ class SearchAim(StatefulTransform):
     ) -> None:
         super().__init__(in_keys, out_keys)
         check_number(0, above=True, zeta=zeta)
-        _check_frame(frame)
+        check_choice(FRAMES, frame=frame)
         self.zeta, self.frame = float(zeta), frame
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
@@ -319,11 +307,6 @@ class DeclareArrival(Transform):
         low, high = action.space.low[..., :2], action.space.high[..., :2]
         input_spec["full_action_spec"][key] = Bounded(low, high, low.shape, device=action.device, dtype=action.dtype)
         return input_spec
-
-
-def _check_frame(frame: str) -> None:
-    if frame not in FRAMES:
-        raise ValueError(f"frame must be one of {FRAMES}, got {frame!r}")
 
 
 def _turned(vectors: Tensor, heading: Tensor) -> Tensor:

@@ -167,8 +167,8 @@ class EpisodeErrors(StatefulTransform):
         """Check the shapes that are read, and add what is written, the errors and the state of the random numbers."""
         observation_spec = super().transform_observation_spec(observation_spec)
         leaf = self._leaf(observation_spec, self.in_keys[0])
-        self._add(observation_spec, leaf, {self.error_key: (self.size,)}, self.error_dtype)
-        self._add(observation_spec, leaf, {self.stream_key: (1,)}, torch.int64)
+        self._add(observation_spec, leaf, self.error_key, self.size, dtype=self.error_dtype)
+        self._add(observation_spec, leaf, self.stream_key, 1, dtype=torch.int64)
         return observation_spec
 
 
@@ -225,8 +225,8 @@ class ReadingErrors(EpisodeErrors):
         leaf = observation_spec[self.in_keys[self.reading]]
         if self.true_key is not None and self.true_key not in observation_spec.keys(True, True):
             observation_spec[self.true_key] = leaf.clone()
-        keys = self.out_keys[self.reading], self.std_key, self.bias_key
-        self._add(observation_spec, leaf, dict.fromkeys(keys, leaf.shape[-1:]))
+        for key in (self.out_keys[self.reading], self.std_key, self.bias_key):
+            self._add(observation_spec, leaf, key, *leaf.shape[-1:])
         return observation_spec
 
 

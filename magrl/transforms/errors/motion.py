@@ -173,7 +173,7 @@ class MotionError(EpisodeErrors):
         """Add the true move, its direction, the errors and the state of the numbers."""
         observation_spec = super().transform_observation_spec(observation_spec)
         move, heading, _ = (observation_spec[key] for key in self.in_keys)
-        self._add(observation_spec, move, {self.out_keys[0]: (2,)})
+        self._add(observation_spec, move, self.out_keys[0], 2)
         observation_spec[self.out_keys[1]] = heading.clone()
         return observation_spec
 
