@@ -116,8 +116,10 @@ class GeomagneticNavEnv(EnvBase):
         check_number(0, above=True, optional=True, objective_limit=objective_limit)
         check_choice((None, "rgb_array"), render_mode=render_mode)
         if unknown := sorted(changes.keys() - Scenario.model_fields.keys()):
+            own = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "changes"}
+            known = sorted(own | Scenario.model_fields.keys())
             # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
-            raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {option_names()}")
+            raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {known}")
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.num_envs, self.drift_km, self.objective_limit = num_envs, float(drift_km), objective_limit
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
@@ -138,9 +140,9 @@ class GeomagneticNavEnv(EnvBase):
         self.max_turn_rad = math.radians(scenario.max_turn_deg)
         self.arrival = Arrival(scenario.arrival, float(scenario.zeta), float(scenario.arrival_radius_km))
         self.zeta, self.start_heading = self.arrival.zeta, scenario.start_heading
-        declare = [1.0] if self.arrival.declared else []
-        self.register_buffer("action_low", self._float64(0.0, -self.max_turn_rad, *(-x for x in declare)))
-        self.register_buffer("action_high", self._float64(self.max_move_km, self.max_turn_rad, *declare))
+        high = self.max_move_km, self.max_turn_rad, *([1.0] if self.arrival.declared else [])
+        self.register_buffer("action_high", torch.tensor(high, dtype=torch.float64, device=self.device))
+        self.register_buffer("action_low", torch.cat((self.action_high.new_zeros(1), -self.action_high[1:])))
         # Modules of the scenario stay where they are.
         self.region, self.edge = copy.deepcopy(scenario.region).to(self.device), scenario.edge.to(self.device)
         self.tasks = scenario.tasks and Tasks(*(values.to(self.device) for values in scenario.tasks))
@@ -150,9 +152,6 @@ class GeomagneticNavEnv(EnvBase):
         if isinstance(field, torch.nn.Module):
             held = (*field.parameters(), *field.buffers())
             self.field = copy.deepcopy(field).to(self.device) if any(x.device != self.device for x in held) else field
-
-    def _float64(self, *values: float) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64, device=self.device)
 
     def observation_view(self, *, observe_heading: bool = True, observe_difference: bool = True) -> ObservationView:
         """Return what an agent observes of this environment, scaled to the range of the field over the region.
@@ -348,14 +347,3 @@ class GeomagneticNavEnv(EnvBase):
         if self._tracks is None:
             raise RuntimeError("no track is kept: create the environment with render_mode='rgb_array'")
         return self._tracks
-
-
-def option_names() -> list[str]:
-    """Return the names of all options of :class:`GeomagneticNavEnv`, those of its scenario included.
-
-    Example:
-        >>> "seed" in option_names(), "max_steps" in option_names()
-        (True, True)
-    """
-    own = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "changes"}
-    return sorted(own | Scenario.model_fields.keys())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import ClassVar, TypeAlias, cast
+from typing import Any, ClassVar, TypeAlias, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -127,6 +127,13 @@ class ObservationTransform(Transform):
             for key, last in zip(self.out_keys, self.out_sizes, strict=True):
                 self._add(observation_spec, like, key, *last)
         return observation_spec
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
+        """Load buffers that are not set yet, too."""
+        for name, buffer in self._buffers.items():
+            if buffer is None and prefix + name in state_dict:
+                self._buffers[name] = torch.empty_like(state_dict[prefix + name])
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _leaf(self, spec: Composite, key: NestedKey) -> TensorSpec:
         if key not in spec.keys(True, True):

@@ -224,10 +224,8 @@ class SearchAim(StatefulTransform):
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], visited: Tensor, weights: Tensor) -> None:
         _, _, _, heading, mean, covariance, *way = values
-        axes = None
-        if self.frame == "vehicle":
-            cos, sin = torch.cos(heading), torch.sin(heading)
-            axes = torch.stack((torch.cat((cos, sin), -1), torch.cat((-sin, cos), -1)), -2)
+        north_east = torch.eye(2, dtype=heading.dtype, device=heading.device)
+        axes = _turned(north_east, heading).mT if self.frame == "vehicle" else None
         aim = tracking.aim(FieldTrack(mean, covariance), Way(*way), visited, weights, axes=axes)
         for key, value in zip(self.out_keys, (aim, visited, weights), strict=True):
             tensordict.set(key, value)

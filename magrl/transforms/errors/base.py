@@ -106,8 +106,7 @@ class EpisodeErrors(StatefulTransform):
         return stream
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        saved = state_dict.get(f"{prefix}streams")
-        self.streams = None if saved is None else torch.empty_like(saved)
+        self.restart()  # the batch may have another size
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     # Data

@@ -85,14 +85,12 @@ class SensorErrors(ReadingErrors):
         super().__init__(**options)
         check_sizes(sensor_std=sensor_std)
         self.count = len(sensor_std)
-        given = {"bias": bias, "scale": scale, "drift": drift, "resolution": resolution}
-        sizes = {name: (0.0,) * self.count if values is None else values for name, values in given.items()}
-        for name, values in sizes.items():
+        sizes = [list(sensor_std)]
+        for name, values in {"bias": bias, "scale": scale, "drift": drift, "resolution": resolution}.items():
+            values = (0.0,) * self.count if values is None else values
             check_sizes(self.count, fixed=fixed and name in ("bias", "scale"), **{name: values})
-        stacked = torch.tensor(
-            [list(values) for values in (sensor_std, *sizes.values())], dtype=torch.get_default_dtype()
-        )
-        self.register_buffer("_sizes", stacked, persistent=False)
+            sizes.append(list(values))
+        self.register_buffer("_sizes", torch.tensor(sizes, dtype=torch.get_default_dtype()), persistent=False)
         check_number(0, 1, outage_rate=outage_rate)
         if outage_rate == 1:
             raise ValueError("outage_rate must be below 1, got 1: no reading would be new")
