@@ -89,12 +89,10 @@ def _pair_indices(pair: object) -> list[int]:
     Raises:
         ValueError: for anything else than two different elements, by name or by index.
     """
-    message = f"pair must be 'auto' or two different elements, by name or by index from 0, got {pair!r}"
-    if not isinstance(pair, (tuple, list)):
-        raise ValueError(message)
-    indices = [element_index(name) if isinstance(name, str) else name for name in pair]
+    given = pair if isinstance(pair, (tuple, list)) else ()
+    indices = [element_index(name) if isinstance(name, str) else name for name in given]
     if len(set(indices)) != 2 or not all(isinstance(i, int) and i >= 0 for i in indices):
-        raise ValueError(message)
+        raise ValueError(f"pair must be 'auto' or two different elements, by name or by index from 0, got {pair!r}")
     return indices
 
 
