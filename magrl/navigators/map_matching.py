@@ -97,8 +97,7 @@ class MapMatching(Navigator):
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_type((Region, Regions), region=region)
-        check_numbers(3, sensor_std=sensor_std, map_error=map_error)
-        check_number(0, sensor_std=min(sensor_std), map_error=min(map_error))
+        check_numbers(3, 0, sensor_std=sensor_std, map_error=map_error)
         check_number(1, GRID_POINTS**2, whole=True, hypotheses=hypotheses)
         self.hypotheses, bank = int(hypotheses), isinstance(field, FieldBank)
         self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if bank else [])]
@@ -112,22 +111,16 @@ class MapMatching(Navigator):
         self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
 
     @classmethod
-    def for_env(
-        cls,
-        env: GeomagneticNavEnv,
-        *,
-        sensor_std: Std = PERFECT,
-        bias_std: Std = PERFECT,
-        map_date: Date | None = None,
-        **options: Any,
-    ) -> Self:
+    def for_env(cls, env: GeomagneticNavEnv, *, map_date: Date | None = None, **options: Any) -> Self:
         """Return the navigator of an environment, with its field as the map, or IGRF at ``map_date``."""
-        field = env.field
         if map_date is not None:
             field = dated_map(env.scenario, map_date, env.max_move_km).to(env.device)
-            options = {"map_error": aged_error(env.scenario, map_date)} | options
-        std = total_std(sensor_std, bias_std)
-        return cls(field, env.edge, env.max_move_km, env.max_turn_rad, std, **options)
+            options = {"field": field, "map_error": aged_error(env.scenario, map_date)} | options
+        return super().for_env(env, **options)
+
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
+        return {"field": env.field, "region": env.edge, "sensor_std": total_std(sensor_std, bias_std)}
 
     def _place(self, region: Regions) -> None:
         """Keep the region, and the elements on a grid of it."""
