@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from magrl.checks import check_type
 from magrl.evaluation.navigators import OWN, TRAINED, parse_navigator
 
 Noise = tuple[float, float, float]
@@ -50,7 +49,6 @@ def run_config(folder: Path) -> dict[str, Any]:
         >>> run_config(folder)
         {'zeta': 0.01}
     """
-    check_type(Path, folder=folder)
     path = folder / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"there is no run at {folder}: it must hold config.json and policy.pt")

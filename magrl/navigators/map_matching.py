@@ -79,10 +79,6 @@ class MapMatching(Navigator):
     needs = "a map and the region"
     options = ("map_date",)
 
-    grid: Tensor
-    grid_elements: Tensor
-    box: Tensor
-
     def __init__(
         self,
         field: FieldModel | FieldBank,
@@ -105,8 +101,8 @@ class MapMatching(Navigator):
         self._place(copy.deepcopy(Regions.of(region)).to(_device(field)))
         squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, sensor_std))
         floor, error, sensors = (x.to(self.grid.device) for x in squares)
-        self.register_buffer("target_std", (floor + error).sqrt())
-        self.register_buffer("std", (floor + error + sensors).sqrt())
+        self.target_std = nn.Buffer((floor + error).sqrt())
+        self.std = nn.Buffer((floor + error + sensors).sqrt())
         # Two elements give a position, so that the second smallest of the three counts.
         self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
 
@@ -137,9 +133,9 @@ class MapMatching(Navigator):
         if missing.any():
             box = region[int(missing.nonzero()[0])]
             raise ValueError(f"the map is not defined on all of {box}: take a map of a larger box, or a smaller region")
-        self.register_buffer("grid", grid.flatten(1, 2))
-        self.register_buffer("grid_elements", elements)
-        self.register_buffer("box", torch.stack((region.latitude, region.longitude), -1))
+        self.grid = nn.Buffer(grid.flatten(1, 2))
+        self.grid_elements = nn.Buffer(elements)
+        self.box = nn.Buffer(torch.stack((region.latitude, region.longitude), -1))
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         position = self.grid.new_zeros(len(seen["heading"]), self.hypotheses, 2)
