@@ -221,9 +221,7 @@ class MapMatching(Navigator):
 
     def _region(self, seen: TensorDictBase) -> Tensor:
         """Return the number of the region of each vehicle ``(P,)``."""
-        return (
-            seen["region"].squeeze(-1) if "region" in self.in_keys else torch.zeros_like(seen["step_count"].squeeze(-1))
-        )
+        return seen.get("region", torch.zeros_like(seen["step_count"])).squeeze(-1)
 
 
 def _device(field: FieldModel | FieldBank) -> torch.device:

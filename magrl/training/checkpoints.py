@@ -164,16 +164,13 @@ class Checkpoints:
                 continue
             if set(content["parts"]) != set(self.parts):
                 raise ValueError(f"{path} holds {sorted(content['parts'])}, not {sorted(self.parts)}")
-            for name in self.parts:
-                self._restore(name, content["parts"][name], path)
+            try:
+                for name, part in self.parts.items():
+                    part.load_state_dict(content["parts"][name])
+            except Exception as error:  # whatever a part raises for the state of another
+                raise ValueError(f"{path}: {name} does not fit this training: {error}") from error
             return int(content["frames"])
         raise FileNotFoundError(f"there is no valid checkpoint in {self.folder}")
-
-    def _restore(self, name: str, state: Any, path: Path) -> None:
-        try:
-            self.parts[name].load_state_dict(state)
-        except Exception as error:  # whatever a part raises for the state of another
-            raise ValueError(f"{path}: {name} does not fit this training: {error}") from error
 
     def clear(self) -> None:
         """Remove all checkpoints, once a training is complete."""

@@ -58,10 +58,7 @@ def _ray_options(env: EnvBase, workers: int) -> dict[str, Any]:
     cluster["runtime_env"] = {"env_vars": {"PYTHONPATH": path}}
     on_gpu = env.device is not None and env.device.type == "cuda"
     gpus = min(1.0, torch.cuda.device_count() / workers) if on_gpu else 0
-    return {
-        "remote_configs": {"num_cpus": 1, "num_gpus": gpus},
-        "ray_init_config": cluster,
-    }
+    return {"remote_configs": {"num_cpus": 1, "num_gpus": gpus}, "ray_init_config": cluster}
 
 
 def worker_seed(seed: int, index: int) -> int:

@@ -96,9 +96,7 @@ class CurveLog:
 
     def __init__(self, name: str, make: Callable[[], Any] | None) -> None:
         self.name, self._before = name, dict[str, float]()
-        self._logger: Any = None
-        if make is not None:
-            self._logger = self._try(make)
+        self._logger: Any = make and self._try(make)
 
     def _try(self, action: Callable[[], Any]) -> Any:
         """Return the result of an action; report an error and disable the logger."""
