@@ -71,8 +71,6 @@ class Kalman(QuasiNewton):
         True
     """
 
-    needs = "nothing"
-
     def __init__(
         self,
         max_move_km: float = 50.0,

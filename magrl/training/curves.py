@@ -199,15 +199,8 @@ class RunLog:
         self._writer = csv.DictWriter(self._file, self.columns, restval="", extrasaction="raise")
         self._writer.writeheader()
         for row in rows:
-            self._write(row)
+            self.row(row)
         aside.replace(self.folder / "train.csv")
-        for row in rows:
-            self._log.row(row)
-
-    def _write(self, row: Mapping[str, float]) -> None:
-        self.rows.append(dict(row))
-        self._writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-        self._file.flush()
 
     @property
     def seconds(self) -> float:
@@ -216,7 +209,9 @@ class RunLog:
 
     def row(self, row: Mapping[str, float]) -> None:
         """Add a row of curves and flush the file. ``frames`` is the step of the logger."""
-        self._write(row)
+        self.rows.append(dict(row))
+        self._writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+        self._file.flush()
         self._log.row(row)
 
     def figure(self, name: str, figure: Figure) -> None:
