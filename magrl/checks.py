@@ -137,8 +137,13 @@ def _is_finite(value: object, kind: type = Real) -> bool:
     return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
 
 
-def check_numbers(count: int, **values: object) -> None:
-    """Raise unless each value consists of ``count`` finite numbers.
+def check_numbers(count: int, low: float = -math.inf, /, **values: object) -> None:
+    """Raise unless each value consists of ``count`` finite numbers, each from ``low`` on.
+
+    Args:
+        count: how many.
+        low: smallest allowed number.
+        values: numbers by the name that the message uses.
 
     Raises:
         ValueError: with the name and the values.
@@ -152,6 +157,8 @@ def check_numbers(count: int, **values: object) -> None:
         given = list(value) if isinstance(value, Iterable) else []
         if len(given) != count or not all(map(_is_finite, given)):
             raise ValueError(f"{name} must be {count} finite numbers, got {value!r}")
+        smallest: dict[str, Any] = {name: min(given)}
+        check_number(low, **smallest)
 
 
 def check_type(kind: type | tuple[type, ...], **values: object) -> None:
