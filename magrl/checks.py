@@ -7,7 +7,7 @@ for an accelerator. :func:`check_finite` and :func:`require` do read values.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from numbers import Integral, Real
 from typing import Any
 
@@ -137,8 +137,13 @@ def _is_finite(value: object, kind: type = Real) -> bool:
     return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
 
 
-def check_numbers(count: int, **values: object) -> None:
-    """Raise unless each value consists of ``count`` finite numbers.
+def check_numbers(count: int, low: float = -math.inf, /, **values: object) -> None:
+    """Raise unless each value consists of ``count`` finite numbers, each from ``low`` on.
+
+    Args:
+        count: how many.
+        low: smallest allowed number.
+        values: numbers by the name that the message uses.
 
     Raises:
         ValueError: with the name and the values.
@@ -152,6 +157,8 @@ def check_numbers(count: int, **values: object) -> None:
         given = list(value) if isinstance(value, Iterable) else []
         if len(given) != count or not all(map(_is_finite, given)):
             raise ValueError(f"{name} must be {count} finite numbers, got {value!r}")
+        smallest: dict[str, Any] = {name: min(given)}
+        check_number(low, **smallest)
 
 
 def check_type(kind: type | tuple[type, ...], **values: object) -> None:
@@ -169,6 +176,22 @@ def check_type(kind: type | tuple[type, ...], **values: object) -> None:
         if not isinstance(value, kind):
             kinds = kind if isinstance(kind, tuple) else (kind,)
             raise TypeError(f"{name} must be a {' or '.join(k.__name__ for k in kinds)}, got {value!r}")
+
+
+def check_choice(choices: Collection[object], **values: object) -> None:
+    """Raise unless each value is one of some choices.
+
+    Raises:
+        ValueError: with the name, the choices and the value.
+
+    Example:
+        >>> check_choice(("guided", "base"), reward="sparse")
+        Traceback (most recent call last):
+        ValueError: reward must be one of 'guided', 'base', got 'sparse'
+    """
+    for name, value in values.items():
+        if value not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
 
 
 class CheckedModel(BaseModel):

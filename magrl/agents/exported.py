@@ -161,7 +161,6 @@ def export_policy(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
         ['field', 'target_field']
     """
     check_type(TensorDictModuleBase, actor=actor)
-    check_type(EnvBase, env=env)
     base = getattr(env, "base_env", env)
     check_type(GeomagneticNavEnv, env=base)
     try:

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
-from magrl.checks import check_number, check_type
+from magrl.checks import check_choice, check_number, check_type
 from magrl.envs import specs
 from magrl.envs.arrival import Arrival
 from magrl.envs.regions import Regions, one_region
@@ -114,11 +114,12 @@ class GeomagneticNavEnv(EnvBase):
         check_number(1, whole=True, num_envs=num_envs)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
         check_number(0, above=True, optional=True, objective_limit=objective_limit)
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        check_choice((None, "rgb_array"), render_mode=render_mode)
         if unknown := sorted(changes.keys() - Scenario.model_fields.keys()):
+            own = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "changes"}
+            known = sorted(own | Scenario.model_fields.keys())
             # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
-            raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {option_names()}")
+            raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {known}")
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.num_envs, self.drift_km, self.objective_limit = num_envs, float(drift_km), objective_limit
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
@@ -139,9 +140,9 @@ class GeomagneticNavEnv(EnvBase):
         self.max_turn_rad = math.radians(scenario.max_turn_deg)
         self.arrival = Arrival(scenario.arrival, float(scenario.zeta), float(scenario.arrival_radius_km))
         self.zeta, self.start_heading = self.arrival.zeta, scenario.start_heading
-        declare = [1.0] if self.arrival.declared else []
-        self.register_buffer("action_low", self._float64(0.0, -self.max_turn_rad, *(-x for x in declare)))
-        self.register_buffer("action_high", self._float64(self.max_move_km, self.max_turn_rad, *declare))
+        high = self.max_move_km, self.max_turn_rad, *([1.0] if self.arrival.declared else [])
+        self.register_buffer("action_high", torch.tensor(high, dtype=torch.float64, device=self.device))
+        self.register_buffer("action_low", torch.cat((self.action_high.new_zeros(1), -self.action_high[1:])))
         # Modules of the scenario stay where they are.
         self.region, self.edge = copy.deepcopy(scenario.region).to(self.device), scenario.edge.to(self.device)
         self.tasks = scenario.tasks and Tasks(*(values.to(self.device) for values in scenario.tasks))
@@ -151,9 +152,6 @@ class GeomagneticNavEnv(EnvBase):
         if isinstance(field, torch.nn.Module):
             held = (*field.parameters(), *field.buffers())
             self.field = copy.deepcopy(field).to(self.device) if any(x.device != self.device for x in held) else field
-
-    def _float64(self, *values: float) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64, device=self.device)
 
     def observation_view(self, *, observe_heading: bool = True, observe_difference: bool = True) -> ObservationView:
         """Return what an agent observes of this environment, scaled to the range of the field over the region.
@@ -185,13 +183,16 @@ class GeomagneticNavEnv(EnvBase):
     def _make_specs(self, boxes: Regions) -> None:
         bounds = specs.field_bounds(self.field, boxes)
         options = self.max_move_km, self.max_turn_rad, len(self.region), self.arrival.declared, self.drift_km
-        self.observation_spec = specs.observation_spec(self.num_envs, bounds, *options).to(self.device)
+        self.observation_spec = self._batched(specs.observation_spec(bounds, *options))
         self.state_spec = specs.state_spec(self.observation_spec)
-        self.action_spec = specs.bounded(self.num_envs, self.action_low.cpu(), self.action_high.cpu()).to(self.device)
-        rewards = {key: Unbounded((self.num_envs, 1)) for key in ("reward", *specs.REWARD_TERMS)}
-        flags = {key: specs.flag(self.num_envs) for key in ("done", "terminated", "truncated")}
-        self.full_reward_spec = Composite(rewards, shape=self.batch_size).to(self.device)
-        self.full_done_spec = Composite(flags, shape=self.batch_size).to(self.device)
+        self.action_spec = self._batched(Bounded(self.action_low.cpu().float(), self.action_high.cpu().float()))
+        self.full_reward_spec = self._batched(
+            Composite(dict.fromkeys(("reward", *specs.REWARD_TERMS), Unbounded((1,))))
+        )
+        self.full_done_spec = self._batched(Composite(dict.fromkeys(("done", "terminated", "truncated"), specs.FLAG)))
+
+    def _batched(self, spec: TensorSpec) -> TensorSpec:
+        return spec.expand(self.num_envs, *spec.shape).to(self.device)
 
     # Reset
 
@@ -226,13 +227,14 @@ class GeomagneticNavEnv(EnvBase):
         field, target_field = field.float().double(), target_field.float().double()
         weights = guidance.objective_weights(field, target_field, self.objective_floors[region]).float().double()
         zeros = field.new_zeros(len(vehicle), 2)
+        heading = zeros[:, :1] if self.start_heading == "north" else random_headings(self.seed, vehicle, episode)
         flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         return TensorDict(
             {
                 "field": field.float(),
                 "target_field": target_field.float(),
                 "move": zeros.float(),
-                "heading": self._start_heading(vehicle, episode).float(),
+                "heading": heading.float(),
                 "step_count": torch.zeros_like(vehicle).unsqueeze(-1),
                 "position": start,
                 "target_position": target,
@@ -255,11 +257,6 @@ class GeomagneticNavEnv(EnvBase):
             return sample_tasks(self.region, distances, self.seed, vehicle, episode, law)
         rows = (vehicle + episode * self.num_envs) % len(self.tasks.start)
         return Tasks(*(values.to(self.device)[rows] for values in self.tasks))  # the batch may have moved
-
-    def _start_heading(self, vehicle: Tensor, episode: Tensor) -> Tensor:
-        if self.start_heading == "north":
-            return torch.zeros(len(vehicle), 1, dtype=torch.float64, device=self.device)
-        return random_headings(self.seed, vehicle, episode)
 
     # Step
 
@@ -350,14 +347,3 @@ class GeomagneticNavEnv(EnvBase):
         if self._tracks is None:
             raise RuntimeError("no track is kept: create the environment with render_mode='rgb_array'")
         return self._tracks
-
-
-def option_names() -> list[str]:
-    """Return the names of all options of :class:`GeomagneticNavEnv`, those of its scenario included.
-
-    Example:
-        >>> "seed" in option_names(), "max_steps" in option_names()
-        (True, True)
-    """
-    own = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "changes"}
-    return sorted(own | Scenario.model_fields.keys())

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl.envs import Compose, Transform, TransformedEnv
 
-from magrl.checks import check_type
+from magrl.checks import check_choice, check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.transforms import AlignmentReward, DeclareArrival, FieldGradient, GradientHeading
 
@@ -51,8 +51,8 @@ def navigation_env(
         torch.Size([4, 13])
     """
     if isinstance(observation, str):
-        check_choice("observation", observation, OBSERVATIONS)
-    check_choice("reward", reward, REWARDS)
+        check_choice(OBSERVATIONS, observation=observation)
+    check_choice(REWARDS, reward=reward)
     check_type(bool, scale_actions=scale_actions)
     check_type(Transform, **{f"transforms[{number}]": each for number, each in enumerate(transforms)})
     base = GeomagneticNavEnv(num_envs=num_envs, **options)
@@ -74,16 +74,3 @@ def _parts(transforms: Iterable[Transform]) -> Iterator[Transform]:
     """Yield transforms, those of a ``Compose`` one by one."""
     for each in transforms:
         yield from _parts(each) if isinstance(each, Compose) else (each,)
-
-
-def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
-    """Raise unless a value is one of some choices.
-
-    Raises:
-        ValueError: naming the choices.
-
-    Example:
-        >>> check_choice("reward", "base", REWARDS)
-    """
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")

@@ -171,17 +171,16 @@ class TrackRecorder:
 
     def __init__(self, length: int) -> None:
         check_number(1, whole=True, length=length)
-        self._states: deque[tuple[Tensor, Tensor, Tensor]] = deque(maxlen=length)
+        self._states: deque[tuple[Tensor, ...]] = deque(maxlen=length)
 
     def add(self, state: TensorDictBase, started: Tensor | None = None) -> None:
         """Record a state of every vehicle; at a partial reset, only the rows ``started`` ``(N,)`` are new."""
         if torch.compiler.is_compiling():
             return
-        entry = (state["position"], state["step_count"], state["target_position"])
+        entry: tuple[Tensor, ...] = (state["position"], state["step_count"], state["target_position"])
         if started is not None and self._states:
             new, last = started.unsqueeze(-1), self._states.pop()
-            position, step, target = (torch.where(new, a, b) for a, b in zip(entry, last, strict=True))
-            entry = (position, step, target)
+            entry = tuple(torch.where(new, a, b) for a, b in zip(entry, last, strict=True))
         self._states.append(entry)
 
     def track(self, vehicle: int) -> Tensor:
@@ -204,7 +203,7 @@ class TrackRecorder:
         return self._latest[2]
 
     @property
-    def _latest(self) -> tuple[Tensor, Tensor, Tensor]:
+    def _latest(self) -> tuple[Tensor, ...]:
         if not self._states:
             raise RuntimeError("there is no episode to show: call reset() first")
         return self._states[-1]

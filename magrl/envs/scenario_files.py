@@ -115,11 +115,7 @@ def _content(path: Path) -> Any:
     if len(content) > MAX_FILE_BYTES:
         raise ValueError(f"the file holds more than {MAX_FILE_BYTES} bytes")
     try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"the file is not UTF-8: {error}") from error
-    try:
-        return parsers[path.suffix.lower()](text)
+        return parsers[path.suffix.lower()](content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"the file is not valid {path.suffix[1:].upper()}: {error}") from error
 

@@ -1,4 +1,4 @@
-"""TensorDict specs of the navigation environment, each for ``N`` vehicles."""
+"""TensorDict specs of the navigation environment, each for one vehicle."""
 
 from __future__ import annotations
 
@@ -22,15 +22,11 @@ STATE_KEYS = (*CONSTANT_KEYS, "heading", "step_count", "position", "objective", 
 """Keys that a step reads: the state of an episode."""
 
 
-def bounded(num_envs: int, low: Tensor, high: Tensor) -> Bounded:
-    """Return a float32 box ``(N, K)`` from bounds ``(K,)``.
-
-    Example:
-        >>> bounded(4, torch.tensor([0.0]), torch.tensor([1.0])).shape
-        torch.Size([4, 1])
-    """
-    shape = (num_envs, *low.shape)
-    return Bounded(low.float().expand(shape), high.float().expand(shape), shape)
+_NORTH_EAST = torch.tensor((90.0, 180.0), dtype=torch.float64)
+POSITION = Bounded(-_NORTH_EAST, _NORTH_EAST, dtype=torch.float64)
+"""Spec of a latitude and a longitude [deg]."""
+FLAG = Binary(1, dtype=torch.bool)
+"""Spec of a flag."""
 
 
 def field_bounds(field: FieldModel | FieldBank, boxes: Regions) -> tuple[Tensor, Tensor]:
@@ -79,7 +75,6 @@ def region_elements(field: FieldModel | FieldBank, regions: Regions, points: int
 
 
 def observation_spec(
-    num_envs: int,
     field_bounds: tuple[Tensor, Tensor],
     max_move_km: float,
     max_turn_rad: float,
@@ -87,10 +82,9 @@ def observation_spec(
     declared: bool = False,
     drift_km: float = 0.0,
 ) -> Composite:
-    """Return the spec of what a step observes, privileged keys included.
+    """Return the spec of what a vehicle observes after a step, privileged keys included.
 
     Args:
-        num_envs: number of vehicles N.
         field_bounds: lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
@@ -100,29 +94,28 @@ def observation_spec(
             ``displacement``.
 
     Example:
-        >>> observation_spec(4, (torch.zeros(3), torch.ones(3)), 50.0, 1.5)["field"].shape
+        >>> observation_spec((torch.zeros(3), torch.ones(3)), 50.0, 1.5).expand(4)["field"].shape
         torch.Size([4, 3])
     """
-    low, high = (bound.cpu() for bound in field_bounds)
+    field = Bounded(*(bound.cpu().float() for bound in field_bounds))
     highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
-    more = {DECLARED: flag(num_envs)} if declared else {}
+    more = {DECLARED: FLAG} if declared else {}
     reach = 2 * max_move_km + drift_km  # from the end of a commanded move to that of a true one
-    more |= {DISPLACEMENT: Bounded(-reach, reach, (num_envs, 2), dtype=torch.float64)} if drift_km else {}
+    more |= {DISPLACEMENT: Bounded(-reach, reach, (2,), dtype=torch.float64)} if drift_km else {}
     return Composite(
-        field=bounded(num_envs, low, high),
-        target_field=bounded(num_envs, low, high),
-        move=bounded(num_envs, highest_move * torch.tensor((0, -1)), highest_move),
-        heading=bounded(num_envs, torch.tensor([-math.pi]), torch.tensor([math.pi])),
-        step_count=Unbounded((num_envs, 1), dtype=torch.int64),
-        position=_position_spec(num_envs),
-        target_position=_position_spec(num_envs),
-        start_position=_position_spec(num_envs),
-        objective=Unbounded((num_envs, 1)),
-        objective_weights=Unbounded((num_envs, 3)),
-        success=flag(num_envs),
-        region=Bounded(0, num_regions - 1, (num_envs, 1), dtype=torch.int64),
+        field=field,
+        target_field=field.clone(),
+        move=Bounded(highest_move * torch.tensor((0, -1)), highest_move),
+        heading=Bounded(-math.pi, math.pi, (1,)),
+        step_count=Unbounded((1,), dtype=torch.int64),
+        position=POSITION.clone(),
+        target_position=POSITION.clone(),
+        start_position=POSITION.clone(),
+        objective=Unbounded((1,)),
+        objective_weights=Unbounded((3,)),
+        success=FLAG.clone(),
+        region=Bounded(0, num_regions - 1, (1,), dtype=torch.int64),
         **more,
-        shape=(num_envs,),
     )
 
 
@@ -161,23 +154,8 @@ def state_spec(observation: Composite) -> Composite:
 
     Example:
         >>> bounds = torch.zeros(3), torch.ones(3)
-        >>> "field" in state_spec(observation_spec(4, bounds, 50.0, 1.5)).keys()
+        >>> "field" in state_spec(observation_spec(bounds, 50.0, 1.5)).keys()
         False
     """
     held = [key for key in STATE_KEYS if key in observation.keys()]  # noqa: SIM118 - a Composite is no mapping
     return Composite({key: observation[key].clone() for key in held}, shape=observation.shape)
-
-
-def _position_spec(num_envs: int) -> Bounded:
-    high = torch.tensor((90.0, 180.0), dtype=torch.float64).expand(num_envs, 2)
-    return Bounded(-high, high, high.shape, dtype=torch.float64)
-
-
-def flag(num_envs: int) -> Binary:
-    """Return the spec of a flag, ``(N, 1)`` bool.
-
-    Example:
-        >>> flag(4).shape
-        torch.Size([4, 1])
-    """
-    return Binary(1, (num_envs, 1), dtype=torch.bool)

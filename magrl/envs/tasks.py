@@ -15,7 +15,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from magrl import paper
-from magrl.checks import check_number, check_numbers, check_tensor, check_type
+from magrl.checks import check_choice, check_number, check_numbers, check_tensor, check_type
 from magrl.counters import counter_uniform
 from magrl.envs.regions import PAPER_REGION, Region, Regions
 from magrl.field.bank import check_index
@@ -83,8 +83,7 @@ def check_distance_range(regions: Regions, distance_range_km: tuple[float, float
         ValueError: distance_range_km (500, 300) must be two rising numbers from 0 on
     """
     check_numbers(2, distance_range_km=distance_range_km)
-    if distance_law not in DISTANCE_LAWS:
-        raise ValueError(f"distance_law must be one of {', '.join(map(repr, DISTANCE_LAWS))}, got {distance_law!r}")
+    check_choice(DISTANCE_LAWS, distance_law=distance_law)
     shortest, longest = distance_range_km
     if not 0 <= shortest < longest or (distance_law == "log" and shortest == 0):
         start = "above 0 with distance_law 'log'" if distance_law == "log" else "from 0 on"

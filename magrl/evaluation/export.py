@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element, indent, tostring
 
 from tensordict import TensorDictBase
 
-from magrl.checks import check_numbers, check_type
+from magrl.checks import check_number
 from magrl.envs.rendering import START, TARGET
 from magrl.evaluation.metrics import episode_measures
 from magrl.evaluation.navigators import NAVIGATOR_COLORS, parse_navigator
@@ -200,7 +200,6 @@ def check_suffix(path: Path | str) -> str:
         >>> check_suffix("tracks.GPX")
         '.gpx'
     """
-    check_type((Path, str), path=path)
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         raise ValueError(f"a file of tracks must end in one of {', '.join(WRITERS)}, got {str(path)!r}")
@@ -265,12 +264,9 @@ def _checked(positions: Sequence[Position]) -> list[Position]:
     """Return at least two valid positions as floats."""
     if len(positions) < 2:
         raise ValueError(f"a line must have at least two positions, got {list(positions)}")
-    for position in positions:
-        check_numbers(2, position=position)
-        if not (abs(position[0]) <= 90 and abs(position[1]) <= 180):
-            raise ValueError(
-                f"position must be a latitude within 90 and a longitude within 180 degrees, got {position}"
-            )
+    for latitude, longitude in positions:
+        check_number(-90, 90, latitude=latitude)
+        check_number(-180, 180, longitude=longitude)
     return [(float(latitude), float(longitude)) for latitude, longitude in positions]
 
 

@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from magrl.checks import check_number
 from magrl.envs import Region, Tasks
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
 from magrl.evaluation.intervals import interquartile_mean
@@ -105,7 +104,6 @@ def learning_curves(
         >>> figure.axes[0].get_legend().get_texts()[0].get_text()
         'TD3, 2 seeds'
     """
-    check_number(2, whole=True, points=points)
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     for name, runs in curves.items():

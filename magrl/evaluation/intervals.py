@@ -26,7 +26,7 @@ def bootstrap_interval(values: Tensor, resamples: int = 1000, seed: int = 0) -> 
         Low and high end; NaN if a value is NaN.
 
     Raises:
-        ValueError: for no values, another shape, or no resamples.
+        ValueError: for no values, or another shape.
 
     Source:
         B. Efron, Bootstrap methods: another look at the jackknife, Annals of Statistics 7 (1979).
@@ -36,8 +36,6 @@ def bootstrap_interval(values: Tensor, resamples: int = 1000, seed: int = 0) -> 
         (1.0, 1.0)
     """
     check_tensor(values=values)
-    check_number(1, whole=True, resamples=resamples)
-    check_number(whole=True, seed=seed)
     if values.ndim != 1 or not len(values):
         raise ValueError(f"values must be of shape (M,) with M >= 1, got {tuple(values.shape)}")
     generator = torch.Generator().manual_seed(seed)
@@ -93,7 +91,7 @@ def stratified_bootstrap(strata: Sequence[Tensor], resamples: int = 10_000, seed
         Low and high end; NaN if a score is NaN.
 
     Raises:
-        ValueError: for no stratum, one without runs or of another shape, or no resamples.
+        ValueError: for no stratum, or one without runs or of another shape.
 
     Source:
         R. Agarwal et al., Deep reinforcement learning at the edge of the statistical precipice, NeurIPS (2021), whose
@@ -104,8 +102,6 @@ def stratified_bootstrap(strata: Sequence[Tensor], resamples: int = 10_000, seed
         (99.0, 99.0)
     """
     check_type(Sequence, strata=strata)
-    check_number(1, whole=True, resamples=resamples)
-    check_number(whole=True, seed=seed)
     check_tensor(**{f"stratum {index}": scores for index, scores in enumerate(strata)})
     shapes = [tuple(scores.shape) for scores in strata]
     if not strata or any(len(shape) != 1 or not shape[0] for shape in shapes):

@@ -22,7 +22,7 @@ from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor, check_type
+from magrl.checks import check_number, check_tensor
 from magrl.envs import Region, Regions
 from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
@@ -286,7 +286,6 @@ def write_gif(
         >>> path.read_bytes()[:3]
         b'GIF'
     """
-    check_type((Path, str), path=path)
     check_number(1, whole=True, width_px=width_px)
     frames = list(_frames(rollout.cpu(), field, one_region(region), title, width_px))
     sample = np.hstack([np.asarray(image) for image in (frames[0], frames[len(frames) // 2], frames[-1])])

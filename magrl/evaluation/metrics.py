@@ -85,13 +85,15 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
     success = rollout["next", "success"].squeeze(-1).gather(1, last).squeeze(-1)
     start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
     end = rollout["next", "position"].gather(1, last.unsqueeze(-1).expand(-1, 1, 2)).squeeze(1)
-    length_km = (moved(rollout["next"])[0] * valid).sum(1)
-    deviation = _heading_deviation(rollout, valid)
+    distance, heading = moved(rollout["next"])
+    length_km, moving = (distance * valid).sum(1), valid & (distance > 1e-6)
+    _, bearing = geodesic(*rollout["position"].unbind(-1), *rollout["target_position"].unbind(-1))
+    deviation = torch.where(moving, torch.rad2deg(wrap_angle(heading - bearing).abs()), math.nan)
     measures = {
         "success": success,
         "steps": steps,
         **path_measures(success, start, end, target, length_km),
-        "smoothness_deg": 180 - _turns(rollout, valid).nanmean(1),
+        "smoothness_deg": 180 - _turns(heading, moving).nanmean(1),
         "heading_mae_deg": deviation.nanmean(1),
         "heading_rmse_deg": (deviation**2).nanmean(1).sqrt(),
     }
@@ -134,22 +136,8 @@ def _nearest_arrival(rollout: TensorDictBase, env: GeomagneticNavEnv, shortest_k
     return distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region)
 
 
-def _moving(rollout: TensorDictBase, valid: Tensor) -> Tensor:
-    """Return the mask of the moves that have a direction, ``(M, T)``."""
-    return valid & (moved(rollout["next"])[0] > 1e-6)
-
-
-def _heading_deviation(rollout: TensorDictBase, valid: Tensor) -> Tensor:
-    """Return the angle between each move and the bearing to the destination at its start, ``(M, T)`` [deg] or NaN."""
-    _, bearing = geodesic(*rollout["position"].unbind(-1), *rollout["target_position"].unbind(-1))
-    angle = wrap_angle(moved(rollout["next"])[1] - bearing).abs()
-    return torch.where(_moving(rollout, valid), torch.rad2deg(angle), math.nan)
-
-
-def _turns(rollout: TensorDictBase, valid: Tensor) -> Tensor:
+def _turns(heading: Tensor, moving: Tensor) -> Tensor:
     """Return the turn between each move and the last move of nonzero length before it, ``(M, T)`` [deg] or NaN."""
-    _, heading = moved(rollout["next"])
-    moving = _moving(rollout, valid)
     index = torch.arange(heading.shape[1], device=heading.device).expand_as(heading)
     latest = torch.where(moving, index, -1).cummax(1).values
     previous = torch.cat((torch.full_like(latest[:, :1], -1), latest[:, :-1]), 1)
@@ -192,11 +180,7 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
     success = episodes["success"]
     if success.dtype != torch.bool or success.ndim != 1 or not len(success):
         raise ValueError(f"success must be bool of shape (M,) with M >= 1, got {success!r}")
-    count = len(success)
-    rate = success.double().mean().item()
-    low, high = wilson_interval(rate, count)
-    error = episodes["navigation_error_km"]
-    summary = {"success_rate": 100 * rate, "success_rate_low": 100 * low, "success_rate_high": 100 * high}
+    summary, error = _rate("success_rate", success), episodes["navigation_error_km"]
     summary |= {f"success_rate_within_{d}km": 100 * (error <= d).double().mean().item() for d in WITHIN_KM}
     summary["final_distance_km_median"] = error.double().quantile(0.5).item()
     efficiency = episodes["path_efficiency"]
@@ -210,17 +194,17 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
     for name in ("navigation_error_km", "smoothness_deg", "heading_mae_deg", "heading_rmse_deg"):
         summary[name] = episodes[name][success].nanmean().item()
     if "false_arrival" in episodes:
-        summary |= _declarations(success, episodes["false_arrival"], error)
-    return summary | {"num_tasks": count}
+        false = episodes["false_arrival"]  # each declared arrival is a success or a false arrival
+        summary |= _rate("false_arrival_rate", false)
+        summary["navigation_error_km_declared"] = error[success | false].mean().item()
+    return summary | {"num_tasks": len(success)}
 
 
-def _declarations(success: Tensor, false: Tensor, error_km: Tensor) -> dict[str, float]:
-    """Return the measures of declared arrivals, of which each is a success or a false arrival."""
-    rate = false.double().mean().item()
-    low, high = wilson_interval(rate, len(false))
-    rates = {"rate": rate, "rate_low": low, "rate_high": high}
-    measures = {f"false_arrival_{name}": 100 * value for name, value in rates.items()}
-    return measures | {"navigation_error_km_declared": error_km[success | false].mean().item()}
+def _rate(name: str, mask: Tensor) -> dict[str, float]:
+    """Return the share of True [%] and its Wilson 95 % interval."""
+    rate = mask.double().mean().item()
+    low, high = wilson_interval(rate, len(mask))
+    return {name: 100 * rate, f"{name}_low": 100 * low, f"{name}_high": 100 * high}
 
 
 def _percent(name: str, values: Tensor) -> dict[str, float]:

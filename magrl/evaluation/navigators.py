@@ -118,10 +118,8 @@ def make_navigator(
     kind = NAVIGATORS.get(name)
     if kind is None or source or (option and "mode" not in kind.options):
         trained = [f"{agent}=RUN" for agent in TRAINED if agent != OWN]
-        raise ValueError(
-            f"unknown navigator {text!r}: choose from "
-            + ", ".join([*PRETRAINED, *trained, "policy:NAME=FILE", *NAVIGATORS])
-        )
+        known = [*PRETRAINED, *trained, "policy:NAME=FILE", *NAVIGATORS]
+        raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(known)}")
     options = {"mode": option or mode, "seed": seed, "map_date": map_date}
     own = {key: value for key, value in options.items() if key in kind.options}
     return kind.for_env(env, sensor_std=sensor_std, bias_std=bias_std, **own).to(env.device)

@@ -8,7 +8,6 @@ import re
 import torch
 from torch import Tensor
 
-from magrl.checks import check_type
 from magrl.envs import Region, Regions
 from magrl.envs.specs import field_bounds
 from magrl.field import FieldModel, elements_at, elements_gradient_at
@@ -39,7 +38,6 @@ def parse_coordinates(text: str) -> Tensor:
         >>> parse_coordinates("33.9S 18.4E")
         tensor([-33.9000,  18.4000], dtype=torch.float64)
     """
-    check_type(str, text=text)
     found = _COORDINATES.fullmatch(text)
     if not found:
         raise ValueError(f"a place must be written such as '60.4N 5.3E', '60.4, 5.3' or '-33.9 18.4', got {text!r}")
@@ -68,7 +66,6 @@ def parse_elements(text: str) -> Tensor | None:
         >>> parse_elements("D=-3.2 I=71.5 BH=15000").tolist(), parse_elements("60.4N 5.3E")
         ([-3.2, 71.5, 15000.0], None)
     """
-    check_type(str, text=text)
     found = _ELEMENTS.fullmatch(text)
     if not found:
         return None

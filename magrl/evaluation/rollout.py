@@ -131,7 +131,6 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
         >>> evaluation_rollout(env, env.rand_action).shape
         torch.Size([2, 3])
     """
-    check_type(EnvBase, env=env)
     restart(env)
     return _rollout(env, policy)
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from magrl.checks import check_type
 from magrl.evaluation.navigators import OWN, TRAINED, parse_navigator
 
 Noise = tuple[float, float, float]
@@ -36,30 +35,6 @@ class TrainedRun:
     """Arrival threshold on the objective."""
 
 
-def run_config(folder: Path) -> dict[str, Any]:
-    """Return the settings that a training left in its folder.
-
-    Raises:
-        FileNotFoundError: for a folder without a run.
-        ValueError: for a file that does not hold settings.
-
-    Example:
-        >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> _ = (folder / "config.json").write_text('{"zeta": 0.01}')
-        >>> run_config(folder)
-        {'zeta': 0.01}
-    """
-    check_type(Path, folder=folder)
-    path = folder / "config.json"
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no run at {folder}: it must hold config.json and policy.pt")
-    try:
-        return dict(json.loads(path.read_text()))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path} is not the configuration of a run: {error}") from error
-
-
 def read_run(folder: Path) -> TrainedRun:
     """Return how the agent of a run folder was trained.
 
@@ -75,8 +50,11 @@ def read_run(folder: Path) -> TrainedRun:
         >>> run.kind, run.start_heading, run.noise
         ('td3', 'random', (0.0, 0.0, 0.0))
     """
-    settings = run_config(folder)
+    path = folder / "config.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no run at {folder}: it must hold config.json and policy.pt")
     try:
+        settings = dict(json.loads(path.read_text()))
         kinds: dict[Any, str] = {True: "gg_td3", False: "td3"}
         guided = kinds.get(settings.get("guided"))
         kind = {"td3_recurrent.py": "recurrent", "td3_anywhere.py": "anywhere"}.get(settings.get("recipe", ""), guided)
@@ -84,7 +62,7 @@ def read_run(folder: Path) -> TrainedRun:
         scenario = folder / Path(settings["scenario"]).name if settings.get("scenario") else None
         zeta = float(settings.get("zeta", 0.01))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{folder / 'config.json'} is not the configuration of a run: {error}") from error
+        raise ValueError(f"{path} is not the configuration of a run: {error}") from error
     if scenario is not None and not scenario.is_file():
         raise FileNotFoundError(f"{folder} was trained in its scenario file {scenario.name}, which is missing there")
     heading, noise = str(settings.get("start_heading", "north")), (first, second, third)

@@ -11,7 +11,7 @@ from magrl.checks import check_number, check_tensor, require
 from magrl.field import harmonics
 from magrl.field.harmonics import chebyshev, chebyshev_nodes, checked_gauss
 from magrl.field.model import Float64Module, in_chunks
-from magrl.field.regional import box_scaling, in_half_spans, inside_box
+from magrl.field.regional import box_scaling, check_expansion, in_half_spans, inside_box
 from magrl.geodesy import check_box, curvature_radii, to_ecef
 
 
@@ -46,9 +46,6 @@ class FieldBank(Float64Module):
     """Whether an evaluation takes an index."""
     CHUNK = 10240
     """Positions evaluated at a time; temporary memory is about 3 kB per position."""
-    coefficients: Tensor
-    scaling: Tensor
-    slopes: Tensor
     error_nt: Tensor
     """Largest difference from the exact field at the check points of each expansion, ``(K,)`` [nT]; NaN if unknown."""
 
@@ -63,10 +60,9 @@ class FieldBank(Float64Module):
             raise ValueError(f"latitude must hold {len(expansion)} boxes, as expansion, got {len(edges)}")
         self.degree = terms - 1
         # The latitude order, then, as in RegionalField, the longitude order and within it the component.
-        coefficients = expansion.double().permute(0, 2, 3, 1).flatten(2).contiguous()
-        self.register_buffer("coefficients", coefficients)
-        self.register_buffer("scaling", box_scaling(edges).to(expansion.device))
-        self.register_buffer("slopes", _slopes(terms).to(expansion.device), persistent=False)
+        self.coefficients = nn.Buffer(expansion.double().permute(0, 2, 3, 1).flatten(2).contiguous())
+        self.scaling = nn.Buffer(box_scaling(edges).to(expansion.device))
+        self.slopes = nn.Buffer(_slopes(terms).to(expansion.device), persistent=False)
         self.register_buffer("error_nt", torch.full_like(self.scaling[:, 0, 0], torch.nan))
 
     @classmethod
@@ -118,7 +114,9 @@ class FieldBank(Float64Module):
             found = polynomials.T @ table.unflatten(2, (-1, 3)).permute(0, 3, 1, 2) @ polynomials
             errors.append((found - _synthesis(weights[k], *inside_box(unit, box))).abs().amax((1, 2, 3)))
         bank.error_nt.copy_(torch.cat(errors))
-        bank._check_error(planet_index, edges, tolerance_nt)
+        worst = int(bank.error_nt.nan_to_num(torch.inf).argmax())
+        place = f"box {worst}, of planet {planet_index[worst]}"
+        check_expansion(degree, bank.error_nt[worst].item(), tolerance_nt, edges[worst].tolist(), place)
         return bank
 
     def __len__(self) -> int:
@@ -197,17 +195,6 @@ class FieldBank(Float64Module):
             rows, self.coefficients.flatten(0, 1), per_sample_weights=polynomials.T, mode="sum"
         )
         return bags.T.contiguous().unflatten(0, (terms, 3))
-
-    def _check_error(self, planet_index: Tensor, edges: Tensor, tolerance_nt: float) -> None:
-        """Raise unless every error is within the tolerance; an error that is NaN is the worst."""
-        worst = int(self.error_nt.nan_to_num(torch.inf).argmax())
-        if not self.error_nt[worst] <= tolerance_nt:
-            latitude, longitude = map(tuple, edges[worst].tolist())
-            raise ValueError(
-                f"the expansion of degree {self.degree} misses the field by {self.error_nt[worst]:.3g} nT in box "
-                f"{worst}, of planet {planet_index[worst]}, latitudes {latitude}, longitudes {longitude}; the "
-                f"tolerance is {tolerance_nt:.3g} nT: raise the degree or shrink the boxes"
-            )
 
     def extra_repr(self) -> str:
         """Return the number of expansions, their degree and the largest error as text."""

@@ -159,7 +159,6 @@ class IGRF(SphericalHarmonicField):
             generation; or a list, an array or a pandas column of them.
         generation: 13 (to 2025) or 14 (to 2030). The paper's figures are those of 13 at 2022-01-01.
         altitude_km: default height above the ellipsoid [km], from -15 (15 km deep) to 1000.
-        chunk: points evaluated at a time.
 
     Raises:
         ValueError: for an unknown generation, a date outside the model, with the valid span, or an altitude beyond
@@ -180,12 +179,7 @@ class IGRF(SphericalHarmonicField):
     share: Tensor | None
 
     def __init__(
-        self,
-        date: Date | Sequence[Date] | NDArray[Any],
-        generation: int = 14,
-        *,
-        altitude_km: float = 0.0,
-        chunk: int = 16384,
+        self, date: Date | Sequence[Date] | NDArray[Any], generation: int = 14, *, altitude_km: float = 0.0
     ) -> None:
         self.date: datetime.datetime | NDArray[np.datetime64]
         if np.ndim(date):  # type: ignore[arg-type]
@@ -194,11 +188,10 @@ class IGRF(SphericalHarmonicField):
         else:
             self.date = parse_date(date)  # type: ignore[arg-type]
             gauss, share = igrf_coefficients(self.date, generation).unsqueeze(0), None
-        super().__init__(gauss[0], altitude_km=altitude_km, chunk=chunk)
+        super().__init__(gauss[0], altitude_km=altitude_km)
         self.generation = generation
         # Of many dates, this is the field of their first epoch; those of the others follow it.
-        others = (SphericalHarmonicField(table, altitude_km=altitude_km, chunk=chunk) for table in gauss[1:])
-        self.others = nn.ModuleList(others)
+        self.others = nn.ModuleList(SphericalHarmonicField(table, altitude_km=altitude_km) for table in gauss[1:])
         self.register_buffer("share", share, persistent=False)
 
     def _evaluate(

@@ -95,23 +95,11 @@ def random_planets(
     normal = torch.randn(count, degree + 1, degree + 1, 2, generator=generator, dtype=torch.float64)
     gauss = torch.view_as_complex(normal * torch.sqrt(variance.reshape(-1, 1, 1) * factor)).tril()
     gauss[..., 0] = gauss[..., 0].real.to(gauss.dtype)
-    gauss[:, 1, :2] = _dipoles(
-        _earth_dipole() * uniform(*strength, count),
-        torch.deg2rad(uniform(0.0, tilt_deg, count)),
-        uniform(0.0, 2 * math.pi, count),
-    )
+    dipole = math.sqrt(float(power_spectrum(_earth())[1]) / 2) * uniform(*strength, count)
+    tilt = torch.deg2rad(uniform(0.0, tilt_deg, count))  # from the south pole, to a side
+    gauss[:, 1, 0] = (-dipole * torch.cos(tilt)).to(gauss.dtype)
+    gauss[:, 1, 1] = torch.polar(dipole * torch.sin(tilt), uniform(0.0, 2 * math.pi, count))
     return gauss
-
-
-def _dipoles(strength: Tensor, tilt: Tensor, side: Tensor) -> Tensor:
-    """Return the coefficients of degree 1 of dipoles [nT] tilted from the south pole to a side [rad]: ``(P, 2)``."""
-    axial = -strength * torch.cos(tilt)
-    return torch.stack((axial.to(torch.complex128), torch.polar(strength * torch.sin(tilt), side)), -1)
-
-
-def _earth_dipole() -> float:
-    """Return the strength of the Earth's dipole [nT]."""
-    return math.sqrt(float(power_spectrum(_earth())[1]) / 2)
 
 
 def _earth_variance(degree: int) -> Tensor:

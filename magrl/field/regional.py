@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from magrl.checks import check_number, check_tensor
 from magrl.field.harmonics import chebyshev, chebyshev_nodes
@@ -40,8 +41,6 @@ class RegionalField(Float64Module):
 
     CHUNK = 10240
     """Points evaluated at a time; temporary memory is about 2 kB per point."""
-    coefficients: Tensor
-    scaling: Tensor
 
     def __init__(
         self,
@@ -61,18 +60,13 @@ class RegionalField(Float64Module):
         angles, from_nodes = chebyshev_nodes(degree + 1)
         samples = model(*torch.meshgrid(*inside_box(angles.cos(), edges), indexing="ij")).to("cpu", torch.float64)
         expansion = torch.einsum("ia,jb,abc->cij", from_nodes, from_nodes, samples)
-        scaling = box_scaling(edges)
-        self.register_buffer("coefficients", _with_derivatives(expansion, (edges[:, 1] - edges[:, 0]) / 2))
-        self.register_buffer("scaling", scaling.unsqueeze(-1), persistent=False)
+        self.coefficients = nn.Buffer(_with_derivatives(expansion, (edges[:, 1] - edges[:, 0]) / 2))
+        self.scaling = nn.Buffer(box_scaling(edges).unsqueeze(-1), persistent=False)
         check_points = torch.linspace(-1, 1, 4 * degree + 1, dtype=torch.float64)
         grid = torch.meshgrid(*inside_box(check_points, edges), indexing="ij")
         self.error_nt = float((self(*grid) - model(*grid).to("cpu", torch.float64)).abs().max())
         """Largest difference from the model on a grid four times as fine as the nodes, corners included [nT]."""
-        if not self.error_nt <= tolerance_nt:
-            raise ValueError(
-                f"the expansion of degree {degree} misses the model by {self.error_nt:.3g} nT on latitudes {latitude}, "
-                f"longitudes {longitude}; the tolerance is {tolerance_nt:.3g} nT: raise the degree or shrink the box"
-            )
+        check_expansion(degree, self.error_nt, tolerance_nt, (latitude, longitude))
 
     def forward(self, latitude: Tensor, longitude: Tensor) -> Tensor:
         """Return the field vector.
@@ -119,6 +113,18 @@ class RegionalField(Float64Module):
         """Return the box, the degree and the measured error as text."""
         return (
             f"latitude={self.latitude}, longitude={self.longitude}, degree={self.degree}, error_nt={self.error_nt:.1e}"
+        )
+
+
+def check_expansion(
+    degree: int, error_nt: float, tolerance_nt: float, edges: Sequence[Sequence[float]], place: str = "the box"
+) -> None:
+    """Raise unless an error is within the tolerance; NaN is not."""
+    if not error_nt <= tolerance_nt:
+        latitude, longitude = map(tuple, edges)
+        raise ValueError(
+            f"the expansion of degree {degree} misses the field by {error_nt:.3g} nT in {place}, latitudes {latitude}, "
+            f"longitudes {longitude}; the tolerance is {tolerance_nt:.3g} nT: raise the degree or shrink the box"
         )
 
 

@@ -21,11 +21,10 @@ class SphericalHarmonicField(Float64Module):
     Args:
         gauss: complex ``(N + 1, N + 1)`` table ``g - i h`` [nT].
         altitude_km: default height above the ellipsoid [km].
-        chunk: points evaluated at a time; temporary memory is about 1 kB per point on a CPU and 6 kB on an accelerator.
 
     Raises:
         TypeError: if ``gauss`` is not a complex tensor.
-        ValueError: for a table of another shape or with non-finite values, an altitude below -100 km, a chunk below 1.
+        ValueError: for a table of another shape or with non-finite values, an altitude below -100 km.
 
     Example:
         >>> dipole = torch.zeros(2, 2, dtype=torch.complex128)
@@ -38,18 +37,19 @@ class SphericalHarmonicField(Float64Module):
 
     altitude_range_km: ClassVar[tuple[float, float]] = (-100.0, math.inf)
     """Range of altitudes [km]: below it there are sources, and the expansion does not hold."""
+    CHUNK = 16384
+    """Points evaluated at a time; temporary memory is about 1 kB per point on a CPU and 6 kB on an accelerator."""
     value_weights: Tensor
     gradient_weights: Tensor
     level_value_weights: Tensor
     level_gradient_weights: Tensor
 
-    def __init__(self, gauss: Tensor, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
+    def __init__(self, gauss: Tensor, *, altitude_km: float = 0.0) -> None:
         super().__init__()
-        check_number(1, whole=True, chunk=chunk)
         check_number(altitude_km=altitude_km)
         gauss = harmonics.checked_gauss(gauss)
         self._check_altitude(torch.tensor(altitude_km, dtype=torch.float64))
-        self.degree, self.altitude_km, self.chunk = len(gauss) - 1, float(altitude_km), int(chunk)
+        self.degree, self.altitude_km = len(gauss) - 1, float(altitude_km)
         value, gradient = harmonics.field_table(gauss), harmonics.gradient_table(gauss)
         padding = (0, gradient.shape[1] - value.shape[1])
         both = torch.cat((nn.functional.pad(value, padding), gradient[list(_INDEPENDENT)]))
@@ -104,7 +104,7 @@ class SphericalHarmonicField(Float64Module):
         """Return the first 3 or all 9 rows of :meth:`_value_and_gradient`: ``(rows, ...)``."""
         points = self._points(latitude, longitude, altitude_km)
         function = partial(self._value if rows == 3 else self._value_and_gradient, altitude_km is None)
-        found = in_chunks(function, [x.reshape(-1) for x in points], rows, self.chunk)
+        found = in_chunks(function, [x.reshape(-1) for x in points], rows, self.CHUNK)
         return found.reshape(rows, *points[0].shape)
 
     def _points(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None) -> tuple[Tensor, ...]:

@@ -82,7 +82,6 @@ class WMMHR(SphericalHarmonicField):
         date: ``datetime``, ISO text or decimal year, from 2025.0 to 2030.0.
         altitude_km: height above the ellipsoid [km], from -1 to 600. Another altitude in a call takes about 15 times as
             long.
-        chunk: points evaluated at a time.
 
     Raises:
         ValueError: for a date outside the model, with the valid span, or an altitude below the model.
@@ -100,8 +99,8 @@ class WMMHR(SphericalHarmonicField):
     altitude_range_km: ClassVar[tuple[float, float]] = (-1.0, 600.0)
     """Range of altitudes [km]: the sources of the field of the crust are not far below."""
 
-    def __init__(self, date: Date, *, altitude_km: float = 0.0, chunk: int = 16384) -> None:
-        super().__init__(wmmhr_coefficients(date), altitude_km=altitude_km, chunk=chunk)
+    def __init__(self, date: Date, *, altitude_km: float = 0.0) -> None:
+        super().__init__(wmmhr_coefficients(date), altitude_km=altitude_km)
         self.date = parse_date(date)
 
     def extra_repr(self) -> str:

@@ -170,8 +170,13 @@ class Navigator(TensorDictModuleBase):
         Raises:
             ValueError: for an option out of its range, or an environment that the navigator cannot navigate in.
         """
-        del sensor_std, bias_std  # only a navigator that weighs its readings uses them
-        return cls(max_move_km=env.max_move_km, max_turn_rad=env.max_turn_rad, **options)
+        bounds = {"max_move_km": env.max_move_km, "max_turn_rad": env.max_turn_rad}
+        return cls(**bounds | cls.env_options(env, sensor_std, bias_std) | options)
+
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:  # noqa: ARG004
+        """Return the options of the constructor that follow from an environment and the data sheet, beside bounds."""
+        return {}
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:  # noqa: ARG002
         """Return the memory of vehicles at the start of an episode: tensors ``(N, ...)``; none by default."""

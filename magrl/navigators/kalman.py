@@ -10,12 +10,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from typing_extensions import Self
 
 from magrl import tracking
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators.base import PERFECT, Std
+from magrl.navigators.base import Std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.navigators.secant import sensor_length
 from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior, Way
@@ -72,8 +71,6 @@ class Kalman(QuasiNewton):
         True
     """
 
-    needs = "nothing"
-
     def __init__(
         self,
         max_move_km: float = 50.0,
@@ -89,8 +86,7 @@ class Kalman(QuasiNewton):
     ) -> None:
         super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std)
         check_number(1, whole=True, max_steps=max_steps)
-        check_numbers(3, bias_std=bias_std)
-        check_number(0, bias_std=min(bias_std))
+        check_numbers(3, 0, bias_std=bias_std)
         check_number(0, above=True, range_km=range_km, zeta=zeta)
         check_type(bool, search=search)
         self.max_steps, self.range_km, self.search = int(max_steps), float(range_km), search
@@ -176,13 +172,11 @@ class Kalman(QuasiNewton):
     name, label = "kalman", "Kalman"
     description = "Kalman (dual control)"
 
-    @classmethod
-    def for_env(
-        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
-    ) -> Self:
-        bounds = env.max_move_km, env.max_turn_rad, sensor_std, env.max_steps
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
         search = env.arrival.rule == "objective"  # else, an episode does not end where the objective is low
-        return cls(*bounds, bias_std=bias_std, zeta=env.zeta, search=search, **options)
+        errors = {"sensor_std": sensor_std, "bias_std": bias_std}
+        return errors | {"max_steps": env.max_steps, "zeta": env.zeta, "search": search}
 
 
 def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:

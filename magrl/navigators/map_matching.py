@@ -79,10 +79,6 @@ class MapMatching(Navigator):
     needs = "a map and the region"
     options = ("map_date",)
 
-    grid: Tensor
-    grid_elements: Tensor
-    box: Tensor
-
     def __init__(
         self,
         field: FieldModel | FieldBank,
@@ -97,8 +93,7 @@ class MapMatching(Navigator):
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_type((Region, Regions), region=region)
-        check_numbers(3, sensor_std=sensor_std, map_error=map_error)
-        check_number(0, sensor_std=min(sensor_std), map_error=min(map_error))
+        check_numbers(3, 0, sensor_std=sensor_std, map_error=map_error)
         check_number(1, GRID_POINTS**2, whole=True, hypotheses=hypotheses)
         self.hypotheses, bank = int(hypotheses), isinstance(field, FieldBank)
         self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if bank else [])]
@@ -106,28 +101,22 @@ class MapMatching(Navigator):
         self._place(copy.deepcopy(Regions.of(region)).to(_device(field)))
         squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, sensor_std))
         floor, error, sensors = (x.to(self.grid.device) for x in squares)
-        self.register_buffer("target_std", (floor + error).sqrt())
-        self.register_buffer("std", (floor + error + sensors).sqrt())
+        self.target_std = nn.Buffer((floor + error).sqrt())
+        self.std = nn.Buffer((floor + error + sensors).sqrt())
         # Two elements give a position, so that the second smallest of the three counts.
         self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
 
     @classmethod
-    def for_env(
-        cls,
-        env: GeomagneticNavEnv,
-        *,
-        sensor_std: Std = PERFECT,
-        bias_std: Std = PERFECT,
-        map_date: Date | None = None,
-        **options: Any,
-    ) -> Self:
+    def for_env(cls, env: GeomagneticNavEnv, *, map_date: Date | None = None, **options: Any) -> Self:
         """Return the navigator of an environment, with its field as the map, or IGRF at ``map_date``."""
-        field = env.field
         if map_date is not None:
             field = dated_map(env.scenario, map_date, env.max_move_km).to(env.device)
-            options = {"map_error": aged_error(env.scenario, map_date)} | options
-        std = total_std(sensor_std, bias_std)
-        return cls(field, env.edge, env.max_move_km, env.max_turn_rad, std, **options)
+            options = {"field": field, "map_error": aged_error(env.scenario, map_date)} | options
+        return super().for_env(env, **options)
+
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
+        return {"field": env.field, "region": env.edge, "sensor_std": total_std(sensor_std, bias_std)}
 
     def _place(self, region: Regions) -> None:
         """Keep the region, and the elements on a grid of it."""
@@ -144,9 +133,9 @@ class MapMatching(Navigator):
         if missing.any():
             box = region[int(missing.nonzero()[0])]
             raise ValueError(f"the map is not defined on all of {box}: take a map of a larger box, or a smaller region")
-        self.register_buffer("grid", grid.flatten(1, 2))
-        self.register_buffer("grid_elements", elements)
-        self.register_buffer("box", torch.stack((region.latitude, region.longitude), -1))
+        self.grid = nn.Buffer(grid.flatten(1, 2))
+        self.grid_elements = nn.Buffer(elements)
+        self.box = nn.Buffer(torch.stack((region.latitude, region.longitude), -1))
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         position = self.grid.new_zeros(len(seen["heading"]), self.hypotheses, 2)
@@ -232,9 +221,7 @@ class MapMatching(Navigator):
 
     def _region(self, seen: TensorDictBase) -> Tensor:
         """Return the number of the region of each vehicle ``(P,)``."""
-        return (
-            seen["region"].squeeze(-1) if "region" in self.in_keys else torch.zeros_like(seen["step_count"].squeeze(-1))
-        )
+        return seen.get("region", torch.zeros_like(seen["step_count"])).squeeze(-1)
 
 
 def _device(field: FieldModel | FieldBank) -> torch.device:

@@ -8,13 +8,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from magrl.checks import check_tensor
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
 from magrl.field.model import FieldModel, elements_gradient_at
-from magrl.navigators.base import PERFECT, Std, total_std
+from magrl.navigators.base import Std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.tracking import GradientPrior
 
@@ -70,11 +69,9 @@ class MeanJacobian(QuasiNewton):
     name, label = "mean_jacobian", "mean Jacobian"
     description = "mean Jacobian (quasi-Newton)"
 
-    @classmethod
-    def for_env(
-        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
-    ) -> Self:
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
         if len(env.region) > 1:
             raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
-        places, std = env.region.grid(21).to(env.device), total_std(sensor_std, bias_std)
-        return cls(env.field, places, env.max_move_km, env.max_turn_rad, sensor_std=std, **options)
+        own = {"field": env.field, "position": env.region.grid(21).to(env.device)}
+        return own | QuasiNewton.env_options(env, sensor_std, bias_std)

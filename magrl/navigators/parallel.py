@@ -9,14 +9,13 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from typing_extensions import Self
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.bank import FieldBank
 from magrl.field.elements import NAMES, element_difference
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.guidance import parallel_approach
-from magrl.navigators.base import Navigator, displacement_to, element_indices, steer
+from magrl.navigators.base import Navigator, Std, displacement_to, element_indices, steer
 from magrl.tracking import CURVATURE
 
 
@@ -62,9 +61,9 @@ class ParallelApproach(Navigator):
         if pair is not None and len(pair) != 2:
             raise ValueError(f"pair must be two of D, I, B_H, got {tuple(pair)}")
 
-    @classmethod
-    def for_env(cls, env: GeomagneticNavEnv, **options: Any) -> Self:
-        return super().for_env(env, field=env.field, **options)
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:  # noqa: ARG004
+        return {"field": env.field}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         here, there = (seen[key].double() for key in ("field", "target_field"))

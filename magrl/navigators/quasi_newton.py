@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl import tracking
-from magrl.checks import check_number, check_numbers
+from magrl.checks import check_numbers
+from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
-from magrl.navigators.base import Navigator, element_indices, steer
+from magrl.navigators.base import Navigator, Std, element_indices, steer, total_std
 from magrl.tracking import FieldTrack, GradientPrior
 
 RANGE_KM = 1000.0
@@ -57,14 +59,17 @@ class QuasiNewton(Navigator):
         sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
-        check_numbers(3, sensor_std=sensor_std)
-        check_number(0, sensor_std=min(sensor_std))
+        check_numbers(3, 0, sensor_std=sensor_std)
         self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
         self.elements = element_indices(elements, 2)
         self._register("sensor_std", sensor_std)
         self._register("scales", [tracking.ELEMENT_SCALES[i] * _FINE for i in self.elements])
         self._register("periods", [tracking.ELEMENT_PERIODS[i] for i in self.elements])
         self._register("curvature", [tracking.CURVATURE[i] for i in self.elements])
+
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:  # noqa: ARG004
+        return {"sensor_std": total_std(sensor_std, bias_std)}
 
     def _register(self, name: str, values: Sequence[float]) -> None:
         self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)

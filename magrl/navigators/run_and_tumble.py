@@ -9,12 +9,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from typing_extensions import Self
 
 from magrl import guidance
 from magrl.checks import check_number, check_numbers
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators.base import Navigator
+from magrl.navigators.base import Navigator, Std
 
 
 class RunAndTumble(Navigator):
@@ -56,9 +55,9 @@ class RunAndTumble(Navigator):
         self.in_keys = ["field", "target_field", "heading", "step_count"]
         self.turn, self.objective_floors = min(math.pi / 2, self.max_turn_rad), tuple(objective_floors)
 
-    @classmethod
-    def for_env(cls, env: GeomagneticNavEnv, **options: Any) -> Self:
-        return super().for_env(env, objective_floors=tuple(env.objective_floors.mean(0).tolist()), **options)
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:  # noqa: ARG004
+        return {"objective_floors": tuple(env.objective_floors.mean(0).tolist())}
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         here, there = seen["field"].double(), seen["target_field"].double()

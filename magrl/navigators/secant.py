@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from typing_extensions import Self
 
 from magrl.checks import check_number, check_numbers
-from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
-from magrl.navigators.base import PERFECT, Std, total_std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.tracking import FieldTrack, GradientPrior
 
@@ -39,8 +35,7 @@ def sensor_length(sensor_std: Sequence[float]) -> float:
         >>> sensor_length((0.04, 0.03, 0.4))
         2.0
     """
-    check_numbers(3, sensor_std=sensor_std)
-    check_number(0, sensor_std=min(sensor_std))
+    check_numbers(3, 0, sensor_std=sensor_std)
     return sorted(std / slope for std, slope in zip(sensor_std, SLOPES, strict=True))[1]
 
 
@@ -109,9 +104,3 @@ class Secant(QuasiNewton):
 
     name = label = "secant"
     description = "secant (quasi-Newton)"
-
-    @classmethod
-    def for_env(
-        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
-    ) -> Self:
-        return cls(env.max_move_km, env.max_turn_rad, sensor_std=total_std(sensor_std, bias_std), **options)

@@ -6,20 +6,17 @@ It holds tensors, numbers and text only.
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from filelock import FileLock, Timeout
+from filelock import AcquireReturnProxy, FileLock, Timeout
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors import Collector
 
-from magrl.checks import check_number
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.files import DamagedFileError, load_tensors, save_tensors
 from magrl.training.config import UsageError
@@ -58,9 +55,8 @@ def create_run_folder(path: Path | str) -> Path:
     return path
 
 
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Claim a run folder for this process while the block runs; a kill releases it too.
+def locked(folder: Path) -> AcquireReturnProxy:
+    """Claim a run folder for this process until the end of the block of ``with``; a kill releases it too.
 
     Raises:
         UsageError: if another process writes it.
@@ -73,15 +69,10 @@ def locked(folder: Path) -> Iterator[None]:
         Traceback (most recent call last):
         magrl.training.config.UsageError: another process is writing the run folder ...
     """
-    lock = FileLock(folder / ".lock")
     try:
-        lock.acquire(timeout=0)
+        return FileLock(folder / ".lock").acquire(timeout=0)
     except Timeout as error:
         raise UsageError(f"another process is writing the run folder {folder}") from error
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 class Stateful(Protocol):
@@ -107,10 +98,6 @@ class Checkpoints:
     Args:
         folder: folder of the files, created by the first :meth:`save`.
         parts: objects with ``state_dict`` and ``load_state_dict``, by name.
-        keep: number of files to keep; with two, one damaged file does not lose the training.
-
-    Raises:
-        ValueError: for a number of files below 1.
 
     Example:
         >>> import tempfile
@@ -125,16 +112,15 @@ class Checkpoints:
         True
     """
 
-    def __init__(self, folder: Path | str, parts: dict[str, Stateful], keep: int = 2) -> None:
-        check_number(1, whole=True, keep=keep)
-        self.folder, self.parts, self.keep = Path(folder), dict(parts), keep
+    def __init__(self, folder: Path | str, parts: dict[str, Stateful]) -> None:
+        self.folder, self.parts = Path(folder), dict(parts)
 
     def files(self) -> list[Path]:
         """Return the files of the checkpoints, oldest first."""
         return sorted(self.folder.glob(_PATTERN))
 
     def save(self, frames: int) -> Path:
-        """Write a checkpoint and remove the oldest beyond :attr:`keep`.
+        """Write a checkpoint and remove those before the last two.
 
         Args:
             frames: frames collected so far; part of the file name.
@@ -143,10 +129,8 @@ class Checkpoints:
             The path of the file.
 
         Raises:
-            ValueError: for a negative or fractional number of frames.
             OSError: if it cannot be written; existing checkpoints stay unchanged.
         """
-        check_number(0, whole=True, frames=frames)
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"checkpoint-{frames:012d}.pt"
         parts = {name: part.state_dict() for name, part in self.parts.items()}
@@ -155,7 +139,7 @@ class Checkpoints:
         except Exception as error:
             kept = f"the newest checkpoint is {self.files()[-1]}" if self.files() else "there is no older checkpoint"
             raise OSError(f"the checkpoint {path} could not be written ({error}); {kept}") from error
-        for old in self.files()[: -self.keep]:
+        for old in self.files()[:-2]:  # with two, one damaged file does not lose the training
             old.unlink()
         return path
 
@@ -180,16 +164,13 @@ class Checkpoints:
                 continue
             if set(content["parts"]) != set(self.parts):
                 raise ValueError(f"{path} holds {sorted(content['parts'])}, not {sorted(self.parts)}")
-            for name in self.parts:
-                self._restore(name, content["parts"][name], path)
+            try:
+                for name, part in self.parts.items():
+                    part.load_state_dict(content["parts"][name])
+            except Exception as error:  # whatever a part raises for the state of another
+                raise ValueError(f"{path}: {name} does not fit this training: {error}") from error
             return int(content["frames"])
         raise FileNotFoundError(f"there is no valid checkpoint in {self.folder}")
-
-    def _restore(self, name: str, state: Any, path: Path) -> None:
-        try:
-            self.parts[name].load_state_dict(state)
-        except Exception as error:  # whatever a part raises for the state of another
-            raise ValueError(f"{path}: {name} does not fit this training: {error}") from error
 
     def clear(self) -> None:
         """Remove all checkpoints, once a training is complete."""

@@ -54,14 +54,10 @@ def make_collector(
 def _ray_options(env: EnvBase, workers: int) -> dict[str, Any]:
     """Return options for one CPU and a share of the GPUs per worker, and the path on which workers find the recipe."""
     path = os.pathsep.join(filter(None, (*sys.path[:1], os.environ.get("PYTHONPATH"))))
-    cluster: dict[str, Any] = {"log_to_driver": False, "include_dashboard": False}
-    cluster["runtime_env"] = {"env_vars": {"PYTHONPATH": path}}
+    cluster = {"log_to_driver": False, "include_dashboard": False, "runtime_env": {"env_vars": {"PYTHONPATH": path}}}
     on_gpu = env.device is not None and env.device.type == "cuda"
     gpus = min(1.0, torch.cuda.device_count() / workers) if on_gpu else 0
-    return {
-        "remote_configs": {"num_cpus": 1, "num_gpus": gpus},
-        "ray_init_config": cluster,
-    }
+    return {"remote_configs": {"num_cpus": 1, "num_gpus": gpus}, "ray_init_config": cluster}
 
 
 def worker_seed(seed: int, index: int) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import time
-import uuid
 from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 
 from magrl.checks import check_number
 from magrl.files import write_json
-from magrl.training.loggers import check_logger, open_log
+from magrl.training.loggers import open_log
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,7 +48,6 @@ class TrainingStatistics:
     """
 
     def __init__(self, window: int = 200) -> None:
-        check_number(1, whole=True, window=window)
         self.frames = self.episodes = self.iterations = self.updates = 0
         self.losses: dict[str, Tensor] = {}
         keys = ("success_rate", "return", *(f"return_{term}" for term in RETURN_TERMS))
@@ -146,8 +144,6 @@ def selection_score(spl: float, success: Tensor, steps: Tensor, max_steps: int) 
         >>> selection_score(50.0, torch.tensor([True, False]), torch.tensor([10, 3]), max_steps=50)
         20.0
     """
-    check_number(spl=spl)
-    check_number(1, whole=True, max_steps=max_steps)
     return spl - torch.where(success, steps, max_steps).double().mean().item()
 
 
@@ -187,32 +183,24 @@ class RunLog:
         label: str = "",
         resumed: bool = False,
     ) -> None:
-        check_logger(logger, wandb_mode)
         self.folder, self.columns, self.rows = folder, tuple(columns), list[dict[str, float]]()
         self._open_log = partial(
             open_log, logger, folder, config, wandb_mode, group=label, tags=(label,) if label else ()
         )
         self._began = time.perf_counter()
         if not resumed:
-            self._open([], uuid.uuid4().hex[:8])
+            self._open([])
 
-    def _open(self, rows: Sequence[Mapping[str, float]], wandb_id: str) -> None:
+    def _open(self, rows: Sequence[Mapping[str, float]], wandb_id: str = "") -> None:
         """Open ``train.csv`` and the logger, and write some rows to both."""
+        self._log = self._open_log(run_id=wandb_id)
         aside = self.folder / "train.csv.aside"
         self._file = aside.open("w", newline="")
         self._writer = csv.DictWriter(self._file, self.columns, restval="", extrasaction="raise")
         self._writer.writeheader()
         for row in rows:
-            self._write(row)
+            self.row(row)
         aside.replace(self.folder / "train.csv")
-        self._log = self._open_log(run_id=wandb_id)
-        for row in rows:
-            self._log.row(row)
-
-    def _write(self, row: Mapping[str, float]) -> None:
-        self.rows.append(dict(row))
-        self._writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-        self._file.flush()
 
     @property
     def seconds(self) -> float:
@@ -221,7 +209,9 @@ class RunLog:
 
     def row(self, row: Mapping[str, float]) -> None:
         """Add a row of curves and flush the file. ``frames`` is the step of the logger."""
-        self._write(row)
+        self.rows.append(dict(row))
+        self._writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+        self._file.flush()
         self._log.row(row)
 
     def figure(self, name: str, figure: Figure) -> None:

@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from magrl.files import json_ready
+
 WANDB_PROJECT = "magrl"
 """Project of the runs, unless the environment variable WANDB_PROJECT is set."""
 
@@ -94,9 +96,7 @@ class CurveLog:
 
     def __init__(self, name: str, make: Callable[[], Any] | None) -> None:
         self.name, self._before = name, dict[str, float]()
-        self._logger: Any = None
-        if make is not None:
-            self._logger = self._try(make)
+        self._logger: Any = make and self._try(make)
 
     def _try(self, action: Callable[[], Any]) -> Any:
         """Return the result of an action; report an error and disable the logger."""
@@ -153,9 +153,6 @@ class WandbRun(CurveLog):
         tags: labels to filter runs by.
         run_id: id of the run; an existing run is resumed.
 
-    Raises:
-        ValueError: for an unknown mode.
-
     Example:
         >>> run = WandbRun(Path("runs/A"), "disabled", {"seed": 0})
         >>> run.row({"frames": 512, "return": -3.5})
@@ -174,7 +171,6 @@ class WandbRun(CurveLog):
         *,
         run_id: str = "",
     ) -> None:
-        check_logger("wandb", mode)
         self.folder, self.run_id = folder, run_id or uuid.uuid4().hex[:8]
         options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags)}
         super().__init__("wandb", None if mode == "disabled" else lambda: _wandb_logger(folder, mode, config, options))
@@ -193,33 +189,19 @@ class WandbRun(CurveLog):
 
     def picture(self, name: str, path: Path) -> None:
         """Log an image file."""
-
-        def log(logger: Any) -> None:
-            import wandb
-
-            logger.experiment.log({f"figures/{name}": wandb.Image(str(path))})
-
-        self._log(log)
+        self._log(lambda logger: logger.experiment.log({f"figures/{name}": _wandb().Image(str(path))}))
 
     def table(self, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Log a table with the columns of its first row; NaN is an empty cell."""
-
-        def log(logger: Any) -> None:
-            import wandb
-
-            cells = [[_plain(row[column]) for column in rows[0]] for row in rows]
-            logger.experiment.log({name: wandb.Table(columns=list(rows[0]), data=cells, allow_mixed_types=True)})
-
-        self._log(log)
+        cells = {"columns": list(rows[0]), "data": json_ready([list(row.values()) for row in rows])}
+        self._log(lambda logger: logger.experiment.log({name: _wandb().Table(**cells, allow_mixed_types=True)}))
 
     def artifact(self, path: Path, metadata: Mapping[str, Any]) -> None:
         """Log a model, named after its file and the run folder; wandb refers to the file and keeps no copy."""
 
         def log(logger: Any) -> None:
-            import wandb
-
             name = re.sub(r"[^\w.-]", "-", f"{path.stem}-{self.folder.name}", flags=re.ASCII)[:128]
-            model = wandb.Artifact(name, "model", metadata={key: _plain(x) for key, x in metadata.items()})
+            model = _wandb().Artifact(name, "model", metadata=json_ready(metadata))
             model.add_file(str(path.absolute()), policy="immutable", skip_cache=True)
             logger.experiment.log_artifact(model)
 
@@ -272,8 +254,11 @@ def _scalar_logger(folder: Path, logger: str) -> Any:
     return get_logger(logger, logger_name=str(folder), experiment_name=logger)
 
 
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _wandb() -> Any:
+    """Return the module wandb, which reads its settings when it is imported."""
+    import wandb
+
+    return wandb
 
 
 @contextlib.contextmanager
@@ -293,14 +278,13 @@ def _wandb_in(folder: Path) -> Iterator[None]:
 
 def _wandb_logger(folder: Path, mode: str, config: Mapping[str, Any], options: Mapping[str, Any]) -> Any:
     """Return TorchRL's wandb logger, which writes to the run folder and records nothing about the machine."""
-    import wandb
     from torchrl.record.loggers import get_logger
 
     disabled = ["disable_git", "disable_code", "disable_job_creation"]
     disabled += ["x_disable_meta", "x_disable_stats", "x_disable_machine_info"]
     settings: dict[str, Any] = {"silent": True, "console": "off", "host": "private", **dict.fromkeys(disabled, True)}
     project = os.environ.get("WANDB_PROJECT", WANDB_PROJECT)
-    wandb_kwargs = {"project": project, "mode": mode, "config": dict(config), "settings": wandb.Settings(**settings)}
+    wandb_kwargs = {"project": project, "mode": mode, "config": dict(config), "settings": _wandb().Settings(**settings)}
     wandb_kwargs |= {"log_env_packages": False, **options}
     logger = get_logger("wandb", logger_name=str(folder), experiment_name=folder.name, wandb_kwargs=wandb_kwargs)
     logger.experiment.define_metric("frames")

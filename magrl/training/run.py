@@ -114,7 +114,9 @@ class Run:
             exits.enter_context(locked(self.folder))
             if self.config.resume is None:
                 exits.push(self._discard)
-                self._write_config()
+                if self.config.scenario:
+                    shutil.copyfile(self.config.scenario, self.folder / self.settings["scenario"])
+                write_json(self.folder / "config.json", self.settings)
             exits.enter_context(self.stop)
             self._exits = exits.pop_all()
         return self
@@ -126,12 +128,6 @@ class Run:
         """Remove the folder after an error before the first batch, so that the same command can be given again."""
         if kind is not None and not self.statistics.frames:
             shutil.rmtree(self.folder, ignore_errors=True)
-
-    def _write_config(self) -> None:
-        settings = self.settings
-        if self.config.scenario:
-            shutil.copyfile(self.config.scenario, self.folder / settings["scenario"])
-        write_json(self.folder / "config.json", settings)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -148,12 +144,11 @@ class Run:
         """
         if self.scenario.tasks is not None:
             self._own = self._evaluation_env(self.scenario, paper.TEST_SEED, options)
-        sets = ((self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED))
-        validation, test = (
-            self._evaluation_env(self.scenario.with_tasks(self.scenario.random_tasks(*each)), each[1], options)
-            for each in sets
-        )
-        return validation, test
+        validation = self._random_tasks_env(self.config.eval_tasks_small, paper.VALIDATION_SEED, options)
+        return validation, self._random_tasks_env(self.config.eval_tasks, paper.TEST_SEED, options)
+
+    def _random_tasks_env(self, count: int, seed: int, options: dict[str, Any]) -> EnvBase:
+        return self._evaluation_env(self.scenario.with_tasks(self.scenario.random_tasks(count, seed)), seed, options)
 
     def _evaluation_env(self, scenario: Scenario, seed: int, options: dict[str, Any]) -> EnvBase:
         base = GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), seed=seed, **options)

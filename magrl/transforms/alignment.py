@@ -18,7 +18,7 @@ from magrl.checks import check_number, check_tensor
 from magrl.field.elements import element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import wrap_angle
-from magrl.transforms.base import Keys, ObservationTransform, StepReward, expect_keys, key_list, several_keys
+from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward
 
 
 class FieldGradient(ObservationTransform):
@@ -46,14 +46,14 @@ class FieldGradient(ObservationTransform):
                 [0., 6.]])
     """
 
+    default_in_keys = ("position",)
+    default_out_keys = ("field_gradient",)
+    in_sizes = (2,)
+
     def __init__(
-        self,
-        field: FieldModel | Callable[[Tensor], Tensor],
-        in_keys: NestedKey | Keys = ("position",),
-        out_keys: NestedKey | Keys = ("field_gradient",),
+        self, field: FieldModel | Callable[[Tensor], Tensor], in_keys: GivenKeys = None, out_keys: GivenKeys = None
     ) -> None:
-        super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
-        expect_keys(self, 1, 1)
+        super().__init__(in_keys, out_keys)
         self.elements = hasattr(field, "value_and_gradient")
         if not self.elements and not callable(field):
             raise ValueError(
@@ -74,14 +74,12 @@ class FieldGradient(ObservationTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the gradient, unbounded."""
-        leaf = self._leaf(observation_spec, self.in_keys[0])
-        if leaf.shape[-1:] != (2,):
-            raise ValueError(f"FieldGradient reads positions of shape (..., 2), got {tuple(leaf.shape)}")
+        leaf = super().transform_observation_spec(observation_spec)[self.in_keys[0]]
         count, dtype = 3, torch.get_default_dtype()
         if not self.elements:
             (like,) = self._compute([leaf.zero()])
             count, dtype = like.shape[-2], like.dtype
-        self._add(observation_spec, leaf, {self.out_keys[0]: (count, 2)}, dtype)
+        self._add(observation_spec, leaf, self.out_keys[0], count, 2, dtype=dtype)
         return observation_spec
 
 
@@ -91,12 +89,10 @@ def _pair_indices(pair: object) -> list[int]:
     Raises:
         ValueError: for anything else than two different elements, by name or by index.
     """
-    message = f"pair must be 'auto' or two different elements, by name or by index from 0, got {pair!r}"
-    if not isinstance(pair, (tuple, list)):
-        raise ValueError(message)
-    indices = [element_index(name) if isinstance(name, str) else name for name in pair]
+    given = pair if isinstance(pair, (tuple, list)) else ()
+    indices = [element_index(name) if isinstance(name, str) else name for name in given]
     if len(set(indices)) != 2 or not all(isinstance(i, int) and i >= 0 for i in indices):
-        raise ValueError(message)
+        raise ValueError(f"pair must be 'auto' or two different elements, by name or by index from 0, got {pair!r}")
     return indices
 
 
@@ -130,17 +126,18 @@ class GradientHeading(ObservationTransform):
         tensor([3.1416])
     """
 
+    default_in_keys = ("field", "target_field", "field_gradient")
+    default_out_keys = ("gradient_heading", "gradient_heading_valid")
+
     def __init__(
         self,
-        in_keys: Keys = ("field", "target_field", "field_gradient"),
-        out_keys: Keys = ("gradient_heading", "gradient_heading_valid"),
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
         *,
         pair: tuple[str | int, str | int] | str = ("D", "I"),
         min_crossing_deg: float = 2.0,
     ) -> None:
-        # A sequence of strings is several keys here, never one nested key.
-        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        expect_keys(self, 3, 2)
+        super().__init__(in_keys, out_keys)
         check_number(0, 90, min_crossing_deg=min_crossing_deg)
         if min_crossing_deg == 90:
             raise ValueError(f"min_crossing_deg must be in [0, 90), got {min_crossing_deg}")
@@ -200,16 +197,13 @@ class AlignmentReward(StepReward):
         tensor([2.])
     """
 
+    default_in_keys = ("heading", "gradient_heading", "gradient_heading_valid")
+    in_counts, out_counts = (2, 3), (1, 2)
+
     def __init__(
-        self,
-        in_keys: Keys = ("heading", "gradient_heading", "gradient_heading_valid"),
-        out_keys: NestedKey | Keys = ("reward",),
-        *,
-        weight: float = 3.0,
-        offset: float = math.pi / 4,
+        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, weight: float = 3.0, offset: float = math.pi / 4
     ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
-        expect_keys(self, (2, 3), (1, 2))
+        super().__init__(in_keys, out_keys)
         check_number(weight=weight, offset=offset)
         self.weight, self.offset = float(weight), float(offset)
 

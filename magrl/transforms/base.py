@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, TypeAlias, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -11,15 +12,24 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from magrl.checks import check_type
-
 Keys = Sequence[NestedKey]
+GivenKeys: TypeAlias = NestedKey | Keys | None
+"""Keys as a user gives them; None for the default ones."""
 
 
 class ObservationTransform(Transform):
     """Base class of transforms that write observations: they also run at reset, and on plain TensorDicts.
 
-    A subclass computes the values at ``out_keys`` from those at ``in_keys`` in :meth:`_compute`.
+    A subclass computes the values at ``out_keys`` from those at ``in_keys`` in :meth:`_compute`, and names its default
+    keys in class attributes.
+
+    Args:
+        in_keys: keys that are read; :attr:`default_in_keys` by default.
+        out_keys: keys that are written; :attr:`default_out_keys` by default.
+        **inverse: ``in_keys_inv`` and ``out_keys_inv`` of an invertible transform.
+
+    Raises:
+        ValueError: for another number of keys than a class with default keys takes.
 
     Example:
         >>> import torch
@@ -31,6 +41,23 @@ class ObservationTransform(Transform):
         >>> Kilometers(in_keys=["depth_m"], out_keys=["depth_km"])(depth)["depth_km"]
         tensor([0.5000])
     """
+
+    default_in_keys: ClassVar[Keys] = ()
+    default_out_keys: ClassVar[Keys] = ()
+    in_counts: ClassVar[Sequence[int]] = ()
+    """Numbers of ``in_keys`` that are allowed; by default that of :attr:`default_in_keys`."""
+    out_counts: ClassVar[Sequence[int]] = ()
+    """Numbers of ``out_keys`` that are allowed; by default that of :attr:`default_out_keys`."""
+    in_sizes: Sequence[int | None] = ()
+    """Last dimensions of the values at ``in_keys``; None for any."""
+    out_sizes: Sequence[tuple[int, ...]] = ()
+    """Last dimensions of the values at ``out_keys``, unbounded ones."""
+
+    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, **inverse: Keys) -> None:
+        ins, outs = self.default_in_keys, self.default_out_keys
+        super().__init__(in_keys=_chosen(in_keys, ins), out_keys=_chosen(out_keys, outs), **inverse)
+        if ins:
+            expect_keys(self, self.in_counts or len(ins), self.out_counts or len(outs))
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
         """Return the values at ``out_keys``, given those at ``in_keys``."""
@@ -84,22 +111,39 @@ class ObservationTransform(Transform):
                 )
         return input_spec
 
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Check the shapes that are read, and add what is written.
+
+        Raises:
+            KeyError: for a key that is missing.
+            ValueError: for a value of another shape.
+        """
+        for key, size in zip(self.in_keys, self.in_sizes, strict=False):
+            shape = self._leaf(observation_spec, key).shape
+            if size is not None and shape[-1:] != (size,):
+                raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(shape)}")
+        if self.out_sizes:
+            like = self._leaf(observation_spec, self.in_keys[0])
+            for key, last in zip(self.out_keys, self.out_sizes, strict=True):
+                self._add(observation_spec, like, key, *last)
+        return observation_spec
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
+        """Load buffers that are not set yet, too."""
+        for name, buffer in self._buffers.items():
+            if buffer is None and prefix + name in state_dict:
+                self._buffers[name] = torch.empty_like(state_dict[prefix + name])
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
     def _leaf(self, spec: Composite, key: NestedKey) -> TensorSpec:
         if key not in spec.keys(True, True):
             raise KeyError(f"{type(self).__name__} reads {key!r}, which is not among {sorted_keys(spec)}")
         return spec[key]
 
     @staticmethod
-    def _add(
-        spec: Composite,
-        like: TensorSpec,
-        sizes: Mapping[NestedKey, tuple[int, ...]],
-        dtype: torch.dtype | None = None,
-    ) -> None:
-        """Add unbounded keys to a spec: their last dimensions follow the batch of another leaf."""
-        for key, size in sizes.items():
-            shape = (*like.shape[:-1], *size)
-            spec[key] = Unbounded(shape, device=like.device, dtype=dtype or like.dtype)
+    def _add(spec: Composite, like: TensorSpec, key: NestedKey, *size: int, dtype: torch.dtype | None = None) -> None:
+        """Add an unbounded key to a spec: its last dimensions follow the batch of another leaf."""
+        spec[key] = Unbounded((*like.shape[:-1], *size), device=like.device, dtype=dtype or like.dtype)
 
 
 class StatefulTransform(ObservationTransform):
@@ -107,8 +151,7 @@ class StatefulTransform(ObservationTransform):
 
     The state is in the TensorDict: it is reset by row, stored with the data, and resumed with them. A reset begins it,
     and each step reads it from the TensorDict before the step. A subclass names its keys in :attr:`state_keys`, writes
-    it with everything else in :meth:`_begin` and :meth:`_advance`, and adds its specs in
-    ``transform_observation_spec``.
+    it with everything else in :meth:`_begin` and :meth:`_advance`, and adds its specs, as in :attr:`out_sizes`.
 
     Example:
         >>> import torch
@@ -125,9 +168,9 @@ class StatefulTransform(ObservationTransform):
     """
 
     @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it."""
-        raise NotImplementedError
+    def state_keys(self) -> Keys:
+        """Keys that a step reads from the TensorDict before it: ``out_keys`` but the first, unless there are others."""
+        return self.out_keys[1:]
 
     @property
     def step_keys(self) -> Keys:
@@ -192,6 +235,8 @@ class StepReward(StatefulTransform):
         tensor([2.])
     """
 
+    default_out_keys = ("reward",)
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
         return tensordict_reset
 
@@ -206,7 +251,7 @@ class StepReward(StatefulTransform):
         like = self._leaf(observed_spec(self), self.in_keys[0])
         for key in self.out_keys:
             known = key in reward_spec.keys(True, True)
-            self._add(reward_spec, reward_spec[key] if known else like, {key: (1,)})
+            self._add(reward_spec, reward_spec[key] if known else like, key, 1)
         return reward_spec
 
 
@@ -248,7 +293,6 @@ def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
         >>> sorted_keys(TensorDict(move=torch.zeros(2), next=TensorDict(heading=torch.zeros(1))))
         ["('next', 'heading')", 'move']
     """
-    check_type((TensorDictBase, Composite), container=container)
     return sorted(str(key) for key in container.keys(True, True))
 
 
@@ -282,6 +326,13 @@ def several_keys(keys: Keys) -> list[NestedKey]:
     return [unravel_key(key) for key in keys]
 
 
+def _chosen(keys: GivenKeys, default: Keys) -> list[NestedKey]:
+    """Return the keys that a user gives, or the default ones; a tuple is one nested key where one key is usual."""
+    if keys is None:
+        return list(default)
+    return several_keys(cast(Keys, keys)) if len(default) > 1 else key_list(keys)
+
+
 def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int | Sequence[int]) -> None:
     """Raise unless a transform has the given numbers of keys.
 
@@ -297,7 +348,6 @@ def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int 
             ...
         ValueError: CatTensors takes 3 in_keys and 1 out_keys, got ['field', 'move'] and ['observation']
     """
-    check_type(Transform, transform=transform)
     counts = [(count,) if isinstance(count, int) else count for count in (num_in, num_out)]
     if len(transform.in_keys) not in counts[0] or len(transform.out_keys) not in counts[1]:
         ins, outs = (" or ".join(map(str, count)) for count in counts)

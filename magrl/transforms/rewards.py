@@ -12,7 +12,7 @@ from torchrl.data import Composite
 
 from magrl.checks import check_number, check_tensor
 from magrl.geodesy import geodesic
-from magrl.transforms.base import Keys, ObservationTransform, StepReward, expect_keys, key_list, several_keys
+from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward
 
 
 class TrueWay(ObservationTransform):
@@ -34,13 +34,8 @@ class TrueWay(ObservationTransform):
         tensor([[  0, 111]], dtype=torch.int32)
     """
 
-    def __init__(
-        self,
-        in_keys: Keys = ("position", "target_position", "heading"),
-        out_keys: NestedKey | Keys = ("true_way",),
-    ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
-        expect_keys(self, 3, 1)
+    default_in_keys = ("position", "target_position", "heading")
+    default_out_keys = ("true_way",)
 
     def _compute(self, values: list[Tensor]) -> list[Tensor]:
         position, target, heading = values
@@ -51,7 +46,7 @@ class TrueWay(ObservationTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the way, unbounded."""
-        self._add(observation_spec, self._leaf(observation_spec, self.in_keys[2]), {self.out_keys[0]: (2,)})
+        self._add(observation_spec, self._leaf(observation_spec, self.in_keys[2]), self.out_keys[0], 2)
         return observation_spec
 
 
@@ -119,14 +114,10 @@ class DetourReward(StepReward):
         torch.Size([2, 3, 1])
     """
 
-    def __init__(
-        self,
-        in_keys: Keys = ("true_way", "move", "start_position", "target_position", "success", "terminated"),
-        out_keys: NestedKey | Keys = ("reward",),
-        **weights: float,
-    ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
-        expect_keys(self, 6, 1)
+    default_in_keys = ("true_way", "move", "start_position", "target_position", "success", "terminated")
+
+    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, **weights: float) -> None:
+        super().__init__(in_keys, out_keys)
         signature(detour_reward).bind_partial(**weights)  # an unknown weight is an error before the first step
         check_number(0, **weights)  # type: ignore[arg-type]
         self.weights = weights
@@ -170,18 +161,13 @@ class DistanceCost(StepReward):
         tensor([1.])
     """
 
-    def __init__(
-        self, cost: float, in_keys: NestedKey | Keys = ("move",), out_keys: NestedKey | Keys = ("reward",)
-    ) -> None:
-        super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
-        expect_keys(self, 1, 1)
+    default_in_keys = ("move",)
+    state_keys = ()
+
+    def __init__(self, cost: float, in_keys: GivenKeys = None, out_keys: GivenKeys = None) -> None:
+        super().__init__(in_keys, out_keys)
         check_number(0, cost=cost)
         self.cost = float(cost)
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: none."""
-        return []
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:  # noqa: ARG002
         key, cost = self.out_keys[0], self.cost * values[0][..., :1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -124,12 +123,6 @@ class MinMaxNorm(ObservationTransform):
                 if isinstance(leaf, Bounded) and getattr(self, f"low_{self._index(key)}") is None:
                     row = (0,) * len(parent.batch_size)
                     self._set_bounds(key, leaf.space.low[row], leaf.space.high[row])
-
-    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        for name, buffer in list(self._buffers.items()):
-            if buffer is None and prefix + name in state_dict:
-                self._buffers[name] = torch.empty_like(state_dict[prefix + name])
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     # Data
 

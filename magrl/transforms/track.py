@@ -13,12 +13,12 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import Transform
 
 from magrl import tracking
-from magrl.checks import check_number, check_numbers
+from magrl.checks import check_choice, check_number, check_numbers
 from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, Way
 from magrl.transforms.base import (
+    GivenKeys,
     Keys,
     StatefulTransform,
-    expect_keys,
     observed_spec,
     several_keys,
     sorted_keys,
@@ -74,6 +74,9 @@ class TrackGradient(StatefulTransform):
         torch.Size([2, 5, 3, 2])
     """
 
+    default_in_keys = IN_KEYS
+    default_out_keys = OUT_KEYS
+    in_counts = (4, 5, 6)
     scales: Tensor
     sensor_std: Tensor
     periods: Tensor
@@ -81,8 +84,8 @@ class TrackGradient(StatefulTransform):
 
     def __init__(
         self,
-        in_keys: Keys = IN_KEYS,
-        out_keys: Keys = OUT_KEYS,
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
         *,
         sensor_std: Sequence[float] | None = None,
         prior: Callable[[Tensor], GradientPrior] = tracking.dipole_prior,
@@ -93,17 +96,18 @@ class TrackGradient(StatefulTransform):
         range_km: float = 300.0,
         frame: str = "world",
     ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        expect_keys(self, (4, 5, 6), 6)
+        super().__init__(in_keys, out_keys)
         if sensor_std is not None and len(self.in_keys) > 4:
             raise ValueError(f"give sensor_std or its key {self.in_keys[4]!r}, not both: got sensor_std {sensor_std}")
         check_number(0, above=True, range_km=range_km)
-        _check_frame(frame)
+        check_choice(FRAMES, frame=frame)
         if not callable(prior) or not (relation is None or callable(relation)):
             raise ValueError(f"prior must be a function, and relation one or None, got {prior!r} and {relation!r}")
         self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
         self.curvature = curvature if callable(curvature) else None
         count = len(scales)
+        self.in_sizes = (count, count, None, 1, count, count)
+        self.out_sizes = (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
         if not set(angles) <= set(range(count)):
             raise ValueError(f"angles must be indices of the {count} elements, got {angles!r}")
         self._register(count, scales=scales, sensor_std=(0.0,) * count if sensor_std is None else sensor_std)
@@ -166,21 +170,6 @@ class TrackGradient(StatefulTransform):
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)
         return field, gradient, way, covariance
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the state and the estimates, unbounded."""
-        reading, target, _, heading, *std = (self._leaf(observation_spec, key) for key in self.in_keys)
-        count, shapes = len(self.scales), [tuple(leaf.shape) for leaf in (reading, target, *std)]
-        if shapes[0][-1:] != (count,) or len(set(shapes)) > 1:
-            raise ValueError(
-                f"TrackGradient needs readings, targets and standard deviations of the same shape (..., {count}), with "
-                f"an element for each of its scales, got {shapes}"
-            )
-        if heading.shape != (*shapes[0][:-1], 1):
-            raise ValueError(f"TrackGradient needs a heading {(*shapes[0][:-1], 1)}, got {tuple(heading.shape)}")
-        sizes = (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
-        self._add(observation_spec, reading, dict(zip(self.out_keys, sizes, strict=True)))
-        return observation_spec
-
 
 class SearchAim(StatefulTransform):
     """Write the way to the most probable destination that the vehicle has not visited.
@@ -213,24 +202,17 @@ class SearchAim(StatefulTransform):
         torch.Size([2, 3, 24, 2])
     """
 
-    def __init__(
-        self,
-        in_keys: Keys = (*IN_KEYS, "track_mean", "track_covariance", "way", "way_covariance"),
-        out_keys: Keys = ("aim", "visited", "arrival_weights"),
-        *,
-        zeta: float,
-        frame: str = "world",
-    ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        expect_keys(self, 8, 3)
-        check_number(0, above=True, zeta=zeta)
-        _check_frame(frame)
-        self.zeta, self.frame = float(zeta), frame
+    default_in_keys = (*IN_KEYS, "track_mean", "track_covariance", "way", "way_covariance")
+    default_out_keys = ("aim", "visited", "arrival_weights")
+    out_sizes = (2,), (tracking.VISITED, 2), (3,)
 
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Visited places and weights of the objective."""
-        return self.out_keys[1:]
+    def __init__(
+        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, zeta: float, frame: str = "world"
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        check_number(0, above=True, zeta=zeta)
+        check_choice(FRAMES, frame=frame)
+        self.zeta, self.frame = float(zeta), frame
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         weights = tracking.arrival_weights(values[0], values[1], self.zeta)
@@ -242,20 +224,11 @@ class SearchAim(StatefulTransform):
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], visited: Tensor, weights: Tensor) -> None:
         _, _, _, heading, mean, covariance, *way = values
-        axes = None
-        if self.frame == "vehicle":
-            cos, sin = torch.cos(heading), torch.sin(heading)
-            axes = torch.stack((torch.cat((cos, sin), -1), torch.cat((-sin, cos), -1)), -2)
+        north_east = torch.eye(2, dtype=heading.dtype, device=heading.device)
+        axes = _turned(north_east, heading).mT if self.frame == "vehicle" else None
         aim = tracking.aim(FieldTrack(mean, covariance), Way(*way), visited, weights, axes=axes)
         for key, value in zip(self.out_keys, (aim, visited, weights), strict=True):
             tensordict.set(key, value)
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the way and the state, unbounded."""
-        sizes = (2,), (tracking.VISITED, 2), (3,)
-        reading = self._leaf(observation_spec, self.in_keys[0])
-        self._add(observation_spec, reading, dict(zip(self.out_keys, sizes, strict=True)))
-        return observation_spec
 
 
 class DeclareArrival(Transform):
@@ -332,11 +305,6 @@ class DeclareArrival(Transform):
         low, high = action.space.low[..., :2], action.space.high[..., :2]
         input_spec["full_action_spec"][key] = Bounded(low, high, low.shape, device=action.device, dtype=action.dtype)
         return input_spec
-
-
-def _check_frame(frame: str) -> None:
-    if frame not in FRAMES:
-        raise ValueError(f"frame must be one of {FRAMES}, got {frame!r}")
 
 
 def _turned(vectors: Tensor, heading: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from magrl import tracking
 from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES, element_difference
-from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, expect_keys, key_list, several_keys
+from magrl.transforms.base import GivenKeys, Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.scaling import MinMaxNorm
 from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, SearchAim, TrackGradient
 
@@ -45,22 +45,20 @@ class AngleVector(ObservationTransform):
     """
 
     def __init__(self, in_keys: NestedKey | Keys, out_keys: NestedKey | Keys) -> None:
-        super().__init__(in_keys=key_list(in_keys), out_keys=key_list(out_keys))
+        super().__init__(in_keys, out_keys)
         if len(self.in_keys) != len(self.out_keys):
             raise ValueError(f"in_keys {self.in_keys} do not pair with out_keys {self.out_keys}")
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        for key, angle in zip(self.out_keys, values or (), strict=values is not None):
-            next_tensordict.set(key, torch.cat((torch.cos(angle), torch.sin(angle)), -1))
-        return next_tensordict
+        self.in_sizes = (1,) * len(self.in_keys)
+
+    def _compute(self, values: list[Tensor]) -> list[Tensor]:
+        return [torch.cat((torch.cos(angle), torch.sin(angle)), -1) for angle in values]
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add a box of [-1, 1] for each vector."""
+        super().transform_observation_spec(observation_spec)
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            leaf = self._leaf(observation_spec, in_key)
-            if leaf.shape[-1:] != (1,):
-                raise ValueError(f"AngleVector reads angles of shape (..., 1); {in_key!r} is {tuple(leaf.shape)}")
+            leaf = observation_spec[in_key]
             shape = (*leaf.shape[:-1], 2)
             observation_spec[out_key] = Bounded(-1.0, 1.0, shape, device=leaf.device, dtype=leaf.dtype)
         return observation_spec
@@ -86,17 +84,11 @@ class TargetDifference(ObservationTransform):
         tensor([ 1., -4.])
     """
 
-    def __init__(
-        self, in_keys: Keys = ("field", "target_field"), out_keys: NestedKey | Keys = ("field_difference",)
-    ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=key_list(out_keys))
-        expect_keys(self, 2, 1)
+    default_in_keys = ("field", "target_field")
+    default_out_keys = ("field_difference",)
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(next_tensordict)
-        if values is not None:
-            next_tensordict.set(self.out_keys[0], values[1] - values[0])
-        return next_tensordict
+    def _compute(self, values: list[Tensor]) -> list[Tensor]:
+        return [values[1] - values[0]]
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the difference, bounded if both of its parts are."""
@@ -335,24 +327,15 @@ class TrackObservation(StatefulTransform):
         torch.Size([2, 3, 15])
     """
 
-    def __init__(
-        self,
-        in_keys: Keys = OBSERVED_KEYS,
-        out_keys: Keys = ("observation", "first_field"),
-        *,
-        zeta: float,
-        max_steps: int,
-    ) -> None:
-        super().__init__(in_keys=several_keys(in_keys), out_keys=several_keys(out_keys))
-        expect_keys(self, 8, 2)
+    default_in_keys = OBSERVED_KEYS
+    default_out_keys = ("observation", "first_field")
+    out_sizes = (OBSERVATION_SIZE,), (3,)
+
+    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, zeta: float, max_steps: int) -> None:
+        super().__init__(in_keys, out_keys)
         check_number(0, above=True, zeta=zeta)
         check_number(1, whole=True, max_steps=max_steps)
         self.zeta, self.max_steps = zeta, max_steps
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """The first reading."""
-        return self.out_keys[1:]
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         self._advance(tensordict, values, values[:1])
@@ -364,13 +347,6 @@ class TrackObservation(StatefulTransform):
         time = (step.to(way.dtype) / self.max_steps).clamp(max=1)  # a policy may fly longer than it was trained for
         observed = track_observation(way, covariance, gradient, remaining, weights, sensor_std, time)
         tensordict.set(self.out_keys[0], observed).set(self.out_keys[1], first)
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the observation and the first reading, unbounded."""
-        reading = self._leaf(observation_spec, self.in_keys[0])
-        sizes = dict(zip(self.out_keys, ((OBSERVATION_SIZE,), (3,)), strict=True))
-        self._add(observation_spec, reading, sizes)
-        return observation_spec
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from magrl.evaluation.runs import TrainedRun, agreed, read_run, run_config, trained_runs, unfinished
+from magrl.evaluation.runs import TrainedRun, agreed, read_run, trained_runs, unfinished
 
 NOISE = (0.05, 0.05, 5.0)
 
@@ -97,7 +97,7 @@ def test_damaged_settings_are_refused(tmp_path: Path, content: str) -> None:
 
 def test_missing_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="there is no run at"):
-        run_config(tmp_path)
+        read_run(tmp_path)
     (tmp_path / "config.json").write_text('{"scenario": "scenario.toml"}')
     with pytest.raises(FileNotFoundError, match=r"was trained in its scenario file scenario\.toml, which is missing"):
         read_run(tmp_path)

@@ -115,7 +115,7 @@ def test_models_are_compiled_whole_and_can_be_differentiated(model, request):
 
 @pytest.mark.parametrize(("degree", "tolerance_nt"), [(4, 1e-3), (12, 1e-13)])
 def test_an_error_above_the_tolerance_raises(igrf, degree, tolerance_nt):
-    message = rf"degree {degree} misses the model by \d[\d.e+-]* nT .*\(-10, 0\).*\(160, 170\).*{tolerance_nt:.3g} nT"
+    message = rf"degree {degree} misses the field by \d[\d.e+-]* nT .*\(-10, 0\).*\(160, 170\).*{tolerance_nt:.3g} nT"
     with pytest.raises(ValueError, match=message):
         RegionalField(igrf, (-10, 0), (160, 170), degree=degree, tolerance_nt=tolerance_nt)
 

@@ -53,7 +53,7 @@ def test_dates_outside_the_model_raise(date) -> None:
 
 def test_expansions_of_wmmhr() -> None:
     """A region and a bank agree with the model and its gradient; too low a degree raises."""
-    with pytest.raises(ValueError, match="degree 16 misses the model"):
+    with pytest.raises(ValueError, match="degree 16 misses the field"):
         RegionalField(wmmhr(2025.0), *BOX, degree=16)
     region = RegionalField(wmmhr(2025.0), *BOX, degree=24)
     assert region.error_nt < 1e-4

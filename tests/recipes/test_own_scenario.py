@@ -91,6 +91,6 @@ def test_training_and_evaluation_take_the_same_file(tmp_path: Path) -> None:
 def test_a_region_too_large_for_a_field_leaves_no_run_folder(tmp_path: Path) -> None:
     recipe, path = load("td3_gradient_guided"), tmp_path / "big.json"
     path.write_text(json.dumps({"region": {"latitude": [-60, 60], "longitude": [0, 90]}, "date": 2026.5}))
-    with pytest.raises(ValueError, match=r"big\.json: region.*misses the model by .* nT.*: choose a smaller region"):
+    with pytest.raises(ValueError, match=r"big\.json: region.*misses the field by .* nT.*: choose a smaller region"):
         recipe.train(recipe.Config(scenario=path, out=tmp_path / "run", wandb_mode="disabled"))
     assert not (tmp_path / "run").exists()

@@ -174,13 +174,6 @@ def test_write_that_fails_leaves_the_others(saved, monkeypatch) -> None:
     assert (checkpoints.load(), part.state["value"]) == (30, 30)
 
 
-def test_bad_arguments(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="keep must be a whole number from 1 on, got 0"):
-        Checkpoints(tmp_path, {}, keep=0)
-    with pytest.raises(ValueError, match="frames must be a whole number"):
-        Checkpoints(tmp_path, {}).save(-1)
-
-
 # Running episodes
 
 

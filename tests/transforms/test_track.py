@@ -186,10 +186,10 @@ def test_other_elements_are_not_wrapped() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"in_keys": ("move", "target_field", "move", "heading")}, r"same shape.*\(3, 2\)"),
-        ({"in_keys": ("field", "target_field", "move", "move")}, r"heading \(3, 1\), got \(3, 2\)"),
-        ({"in_keys": (*IN_KEYS, "position")}, "same shape"),
-        ({"scales": (1.0, 1.0), "curvature": (1.0, 1.0)}, "an element for each of its scales"),
+        ({"in_keys": ("move", "target_field", "move", "heading")}, r"reads 'move' as .*3\), got \(3, 2\)"),
+        ({"in_keys": ("field", "target_field", "move", "move")}, r"reads .move. as .*1\), got \(3, 2\)"),
+        ({"in_keys": (*IN_KEYS, "position")}, "reads .position. as"),
+        ({"scales": (1.0, 1.0), "curvature": (1.0, 1.0)}, "reads .field. as"),
         ({"in_keys": IN_KEYS[:3]}, "4 or 5 or 6 in_keys"),
         ({"in_keys": (*IN_KEYS, "sensor_std"), "sensor_std": STD}, "give sensor_std or its key"),
         ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std must be a finite number from 0 on, got -0.1"),

@@ -7,7 +7,6 @@ from pathlib import Path
 import torch
 
 from magrl.agents.policy import FieldPolicy, load_policy
-from magrl.checks import check_type
 
 _FOLDER = Path(__file__).parent
 
@@ -26,7 +25,6 @@ def load_pretrained(name: str, device: torch.device | str = "cpu") -> FieldPolic
         >>> load_pretrained("anywhere").config.num_cells
         (128, 128, 128)
     """
-    check_type(str, name=name)
     names = sorted(path.stem for path in _FOLDER.glob("*.pt"))
     if name not in names:
         raise ValueError(f"there is no pretrained policy {name!r}: choose from {', '.join(names)}")

@@ -18,7 +18,7 @@ from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number, check_numbers
 from magrl.counters import advanced, counter_stream, split
-from magrl.transforms.base import Keys, StatefulTransform
+from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 """D [deg], I [deg], B_H [nT] at middle latitudes, for which data sheets state the errors that depend on the field.
@@ -45,11 +45,12 @@ class EpisodeErrors(StatefulTransform):
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
-        error_key: key of the errors of an episode ``(..., size)``. Privileged: a policy must not read it.
-        stream_key: key of the state of the random numbers ``(..., 1)``, int64. Privileged.
         seed: seed of the errors. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
+        **keys: of values beside those: ``error_key``, of the errors of an episode ``(..., size)``, and ``stream_key``,
+            of the state of the random numbers ``(..., 1)``, int64. Both are privileged: a policy must not read them.
 
     Raises:
+        TypeError: for the name of a key that the class does not have.
         ValueError: for a seed that is not a whole number.
         KeyError: for a step from a TensorDict without the state.
 
@@ -65,8 +66,6 @@ class EpisodeErrors(StatefulTransform):
     """Default keys of true values, which are privileged."""
     error_key: NestedKey = "error"
     stream_key: NestedKey = "stream"
-    in_sizes: tuple[int | None, ...] = ()
-    """Last dimensions of the values at ``in_keys``; None for any."""
     size: int
     """Numbers that hold the errors of an episode."""
     error_dtype: ClassVar[torch.dtype | None] = None
@@ -78,18 +77,15 @@ class EpisodeErrors(StatefulTransform):
     streams: Tensor | None
 
     def __init__(
-        self,
-        in_keys: Keys,
-        out_keys: Keys,
-        *,
-        error_key: NestedKey | None = None,
-        stream_key: NestedKey | None = None,
-        seed: int = 0,
+        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, seed: int = 0, **keys: NestedKey | None
     ) -> None:
-        super().__init__(in_keys=in_keys, out_keys=out_keys)
+        super().__init__(in_keys, out_keys)
         check_number(whole=True, seed=seed)
         self.seed = int(seed)
-        self.error_key, self.stream_key = error_key or self.error_key, stream_key or self.stream_key
+        for name, key in keys.items():
+            if not name.endswith("_key") or not hasattr(type(self), name):
+                raise TypeError(f"{type(self).__name__} has no option {name!r}")
+            setattr(self, name, key)
         self.register_buffer("streams", None)
 
     # Episodes
@@ -110,8 +106,7 @@ class EpisodeErrors(StatefulTransform):
         return stream
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        saved = state_dict.get(f"{prefix}streams")
-        self.streams = None if saved is None else torch.empty_like(saved)
+        self.restart()  # the batch may have another size
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     # Data
@@ -168,18 +163,11 @@ class EpisodeErrors(StatefulTransform):
     # Specs
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Check the shapes that are read, and add the errors and the state of the random numbers.
-
-        Raises:
-            KeyError: for a key that is missing.
-            ValueError: for a value of another shape.
-        """
-        leaves = [self._leaf(observation_spec, key) for key in self.in_keys]
-        for key, leaf, size in zip(self.in_keys, leaves, self.in_sizes, strict=False):
-            if size is not None and leaf.shape[-1:] != (size,):
-                raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(leaf.shape)}")
-        self._add(observation_spec, leaves[0], {self.error_key: (self.size,)}, self.error_dtype)
-        self._add(observation_spec, leaves[0], {self.stream_key: (1,)}, torch.int64)
+        """Check the shapes that are read, and add what is written, the errors and the state of the random numbers."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        leaf = self._leaf(observation_spec, self.in_keys[0])
+        self._add(observation_spec, leaf, self.error_key, self.size, dtype=self.error_dtype)
+        self._add(observation_spec, leaf, self.stream_key, 1, dtype=torch.int64)
         return observation_spec
 
 
@@ -192,33 +180,24 @@ class ReadingErrors(EpisodeErrors):
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
-        true_key: key of the true value, or None to leave it out. Privileged.
-        std_key: key of the standard deviations of the errors that are new in each reading ``(..., E)``.
-        bias_key: key of those of constant and slow errors ``(..., E)``.
-        **options: of :class:`EpisodeErrors`.
+        seed: seed of the errors.
+        **keys: of :class:`EpisodeErrors`; ``true_key``, of the true value, or None to leave it out, privileged; and
+            ``std_key`` and ``bias_key``, of the standard deviations of the errors that are new in each reading, and of
+            those of constant and slow ones, both ``(..., E)``.
 
     Example:
         >>> ReadingErrors(["field"], ["measured"]).true_key
         'true_field'
     """
 
+    default_out_keys: ClassVar[Keys] = ("field",)
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
     reading: ClassVar[int] = 0
     """Index of the reading among ``in_keys`` and ``out_keys``."""
+    true_key: NestedKey | None = "true_field"
+    std_key: NestedKey = "sensor_std"
+    bias_key: NestedKey = "bias_std"
     _accuracy: Tensor
-
-    def __init__(
-        self,
-        in_keys: Keys,
-        out_keys: Keys,
-        *,
-        true_key: NestedKey | None = "true_field",
-        std_key: NestedKey = "sensor_std",
-        bias_key: NestedKey = "bias_std",
-        **options: Any,
-    ) -> None:
-        super().__init__(in_keys, out_keys, **options)
-        self.true_key, self.std_key, self.bias_key = true_key, std_key, bias_key
 
     def _set_accuracy(self) -> None:
         """Compute the standard deviations that the vehicle knows, when all sizes are set."""
@@ -245,8 +224,8 @@ class ReadingErrors(EpisodeErrors):
         leaf = observation_spec[self.in_keys[self.reading]]
         if self.true_key is not None and self.true_key not in observation_spec.keys(True, True):
             observation_spec[self.true_key] = leaf.clone()
-        keys = self.out_keys[self.reading], self.std_key, self.bias_key
-        self._add(observation_spec, leaf, dict.fromkeys(keys, leaf.shape[-1:]))
+        for key in (self.out_keys[self.reading], self.std_key, self.bias_key):
+            self._add(observation_spec, leaf, key, *leaf.shape[-1:])
         return observation_spec
 
 

@@ -14,7 +14,7 @@ from torchrl.data import Composite, TensorSpec
 from magrl.checks import check_number
 from magrl.counters import NORMAL_LIMIT, counter_stream, normal_of, stream_normal, stream_uniform
 from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
-from magrl.transforms.base import Keys, expect_keys, observed_spec, several_keys
+from magrl.transforms.base import observed_spec
 from magrl.transforms.errors.base import Episode, EpisodeErrors
 
 DISPLACEMENT = "displacement"
@@ -69,8 +69,10 @@ class MotionError(EpisodeErrors):
     """
 
     channel = 4
-    true_keys = ("true_move", "true_course")
+    default_in_keys = ("move", "heading", "position")
+    default_out_keys = true_keys = ("true_move", "true_course")
     error_key, stream_key = "motion_error", "motion_stream"
+    action_key: NestedKey = "action"
     in_sizes = (2, 1, 2)
     size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2
 
@@ -86,14 +88,10 @@ class MotionError(EpisodeErrors):
         eddy_km: float = 200.0,
         speed_km_h: float | None = None,
         fixed: bool = False,
-        in_keys: Keys = ("move", "heading", "position"),
-        out_keys: Keys = ("true_move", "true_course"),
-        action_key: NestedKey = "action",
         **options: Any,
     ) -> None:
-        super().__init__(several_keys(in_keys), several_keys(out_keys), **options)
-        expect_keys(self, 3, 2)
-        self.in_keys_inv = self.out_keys_inv = [action_key, self.in_keys[1]]
+        super().__init__(**options)
+        self.in_keys_inv = self.out_keys_inv = [self.action_key, self.in_keys[1]]
         check_number(-math.inf if fixed else 0, log_scale=log_scale, compass_deg=compass_deg)
         check_number(0, log_noise=log_noise, heading_noise_deg=heading_noise_deg)
         check_number(0, current_km_h=current_km_h, eddies_km_h=eddies_km_h)
@@ -175,7 +173,7 @@ class MotionError(EpisodeErrors):
         """Add the true move, its direction, the errors and the state of the numbers."""
         observation_spec = super().transform_observation_spec(observation_spec)
         move, heading, _ = (observation_spec[key] for key in self.in_keys)
-        self._add(observation_spec, move, {self.out_keys[0]: (2,)})
+        self._add(observation_spec, move, self.out_keys[0], 2)
         observation_spec[self.out_keys[1]] = heading.clone()
         return observation_spec
 
@@ -188,14 +186,11 @@ class MotionError(EpisodeErrors):
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
-        observed, commanded = (
-            observed_spec(self),
-            float(input_spec["full_action_spec"][self.in_keys_inv[0]].space.high[..., 0].max()),
-        )
-        known = DISPLACEMENT in observed.keys()  # noqa: SIM118 - a Composite is no mapping
-        allowed = float(observed[DISPLACEMENT].space.high.max()) - 2 * commanded if known else 0.0
+        commanded = float(input_spec["full_action_spec"][self.action_key].space.high[..., 0].max())
+        known = observed_spec(self).get(DISPLACEMENT, None)
+        allowed = 0.0 if known is None else float(known.space.high.max()) - 2 * commanded
         drift = self.farthest_km(commanded) - commanded
-        if not known or drift > allowed + 1e-6 * commanded:
+        if known is None or drift > allowed + 1e-6 * commanded:
             raise ValueError(
                 f"MotionError carries a vehicle up to {drift:.6g} km farther than its command, the environment allows "
                 f"{allowed:.6g} km: create it with drift_km={math.ceil(100 * drift) / 100}"

@@ -8,13 +8,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.counters import stream_uniform
-from magrl.transforms.base import Keys, expect_keys, key_list
 from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes
 
 
@@ -46,18 +44,11 @@ class SensorNoise(ReadingErrors):
     """
 
     channel = 1
+    default_in_keys = ("field",)
     error_key, stream_key = "sensor_error", "sensor_stream"
 
-    def __init__(
-        self,
-        sensor_std: Sequence[float],
-        *,
-        in_keys: NestedKey | Keys = ("field",),
-        out_keys: NestedKey | Keys = ("field",),
-        **options: Any,
-    ) -> None:
-        super().__init__(key_list(in_keys), key_list(out_keys), **options)
-        expect_keys(self, 1, 1)
+    def __init__(self, sensor_std: Sequence[float], **options: Any) -> None:
+        super().__init__(**options)
         check_sizes(sensor_std=sensor_std)
         self.sensor_std = tuple(float(std) for std in sensor_std)
         self.size = self.step_draws = len(self.sensor_std)

@@ -16,7 +16,7 @@ from torchrl.data import Composite
 from magrl.checks import check_number
 from magrl.counters import stream_normal
 from magrl.geodesy import wrap_angle, wrap_longitude
-from magrl.transforms.base import Keys, expect_keys, several_keys
+from magrl.transforms.base import Keys
 from magrl.transforms.errors.base import Episode, ReadingErrors, gauss_markov
 
 SCHULER_HOURS = 1.407
@@ -80,7 +80,11 @@ class NorthReferenceError(ReadingErrors):
 
     channel = 3
     true_keys = ("true_field", "true_heading")
+    default_in_keys = ("heading", "field", "move")
+    default_out_keys = ("heading", "field")
+    in_counts = (3, 4)
     error_key, stream_key = "north_error", "north_stream"
+    true_heading_key: NestedKey = "true_heading"
     reading = 1
     in_sizes = (1, 3, None, 2)
     size, draws, step_draws = 3, 1, 2
@@ -93,14 +97,11 @@ class NorthReferenceError(ReadingErrors):
         *,
         drift_length_km: float | None = None,
         fixed: bool = False,
-        in_keys: Keys = ("heading", "field", "move"),
-        true_heading_key: NestedKey = "true_heading",
+        in_keys: Keys = default_in_keys,
         **options: Any,
     ) -> None:
-        keys = several_keys(in_keys)
-        super().__init__(keys, keys[:2], **options)
-        expect_keys(self, (3, 4), 2)
-        self.in_keys_inv, self.out_keys_inv = keys[:1], [true_heading_key]
+        super().__init__(in_keys, in_keys[:2], **options)
+        self.in_keys_inv, self.out_keys_inv = self.in_keys[:1], [self.true_heading_key]
         check_number(-math.inf if fixed else 0, constant_deg=constant_deg)
         check_number(0, drift_deg=drift_deg, random_deg=random_deg)
         if drift_deg:
@@ -114,7 +115,7 @@ class NorthReferenceError(ReadingErrors):
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys that a step reads from the TensorDict before it."""
-        return [*super().state_keys, *self.out_keys_inv]
+        return [*super().state_keys, self.true_heading_key]
 
     def _constants(self, stream: Tensor) -> Tensor:
         normal = stream_normal(stream, 1).to(torch.get_default_dtype())
@@ -129,7 +130,7 @@ class NorthReferenceError(ReadingErrors):
         error = constant + drift + self.sizes[2] * white
         if position:
             error = error / torch.cos(torch.deg2rad(position[0][..., :1])).to(error.dtype)
-        tensordict.set(self.out_keys_inv[0], heading)
+        tensordict.set(self.true_heading_key, heading)
         tensordict.set(self.out_keys[0], wrap_angle(heading - torch.deg2rad(error)))
         declination = wrap_longitude(field[..., :1] - error)
         self._measure(tensordict, field, torch.cat((declination, field[..., 1:]), -1))
@@ -155,7 +156,7 @@ class NorthReferenceError(ReadingErrors):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what is true, the error and the state of the numbers; the elements are unbounded."""
         observation_spec = super().transform_observation_spec(observation_spec)
-        observation_spec[self.out_keys_inv[0]] = observation_spec[self.in_keys[0]].clone()
+        observation_spec[self.true_heading_key] = observation_spec[self.in_keys[0]].clone()
         return observation_spec
 
 

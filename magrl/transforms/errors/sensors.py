@@ -8,12 +8,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.counters import normal_of, stream_normal, stream_uniform
-from magrl.transforms.base import Keys, expect_keys, key_list, several_keys
+from magrl.transforms.base import expect_keys
 from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, gauss_markov
 from magrl.transforms.errors.vector import VectorErrors
 
@@ -64,7 +63,10 @@ class SensorErrors(ReadingErrors):
     """
 
     channel = 2
+    default_in_keys = ("field", "move", "heading")
+    in_counts = (1, 2, 3)
     error_key, stream_key = "sensor_error", "sensor_stream"
+    _sizes: Tensor
 
     def __init__(
         self,
@@ -78,19 +80,17 @@ class SensorErrors(ReadingErrors):
         outage_rate: float = 0.0,
         vector: VectorErrors | None = None,
         fixed: bool = False,
-        in_keys: Keys = ("field", "move", "heading"),
-        out_keys: NestedKey | Keys = ("field",),
         **options: Any,
     ) -> None:
-        super().__init__(several_keys(in_keys), key_list(out_keys), **options)
-        expect_keys(self, (1, 2, 3), 1)
+        super().__init__(**options)
         check_sizes(sensor_std=sensor_std)
         self.count = len(sensor_std)
-        sizes = {"bias": bias, "scale": scale, "drift": drift, "resolution": resolution}
-        for name, values in {"noise": sensor_std, **sizes}.items():
+        sizes = [list(sensor_std)]
+        for name, values in {"bias": bias, "scale": scale, "drift": drift, "resolution": resolution}.items():
             values = (0.0,) * self.count if values is None else values
             check_sizes(self.count, fixed=fixed and name in ("bias", "scale"), **{name: values})
-            self.register_buffer(f"_{name}", torch.tensor(values, dtype=torch.get_default_dtype()), persistent=False)
+            sizes.append(list(values))
+        self.register_buffer("_sizes", torch.tensor(sizes, dtype=torch.get_default_dtype()), persistent=False)
         check_number(0, 1, outage_rate=outage_rate)
         if outage_rate == 1:
             raise ValueError("outage_rate must be below 1, got 1: no reading would be new")
@@ -112,21 +112,21 @@ class SensorErrors(ReadingErrors):
         """Return the errors of an episode ``(..., size)``, without drift and last reading."""
         normal, vector = stream_normal(stream, self.draws).tensor_split([2 * self.count], -1)
         drawn = torch.ones_like(normal) if self.fixed else normal
-        constants = drawn * torch.cat((self._bias, self._scale)), torch.zeros_like(drawn)
+        constants = drawn * self._sizes[1:3].flatten(), torch.zeros_like(drawn)
         return torch.cat((*constants, self.vector.constants(vector) if self.vector else vector), -1)
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         (value, *others), count, dtype = values, self.count, values[0].dtype
         errors, stream, first = episode
+        sensor_std, _, _, drift_std, resolution = self._sizes.to(dtype)
         uniform = stream_uniform(stream, self.step_draws)
         noise, walk = normal_of(uniform[..., :-1]).to(dtype).split(count, -1)
         bias, scale, drift, last, vector = errors.tensor_split([count, 2 * count, 3 * count, 4 * count], -1)
         distance = math.inf if first else others[0][..., :1] if others else 1.0
-        drift = gauss_markov(drift, self._drift.to(dtype), distance, self.drift_length, walk)
+        drift = gauss_markov(drift, drift_std, distance, self.drift_length, walk)
         reading = self.vector.disturb(value, others[1], vector) if self.vector else value
-        reading = reading + (reading * scale + bias + drift + noise * self._noise)
-        step = self._resolution.to(dtype)
-        reading = torch.where(step > 0, torch.round(reading / step) * step, reading)
+        reading = reading + (reading * scale + bias + drift + noise * sensor_std)
+        reading = torch.where(resolution > 0, torch.round(reading / resolution) * resolution, reading)
         missing = (uniform[..., -1:] < self.outage_rate) & (not first)
         reading = torch.where(missing, last, reading)
         self._measure(tensordict, value, reading, torch.where(missing, OUTAGE_STD, self._accuracy[0].to(dtype)))
@@ -140,10 +140,7 @@ class SensorErrors(ReadingErrors):
             (tensor([1., 1.]), tensor([4., 0.]))
         """
         check_tensor(self.count, field=field)
-        noise, bias, scale, drift, resolution = (
-            getattr(self, f"_{name}").to(field.dtype).square()
-            for name in ("noise", "bias", "scale", "drift", "resolution")
-        )
+        noise, bias, scale, drift, resolution = self._sizes.to(field.dtype).square()
         slow = bias + drift + scale * field.square()
         if self.vector is not None:
             slow = slow + self.vector.variance(field)

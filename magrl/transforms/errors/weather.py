@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Composite
@@ -16,7 +15,6 @@ from magrl.checks import check_number, check_type
 from magrl.counters import stream_uniform
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
 from magrl.field.records import WeatherRecord, weather_record
-from magrl.transforms.base import Keys, expect_keys, key_list, several_keys
 from magrl.transforms.errors.base import Episode, ReadingErrors
 
 SPEEDS_KM_H = {"aircraft": 341.0, "ship": 24.0, "underwater": 6.1}
@@ -68,6 +66,7 @@ class MagneticWeather(ReadingErrors):
     """
 
     channel = 7
+    default_in_keys = ("field", "move")
     error_key, stream_key = "weather_clock", "weather_stream"
     in_sizes = (3, None)
     size, error_dtype = 2, torch.float64
@@ -80,12 +79,9 @@ class MagneticWeather(ReadingErrors):
         speed_km_h: float,
         reading_s: float = 60.0,
         span_h: float | None = None,
-        in_keys: Keys = ("field", "move"),
-        out_keys: NestedKey | Keys = ("field",),
         **options: Any,
     ) -> None:
-        super().__init__(several_keys(in_keys), key_list(out_keys), **options)
-        expect_keys(self, 2, 1)
+        super().__init__(**options)
         self.record = weather_record(record) if isinstance(record, str) else record
         check_type(WeatherRecord, record=self.record)
         check_number(0, above=True, speed_km_h=speed_km_h)
