@@ -14,7 +14,7 @@ from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.transforms import DeclareArrival, TrackGradient
-from magrl.transforms.track import STD_KEYS
+from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
@@ -118,14 +118,14 @@ def task_names(scenario: Scenario, first: int = 0) -> tuple[str, ...]:
     return scenario.names or tuple(f"task {number}" for number in range(first, first + len(scenario.tasks.start)))
 
 
-def with_declaration(env: EnvBase) -> EnvBase:
+def with_declaration(env: EnvBase, confidence: float = 0.0) -> EnvBase:
     """Return an environment in which navigators of two numbers declare their arrival, where it must be declared.
 
-    They declare where the root mean square of the distance that a filter of their own track estimates is within the
-    radius of arrival (:class:`~magrl.transforms.DeclareArrival`).
+    They declare by a filter of their own track (:class:`~magrl.transforms.DeclareArrival`).
 
     Args:
         env: navigation environment with all errors of the sensors.
+        confidence: least probability of a right declaration at which they declare.
 
     Example:
         >>> env = with_declaration(GeomagneticNavEnv(num_envs=2, arrival="declared", seed=0))
@@ -136,6 +136,12 @@ def with_declaration(env: EnvBase) -> EnvBase:
     if not base.arrival.declared:
         return env
     told = STD_KEYS if STD_KEYS[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
-    furthest = torch.tensor(base.scenario.distance_range_km).max().item()
-    track = TrackGradient(("field", "target_field", "move", "heading", *told), range_km=furthest)
-    return TransformedEnv(env, Compose(track, DeclareArrival(base.arrival.radius_km)))
+    farthest = torch.tensor(base.scenario.distance_range_km).max().item()
+    declare = DeclareArrival(
+        base.arrival.radius_km,
+        max_steps=base.max_steps,
+        confidence=confidence,
+        range_km=farthest,
+        in_keys=(*DeclareArrival.default_in_keys, *told),
+    )
+    return TransformedEnv(env, Compose(TrackGradient((*IN_KEYS, *told), range_km=farthest), declare))

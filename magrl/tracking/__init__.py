@@ -1,6 +1,7 @@
 """Estimation of a field and its gradient along a dead-reckoned track."""
 
 from magrl.tracking.belief import probability_below, probability_within, steepest, surprise
+from magrl.tracking.decision import ArrivalDecision, approach, arrival_decision
 from magrl.tracking.filter import (
     CURVATURE,
     DISTANCE_SCALE_KM,
@@ -17,6 +18,7 @@ from magrl.tracking.filter import (
     start,
     update,
 )
+from magrl.tracking.posterior import WayPosterior, way_posterior
 from magrl.tracking.priors import (
     curl_relation,
     dipole_prior,
@@ -39,11 +41,15 @@ __all__ = [
     "ELEMENT_SCALES",
     "VARIANCE_FLOOR",
     "VISITED",
+    "ArrivalDecision",
     "FieldTrack",
     "GradientPrior",
     "GradientRelation",
     "Way",
+    "WayPosterior",
     "aim",
+    "approach",
+    "arrival_decision",
     "arrival_weights",
     "curl_relation",
     "dipole_prior",
@@ -64,5 +70,6 @@ __all__ = [
     "unvisited_yet",
     "update",
     "visit",
+    "way_posterior",
     "way_to",
 ]

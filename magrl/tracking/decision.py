@@ -8,19 +8,24 @@ import torch
 from torch import Tensor
 
 from magrl.checks import check_number, check_tensor
+from magrl.geodesy import wrap_angle
 from magrl.tracking.filter import (
     DISTANCE_SCALE_KM,
+    ELEMENT_PERIODS,
     ELEMENT_SCALES,
     FieldTrack,
     PerElement,
     _nonnegative_or_nan,
     _units,
     _variance,
+    estimated_field,
 )
-from magrl.tracking.posterior import _NORMAL, WayPosterior
+from magrl.tracking.posterior import _NORMAL, WayPosterior, way_posterior
+from magrl.tracking.priors import curl_relation, field_curvature
+from magrl.tracking.track import related
 
 TRIP_KM = 400.0
-"""Path that certainty is worth: a vehicle goes on for a kilometer if that makes a right declaration 1/400 more likely."""
+"""Path before the decision [km]: another kilometer has to make a right declaration about 1/400 more likely."""
 STEP_KM = 0.2
 """Path that a reading costs [km]."""
 READINGS = (1, 2, 4, 8, 16, 32)
@@ -28,67 +33,103 @@ READINGS = (1, 2, 4, 8, 16, 32)
 
 
 class ArrivalDecision(NamedTuple):
-    """Whether to declare ``(...)``, and probabilities ``(...)`` of being right now and after the best further readings.
+    """Probability ``(...)`` of being right now, that at which going on is worth as much, the highest that readings at
+    the place can reach, and the posterior of the way.
 
     Example:
-        >>> ArrivalDecision(torch.tensor(True), torch.tensor(0.9), torch.tensor(0.9)).declare
+        >>> there = WayPosterior(torch.zeros(1, 2), torch.ones(1))
+        >>> ArrivalDecision(torch.tensor(0.9), torch.tensor(0.8), torch.tensor(0.9), there).declare
         tensor(True)
     """
 
-    declare: Tensor
     probability: Tensor
+    worth: Tensor
     attainable: Tensor
+    posterior: WayPosterior
+
+    @property
+    def declare(self) -> Tensor:
+        """Whether to declare now."""
+        return self.probability >= self.worth
 
 
 def arrival_decision(
     track: FieldTrack,
-    posterior: WayPosterior,
+    target: Tensor,
     sensor_std: PerElement,
     bias_std: PerElement,
     steps_left: Tensor,
     radius_km: float,
-    scales: PerElement = ELEMENT_SCALES,
+    range_km: float,
 ) -> ArrivalDecision:
     """Return whether to declare that the target is within a radius, or to go to the estimated place and read on.
 
-    It compares the probability of being right now with that after 1 to 32 more readings at the estimated place, minus
-    what they cost: the way there over :data:`TRIP_KM`, and :data:`STEP_KM` for each. A reading there reduces the
-    variance of the field at the vehicle, not that of a constant error. Without steps left, it declares.
+    It compares the probability of being right now with that after 1 to 32 more readings at the estimated place, times
+    the share of the path that remains useful: a path of :data:`TRIP_KM` over itself, the way there and
+    :data:`STEP_KM` for each reading. Readings there reduce the variance of the field at the vehicle, but not that of a
+    constant error. Without steps left, going on is worth nothing.
 
     Args:
-        track: state of the filter, with the gradients that the posterior was computed from.
-        posterior: of the way to the target.
-        sensor_std: ``(..., E)`` or E numbers: standard deviations of new errors of a reading.
+        track: state of the filter of D, I, B_H.
+        target: ``(..., 3)`` D [deg], I [deg], B_H [nT] at the target.
+        sensor_std: standard deviations of new errors of a reading, ``(..., 3)`` or 3 numbers.
         bias_std: the same of constant and slow errors.
-        steps_left: ``(...)`` number of steps that are left.
+        steps_left: ``(...)`` number of steps that are left after this one.
         radius_km: distance from the target within which a declaration is right [km].
-        scales: those of :func:`~magrl.tracking.start`.
+        range_km: prior standard deviation of the way along each axis [km].
 
     Raises:
-        ValueError: for shapes that do not match, a radius that is not above 0, or a negative standard deviation.
+        ValueError: for shapes that do not match, a radius or range that is not above 0, or a negative standard
+            deviation.
 
     Example:
-        >>> sure = FieldTrack(torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 1e-4 * torch.eye(3).expand(2, 3, 3))
-        >>> there = WayPosterior(torch.zeros(1, 2), torch.ones(1))
-        >>> std = (0.01, 0.01), (0.0, 0.0)
-        >>> arrival_decision(sure, there, *std, torch.tensor(9), radius_km=25.0, scales=(1.0, 1.0)).declare
+        >>> from magrl.tracking import dipole_prior, start
+        >>> here = torch.tensor([8.0, -16.0, 35000.0])
+        >>> track = start(here, dipole_prior(here), (0.02, 0.02, 2.0))
+        >>> std = (0.02, 0.02, 2.0), (0.0, 0.0, 0.0)
+        >>> arrival_decision(track, here, *std, torch.tensor(9), radius_km=25.0, range_km=300.0).declare
         tensor(True)
     """
     check_number(0, above=True, radius_km=radius_km)
-    unit = _units(track, scales)
-    way = posterior.way()
-    noise, count = _variance(sensor_std, unit), unit.shape[-1]
-    bias = (_nonnegative_or_nan("bias_std", bias_std, count, unit) / unit).square()
+    known, shared = related(track, curl_relation)
+    curvature = field_curvature(estimated_field(known))
+    posterior = way_posterior(
+        known, target, range_km, shared=shared, bias_std=bias_std, periods=ELEMENT_PERIODS, curvature=curvature
+    )
+    probability, way = posterior.within(radius_km), posterior.way().displacement
+    unit, count = _units(known, ELEMENT_SCALES), 3
+    noise = _variance(sensor_std, unit).unsqueeze(-2)
+    bias = (_nonnegative_or_nan("bias_std", bias_std, count, unit) / unit).square().unsqueeze(-2)
     readings = torch.tensor(READINGS, dtype=unit.dtype, device=unit.device)
-    variance = _variance_at(track, way.displacement / DISTANCE_SCALE_KM)
-    later = 1 / (1 / variance.unsqueeze(-2) + readings.unsqueeze(-1) / noise.unsqueeze(-2)) + bias.unsqueeze(-2)
-    attainable = _within(track, later, radius_km)
-    cost = way.displacement.norm(dim=-1, keepdim=True) + STEP_KM * readings
-    possible = readings <= steps_left.unsqueeze(-1)
-    value = (attainable * (TRIP_KM / (TRIP_KM + cost))).where(possible, 0.0).amax(-1)
-    probability = posterior.within(radius_km)
-    best = attainable.where(possible, 0.0).amax(-1)
-    return ArrivalDecision((probability >= value) | (steps_left <= 0), probability, torch.maximum(probability, best))
+    there = _variance_at(known, way / DISTANCE_SCALE_KM).unsqueeze(-2)
+    later = _within(known, 1 / (1 / there + readings.unsqueeze(-1) / noise) + bias, radius_km)
+    later = later.where(readings <= steps_left.unsqueeze(-1), 0.0)
+    cost = way.norm(dim=-1, keepdim=True) + STEP_KM * readings
+    worth = (later * (TRIP_KM / (TRIP_KM + cost))).amax(-1)
+    return ArrivalDecision(probability, worth, torch.maximum(probability, later.amax(-1)), posterior)
+
+
+def approach(way: Tensor, heading: Tensor, max_move_km: Tensor | float, max_turn_rad: Tensor | float) -> Tensor:
+    """Return the action ``(..., 2)``, distance [km] and turn [rad], that goes along a way.
+
+    Where the turn is larger than the largest, the vehicle turns where it is.
+
+    Args:
+        way: ``(..., 2)`` northward and eastward [km].
+        heading: ``(..., 1)`` [rad].
+        max_move_km: longest move.
+        max_turn_rad: largest turn.
+
+    Example:
+        >>> approach(torch.tensor([0.0, 30.0]), torch.tensor([0.0]), 50.0, 1.6).round(decimals=2)
+        tensor([30.0000,  1.5700])
+    """
+    check_tensor(2, way=way)
+    north, east = way.split(1, -1)
+    turn = wrap_angle(torch.atan2(east, north) - heading)
+    limit = torch.as_tensor(max_turn_rad, dtype=way.dtype, device=way.device)
+    distance = torch.hypot(north, east).clamp_max(torch.as_tensor(max_move_km, dtype=way.dtype, device=way.device))
+    return torch.cat((distance.where(turn.abs() <= limit, 0.0), torch.minimum(torch.maximum(turn, -limit), limit)), -1)
 
 
 def _variance_at(track: FieldTrack, way: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number
 from magrl.tracking.filter import (
     DISTANCE_SCALE_KM,
     ELEMENT_SCALES,

@@ -6,6 +6,7 @@ module where that makes sense.
 """
 
 from magrl.transforms.alignment import AlignmentReward, FieldGradient, GradientHeading
+from magrl.transforms.declaration import DeclareArrival
 from magrl.transforms.errors.conditions import CONDITIONS, TRUE_KEYS, Conditions, conditions_named, with_conditions
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.noise import RandomSensorNoise, SensorNoise, sensor_levels, with_sensor_noise
@@ -15,7 +16,7 @@ from magrl.transforms.errors.vector import VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
 from magrl.transforms.rewards import DetourReward, DistanceCost, TrueWay
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.track import DeclareArrival, SearchAim, TrackGradient
+from magrl.transforms.track import SearchAim, TrackGradient
 from magrl.transforms.views import AngleVector, ObservationView, TargetDifference, TrackObservation, TrackView
 
 __all__ = [

@@ -1,0 +1,117 @@
+"""Declaration of the arrival by the vehicle's own estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
+
+from magrl import tracking
+from magrl.checks import check_number
+from magrl.tracking import FieldTrack
+from magrl.transforms.base import GivenKeys, ObservationTransform, observed_spec, with_state
+from magrl.transforms.track import OUT_KEYS
+
+
+class DeclareArrival(ObservationTransform):
+    """Declare the arrival of vehicles by their own estimate; so any navigator can be flown without being told.
+
+    For an environment whose action has a third number that declares the arrival. To the policy, the action has the
+    first two. Where the vehicle is probably within the radius, and further readings are not worth their cost
+    (:func:`magrl.tracking.arrival_decision`), it stays where it is and declares. Before, where its estimated distance
+    is less than the radius, it goes to the estimated place. Elsewhere it moves as the policy wants.
+
+    In ``Compose``, it stands behind :class:`TrackGradient`. It reads nothing privileged.
+
+    Args:
+        radius_km: distance from the target within which a declaration is right [km].
+        max_steps: step limit: the last step declares.
+        confidence: least probability at which the vehicle declares; below, the episode ends without a declaration.
+        range_km: prior standard deviation of the way along each axis [km].
+        in_keys: values at the target ``(..., 3)``, mean ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the filter,
+            heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, and optionally the standard deviations
+            ``(..., 3)`` of new errors of a reading, and of constant and slow ones.
+        out_keys: probability ``(..., 1)`` that the target is within the radius, the probability ``(..., 1)`` at which
+            going on is worth as much, and the mean way ``(..., 2)`` northward and eastward [km].
+        action_key: action, ``(..., 2)`` to the policy and ``(..., 3)`` to the environment.
+
+    Raises:
+        ValueError: for an option out of its range, another number of keys, or an environment whose action has no third
+            number.
+        KeyError: for a missing key.
+
+    Example:
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from magrl.navigators import Kalman
+        >>> from magrl.transforms import TrackGradient
+        >>> base = GeomagneticNavEnv(num_envs=20, arrival="declared", arrival_radius_km=25.0, seed=0)
+        >>> env = TransformedEnv(base, Compose(TrackGradient(), DeclareArrival(25.0, max_steps=50)))
+        >>> flown = env.rollout(50, Kalman(), break_when_any_done=False)
+        >>> flown["next", "declared"].any(1).sum(), flown["next", "success"].any(1).sum()
+        (tensor(20), tensor(20))
+    """
+
+    default_in_keys = ("target_field", *OUT_KEYS[:2], "heading", "step_count")
+    default_out_keys = ("arrival_probability", "arrival_worth", "arrival_way")
+    in_counts = (5, 7)
+    in_sizes = (3, 3, 3, 1, 1, 3, 3)
+    out_sizes = ((1,), (1,), (2,))
+    invertible = True
+
+    def __init__(
+        self,
+        radius_km: float,
+        *,
+        max_steps: int,
+        confidence: float = 0.0,
+        range_km: float = 300.0,
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
+        action_key: NestedKey = "action",
+    ) -> None:
+        super().__init__(in_keys, out_keys, in_keys_inv=[action_key], out_keys_inv=[action_key])
+        check_number(0, above=True, radius_km=radius_km, range_km=range_km)
+        check_number(0, 1, confidence=confidence)
+        check_number(1, whole=True, max_steps=max_steps)
+        self.radius_km, self.range_km = float(radius_km), float(range_km)
+        self.max_steps, self.confidence = int(max_steps), float(confidence)
+
+    def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
+        target, mean, covariance, _, step, *std = values
+        sensor_std, bias_std = std or (torch.zeros_like(target), torch.zeros_like(target))
+        left = self.max_steps - 1 - step.squeeze(-1)
+        track = FieldTrack(mean, covariance)
+        decision = tracking.arrival_decision(track, target, sensor_std, bias_std, left, self.radius_km, self.range_km)
+        return decision.probability.unsqueeze(-1), decision.worth.unsqueeze(-1), decision.posterior.way().displacement
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        values = self._read(tensordict, [*self.out_keys, self.in_keys[3], *self.in_keys_inv])
+        if values is None:
+            return tensordict
+        probability, worth, way, heading, action = values
+        high = self.parent.full_action_spec[self.in_keys_inv[0]].space.high
+        approach = tracking.approach(way, heading, *high[..., :2].split(1, -1)).to(action.dtype)
+        near = way.norm(dim=-1, keepdim=True) < self.radius_km
+        declare = (probability >= worth) & (probability >= self.confidence)
+        action = torch.where(near, approach, action).masked_fill(declare, 0.0)
+        return tensordict.set(self.in_keys_inv[0], torch.cat((action, 2.0 * declare - 1), -1))
+
+    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
+        """Leave the third number out of the action, and make the estimates part of the state for other processes."""
+        key, action = self.in_keys_inv[0], input_spec["full_action_spec"][self.in_keys_inv[0]]
+        if action.shape[-1] != 3:
+            raise ValueError(
+                "DeclareArrival needs an environment whose action has a third number that declares the arrival, such "
+                f"as GeomagneticNavEnv(arrival='declared'); {key!r} is {tuple(action.shape)}"
+            )
+        if self.parent is not None:
+            observed = self.transform_observation_spec(observed_spec(self).clone())
+            input_spec = with_state(input_spec, {name: observed[name] for name in self.out_keys})
+        low, high = action.space.low[..., :2], action.space.high[..., :2]
+        input_spec["full_action_spec"][key] = Bounded(low, high, low.shape, device=action.device, dtype=action.dtype)
+        return input_spec
