@@ -20,16 +20,22 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-import gymnasium
 import magrl
 
 assert "torch" not in sys.modules
+import torchrl.envs, torchrl.modules, torchrl.objectives
+
+theirs = set(sys.modules)
+from magrl import agents, envs, field, navigators, transforms
+
+assert not {"matplotlib", "pandas", "wandb", "tqdm", "tyro"} & (set(sys.modules) - theirs), "imports are not light"
+import gymnasium
+
 assert gymnasium.make("magrl/GeomagneticNavigation-v0").reset(seed=0)[0].shape == (13,)
 
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
-from magrl import guidance, navigators
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation import maps, replay
 
