@@ -15,7 +15,7 @@ from torchrl.envs import CatTensors, Compose, InitTracker, ObservationNorm, Rewa
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
-from magrl.agents import ExportedPolicy, export_policy, load_policy, save_policy
+from magrl.agents import ExportedPolicy, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.files import save_tensors
 from magrl.transforms import (
@@ -90,16 +90,6 @@ def test_a_policy_acts_alike_after_saving(saved: Path) -> None:
     torch.testing.assert_close(policy(seen)["action"], wanted, rtol=1e-5, atol=1e-5)
     assert wanted.std(0).min() > 1e-3
     assert torch.equal(policy(seen[0, 0])["action"], policy(seen[:1, 0])["action"][0])
-
-
-def test_an_export_keeps_its_weights_where_the_training_goes_on() -> None:
-    base = GeomagneticNavEnv(num_envs=2, seed=3)
-    actor = TensorDictModule(nn.Sequential(nn.Linear(2, 2), nn.Sigmoid()), ["move"], ["action"])
-    policy, state = export_policy(actor, base), base.reset().select("move")
-    wanted = actor(state.clone())["action"]
-    with torch.no_grad():
-        actor.module[0].bias += 1
-    torch.testing.assert_close(policy(state)["action"], wanted)
 
 
 def test_an_export_acts_with_torch_alone(saved: Path, tmp_path: Path, monkeypatch) -> None:
@@ -187,11 +177,8 @@ def step(name: object, *args: object, **named: object) -> Callable:
 class Touch:
     """An object whose loading with pickle creates a file."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
     def __reduce__(self) -> tuple:
-        return Path.touch, (self.path,)
+        return Path.touch, (Path("touched"),)
 
 
 @pytest.mark.parametrize(
@@ -199,17 +186,12 @@ class Touch:
     [
         (step("from_file.default", 1), "'from_file.default' is not one of PyTorch's core operations"),
         (step("add_.Tensor", {"value": 0}, 1), "'add_.Tensor' is not one of"),
-        (step("rand.default", [2]), "rand.default draws random numbers"),
         (step("__class__.mro"), "is no operation of PyTorch"),
-        (step(7), "7 is no operation of PyTorch"),
         (step("neg.default", {"value": 9999}), "a known value or a list of these, got {'value': 9999}"),
         (step("neg.default", "/etc/passwd"), "got '/etc/passwd'"),
-        (step("neg.default", {"value": 0}, dtype={"dtype": "load"}), "got {'dtype': 'load'}"),
         (lambda c: c["program"]["steps"].append("neg"), "must be a name, arguments and named arguments, got 'neg'"),
         (lambda c: c["program"]["tensors"].__setitem__(0, torch.tensor(torch.nan)), "tensor 0 is not finite"),
-        (lambda c: c["program"]["tensors"].__setitem__(0, 5), "tensor 0 must be a Tensor, got 5"),
         (lambda c: c["program"].update(outputs=[10**6]), "outputs must be numbers of values"),
-        (lambda c: c.update(program=None), "must be a mapping, not NoneType"),
         (lambda c: c.update(in_keys=["position"]), "in_keys must be among field, target_field"),
         (lambda c: c.update(in_keys=["field"]), "a program for 1 keys must take that many inputs"),
         (lambda c: c.update(view={"field_low": 1}), "does not hold a valid policy"),
@@ -225,10 +207,11 @@ def test_damaged_and_foreign_content_is_refused(saved: Path, tmp_path: Path, cha
     assert str(tmp_path / "own.pt") in str(error.value)
 
 
-def test_loading_runs_no_code(saved: Path, tmp_path: Path) -> None:
+def test_loading_runs_no_code(saved: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
     content = torch.load(saved, weights_only=True)
-    content["exported"]["view"] = Touch(tmp_path / "touched")
+    content["exported"]["view"] = Touch()
     save_tensors(content, tmp_path / "own.pt")
     with pytest.raises(ValueError, match=r"own\.pt is not a policy file"):
         load_policy(tmp_path / "own.pt")
-    assert not (tmp_path / "touched").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["own.pt"]

@@ -12,9 +12,9 @@ import td3_gradient_guided as recipe
 
 from magrl import paper
 from magrl.training import RunConfig, UsageError, command, parse_config
-from magrl.training.config import resumed_config
 
 ROOT = Path(__file__).parent.parent.parent
+OWN = "date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n"
 
 
 def parse(*args: str) -> recipe.Config:
@@ -46,14 +46,13 @@ def test_bad_settings_of_a_run(bad: dict, message: str) -> None:
 
 def test_scenario_and_settings_must_agree(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    text = "date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n"
-    path.write_text(text + "zeta = 0.02\n")
+    path.write_text(OWN + "zeta = 0.02\n")
     with pytest.raises(ValueError, match=r"zeta = 0\.02, the training 0\.01: add --zeta 0\.02"):
         RunConfig(scenario=path)
-    path.write_text(text + 'arrival = "declared"\n')
+    path.write_text(OWN + 'arrival = "declared"\n')
     with pytest.raises(ValueError, match="the recipes train no agent that declares"):
         RunConfig(scenario=path)
-    path.write_text(text.replace("[40, 50]", "[75, 85]"))
+    path.write_text(OWN.replace("[40, 50]", "[75, 85]"))
     with pytest.raises(ValueError, match=r"mine.toml: region.latitude \(75.0, 85.0\): with margin_deg 5"):
         RunConfig(scenario=path)
 
@@ -102,13 +101,13 @@ def test_complete_run_and_other_options_are_refused(tmp_path: Path) -> None:
 
 def test_resumed_settings_are_those_of_the_run(tmp_path: Path) -> None:
     """However the folder is written; paths are those of this machine."""
-    settings = {"recipe": recipe.RECIPE, "seed": 7, "num_cells": [8, 8], "guided": False}
+    settings = {"recipe": recipe.RECIPE, "seed": 7, "num_cells": [8, 8], "guided": False, "scenario": "scenario.toml"}
     (tmp_path / "config.json").write_text(json.dumps(settings))
+    (tmp_path / "scenario.toml").write_text(OWN)
     for text in (f"--resume={tmp_path}", f"--resume {tmp_path}/."):
         config = parse(*text.split())
         assert (config.seed, config.num_cells, config.guided) == (7, (8, 8), False)
-        assert config.out == config.resume == tmp_path
-    assert resumed_config(tmp_path, recipe.Config, recipe.RECIPE) == config
+        assert (config.out, config.resume, config.scenario) == (tmp_path, tmp_path, tmp_path / "scenario.toml")
 
 
 # The end of a command
