@@ -82,14 +82,6 @@ def test_navigators_are_made_for_their_environment_and_sensors(env: GeomagneticN
     assert (first, second) == (3, 4)
 
 
-def test_navigators_are_on_the_device_of_their_environment(monkeypatch) -> None:
-    env = GeomagneticNavEnv(num_envs=2, seed=0)
-    monkeypatch.setattr(GeomagneticNavEnv, "device", torch.device("meta"))
-    for name in ("anywhere", "secant", "kalman", "map_matching"):
-        navigator = make_navigator(name, env)
-        assert {x.device.type for x in (*navigator.parameters(), *navigator.buffers())} == {"meta"}
-
-
 def test_a_policy_of_any_algorithm_is_a_file_or_a_folder(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:
     """Its network may be none of the library: this one moves by 25 km, straight on."""
     steps = [["mul.Tensor", [{"value": 0}, 0.0], {}], ["add.Tensor", [{"value": 2}, {"value": 1}], {}]]
@@ -108,7 +100,6 @@ def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_pat
     for text, error, message in (
         ("gg_td3", ValueError, "gg_td3 needs the folder of a finished run: gg_td3=RUN"),
         ("policy:SAC", ValueError, "policy needs the folder of a finished run or the file of a policy"),
-        ("policy=nowhere.pt", FileNotFoundError, r"there is no policy file at .*nowhere\.pt"),
         (f"td3={tmp_path}", FileNotFoundError, "there is no policy file at"),
         ("ga:dreamt", ValueError, "mode must be one of .*dreamt"),
     ):
@@ -123,7 +114,6 @@ def test_navigators_that_are_given_twice(run: Path) -> None:
     check_distinct(["secant", "ga", "ga:flown", f"td3={run}", "policy:A=a.pt", "policy:B=b.pt"])
     for texts, mode, message in (
         (("secant", "ga", "secant"), "look-ahead", "^secant is given twice: the same episodes again are no spread"),
-        (("ga", "pso", "ga:look-ahead"), "look-ahead", "^ga:look-ahead is given twice"),
         (("ga:flown", "ga"), "flown", "^ga is given twice"),
         ((f"gg_td3={run}", f"td3={run.parent / 'x' / '..' / run.name}"), "look-ahead", "^td3=.* is given twice"),
         (("anywhere", f"anywhere={run}"), "look-ahead", "has the name of the pretrained anywhere: write policy:LABEL="),
