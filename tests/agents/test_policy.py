@@ -31,16 +31,6 @@ def policy(view) -> FieldPolicy:
     return FieldPolicy(PolicyConfig(view, CELLS))
 
 
-@pytest.mark.parametrize("difference", [True, False])
-@pytest.mark.parametrize("heading", [True, False])
-def test_observation_is_what_the_view_says(env, difference: bool, heading: bool) -> None:
-    view = env.observation_view(observe_heading=heading, observe_difference=difference)
-    observed = Compose(*view.observation_transforms())(env.reset())
-    assert observed["observation"].shape == (5, view.size)
-    low, high = torch.tensor(view.field_low), torch.tensor(view.field_high)
-    torch.testing.assert_close(observed["observation"][:, :3], 2 * (observed["field"] - low) / (high - low) - 1)
-
-
 def test_policy_acts_alike_in_the_plain_and_in_the_training_environment(env, view, policy) -> None:
     scenario = Scenario(field=env.field)
     transforms = Compose(*view.observation_transforms(), view.action_transform())

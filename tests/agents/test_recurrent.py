@@ -80,20 +80,6 @@ def test_last_move() -> None:
     torch.testing.assert_close(LastMove(math.pi / 2)(moves), expected)
 
 
-def test_memory_is_reset_at_the_start_of_an_episode(env, view, actor) -> None:
-    states = env.rollout(4)
-    policy, fresh = (make_policy(view, actor) for _ in range(2))
-    for step in range(3):
-        policy(states[:, step].clone())
-    restarted = torch.tensor([True, False, True, False, False, True])
-    now = states[:, 3].clone()
-    now["step_count"] = torch.where(restarted.unsqueeze(-1), 0, now["step_count"])
-    action = policy(now.clone())["action"]
-    anew = fresh(now.clone())["action"]
-    assert torch.equal(action[restarted], anew[restarted])
-    assert (action[~restarted] != anew[~restarted]).any(-1).all()
-
-
 def test_memory_is_reset_in_collected_steps(collected) -> None:
     _, steps, _ = collected
     begins = steps["is_init"].squeeze(-1)

@@ -55,16 +55,11 @@ def test_links_and_names_lead_somewhere(page: Path) -> None:
 
 
 def test_every_page_is_in_the_index_and_linked_from_the_readme() -> None:
-    index = TEXTS[ROOT / "docs" / "index.md"].splitlines()
+    index, readme = (TEXTS[ROOT / name].splitlines() for name in ("docs/index.md", "README.md"))
     for page in {*ROOT.glob("docs/*.md"), NOTEBOOK} - {ROOT / "docs" / "index.md"}:
         assert page.stem in index
-        assert f"(docs/{page.name})" in TEXTS[ROOT / "README.md"]
-
-
-def test_citation_names_the_version_and_the_paper() -> None:
-    citation = (ROOT / "CITATION.cff").read_text()
-    assert f"version: {magrl.__version__}\n" in citation
-    assert all("2410.15837" in text for text in (citation, TEXTS[ROOT / "README.md"]))
+        assert any(f"(docs/{page.name})" in line for line in readme)
+    assert f"version: {magrl.__version__}" in (ROOT / "CITATION.cff").read_text().splitlines()
 
 
 # Examples and commands

@@ -231,14 +231,3 @@ def test_failing_loggers_are_reported_and_disabled(tmp_path: Path, monkeypatch, 
         log.close()
         message = rf"{name} failed and is disabled for the rest of this run: .*{reason}.*\n"
         assert re.fullmatch(message, capsys.readouterr().err)
-
-
-def test_evaluation_logs_a_row_per_navigator(tmp_path: Path) -> None:
-    import evaluate
-
-    out = tmp_path / "comparison"
-    evaluate.evaluate(evaluate.Config(navigators=("secant", "parallel"), tasks="figure-4-1", out=out))
-    offline = only(out)
-    assert [row["navigator"] for row in offline.table("eval/navigators")] == ["secant", "parallel"]
-    assert (offline.run.run_group, list(offline.run.tags)) == ("evaluation", ["secant", "parallel"])
-    assert values(offline.run.config.update)["tasks"] == "figure-4-1"
