@@ -18,12 +18,8 @@ def test_training_figure_shows_the_columns_of_a_training() -> None:
     rows = [{"frames": 0.0, "return": math.nan}]  # a row without values is left out
     rows += [{"frames": frames, **{key: 10.0 * i + frames for i, key in enumerate(columns)}} for frames in (1, 2)]
     panels = figures.training_figure(rows).axes
-    assert [[line.get_ydata()[0] for line in axes.lines] for axes in panels] == [
-        [1],
-        [11, 21, 31],
-        [41, 51, 61],
-        [71, 81],
-    ]
+    shown = [[line.get_ydata()[0] for line in axes.lines] for axes in panels]
+    assert shown == [[1], [11, 21, 31], [41, 51, 61], [71, 81]]
     assert [text.get_text() for text in panels[1].get_legend().get_texts()] == list(TERMS)
 
 
@@ -34,10 +30,8 @@ def test_noise_figure_shows_average_and_range_of_runs() -> None:
     axes = figures.noise_figure(levels, "flown").axes[0]
     assert [line.get_ydata().tolist() for line in axes.lines] == [[91, 70], pytest.approx([5, math.nan], nan_ok=True)]
     assert [line.get_linestyle() for line in axes.lines] == ["-", "--"]
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
-        "Gradient-Guided TD3",
-        "GA, flown (below 50 %)",
-    ]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == ["Gradient-Guided TD3", "GA, flown (below 50 %)"]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["none", "high"]
     edge = axes.collections[0].get_paths()[0].vertices
     assert {tuple(point) for point in edge} == {(0, 80), (0, 99), (1, 70)}

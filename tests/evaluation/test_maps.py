@@ -15,7 +15,7 @@ from torchrl.envs import TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
 from magrl.evaluation import episode_measures, evaluation_rollout, maps
-from magrl.evaluation.maps import coastlines, shortest_path, trajectories_figure, way_ellipse, write_gif
+from magrl.evaluation.maps import coastlines, trajectories_figure, way_ellipse, write_gif
 from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Secant
 from magrl.transforms import TrackGradient
@@ -47,13 +47,6 @@ def test_coastlines() -> None:
         assert (near < 0.3) == (known != (28.21, -177.35)), known  # Midway is too small
     assert np.nanmax(np.abs(np.diff(lines[:, 1]))) < 90
     assert np.isnan(lines).all(1).sum() == np.isnan(lines).any(1).sum() > 500
-
-
-def test_shortest_path() -> None:
-    path = shortest_path(place(51.5, -0.1), place(-33.9, 151.2), points=50)
-    legs, _ = geodesic(*path[:-1].T, *path[1:].T)
-    assert legs.sum().item() == pytest.approx(geodesic(*path[0], *path[-1])[0].item(), abs=0.01)
-    assert legs.std() < 0.01
 
 
 def test_tracks_end_where_the_episode_did(env: GeomagneticNavEnv) -> None:

@@ -19,7 +19,6 @@ from magrl.evaluation.navigators import (
     label,
     make_navigator,
     needs,
-    parse_navigator,
 )
 from magrl.navigators import NAVIGATORS
 from magrl.navigators.secant import probe_length
@@ -38,12 +37,6 @@ def run(env: GeomagneticNavEnv, tmp_path_factory: pytest.TempPathFactory) -> Pat
     folder = tmp_path_factory.mktemp("run")
     save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False)))
     return folder
-
-
-def test_texts_are_parsed() -> None:
-    assert parse_navigator("secant") == ("secant", "", "")
-    assert parse_navigator("pso:flown") == ("pso", "flown", "")
-    assert parse_navigator("policy:SAC=a=b.pt") == ("policy", "SAC", "a=b.pt")
 
 
 def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv, run: Path) -> None:

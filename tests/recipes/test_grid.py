@@ -44,9 +44,7 @@ def test_every_table_declares_options_of_its_kind() -> None:
     [
         (("mars",), {}, "declares no table mars: choose from"),
         (("earth",), {"navigators": ("dowsing",), "tasks": 2}, "earth: unknown navigator 'dowsing'"),
-        (("earth",), {"navigators": ("secant", "secant")}, "earth: secant is given twice"),
         (("learning",), {"tasks": 3}, "learning: got an unexpected keyword argument 'tasks'"),
-        (("globe",), {"tasks": 0}, "num_tasks must be a whole number from 1 on, got 0"),
         (("learning",), {}, "there is no runs/.*: train it by make tables"),
     ],
 )
@@ -208,12 +206,6 @@ def test_learning_of_runs(runs: str) -> None:
     assert row[:4] == ["mine", "2", "150 [100–200]", "400 [400–400]"]
     # areas: (200 * 45 + 200 * 94) / 400 = 69.5 and (100 * 45 + 300 * 94) / 400 = 81.75
     assert row[4:] == ["75.6 [69.5–81.8]", "95.00 [95.00–95.00]"]
-
-
-def test_curves_of_a_run_and_a_cut_one(runs: str) -> None:
-    (run,) = trainings.matching(runs)[1:]
-    assert rows(trainings.curves({"mine": run}))[2] == ["mine", "400", "20", "100", "98.0", "94.0", "87.5", "11.0", "2"]
-    assert rows(trainings.curves({"mine": run}, moves=100))[2][:4] == ["mine", "100", "10", "100"]
 
 
 def test_evaluations_and_the_rows_of_other_tables(tmp_path: Path, monkeypatch) -> None:

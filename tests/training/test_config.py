@@ -2,7 +2,6 @@
 
 import json
 import math
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -132,13 +131,3 @@ def test_reader_that_ends_first_leaves_no_traceback(tmp_path: Path, monkeypatch,
     assert (stop.value.code, capsys.readouterr().err) == (141, "")
     for script in [*ROOT.glob("recipes/*.py"), *(ROOT / f"recipes/tables/{name}.py" for name in ("grid", "figures"))]:
         assert "    command(RECIPE, " in script.read_text(), script.name
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("script", ["recipes/fly.py", "-m magrl.field"])
-def test_help_of_a_process_whose_reader_ends_first(script: str) -> None:
-    command = [sys.executable, *script.split(), "--help"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        process.stdout.close()
-        assert "Traceback" not in process.stderr.read()
-    assert process.returncode in (141, -13)
