@@ -72,7 +72,6 @@ def config(**change) -> Callable:
         (lambda c: c | {"extra": 1}, "must hold format, config and weights"),
         (lambda c: c | {"config": {"num_cells": (16,)}}, "must hold exactly"),
         (config(num_cells=(8, 8)), "do not have the shapes"),
-        (config(num_cells=("a",)), "num_cells must be a whole number"),
         (config(memory_size=8), "do not have the shapes"),
         (config(view={}), "does not hold a valid policy"),
         (lambda c: c | {"weights": {k: v * math.nan for k, v in c["weights"].items()}}, "is not finite"),

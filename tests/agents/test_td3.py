@@ -128,6 +128,14 @@ def test_optimize_clips_the_gradient_of_some_parameters() -> None:
     assert free.grad is None
 
 
+def test_a_step_limit_may_count_as_the_end() -> None:
+    """No value is expected after it."""
+    loss, batch = make_loss(policy_noise=0.0), transitions()
+    batch["next"].update({"done": torch.ones(32, 1).bool(), "terminated": torch.zeros(32, 1).bool()})
+    loss.set_keys(terminated="done")
+    assert torch.equal(loss.value_loss(batch)[1]["target_value"], batch["next", "reward"])
+
+
 @pytest.mark.parametrize("change", [{"gamma": 1.5}, {"policy_noise": -1.0}, {"noise_clip": math.nan}], ids=str)
 def test_bad_options_of_the_loss_are_refused(change: dict) -> None:
     options = {"gamma": 0.9, "policy_noise": 0.1, "noise_clip": 0.5} | change

@@ -154,8 +154,3 @@ def test_format_goes_by_the_suffix(tmp_path: Path) -> None:
         check_suffix("a.shp")
     with pytest.raises(ValueError, match="must end in one of"):
         write_tracks(tmp_path / "tracks", [STRAIGHT])
-
-
-def test_no_episode_is_an_empty_file_of_its_kind() -> None:
-    assert json.loads(to_geojson([]))["features"] == []
-    assert gpx_places(to_gpx([])) == kml_lines(to_kml([])) == []

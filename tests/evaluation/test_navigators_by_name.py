@@ -107,7 +107,6 @@ def test_navigators_that_are_given_twice(run: Path) -> None:
     check_distinct(["secant", "ga", "ga:flown", f"td3={run}", "policy:A=a.pt", "policy:B=b.pt"])
     for texts, mode, message in (
         (("secant", "ga", "secant"), "look-ahead", "^secant is given twice: the same episodes again are no spread"),
-        (("ga:flown", "ga"), "flown", "^ga is given twice"),
         ((f"gg_td3={run}", f"td3={run.parent / 'x' / '..' / run.name}"), "look-ahead", "^td3=.* is given twice"),
         (("anywhere", f"anywhere={run}"), "look-ahead", "has the name of the pretrained anywhere: write policy:LABEL="),
     ):

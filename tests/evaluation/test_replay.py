@@ -76,9 +76,8 @@ def test_the_page_holds_the_rollouts(path: Path, rollouts: dict[str, Any]) -> No
             np.testing.assert_allclose(episode["objective"], states["objective"][:, 0], rtol=6e-4)
             np.testing.assert_allclose(episode["move_km"], states["move"][:, 0], atol=6e-4)
             np.testing.assert_allclose(np.radians(episode["turn_deg"]), states["move"][:, 1], atol=1e-4)
-            np.testing.assert_allclose(
-                np.sin(np.radians(episode["heading_deg"])), np.sin(states["heading"])[:, 0], atol=2e-4
-            )
+            heading = np.radians(episode["heading_deg"])
+            np.testing.assert_allclose(np.sin(heading), np.sin(states["heading"])[:, 0], atol=2e-4)
             assert row["next", "done"][:count].flatten().tolist() == [False] * (count - 1) + [True]
 
 
@@ -103,9 +102,7 @@ def test_pieces_of_a_leg_are_equal_and_on_its_geodesic(env: GeomagneticNavEnv, r
     for track in episode_tracks(rollouts["secant"], env.region):
         pieces, _ = geodesic(*track[:-1].T, *track[1:].T)
         legs, _ = geodesic(*track[:-PIECES:PIECES].T, *track[PIECES::PIECES].T)
-        np.testing.assert_allclose(
-            pieces.reshape(-1, PIECES), legs.unsqueeze(-1).expand(-1, PIECES) / PIECES, atol=1e-2
-        )
+        np.testing.assert_allclose(pieces.reshape(-1, PIECES), legs[:, None].expand(-1, PIECES) / PIECES, atol=1e-2)
 
 
 def test_no_track_breaks_at_the_antimeridian() -> None:

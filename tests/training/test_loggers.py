@@ -129,8 +129,8 @@ def test_table_picture_policy_and_final_values(finished: Path) -> None:
 
 def test_nothing_about_the_machine_is_logged(finished: Path) -> None:
     """Except the paths of artifacts, which `wandb sync` reads and does not send."""
-    private = [os.fsencode(finished.parent), os.fsencode(Path.home()) + b"/", os.fsencode(os.getcwd())]
-    private += [b"do-not-tell-anyone", *([host] if len(host := socket.gethostname().encode()) > 4 else [])]
+    private = [b"do-not-tell-anyone", *(os.fsencode(x) for x in (finished.parent, f"{Path.home()}/", os.getcwd()))]
+    private += [host] if len(host := socket.gethostname().encode()) > 4 else []
     told = [path.read_bytes() for path in (finished / "wandb").rglob("*") if path.is_file() and path.suffix != ".wandb"]
     for record in records(next(only(finished).folder.glob("*.wandb"))):
         for entry in record.artifact.manifest.contents:
@@ -170,8 +170,7 @@ def resumed(folder: Path, **options: Any) -> RunLog:
 
 def test_resumed_run_of_wandb_continues_its_curve(tmp_path: Path) -> None:
     log = resumed(tmp_path, wandb_mode="offline")
-    other = {**ROWS[1], "return": 9.0}
-    log.row(other)
+    log.row({**ROWS[1], "return": 9.0})
     log.close()
     parts = [Offline(path) for path in (tmp_path / "wandb").glob("offline-run-*")]
     assert {part.run.run_id for part in parts} == {log.state_dict()["wandb_id"]}, "one run in wandb"
