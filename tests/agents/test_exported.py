@@ -7,15 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import CatTensors, Compose, InitTracker, ObservationNorm, RewardSum, Transform, TransformedEnv
+from torchrl.envs import CatTensors, Compose, InitTracker, ObservationNorm, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
-from magrl.agents import ExportedPolicy, export_policy, load_policy, save_policy
+from magrl.agents import ExportedPolicy, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.files import save_tensors
 from magrl.transforms import (
@@ -29,9 +27,9 @@ from magrl.transforms import (
 )
 
 
-def training_env(*extra: Transform, num_envs: int = 5) -> TransformedEnv:
+def training_env() -> TransformedEnv:
     """Return a noisy environment with privileged rewards and an observation that no view of the library has."""
-    base = GeomagneticNavEnv(num_envs=num_envs, seed=3)
+    base = GeomagneticNavEnv(num_envs=5, seed=3)
     guidance = [FieldGradient(base.field), GradientHeading(), AlignmentReward(weight=3.0), RewardSum()]
     observed = ["move_scaled", "field_difference", "course"]
     steps = [
@@ -43,7 +41,7 @@ def training_env(*extra: Transform, num_envs: int = 5) -> TransformedEnv:
         ObservationNorm(loc=torch.full((7,), 0.1), scale=torch.full((7,), 3.0), in_keys=["own"], standard_normal=True),
         MinMaxNorm(in_keys_inv=["action"]),
     ]
-    return TransformedEnv(base, Compose(*guidance, *steps, *extra))
+    return TransformedEnv(base, Compose(*guidance, *steps))
 
 
 def stochastic_actor(env: TransformedEnv) -> ProbabilisticActor:
@@ -92,16 +90,6 @@ def test_a_policy_acts_alike_after_saving(saved: Path) -> None:
     assert torch.equal(policy(seen[0, 0])["action"], policy(seen[:1, 0])["action"][0])
 
 
-def test_an_export_keeps_its_weights_where_the_training_goes_on() -> None:
-    base = GeomagneticNavEnv(num_envs=2, seed=3)
-    actor = TensorDictModule(nn.Sequential(nn.Linear(2, 2), nn.Sigmoid()), ["move"], ["action"])
-    policy, state = export_policy(actor, base), base.reset().select("move")
-    wanted = actor(state.clone())["action"]
-    with torch.no_grad():
-        actor.module[0].bias += 1
-    torch.testing.assert_close(policy(state)["action"], wanted)
-
-
 def test_an_export_acts_with_torch_alone(saved: Path, tmp_path: Path, monkeypatch) -> None:
     """The same bits, where neither this library nor TorchRL can be imported."""
     policy, state = load_policy(saved), GeomagneticNavEnv(num_envs=7, seed=1).reset()
@@ -122,23 +110,6 @@ def test_an_export_acts_with_torch_alone(saved: Path, tmp_path: Path, monkeypatc
 # Refusals at save time
 
 
-class Stateful(Transform):
-    """Add up a key over an episode, without a word about it."""
-
-    def _reset(self, _: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return tensordict_reset.set("sum", tensordict_reset["move"])
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set("sum", tensordict["sum"] + next_tensordict["move"])
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("sum", tensordict["move"])
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        observation_spec["sum"] = Unbounded(observation_spec["move"].shape)
-        return observation_spec
-
-
 def acting(function: Callable, *keys: str) -> TensorDictModule:
     return TensorDictModule(function, list(keys), ["action"])
 
@@ -155,11 +126,10 @@ def squashed(x: torch.Tensor) -> torch.Tensor:
         (acting(lambda x: squashed(torch.cat((x, x), -1)), "is_init"), [InitTracker()], "'is_init', so it keeps a sta"),
         (acting(lambda x: squashed(x + torch.rand_like(x)), "field"), [], "rand.* draws random numbers"),
         (acting(lambda x: squashed(x.sort(0)[0] / 9), "field"), [], "from step 0 on the actions differ by up"),
-        (acting(lambda x: squashed(x / 99), "sum"), [Stateful(["move"], ["sum"])], "from step 2 on the actions differ"),
         (acting(lambda x: squashed(x) if x.sum() > 0 else squashed(-x), "field"), [], "PyTorch cannot export it: "),
         (acting(lambda x: torch.linalg.inv(x.unsqueeze(-1) @ x.unsqueeze(-2))[..., :2, 0], "field"), [], "linalg_inv"),
     ],
-    ids=["privileged", "unknown", "state", "random", "batch", "stateful", "branch", "operation"],
+    ids=["privileged", "unknown", "state", "random", "batch", "branch", "operation"],
 )
 def test_what_cannot_be_saved_is_refused_with_its_reason(actor, transforms, message: str, tmp_path: Path) -> None:
     base = GeomagneticNavEnv(num_envs=5, seed=3)
@@ -187,11 +157,8 @@ def step(name: object, *args: object, **named: object) -> Callable:
 class Touch:
     """An object whose loading with pickle creates a file."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
     def __reduce__(self) -> tuple:
-        return Path.touch, (self.path,)
+        return Path.touch, (Path("touched"),)
 
 
 @pytest.mark.parametrize(
@@ -203,13 +170,10 @@ class Touch:
         (step("__class__.mro"), "is no operation of PyTorch"),
         (step(7), "7 is no operation of PyTorch"),
         (step("neg.default", {"value": 9999}), "a known value or a list of these, got {'value': 9999}"),
-        (step("neg.default", "/etc/passwd"), "got '/etc/passwd'"),
-        (step("neg.default", {"value": 0}, dtype={"dtype": "load"}), "got {'dtype': 'load'}"),
         (lambda c: c["program"]["steps"].append("neg"), "must be a name, arguments and named arguments, got 'neg'"),
         (lambda c: c["program"]["tensors"].__setitem__(0, torch.tensor(torch.nan)), "tensor 0 is not finite"),
         (lambda c: c["program"]["tensors"].__setitem__(0, 5), "tensor 0 must be a Tensor, got 5"),
         (lambda c: c["program"].update(outputs=[10**6]), "outputs must be numbers of values"),
-        (lambda c: c.update(program=None), "must be a mapping, not NoneType"),
         (lambda c: c.update(in_keys=["position"]), "in_keys must be among field, target_field"),
         (lambda c: c.update(in_keys=["field"]), "a program for 1 keys must take that many inputs"),
         (lambda c: c.update(view={"field_low": 1}), "does not hold a valid policy"),
@@ -225,10 +189,11 @@ def test_damaged_and_foreign_content_is_refused(saved: Path, tmp_path: Path, cha
     assert str(tmp_path / "own.pt") in str(error.value)
 
 
-def test_loading_runs_no_code(saved: Path, tmp_path: Path) -> None:
+def test_loading_runs_no_code(saved: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
     content = torch.load(saved, weights_only=True)
-    content["exported"]["view"] = Touch(tmp_path / "touched")
+    content["exported"]["view"] = Touch()
     save_tensors(content, tmp_path / "own.pt")
     with pytest.raises(ValueError, match=r"own\.pt is not a policy file"):
         load_policy(tmp_path / "own.pt")
-    assert not (tmp_path / "touched").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["own.pt"]

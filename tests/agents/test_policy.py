@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
-from magrl.agents import FieldPolicy, PolicyConfig, load_policy, make_actor, save_policy
+from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.files import save_tensors
 from magrl.transforms import ObservationView
@@ -31,27 +31,12 @@ def policy(view) -> FieldPolicy:
     return FieldPolicy(PolicyConfig(view, CELLS))
 
 
-@pytest.mark.parametrize("difference", [True, False])
-@pytest.mark.parametrize("heading", [True, False])
-def test_observation_is_what_the_view_says(env, difference: bool, heading: bool) -> None:
-    view = env.observation_view(observe_heading=heading, observe_difference=difference)
-    observed = Compose(*view.observation_transforms())(env.reset())
-    assert observed["observation"].shape == (5, view.size)
-    low, high = torch.tensor(view.field_low), torch.tensor(view.field_high)
-    torch.testing.assert_close(observed["observation"][:, :3], 2 * (observed["field"] - low) / (high - low) - 1)
-
-
 def test_policy_acts_alike_in_the_plain_and_in_the_training_environment(env, view, policy) -> None:
     scenario = Scenario(field=env.field)
     transforms = Compose(*view.observation_transforms(), view.action_transform())
     training = TransformedEnv(GeomagneticNavEnv(scenario, num_envs=5, seed=9), transforms)
     one, other = GeomagneticNavEnv(scenario, num_envs=5, seed=9).rollout(6, policy), training.rollout(6, policy.actor)
     assert torch.equal(one["next", "position"], other["next", "position"])
-
-
-def test_action_covers_its_bounds(view) -> None:
-    ends = view.action_transform().denormalize("action", torch.tensor([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0]]))
-    torch.testing.assert_close(ends, torch.tensor([[0.0, -math.pi / 2], [50.0, math.pi / 2], [25.0, 0.0]]))
 
 
 def test_a_policy_is_of_its_region(env, policy) -> None:
@@ -85,15 +70,9 @@ def config(**change) -> Callable:
     [
         (lambda c: c | {"format": 1}, r"a policy of format 1; this version reads format 2: train it again"),
         (lambda c: c | {"extra": 1}, "must hold format, config and weights"),
-        (lambda _: [1, 2], "must hold format, config and weights"),
         (lambda c: c | {"config": {"num_cells": (16,)}}, "must hold exactly"),
-        (lambda c: c | {"config": None}, "must hold exactly"),
-        (lambda c: c | {"weights": [1]}, "must hold exactly"),
         (config(num_cells=(8, 8)), "do not have the shapes"),
-        (config(num_cells=()), "do not have the shapes"),
-        (config(num_cells=("a",)), "num_cells must be a whole number"),
         (config(memory_size=8), "do not have the shapes"),
-        (config(memory_size=-1), "memory_size"),
         (config(view={}), "does not hold a valid policy"),
         (lambda c: c | {"weights": {k: v * math.nan for k, v in c["weights"].items()}}, "is not finite"),
     ],
@@ -113,5 +92,3 @@ def test_missing_policy_and_foreign_file(tmp_path: Path) -> None:
     (tmp_path / "text.pt").write_text("not an archive")
     with pytest.raises(ValueError, match="not a policy file"):
         load_policy(tmp_path / "text.pt")
-    with pytest.raises(TypeError, match="is saved with the transforms of its environment"):
-        save_policy(tmp_path / "text.pt", make_actor(13, (8,)))

@@ -3,36 +3,29 @@
 from pathlib import Path
 
 import pytest
-import torch
-from torchrl.envs import TransformedEnv
 
 import magrl
-from magrl.agents import FieldPolicy, pretrained
+from magrl.agents import pretrained
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
-from magrl.transforms import SensorNoise, TrackView
+from magrl.transforms import TrackView
 
 FOLDER = Path(pretrained.__file__).parent
 
 
 def test_anywhere_acts_without_a_map() -> None:
     policy = magrl.load_pretrained("anywhere")
-    assert isinstance(policy, FieldPolicy)
     assert isinstance(policy.config.view, TrackView)
     assert not set(policy.in_keys) & {*PRIVILEGED_KEYS, "region", "true_field"}
-    env = TransformedEnv(GeomagneticNavEnv(num_envs=3, seed=0), SensorNoise((0.05, 0.05, 5.0)))
-    with torch.no_grad():
-        moves = env.rollout(5, policy)["next", "move"]
+    moves = GeomagneticNavEnv(num_envs=3, seed=0).rollout(5, policy)["next", "move"]
     assert moves.isfinite().all()
     assert moves[..., 0].max() > 1
 
 
 def test_every_policy_is_small_and_has_a_card() -> None:
-    files = sorted(FOLDER.glob("*.pt"))
-    assert [file.stem for file in files] == ["anywhere"]
-    for file in files:
-        assert file.stat().st_size < 1_000_000
-        card = file.with_suffix(".md").read_text()
-        assert all(f"## {part}\n" in card for part in ("Training", "Data", "Figures", "Limits"))
+    (file,) = FOLDER.glob("*.pt")
+    assert file.stat().st_size < 1_000_000
+    card = file.with_suffix(".md").read_text()
+    assert all(f"## {part}\n" in card for part in ("Training", "Data", "Figures", "Limits"))
 
 
 def test_unknown_name() -> None:

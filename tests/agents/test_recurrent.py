@@ -9,7 +9,6 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import TD3Loss as StockTD3Loss
 
@@ -79,41 +78,6 @@ def test_last_move() -> None:
     moves = torch.tensor([[0.5, 1 / 3], [-1.0, 0.0]])
     expected = torch.tensor([[0.5, 1 / 3, math.sqrt(3) / 2, 0.5], [-1.0, 0.0, 1.0, 0.0]])
     torch.testing.assert_close(LastMove(math.pi / 2)(moves), expected)
-
-
-def test_last_move_is_that_of_the_environment(env, view) -> None:
-    """``move_scaled`` holds distance and turn, in this order, whatever the columns of the observation."""
-    moves = env.rollout(5)["next"][:, -1]
-    observed = Compose(*view.observation_transforms())(moves.clone())
-    distance, turn = (view.max_move_km / 2 * (observed["move_scaled"][:, 0] + 1), observed["move_scaled"][:, 1])
-    torch.testing.assert_close(distance, moves["move"][:, 0])
-    torch.testing.assert_close(turn * view.max_turn_rad, moves["move"][:, 1])
-
-
-def test_memory_tells_apart_what_the_eight_numbers_do_not(env, view, actor) -> None:
-    """Vehicles with equal observations and different pasts act differently."""
-    policy = make_policy(view, actor)
-    states = env.rollout(3)
-    for step in range(2):
-        policy(states[:, step].clone())
-    last = states[:, 2].clone()
-    last.update({key: last[key][:1].expand_as(last[key]).clone() for key in ("field", "target_field", "move")})
-    action = policy(last)["action"]
-    assert (action[1:] != action[0]).any(-1).all()
-
-
-def test_memory_is_reset_at_the_start_of_an_episode(env, view, actor) -> None:
-    states = env.rollout(4)
-    policy, fresh = (make_policy(view, actor) for _ in range(2))
-    for step in range(3):
-        policy(states[:, step].clone())
-    restarted = torch.tensor([True, False, True, False, False, True])
-    now = states[:, 3].clone()
-    now["step_count"] = torch.where(restarted.unsqueeze(-1), 0, now["step_count"])
-    action = policy(now.clone())["action"]
-    anew = fresh(now.clone())["action"]
-    assert torch.equal(action[restarted], anew[restarted])
-    assert (action[~restarted] != anew[~restarted]).any(-1).all()
 
 
 def test_memory_is_reset_in_collected_steps(collected) -> None:
@@ -220,10 +184,6 @@ def test_gradients_reach_their_parameters_only(view, collected) -> None:
 
 
 # Environment and policy
-
-
-def test_training_environment_is_sound(env, view, actor) -> None:
-    check_env_specs(training_env(env, view, actor))
 
 
 def test_policy_acts_alike_in_the_plain_and_in_the_training_environment(env, view, actor) -> None:

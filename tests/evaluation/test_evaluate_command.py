@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 from pathlib import Path
 
 import evaluate
@@ -10,30 +9,32 @@ import pytest
 import torch
 
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
-from magrl.envs import GeomagneticNavEnv, Scenario, named_tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.training import UsageError
 
 NOISE = (0.05, 0.05, 5.0)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a run with noise, whose agent has learned nothing."""
-    folder = tmp_path_factory.mktemp("runs") / "noisy"
+def make_run(folder: Path, env: GeomagneticNavEnv, **settings: object) -> Path:
+    """Return the folder of a run whose agent has learned nothing."""
     folder.mkdir()
     torch.manual_seed(0)
-    view = GeomagneticNavEnv(seed=0).observation_view()
-    save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(view, (8,), layer_norm=False)))
-    settings = {"guided": True, "zeta": 0.02, "noise": NOISE, "start_heading": "random"}
-    (folder / "config.json").write_text(json.dumps(settings))
+    save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False)))
+    (folder / "config.json").write_text(json.dumps({"guided": True} | settings))
     return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "noisy"
+    return make_run(folder, GeomagneticNavEnv(seed=0), zeta=0.02, noise=NOISE, start_heading="random")
 
 
 @pytest.fixture(scope="module")
 def results(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("results") / "comparison"
     texts = [f"gg_td3={run}", "secant", "pso", "afsa:flown"]
-    evaluate.main([*texts, "--tasks", "8", "--out", str(out), "--wandb-mode", "disabled"])
+    evaluate.main([*texts, "--tasks", "8", "--out", str(out)])
     return out
 
 
@@ -77,55 +78,56 @@ def test_paths_are_those_of_the_papers_example_with_the_true_field(results: Path
 
 def test_settings_state_what_was_flown(results: Path) -> None:
     """A run is flown as it was trained."""
-    assert json.loads((results / "settings.json").read_text()) == {
-        "navigators": ["gg_td3=noisy", "secant", "pso", "afsa:flown"],
-        "tasks": 8,
-        "num_tasks": 8,
-        "tasks_seed": 0,
-        "scenario": None,
-        "zeta": 0.02,
-        "arrival": "objective",
-        "arrival_radius_km": 25,
-        "max_steps": 50,
-        "max_move_km": 50,
-        "max_turn_deg": 90,
-        "altitude_km": 0,
-        "margin_deg": 5,
-        "noise": list(NOISE),
-        "start_heading": "random",
-        "mode": "look-ahead",
-        "map_date": None,
-        "conditions": None,
-        "seed": 0,
-    }
+    settings = json.loads((results / "settings.json").read_text())
+    assert settings["navigators"] == ["gg_td3=noisy", "secant", "pso", "afsa:flown"]
+    expected = {"zeta": 0.02, "noise": list(NOISE), "start_heading": "random", "scenario": None, "tasks_seed": 0}
+    assert settings.items() >= expected.items()
+    assert list((results / "wandb").glob("offline-run-*/files/media/table/eval/navigators*.json"))
 
 
 OWN = """date = 2026-07-01
 zeta = 0.02
 arrival = "distance"
 region = {latitude = [36, 46], longitude = [-32, -22]}
-tasks = [{name = "far off", start = [37.74, -25.67], target = [53.5, -31.13]}]
+tasks = [
+    {name = "far off", start = [37.74, -25.67], target = [53.5, -31.13]},
+    {start = [40, -30], target = [42, 332]},
+]
 """
 
 
 def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Path) -> None:
     """The destination, seven degrees north of the region, needs a wider margin than the five of the default."""
-    path, out, tracks = tmp_path / "own.toml", tmp_path / "out", tmp_path / "tracks.kml"
+    path, out, tracks = tmp_path / "own.toml", tmp_path / "out", tmp_path / "maps" / "tracks.geojson"
     path.write_text(OWN)
     config = {"scenario": path, "out": out, "wandb_mode": "disabled", "export": tracks}
     with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5 to at least 7\.5$"):
         evaluate.evaluate(evaluate.Config(("secant",), **config))
     options = {"margin_deg": 8.0, "max_steps": 90, "max_turn_deg": 120.0, "start_heading": "random"}
-    evaluate.evaluate(evaluate.Config(("secant", "map_matching"), map_date="2020-01-01", **config, **options))
+    own = load_scenario(path, margin_deg=8.0)
+    run = make_run(
+        tmp_path / "run", GeomagneticNavEnv(own), scenario="scenario.toml", zeta=0.02, start_heading="random"
+    )
+    (run / "scenario.toml").write_text(OWN)
+    names = (f"gg_td3={run}", "secant", "map_matching")
+    evaluate.evaluate(evaluate.Config(names, map_date="2020-01-01", **config, **options))
     settings = json.loads((out / "settings.json").read_text())
-    assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 1}).items()
+    assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 2}).items()
     arrived = [row for row in rows(out / "episodes.csv") if row["success"] == "True"]
     assert max(float(row["navigation_error_km"]) for row in arrived) <= 25
     text = (out / "table.md").read_text()
     assert "paper" not in text
     assert "Arrival: distance, within 25 km." in text
     assert "Date of the map of map matching: 2020-01-01." in text
-    assert "far off" in tracks.read_text()
+    flown = [feature["properties"] for feature in json.loads(tracks.read_text())["features"]]
+    assert [(x["navigator"], x["name"]) for x in flown[1:3]] == [("gg_td3", "task 2"), ("secant", "far off")]
+    for message, change in (
+        (r"gg_td3=.*trained where D is", {"tasks": "figure-4-1", "scenario": None}),
+        ("--tasks figure-4-1 lies in the paper's region", {"tasks": "figure-4-1"}),
+    ):
+        with pytest.raises(UsageError, match=message):
+            evaluate.evaluate(evaluate.Config(names[:1], **(config | options | change | {"out": tmp_path / "other"})))
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize(
@@ -133,19 +135,13 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     [
         ((), {}, "at least one navigator"),
         (("dowsing",), {}, "unknown navigator 'dowsing'"),
-        (("secant", "secant"), {}, "^secant is given twice"),
         (("secant",), {"map_date": "2020-01-01"}, "add that navigator, or omit the date"),
         (("secant",), {"zeta": 3.0}, "zeta must be below 3, got 3.0"),
-        (("secant",), {"max_steps": 0}, "max_steps must be .*got 0"),
-        (("secant",), {"start_heading": "south"}, "start_heading must be 'north' or 'random', got 'south'"),
         (("secant",), {"noise": (0.05, -1.0, 5.0)}, "noise must be a finite number from 0 on, got -1.0"),
-        (("secant",), {"noise": (0.05, math.nan, 5.0)}, "noise .*nan"),
         (("secant",), {"noise": NOISE, "conditions": "ship"}, "omit --noise"),
         (("secant",), {"tasks": 0}, "num_tasks must be a whole number from 1 on, got 0"),
-        (("secant",), {"tasks": 3, "tasks_seed": -1}, "tasks_seed .*-1"),
         (("secant",), {"tasks_seed": 7}, "--tasks-seed 7 needs a number of random tasks, such as --tasks 300"),
         (("ga",), {"seed": -1}, "seed"),
-        (("secant",), {"wandb_mode": "sometimes"}, "wandb_mode"),
         (("secant",), {"scenario": Path("missing.toml")}, "no scenario file at"),
         (("secant",), {"export": Path("tracks.shp")}, r"\.geojson, \.gpx, \.kml"),
     ],

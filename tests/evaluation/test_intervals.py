@@ -53,11 +53,11 @@ def test_interquartile_mean_by_hand() -> None:
     assert interquartile_mean(torch.tensor([1.0, 2.0, 3.0, math.nan])).isnan()
 
 
-@pytest.mark.parametrize("count", [1, 3, 4, 7, 20, 41])
-def test_interquartile_mean_is_that_of_scipy(count: int) -> None:
-    values = torch.rand(6, count, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
-    expected = scipy.stats.trim_mean(values.numpy(), 0.25, axis=1)
-    assert interquartile_mean(values).numpy() == pytest.approx(expected, abs=1e-12)
+def test_interquartile_mean_is_that_of_scipy() -> None:
+    for count in (1, 3, 4, 7, 20, 41):
+        values = torch.rand(6, count, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
+        expected = scipy.stats.trim_mean(values.numpy(), 0.25, axis=1)
+        assert interquartile_mean(values).numpy() == pytest.approx(expected, abs=1e-12)
 
 
 def scores(count: int, seed: int = 0) -> Tensor:
@@ -67,14 +67,9 @@ def scores(count: int, seed: int = 0) -> Tensor:
 def test_stratified_bootstrap_is_that_of_scipy() -> None:
     """Of one stratum; both ends within the noise of 10 000 resamples."""
     values = scores(20)
-    expected = scipy.stats.bootstrap(
-        (values.numpy(),),
-        lambda x, axis: scipy.stats.trim_mean(x, 0.25, axis),
-        n_resamples=10_000,
-        method="percentile",
-        rng=1,
-    ).confidence_interval
-    assert stratified_bootstrap([values]) == pytest.approx(tuple(expected), abs=0.01)
+    options = {"n_resamples": 10_000, "method": "percentile", "rng": 1}
+    expected = scipy.stats.bootstrap((values.numpy(),), lambda x, axis: scipy.stats.trim_mean(x, 0.25, axis), **options)
+    assert stratified_bootstrap([values]) == pytest.approx(tuple(expected.confidence_interval), abs=0.01)
 
 
 def test_stratified_bootstrap_draws_within_strata() -> None:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageSequence
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks
+from magrl.envs import GeomagneticNavEnv, Region, Scenario, Tasks
 from magrl.evaluation import episode_measures, evaluation_rollout, maps
-from magrl.evaluation.maps import coastlines, frame, shortest_path, trajectories_figure, way_ellipse, write_gif
+from magrl.evaluation.maps import coastlines, trajectories_figure, way_ellipse, write_gif
 from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Secant
 from magrl.transforms import TrackGradient
@@ -49,27 +49,10 @@ def test_coastlines() -> None:
     assert np.isnan(lines).all(1).sum() == np.isnan(lines).any(1).sum() > 500
 
 
-def test_shortest_path() -> None:
-    path = shortest_path(place(51.5, -0.1), place(-33.9, 151.2), points=50)
-    legs, _ = geodesic(*path[:-1].T, *path[1:].T)
-    assert legs.sum().item() == pytest.approx(geodesic(*path[0], *path[-1])[0].item(), abs=0.01)
-    assert legs.std() < 0.01
-
-
-def test_frame_has_room_on_each_side() -> None:
-    for positions in ([[0.0, 10.0], [0.0, 20.0]], [[60.0, 170.0], [62.0, 190.0]], [[80.0, 0.0], [-80.0, 5.0]]):
-        box = frame(torch.tensor(positions))
-        height = box.latitude[1] - box.latitude[0]
-        width = (box.longitude[1] - box.longitude[0]) * math.cos(math.radians(sum(box.latitude) / 2))
-        assert 0.4 < height / width < 2.6
-        assert Regions.of(box).contains(torch.tensor(positions)).all()
-
-
 def test_tracks_end_where_the_episode_did(env: GeomagneticNavEnv) -> None:
     """One map for each navigator, at most three in a row, and the names of the tasks."""
     rollout = evaluation_rollout(env, Secant())
-    for count in (1, 2, 4):
-        assert len(trajectories_figure(dict.fromkeys("abcd"[:count], rollout), env.field, env.region).axes) == count
+    assert len(trajectories_figure(dict.fromkeys("abcd", rollout), env.field, env.region).axes) == 4
     axes = trajectories_figure(rollout, env.field, env.region, episodes=2, names=["home", "port", "other"]).axes[0]
     tracks = [line.get_xydata() for line in axes.lines if line.get_marker() == "."]
     assert len(tracks) == 2
@@ -113,10 +96,7 @@ def test_gif_of_several_vehicles_shows_them_moving(env: GeomagneticNavEnv, tmp_p
     assert picture.width == 320
     assert picture.n_frames == 2 * int(episode_measures(rollout)["steps"].max()) + 1
     assert (picture.info["loop"], picture.info["duration"]) == (0, maps.FRAME_MS)
-    frames = []
-    for index in range(picture.n_frames):
-        picture.seek(index)
-        frames.append(np.asarray(picture.convert("RGB")))
+    frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(picture)]
     assert all((before != after).any() for before, after in itertools.pairwise(frames))
     assert (frames[0] == frames[-1]).all(-1).mean() > 0.9  # the map itself stands still
     with pytest.raises(ValueError, match="width_px must be a whole number from 1 on, got 0"):

@@ -61,15 +61,6 @@ def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:
     assert torch.equal(*episodes)
 
 
-def test_episodes_are_a_data_frame() -> None:
-    pandas = pytest.importorskip("pandas")
-    episodes = evaluate("geodesic", "figure-4-1")
-    frame = pandas.DataFrame(episodes.to_dict(convert_tensors="numpy"))
-    assert len(frame) == 1
-    assert frame["success"].dtype == bool
-    assert set(frame) == set(episodes.keys()) > {"spl", "spl_to_arrival", "navigation_error_km"}
-
-
 def test_what_cannot_be_evaluated_is_refused() -> None:
     agent = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
     elsewhere = Scenario(region={"latitude": (40, 50), "longitude": (0, 10)}, objective_floors=None)

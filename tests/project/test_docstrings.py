@@ -32,9 +32,7 @@ def uses(docstring: str, name: str) -> bool:
 
 
 def test_names_were_found() -> None:
-    assert {"geodesy.move", "envs.GeomagneticNavEnv", "envs.gymnasium.GeomagneticNavGymEnv", "training.Run"} <= set(
-        MEMBERS
-    )
+    assert {"geodesy.move", "envs.gymnasium.GeomagneticNavGymEnv", "training.Run"} <= set(MEMBERS)
 
 
 def test_every_module_has_a_docstring() -> None:

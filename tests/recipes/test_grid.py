@@ -44,9 +44,7 @@ def test_every_table_declares_options_of_its_kind() -> None:
     [
         (("mars",), {}, "declares no table mars: choose from"),
         (("earth",), {"navigators": ("dowsing",), "tasks": 2}, "earth: unknown navigator 'dowsing'"),
-        (("earth",), {"navigators": ("secant", "secant")}, "earth: secant is given twice"),
         (("learning",), {"tasks": 3}, "learning: got an unexpected keyword argument 'tasks'"),
-        (("globe",), {"tasks": 0}, "num_tasks must be a whole number from 1 on, got 0"),
         (("learning",), {}, "there is no runs/.*: train it by make tables"),
     ],
 )
@@ -77,10 +75,10 @@ def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
 
 def test_earth_has_a_row_for_each_date_and_navigator(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(grid, "earth_env", functools.partial(grid.earth_env, regions=4))
+    monkeypatch.setattr(grid, "LEVELS", grid.LEVELS[::4])
     dates = ["1900-01-01", "2025-01-01"]
-    found = rows(grid.earth(["geodesic", {"name": "map_matching", "map_date": "2015-01-01"}], tasks=3, dates=dates))
-    assert found[0][:4] == ["date", "navigator", "needs", "runs"]
-    assert found[0][4:] == ["0, 0, 0", "0.02, 0.02, 2", "0.05, 0.05, 5", "0.1, 0.1, 10", "0.5, 0.1, 20"]
+    found = rows(grid.earth(["geodesic", {"name": "map_matching", "map_date": "2015-01-01"}], tasks=2, dates=dates))
+    assert found[0] == ["date", "navigator", "needs", "runs", "0, 0, 0", "0.5, 0.1, 20"]
     assert [row[0] for row in found[2:]] == [dates[0]] * 2 + [dates[1]] * 2
     assert found[2][4].startswith("100.0 / 100.0 / ")
     assert found[3][1] == "map matching (Kalman filter), map of 2015-01-01"
@@ -92,19 +90,10 @@ def test_earth_has_a_row_for_each_date_and_navigator(tmp_path: Path, monkeypatch
     assert row[2].startswith("100.0 / 100.0 / ")
 
 
-def test_boxes_follow_the_seed_and_are_drawn_again(monkeypatch) -> None:
-    regions = [scenario.region for scenario in grid.random_boxes(4, seed=1)]
-    assert grid.place(Scenario(region=regions[0], objective_floors=None)) == "51°S to 41°S, 99°W to 89°W"
-    usable, refused = Scenario.build_field, []
-
-    def build_field(scenario, *args):
-        if not refused:
-            refused.append(scenario.region)
-            raise ValueError("a declination that jumps")
-        return usable(scenario, *args)
-
-    monkeypatch.setattr(Scenario, "build_field", build_field)
-    assert [scenario.region for scenario in grid.random_boxes(2, seed=1)] == regions[1:3]
+def test_boxes_follow_the_seed() -> None:
+    first, second = (scenario.region for scenario in grid.random_boxes(2, seed=1))
+    assert grid.place(Scenario(region=first, objective_floors=None)) == "51°S to 41°S, 99°W to 89°W"
+    assert grid.random_boxes(2, seed=1)[1].region == second
 
 
 def test_boxes_have_mean_and_lowest_rows() -> None:
@@ -186,16 +175,6 @@ def test_map_shows_the_dip_poles_and_the_failures() -> None:
     assert axes.collections[-1].get_array() == pytest.approx(np.array([90.0]))
 
 
-def test_figure_of_errors_has_a_line_for_each_navigator(monkeypatch) -> None:
-    monkeypatch.setattr(figures, "PANELS", dict(list(figures.PANELS.items())[:2]))
-    monkeypatch.setattr(figures, "declarations", lambda: {"conditions": {"navigators": ["geodesic", "secant"]}})
-    figure = figures.conditions(2)["conditions"]
-    assert [list(axes.lines[0].get_ydata()) for axes in figure.axes[:2]] == [[100.0] * 5] * 2
-    assert [len(axes.lines) for axes in figure.axes[:3]] == [2, 2, 0]
-    assert figure.axes[0].get_xticklabels()[1].get_text() == "0.1"
-    assert [text.get_text() for text in figure.axes[-1].get_legend().get_texts()] == ["geodesic", "secant"]
-
-
 # Trainings
 
 
@@ -227,12 +206,6 @@ def test_learning_of_runs(runs: str) -> None:
     assert row[:4] == ["mine", "2", "150 [100–200]", "400 [400–400]"]
     # areas: (200 * 45 + 200 * 94) / 400 = 69.5 and (100 * 45 + 300 * 94) / 400 = 81.75
     assert row[4:] == ["75.6 [69.5–81.8]", "95.00 [95.00–95.00]"]
-
-
-def test_curves_of_a_run_and_a_cut_one(runs: str) -> None:
-    (run,) = trainings.matching(runs)[1:]
-    assert rows(trainings.curves({"mine": run}))[2] == ["mine", "400", "20", "100", "98.0", "94.0", "87.5", "11.0", "2"]
-    assert rows(trainings.curves({"mine": run}, moves=100))[2][:4] == ["mine", "100", "10", "100"]
 
 
 def test_evaluations_and_the_rows_of_other_tables(tmp_path: Path, monkeypatch) -> None:

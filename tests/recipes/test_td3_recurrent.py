@@ -6,26 +6,10 @@ from pathlib import Path
 import pytest
 import td3_recurrent as recipe
 import torch
+from support.recipes import small
 
 from magrl.agents import RecurrentTD3Loss
 from magrl.training import Run
-
-SMALL = {
-    "num_envs": 16,
-    "total_frames": 448,
-    "num_cells": (16, 16),
-    "memory_size": 8,
-    "num_slices": 4,
-    "updates_per_step": 1,
-    "eval_every": 5,
-    "eval_tasks_small": 4,
-    "eval_tasks": 6,
-    "wandb_mode": "disabled",
-}
-
-
-def settings(out: Path, **options) -> recipe.Config:
-    return recipe.Config(out=out, **SMALL | options)
 
 
 def test_non_finite_weight_stops_the_training(tmp_path: Path, monkeypatch) -> None:
@@ -45,25 +29,16 @@ def test_non_finite_weight_stops_the_training(tmp_path: Path, monkeypatch) -> No
 
     monkeypatch.setattr(recipe, "SoftUpdate", Poisoned)
     with pytest.raises(FloatingPointError, match=r"after update 8: .*lstm.* is not finite in rows \[0"):
-        recipe.train(settings(tmp_path / "run"))
+        recipe.train(small(recipe, tmp_path))
 
 
 @pytest.mark.parametrize(
-    "bad",
-    [
-        {"num_envs": 1},
-        {"memory_size": 0},
-        {"steps_per_batch": 1},
-        {"buffer_size": 63},
-        {"shortest_task_km": 500.0},
-        {"noise_share": 0.0},
-        {"random_share": 1.5},
-    ],
-    ids=str,
+    ("name", "value"),
+    [("memory_size", 0), ("steps_per_batch", 1), ("buffer_size", 63), ("noise_share", 0.0), ("random_share", 1.5)],
 )
-def test_bad_settings_are_refused_by_name(tmp_path: Path, bad: dict) -> None:
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        settings(tmp_path / "run", **bad)
+def test_bad_settings_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        recipe.Config(**{name: value})
 
 
 def test_a_scenario_has_distances_and_steps_of_its_own(tmp_path: Path) -> None:
@@ -73,8 +48,8 @@ def test_a_scenario_has_distances_and_steps_of_its_own(tmp_path: Path) -> None:
     near.write_text(json.dumps(content | {"distance_range_km": [50, 90]}))
     far.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="shortest_task_km must be below 90, got 100"):
-        settings(tmp_path / "run", scenario=near)
-    config = settings(tmp_path / "run", scenario=far)
+        recipe.Config(out=tmp_path / "run", scenario=near)
+    config = recipe.Config(out=tmp_path / "run", scenario=far)
     with Run(config, recipe="mine.py", name="mine") as run:
         assert recipe.make_base(run, config).max_steps == config.train_steps != 80
         assert [env.max_steps for env in run.evaluation_envs()] == [80, 80]

@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+from magrl.training import RunConfig
+
 RECIPES = Path(__file__).parent.parent.parent / "recipes"
 
 
@@ -15,3 +17,31 @@ def load(name: str) -> ModuleType:
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
+
+
+SMALL = {
+    "num_envs": 16,
+    "total_frames": 320,
+    "num_cells": (16, 16),
+    "batch_size": 32,
+    "buffer_size": 1000,
+    "init_random_frames": 32,
+    "updates_per_batch": 2,
+    "updates_per_step": 1,
+    "epochs": 1,
+    "num_slices": 4,
+    "memory_size": 8,
+    "num_regions": 8,
+    "max_steps": 5,
+    "eval_every": 10,
+    "eval_tasks_small": 4,
+    "eval_tasks": 6,
+    "wandb_mode": "disabled",
+}
+"""Settings of a small training, as far as a recipe has them."""
+
+
+def small(module: ModuleType, out: Path, **options: object) -> RunConfig:
+    """Return the configuration of a small training of a recipe."""
+    settings = {key: value for key, value in (SMALL | options).items() if key in module.Config.model_fields}
+    return module.Config(out=out, **settings)

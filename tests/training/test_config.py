@@ -1,8 +1,6 @@
 """Settings of runs, the command line, the settings of a run that is resumed, and how a command ends."""
 
 import json
-import math
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,9 +10,9 @@ import td3_gradient_guided as recipe
 
 from magrl import paper
 from magrl.training import RunConfig, UsageError, command, parse_config
-from magrl.training.config import resumed_config
 
 ROOT = Path(__file__).parent.parent.parent
+OWN = "date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n"
 
 
 def parse(*args: str) -> recipe.Config:
@@ -25,16 +23,11 @@ def parse(*args: str) -> recipe.Config:
     ("bad", "message"),
     [
         ({"device": "foo"}, "device 'foo' cannot be used here"),
-        ({"device": "meta"}, "device 'meta' cannot be used here"),
         ({"scenario": Path("nowhere.toml")}, "there is no scenario file at nowhere.toml"),
         ({"seed": paper.TEST_SEED}, "seed must be less than"),
-        ({"seed": paper.VALIDATION_SEED}, "seed must be less than"),
         ({"total_frames": 0}, "total_frames must be greater than or equal to 1, got 0"),
-        ({"checkpoint_every": math.nan}, "checkpoint_every"),
         ({"zeta": 3.0}, "zeta must be below 3, got 3"),
         ({"noise": (0.05, -0.05, 5.0)}, "noise.1 must be greater than or equal to 0, got -0.05"),
-        ({"noise": (0.05, 0.05)}, "noise"),
-        ({"logger": "paper"}, "logger"),
         ({"speed": 1}, "unknown key 'speed'"),
     ],
     ids=str,
@@ -46,14 +39,13 @@ def test_bad_settings_of_a_run(bad: dict, message: str) -> None:
 
 def test_scenario_and_settings_must_agree(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    text = "date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n"
-    path.write_text(text + "zeta = 0.02\n")
+    path.write_text(OWN + "zeta = 0.02\n")
     with pytest.raises(ValueError, match=r"zeta = 0\.02, the training 0\.01: add --zeta 0\.02"):
         RunConfig(scenario=path)
-    path.write_text(text + 'arrival = "declared"\n')
+    path.write_text(OWN + 'arrival = "declared"\n')
     with pytest.raises(ValueError, match="the recipes train no agent that declares"):
         RunConfig(scenario=path)
-    path.write_text(text.replace("[40, 50]", "[75, 85]"))
+    path.write_text(OWN.replace("[40, 50]", "[75, 85]"))
     with pytest.raises(ValueError, match=r"mine.toml: region.latitude \(75.0, 85.0\): with margin_deg 5"):
         RunConfig(scenario=path)
 
@@ -77,8 +69,6 @@ MINE = '"recipe": "td3_gradient_guided.py"'
         ('{"recipe": "td3_recurrent.py"}', r"the run was started by td3_recurrent\.py: resume it with that recipe"),
         (f'{{{MINE}, "wings": 2}}', "unknown key 'wings'"),
         (f'{{{MINE}, "gamma": 2.0}}', "gamma must be less than 1, got 2.0"),
-        (f'{{{MINE}, "num_cells": 8}}', "num_cells"),
-        (f'{{{MINE}, "scenario": 7}}', "cannot resume"),
         (f'{{{MINE}, "scenario": "scenario.toml"}}', "there is no scenario file at"),
         (f'{{{MINE}, "wandb_mode": "loud"}}', "wandb_mode must be 'offline', 'online' or 'disabled'"),
     ],
@@ -102,13 +92,13 @@ def test_complete_run_and_other_options_are_refused(tmp_path: Path) -> None:
 
 def test_resumed_settings_are_those_of_the_run(tmp_path: Path) -> None:
     """However the folder is written; paths are those of this machine."""
-    settings = {"recipe": recipe.RECIPE, "seed": 7, "num_cells": [8, 8], "guided": False}
+    settings = {"recipe": recipe.RECIPE, "seed": 7, "num_cells": [8, 8], "guided": False, "scenario": "scenario.toml"}
     (tmp_path / "config.json").write_text(json.dumps(settings))
+    (tmp_path / "scenario.toml").write_text(OWN)
     for text in (f"--resume={tmp_path}", f"--resume {tmp_path}/."):
         config = parse(*text.split())
         assert (config.seed, config.num_cells, config.guided) == (7, (8, 8), False)
-        assert config.out == config.resume == tmp_path
-    assert resumed_config(tmp_path, recipe.Config, recipe.RECIPE) == config
+        assert (config.out, config.resume, config.scenario) == (tmp_path, tmp_path, tmp_path / "scenario.toml")
 
 
 # The end of a command
@@ -138,13 +128,3 @@ def test_reader_that_ends_first_leaves_no_traceback(tmp_path: Path, monkeypatch,
     assert (stop.value.code, capsys.readouterr().err) == (141, "")
     for script in [*ROOT.glob("recipes/*.py"), *(ROOT / f"recipes/tables/{name}.py" for name in ("grid", "figures"))]:
         assert "    command(RECIPE, " in script.read_text(), script.name
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("script", ["recipes/fly.py", "-m magrl.field"])
-def test_help_of_a_process_whose_reader_ends_first(script: str) -> None:
-    command = [sys.executable, *script.split(), "--help"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        process.stdout.close()
-        assert "Traceback" not in process.stderr.read()
-    assert process.returncode in (141, -13)

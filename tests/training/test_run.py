@@ -1,21 +1,18 @@
-"""Runs around a training: folder, settings, noise, resume after any end, and several collecting processes."""
+"""Runs around a training: folder, settings, noise, resume after any end, and workers."""
 
-import importlib.util
 import json
-import random
-import shlex
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import td3_gradient_guided as recipe
 import torch
+from torch import nn
+from torchrl.collectors import Collector
 
-from magrl.training import Run, RunConfig, UsageError, command, parse_config
+from magrl.agents import FieldPolicy, PolicyConfig
+from magrl.envs import GeomagneticNavEnv
+from magrl.training import Run, RunConfig, UsageError, command
 from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
 from magrl.training.collectors import worker_seed
 from magrl.training.run import StopRequest, passes_paper
@@ -23,18 +20,25 @@ from magrl.training.run import StopRequest, passes_paper
 ROOT = Path(__file__).parent.parent.parent
 AZORES = ROOT / "docs" / "examples" / "azores.toml"
 NOISE = (0.05, 0.05, 5.0)
-SMALL = shlex.split(
-    "--num-envs 16 --total-frames 320 --num-cells 16 16 --batch-size 32 --buffer-size 1000 --init-random-frames 32 "
-    "--updates-per-batch 1 --eval-every 10 --eval-tasks-small 4 --eval-tasks 6 --wandb-mode disabled"
-)
-
-
-def parse(*args: str) -> recipe.Config:
-    return parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, recipe.__doc__, args)
 
 
 def in_run(config: RunConfig) -> Run:
     return Run(config, recipe="mine.py", name="mine")
+
+
+def train(folder: Path, width: int = 1, **options: object) -> None:
+    """A training whose agent flies at random and learns nothing."""
+    options = {"total_frames": 12, "eval_every": 2, "eval_tasks_small": 2, "eval_tasks": 2} | options
+    with in_run(RunConfig(out=folder, wandb_mode="disabled", **options)) as run:
+        torch.manual_seed(run.config.seed)
+        base = GeomagneticNavEnv(num_envs=2, seed=0, max_steps=2)
+        validation, test = run.evaluation_envs(max_steps=2, zeta=2.9)
+        policy = FieldPolicy(PolicyConfig(base.observation_view(), (8,)))
+        collector = Collector(base, base.rand_action, frames_per_batch=2, total_frames=12, track_traj_ids=False)
+        run.start(policy=policy, validation=validation, env=base, collector=collector, part=nn.Linear(width, 1))
+        for _ in run.batches():
+            pass
+        run.finish(test)
 
 
 # The folder
@@ -54,23 +58,19 @@ def test_config_and_scenario_are_written_with_the_folder(tmp_path: Path) -> None
         pass
 
 
-def test_only_a_start_that_fails_removes_the_folder(tmp_path: Path, monkeypatch) -> None:
+def test_only_a_start_that_fails_removes_the_folder(tmp_path: Path) -> None:
     """So the same command can be given again; what was collected, another's folder and a resumed run stay."""
-
-    def broken(*_: object, **__: object) -> None:
-        raise MemoryError("no room for the collector")
-
-    monkeypatch.setattr(recipe, "make_collector", broken)
-    with pytest.raises(MemoryError, match="no room"):
-        recipe.train(parse(*SMALL, "--out", str(tmp_path / "run")))
+    config = RunConfig(out=tmp_path / "run")
+    with pytest.raises(MemoryError), in_run(config):
+        raise MemoryError
     assert not (tmp_path / "run").exists()
-    run = in_run(RunConfig(out=tmp_path / "run"))
+    run = in_run(config)
     run.statistics.frames = 1
     with pytest.raises(RuntimeError), run:
         raise RuntimeError
-    with pytest.raises(RuntimeError), in_run(RunConfig(out=tmp_path / "run", resume=tmp_path / "run")):
+    with pytest.raises(RuntimeError), in_run(config.replace(resume=tmp_path / "run")):
         raise RuntimeError
-    with pytest.raises(UsageError), in_run(RunConfig(out=tmp_path / "run")):
+    with pytest.raises(UsageError), in_run(config):
         pass
     assert (tmp_path / "run" / "config.json").is_file()
 
@@ -100,9 +100,9 @@ def test_validation_and_test_have_the_noise_of_the_run(tmp_path: Path) -> None:
         assert not share or not torch.equal(errors[0], errors[1][:4])
 
 
-@pytest.mark.parametrize(("rate", "spl", "passes"), [(97.0, 88.4, True), (96.9, 99.0, False), (99.0, 88.3, False)])
-def test_results_of_the_paper(rate: float, spl: float, passes: bool) -> None:
-    assert passes_paper({"eval_success_rate": rate, "eval_spl": spl}) is passes
+def test_results_of_the_paper() -> None:
+    for rate, spl, passes in ((97.0, 88.4, True), (96.9, 99.0, False), (99.0, 88.3, False)):
+        assert passes_paper({"eval_success_rate": rate, "eval_spl": spl}) is passes
 
 
 # Resume
@@ -121,18 +121,18 @@ def test_stop_request_waits_and_a_second_one_does_not() -> None:
 @pytest.mark.usefixtures("without_figures")
 def test_run_that_ended_before_its_first_checkpoint_starts_again(tmp_path: Path, same_outcome, monkeypatch) -> None:
     """``config.json`` is there as soon as the folder is, and the seed leads to the same training."""
-    folder, whole = tmp_path / "killed", tmp_path / "whole"
-    recipe.train(parse(*SMALL, "--out", str(whole)))
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
+    folder, whole = tmp_path / "killed", tmp_path / "whole"
+    train(whole, scenario=AZORES)
     with monkeypatch.context() as patch:
         patch.setattr(Checkpoints, "save", killed)
         with pytest.raises(KeyboardInterrupt):
-            recipe.train(parse(*SMALL, "--out", str(folder), "--checkpoint-every", "0"))
+            train(folder, scenario=AZORES, checkpoint_every=0)
     assert not (folder / "checkpoints").exists()
-    recipe.train(parse("--resume", str(folder)))
+    train(folder, scenario=AZORES, resume=folder)
     assert same_outcome(folder, whole)
 
 
@@ -141,97 +141,19 @@ def test_run_that_ended_before_its_first_checkpoint_starts_again(tmp_path: Path,
 def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> None:
     """The curves so far stay in their file."""
     with signalled(5, signal.SIGTERM), pytest.raises(SystemExit):
-        recipe.train(parse(*SMALL, "--eval-every", "2", "--out", str(tmp_path)))
+        train(tmp_path)
     curves = (tmp_path / "train.csv").read_text()
-    config = tmp_path / "config.json"
-    settings = config.read_text()
-    config.write_text(settings.replace("16,\n    16", "24,\n    24"))
-    with pytest.raises(UsageError, match=r"cannot resume: .*checkpoint-\d+\.pt: loss does not fit this training"):
-        recipe.train(parse("--resume", str(tmp_path)))
-    config.write_text(settings)
+    with pytest.raises(UsageError, match=r"cannot resume: .*checkpoint-\d+\.pt: part does not fit this training"):
+        train(tmp_path, width=2, resume=tmp_path)
     for file in tmp_path.glob("checkpoints/*.pt"):
         file.write_bytes(b"")
     with pytest.raises(UsageError, match="cannot resume: there is no valid checkpoint in"):
-        recipe.train(parse("--resume", str(tmp_path)))
+        train(tmp_path, resume=tmp_path)
     assert len(curves.splitlines()) == 3
     assert (tmp_path / "train.csv").read_text() == curves
 
 
-def run_process(*args: str, kill_after: float | None = None) -> int:
-    """Run the recipe to its end, or until some seconds after its first checkpoint; return the exit code."""
-    folder = Path(args[-1])
-    process = subprocess.Popen([sys.executable, str(ROOT / "recipes" / recipe.RECIPE), *args])
-    if kill_after is not None:
-        while process.poll() is None and not list(folder.glob("checkpoints/checkpoint-*.pt")):
-            time.sleep(0.01)
-        time.sleep(kill_after)
-        process.kill()
-    return process.wait()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 9))
-def test_many_kills(tmp_path: Path, same_outcome: Callable, seed: int, monkeypatch) -> None:
-    """Kill a training several times, let it end, and compare it with one that was left alone."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # as in this process: other numbers round differently
-    folder, whole, survived, moments = tmp_path / "killed", tmp_path / "whole", 0, random.Random(seed)
-    options = (*SMALL, "--total-frames", "3200", "--checkpoint-every", "0.05", "--out")
-    assert run_process(*options, str(whole)) == 0
-    code = run_process(*options, str(folder), kill_after=moments.uniform(0, 1))
-    while code == -signal.SIGKILL:
-        survived += 1
-        code = run_process("--resume", str(folder), kill_after=moments.uniform(0, 5) if survived < 5 else None)
-        assert code in (0, -signal.SIGKILL)
-    assert same_outcome(folder, whole)
-    assert survived >= 1
-
-
 # Several collecting processes
-
-
-@pytest.fixture
-def _without_ray():
-    yield
-    if "ray" in sys.modules:
-        sys.modules["ray"].shutdown()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("without_figures", "_without_ray")
-@pytest.mark.parametrize("backend", ["process", "ray"])
-def test_interrupted_training_of_several_processes_resumes(
-    backend: str, tmp_path: Path, signalled, monkeypatch
-) -> None:
-    """Other processes start new episodes; frames and updates add up, and weights that change here act there."""
-    if backend == "ray" and importlib.util.find_spec("ray") is None:
-        pytest.skip("ray is an extra")
-    run, made = tmp_path / "run", {}
-    config = parse(*SMALL).replace(num_envs=8, num_cells=(8,), batch_size=16, init_random_frames=16, total_frames=80)
-    with signalled(4, signal.SIGTERM), pytest.raises(SystemExit):
-        recipe.train(config.replace(out=run, collectors=2, collector_backend=backend))
-
-    def recorded(name: str, kind: type) -> None:
-        class Recorded(kind):
-            def __init__(self, *args, **options) -> None:
-                super().__init__(*args, **options)
-                made[name] = self
-
-        monkeypatch.setattr(recipe, kind.__name__, Recorded)
-
-    def turn_right(*_: object, **__: object) -> None:
-        with torch.no_grad():
-            made["loss"].networks.actor[0].module[-1].bias.fill_(50.0)
-
-    recorded("loss", recipe.TD3Loss)
-    recorded("buffer", recipe.TensorDictReplayBuffer)
-    monkeypatch.setattr(recipe, "optimize", turn_right)
-    recipe.train(parse("--resume", str(run)))
-    result = json.loads((run / "eval.json").read_text())
-    assert (result["frames"], result["updates"]) == (80, 9)
-    stored = made["buffer"][:]
-    assert all(len(batch["observation"].unique(dim=0)) == 8 for batch in stored.split(8))
-    assert (stored["action"][: 4 * 8] < 0).any()
-    assert (stored["action"][-8:] > 0.3).all()  # 1, less the noise of exploration
 
 
 def test_workers_fly_random_tasks_of_their_own() -> None:
