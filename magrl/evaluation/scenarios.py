@@ -144,4 +144,5 @@ def with_declaration(env: EnvBase, confidence: float = 0.0) -> EnvBase:
         range_km=farthest,
         in_keys=(*DeclareArrival.default_in_keys, *told),
     )
-    return TransformedEnv(env, Compose(TrackGradient((*IN_KEYS, *told), range_km=farthest), declare))
+    track = TrackGradient((*IN_KEYS, *told))
+    return TransformedEnv(env, Compose(track, declare), auto_unwrap=True)

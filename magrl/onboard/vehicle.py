@@ -26,6 +26,7 @@ from magrl.navigators import Kalman, Navigator, RunAndTumble, Secant
 from magrl.onboard.estimator import Estimator
 from magrl.onboard.limits import check_move, move_limits, out_of_range, view_of
 from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_jump, check_earth_reading
+from magrl.tracking import ArrivalDecision, Way
 from magrl.transforms import TrackView
 from magrl.transforms.track import STD_KEYS
 
@@ -38,9 +39,9 @@ LOST_SURPRISE = 100.0
 simulation, it reached 5 with a right data sheet, and 31 under the conditions of an aircraft."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 4
-_FORMAT, _NOT_STARTED = 1, "the vehicle has no destination yet: call start(target) first"
-_OPTIONS = ("name", "sensor_std", "bias_std", "max_move_km", "max_turn_deg", "max_steps", "zeta", "arrival_km")
-_PLAIN = ("_step", "_steer", "_first", "_last", "_surprises")  # parts of the state that are numbers
+_FORMAT, _NOT_STARTED = 2, "the vehicle has no destination yet: call start(target) first"
+_OPTIONS = ("name", "sensor_std", "bias_std", "max_move_km", "max_turn_deg", "max_steps", "arrival_km")
+_PLAIN = ("_step", "_steer", "_last", "_surprises")  # parts of the state that are numbers
 _STATES = ("state", "memory")  # attributes in which policies and navigators keep their state
 
 
@@ -52,11 +53,13 @@ class Command:
         distance_km: distance to move; 0 to stay and read again.
         turn_deg: turn before the move, to the right.
         heading_deg: heading after that turn, 0 to 360: what to steer.
-        way_km: estimated way to the destination, northward and eastward.
+        way_km: mean of the way to the destination, northward and eastward.
         way_covariance_km2: its covariance, by rows.
-        confidence: estimated probability that the vehicle is at its destination.
-        stop: None, or ``"arrived"``, ``"lost"`` or ``"out of range"``; the vehicle is then told to stay.
+        confidence: estimated probability that the destination is within ``arrival_km``.
+        stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
+            the vehicle is then told to stay.
         reason: why to stop, as text.
+        radius_km: radius that holds the destination with the ``confidence`` that the vehicle was given.
 
     Example:
         >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
@@ -71,6 +74,7 @@ class Command:
     confidence: float
     stop: str | None = None
     reason: str = ""
+    radius_km: float = math.inf
 
     @property
     def error_km(self) -> float:
@@ -92,10 +96,9 @@ class Onboard:
         bias_std: standard deviations of constant and slow errors of the same.
         max_move_km: longest move; 50 km, or for a trained policy that of its training.
         max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.
-        max_steps: moves after which the vehicle is lost.
-        zeta: arrival threshold on the objective F (Eq. 2-6).
-        arrival_km: distance that counts as arrived, in place of ``zeta``.
-        confidence: least estimated probability of arrival at which the vehicle stops.
+        max_steps: steps of a way, the last of which stops.
+        arrival_km: distance from the destination that counts as arrived.
+        confidence: least estimated probability of arrival at which the vehicle is told that it has arrived.
 
     Raises:
         ValueError: for an option out of its range, an unknown navigator, one that reads more than the vehicle knows,
@@ -123,19 +126,17 @@ class Onboard:
         max_move_km: float | None = None,
         max_turn_deg: float | None = None,
         max_steps: int = 120,
-        zeta: float = 0.01,
-        arrival_km: float | None = None,
+        arrival_km: float = 25.0,
         confidence: float = 0.8,
     ) -> None:
         check_type((str, TensorDictModuleBase), navigator=navigator)
         check_numbers(3, sensor_std=sensor_std, bias_std=bias_std)
         check_number(0, sensor_std=min(sensor_std), bias_std=min(bias_std))
         check_number(1, whole=True, max_steps=max_steps)
-        check_number(0, 3, above=True, zeta=zeta)
-        check_number(0, above=True, arrival_km=1.0 if arrival_km is None else arrival_km)
-        check_number(0, 1, above=True, confidence=confidence)
+        check_number(0, above=True, arrival_km=arrival_km)
+        check_number(0, 1, confidence=confidence)
         self.sensor_std, self.bias_std = tuple(map(float, sensor_std)), tuple(map(float, bias_std))
-        self.max_steps, self.zeta, self.arrival_km, self.confidence = max_steps, zeta, arrival_km, confidence
+        self.max_steps, self.arrival_km, self.confidence = max_steps, float(arrival_km), confidence
         known = load_pretrained("anywhere") if navigator == "anywhere" else navigator
         policy = None if isinstance(known, str) else known
         self.max_move_km, self.max_turn_deg = move_limits(policy, max_move_km, max_turn_deg)
@@ -157,11 +158,11 @@ class Onboard:
         raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(NAMED)}, or give a policy")
 
     def _aware(self, navigator: TensorDictModuleBase) -> TensorDictModuleBase:
-        """Return a navigator that knows what counts as arrived, and that nobody tells it so."""
+        """Return a navigator that nobody tells that it has not arrived."""
         view = view_of(navigator)
         if not isinstance(navigator, FieldPolicy) or not isinstance(view, TrackView):
             return navigator
-        view = replace(view, zeta=self.zeta, search=False)
+        view = replace(view, search=False)
         return FieldPolicy(replace(navigator.config, view=view), navigator.actor)
 
     def start(self, target: Sequence[float]) -> None:
@@ -178,7 +179,7 @@ class Onboard:
         self.target = tuple(map(float, target))
         self._step, self._estimator.state = 0, None
         self._steer: float | None = None  # heading that the vehicle was to steer [deg]
-        self._first, self._last, self._surprises = Values(), Values(), Values()  # readings, the last with its course
+        self._last, self._surprises = Values(), Values()  # the last reading with its course
         for name in _STATES:
             if hasattr(self.navigator, name):
                 setattr(self.navigator, name, [] if isinstance(getattr(self.navigator, name), list) else None)
@@ -208,11 +209,11 @@ class Onboard:
         with torch.inference_mode():
             seen = self._seen(reading, course, (distance, turn))
             surprises = (*self._surprises, *((self._estimator.surprise(seen),) if self._last else ()))
-            observed, action = self._estimator.act(seen)
+            action = self._estimator.act(seen)
             self._surprises = surprises[-_SURPRISES:]
-            self._first = self._first or reading
-            self._last, self._step = (*reading, course), self._step + 1
-            command = self._command(observed, action, course)
+            self._last = (*reading, course)
+            command = self._command(seen, action, course)
+            self._step += 1
         self._steer = command.heading_deg
         return command
 
@@ -237,49 +238,48 @@ class Onboard:
         seen |= {"step_count": torch.tensor([[self._step]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")
 
-    def _confidence(self, observed: TensorDictBase) -> float:
-        """Return the estimated probability that the vehicle is at its destination."""
-        if self.arrival_km is not None:
-            return tracking.probability_within(observed["way"][0], observed["way_covariance"][0], self.arrival_km)
-        variances, scales = self._estimator.track.covariance[:, 0, 0].tolist(), self._estimator.tracker.scales.tolist()
-        known = zip(variances, scales, self.sensor_std, self.bias_std, strict=True)
-        # A reading alone tells the field to within the noise of the sensor.
-        std = [math.hypot(min(math.sqrt(max(v, 0.0)) * unit, noise), bias) for v, unit, noise, bias in known]
-        here = observed["estimated_field"][0].tolist()
-        return tracking.probability_below(self._first, self.target, here, std, self.zeta)
+    def _command(self, seen: TensorDictBase, action: tuple[float, float], course: float) -> Command:
+        """Return the command: to stop, to go to the estimated place where it is near, or what the navigator wants."""
+        left = torch.tensor([self.max_steps - 1 - self._step])
+        decision = self._estimator.decide(seen, left, self.arrival_km)
+        way = decision.posterior.way()
+        probability, radius = decision.probability.item(), decision.posterior.radius(self.confidence).item()
+        stop, reason = self._stop(way, decision, radius)
+        if stop:
+            action = 0.0, 0.0
+        elif way.displacement.norm() < self.arrival_km:
+            limits = self.max_move_km, math.radians(self.max_turn_deg)
+            distance, turn = tracking.approach(way.displacement, seen["heading"], *limits)[0].tolist()
+            action = distance, turn
+        steer = math.degrees(course + action[1]) % 360.0
+        north, east = way.displacement[0].tolist()
+        (nn, ne), (en, ee) = way.covariance[0].tolist()
+        estimates = (north, east), ((nn, ne), (en, ee)), probability, stop, reason, radius
+        return Command(action[0], math.degrees(action[1]), steer, *estimates)
 
-    def _command(self, observed: TensorDictBase, action: tuple[float, float], course: float) -> Command:
-        """Return the command, with the estimates northward and eastward."""
-        cos, sin = math.cos(course), math.sin(course)
-        (forward, right), ((ff, fr), (_, rr)) = observed["way"][0].tolist(), observed["way_covariance"][0].tolist()
-        north, east = cos * forward - sin * right, sin * forward + cos * right
-        ne = cos * sin * (ff - rr) + (cos * cos - sin * sin) * fr
-        nn = cos * cos * ff - 2 * cos * sin * fr + sin * sin * rr
-        ee = ff + rr - nn
-        confidence = self._confidence(observed)
-        stop, reason = self._stop(math.hypot(north, east), math.sqrt(nn + ee), confidence)
-        distance, turn = (0.0, 0.0) if stop else action
-        steer = math.degrees(course + turn) % 360.0
-        way = (north, east), ((nn, ne), (ne, ee))
-        return Command(distance, math.degrees(turn), steer, *way, confidence, stop, reason)
-
-    def _stop(self, way_km: float, error_km: float, confidence: float) -> tuple[str | None, str]:
+    def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return why to stop, and that as a sentence."""
         level = sum(self._surprises) / max(len(self._surprises), 1)
         if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
             return "lost", f"readings deviate {level**0.5:.0f} times as much as expected: check sensors and compass"
-        slope = tracking.steepest(self._estimator.track, 1, self._estimator.tracker.scales)
+        slope = tracking.steepest(self._estimator.track, 1)
         if abs(self._last[1]) <= math.pi / 2 and slope < EQUATOR_SLOPE_DEG:
             return "lost", f"inclination {self._last[1]:g} hardly changes: it looks like radians; degrees are expected"
         if text := out_of_range(self._view, self._last[:3]):
             return "out of range", text
+        way_km, error_km = way.displacement.norm().item(), way.covariance[0].trace().sqrt().item()
         if self._estimator.trained and way_km - 2 * error_km > LONGEST_WAY_KM:
             return "out of range", f"the way is {way_km:.0f} ± {error_km:.0f} km, the policy's {LONGEST_WAY_KM:g} km"
-        if confidence >= self.confidence:
-            rule = f"F < {self.zeta:g}" if self.arrival_km is None else f"within {self.arrival_km:g} km"
-            return "arrived", f"{rule} with an estimated probability of {confidence:.2f}"
-        if self._step > self.max_steps:
-            return "lost", f"{self.max_steps} moves without arrival"
+        if not decision.declare.item() or level > LOST_SURPRISE:
+            return None, ""
+        if decision.probability.item() >= self.confidence:
+            within = f"within {self.arrival_km:g} km with an estimated probability of {decision.probability.item():.2f}"
+            return "arrived", within
+        near = f"within {radius_km:.0f} km with an estimated probability of {self.confidence:.2f}"
+        if self._step >= self.max_steps - 1:
+            return "nearest", f"out of steps: {near}"
+        if decision.attainable.item() < self.confidence:
+            return "nearest", f"as near as these sensors allow: {near}"
         return None, ""
 
     def save(self, path: Path | str) -> None:

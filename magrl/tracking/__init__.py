@@ -1,7 +1,7 @@
 """Estimation of a field and its gradient along a dead-reckoned track."""
 
-from magrl.tracking.belief import probability_below, probability_within, steepest, surprise
-from magrl.tracking.decision import ArrivalDecision, approach, arrival_decision
+from magrl.tracking.belief import steepest, surprise
+from magrl.tracking.decision import RANGE_KM, ArrivalDecision, approach, arrival_decision
 from magrl.tracking.filter import (
     CURVATURE,
     DISTANCE_SCALE_KM,
@@ -39,6 +39,7 @@ __all__ = [
     "DISTANCE_SCALE_KM",
     "ELEMENT_PERIODS",
     "ELEMENT_SCALES",
+    "RANGE_KM",
     "VARIANCE_FLOOR",
     "VISITED",
     "ArrivalDecision",
@@ -58,8 +59,6 @@ __all__ = [
     "estimated_gradient",
     "field_curvature",
     "predict",
-    "probability_below",
-    "probability_within",
     "read",
     "relate",
     "related",

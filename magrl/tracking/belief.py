@@ -1,19 +1,10 @@
-"""Reliability of the filter's estimates: probabilities of arrival, and how well a reading fits the track.
-
-Probabilities are means over a fixed set of 1024 quasi-random points of the normal distribution, so that equal estimates
-have equal probabilities.
-"""
+"""How well a reading fits the track, and how steep the field may be."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from functools import cache
 
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_numbers, check_tensor
-from magrl.field.elements import element_difference
 from magrl.tracking.filter import (
     ELEMENT_PERIODS,
     ELEMENT_SCALES,
@@ -26,60 +17,6 @@ from magrl.tracking.filter import (
     predict,
 )
 from magrl.tracking.priors import field_curvature
-from magrl.tracking.search import arrival_weights
-
-_POINTS = 1024
-
-
-@cache
-def _normal() -> Tensor:
-    """Points of the standard normal distribution in three dimensions, ``(1024, 3)``."""
-    points = torch.quasirandom.SobolEngine(3, scramble=True, seed=0).draw(_POINTS, dtype=torch.float64)
-    return torch.special.ndtri(points.clamp(1e-6, 1 - 1e-6))
-
-
-def probability_below(
-    first: Sequence[float], target: Sequence[float], estimate: Sequence[float], std: Sequence[float], zeta: float
-) -> float:
-    """Return the probability that the objective F (Eq. 2-6) is below a threshold, for independent normal errors.
-
-    Args:
-        first: D [deg], I [deg], B_H [nT] where the way began.
-        target: the same at the destination.
-        estimate: the same at the vehicle, as estimated.
-        std: standard deviations of the errors of the estimate.
-        zeta: threshold.
-
-    Example:
-        >>> first, target = (0.0, 60.0, 20000.0), (10.0, 60.0, 20000.0)
-        >>> probability_below(first, target, (9.0, 60.0, 20000.0), (0.5, 0.0, 0.0), 0.01)
-        0.5
-    """
-    check_numbers(3, first=first, target=target, estimate=estimate, std=std)
-    check_number(0, above=True, zeta=zeta)
-    start, end, here, deviation = torch.tensor((first, target, estimate, std), dtype=torch.float64)
-    ends = element_difference(end, here) + deviation * _normal()
-    return (ends.square() @ arrival_weights(start, end, zeta) < 1).double().mean().item()
-
-
-def probability_within(way: Tensor, covariance: Tensor, radius_km: float) -> float:
-    """Return the probability that the destination is within a radius, for a normal error of the way to it.
-
-    Args:
-        way: ``(2,)`` estimated way [km].
-        covariance: ``(2, 2)`` its covariance [km^2].
-        radius_km: radius [km].
-
-    Example:
-        >>> probability_within(torch.tensor([3.0, 4.0]), 1e-6 * torch.eye(2), 6.0)
-        1.0
-    """
-    check_tensor(2, way=way)
-    check_tensor(2, 2, covariance=covariance)
-    check_number(0, above=True, radius_km=radius_km)
-    values, axes = torch.linalg.eigh(covariance.double())
-    ends = way.double() + (_normal()[:, :2].to(way.device) * values.clamp_min(0).sqrt()) @ axes.mT
-    return (ends.norm(dim=-1) <= radius_km).double().mean().item()
 
 
 def surprise(

@@ -20,14 +20,16 @@ from magrl.tracking.filter import (
     _variance,
     estimated_field,
 )
-from magrl.tracking.posterior import _NORMAL, WayPosterior, way_posterior
+from magrl.tracking.posterior import WayPosterior, _sobol, way_posterior
 from magrl.tracking.priors import curl_relation, field_curvature
 from magrl.tracking.track import related
 
-TRIP_KM = 400.0
-"""Path before the decision [km]: another kilometer has to make a right declaration about 1/400 more likely."""
-STEP_KM = 0.2
+TRIP_KM = 800.0
+"""Path before the decision [km]: another kilometer has to make a right declaration about 1/800 more likely."""
+STEP_KM = 1.0
 """Path that a reading costs [km]."""
+RANGE_KM = 500.0
+"""Prior standard deviation of the way along each axis [km]."""
 READINGS = (1, 2, 4, 8, 16, 32)
 """Numbers of further readings at the estimated place that are compared with declaring now."""
 
@@ -60,7 +62,7 @@ def arrival_decision(
     bias_std: PerElement,
     steps_left: Tensor,
     radius_km: float,
-    range_km: float,
+    range_km: float = RANGE_KM,
 ) -> ArrivalDecision:
     """Return whether to declare that the target is within a radius, or to go to the estimated place and read on.
 
@@ -87,15 +89,14 @@ def arrival_decision(
         >>> here = torch.tensor([8.0, -16.0, 35000.0])
         >>> track = start(here, dipole_prior(here), (0.02, 0.02, 2.0))
         >>> std = (0.02, 0.02, 2.0), (0.0, 0.0, 0.0)
-        >>> arrival_decision(track, here, *std, torch.tensor(9), radius_km=25.0, range_km=300.0).declare
-        tensor(True)
+        >>> decision = arrival_decision(track, here, *std, torch.tensor(9), radius_km=25.0, range_km=300.0)
+        >>> decision.probability.round(decimals=2), decision.declare  # another reading is worth more
+        (tensor(0.8300), tensor(False))
     """
     check_number(0, above=True, radius_km=radius_km)
     known, shared = related(track, curl_relation)
     curvature = field_curvature(estimated_field(known))
-    posterior = way_posterior(
-        known, target, range_km, shared=shared, bias_std=bias_std, periods=ELEMENT_PERIODS, curvature=curvature
-    )
+    posterior = way_posterior(known, target, range_km, ELEMENT_SCALES, shared, bias_std, ELEMENT_PERIODS, curvature)
     probability, way = posterior.within(radius_km), posterior.way().displacement
     unit, count = _units(known, ELEMENT_SCALES), 3
     noise = _variance(sensor_std, unit).unsqueeze(-2)
@@ -157,3 +158,6 @@ def _within(track: FieldTrack, variance: Tensor, radius_km: float) -> Tensor:
     east = second * y
     north = first * (x - below * east)
     return (torch.hypot(north, east) * DISTANCE_SCALE_KM <= radius_km).to(variance.dtype).mean(-1)
+
+
+_NORMAL = torch.special.ndtri(_sobol(512, seed=2).clamp(1e-6, 1 - 1e-6))  # standard normal

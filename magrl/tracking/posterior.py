@@ -25,7 +25,7 @@ from magrl.tracking.filter import (
 )
 from magrl.tracking.way import Way, way_to
 
-_BEARINGS, _RINGS, _NEAR_KM, _FAR_KM = 24, 16, 4.0, 2000.0  # of the points around the vehicle
+_NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances of the points around the vehicle
 _SPREAD = 1.5  # standard deviations of the points around the estimated way, over those of the way
 _LEAST_VARIANCE = 1e-8  # of a remaining difference, in squared scaled units
 _LEAST_AREA = 1e-6  # of the points around the way, in squared scaled units: a standard deviation of 0.1 km
@@ -141,32 +141,36 @@ def way_posterior(
 
 
 def _points(way: Way) -> tuple[Tensor, Tensor]:
-    """Return points ``(..., M, 2)`` around a way and around the vehicle, and their density ``(..., M)``, unnormalized."""
+    """Return points ``(..., M, 2)`` around a way and the vehicle, and their density ``(..., M)``, unnormalized."""
     center, covariance = way.displacement.unsqueeze(-2), way.covariance * _SPREAD**2
     first = covariance[..., 0, 0].clamp_min(_LEAST_AREA).sqrt().unsqueeze(-1)  # Cholesky factor
     below = covariance[..., 0, 1].unsqueeze(-1) / first
     second = (covariance[..., 1, 1].unsqueeze(-1) - below * below).clamp_min(_LEAST_AREA).sqrt()
-    normal, rings = _NORMAL.to(center), _rings().to(center)
+    normal, around = _NORMAL.to(center), _AROUND.to(center)
     x, y = normal.unbind(-1)
     near = center + torch.stack((first * x, below * x + second * y), -1)
-    points = torch.cat((near, rings.expand(*near.shape[:-2], *rings.shape)), -2)
+    points = torch.cat((near, around.expand(*near.shape[:-2], *around.shape)), -2)
     dn, de = (points - center).unbind(-1)
     z0 = dn / first
     z1 = (de - below * z0) / second
     bell = torch.exp(-(z0 * z0 + z1 * z1) / 2) * (len(normal) / (2 * math.pi)) / (first * second)
     nearest = (_NEAR_KM / DISTANCE_SCALE_KM) ** 2
-    return points, bell + _RING_DENSITY / points.square().sum(-1).clamp_min(nearest)
+    return points, bell + _AROUND_DENSITY / points.square().sum(-1).clamp_min(nearest)
 
 
-def _rings() -> Tensor:
-    """Return points ``(384, 2)`` around the vehicle in scaled units, whose density is that of the inverse square."""
-    ring, number = torch.meshgrid(torch.arange(_RINGS), torch.arange(_BEARINGS), indexing="ij")
-    radius = _NEAR_KM / DISTANCE_SCALE_KM * torch.exp((ring + 0.5) * _LOG_STEP)
-    bearing = 2 * math.pi / _BEARINGS * (number + 0.5 * (ring % 2))
-    return torch.stack((radius * torch.cos(bearing), radius * torch.sin(bearing)), -1).flatten(0, 1)
+def _sobol(count: int, seed: int) -> Tensor:
+    """Return quasi-random points ``(count, 2)`` between 0 and 1."""
+    return torch.quasirandom.SobolEngine(2, scramble=True, seed=seed).draw(count, dtype=torch.float64)
 
 
-_LOG_STEP = math.log(_FAR_KM / _NEAR_KM) / _RINGS
-_RING_DENSITY = _BEARINGS / (2 * math.pi * _LOG_STEP)
-_SOBOL = torch.quasirandom.SobolEngine(2, scramble=True, seed=0).draw(128, dtype=torch.float64)
-_NORMAL = torch.special.ndtri(_SOBOL.clamp(1e-6, 1 - 1e-6))  # standard normal, (128, 2)
+def _around(count: int) -> Tensor:
+    """Return points ``(count, 2)`` around the vehicle in scaled units, whose density is that of the inverse square."""
+    share, turn = _sobol(count, seed=1).unbind(-1)
+    radius, bearing = _NEAR_KM / DISTANCE_SCALE_KM * torch.exp(share * _LOG_RANGE), 2 * math.pi * turn
+    return torch.stack((radius * torch.cos(bearing), radius * torch.sin(bearing)), -1)
+
+
+_LOG_RANGE = math.log(_FAR_KM / _NEAR_KM)
+_NORMAL = torch.special.ndtri(_sobol(128, seed=0).clamp(1e-6, 1 - 1e-6))  # standard normal
+_AROUND = _around(384)
+_AROUND_DENSITY = len(_AROUND) / (2 * math.pi * _LOG_RANGE)

@@ -32,8 +32,8 @@ class DeclareArrival(ObservationTransform):
         max_steps: step limit: the last step declares.
         confidence: least probability at which the vehicle declares; below, the episode ends without a declaration.
         range_km: prior standard deviation of the way along each axis [km].
-        in_keys: values at the target ``(..., 3)``, mean ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the filter,
-            heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, and optionally the standard deviations
+        in_keys: values at the target ``(..., 3)``, mean ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the
+            filter, heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, and optionally the standard deviations
             ``(..., 3)`` of new errors of a reading, and of constant and slow ones.
         out_keys: probability ``(..., 1)`` that the target is within the radius, the probability ``(..., 1)`` at which
             going on is worth as much, and the mean way ``(..., 2)`` northward and eastward [km].
@@ -69,7 +69,7 @@ class DeclareArrival(ObservationTransform):
         *,
         max_steps: int,
         confidence: float = 0.0,
-        range_km: float = 300.0,
+        range_km: float = tracking.RANGE_KM,
         in_keys: GivenKeys = None,
         out_keys: GivenKeys = None,
         action_key: NestedKey = "action",

@@ -1,0 +1,72 @@
+"""The posterior of the way: against an integral in NumPy, and calibrated on fields drawn from the filter's state."""
+
+import numpy as np
+import pytest
+import torch
+from support.tracks import F64, f64, randn, random_track
+
+from magrl.tracking import FieldTrack, GradientRelation, relate, way_posterior
+
+ONE = (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("related", [False, True])
+def test_it_is_the_integral_of_its_density(related: bool) -> None:
+    """On a grid of 3 km over 3000 km, with errors that are constant and a gradient that changes along the way."""
+    (track, shared), target = (random_track(6, 3), None), randn(6, 3, seed=7)
+    if related:
+        relation = GradientRelation(100 * randn(6, 3, 2, seed=5), randn(6, seed=6), randn(6, seed=7).abs() + 0.1)
+        track, shared = relate(track, relation, ONE)
+    bias, bend = f64(0.1, 0.0, 0.2), f64(0.05, 0.0, 0.1)
+    posterior = way_posterior(track, target, 200.0, ONE, shared, bias, curvature=bend)
+    axis = np.arange(-1500, 1500, 3) / 100
+    way = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1)
+    lever = np.concatenate((np.ones((*way.shape[:2], 1)), way), -1)
+    for n in range(6):
+        mean, blocks = track.mean[n].numpy(), track.covariance[n].numpy()
+        variance = np.einsum("xyi,eij,xyj->xye", lever, blocks, lever)
+        variance += bias.numpy() ** 2 + bend.numpy() ** 2 * (way**2).sum(-1, keepdims=True) ** 2 / 4
+        covariance = variance[..., None] * np.eye(3)
+        if shared is not None:
+            together = lever @ shared[n].numpy().T
+            covariance -= together[..., None] * together[..., None, :]
+        left = target[n].numpy() - lever @ mean.T
+        square = np.einsum("xye,xyef,xyf->xy", left, np.linalg.inv(covariance), left)
+        density = np.exp(-(square + np.linalg.slogdet(covariance)[1] + (way**2).sum(-1) / 4) / 2)
+        density /= density.sum()
+        expected = (density[..., None] * way).sum((0, 1)) * 100
+        within = density[(way**2).sum(-1) <= 0.5**2].sum()
+        size = np.sqrt((density * ((100 * way - expected) ** 2).sum(-1)).sum())
+        found = posterior.way()
+        assert np.linalg.norm(found.displacement[n].numpy() - expected) < 0.1 * size
+        assert found.covariance[n].trace().sqrt().item() == pytest.approx(size, rel=0.1)
+        assert posterior.within(50.0)[n].item() == pytest.approx(within, abs=0.03)
+
+
+def test_its_probabilities_are_the_shares_of_fields_drawn_from_the_state() -> None:
+    """4000 ways from the prior and fields from the filter, with gradients that are known to a third of their size."""
+    count, spread = 4000, 0.3
+    mean = torch.cat((torch.zeros(3, 1, dtype=F64), f64((1.0, 0.2), (-0.1, 0.8), (0.5, -0.5))), -1)
+    covariance = torch.diag(f64(0.01, spread**2, spread**2)).expand(3, 3, 3)
+    way = 0.6 * randn(count, 2, seed=1)
+    state = mean + randn(count, 3, 3, seed=2) * f64(0.1, spread, spread)
+    target = state[..., 0] + (state[..., 1:] * way[:, None]).sum(-1)
+    track = FieldTrack(mean.expand(count, 3, 3), covariance.expand(count, 3, 3, 3))
+    posterior = way_posterior(track, target, 60.0, ONE)
+    probability, right = posterior.within(40.0), 100 * way.norm(dim=-1) <= 40.0
+    for low in torch.arange(0, 1, 0.2):
+        bin_ = (probability >= low) & (probability <= low + 0.2)
+        assert right[bin_].double().mean().item() == pytest.approx(probability[bin_].mean().item(), abs=0.05)
+    held = 100 * way.norm(dim=-1) <= posterior.radius(0.8)
+    assert held.double().mean().item() == pytest.approx(0.8, abs=0.03)
+    estimate = posterior.way()
+    error = 100 * way - estimate.displacement
+    squares = (error * torch.linalg.solve(estimate.covariance, error)).sum(-1) / 2
+    assert squares.mean().item() == pytest.approx(1, abs=0.1)
+
+
+def test_both_precisions_agree() -> None:
+    track, target = random_track(50, 3), randn(50, 3, seed=7)
+    exact = way_posterior(track, target, 200.0, ONE).way()
+    low = way_posterior(FieldTrack(*(x.float() for x in track)), target.float(), 200.0, ONE).way()
+    torch.testing.assert_close(low.displacement.double(), exact.displacement, rtol=1e-3, atol=0.1)
