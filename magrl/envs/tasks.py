@@ -291,8 +291,7 @@ def named_tasks(name: str) -> Tasks:
         >>> named_tasks("figure-4-1").start
         tensor([[ -2., 162.]], dtype=torch.float64)
     """
+    check_choice(TASK_SETS, tasks=name)
     if name in RANDOM_SETS:
         return task_set(*RANDOM_SETS[name])
-    if name == "figure-4-1":
-        return Tasks(*(torch.tensor([end], dtype=torch.float64) for end in (paper.EXAMPLE_START, paper.EXAMPLE_TARGET)))
-    raise ValueError(f"unknown task set {name!r}: choose from {', '.join(TASK_SETS)}")
+    return Tasks(*(torch.tensor([end], dtype=torch.float64) for end in (paper.EXAMPLE_START, paper.EXAMPLE_TARGET)))

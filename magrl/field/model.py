@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
@@ -21,7 +22,6 @@ class FieldModel(Protocol):
     """Interface of a field model, as environments use it.
 
     Example:
-        >>> import torch
         >>> class UniformField:
         ...     def __call__(self, latitude, longitude):
         ...         return torch.tensor([30000.0, 0.0, 30000.0]).expand(*latitude.shape, 3)
@@ -54,7 +54,6 @@ class Float64Module(nn.Module):
     """A module that follows device moves but keeps float64: float32 coefficients would cost meters of position.
 
     Example:
-        >>> import torch
         >>> from magrl.field import IGRF
         >>> field = IGRF("2022-01-01").half()
         >>> isinstance(field, Float64Module), field.value_weights.dtype
@@ -78,7 +77,6 @@ def in_chunks(function: Callable[..., Tensor], points: Sequence[Tensor], rows: i
         ``(rows, P)``.
 
     Example:
-        >>> import torch
         >>> in_chunks(lambda x: torch.stack((x, x * x)), [torch.arange(5.0)], rows=2, chunk=2)
         tensor([[ 0.,  1.,  2.,  3.,  4.],
                 [ 0.,  1.,  4.,  9., 16.]])
@@ -104,7 +102,6 @@ def elements_at(field: FieldModel | FieldBankModel, position: Tensor, index: Ten
         ``(..., 3)``: D [deg], I [deg], B_H [nT].
 
     Example:
-        >>> import torch
         >>> from magrl.field import IGRF
         >>> paper = IGRF("2022-01-01", generation=13)
         >>> [round(x, 2) for x in elements_at(paper, torch.tensor([-2.0, 162.0])).tolist()]
@@ -128,7 +125,6 @@ def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]
         ValueError: for an empty tensor of positions.
 
     Example:
-        >>> import torch
         >>> from magrl.field import IGRF
         >>> corners = torch.tensor([[-10.0, 160.0], [-10.0, 170.0], [0.0, 160.0], [0.0, 170.0]])
         >>> low, high = elements_range(IGRF("2022-01-01"), corners)
@@ -153,7 +149,6 @@ def elements_gradient_at(field: FieldModel | FieldBankModel, position: Tensor, i
         ``(..., 3, 2)``: element unit per km, northward and eastward.
 
     Example:
-        >>> import torch
         >>> from magrl.field import IGRF
         >>> elements_gradient_at(IGRF("2022-01-01"), torch.tensor([-5.0, 165.0])).round(decimals=4)
         tensor([[-0.0012,  0.0015],
@@ -162,6 +157,18 @@ def elements_gradient_at(field: FieldModel | FieldBankModel, position: Tensor, i
     """
     check_tensor(2, position=position)
     return elements_gradient(*field.value_and_gradient(*_place(field, position, index)))
+
+
+def device_of(field: object) -> torch.device:
+    """Return the device of the coefficients of a field model; the CPU for one without any.
+
+    Example:
+        >>> from magrl.field import IGRF
+        >>> device_of(IGRF("2022-01-01"))
+        device(type='cpu')
+    """
+    buffers = field.buffers() if isinstance(field, nn.Module) else iter(())
+    return next((values.device for values in buffers), torch.device("cpu"))
 
 
 def _place(field: FieldModel | FieldBankModel, position: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:
