@@ -68,15 +68,13 @@ class Region:
             position: ``(..., 2)`` latitude, longitude [deg], unwrapped.
 
         Raises:
-            ValueError: for an empty tensor, or a non-finite position.
+            ValueError: for a non-finite position.
 
         Example:
             >>> Region((-10, 0), (160, 170)).holding(torch.tensor([[-12.0, 165.0]]))
             Region(latitude=(-12.0, 0.0), longitude=(160.0, 170.0))
         """
         check_tensor(2, position=position)
-        if not position.numel() or not position.isfinite().all():
-            raise ValueError(f"position must hold finite numbers, got {position!r}")
         low, high = (end(position.reshape(-1, 2), 0).tolist() for end in (torch.amin, torch.amax))
         (south, north), (west, east) = self.latitude, self.longitude
         return Region((min(south, low[0]), max(north, high[0])), (min(west, low[1]), max(east, high[1])))

@@ -35,6 +35,7 @@ class SphericalHarmonicField(Float64Module):
                 [    0.,     0., 60410.]], dtype=torch.float64)
     """
 
+    shown: ClassVar[tuple[str, ...]] = ("degree", "altitude_km")
     altitude_range_km: ClassVar[tuple[float, float]] = (-100.0, math.inf)
     """Range of altitudes [km]: below it there are sources, and the expansion does not hold."""
     CHUNK = 16384

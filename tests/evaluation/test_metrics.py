@@ -287,8 +287,6 @@ def test_bad_values_are_named() -> None:
     places, index = torch.zeros(2, 2), torch.zeros(2, dtype=torch.int64)
     ones = torch.ones(2, 3), IGRF("2022-01-01"), 0.01, Regions.of(Region((-10, 0), (160, 170))), index
     for call, message in (
-        (lambda: first_episode_mask(torch.zeros(2, 3)), "done must be bool of shape"),
-        (lambda: first_episode_mask(torch.ones(1, 3, 2, dtype=torch.bool)), r"done must be .*\(1, 3, 2\)"),
         (lambda: episode_measures(TensorDict(batch_size=[2, 0])), r"each at least 1, got \(2, 0\)"),
         (lambda: summarize({"success": torch.ones(2)}), "success must be bool"),
         (lambda: distance_to_arrival(places[:, :1], places, *ones), r"start .*\(2, 1\)"),
