@@ -153,12 +153,11 @@ class GeomagneticNavEnv(EnvBase):
             field = copy.deepcopy(field).to(self.device)
         self.field = field
 
-    def observation_view(self, *, observe_heading: bool = True, observe_difference: bool = True) -> ObservationView:
+    def observation_view(self, **observed: bool) -> ObservationView:
         """Return what an agent observes of this environment, scaled to the range of the field over the region.
 
         Args:
-            observe_heading: whether cosine and sine of the heading are observed.
-            observe_difference: whether target elements minus measured elements are observed.
+            **observed: ``observe_heading`` and ``observe_difference`` of :class:`~magrl.transforms.ObservationView`.
 
         Raises:
             ValueError: over several regions, which have no range in common.
@@ -170,12 +169,11 @@ class GeomagneticNavEnv(EnvBase):
         one_region(self.region)
         low, high = elements_range(self.field, self.region.grid(81))
         return ObservationView(
-            observe_heading=observe_heading,
-            observe_difference=observe_difference,
             field_low=tuple(low.tolist()),
             field_high=tuple(high.tolist()),
             max_move_km=self.max_move_km,
             max_turn_rad=self.max_turn_rad,
+            **observed,
         )
 
     # Specs

@@ -213,7 +213,7 @@ def test_a_map_must_be_given_with_its_regions(box: GeomagneticNavEnv, earth: Geo
         MapMatching(box.field, None)
     with pytest.raises(ValueError, match="1 boxes, and field 16 expansions"):
         MapMatching(earth.field, box.edge)
-    with pytest.raises(ValueError, match="1 maps and region 16 boxes"):
+    with pytest.raises(ValueError, match="16 boxes, and field 1 expansions"):
         MapMatching(box.field, earth.edge)
     with pytest.raises(ValueError, match=r"2040.*outside IGRF"):
         MapMatching.for_env(box, map_date="2040-01-01")
