@@ -49,6 +49,8 @@ class Kalman(QuasiNewton):
         max_turn_rad: largest turn [rad].
         sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
         max_steps: step limit of the episode.
+        caution: weight of the uncertainty; for None that of :func:`trade_off`.
+        step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
         bias_std: standard deviations of constant and slow errors of the readings.
         zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
@@ -75,6 +77,8 @@ class Kalman(QuasiNewton):
         max_turn_rad: float = math.pi / 2,
         sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
         max_steps: int = 50,
+        caution: float | None = None,
+        step_km: float | None = None,
         range_km: float = 300.0,
         bias_std: Sequence[float] = (0.0, 0.0, 0.0),
         zeta: float = 0.01,
@@ -86,7 +90,11 @@ class Kalman(QuasiNewton):
         check_number(0, above=True, range_km=range_km, zeta=zeta)
         check_type(bool, search=search)
         self.max_steps, self.range_km, self.search = int(max_steps), float(range_km), search
-        self.zeta, (self.caution, self.step_km) = float(zeta), trade_off(sensor_std)
+        usual_caution, usual_step_km = trade_off(sensor_std)
+        self.zeta, self.caution = float(zeta), usual_caution if caution is None else caution
+        self.step_km = usual_step_km if step_km is None else step_km
+        check_number(0, caution=self.caution)
+        check_number(0, above=True, step_km=self.step_km)
         self._register("bias_std", bias_std)
 
     def prior(self, reading: Tensor) -> GradientPrior:
