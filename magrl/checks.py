@@ -224,15 +224,11 @@ class CheckedModel(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ValueError(self._message(error)) from None
+            raise ValueError("; ".join(dict.fromkeys(map(self._sentence, error.errors())))) from None
 
     def replace(self, **values: Any) -> Self:
         """Return a copy with other values, validated again; what was not given keeps its default."""
         return type(self)(**{name: getattr(self, name) for name in self.model_fields_set} | values)
-
-    @classmethod
-    def _message(cls, error: ValidationError) -> str:
-        return "; ".join(dict.fromkeys(cls._sentence(item) for item in error.errors()))
 
     @classmethod
     def _sentence(cls, item: Any) -> str:

@@ -1,27 +1,18 @@
 """Agents: networks, the TD3 losses that train them, and trained policies with their files."""
 
-from magrl.agents.exported import ExportedPolicy, export_policy
-from magrl.agents.networks import make_actor, make_critic
-from magrl.agents.policy import FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.agents.pretrained import load_pretrained
-from magrl.agents.recurrent import RecurrentTD3Loss, make_recurrent_actor, recurrent_transforms
-from magrl.agents.td3 import SoftUpdate, TD3Loss, optimize, saturation_penalty
-
-__all__ = [
-    "ExportedPolicy",
-    "FieldPolicy",
-    "PolicyConfig",
-    "RecurrentTD3Loss",
-    "SoftUpdate",
-    "TD3Loss",
-    "export_policy",
-    "load_policy",
-    "load_pretrained",
-    "make_actor",
-    "make_critic",
-    "make_recurrent_actor",
-    "optimize",
-    "recurrent_transforms",
-    "saturation_penalty",
-    "save_policy",
-]
+from magrl.agents.exported import ExportedPolicy as ExportedPolicy
+from magrl.agents.exported import export_policy as export_policy
+from magrl.agents.networks import make_actor as make_actor
+from magrl.agents.networks import make_critic as make_critic
+from magrl.agents.policy import FieldPolicy as FieldPolicy
+from magrl.agents.policy import PolicyConfig as PolicyConfig
+from magrl.agents.policy import load_policy as load_policy
+from magrl.agents.policy import save_policy as save_policy
+from magrl.agents.pretrained import load_pretrained as load_pretrained
+from magrl.agents.recurrent import RecurrentTD3Loss as RecurrentTD3Loss
+from magrl.agents.recurrent import make_recurrent_actor as make_recurrent_actor
+from magrl.agents.recurrent import recurrent_transforms as recurrent_transforms
+from magrl.agents.td3 import SoftUpdate as SoftUpdate
+from magrl.agents.td3 import TD3Loss as TD3Loss
+from magrl.agents.td3 import optimize as optimize
+from magrl.agents.td3 import saturation_penalty as saturation_penalty

@@ -20,7 +20,7 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate as TorchRLSoftUpdate
 from torchrl.objectives import TD3Loss as TorchRLTD3Loss
 
-from magrl.checks import check_number, check_tensor, check_type
+from magrl.checks import check_choice, check_number, check_tensor, check_type
 
 
 class Networks(NamedTuple):
@@ -83,8 +83,7 @@ class TD3Loss(TorchRLTD3Loss):
         check_type(ValueOperator, critic=critic)
         check_number(0, 1, gamma=gamma)
         check_number(0, policy_noise=policy_noise, noise_clip=noise_clip)
-        if precision not in ("float32", "bfloat16"):
-            raise ValueError(f"precision must be 'float32' or 'bfloat16', got {precision!r}")
+        check_choice(("float32", "bfloat16"), precision=precision)
         super().__init__(
             actor,
             critic,

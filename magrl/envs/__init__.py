@@ -1,25 +1,16 @@
 """The navigation environment, its scenarios and tasks, and its Gymnasium interface (:mod:`magrl.envs.gymnasium`)."""
 
-from magrl.envs.geomagnetic import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
-from magrl.envs.random_regions import earth_scenario, planet_scenario
-from magrl.envs.regions import PAPER_REGION, Region, Regions
-from magrl.envs.scenario import Scenario
-from magrl.envs.scenario_files import load_scenario
-from magrl.envs.tasks import TASK_SETS, Tasks, named_tasks, task_set
-
-__all__ = [
-    "PAPER_REGION",
-    "PRIVILEGED_KEYS",
-    "PUBLIC_KEYS",
-    "TASK_SETS",
-    "GeomagneticNavEnv",
-    "Region",
-    "Regions",
-    "Scenario",
-    "Tasks",
-    "earth_scenario",
-    "load_scenario",
-    "named_tasks",
-    "planet_scenario",
-    "task_set",
-]
+from magrl.envs.geomagnetic import PRIVILEGED_KEYS as PRIVILEGED_KEYS
+from magrl.envs.geomagnetic import PUBLIC_KEYS as PUBLIC_KEYS
+from magrl.envs.geomagnetic import GeomagneticNavEnv as GeomagneticNavEnv
+from magrl.envs.random_regions import earth_scenario as earth_scenario
+from magrl.envs.random_regions import planet_scenario as planet_scenario
+from magrl.envs.regions import PAPER_REGION as PAPER_REGION
+from magrl.envs.regions import Region as Region
+from magrl.envs.regions import Regions as Regions
+from magrl.envs.scenario import Scenario as Scenario
+from magrl.envs.scenario_files import load_scenario as load_scenario
+from magrl.envs.tasks import TASK_SETS as TASK_SETS
+from magrl.envs.tasks import Tasks as Tasks
+from magrl.envs.tasks import named_tasks as named_tasks
+from magrl.envs.tasks import task_set as task_set

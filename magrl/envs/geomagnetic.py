@@ -29,6 +29,7 @@ from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
 from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
+from magrl.field.model import device_of
 from magrl.geodesy import displaced, move, polar, wrap_angle
 from magrl.transforms.errors.motion import DISPLACEMENT
 from magrl.transforms.views import ObservationView
@@ -148,17 +149,15 @@ class GeomagneticNavEnv(EnvBase):
         self.tasks = scenario.tasks and Tasks(*(values.to(self.device) for values in scenario.tasks))
         field = scenario.build_field(self.drift_km)
         self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
+        if isinstance(field, torch.nn.Module) and device_of(field) != self.device:
+            field = copy.deepcopy(field).to(self.device)
         self.field = field
-        if isinstance(field, torch.nn.Module):
-            held = (*field.parameters(), *field.buffers())
-            self.field = copy.deepcopy(field).to(self.device) if any(x.device != self.device for x in held) else field
 
-    def observation_view(self, *, observe_heading: bool = True, observe_difference: bool = True) -> ObservationView:
+    def observation_view(self, **observed: bool) -> ObservationView:
         """Return what an agent observes of this environment, scaled to the range of the field over the region.
 
         Args:
-            observe_heading: whether cosine and sine of the heading are observed.
-            observe_difference: whether target elements minus measured elements are observed.
+            **observed: ``observe_heading`` and ``observe_difference`` of :class:`~magrl.transforms.ObservationView`.
 
         Raises:
             ValueError: over several regions, which have no range in common.
@@ -170,12 +169,11 @@ class GeomagneticNavEnv(EnvBase):
         one_region(self.region)
         low, high = elements_range(self.field, self.region.grid(81))
         return ObservationView(
-            observe_heading=observe_heading,
-            observe_difference=observe_difference,
             field_low=tuple(low.tolist()),
             field_high=tuple(high.tolist()),
             max_move_km=self.max_move_km,
             max_turn_rad=self.max_turn_rad,
+            **observed,
         )
 
     # Specs

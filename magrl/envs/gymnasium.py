@@ -176,10 +176,8 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         inside = ((array >= space.low - slack) & (array <= space.high + slack)).all(-1)
         if not inside.all():
             vehicle = int(inside.argmin())
-            limits = ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(space.low[0], space.high[0], strict=True))
-            raise ValueError(
-                f"action {array[vehicle].tolist()} of vehicle {vehicle} is not finite or out of bounds, {limits}"
-            )
+            bounds = f"is not finite or out of bounds, {self.single_action_space}"
+            raise ValueError(f"action {array[vehicle].tolist()} of vehicle {vehicle} {bounds}")
         return torch.from_numpy(array).to(self.torchrl_env.device)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor, check_type
+from magrl.checks import check_number, check_tensor
 from magrl.envs.regions import Regions
 from magrl.field import elements_at, elements_gradient_at
 from magrl.geodesy import geodesic, move
@@ -49,7 +49,7 @@ def spl(success: Tensor, shortest_km: Tensor, length_km: Tensor) -> Tensor:
         0.
 
     Raises:
-        TypeError: for ``success`` that is not a bool tensor, or lengths that are not real tensors.
+        TypeError: for lengths that are not real tensors.
 
     Source:
         P. Anderson et al., On evaluation of embodied navigation agents, arXiv 1807.06757 (2018).
@@ -58,10 +58,7 @@ def spl(success: Tensor, shortest_km: Tensor, length_km: Tensor) -> Tensor:
         >>> spl(torch.tensor([True, True, False]), torch.full((3,), 400.0), torch.tensor([500.0, 390.0, 500.0]))
         tensor([0.8000, 1.0000, 0.0000])
     """
-    check_type(Tensor, success=success)
     check_tensor(shortest_km=shortest_km, length_km=length_km)
-    if success.dtype != torch.bool:
-        raise TypeError(f"success must be bool, got {success.dtype}")
     longer_km = torch.maximum(length_km, shortest_km)
     return success * torch.where(longer_km == 0, 1.0, shortest_km / longer_km)
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from magrl import paper
 from magrl.checks import check_number, check_type
 from magrl.counters import counter_uniform
 from magrl.envs.regions import Regions
@@ -31,8 +30,7 @@ def planet_scenario(count: int, seed: int, **options: Any) -> Scenario:
         **options: of :func:`region_scenario`.
 
     Raises:
-        TypeError: for an unknown option.
-        ValueError: as :func:`region_scenario`.
+        ValueError: for an unknown option, or as :func:`region_scenario`.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -60,8 +58,7 @@ def earth_scenario(
         **options: of :func:`region_scenario`.
 
     Raises:
-        TypeError: for an unknown option.
-        ValueError: for a date outside the field model; or as :func:`region_scenario`.
+        ValueError: for an unknown option, a date outside the field model, or as :func:`region_scenario`.
 
     Example:
         >>> scenario = earth_scenario(8, seed=0)
@@ -87,8 +84,7 @@ def region_scenario(
     max_move_km: float = 50.0,
     degree: int = 12,
     tolerance_nt: float = 0.1,
-    distance_range_km: tuple[float, float] = paper.DISTANCE_KM,
-    distance_law: Literal["area", "log"] = "area",
+    **options: Any,
 ) -> Scenario:
     """Return a scenario over random regions, each as wide as high at its middle.
 
@@ -106,8 +102,7 @@ def region_scenario(
         max_move_km: longest move of the environment; the field ends one move beyond the margin.
         degree: degree of the expansions of the field; larger regions need a higher one.
         tolerance_nt: largest error of the expansions [nT].
-        distance_range_km: shortest and longest distance of random tasks [km].
-        distance_law: ``"area"`` or ``"log"``, as in :class:`Scenario`.
+        **options: further fields of :class:`Scenario`, such as ``distance_range_km`` and ``distance_law``.
 
     Returns:
         The scenario, with floors of Eq. 2-6 from the field of each region.
@@ -143,8 +138,7 @@ def region_scenario(
         field=expand(regions, planet, tolerance_nt)[1],
         margin_deg=margin_deg,
         objective_floors=None,
-        distance_range_km=distance_range_km,
-        distance_law=distance_law,
+        **options,
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from magrl import paper
 from magrl.checks import check_number, check_numbers, check_tensor, check_type
-from magrl.field.bank import check_index, checked_boxes
+from magrl.field.bank import FieldBank, check_index, checked_boxes
 from magrl.field.model import Float64Module
 from magrl.geodesy import MEAN_RADIUS_KM, check_box, geodesic, wrap_longitude
 
@@ -68,15 +68,13 @@ class Region:
             position: ``(..., 2)`` latitude, longitude [deg], unwrapped.
 
         Raises:
-            ValueError: for an empty tensor, or a non-finite position.
+            ValueError: for a non-finite position.
 
         Example:
             >>> Region((-10, 0), (160, 170)).holding(torch.tensor([[-12.0, 165.0]]))
             Region(latitude=(-12.0, 0.0), longitude=(160.0, 170.0))
         """
         check_tensor(2, position=position)
-        if not position.numel() or not position.isfinite().all():
-            raise ValueError(f"position must hold finite numbers, got {position!r}")
         low, high = (end(position.reshape(-1, 2), 0).tolist() for end in (torch.amin, torch.amax))
         (south, north), (west, east) = self.latitude, self.longitude
         return Region((min(south, low[0]), max(north, high[0])), (min(west, low[1]), max(east, high[1])))
@@ -246,6 +244,26 @@ def one_region(region: Region | Regions) -> Region:
             f"this is made for one region, the scenario has {len(regions)}: take one of them, as region[0]"
         )
     return regions[0]
+
+
+def check_expansions(field: object, regions: Regions) -> None:
+    """Raise unless a bank has an expansion for each region, and a single field model one region.
+
+    Raises:
+        ValueError: with both numbers.
+
+    Example:
+        >>> check_expansions(None, Regions.of([PAPER_REGION, PAPER_REGION]))
+        Traceback (most recent call last):
+        ValueError: region holds 2 boxes, and field 1 expansions: give several regions a FieldBank with one for each, \
+and a single Region a field model or None
+    """
+    expansions = len(field) if isinstance(field, FieldBank) else 1
+    if len(regions) != expansions:
+        raise ValueError(
+            f"region holds {len(regions)} boxes, and field {expansions} expansions: give several regions a FieldBank "
+            "with one for each, and a single Region a field model or None"
+        )
 
 
 def _longest_km(latitude: Tensor, longitude: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 from magrl.checks import check_number, check_tensor
 from magrl.envs.regions import Region, Regions, one_region
 from magrl.field.elements import NAMES, UNITS
-from magrl.field.model import FieldModel, elements_at
+from magrl.field.model import FieldModel, device_of, elements_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,7 +76,7 @@ def contour_lines(axes: Axes, field: FieldModel, region: Region | Regions) -> di
         ['D', 'I', 'B_H']
     """
     grid = Regions.of(one_region(region)).grid(61)[0]
-    values = elements_at(field, grid.to(_device(field))).cpu().numpy()
+    values = elements_at(field, grid.to(device_of(field))).cpu().numpy()
     longitude, latitude = grid[0, :, 1].numpy(), grid[:, 0, 0].numpy()
     contours: dict[str, ContourSet] = {}
     for index, name in enumerate(NAMES):
@@ -145,11 +145,6 @@ def draw_tracks(
     axes.plot(starts[:, 1], starts[:, 0], "s", color=START, ms=5, label="start")
     axes.plot(ends[:, 1], ends[:, 0], "^", color=TARGET, ms=6, label="destination")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=5, fontsize=8, frameon=False)
-
-
-def _device(field: FieldModel) -> torch.device:
-    buffers = field.buffers() if isinstance(field, torch.nn.Module) else iter(())
-    return next((b.device for b in buffers), torch.device("cpu"))
 
 
 class TrackRecorder:

@@ -13,7 +13,7 @@ from typing_extensions import Self
 from magrl import guidance, paper
 from magrl.checks import CheckedModel, check_number, check_numbers, short
 from magrl.envs.measures import check_zeta
-from magrl.envs.regions import PAPER_REGION, Region, Regions
+from magrl.envs.regions import PAPER_REGION, Region, Regions, check_expansions
 from magrl.envs.specs import field_bounds
 from magrl.envs.tasks import Tasks, check_distance_range, check_tasks, task_set
 from magrl.field import (
@@ -146,7 +146,7 @@ class Scenario(CheckedModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        self._check_bank()
+        check_expansions(self.field, self.region)
         check_number(*IGRF.altitude_range_km, altitude_km=self.altitude_km)
         if self.objective_floors is not None:
             check_number(0, above=True, objective_floors=min(self.objective_floors))
@@ -160,15 +160,6 @@ class Scenario(CheckedModel):
         if self.names and len(self.names) != count:
             raise ValueError(f"names must hold one name for each of {count} tasks, got {short(self.names)}")
         return self
-
-    def _check_bank(self) -> None:
-        """Raise unless there is an expansion for each region."""
-        expansions = len(self.field) if isinstance(self.field, FieldBank) else 1
-        if len(self.region) != expansions:
-            raise ValueError(
-                f"region holds {len(self.region)} boxes, and field {expansions} expansions: give several regions a "
-                "FieldBank with one for each, and a single Region a field model or None"
-            )
 
     def _checked_tasks(self, tasks: Tasks) -> Tasks:
         try:

@@ -119,8 +119,7 @@ def sample_tasks(
         ``P`` tasks, each a function of (seed, vehicle, episode) alone.
 
     Raises:
-        ValueError: for an invalid range, one that a region cannot hold, a seed that is not a whole number, or
-            vehicles and episodes of different shapes.
+        ValueError: for an invalid range, one that a region cannot hold, or a seed that is not a whole number.
         RuntimeError: if no task is found because a region can hardly hold the distances.
 
     Example:
@@ -131,9 +130,6 @@ def sample_tasks(
         True
     """
     check_distance_range(regions, distance_range_km, distance_law)
-    check_tensor(vehicle=vehicle, episode=episode)
-    if vehicle.ndim != 1 or vehicle.shape != episode.shape or {vehicle.dtype, episode.dtype} != {torch.int64}:
-        raise ValueError(f"vehicle and episode must be int64 of one shape (P,), got {vehicle!r} and {episode!r}")
     counters = torch.stack((vehicle, episode), -1)
     region = (_draw(seed, counters, _REGION_STREAM) * len(regions)).long().squeeze(-1)
     radii_km = torch.tensor(distance_range_km, dtype=torch.float64, device=vehicle.device).expand(len(vehicle), 2)
@@ -291,8 +287,7 @@ def named_tasks(name: str) -> Tasks:
         >>> named_tasks("figure-4-1").start
         tensor([[ -2., 162.]], dtype=torch.float64)
     """
+    check_choice(TASK_SETS, tasks=name)
     if name in RANDOM_SETS:
         return task_set(*RANDOM_SETS[name])
-    if name == "figure-4-1":
-        return Tasks(*(torch.tensor([end], dtype=torch.float64) for end in (paper.EXAMPLE_START, paper.EXAMPLE_TARGET)))
-    raise ValueError(f"unknown task set {name!r}: choose from {', '.join(TASK_SETS)}")
+    return Tasks(*(torch.tensor([end], dtype=torch.float64) for end in (paper.EXAMPLE_START, paper.EXAMPLE_TARGET)))

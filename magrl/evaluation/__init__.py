@@ -1,6 +1,6 @@
 """Evaluation: rollouts, measures and their intervals, tables, figures, replay pages, and tracks for maps."""
 
-from magrl.evaluation.metrics import episode_measures, summarize
-from magrl.evaluation.rollout import evaluate, evaluation_rollout
-
-__all__ = ["episode_measures", "evaluate", "evaluation_rollout", "summarize"]
+from magrl.evaluation.metrics import episode_measures as episode_measures
+from magrl.evaluation.metrics import summarize as summarize
+from magrl.evaluation.rollout import evaluate as evaluate
+from magrl.evaluation.rollout import evaluation_rollout as evaluation_rollout

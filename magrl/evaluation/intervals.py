@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor, check_type
+from magrl.checks import check_number, check_tensor
 
 _ENDS = torch.tensor((0.025, 0.975), dtype=torch.float64)
 """Quantiles of a 95 % interval."""
@@ -101,7 +101,6 @@ def stratified_bootstrap(strata: Sequence[Tensor], resamples: int = 10_000, seed
         >>> stratified_bootstrap([torch.full((5,), 99.0), torch.full((3,), 99.0)])
         (99.0, 99.0)
     """
-    check_type(Sequence, strata=strata)
     check_tensor(**{f"stratum {index}": scores for index, scores in enumerate(strata)})
     shapes = [tuple(scores.shape) for scores in strata]
     if not strata or any(len(shape) != 1 or not shape[0] for shape in shapes):
@@ -141,7 +140,6 @@ def wilson_interval(rate: float, count: int, z: float = 1.96) -> tuple[float, fl
     """
     check_number(0, 1, rate=rate)
     check_number(1, whole=True, count=count)
-    check_number(0, above=True, z=z)
     center = rate + z**2 / (2 * count)
     half = z * math.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
     scale = 1 + z**2 / count

@@ -32,17 +32,10 @@ def first_episode_mask(done: Tensor) -> Tensor:
     Returns:
         ``(M, T)`` bool: True up to and including the first done.
 
-    Raises:
-        TypeError: for ``done`` that is not a tensor.
-        ValueError: for another shape or dtype.
-
     Example:
         >>> first_episode_mask(torch.tensor([[False, True, True]]))
         tensor([[ True,  True, False]])
     """
-    check_type(Tensor, done=done)
-    if done.dtype != torch.bool or done.ndim not in (2, 3) or done.shape[2:].numel() != 1:
-        raise ValueError(f"done must be bool of shape (M, T) or (M, T, 1), got {done.dtype} of {tuple(done.shape)}")
     done = done.reshape(done.shape[:2])
     return done.long().cumsum(1) - done.long() == 0
 

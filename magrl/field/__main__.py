@@ -173,8 +173,6 @@ def read_points(path: Path) -> DataFrame:
     import pandas
 
     check_suffix(path)
-    if not path.is_file():
-        raise ValueError(f"there is no file {path}")
     try:
         if path.suffix == ".parquet":
             return pandas.read_parquet(path)

@@ -42,6 +42,7 @@ class FieldBank(Float64Module):
         torch.Size([2, 3])
     """
 
+    shown = ("degree", "error_nt")
     indexed = True
     """Whether an evaluation takes an index."""
     CHUNK = 10240
@@ -195,10 +196,6 @@ class FieldBank(Float64Module):
             rows, self.coefficients.flatten(0, 1), per_sample_weights=polynomials.T, mode="sum"
         )
         return bags.T.contiguous().unflatten(0, (terms, 3))
-
-    def extra_repr(self) -> str:
-        """Return the number of expansions, their degree and the largest error as text."""
-        return f"expansions={len(self.coefficients)}, degree={self.degree}, error_nt={self.error_nt.max():.1e}"
 
 
 _BOXES = 64

@@ -176,6 +176,7 @@ class IGRF(SphericalHarmonicField):
 
     altitude_range_km: ClassVar[tuple[float, float]] = (-15.0, 1000.0)
     """Range of altitudes: from below the deepest trench to the height of satellites that measure the field [km]."""
+    shown = ("date", "generation", "altitude_km")
     share: Tensor | None
 
     def __init__(
@@ -215,9 +216,3 @@ class IGRF(SphericalHarmonicField):
             used = share.nonzero().squeeze(-1)
             found[:, used] += share[used] * SphericalHarmonicField._evaluate(field, rows, *(x[used] for x in points))
         return found.reshape(rows, *shape)
-
-    def extra_repr(self) -> str:
-        """Return the date, the generation and the default height as text."""
-        date = self.date
-        dates = f"date={date.isoformat()}" if isinstance(date, datetime.datetime) else f"dates={date.shape}"
-        return f"{dates}, generation={self.generation}, altitude_km={self.altitude_km}"

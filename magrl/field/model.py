@@ -8,8 +8,9 @@ inside and out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, ClassVar, Protocol
 
+import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
@@ -21,7 +22,6 @@ class FieldModel(Protocol):
     """Interface of a field model, as environments use it.
 
     Example:
-        >>> import torch
         >>> class UniformField:
         ...     def __call__(self, latitude, longitude):
         ...         return torch.tensor([30000.0, 0.0, 30000.0]).expand(*latitude.shape, 3)
@@ -40,26 +40,22 @@ class FieldModel(Protocol):
         """Return the vector and its derivative northward and eastward, ``(..., 3, 2)`` [nT/km]."""
 
 
-class FieldBankModel(Protocol):
-    """Interface of many field models evaluated together, such as :class:`magrl.field.FieldBank`."""
-
-    def __call__(self, latitude: Tensor, longitude: Tensor, index: Tensor, /) -> Tensor:
-        """Return the vector ``(..., 3)`` [nT] of the field that ``index`` ``(...)`` int64 names."""
-
-    def value_and_gradient(self, latitude: Tensor, longitude: Tensor, index: Tensor, /) -> tuple[Tensor, Tensor]:
-        """Return the vector and its derivative northward and eastward, ``(..., 3, 2)`` [nT/km]."""
-
-
 class Float64Module(nn.Module):
     """A module that follows device moves but keeps float64: float32 coefficients would cost meters of position.
 
     Example:
-        >>> import torch
         >>> from magrl.field import IGRF
         >>> field = IGRF("2022-01-01").half()
         >>> isinstance(field, Float64Module), field.value_weights.dtype
         (True, torch.float64)
     """
+
+    shown: ClassVar[tuple[str, ...]] = ()
+    """Attributes that the representation shows."""
+
+    def extra_repr(self) -> str:
+        """Return these attributes as text."""
+        return ", ".join(f"{name}={getattr(self, name)}" for name in self.shown)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
@@ -78,7 +74,6 @@ def in_chunks(function: Callable[..., Tensor], points: Sequence[Tensor], rows: i
         ``(rows, P)``.
 
     Example:
-        >>> import torch
         >>> in_chunks(lambda x: torch.stack((x, x * x)), [torch.arange(5.0)], rows=2, chunk=2)
         tensor([[ 0.,  1.,  2.,  3.,  4.],
                 [ 0.,  1.,  4.,  9., 16.]])
@@ -92,7 +87,7 @@ def in_chunks(function: Callable[..., Tensor], points: Sequence[Tensor], rows: i
     return out
 
 
-def elements_at(field: FieldModel | FieldBankModel, position: Tensor, index: Tensor | None = None) -> Tensor:
+def elements_at(field: Any, position: Tensor, index: Tensor | None = None) -> Tensor:
     """Return D, I, B_H of a field at positions.
 
     Args:
@@ -104,7 +99,6 @@ def elements_at(field: FieldModel | FieldBankModel, position: Tensor, index: Ten
         ``(..., 3)``: D [deg], I [deg], B_H [nT].
 
     Example:
-        >>> import torch
         >>> from magrl.field import IGRF
         >>> paper = IGRF("2022-01-01", generation=13)
         >>> [round(x, 2) for x in elements_at(paper, torch.tensor([-2.0, 162.0])).tolist()]
@@ -124,24 +118,18 @@ def elements_range(field: FieldModel, position: Tensor) -> tuple[Tensor, Tensor]
     Returns:
         Two tensors ``(3,)``: D [deg], I [deg], B_H [nT].
 
-    Raises:
-        ValueError: for an empty tensor of positions.
-
     Example:
-        >>> import torch
         >>> from magrl.field import IGRF
         >>> corners = torch.tensor([[-10.0, 160.0], [-10.0, 170.0], [0.0, 160.0], [0.0, 170.0]])
         >>> low, high = elements_range(IGRF("2022-01-01"), corners)
         >>> (high - low).round(decimals=1)
         tensor([  3.1000,  22.4000, 783.4000], dtype=torch.float64)
     """
-    if not position.numel():
-        raise ValueError(f"position must hold at least one place, got shape {tuple(position.shape)}")
     values = elements_at(field, position).reshape(-1, 3)
     return values.amin(0), values.amax(0)
 
 
-def elements_gradient_at(field: FieldModel | FieldBankModel, position: Tensor, index: Tensor | None = None) -> Tensor:
+def elements_gradient_at(field: Any, position: Tensor, index: Tensor | None = None) -> Tensor:
     """Return the horizontal gradient of D, I, B_H of a field at positions.
 
     Args:
@@ -153,7 +141,6 @@ def elements_gradient_at(field: FieldModel | FieldBankModel, position: Tensor, i
         ``(..., 3, 2)``: element unit per km, northward and eastward.
 
     Example:
-        >>> import torch
         >>> from magrl.field import IGRF
         >>> elements_gradient_at(IGRF("2022-01-01"), torch.tensor([-5.0, 165.0])).round(decimals=4)
         tensor([[-0.0012,  0.0015],
@@ -164,7 +151,19 @@ def elements_gradient_at(field: FieldModel | FieldBankModel, position: Tensor, i
     return elements_gradient(*field.value_and_gradient(*_place(field, position, index)))
 
 
-def _place(field: FieldModel | FieldBankModel, position: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:
+def device_of(field: object) -> torch.device:
+    """Return the device of the tensors of a field model; the CPU for one without any.
+
+    Example:
+        >>> from magrl.field import IGRF
+        >>> device_of(IGRF("2022-01-01"))
+        device(type='cpu')
+    """
+    held = (*field.parameters(), *field.buffers()) if isinstance(field, nn.Module) else ()
+    return next((values.device for values in held), torch.device("cpu"))
+
+
+def _place(field: Any, position: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:
     """Return the arguments of a field model, or of a bank, which alone takes the index."""
     place = (position[..., 0], position[..., 1])
     return (*place, index) if index is not None and getattr(field, "indexed", False) else place

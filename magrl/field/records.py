@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor, check_type
+from magrl.checks import check_choice, check_number, check_tensor, check_type
 
 _DAY = 1440  # minutes
 
@@ -137,8 +137,7 @@ def weather_record(name: str) -> WeatherRecord:
         >>> round(float(horizontal.max() - horizontal.min()))
         33
     """
-    if not isinstance(name, str) or name not in WEATHER:
-        raise ValueError(f"unknown magnetic weather {name!r}: choose from {', '.join(WEATHER)}")
+    check_choice(WEATHER, record=name)
     record, first, last = WEATHER[name]
     with np.load(Path(__file__).parent / "weather.npz") as file:
         variation = torch.from_numpy(file[record].astype(np.float32) / 10)

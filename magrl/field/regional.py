@@ -39,6 +39,7 @@ class RegionalField(Float64Module):
         True
     """
 
+    shown = ("latitude", "longitude", "degree", "error_nt")
     CHUNK = 10240
     """Points evaluated at a time; temporary memory is about 2 kB per point."""
 
@@ -108,12 +109,6 @@ class RegionalField(Float64Module):
         polynomials = chebyshev(in_half_spans(position, self.scaling), self.degree + 1)
         terms = (coefficients @ polynomials[:, 0]).unflatten(0, (-1, self.degree + 1, 3))
         return terms.mul_(polynomials[:, 1:]).sum(1).flatten(0, 1)
-
-    def extra_repr(self) -> str:
-        """Return the box, the degree and the measured error as text."""
-        return (
-            f"latitude={self.latitude}, longitude={self.longitude}, degree={self.degree}, error_nt={self.error_nt:.1e}"
-        )
 
 
 def check_expansion(

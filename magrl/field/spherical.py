@@ -35,6 +35,7 @@ class SphericalHarmonicField(Float64Module):
                 [    0.,     0., 60410.]], dtype=torch.float64)
     """
 
+    shown: ClassVar[tuple[str, ...]] = ("degree", "altitude_km")
     altitude_range_km: ClassVar[tuple[float, float]] = (-100.0, math.inf)
     """Range of altitudes [km]: below it there are sources, and the expansion does not hold."""
     CHUNK = 16384
@@ -129,13 +130,13 @@ class SphericalHarmonicField(Float64Module):
     def _value(self, level: bool, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> Tensor:
         """Return north, east, down, ``(3, P)`` [nT]; ``level`` if the altitude is the model's."""
         place = _place(latitude, longitude, altitude_km)
-        sums = _level_sums(self.level_value_weights, place) if level else _sums(self.value_weights, place)
+        sums = _sums(self.level_value_weights if level else self.value_weights, place, level)
         return (place.frame * sums).sum(1)
 
     def _value_and_gradient(self, level: bool, latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> Tensor:
         """Return the vector [nT], then the derivative of each component northward and eastward [nT/km]: ``(9, P)``."""
         place = _place(latitude, longitude, altitude_km)
-        sums = _level_sums(self.level_gradient_weights, place) if level else _sums(self.gradient_weights, place)
+        sums = _sums(self.level_gradient_weights if level else self.gradient_weights, place, level)
         value = (place.frame * sums[:3]).sum(1)
         xx, xy, xz, yy, yz = sums[3:]
         tensor = torch.stack((xx, xy, xz, xy, yy, yz, xz, yz, -xx - yy)).unflatten(0, (3, 3))
@@ -170,26 +171,18 @@ def _place(latitude: Tensor, longitude: Tensor, altitude_km: Tensor) -> _Place:
     return _Place((sp, sl), (cp, cl), frame.unflatten(0, (3, 3)), meridian, prime_vertical + altitude_km, z)
 
 
-def _sums(weights: Tensor, place: _Place) -> Tensor:
-    """Return rows of an expansion at points of any altitude: ``(R, P)``."""
+def _sums(weights: Tensor, place: _Place, level: bool) -> Tensor:
+    """Return rows of an expansion ``(R, P)``; ``level`` if the weights were made for the altitude of the points."""
+    degree, features = weights.shape[1] // 2, weights.shape[2]
 
-    def some(axis_km: Tensor, z_km: Tensor, cos_lon: Tensor, sin_lon: Tensor) -> Tensor:
-        features, lift = harmonics.products(axis_km, z_km, weights.shape[1] // 2)
-        return harmonics.contract(weights, features, harmonics.waves(cos_lon, sin_lon, lift, weights.shape[1] // 2))
+    def some(out: Tensor, up: Tensor, cos_lon: Tensor, sin_lon: Tensor) -> Tensor:
+        terms, lift = (harmonics.chebyshev(up, features), out) if level else harmonics.products(out, up, degree)
+        return harmonics.contract(weights, terms, harmonics.waves(cos_lon, sin_lon, lift, degree))
 
-    points = (place.across_km * place.cosines[0], place.z_km, place.cosines[1], place.sines[1])
-    return in_chunks(some, points, len(weights), _points_in_cache(weights))
-
-
-def _level_sums(weights: Tensor, place: _Place) -> Tensor:
-    """Return rows of an expansion at the altitude that the weights were made for: ``(R, P)``."""
-
-    def some(sin_lat: Tensor, cos_lat: Tensor, cos_lon: Tensor, sin_lon: Tensor) -> Tensor:
-        features = harmonics.chebyshev(sin_lat, weights.shape[2])
-        return harmonics.contract(weights, features, harmonics.waves(cos_lon, sin_lon, cos_lat, weights.shape[1] // 2))
-
-    points = (place.sines[0], place.cosines[0], place.cosines[1], place.sines[1])
-    return in_chunks(some, points, len(weights), _points_in_cache(weights))
+    meridian = place.cosines[0], place.sines[0]
+    if not level:
+        meridian = place.across_km * place.cosines[0], place.z_km
+    return in_chunks(some, (*meridian, place.cosines[1], place.sines[1]), len(weights), _points_in_cache(weights))
 
 
 def _points_in_cache(weights: Tensor) -> int:

@@ -96,13 +96,10 @@ class WMMHR(SphericalHarmonicField):
         tensor([32140.,  1112., -8271.], dtype=torch.float64)
     """
 
+    shown = ("date", "altitude_km")
     altitude_range_km: ClassVar[tuple[float, float]] = (-1.0, 600.0)
     """Range of altitudes [km]: the sources of the field of the crust are not far below."""
 
     def __init__(self, date: Date, *, altitude_km: float = 0.0) -> None:
         super().__init__(wmmhr_coefficients(date), altitude_km=altitude_km)
         self.date = parse_date(date)
-
-    def extra_repr(self) -> str:
-        """Return the date and the default height as text."""
-        return f"date={self.date.isoformat()}, altitude_km={self.altitude_km}"

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from magrl.navigators.base import Navigator
-from magrl.navigators.geodesic import Geodesic
-from magrl.navigators.kalman import Kalman
-from magrl.navigators.map_matching import MapMatching
-from magrl.navigators.mean_jacobian import MeanJacobian
+from magrl.navigators.base import Navigator as Navigator
+from magrl.navigators.geodesic import Geodesic as Geodesic
+from magrl.navigators.kalman import Kalman as Kalman
+from magrl.navigators.map_matching import MapMatching as MapMatching
+from magrl.navigators.mean_jacobian import MeanJacobian as MeanJacobian
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
-from magrl.navigators.parallel import ParallelApproach
-from magrl.navigators.quasi_newton import QuasiNewton
-from magrl.navigators.run_and_tumble import RunAndTumble
-from magrl.navigators.secant import Secant
+from magrl.navigators.parallel import ParallelApproach as ParallelApproach
+from magrl.navigators.quasi_newton import QuasiNewton as QuasiNewton
+from magrl.navigators.run_and_tumble import RunAndTumble as RunAndTumble
+from magrl.navigators.secant import Secant as Secant
 
 _CLASSES: tuple[type[Navigator], ...] = (
     GeneticAlgorithm,
@@ -27,16 +27,3 @@ _CLASSES: tuple[type[Navigator], ...] = (
 )
 NAVIGATORS = {navigator.name: navigator for navigator in _CLASSES}
 """Classes by the names that commands take. Figures color them in this order: add a new one at the end."""
-
-__all__ = [
-    "NAVIGATORS",
-    "Geodesic",
-    "Kalman",
-    "MapMatching",
-    "MeanJacobian",
-    "Navigator",
-    "ParallelApproach",
-    "QuasiNewton",
-    "RunAndTumble",
-    "Secant",
-]

@@ -14,8 +14,10 @@ from typing_extensions import Self
 from magrl import geodesy
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario
+from magrl.envs.regions import check_expansions
 from magrl.field import Date, FieldBank, FieldModel, RegionalField, elements_at, igrf_coefficients, parse_date
 from magrl.field.elements import element_difference, elements_gradient, measured_elements
+from magrl.field.model import device_of
 from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to, steer, total_std
 from magrl.navigators.secant import SLOPES
 
@@ -98,7 +100,7 @@ class MapMatching(Navigator):
         self.hypotheses, bank = int(hypotheses), isinstance(field, FieldBank)
         self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if bank else [])]
         self.map = field
-        self._place(copy.deepcopy(Regions.of(region)).to(_device(field)))
+        self._place(copy.deepcopy(Regions.of(region)).to(device_of(field)))
         squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, sensor_std))
         floor, error, sensors = (x.to(self.grid.device) for x in squares)
         self.target_std = nn.Buffer((floor + error).sqrt())
@@ -120,12 +122,7 @@ class MapMatching(Navigator):
 
     def _place(self, region: Regions) -> None:
         """Keep the region, and the elements on a grid of it."""
-        expansions = len(self.map) if isinstance(self.map, FieldBank) else 1
-        if expansions != len(region):
-            raise ValueError(
-                f"field holds {expansions} maps and region {len(region)} boxes: give many regions a FieldBank with one "
-                "expansion for each, and a single Region a field model"
-            )
+        check_expansions(self.map, region)
         grid = region.grid(GRID_POINTS)
         index = torch.arange(len(region), device=grid.device).reshape(-1, 1, 1)
         elements = elements_at(self.map, grid, index)
@@ -222,11 +219,6 @@ class MapMatching(Navigator):
     def _region(self, seen: TensorDictBase) -> Tensor:
         """Return the number of the region of each vehicle ``(P,)``."""
         return seen.get("region", torch.zeros_like(seen["step_count"])).squeeze(-1)
-
-
-def _device(field: FieldModel | FieldBank) -> torch.device:
-    buffers = field.buffers() if isinstance(field, nn.Module) else ()
-    return next((values.device for values in buffers), torch.device("cpu"))
 
 
 def update(covariance: Tensor, jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from magrl.checks import check_tensor
 from magrl.envs import GeomagneticNavEnv
-from magrl.field.elements import NAMES
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.navigators.base import Std
 from magrl.navigators.quasi_newton import QuasiNewton
@@ -29,11 +28,10 @@ class MeanJacobian(QuasiNewton):
         position: ``(..., 2)`` places to average over, latitude, longitude [deg], usually ``env.region.grid(21)``.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        elements: two or three of D, I, B_H.
         sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
 
     Raises:
-        ValueError: for a bound out of its range, fewer than two elements or places, or a negative standard deviation.
+        ValueError: for a bound out of its range, fewer than two places, or a negative standard deviation.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -50,16 +48,15 @@ class MeanJacobian(QuasiNewton):
         position: Tensor,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        elements: Sequence[str] = NAMES,
         sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, elements, sensor_std)
+        super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_tensor(2, position=position)
         if position.numel() < 4:
             raise ValueError(f"position must hold at least two places (..., 2), got shape {tuple(position.shape)}")
-        gradients = elements_gradient_at(field, position.reshape(-1, 2).double())[:, self.elements]
+        gradients = elements_gradient_at(field, position.reshape(-1, 2).double())
         self.register_buffer("mean", gradients.mean(0))
         self.register_buffer("std", gradients.std(0))
 

@@ -33,7 +33,7 @@ class ParallelApproach(Navigator):
         pair: two elements whose errors shrink in proportion, ``("D", "I")`` in the paper; all three for None.
 
     Raises:
-        ValueError: for a bound out of its range, or ``pair`` that is not two different elements.
+        ValueError: for a bound out of its range, or ``pair`` that is not different elements.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -58,8 +58,6 @@ class ParallelApproach(Navigator):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         self.in_keys = ["field", "target_field", "heading", "position", "step_count", "region"]
         self.field, self.elements = field, element_indices(NAMES if pair is None else pair, 2)
-        if pair is not None and len(pair) != 2:
-            raise ValueError(f"pair must be two of D, I, B_H, got {tuple(pair)}")
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:  # noqa: ARG004

@@ -1,16 +1,10 @@
 """Navigation on board one vehicle: a navigator behind plain numbers, its limits, and its step for other programs."""
 
-from magrl.onboard.readings import check_earth_jump, check_earth_reading
-from magrl.onboard.step import VehicleStep, first_state, write_step
-from magrl.onboard.vehicle import NAMED, Command, Onboard
-
-__all__ = [
-    "NAMED",
-    "Command",
-    "Onboard",
-    "VehicleStep",
-    "check_earth_jump",
-    "check_earth_reading",
-    "first_state",
-    "write_step",
-]
+from magrl.onboard.readings import check_earth_jump as check_earth_jump
+from magrl.onboard.readings import check_earth_reading as check_earth_reading
+from magrl.onboard.step import VehicleStep as VehicleStep
+from magrl.onboard.step import first_state as first_state
+from magrl.onboard.step import write_step as write_step
+from magrl.onboard.vehicle import NAMED as NAMED
+from magrl.onboard.vehicle import Command as Command
+from magrl.onboard.vehicle import Onboard as Onboard

@@ -1,74 +1,38 @@
 """Estimation of a field and its gradient along a dead-reckoned track."""
 
-from magrl.tracking.belief import steepest, surprise
-from magrl.tracking.decision import RANGE_KM, ArrivalDecision, approach, arrival_decision
-from magrl.tracking.filter import (
-    CURVATURE,
-    DISTANCE_SCALE_KM,
-    ELEMENT_PERIODS,
-    ELEMENT_SCALES,
-    VARIANCE_FLOOR,
-    FieldTrack,
-    GradientPrior,
-    GradientRelation,
-    estimated_field,
-    estimated_gradient,
-    predict,
-    relate,
-    start,
-    update,
-)
-from magrl.tracking.posterior import WayPosterior, way_posterior
-from magrl.tracking.priors import (
-    curl_relation,
-    dipole_prior,
-    field_curvature,
-)
-from magrl.tracking.search import (
-    VISITED,
-    arrival_weights,
-    unvisited,
-    unvisited_yet,
-    visit,
-)
-from magrl.tracking.track import aim, displacement_of, read, related
-from magrl.tracking.way import Way, way_to
-
-__all__ = [
-    "CURVATURE",
-    "DISTANCE_SCALE_KM",
-    "ELEMENT_PERIODS",
-    "ELEMENT_SCALES",
-    "RANGE_KM",
-    "VARIANCE_FLOOR",
-    "VISITED",
-    "ArrivalDecision",
-    "FieldTrack",
-    "GradientPrior",
-    "GradientRelation",
-    "Way",
-    "WayPosterior",
-    "aim",
-    "approach",
-    "arrival_decision",
-    "arrival_weights",
-    "curl_relation",
-    "dipole_prior",
-    "displacement_of",
-    "estimated_field",
-    "estimated_gradient",
-    "field_curvature",
-    "predict",
-    "read",
-    "relate",
-    "related",
-    "start",
-    "steepest",
-    "surprise",
-    "unvisited",
-    "unvisited_yet",
-    "update",
-    "visit",
-    "way_posterior",
-    "way_to",
-]
+from magrl.tracking.belief import steepest as steepest
+from magrl.tracking.belief import surprise as surprise
+from magrl.tracking.decision import RANGE_KM as RANGE_KM
+from magrl.tracking.decision import ArrivalDecision as ArrivalDecision
+from magrl.tracking.decision import approach as approach
+from magrl.tracking.decision import arrival_decision as arrival_decision
+from magrl.tracking.filter import CURVATURE as CURVATURE
+from magrl.tracking.filter import DISTANCE_SCALE_KM as DISTANCE_SCALE_KM
+from magrl.tracking.filter import ELEMENT_PERIODS as ELEMENT_PERIODS
+from magrl.tracking.filter import ELEMENT_SCALES as ELEMENT_SCALES
+from magrl.tracking.filter import VARIANCE_FLOOR as VARIANCE_FLOOR
+from magrl.tracking.filter import FieldTrack as FieldTrack
+from magrl.tracking.filter import GradientPrior as GradientPrior
+from magrl.tracking.filter import GradientRelation as GradientRelation
+from magrl.tracking.filter import estimated_field as estimated_field
+from magrl.tracking.filter import estimated_gradient as estimated_gradient
+from magrl.tracking.filter import predict as predict
+from magrl.tracking.filter import relate as relate
+from magrl.tracking.filter import start as start
+from magrl.tracking.filter import update as update
+from magrl.tracking.posterior import WayPosterior as WayPosterior
+from magrl.tracking.posterior import way_posterior as way_posterior
+from magrl.tracking.priors import curl_relation as curl_relation
+from magrl.tracking.priors import dipole_prior as dipole_prior
+from magrl.tracking.priors import field_curvature as field_curvature
+from magrl.tracking.search import VISITED as VISITED
+from magrl.tracking.search import arrival_weights as arrival_weights
+from magrl.tracking.search import unvisited as unvisited
+from magrl.tracking.search import unvisited_yet as unvisited_yet
+from magrl.tracking.search import visit as visit
+from magrl.tracking.track import aim as aim
+from magrl.tracking.track import displacement_of as displacement_of
+from magrl.tracking.track import read as read
+from magrl.tracking.track import related as related
+from magrl.tracking.way import Way as Way
+from magrl.tracking.way import way_to as way_to

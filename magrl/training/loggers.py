@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from magrl.checks import check_choice
 from magrl.files import json_ready
 
 WANDB_PROJECT = "magrl"
@@ -38,11 +39,10 @@ def check_logger(logger: str, wandb_mode: str = "offline") -> None:
         >>> check_logger("csv")
         >>> check_logger("paper")
         Traceback (most recent call last):
-        ValueError: logger must be one of wandb, tensorboard, csv, got 'paper'
+        ValueError: logger must be one of 'wandb', 'tensorboard', 'csv', got 'paper'
     """
-    for name, value, known in (("logger", logger, LOGGERS), ("wandb_mode", wandb_mode, WANDB_MODES)):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    check_choice(LOGGERS, logger=logger)
+    check_choice(WANDB_MODES, wandb_mode=wandb_mode)
     if logger == "tensorboard" and importlib.util.find_spec("tensorboard") is None:
         raise ValueError("the logger tensorboard is not installed: pip install 'magrl[tensorboard]'")
 

@@ -142,17 +142,17 @@ class Run:
         Args:
             options: options of :class:`magrl.envs.GeomagneticNavEnv`.
         """
+
+        def make(scenario: Scenario, seed: int) -> EnvBase:
+            base = GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), seed=seed, **options)
+            return with_sensor_noise(base, self.config.noise, seed)
+
         if self.scenario.tasks is not None:
-            self._own = self._evaluation_env(self.scenario, paper.TEST_SEED, options)
-        validation = self._random_tasks_env(self.config.eval_tasks_small, paper.VALIDATION_SEED, options)
-        return validation, self._random_tasks_env(self.config.eval_tasks, paper.TEST_SEED, options)
-
-    def _random_tasks_env(self, count: int, seed: int, options: dict[str, Any]) -> EnvBase:
-        return self._evaluation_env(self.scenario.with_tasks(self.scenario.random_tasks(count, seed)), seed, options)
-
-    def _evaluation_env(self, scenario: Scenario, seed: int, options: dict[str, Any]) -> EnvBase:
-        base = GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), seed=seed, **options)
-        return with_sensor_noise(base, self.config.noise, seed)
+            self._own = make(self.scenario, paper.TEST_SEED)
+        sets = (self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED)
+        random = (make(self.scenario.with_tasks(self.scenario.random_tasks(*each)), each[1]) for each in sets)
+        validation, test = random
+        return validation, test
 
     # Parts
 

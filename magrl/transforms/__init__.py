@@ -5,51 +5,35 @@ transform takes ``in_keys`` and ``out_keys`` (nested ones too), works in ``Compo
 module where that makes sense.
 """
 
-from magrl.transforms.alignment import AlignmentReward, FieldGradient, GradientHeading
-from magrl.transforms.declaration import DeclareArrival
-from magrl.transforms.errors.conditions import CONDITIONS, TRUE_KEYS, Conditions, conditions_named, with_conditions
-from magrl.transforms.errors.motion import MotionError
-from magrl.transforms.errors.noise import RandomSensorNoise, SensorNoise, sensor_levels, with_sensor_noise
-from magrl.transforms.errors.north import NORTH_REFERENCES, NorthReferenceError, north_reference
-from magrl.transforms.errors.sensors import SensorErrors
-from magrl.transforms.errors.vector import VectorErrors
-from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
-from magrl.transforms.rewards import DetourReward, DistanceCost, TrueWay
-from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.track import SearchAim, TrackGradient
-from magrl.transforms.views import AngleVector, ObservationView, TargetDifference, TrackObservation, TrackView
-
-__all__ = [
-    "CONDITIONS",
-    "NORTH_REFERENCES",
-    "SPEEDS_KM_H",
-    "TRUE_KEYS",
-    "AlignmentReward",
-    "AngleVector",
-    "Conditions",
-    "DeclareArrival",
-    "DetourReward",
-    "DistanceCost",
-    "FieldGradient",
-    "GradientHeading",
-    "MagneticWeather",
-    "MinMaxNorm",
-    "MotionError",
-    "NorthReferenceError",
-    "ObservationView",
-    "RandomSensorNoise",
-    "SearchAim",
-    "SensorErrors",
-    "SensorNoise",
-    "TargetDifference",
-    "TrackGradient",
-    "TrackObservation",
-    "TrackView",
-    "TrueWay",
-    "VectorErrors",
-    "conditions_named",
-    "north_reference",
-    "sensor_levels",
-    "with_conditions",
-    "with_sensor_noise",
-]
+from magrl.transforms.alignment import AlignmentReward as AlignmentReward
+from magrl.transforms.alignment import FieldGradient as FieldGradient
+from magrl.transforms.alignment import GradientHeading as GradientHeading
+from magrl.transforms.declaration import DeclareArrival as DeclareArrival
+from magrl.transforms.errors.conditions import CONDITIONS as CONDITIONS
+from magrl.transforms.errors.conditions import TRUE_KEYS as TRUE_KEYS
+from magrl.transforms.errors.conditions import Conditions as Conditions
+from magrl.transforms.errors.conditions import conditions_named as conditions_named
+from magrl.transforms.errors.conditions import with_conditions as with_conditions
+from magrl.transforms.errors.motion import MotionError as MotionError
+from magrl.transforms.errors.noise import RandomSensorNoise as RandomSensorNoise
+from magrl.transforms.errors.noise import SensorNoise as SensorNoise
+from magrl.transforms.errors.noise import sensor_levels as sensor_levels
+from magrl.transforms.errors.noise import with_sensor_noise as with_sensor_noise
+from magrl.transforms.errors.north import NORTH_REFERENCES as NORTH_REFERENCES
+from magrl.transforms.errors.north import NorthReferenceError as NorthReferenceError
+from magrl.transforms.errors.north import north_reference as north_reference
+from magrl.transforms.errors.sensors import SensorErrors as SensorErrors
+from magrl.transforms.errors.vector import VectorErrors as VectorErrors
+from magrl.transforms.errors.weather import SPEEDS_KM_H as SPEEDS_KM_H
+from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
+from magrl.transforms.rewards import DetourReward as DetourReward
+from magrl.transforms.rewards import DistanceCost as DistanceCost
+from magrl.transforms.rewards import TrueWay as TrueWay
+from magrl.transforms.scaling import MinMaxNorm as MinMaxNorm
+from magrl.transforms.track import SearchAim as SearchAim
+from magrl.transforms.track import TrackGradient as TrackGradient
+from magrl.transforms.views import AngleVector as AngleVector
+from magrl.transforms.views import ObservationView as ObservationView
+from magrl.transforms.views import TargetDifference as TargetDifference
+from magrl.transforms.views import TrackObservation as TrackObservation
+from magrl.transforms.views import TrackView as TrackView

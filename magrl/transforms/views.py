@@ -158,8 +158,8 @@ class ObservationView(_View):
         13
     """
 
-    observe_heading: bool
-    observe_difference: bool
+    observe_heading: bool = True
+    observe_difference: bool = True
     field_low: tuple[float, float, float]
     field_high: tuple[float, float, float]
 

@@ -29,7 +29,7 @@ def test_every_policy_is_small_and_has_a_card() -> None:
 
 
 def test_unknown_name() -> None:
-    with pytest.raises(ValueError, match="no pretrained policy 'nowhere': choose from anywhere"):
+    with pytest.raises(ValueError, match="pretrained_policy must be one of 'anywhere', got 'nowhere'"):
         magrl.load_pretrained("nowhere")
-    with pytest.raises(ValueError, match="choose from anywhere"):
+    with pytest.raises(ValueError, match="must be one of 'anywhere'"):
         magrl.load_pretrained("../pretrained/anywhere")

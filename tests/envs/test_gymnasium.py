@@ -323,8 +323,11 @@ def test_bad_calls() -> None:
     env.reset(seed=0)
     for bad, message in (
         ((0, 0, 0), r"must have shape \(1, 2\).*got shape \(1, 3\)"),
-        ((1.5, 0.0), r"action \[1.5, 0.0\] of vehicle 0 is not finite or out of bounds, \[-1, 1\], \[-1, 1\]$"),
-        ((0.0, math.nan), r"out of bounds, \[-1, 1\], \[-1, 1\]$"),
+        (
+            (1.5, 0.0),
+            r"action \[1.5, 0.0\] of vehicle 0 is not finite or out of bounds, Box\(-1.0, 1.0,",
+        ),
+        ((0.0, math.nan), "out of bounds, Box"),
     ):
         with pytest.raises(ValueError, match=message):
             env.step(action(*bad))
@@ -333,7 +336,7 @@ def test_bad_calls() -> None:
         env.step(np.zeros(2))
     envs = make_vec(2, scale_actions=False)
     envs.reset(seed=0)
-    with pytest.raises(ValueError, match=r"of vehicle 1 .* out of bounds, \[0, 50\], \[-1.5708, 1.5708\]$"):
+    with pytest.raises(ValueError, match=r"of vehicle 1 .* out of bounds, Box\(\[ 0. +-1.570\d*\], \[50. +1.570\d*\]"):
         envs.step(np.array([[50.0, 0.0], [51.0, 0.0]]))
 
 

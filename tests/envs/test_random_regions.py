@@ -179,7 +179,7 @@ BAD: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: earth_scenario(2, -1), ValueError, "seed must be a whole number from 0"),
     (lambda: earth_scenario(2, 0, "2055-01-01"), ValueError, "2055-01-01T00:00:00 is outside IGRF-14"),
     (lambda: planet_scenario(2, 0, half_size_deg=61), ValueError, "half_size_deg must be a finite number above 0"),
-    (lambda: planet_scenario(2, 0, size=3), TypeError, "size"),
+    (lambda: planet_scenario(2, 0, size=3), ValueError, "size"),
     (lambda: planet_scenario(2, 0, min_intensity_nt=1e6), ValueError, "no place was found in 100 tries for region 0"),
     (lambda: planet_scenario(2, 0, degree=5), ValueError, "misses the field by"),
     (lambda: planet_scenario(2, 0, distance_range_km=(4e3, 5e3)), ValueError, "(4000.0, 5000.0): no two points of"),

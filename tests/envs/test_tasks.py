@@ -208,10 +208,8 @@ def test_bad_distances(distance_range_km, law, says):
 def test_bad_sets():
     with pytest.raises(ValueError, match=r"num_tasks.*0"):
         task_set(0, seed=0)
-    with pytest.raises(ValueError, match=r"'test-10'.*test-1000"):
+    with pytest.raises(ValueError, match=r"'test-1000'.*'test-10'"):
         named_tasks("test-10")
-    with pytest.raises(ValueError, match=r"vehicle and episode must be int64 of one shape"):
-        sample_tasks(Regions.of(PAPER_REGION), (300, 500), 0, torch.arange(3), torch.arange(2))
 
 
 def test_checked_tasks_are_wrapped_float64_in_region_0():

@@ -97,7 +97,7 @@ def test_missing_file_and_missing_engine_raise(points, monkeypatch, capsys) -> N
 
     monkeypatch.setattr(pandas.DataFrame, "to_parquet", without_engine)
     for arguments, message in (
-        (["nowhere.csv"], "there is no file nowhere.csv"),
+        (["nowhere.csv"], "nowhere.csv is not a table: "),
         ([str(points), "--out", str(points.with_suffix(".parquet"))], "pip install pyarrow"),
     ):
         with pytest.raises(SystemExit):

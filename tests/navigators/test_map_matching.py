@@ -211,9 +211,9 @@ def test_bad_options_are_refused_with_their_value(box: GeomagneticNavEnv, option
 def test_a_map_must_be_given_with_its_regions(box: GeomagneticNavEnv, earth: GeomagneticNavEnv) -> None:
     with pytest.raises(TypeError, match="region"):
         MapMatching(box.field, None)
-    with pytest.raises(ValueError, match="16 maps and region 1 boxes"):
+    with pytest.raises(ValueError, match="1 boxes, and field 16 expansions"):
         MapMatching(earth.field, box.edge)
-    with pytest.raises(ValueError, match="1 maps and region 16 boxes"):
+    with pytest.raises(ValueError, match="16 boxes, and field 1 expansions"):
         MapMatching(box.field, earth.edge)
     with pytest.raises(ValueError, match=r"2040.*outside IGRF"):
         MapMatching.for_env(box, map_date="2040-01-01")

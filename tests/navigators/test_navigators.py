@@ -301,8 +301,6 @@ def test_bad_options_are_refused_with_their_value() -> None:
 
 
 def test_maps_and_pairs_are_checked(env) -> None:
-    with pytest.raises(ValueError, match="B_H"):
-        ParallelApproach(env.field, pair=("D", "I", "B_H"))
     with pytest.raises(ValueError, match=r"two places.*\(1, 2\)"):
         MeanJacobian(env.field, torch.zeros(1, 2))
     for kind in (ParallelApproach, lambda field: MeanJacobian(field, torch.zeros(2, 2))):

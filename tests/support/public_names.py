@@ -18,7 +18,7 @@ PACKAGES = (
     "evaluation",
     "training",
 )
-"""Packages whose ``__all__`` is public."""
+"""Packages whose functions and classes are public."""
 MODULES = ("checks", "files", "geodesy", "guidance", "envs.gymnasium")
 """Modules whose functions and classes are public."""
 
@@ -37,7 +37,7 @@ def own_names(module: ModuleType) -> Iterator[str]:
 
 def public_members() -> dict[str, object]:
     """Public functions and classes by name, such as ``envs.Region``."""
-    exported = {name: import_module(f"magrl.{name}").__all__ for name in PACKAGES}
+    exported = {name: vars(import_module(f"magrl.{name}")) for name in PACKAGES}
     listed = {name: own_names(import_module(f"magrl.{name}")) for name in MODULES}
     return {
         f"{home}.{name}": member

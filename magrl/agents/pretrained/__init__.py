@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from magrl.agents.policy import FieldPolicy, load_policy
+from magrl.checks import check_choice
 
 _FOLDER = Path(__file__).parent
 
@@ -26,6 +27,5 @@ def load_pretrained(name: str, device: torch.device | str = "cpu") -> FieldPolic
         (128, 128, 128)
     """
     names = sorted(path.stem for path in _FOLDER.glob("*.pt"))
-    if name not in names:
-        raise ValueError(f"there is no pretrained policy {name!r}: choose from {', '.join(names)}")
+    check_choice(names, pretrained_policy=name)
     return load_policy(_FOLDER / f"{name}.pt", device)

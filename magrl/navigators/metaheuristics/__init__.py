@@ -8,9 +8,8 @@ An individual is a displacement ``(north, east)`` in units of the longest move, 
 averages and differences of individuals are displacements too. Lower fitness is better.
 """
 
-from magrl.navigators.metaheuristics.base import MODES, Metaheuristic
-from magrl.navigators.metaheuristics.fish_swarm import ArtificialFishSwarm
-from magrl.navigators.metaheuristics.genetic import GeneticAlgorithm
-from magrl.navigators.metaheuristics.particle_swarm import ParticleSwarm
-
-__all__ = ["MODES", "ArtificialFishSwarm", "GeneticAlgorithm", "Metaheuristic", "ParticleSwarm"]
+from magrl.navigators.metaheuristics.base import MODES as MODES
+from magrl.navigators.metaheuristics.base import Metaheuristic as Metaheuristic
+from magrl.navigators.metaheuristics.fish_swarm import ArtificialFishSwarm as ArtificialFishSwarm
+from magrl.navigators.metaheuristics.genetic import GeneticAlgorithm as GeneticAlgorithm
+from magrl.navigators.metaheuristics.particle_swarm import ParticleSwarm as ParticleSwarm

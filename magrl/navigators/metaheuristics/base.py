@@ -12,7 +12,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from magrl import guidance
-from magrl.checks import check_number, check_numbers
+from magrl.checks import check_choice, check_number, check_numbers
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.model import FieldModel, elements_at
 from magrl.geodesy import move, wrap_angle
@@ -122,8 +122,7 @@ class Metaheuristic(Navigator):
         seed: int = 0,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
-        if mode not in MODES:
-            raise ValueError(f"mode must be one of {MODES}, got {mode!r}")
+        check_choice(MODES, mode=mode)
         if (field is not None) != (mode == "look-ahead"):
             raise ValueError(f"field must be given in mode 'look-ahead' and in no other, got {field} in mode {mode!r}")
         check_numbers(3, objective_floors=objective_floors)

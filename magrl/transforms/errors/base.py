@@ -7,6 +7,7 @@ streams from which the next episodes split off.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -243,13 +244,11 @@ def check_sizes(count: int | None = None, *, fixed: bool = False, **sizes: Seque
     Example:
         >>> check_sizes(3, bias=(0.1, 0.1, -5.0))
         Traceback (most recent call last):
-        ValueError: bias must be standard deviations, which are not negative, got (0.1, 0.1, -5.0)
+        ValueError: bias must be a finite number from 0 on, got -5.0
     """
     for name, values in sizes.items():
         held = len(values) if count is None and isinstance(values, Sequence) else count
-        check_numbers(held or 1, **{name: values})
-        if not fixed and min(values) < 0:
-            raise ValueError(f"{name} must be standard deviations, which are not negative, got {values!r}")
+        check_numbers(held or 1, -math.inf if fixed else 0, **{name: values})
 
 
 def gauss_markov(value: Tensor, std: Tensor | float, distance: Tensor | float, length: float, normal: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from magrl.checks import check_type
+from magrl.checks import check_choice, check_type
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NorthReferenceError, north_reference
@@ -211,8 +211,7 @@ def conditions_named(name: str) -> Conditions:
         >>> conditions_named("aircraft").north
         'fiber-optic'
     """
-    if not isinstance(name, str) or name not in CONDITIONS:
-        raise ValueError(f"unknown conditions {name!r}: choose from {', '.join(CONDITIONS)}")
+    check_choice(CONDITIONS, conditions=name)
     return CONDITIONS[name]
 
 

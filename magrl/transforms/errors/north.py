@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Composite
 
-from magrl.checks import check_number
+from magrl.checks import check_choice, check_number
 from magrl.counters import stream_normal
 from magrl.geodesy import wrap_angle, wrap_longitude
 from magrl.transforms.base import Keys
@@ -175,8 +175,7 @@ def north_reference(name: str, *, speed_km_h: float, **options: Any) -> NorthRef
         >>> north_reference("marine", speed_km_h=30).sizes
         (0.375, 0.125, 0.25)
     """
-    if name not in NORTH_REFERENCES:
-        raise ValueError(f"unknown north reference {name!r}: choose from {', '.join(NORTH_REFERENCES)}")
+    check_choice(NORTH_REFERENCES, north_reference=name)
     check_number(0, above=True, speed_km_h=speed_km_h)
     keys = ("heading", "field", "move") if name == "low-cost" else ("heading", "field", "move", "position")
     options = {**NORTH_REFERENCES[name], "drift_length_km": SCHULER_HOURS * speed_km_h, "in_keys": keys, **options}
