@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict
 from torchrl.envs import Compose, GymEnv, TransformedEnv
 
-from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks, task_set
+from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks
 from magrl.envs.gymnasium import ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
 from magrl.evaluation import episode_measures
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorNoise, TrackGradient, TrackView
@@ -114,9 +114,7 @@ def test_one_vehicle_flies_as_in_torchrl() -> None:
 @pytest.mark.parametrize(
     ("scaled", "given", "move"),
     [
-        (True, (-1, -1), (0, -math.pi / 2)),
         (True, (1, 1), (50, math.pi / 2)),
-        (True, (0, 0), (25, 0)),
         (False, (12.5, 0.25), (12.5, 0.25)),
     ],
 )
@@ -136,20 +134,6 @@ def test_seeds_and_episodes() -> None:
     np.testing.assert_array_equal(env.reset(seed=3)[0], first)
     np.testing.assert_array_equal(env.reset()[0], second)
     assert not np.array_equal(env.reset(seed=4)[0], first)
-
-
-def test_first_row_of_a_batch_flies_the_episodes_of_the_single_vehicle() -> None:
-    batch, single = make_vec().reset(seed=3)[0], make().reset(seed=3)[0]
-    np.testing.assert_array_equal(batch[0], single)
-    assert len(np.unique(batch, axis=0)) == NUM
-
-
-def test_frozen_tasks_are_flown_in_turn() -> None:
-    tasks = task_set(3, 0)
-    env = make(scenario=PAPER.with_tasks(tasks)).unwrapped
-    for index in range(4):
-        env.reset()
-        assert torch.equal(env._envs._state["start_position"][0], tasks.start[index % 3])
 
 
 # Spaces
@@ -301,11 +285,7 @@ def test_pictures() -> None:
     [
         ({"observation": "pixels"}, "observation must be one of 'flat', 'dict', got 'pixels'"),
         ({"observation": ("field", "wings")}, "observation names 'wings', which is not among the keys"),
-        ({"reward": "sparse"}, "reward must be one of 'guided', 'base', got 'sparse'"),
-        ({"alignment_weight": math.nan}, "weight .*finite.*, got nan"),
         ({"zetta": 1.0}, "unexpected keyword argument 'zetta'; the options are .*'zeta'"),
-        ({"num_envs": 3}, "num_envs"),
-        ({"scale_actions": 1}, "scale_actions must be a bool, got 1"),
         ({"transforms": [5]}, r"transforms\[0\] must be a Transform, got 5"),
     ],
 )
@@ -328,9 +308,6 @@ def test_bad_calls() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             env.step(action(*bad))
-    env.step(np.zeros(2))
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(np.zeros(2))
     envs = make_vec(2, scale_actions=False)
     envs.reset(seed=0)
     with pytest.raises(ValueError, match=r"of vehicle 1 .* out of bounds, \[0, 50\], \[-1.5708, 1.5708\]$"):
@@ -359,10 +336,9 @@ print(heavy)
     assert type(make_vec(1)) is GeomagneticNavVectorEnv
 
 
-@pytest.mark.parametrize("observation", ["flat", "dict"])
-def test_checkers_find_nothing(observation: str) -> None:
+def test_checkers_find_nothing() -> None:
     stable_baselines3 = pytest.importorskip("stable_baselines3.common.env_checker")
-    env = make(observation=observation, disable_env_checker=True, render_mode="rgb_array").unwrapped
+    env = make(disable_env_checker=True, render_mode="rgb_array").unwrapped
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env)
@@ -381,12 +357,11 @@ def load(path: str) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("algorithm", ["td3", "sac"])
-def test_stable_baselines3_example(algorithm: str, tmp_path: Path, monkeypatch) -> None:
+def test_stable_baselines3_example(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("SB3_LOGDIR", str(tmp_path))
     example = load("docs/examples/sb3.py")
     small = {"num_envs": 8, "total_timesteps": 80, "learning_starts": 60, "gradient_steps": 1, "eval_tasks": 4}
-    result = example.main(example.Config(algorithm, **small))
+    result = example.main(example.Config("sac", **small))
     assert result.keys() == {"success", "spl", "steps"}
     assert 1 <= result["steps"] <= 50
 

@@ -17,7 +17,6 @@ from magrl.envs.regions import Region
 from magrl.transforms import AngleVector, FieldGradient, GradientHeading, MinMaxNorm
 
 DTYPES = [torch.float32, torch.float64]
-OPEN = torch.tensor(torch.finfo(torch.float32).min), torch.tensor(0.0)  # the bounds of an open spec
 
 
 def minmax_nav() -> MinMaxNorm:
@@ -54,15 +53,6 @@ def test_env_gets_physical_actions_and_the_data_keep_scaled_ones() -> None:
     assert torch.equal(step["action"], scaled)
     physical = torch.tensor([[0.0, -math.pi / 2], [25.0, math.pi / 4], [50.0, math.pi / 2]])
     torch.testing.assert_close(step["next", "move"], physical, rtol=1e-6, atol=0)
-
-
-def test_scaled_action_under_another_name() -> None:
-    env = TransformedEnv(nav(3), MinMaxNorm([], in_keys_inv=["action"], out_keys_inv=["stick"]))
-    assert env.action_keys == ["stick"]
-    td = env.rollout(2)
-    assert "stick" in td
-    assert "action" not in td
-    torch.testing.assert_close(td["next", "move"][..., 0], (td["stick"][..., 0] + 1) * 25, rtol=1e-5, atol=1e-5)
 
 
 def test_state_scaled_both_ways_leaves_the_env_as_it_was() -> None:
@@ -148,13 +138,6 @@ def test_loaded_bounds_are_kept_when_attached_elsewhere() -> None:
     assert torch.equal(there.transform.low_0, env.transform.low_0)
 
 
-def test_loading_copies() -> None:
-    source, norm = MinMaxNorm(["x"], bounds={"x": (0.0, 1.0)}), MinMaxNorm(["x"])
-    norm.load_state_dict(source.state_dict())
-    source.high_0.fill_(9.0)
-    assert norm.high_0 == 1.0
-
-
 def test_an_unattached_clone_takes_the_bounds_of_its_own_env() -> None:
     norm = MinMaxNorm(["field"], ["f"])
     other = norm.clone()
@@ -191,12 +174,6 @@ def test_what_another_transform_wrote_has_the_bounds_of_its_spec() -> None:
     torch.testing.assert_close(td["g"] * math.pi, td["gradient_heading"], rtol=1e-5, atol=1e-5)
 
 
-def test_compose_runs_in_order() -> None:
-    norm = MinMaxNorm(["x"], bounds={"x": (0.0, 180.0)}, interval=(0.0, math.pi))
-    td = TensorDict(x=torch.tensor([90.0]))
-    torch.testing.assert_close(Compose(norm, AngleVector("x", "v"))(td)["v"], torch.tensor([0.0, 1.0]))
-
-
 def test_bounds_that_are_not_known() -> None:
     with pytest.raises(ValueError, match=r"no bounds for 'x': give bounds=\{'x': \(low, high\)\}"):
         MinMaxNorm(["x"])(TensorDict(x=torch.zeros(1)))
@@ -208,24 +185,14 @@ def test_bounds_that_are_not_known() -> None:
         _ = TransformedEnv(nav(), MinMaxNorm(["nope"], ["y"])).specs
 
 
-def test_an_action_that_is_missing() -> None:
-    norm = MinMaxNorm(in_keys_inv=["action"], bounds={"action": (0.0, 1.0)})
-    with pytest.raises(KeyError, match=r"'action'.* not among \['x'\]"):
-        norm.inv(TensorDict(x=torch.zeros(2)))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"bounds": {"x": (2.0, 1.0)}}, "'x'.*2.0.*1.0"),
-        ({"bounds": {"x": (torch.tensor([0.0, 1.0]), torch.tensor([1.0, 1.0]))}}, r"\[0.0, 1.0\].*\[1.0, 1.0\]"),
-        ({"bounds": {"x": (math.nan, 1.0)}}, "'x'.*nan.*1.0"),
         ({"bounds": {"x": (0.0, math.inf)}}, "'x'.*0.0.*inf"),
-        ({"bounds": {"x": OPEN}}, "'x'.*-3.4.*0.0"),
         ({"bounds": {"x": 1.0}}, r"the bounds of 'x' must be \(low, high\), got 1.0"),
         ({"bounds": {"z": (0.0, 1.0)}}, r"'z'.*\['x'\]"),
         ({"interval": (0.5, 0.5)}, r"interval.*\(0.5, 0.5\)"),
-        ({"interval": (0.0, math.inf)}, r"interval.*\(0.0, inf\)"),
         ({"out_keys": ["y", "z"]}, r"\['x'\].*\['y', 'z'\]"),
     ],
 )
