@@ -111,19 +111,6 @@ def test_one_vehicle_flies_as_in_torchrl() -> None:
             state, (observation, info) = reference.reset(), env.reset()
 
 
-@pytest.mark.parametrize(
-    ("scaled", "given", "move"),
-    [
-        (True, (1, 1), (50, math.pi / 2)),
-        (False, (12.5, 0.25), (12.5, 0.25)),
-    ],
-)
-def test_units_of_actions(scaled: bool, given: tuple, move: tuple) -> None:
-    env = make(scale_actions=scaled, observation="dict")
-    env.reset(seed=0)
-    np.testing.assert_array_equal(env.step(action(*given))[0]["move"], action(*move))
-
-
 # Seeds and tasks
 
 
@@ -149,15 +136,6 @@ def test_observations_stay_in_their_spaces(observation: str) -> None:
         assert envs.observation_space.contains(observations)
         for final in info.get("final_obs", ()):
             assert final is None or envs.single_observation_space.contains(final)
-
-
-def test_bounds_of_the_flat_observation() -> None:
-    space = make().observation_space
-    assert space.shape == (13,)
-    assert np.isfinite([space.low, space.high]).all()
-    np.testing.assert_array_equal(space.low[[6, 7, 11, 12]], [-1] * 4)  # last move, then the heading's cosine and sine
-    np.testing.assert_array_equal(space.high[[6, 7, 11, 12]], [1] * 4)
-    np.testing.assert_array_equal(space.low[:3], space.low[3:6])  # the field here and at the destination
 
 
 def test_dict_observation_is_a_copy_of_the_public_keys() -> None:

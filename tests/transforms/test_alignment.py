@@ -55,20 +55,6 @@ def nav_with_gradient(spread: float) -> TensorDict:
     return TensorDict(field=here, target_field=there, field_gradient=gradient, batch_size=[64])
 
 
-@pytest.mark.parametrize(
-    ("error", "degrees"),
-    [
-        ((0.5, 1.0), 45.0),  # 50 km to the east and 50 to the north
-        ((-0.5, -1.0), -135.0),
-    ],
-)
-def test_pair_of_angles(error: tuple[float, float], degrees: float) -> None:
-    there = [8 + error[0], -16 + error[1], 35000.0]
-    heading, valid = heading_of([8.0, -16.0, 35000.0], there, D_EAST_I_NORTH_B_SOUTH_EAST)
-    assert valid
-    assert heading == pytest.approx(degrees, abs=1e-9)
-
-
 @pytest.mark.parametrize("pair", [("B_H", "I"), (1, 2)])
 def test_pair_of_inclination_and_intensity(pair: tuple[str | int, str | int]) -> None:
     """2 deg of I are 100 km north; 200 nT then ask for 300 km east. D, which asks for west, is not heard."""
@@ -150,9 +136,8 @@ def test_near_parallel_gradients_are_masked(crossing_deg: float, least_deg: floa
     ],
     ids=["no gradient", "parallel", "on target"],
 )
-@pytest.mark.parametrize("least_deg", [0.0, 2.0])
-def test_no_direction_is_masked_and_not_nan(there: list[float], gradient: list[list[float]], least_deg: float) -> None:
-    assert heading_of([0.0, 0.0], there, gradient, pair=(0, 1), min_crossing_deg=least_deg) == (0.0, False)
+def test_no_direction_is_masked_and_not_nan(there: list[float], gradient: list[list[float]]) -> None:
+    assert heading_of([0.0, 0.0], there, gradient, pair=(0, 1), min_crossing_deg=0.0) == (0.0, False)
 
 
 def guided() -> TransformedEnv:

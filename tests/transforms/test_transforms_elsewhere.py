@@ -40,14 +40,6 @@ def test_concentration_north_of_an_outfall_falls_with_the_root_of_the_distance()
     torch.testing.assert_close(value, -north.log() / 2)
 
 
-def test_concentration_against_the_current_falls_by_the_spread() -> None:
-    """At 1 km south, r - x is 2 km."""
-    west, east = plume_env.OUTFALLS_KM
-    for index, outfall in enumerate((west, east)):
-        value = plume_env.concentration(outfall - torch.tensor([1.0, 0.0]))[index]
-        assert float(value) == pytest.approx(-2 / plume_env.SPREAD_KM)
-
-
 def test_a_move_of_the_plume_env_by_hand() -> None:
     env = plume_env.PlumeEnv(1)
     td = env.reset()

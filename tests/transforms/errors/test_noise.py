@@ -14,8 +14,6 @@ from torchrl.envs import TransformedEnv
 
 from magrl.navigators import Secant
 from magrl.transforms import (
-    FieldGradient,
-    GradientHeading,
     RandomSensorNoise,
     SensorNoise,
     sensor_levels,
@@ -76,14 +74,6 @@ def test_without_noise_the_reading_is_the_value_to_the_bit() -> None:
     base = nav()
     assert with_sensor_noise(base, (0.0, 0.0, 0.0)) is base
     assert isinstance(with_sensor_noise(base, (0.0, 0.0, 1.0)), TransformedEnv)
-
-
-def test_guidance_before_the_noise_uses_the_truth() -> None:
-    guidance = [FieldGradient(nav().field), GradientHeading()]
-    state = under(*guidance, SensorNoise((1.0, 1.0, 100.0))).reset()
-    plain = under(*(part.clone() for part in guidance)).reset()
-    assert torch.equal(state["gradient_heading"], plain["gradient_heading"])
-    assert not torch.equal(state["field"], plain["field"])
 
 
 def test_levels_by_hand() -> None:
