@@ -22,8 +22,6 @@ from magrl.field.elements import measured_elements, seven_elements
 from magrl.field.spherical import SphericalHarmonicField
 from magrl.guidance import objective, objective_weights, parallel_approach
 
-MILLIMETER = 1e-6
-
 
 def f64(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
