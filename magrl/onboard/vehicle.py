@@ -130,8 +130,7 @@ class Onboard:
         confidence: float = 0.8,
     ) -> None:
         check_type((str, TensorDictModuleBase), navigator=navigator)
-        check_numbers(3, sensor_std=sensor_std, bias_std=bias_std)
-        check_number(0, sensor_std=min(sensor_std), bias_std=min(bias_std))
+        check_numbers(3, 0, sensor_std=sensor_std, bias_std=bias_std)
         check_number(1, whole=True, max_steps=max_steps)
         check_number(0, above=True, arrival_km=arrival_km)
         check_number(0, 1, confidence=confidence)

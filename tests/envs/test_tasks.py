@@ -192,12 +192,9 @@ def test_log_uniform_distances():
     ("distance_range_km", "law", "says"),
     [
         ((500, 300), "area", r"\(500, 300\) must be two rising numbers"),
-        ((-1, 300), "area", r"\(-1, 300\) must be two rising numbers"),
-        ((0, math.inf), "area", r"distance_range_km .*inf"),
         ((0, 300), "log", r"\(0, 300\) must be two rising numbers above 0 with distance_law 'log'"),
         ((300, 500), "even", r"distance_law must be one of 'area', 'log', got 'even'"),
         ((1600, 1700), "area", r"\(1600, 1700\): no two points of Region.*160.*170.*more than 1565 km"),
-        ((300, 1700), "log", r"\(300, 1700\): no two points of Region.*more than 1565 km"),
     ],
 )
 def test_bad_distances(distance_range_km, law, says):
@@ -230,20 +227,11 @@ ZERO = torch.zeros(2, dtype=torch.int64)
     ("start", "target", "region", "error", "says"),
     [
         (torch.zeros(2, 3), torch.zeros(2, 3), None, ValueError, r"tasks.start must have the shape \(..., 2\)"),
-        (GOOD[0], GOOD[0], None, ValueError, r"\(M, 2\).*\(2,\) and \(2,\)"),
         (GOOD, GOOD[:1], None, ValueError, r"\(M, 2\).*\(2, 2\) and \(1, 2\)"),
-        (GOOD[:0], GOOD[:0], None, ValueError, r"M >= 1.*\(0, 2\)"),
         (GOOD, f64([-5.0, 165.0], [95.0, 165.0]), None, ValueError, "latitude 95"),
         (f64([-5.0, 165.0], [1.0, 165.0]), GOOD, None, ValueError, r"start of task 1 .*, \[1.0, 165.0\], lies outside"),
-        (
-            GOOD,
-            f64([-8.0, 164.0], [-2.000008, 522.0]),
-            None,
-            ValueError,
-            r"task 1 .* starts at its destination",
-        ),  # 0.9 m
+        (GOOD, f64([-8.0, 164.0], [-2.000008, 522.0]), None, ValueError, "task 1 .* starts at its destination"),
         (GOOD, GOOD.flip(0), ZERO + 1, ValueError, r"tasks.region 1 is not in \[0, 1\)"),
-        (GOOD, GOOD.flip(0), ZERO.float(), TypeError, "tasks.region must be int64"),
         (GOOD, GOOD.flip(0), ZERO[:1], ValueError, r"tasks.region must hold 2 indices, one a task, got \(1,\)"),
     ],
 )

@@ -102,14 +102,6 @@ def test_the_edges_belong_to_the_box_and_beyond_is_nan(bank: FieldBank) -> None:
             assert found.isnan().all()
 
 
-def test_chunks_do_not_show_and_a_bank_is_compiled_whole(bank: FieldBank) -> None:
-    places, small = inside(100), copy.deepcopy(bank)
-    small.CHUNK = 7
-    assert_same(small.value_and_gradient(*places), bank.value_and_gradient(*places))
-    whole = torch.compile(bank.forward, fullgraph=True, backend="eager")
-    assert_same((whole(*places), small(*places)), (bank(*places), bank(*places)))
-
-
 def test_many_boxes_are_built_as_one_by_one() -> None:
     """More boxes and planets than are expanded at a time."""
     planets, planet = random_planets(70, seed=2, degree=4), torch.arange(150) % 70

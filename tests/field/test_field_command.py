@@ -105,18 +105,6 @@ def test_missing_file_and_missing_engine_raise(points, monkeypatch, capsys) -> N
         assert message in capsys.readouterr().err
 
 
-def test_columns_of_numbers_are_numbers_in_parquet(tmp_path: Path, monkeypatch) -> None:
-    """And dates and mixed columns stay what they were."""
-    written: list[pandas.DataFrame] = []
-    monkeypatch.setattr(pandas.DataFrame, "to_parquet", lambda table, *_, **__: written.append(table))
-    rows = "name,latitude,longitude,altitude,date\na,60,5,0,2025-06-01\n7,-10,165.5,-2,2022-01-01\n"
-    (tmp_path / "points.csv").write_text(rows)
-    main([str(tmp_path / "points.csv"), "--out", str(tmp_path / "field.parquet")])
-    (table,) = written
-    assert table[["latitude", "longitude", "altitude"]].sum().tolist() == [50.0, 170.5, -2.0]
-    assert table[["name", "date"]].to_numpy().tolist() == [["a", "2025-06-01"], ["7", "2022-01-01"]]
-
-
 def test_help_ends_without_a_traceback_when_the_pipe_is_closed() -> None:
     done = subprocess.run(
         f"{sys.executable} -W ignore -m magrl.field points.csv --help | head -n 1",

@@ -89,17 +89,6 @@ def test_shapes_and_dtypes_of_models(model, request):
 
 
 @pytest.mark.parametrize("model", ["igrf", "region"])
-def test_many_points_are_those_points_one_by_one(model, request):
-    """More than any chunk holds."""
-    field, position = request.getfixturevalue(model), inside(*BOX, 20_000)
-    chosen = torch.tensor([0, 1, 2067, 2068, 10240, 16383, 16384, 19_999])
-    few = tuple(x[chosen] for x in position)
-    torch.testing.assert_close(field(*position)[chosen], field(*few), rtol=0, atol=ROUNDING_NT)
-    for found, expected in zip(field.value_and_gradient(*position), field.value_and_gradient(*few), strict=True):
-        torch.testing.assert_close(found[chosen], expected, rtol=0, atol=ROUNDING_NT)
-
-
-@pytest.mark.parametrize("model", ["igrf", "region"])
 def test_models_are_compiled_whole_and_can_be_differentiated(model, request):
     """Their own gradient, northward per km, is what autograd finds per degree."""
     field = request.getfixturevalue(model)

@@ -9,7 +9,7 @@ import torch
 from support.field_checks import central_differences, f64, globe, relative_error
 
 from magrl.field.elements import seven_elements
-from magrl.field.igrf import IGRF, igrf_coefficients
+from magrl.field.igrf import IGRF
 from magrl.field.spherical import SphericalHarmonicField
 from magrl.geodesy import REFERENCE_RADIUS_KM, WGS84_A_KM, WGS84_B_KM
 
@@ -53,19 +53,6 @@ def test_another_model_gives_its_published_values():
         nanotesla = (found.B_x, found.B_y, found.B_z, found.B_H, found.B_F)
         assert [float(x) for x in nanotesla] == pytest.approx(published[:5], rel=0, abs=0.0501)
         assert [float(x) for x in (found.I, found.D)] == pytest.approx(published[5:], rel=0, abs=0.00501)
-
-
-@pytest.mark.parametrize("altitude_km", [-5.0, 0.0, 600.1, 36000.0])
-def test_default_altitude_and_the_same_given_agree(altitude_km):
-    """One is a short series made for that altitude, the other the whole expansion: over the globe and at its poles."""
-    latitude, longitude = globe(500, 6)
-    latitude[:2] = f64(90.0, -90.0)
-    model = SphericalHarmonicField(igrf_coefficients("2022-01-01", 13), altitude_km=altitude_km)
-    value, gradient = model.value_and_gradient(latitude, longitude, altitude_km)
-    assert_same(model(latitude, longitude), value)
-    assert_same(model(latitude, longitude, f64(altitude_km)[0]), value)
-    found = model.value_and_gradient(latitude[2:], longitude[2:])
-    torch.testing.assert_close(found[1], gradient[2:], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("altitude_km", [-5.0, 600.0])

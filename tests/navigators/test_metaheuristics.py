@@ -1,6 +1,5 @@
 """Genetic algorithm, particle swarm and fish swarm as navigators."""
 
-import copy
 import math
 
 import pytest
@@ -14,7 +13,7 @@ from magrl.field import elements_at
 from magrl.geodesy import move
 from magrl.navigators import NAVIGATORS
 from magrl.navigators.metaheuristics import MODES, ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
-from magrl.navigators.metaheuristics.base import in_disc, reachable, take
+from magrl.navigators.metaheuristics.base import reachable, take
 
 every_algorithm = pytest.mark.parametrize("name", ["afsa", "ga", "pso"])
 
@@ -50,12 +49,6 @@ def test_reachable_by_hand() -> None:
     distance, turn = reachable(candidate, torch.tensor([0.0, math.pi, math.pi / 2]), math.pi / 2)
     torch.testing.assert_close(distance, torch.tensor([0.5, 1.0, 0.3 * math.sqrt(2)]))
     torch.testing.assert_close(turn, torch.tensor([math.pi / 2, 0.0, -math.pi / 2]), atol=1e-6, rtol=0)
-
-
-def test_take_and_disc_by_hand() -> None:
-    values = torch.tensor([[10, 11, 12], [20, 21, 22]])
-    assert take(values, torch.tensor([[2, 0], [1, 1]])).tolist() == [[12, 10], [21, 21]]
-    torch.testing.assert_close(in_disc(torch.tensor([[3.0, 4.0], [0.3, 0.4]])), torch.tensor([[0.6, 0.8], [0.3, 0.4]]))
 
 
 @every_algorithm
@@ -182,33 +175,6 @@ def test_a_seed_repeats_the_moves(env, name: str, mode: str) -> None:
         moves.append(env.rollout(6, navigator, break_when_any_done=False)["action"])
     assert torch.equal(moves[0], moves[1])
     assert not torch.equal(moves[0], moves[2])
-
-
-@every_algorithm
-def test_a_new_episode_begins_a_new_memory_for_its_vehicle_alone(env, name: str) -> None:
-    navigator = NAVIGATORS[name].for_env(env, mode="flown", seed=0)
-    env.set_seed(0)
-    state = env.reset()
-    for _ in range(3):
-        state = env.step(navigator(state))["next"]
-    began = torch.arange(30) % 3 == 0
-    first = env.reset()
-    before = copy.deepcopy(navigator.memory)
-    navigator(torch.where(began, first.select(*navigator.in_keys), state.select(*navigator.in_keys)))
-    after = navigator.memory
-    assert (after["moves"][began] == 1).all()
-    assert (after["moves"][~began] == 4).all()
-    assert torch.equal(after["weights"][~began], before["weights"][~began])
-    torch.testing.assert_close(after["weights"][began].float(), first["objective_weights"][began], rtol=1e-3, atol=0)
-    assert (after["fitness"][began] == 0).all()
-
-
-@every_algorithm
-def test_another_batch_begins_anew(env, name: str) -> None:
-    navigator = NAVIGATORS[name].for_env(env, mode="flown", seed=0)
-    navigator(env.reset())
-    other = GeomagneticNavEnv(Scenario(field=env.field), num_envs=5, seed=1)
-    assert navigator(other.reset())["action"].shape == (5, 2)
 
 
 def test_bad_options_are_refused_with_their_value() -> None:

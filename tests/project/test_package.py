@@ -109,6 +109,7 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     assert any(path.name == "LICENSE" for path in held)
 
 
+@pytest.mark.slow
 def test_wheel_works_without_the_tree(python: Path, tmp_path: Path) -> None:
     assert len(run(python, "-c", TOUR, cwd=tmp_path).splitlines()) == 2
     assert (tmp_path / "episodes.png").stat().st_size > 10_000

@@ -15,7 +15,6 @@ from magrl.field.model import elements_at
 from magrl.geodesy import move
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
-DTYPES = [torch.float32, torch.float64]
 D_EAST_I_NORTH_B_SOUTH_EAST = [[0.0, 0.01], [0.02, 0.0], [-1.0, 1.0]]
 
 
@@ -35,50 +34,15 @@ def test_field_gradient_is_the_slope_between_neighbors() -> None:
 
 
 def heading_of(
-    here: list[float], there: list[float], gradient: list[list[float]], dtype: torch.dtype = torch.float64, **options
+    here: list[float], there: list[float], gradient: list[list[float]], **options: object
 ) -> tuple[float, bool]:
     """The heading in degrees and the mask, for one place."""
     names = ("field", "target_field", "field_gradient")
-    td = TensorDict({n: torch.tensor(x, dtype=dtype) for n, x in zip(names, (here, there, gradient), strict=True)})
+    td = TensorDict(
+        {n: torch.tensor(x, dtype=torch.float64) for n, x in zip(names, (here, there, gradient), strict=True)}
+    )
     out = GradientHeading(**options)(td)
     return math.degrees(out["gradient_heading"]), bool(out["gradient_heading_valid"])
-
-
-def nav_with_gradient(spread: float) -> TensorDict:
-    """64 places whose gradients point in random directions."""
-    draw = torch.Generator().manual_seed(0)
-    scale = torch.tensor([0.01, 0.02, 1.0])
-    gradient = torch.randn(64, 3, 2, generator=draw) * scale.unsqueeze(-1)
-    here = torch.tensor([8.0, -16.0, 35000.0]).expand(64, 3)
-    there = here + spread * 100 * scale * torch.randn(64, 3, generator=draw)
-    return TensorDict(field=here, target_field=there, field_gradient=gradient, batch_size=[64])
-
-
-@pytest.mark.parametrize(
-    ("error", "degrees"),
-    [
-        ((0.0, 1.0), 0.0),
-        ((1.0, 0.0), 90.0),
-        ((0.0, -1.0), 180.0),
-        ((-1.0, 0.0), -90.0),
-        ((0.5, 1.0), 45.0),  # 50 km to the east and 50 to the north
-        ((-0.5, -1.0), -135.0),
-    ],
-)
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_pair_of_angles(error: tuple[float, float], degrees: float, dtype: torch.dtype) -> None:
-    there = [8 + error[0], -16 + error[1], 35000.0]
-    heading, valid = heading_of([8.0, -16.0, 35000.0], there, D_EAST_I_NORTH_B_SOUTH_EAST, dtype)
-    assert valid
-    assert heading == pytest.approx(degrees, abs=1e-3 if dtype == torch.float32 else 1e-9)
-
-
-@pytest.mark.parametrize("pair", [("I", "B_H"), ("B_H", "I"), (1, 2), ("I", 2)])
-def test_pair_of_inclination_and_intensity(pair: tuple[str | int, str | int]) -> None:
-    """2 deg of I are 100 km north; 200 nT then ask for 300 km east. D, which asks for west, is not heard."""
-    heading, valid = heading_of([8.0, -16.0, 35000.0], [7.0, -14.0, 35200.0], D_EAST_I_NORTH_B_SOUTH_EAST, pair=pair)
-    assert valid
-    assert heading == pytest.approx(math.degrees(math.atan2(300, 100)), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -96,27 +60,6 @@ def test_automatic_pair_is_the_one_that_crosses_best(gradient: list, pair: tuple
     assert heading == heading_of(here, there, gradient, pair=pair)[0]
 
 
-def test_automatic_pair_has_no_heading_where_no_two_gradients_cross() -> None:
-    parallel = [[0.0, 0.01], [0.0, 0.02], [0.0, 1.0]]
-    for gradient, there in (
-        (parallel, [7.0, -14.0, 35200.0]),
-        (D_EAST_I_NORTH_B_SOUTH_EAST, [8.0, -16.0, 35000.0]),
-    ):
-        assert heading_of([8.0, -16.0, 35000.0], there, gradient, pair="auto") == (0.0, False)
-
-
-def test_automatic_pair_in_a_batch_is_chosen_place_by_place() -> None:
-    td = nav_with_gradient(2.0)
-    automatic = GradientHeading(pair="auto")(td.clone())
-    fixed = [GradientHeading(pair=pair)(td.clone()) for pair in (("D", "I"), ("D", "B_H"), ("I", "B_H"))]
-    names = ("gradient_heading", "gradient_heading_valid")
-    heading, valid = (torch.stack([out[name] for out in (automatic, *fixed)]) for name in names)
-    assert valid[0].all()
-    same = heading[0] == heading[1:]
-    assert same.any(0).all()
-    assert [bool(same[k].any()) for k in range(3)] == [True, True, True]
-
-
 @pytest.mark.parametrize(
     ("here", "there", "degrees"), [(179.0, -179.0, 90.0), (-179.5, 179.5, -90.0), (-1.0, 1.0, 90.0)]
 )
@@ -125,24 +68,6 @@ def test_declination_is_taken_the_short_way(here: float, there: float, degrees: 
     heading, valid = heading_of([here, 0.0], [there, 0.0], gradient)
     assert valid
     assert heading == pytest.approx(degrees, abs=1e-9)
-
-
-def test_an_index_is_taken_as_it_stands() -> None:
-    heading, _ = heading_of([179.0, 0.0], [-179.0, 0.0], [[0.0, 0.01], [0.02, 0.0]], pair=(0, 1))
-    assert heading == pytest.approx(-90.0, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("crossing_deg", "least_deg", "expected"),
-    [(1.9, 2.0, False), (2.1, 2.0, True), (1.9, 0.0, True), (30, 45, False)],
-)
-@pytest.mark.parametrize("sign", [1, -1])
-def test_near_parallel_gradients_are_masked(crossing_deg: float, least_deg: float, expected: bool, sign: int) -> None:
-    turn = math.radians(sign * crossing_deg)
-    gradient = [[3.0, 0.0], [5 * math.cos(turn), 5 * math.sin(turn)]]
-    heading, valid = heading_of([0.0, 0.0], [0.1, 0.2], gradient, pair=(0, 1), min_crossing_deg=least_deg)
-    assert valid is expected
-    assert valid or heading == 0.0
 
 
 @pytest.mark.parametrize(
@@ -154,9 +79,8 @@ def test_near_parallel_gradients_are_masked(crossing_deg: float, least_deg: floa
     ],
     ids=["no gradient", "parallel", "on target"],
 )
-@pytest.mark.parametrize("least_deg", [0.0, 2.0])
-def test_no_direction_is_masked_and_not_nan(there: list[float], gradient: list[list[float]], least_deg: float) -> None:
-    assert heading_of([0.0, 0.0], there, gradient, pair=(0, 1), min_crossing_deg=least_deg) == (0.0, False)
+def test_no_direction_is_masked_and_not_nan(there: list[float], gradient: list[list[float]]) -> None:
+    assert heading_of([0.0, 0.0], there, gradient, pair=(0, 1), min_crossing_deg=0.0) == (0.0, False)
 
 
 def guided() -> TransformedEnv:
@@ -172,23 +96,9 @@ def transition(**changes: object) -> TensorDict:
     return td.update(changes)
 
 
-@pytest.mark.parametrize("mask", [[], ["trusted"]])
-def test_angle_after_the_move_and_reference_and_mask_before_it(mask: list[str]) -> None:
-    out = AlignmentReward(["angle", "reference", *mask])(transition())
-    assert float(out["next", "reward"]) == pytest.approx(7 + 3 * (math.pi / 4 - 0.3), abs=1e-5)
-
-
 def test_masked_reference_earns_nothing_even_if_it_is_nan() -> None:
     td = transition(trusted=torch.tensor([False]), reference=torch.tensor([float("nan")]))
     assert float(AlignmentReward(["angle", "reference", "trusted"])(td)["next", "reward"]) == 7.0
-
-
-@pytest.mark.parametrize(("angle", "reference", "apart"), [(3.0, -3.0, 2 * math.pi - 6), (-math.pi, math.pi, 0.0)])
-def test_deviation_is_wrapped(angle: float, reference: float, apart: float) -> None:
-    td = transition(reference=torch.tensor([reference]))
-    td["next", "angle"] = torch.tensor([angle])
-    out = AlignmentReward(["angle", "reference"])(td)
-    assert float(out["next", "reward"]) == pytest.approx(7 + 3 * (math.pi / 4 - apart), abs=1e-5)
 
 
 def test_reward_is_created_when_missing() -> None:
@@ -217,14 +127,9 @@ def test_without_next_the_error_says_what_is_needed() -> None:
     ("make", "message"),
     [
         (lambda: FieldGradient("IGRF"), "value_and_gradient.*str"),
-        (lambda: FieldGradient(field(), ["x", "y"]), r"FieldGradient.*\['x', 'y'\]"),
         (lambda: GradientHeading(pair=("D", "Z")), "'Z'.*D, I, B_H"),
-        (lambda: GradientHeading(pair=("D", 0)), r"\('D', 0\)"),
-        (lambda: GradientHeading(pair=5), "pair .*5"),
         (lambda: GradientHeading(min_crossing_deg=90.0), "min_crossing_deg.*90.0"),
-        (lambda: GradientHeading(["x", "y"]), r"GradientHeading.*\['x', 'y'\]"),
         (lambda: AlignmentReward(["x"]), r"2 or 3 in_keys and 1 or 2 out_keys, got \['x'\]"),
-        (lambda: AlignmentReward(weight=math.nan), "weight.*nan"),
     ],
 )
 def test_bad_options(make, message: str) -> None:

@@ -8,16 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.environments import parallel
 from support.readings import first_reading, moved
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
-from magrl.files import save_tensors
 from magrl.guidance import OBJECTIVE_FLOORS
 from magrl.transforms import ObservationView, SensorNoise, TrackGradient, TrackView
 from magrl.transforms.track import IN_KEYS, STD_KEYS
@@ -99,11 +95,10 @@ def observed_track(turn: float) -> Tensor:
     return torch.stack(observations)
 
 
-@pytest.mark.parametrize("turn", [0.5, 3.0])
-def test_a_turn_of_world_and_vehicle_is_not_observed(turn: float) -> None:
-    """D turns with the world, and for the last angle passes 180 degrees."""
+def test_a_turn_of_world_and_vehicle_is_not_observed() -> None:
+    """D turns with the world, and passes 180 degrees."""
     plain = observed_track(0.0)
-    torch.testing.assert_close(observed_track(turn), plain, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(observed_track(3.0), plain, rtol=1e-9, atol=1e-9)
     assert (plain[1:] - plain[:-1]).abs().amax(-1).min() > 0.01
 
 
@@ -125,29 +120,6 @@ def test_weights_are_those_of_the_first_reading_of_each_row() -> None:
     torch.testing.assert_close(nexts["observation"][:, 11], torch.where(chosen, 1, 4) / 50)
 
 
-@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
-def test_specs_in_other_processes() -> None:
-    env = parallel(observing)
-    try:
-        check_env_specs(env)
-        assert {"first_field", "observation"} & set(env.full_state_spec.keys()) == {"first_field"}
-    finally:
-        env.close()
-
-
-def test_policy_acts_alike_in_the_plain_and_in_the_training_environment() -> None:
-    """Over episodes of different lengths, whose vehicles start again at different steps."""
-    agent, make = policy(), partial(nav, num_envs=16, zeta=2.5, max_steps=9, start_heading="random")
-    with torch.no_grad():
-        one = TransformedEnv(make(), SensorNoise(STD, seed=1)).rollout(20, agent, break_when_any_done=False)
-        other = observing(make()).rollout(20, agent.actor, break_when_any_done=False)
-    ended = one["next", "done"].squeeze(-1)
-    assert ended.any(0).sum() > 5
-    assert not ended.all(0).any()
-    assert torch.equal(one["next", "done"], other["next", "done"])
-    torch.testing.assert_close(one["next", "position"], other["next", "position"], rtol=0, atol=1e-9)
-
-
 def test_policy_starts_again_where_the_batch_is_another(tmp_path: Path) -> None:
     """In the middle of an episode, too: what it kept is of other vehicles. So does one from a file."""
     agent, middle = policy(), nav(num_envs=2).rollout(3)[:, -1]
@@ -159,19 +131,7 @@ def test_policy_starts_again_where_the_batch_is_another(tmp_path: Path) -> None:
         assert torch.equal(found(middle.clone())["action"], expected)
 
 
-@pytest.mark.parametrize("change", [{"kind": "region"}, {"kind": "map"}, {"memory_size": 4}, {"view": {"zeta": 0.01}}])
-def test_a_file_of_another_kind_is_refused(tmp_path: Path, change: dict) -> None:
-    path = tmp_path / "policy.pt"
-    save_policy(path, policy())
-    content: TensorDictBase = torch.load(path, weights_only=True)
-    save_tensors(content | {"config": content["config"] | change}, path)
-    with pytest.raises(ValueError, match="does not hold a valid policy"):
-        load_policy(path)
-
-
 def test_bad_bounds_of_a_view_are_refused() -> None:
     options = {"observe_heading": True, "observe_difference": True, "max_move_km": 50.0, "max_turn_rad": 1.5}
     with pytest.raises(ValueError, match=r"field_low \(1.0, 0.0, 0.0\) must lie below field_high"):
         ObservationView(**options, field_low=(1.0, 0.0, 0.0), field_high=(1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="max_turn_rad must be"):
-        ObservationView(**(options | {"max_turn_rad": 4.0}), field_low=(0.0,) * 3, field_high=(1.0,) * 3)

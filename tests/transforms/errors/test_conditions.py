@@ -19,7 +19,6 @@ from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
 from magrl.field.records import weather_record
 from magrl.navigators import Kalman
-from magrl.training import UsageError
 from magrl.transforms import (
     CONDITIONS,
     Conditions,
@@ -42,12 +41,6 @@ def nav(num_envs: int, drift_km: float = 0.0, **options: object) -> GeomagneticN
 
 def under(name: str, num_envs: int = 2, seed: int = 0) -> EnvBase:
     return with_conditions(nav(num_envs, CONDITIONS[name].drift_km(50.0)), name, seed)
-
-
-def test_without_errors_the_environment_stays() -> None:
-    env = nav(2)
-    assert with_conditions(env, "laboratory") is env
-    assert CONDITIONS["laboratory"].sensor_std == CONDITIONS["laboratory"].bias_std == (0.0, 0.0, 0.0)
 
 
 def test_order_of_the_errors() -> None:
@@ -151,23 +144,6 @@ def test_evaluate_under_conditions(tmp_path: Path) -> None:
     assert {type(part) for part in env.transform} >= {MotionError, NorthReferenceError}
     assert navigators[0][0].bias_std.tolist() == list(CONDITIONS["ship"].bias_std)
     assert evaluate.settings(config, env)["conditions"] == "ship"
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"conditions": "ship", "noise": (0.1, 0.1, 1.0)},
-            "--conditions ship hold the noise of the sensors: omit --noise",
-        ),
-        ({"conditions": "sledge"}, "conditions must be one of 'laboratory', .*'sledge'"),
-    ],
-)
-def test_bad_conditions_of_the_commands_are_refused(tmp_path: Path, options: dict, message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        evaluate.prepare(evaluate.Config(("secant",), out=tmp_path / "a", **options))
-    with pytest.raises(UsageError, match=message):
-        fly.prepare(fly.Config("60.4N 5.3E", "64.1N 21.9W", out=tmp_path / "b", **options))
 
 
 def test_fly_under_conditions(tmp_path: Path) -> None:

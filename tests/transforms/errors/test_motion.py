@@ -90,10 +90,8 @@ def test_the_environment_must_allow_the_farthest_move() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"log_noise": -0.1}, "log_noise .*-0.1"),
         ({"log_scale": 0.3}, "log_scale 0.3 .*above 0"),
         ({"current_km_h": 1.0}, "speed_km_h .*None"),
-        ({"eddy_km": 0.0}, "eddy_km .*0.0"),
         ({"in_keys": ["move"]}, r"3 in_keys .*\['move'\]"),
     ],
 )
