@@ -41,7 +41,7 @@ from torchrl import torchrl_logger
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from magrl.checks import check_number
+from magrl.checks import check_numbers
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize
 from magrl.evaluation.maps import trajectories_figure
@@ -98,6 +98,8 @@ class Config(ScenarioOptions):
     """Date of the map of map_matching, as 2015-01-01 (IGRF); by default its map is the field itself."""
     kilometers: bool = False
     """Whether the tables lead with distances, as they do where arrival is not by the objective."""
+    confidence: float = 0.0
+    """Least probability at which a vehicle declares its arrival, with --arrival declared."""
     seed: int = 0
     """Random seed of metaheuristics, sensor noise and random start headings."""
     out: Path = field(default_factory=free_folder)
@@ -136,8 +138,7 @@ def settle(config: Config) -> tuple[Config, list[str]]:
         ValueError: for runs that differ in a setting that was not chosen, or conditions with noise.
         FileNotFoundError: for a run without its scenario file.
     """
-    for level in config.noise or ():
-        check_number(0, noise=level)
+    check_numbers(3, 0, noise=config.noise or NO_NOISE)
     if config.conditions and config.noise:
         raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
     every = trained_runs(config.navigators)
@@ -201,7 +202,7 @@ def make_fleet(config: Config, scenarios: Sequence[Scenario]) -> tuple[list[EnvB
     options = {"mode": config.mode, "seed": config.seed, "map_date": config.map_date}
     options |= {"sensor_std": sensor_std, "bias_std": conditions.bias_std}
     navigators = [tuple(make_navigator(text, base, **options) for base in bases) for text in config.navigators]
-    return [with_declaration(env) for env in envs], navigators
+    return [with_declaration(env, config.confidence) for env in envs], navigators
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:

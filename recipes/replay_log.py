@@ -62,10 +62,8 @@ class Config:
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]: the data sheet of the sensors."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of constant and slow errors of the same."""
-    zeta: float = 0.01
-    """Arrival threshold on the objective F (Eq. 2-6)."""
-    arrival_km: float | None = None
-    """Distance that counts as arrived, in place of the threshold [km]."""
+    arrival_km: float = 25.0
+    """Distance from the destination that counts as arrived [km]."""
     every_km: float = 0.0
     """Least length of a move: shorter ones are joined [km]."""
     time: str = "time"
@@ -143,7 +141,7 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
     """
     navigator = load_policy(config.navigator) if config.navigator.endswith(".pt") else config.navigator
     sheet = {"sensor_std": config.noise, "bias_std": config.bias}
-    board = Onboard(navigator, max_steps=len(log), zeta=config.zeta, arrival_km=config.arrival_km, **sheet)
+    board = Onboard(navigator, max_steps=len(log) + 1, arrival_km=config.arrival_km, **sheet)
     board.start(log[ELEMENTS].iloc[-1].tolist() if config.target is None else config.target)
     found = []
     for _, row in log.iterrows():

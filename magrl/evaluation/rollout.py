@@ -30,6 +30,7 @@ def evaluate(
     num_envs: int | None = None,
     noise: Noise = NO_NOISE,
     conditions: str | None = None,
+    confidence: float = 0.0,
     seed: int = 0,
     device: torch.device | str = "cpu",
     **options: Any,
@@ -45,6 +46,7 @@ def evaluate(
             each task. Sensor noise, other errors and random start headings depend on it, the tasks do not.
         noise: standard deviations of the noise on D [deg], I [deg], B_H [nT].
         conditions: errors of a real vehicle instead of noise, a name of :data:`magrl.transforms.CONDITIONS`.
+        confidence: least probability at which navigators declare an arrival.
         seed: random seed of the errors, random start headings and metaheuristics.
         device: device of the environment.
         options: further options of :class:`~magrl.envs.GeomagneticNavEnv`, such as ``max_steps`` or ``zeta``. With
@@ -81,7 +83,7 @@ def evaluate(
         policy.check_fits(base)
     env = with_sensor_noise(base, noise, seed) if conditions is None else with_conditions(base, flown, seed)
     if isinstance(policy, FieldPolicy | Navigator):
-        env = with_declaration(env)
+        env = with_declaration(env, confidence)
     restart(env)
     episodes = [_next_episodes(env, policy) for _ in range(math.ceil(count / num_envs))]
     return torch.cat(episodes)[:count]  # a last batch that is not full has flown the first tasks again

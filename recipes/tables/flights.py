@@ -13,6 +13,7 @@ from magrl.envs import GeomagneticNavEnv, earth_scenario
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.runs import NO_NOISE, Noise
+from magrl.evaluation.scenarios import with_declaration
 from magrl.transforms import Conditions, with_conditions, with_sensor_noise
 
 FAR_KM = 500.0
@@ -26,9 +27,19 @@ Spec = str | Mapping[str, Any]
 
 
 def flown(
-    navigator: TensorDictModuleBase | Spec, base: GeomagneticNavEnv, errors: Noise | Conditions
+    navigator: TensorDictModuleBase | Spec, base: GeomagneticNavEnv, errors: Noise | Conditions, confidence: float = 0.0
 ) -> TensorDictBase:
-    """Return the measures of an episode of each vehicle, under noise or under the conditions of a real vehicle."""
+    """Return the measures of an episode of each vehicle, under noise or under the conditions of a real vehicle.
+
+    Where arrivals are declared, ``confidence`` is the least probability at which the navigators declare them.
+    """
+    return episode_measures(rollout(navigator, base, errors, confidence))
+
+
+def rollout(
+    navigator: TensorDictModuleBase | Spec, base: GeomagneticNavEnv, errors: Noise | Conditions, confidence: float = 0.0
+) -> TensorDictBase:
+    """Return an episode of each vehicle, as :func:`flown` measures it."""
     if isinstance(errors, Conditions):
         env, std, bias = with_conditions(base, errors, base.seed), errors.sensor_std, errors.bias_std
     else:
@@ -38,7 +49,7 @@ def flown(
     if isinstance(navigator, Mapping):
         options = {key: value for key, value in navigator.items() if key != "name"}
         navigator = make_navigator(navigator["name"], base, sensor_std=std, bias_std=bias, **options)
-    return episode_measures(evaluation_rollout(env, navigator))
+    return evaluation_rollout(with_declaration(env, confidence), navigator)
 
 
 def earth_env(

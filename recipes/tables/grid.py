@@ -18,6 +18,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each ot
 
 import contextlib
 import inspect
+import itertools
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,10 +33,12 @@ from tqdm import tqdm
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
 from magrl.evaluation import summarize
+from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import check_distinct, label, needs
 from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
+from magrl.geodesy import geodesic
 from magrl.navigators import ParallelApproach, Secant
 from magrl.training import UsageError, command
 from magrl.transforms import Conditions, conditions_named
@@ -46,10 +49,9 @@ else:
     import tomli as tomllib
 
 sys.path.insert(0, str(Path(__file__).parent))
-import aboard
 import globe
 import trainings
-from flights import DRIFT_KM, FAR_KM, Spec, earth_env, flown
+from flights import DRIFT_KM, FAR_KM, Spec, earth_env, flown, rollout
 
 RECIPE = "grid.py"
 LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
@@ -83,21 +85,56 @@ def earth(
     distance_km: Sequence[float] = paper.DISTANCE_KM,
     max_steps: int = 50,
     crust: bool = False,
+    declared_km: float | None = None,
+    confidence: Sequence[float] = (0.0,),
 ) -> str:
-    """Return a row for each date and navigator, with a column for each level of noise or each of some conditions."""
-    columns: dict[str, Noise | Conditions] = {name: conditions_named(name) for name in conditions}
-    columns = columns or {", ".join(f"{level:g}" for level in noise): noise for noise in LEVELS}
-    drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM} if conditions else {}
+    """Return a row for each date and navigator, with a column for each level of noise or each of some conditions.
+
+    With ``declared_km``, the vehicles declare their arrival within this distance, and there is a row for each level of
+    confidence.
+    """
+    columns = columns_of(conditions)
+    options: dict[str, Any] = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM} if conditions else {}
+    options |= {"arrival": "declared", "arrival_radius_km": declared_km} if declared_km else {}
     measures = ["success_rate_within_25km"] * (distance_km[1] > FAR_KM) + ["success_rate", "spl", "steps"]
+    measures = ["success_rate", "spl", "false_arrival_rate", "final_distance_km_median"] if declared_km else measures
     rows = []
     for date in dates:
-        base = earth_env(tasks, distance_km, date, max_steps=max_steps, crust=crust, **drift)
-        for navigator in tqdm(navigators, unit="navigator"):
-            summaries = [summarize(flown(navigator, base, errors)) for errors in columns.values()]
+        base = earth_env(tasks, distance_km, date, max_steps=max_steps, crust=crust, **options)
+        for navigator, least in tqdm(list(itertools.product(navigators, confidence)), unit="row"):
+            summaries = [summarize(flown(navigator, base, errors, least)) for errors in columns.values()]
             cells = [" / ".join(f"{summary[name]:.1f}" for name in measures) for summary in summaries]
-            rows.append([*[date] * (len(dates) > 1), *names(navigator), *[1] * (not conditions), *cells])
-    head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["runs"] * (not conditions), *columns]
-    return markdown_table(head, rows)
+            first = [*[date] * (len(dates) > 1), *names(navigator), *[f"{least:g}"] * (len(confidence) > 1)]
+            rows.append([*first, *[1] * (not conditions and not declared_km), *cells])
+    head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["confidence"] * (len(confidence) > 1)]
+    return markdown_table([*head, *["runs"] * (not conditions and not declared_km), *columns], rows)
+
+
+def columns_of(conditions: Sequence[str]) -> dict[str, Noise | Conditions]:
+    """Return some conditions by name, or the levels of noise."""
+    columns: dict[str, Noise | Conditions] = {name: conditions_named(name) for name in conditions}
+    return columns or {", ".join(f"{level:g}" for level in noise): noise for noise in LEVELS}
+
+
+def reliability(
+    navigators: Sequence[Spec], *, conditions: Sequence[str], tasks: int = 1000, max_steps: int = 80
+) -> str:
+    """Return, for ten bins of the probability of being within 25 km, the share of readings at which that was so [%]."""
+    drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM}
+    base = earth_env(tasks, max_steps=max_steps, arrival="declared", arrival_radius_km=25.0, **drift)
+    rows = []
+    for navigator, (name, errors) in itertools.product(navigators, (columns_of(()) | columns_of(conditions)).items()):
+        flight = rollout(navigator, base, errors)
+        kept = first_episode_mask(flight["next", "done"]).squeeze(-1)
+        probability, places = flight["arrival_probability"][kept].squeeze(-1), flight["position"][kept].unbind(-1)
+        distance, _ = geodesic(*places, *flight["target_position"][kept].unbind(-1))
+        cells = []
+        for low in range(0, 100, 10):
+            inside = (100 * probability >= low) & (100 * probability < low + 10 + (low == 90))
+            right = 100 * (distance[inside] <= 25).double().mean().item()
+            cells.append(f"{right:.0f}" if inside.sum() >= 100 else "—")
+        rows.append([names(navigator)[0], name, *cells])
+    return markdown_table(["navigator", "errors", *(f"{low}–{low + 10} %" for low in range(0, 100, 10))], rows)
 
 
 def names(navigator: Spec) -> list[str]:
@@ -176,7 +213,7 @@ KINDS: Mapping[str, Callable[..., str]] = {
     "boxes": boxes,
     "rows": rows_of,
     "globe": globe.globe,
-    "onboard": aboard.onboard,
+    "reliability": reliability,
     "evaluation": trainings.evaluation,
     "short": trainings.short,
     "noise_levels": trainings.noise_levels,

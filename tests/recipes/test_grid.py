@@ -16,7 +16,6 @@ from magrl.field import IGRF
 from magrl.training import UsageError
 
 sys.path.insert(0, str(RECIPES / "tables"))
-import aboard
 import figures
 import globe
 import grid
@@ -33,7 +32,7 @@ def rows(table: str) -> list[list[str]]:
 
 def test_every_table_declares_options_of_its_kind() -> None:
     known = grid.declarations()
-    assert {"earth", "conditions", "globe", "readme", "learning", "onboard", "paper-run"} <= known.keys()
+    assert {"earth", "conditions", "globe", "readme", "learning", "alone", "paper-run"} <= known.keys()
     for name, options in known.items():
         grid.inspect.signature(grid.KINDS[options.pop("kind")]).bind(**options)
         assert not set(options.get("of", ())) - known.keys(), name
@@ -105,10 +104,19 @@ def test_boxes_have_mean_and_lowest_rows() -> None:
     assert values[3] == pytest.approx(values[:2].min(0))
 
 
-def test_vehicles_aboard_declare_at_each_level() -> None:
-    (row,) = rows(aboard.onboard(["secant"], conditions=["laboratory"], tasks=2, arrival_km=25))[2:]
-    assert row[:2] == ["secant (quasi-Newton)", "laboratory"]
-    assert all(cell.startswith("100.0 / 100.0 / ") for cell in row[2:])
+def test_vehicles_that_declare_have_a_row_for_each_confidence() -> None:
+    sure, bold = rows(grid.earth(["secant"], conditions=["ship"], tasks=4, declared_km=25, confidence=[1.0, 0.0]))[2:]
+    assert (sure[2:], bold[2]) == (["1", sure[3]], "0")
+    assert sure[3].split(" / ")[:3] == ["0.0", "0.0", "0.0"]
+    right, _, false, _ = map(float, bold[3].split(" / "))
+    assert right + false == 100
+
+
+def test_reliability_counts_readings_by_their_probability() -> None:
+    table = rows(grid.reliability(["secant"], conditions=["ship"], tasks=30, max_steps=12))[2:]
+    assert [row[1] for row in table][-1] == "ship"
+    assert len(table) == len(grid.LEVELS) + 1
+    assert all(float(row[2]) < 20 for row in table)
 
 
 # The globe
