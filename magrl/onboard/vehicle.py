@@ -247,7 +247,7 @@ class Onboard:
         if stop:
             action = 0.0, 0.0
         elif way.displacement.norm() < self.arrival_km:
-            limits = self.max_move_km, math.radians(self.max_turn_deg)
+            limits = self.arrival_km, self.max_move_km, math.radians(self.max_turn_deg)
             distance, turn = tracking.approach(way.displacement, seen["heading"], *limits)[0].tolist()
             action = distance, turn
         steer = math.degrees(course + action[1]) % 360.0

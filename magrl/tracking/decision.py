@@ -30,6 +30,8 @@ STEP_KM = 1.0
 """Path that a reading costs [km]."""
 RANGE_KM = 500.0
 """Prior standard deviation of the way along each axis [km]."""
+SHORT = 0.25
+"""Distance from the estimated place at which an approach ends, as a share of the radius."""
 READINGS = (1, 2, 4, 8, 16, 32)
 """Numbers of further readings at the estimated place that are compared with declaring now."""
 
@@ -110,26 +112,31 @@ def arrival_decision(
     return ArrivalDecision(probability, worth, torch.maximum(probability, later.amax(-1)), posterior)
 
 
-def approach(way: Tensor, heading: Tensor, max_move_km: Tensor | float, max_turn_rad: Tensor | float) -> Tensor:
-    """Return the action ``(..., 2)``, distance [km] and turn [rad], that goes along a way.
+def approach(
+    way: Tensor, heading: Tensor, radius_km: float, max_move_km: Tensor | float, max_turn_rad: Tensor | float
+) -> Tensor:
+    """Return the action ``(..., 2)``, distance [km] and turn [rad], that goes to the estimated place.
 
-    Where the turn is larger than the largest, the vehicle turns where it is.
+    It ends :data:`SHORT` of the radius before it, as estimates vary by more. Where the turn is larger than the largest,
+    the vehicle turns where it is.
 
     Args:
         way: ``(..., 2)`` northward and eastward [km].
         heading: ``(..., 1)`` [rad].
+        radius_km: distance within which the vehicle has arrived.
         max_move_km: longest move.
         max_turn_rad: largest turn.
 
     Example:
-        >>> approach(torch.tensor([0.0, 30.0]), torch.tensor([0.0]), 50.0, 1.6).round(decimals=2)
-        tensor([30.0000,  1.5700])
+        >>> approach(torch.tensor([0.0, 30.0]), torch.tensor([0.0]), 40.0, 50.0, 1.6).round(decimals=2)
+        tensor([20.0000,  1.5700])
     """
     check_tensor(2, way=way)
     north, east = way.split(1, -1)
     turn = wrap_angle(torch.atan2(east, north) - heading)
     limit = torch.as_tensor(max_turn_rad, dtype=way.dtype, device=way.device)
-    distance = torch.hypot(north, east).clamp_max(torch.as_tensor(max_move_km, dtype=way.dtype, device=way.device))
+    longest = torch.as_tensor(max_move_km, dtype=way.dtype, device=way.device)
+    distance = (torch.hypot(north, east) - SHORT * radius_km).clamp_min(0).clamp_max(longest)
     return torch.cat((distance.where(turn.abs() <= limit, 0.0), torch.minimum(torch.maximum(turn, -limit), limit)), -1)
 
 

@@ -95,7 +95,7 @@ class DeclareArrival(ObservationTransform):
             return tensordict
         probability, worth, way, heading, action = values
         high = self.parent.full_action_spec[self.in_keys_inv[0]].space.high
-        approach = tracking.approach(way, heading, *high[..., :2].split(1, -1)).to(action.dtype)
+        approach = tracking.approach(way, heading, self.radius_km, *high[..., :2].split(1, -1)).to(action.dtype)
         near = way.norm(dim=-1, keepdim=True) < self.radius_km
         declare = (probability >= worth) & (probability >= self.confidence)
         action = torch.where(near, approach, action).masked_fill(declare, 0.0)

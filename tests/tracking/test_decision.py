@@ -54,5 +54,5 @@ def test_a_vehicle_near_the_border_goes_nearer_if_readings_there_help() -> None:
 
 def test_the_approach_turns_where_it_is_if_the_way_is_behind() -> None:
     way = f64((0.0, 30.0), (-30.0, 0.0), (0.0, -80.0))
-    action = approach(way, torch.zeros(3, 1, dtype=F64), 50.0, math.pi / 2)
-    assert action.tolist() == [pytest.approx(row) for row in ([30, math.pi / 2], [0, math.pi / 2], [50, -math.pi / 2])]
+    action = approach(way, torch.zeros(3, 1, dtype=F64), 20.0, 50.0, math.pi / 2)
+    assert action.tolist() == [pytest.approx(row) for row in ([25, math.pi / 2], [0, math.pi / 2], [50, -math.pi / 2])]

@@ -97,15 +97,15 @@ def test_every_navigator_can_be_flown(navigator) -> None:
 def test_the_accuracy_decides_and_confidence_prevents_false_arrivals() -> None:
     keys = (*DeclareArrival.default_in_keys, *STD_KEYS)
     rates = []
-    for confidence in (0.0, 0.8):
+    for confidence in (0.0, 0.7):
         declare = DeclareArrival(25.0, max_steps=50, confidence=confidence, in_keys=keys)
         steps = Compose(SensorErrors(STD, bias=BIAS, seed=1), TrackGradient((*IN_KEYS, *STD_KEYS)), declare)
         env = TransformedEnv(declared(200), steps)
         rates.append(summarize(episode_measures(evaluation_rollout(env, Secant(sensor_std=STD)))))
     bold, careful = rates
+    assert bold["success_rate"] + bold["false_arrival_rate"] == 100
     assert bold["false_arrival_rate"] > careful["false_arrival_rate"] + 5
-    assert 5 < careful["success_rate"] < bold["success_rate"]
-    assert careful["false_arrival_rate"] < 0.1 * (careful["success_rate"] + careful["false_arrival_rate"])
+    assert 30 < careful["success_rate"] < bold["success_rate"]
 
 
 def test_it_goes_to_the_estimated_place_where_that_is_near() -> None:
@@ -115,7 +115,7 @@ def test_it_goes_to_the_estimated_place_where_that_is_near() -> None:
     state["arrival_way"] = torch.tensor([[0.0, 20.0], [0.0, 30.0]])
     state["arrival_probability"], state["arrival_worth"] = torch.zeros(2, 1), torch.ones(2, 1)
     sent = env.transform.inv(state)["action"]
-    assert sent.tolist() == [pytest.approx([20.0, math.pi / 2, -1.0]), [50.0, -1.0, -1.0]]
+    assert sent.tolist() == [pytest.approx([20.0 - 0.25 * 25.0, math.pi / 2, -1.0]), [50.0, -1.0, -1.0]]
     state["arrival_probability"] += 1
     assert env.transform.inv(state)["action"].tolist() == [[0.0, 0.0, 1.0]] * 2
 
