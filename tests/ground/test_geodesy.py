@@ -244,6 +244,15 @@ def test_a_nearly_antipodal_pair_gives_the_truth_or_nan(nearest_deg, all_known):
     assert wrap_angle(bearing - azimuth)[known].abs().max() < 1e-7
 
 
+def test_geodesic_of_whole_degrees_is_not_cut_to_whole_kilometers():
+    distance, bearing = geodesic(*torch.tensor([0, 0, 0, 1]))
+    assert float(distance) == pytest.approx(111.319491, abs=1e-4)
+    assert float(bearing) == pytest.approx(math.pi / 2, abs=1e-6)
+    single, double = torch.ones(2), f64(1.0, 2.0)
+    for inputs in ((double, single, single, single), (single, single, single, double)):
+        assert [x.dtype for x in geodesic(*inputs)] == [torch.float64, torch.float64]
+
+
 @pytest.mark.parametrize("place", [0, 1, 2, 3])
 def test_nan_gives_nan_and_a_latitude_beyond_a_pole_raises(place):
     inputs = [f64(1.0), f64(2.0), f64(3.0), f64(4.0)]
@@ -254,6 +263,14 @@ def test_nan_gives_nan_and_a_latitude_beyond_a_pole_raises(place):
     if place % 2 == 0:
         with pytest.raises(ValueError, match=r"latitude -90\.5 is not between -90 and 90 degrees"):
             geodesic(*inputs)
+
+
+def test_displacements_of_moves():
+    """3 km northward and 4 km eastward."""
+    total = displaced(f64(5.0), f64(math.atan2(4, 3)), f64(0.0, 0.0).unsqueeze(0))
+    torch.testing.assert_close(total, f64(3.0, 4.0).unsqueeze(0))
+    distance, heading = polar(total + f64(-3.0, 0.0))
+    assert (float(distance), float(heading)) == pytest.approx((4.0, math.pi / 2))
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,14 @@ def test_destination_pays_only_at_arrival():
         assert torch.equal(destination_reward(torch.zeros(shape, dtype=torch.bool), 200.0), torch.zeros(shape))
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_proximity_pays_what_the_objective_loses(dtype):
+    before, after = torch.tensor([3.0, 2.5, 1.0], dtype=dtype), torch.tensor([2.5, 3.0, 1.0], dtype=dtype)
+    found = proximity_reward(before, after, 10.0)
+    assert found.dtype == dtype
+    assert found.tolist() == [5.0, -5.0, 0.0]
+
+
 @pytest.mark.parametrize("limit", [0.1, 2.0, 50.0])
 def test_a_limit_of_the_objective_leaves_no_gain_in_a_round_trip(limit):
     """A bound on F, unlike one on the reward, pays nothing for going away and coming back."""
@@ -240,6 +248,15 @@ def test_elements_must_be_the_same(function):
             function(*[*good[:k], torch.ones(shape), *good[k + 1 :]])
 
 
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_nan_is_masked_in_its_own_vehicle(place):
+    inputs = [torch.zeros(3, 2), torch.ones(3, 2), torch.eye(2).expand(3, 2, 2).clone()]
+    inputs[place][1] = math.nan
+    heading, valid = parallel_approach(*inputs)
+    assert valid.squeeze(-1).tolist() == [True, False, True]
+    assert heading[1] == 0
+
+
 def test_bad_arguments_raise():
     with pytest.raises(TypeError, match="arrived must be a tensor of bools"):
         destination_reward(torch.zeros(2), 1.0)
@@ -251,6 +268,16 @@ def test_bad_arguments_raise():
         parallel_approach(torch.zeros(2), torch.zeros(2), torch.eye(2), -1)
     with pytest.raises(ValueError, match=r"at least two elements \(\.\.\., E, 2\), got \(1, 2\)"):
         best_pair(torch.zeros(1, 2))
+
+
+def test_approach_depends_on_the_difference_alone() -> None:
+    here, there, gradient = (
+        torch.tensor([3.0, -20.0]),
+        torch.tensor([3.5, -19.0]),
+        torch.tensor([[0.2, 0.1], [0.0, 1.5]]),
+    )
+    moved = parallel_approach(here + 7, there + 7, gradient)
+    torch.testing.assert_close(parallel_approach(here, there, gradient), moved, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -267,3 +294,7 @@ def test_bad_arguments_raise():
 def test_a_wrong_size_is_named(call: Callable[[], object], name: str) -> None:
     with pytest.raises(ValueError, match=name):
         call()
+
+
+def test_two_elements_have_one_pair() -> None:
+    assert best_pair(torch.eye(2)).tolist() == [0, 1]

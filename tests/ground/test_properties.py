@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 from torch import Tensor
@@ -21,6 +21,8 @@ from magrl import geodesy
 from magrl.field.elements import measured_elements, seven_elements
 from magrl.field.spherical import SphericalHarmonicField
 from magrl.guidance import objective, objective_weights, parallel_approach
+
+MILLIMETER = 1e-6
 
 
 def f64(*values: float) -> Tensor:
@@ -54,6 +56,15 @@ def geodesic(place: tuple[float, float], other: tuple[float, float]) -> tuple[fl
 
 
 # --- Geodesy ----------------------------------------------------------------------------------------------------------
+
+
+@given(PLACES, PLACES, PLACES)
+def test_distances_are_a_metric(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> None:
+    sides = [geodesic(a, b)[0] for a, b in ((one, two), (two, three), (one, three), (two, one))]
+    assume(all(math.isfinite(side) for side in sides))
+    assert sides[0] == pytest.approx(sides[3], abs=MILLIMETER)
+    assert sides[2] <= sides[0] + sides[1] + MILLIMETER
+    assert sides[0] >= apart_km(one, two) - MILLIMETER  # no arc is shorter than its chord
 
 
 # --- Elements ---------------------------------------------------------------------------------------------------------
@@ -162,6 +173,16 @@ def heading_of(error: Tensor, gradient: Tensor) -> float:
     heading, valid = parallel_approach(torch.zeros(2, dtype=torch.float64), error, gradient)
     assert valid
     return float(heading)
+
+
+@given(CROSSING)
+def test_the_heading_closes_both_elements_in_proportion(approach: tuple[Tensor, Tensor]) -> None:
+    error, gradient = approach
+    heading = heading_of(error, gradient)
+    change = gradient @ f64(math.cos(heading), math.sin(heading))  # per km
+    share = change / error
+    assert (share > 0).all()
+    torch.testing.assert_close(share[0], share[1], rtol=1e-9, atol=0)
 
 
 @given(CROSSING, ANGLES)
