@@ -40,7 +40,7 @@ def check_finite(data: TensorDictBase | Iterable[tuple[str, Tensor]], what: str)
         if value.is_floating_point() and not torch.isfinite(value.detach().sum()):
             bad = ~torch.isfinite(value.detach())
             if bad.any():
-                rows = bad.reshape(len(bad) if bad.ndim else 1, -1).any(1).nonzero().squeeze(-1)[:8].tolist()
+                rows = bad.reshape(len(bad) if bad.ndim else 1, -1).any(1).nonzero().squeeze(1)[:8].tolist()
                 name = ".".join(key) if isinstance(key, tuple) else key
                 raise FloatingPointError(f"{what}: {name} is not finite in rows {rows}")
 

@@ -89,14 +89,14 @@ def path_measures(success: Tensor, start: Tensor, end: Tensor, target: Tensor, l
     """Return the measures of episodes that depend only on how far they led and where they ended.
 
     Args:
-        success: ``(N,)`` bool.
-        start: ``(N, 2)`` latitude, longitude [deg].
-        end: ``(N, 2)`` last position [deg].
-        target: ``(N, 2)`` destination [deg].
-        length_km: ``(N,)`` length of the path [km].
+        success: ``(...)`` bool.
+        start: ``(..., 2)`` latitude, longitude [deg].
+        end: ``(..., 2)`` last position [deg].
+        target: ``(..., 2)`` destination [deg].
+        length_km: ``(...)`` length of the path [km].
 
     Returns:
-        Tensors ``(N,)``: ``shortest_km``, the geodesic distance from start to destination; ``length_km``;
+        Tensors ``(...)``: ``shortest_km``, the geodesic distance from start to destination; ``length_km``;
         ``navigation_error_km``, the distance left at the end; ``spl`` and ``path_efficiency`` in [0, 1].
 
     Raises:
@@ -160,16 +160,16 @@ def distance_to_arrival(
     check_tensor(2, start=start, target=target)
     check_tensor(3, weights=weights)
     arrival = _ArrivalSet(target, weights, field, check_zeta(zeta), boxes, region)
-    farthest_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
+    farthest_km, _ = geodesic(*start.unbind(1), *target.unbind(1))
     ellipse = arrival.ellipse(farthest_km)
     best_km, best, width = farthest_km, torch.zeros_like(farthest_km), math.pi
     for lines in (32, 8, 8, 8):
-        angle = best.unsqueeze(-1) + width * torch.linspace(-1, 1, lines + 1, dtype=torch.float64, device=start.device)
+        angle = best.unsqueeze(1) + width * torch.linspace(-1, 1, lines + 1).to(best)
         edge = arrival.edge(ellipse, angle)
-        distance_km, _ = geodesic(*start.unsqueeze(-2).unbind(-1), *edge.unbind(-1))
-        best_km, index = distance_km.min(-1)
-        best, width = angle.gather(-1, index.unsqueeze(-1)).squeeze(-1), width * 2 / lines
-    return torch.where(arrival.holds(start.unsqueeze(-2)).squeeze(-1), 0.0, best_km)
+        distance_km, _ = geodesic(*start.unsqueeze(1).unbind(2), *edge.unbind(2))
+        best_km, index = distance_km.min(1)
+        best, width = angle.gather(1, index.unsqueeze(1)).squeeze(1), width * 2 / lines
+    return torch.where(arrival.holds(start.unsqueeze(1)).squeeze(1), 0.0, best_km)
 
 
 class _ArrivalSet:
@@ -179,14 +179,14 @@ class _ArrivalSet:
         self, target: Tensor, weights: Tensor, field: Any, zeta: float, boxes: Regions, region: Tensor
     ) -> None:
         self.target, self.weights, self.field, self.zeta = target.double(), weights.double(), field, zeta
-        self.boxes, self.region = boxes, region.unsqueeze(-1)
+        self.boxes, self.region = boxes, region.unsqueeze(1)
         self.target_field = elements_at(field, self.target.unsqueeze(-2), self.region)
 
     def holds(self, position: Tensor) -> Tensor:
         """Return whether positions ``(N, K, 2)`` belong to the set: ``(N, K)``; False where there is no field."""
         values = elements_at(self.field, position, self.region)
         arrived = objective(values, self.target_field, self.weights.unsqueeze(-2)) < self.zeta
-        return arrived.logical_and(self.boxes.contains(position, self.region)).squeeze(-1)
+        return arrived.logical_and(self.boxes.contains(position, self.region)).squeeze(2)
 
     def ellipse(self, longest_km: Tensor) -> Tensor:
         """Return ``(N, 2, 2)`` [km]: maps the unit circle to the edge where the field is linear, north and east.
@@ -195,7 +195,7 @@ class _ArrivalSet:
         """
         gradient = elements_gradient_at(self.field, self.target.unsqueeze(-2), self.region).squeeze(-3)
         curvature, axes = torch.linalg.eigh(gradient.mT @ (self.weights.unsqueeze(-1) * gradient))
-        return axes * (self.zeta / curvature.clamp_min(1e-300)).sqrt().minimum(longest_km.unsqueeze(-1)).unsqueeze(-2)
+        return axes * (self.zeta / curvature.clamp_min(1e-300)).sqrt().minimum(longest_km.unsqueeze(1)).unsqueeze(1)
 
     def edge(self, ellipse: Tensor, angle: Tensor, bisections: int = 18) -> Tensor:
         """Return the last places of the set on lines from the destinations, ``(N, K, 2)``, by angles ``(N, K)``."""

@@ -74,10 +74,10 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
         raise ValueError(f"a rollout must be of shape (M, T), each at least 1, got {tuple(rollout.shape)}")
     valid = first_episode_mask(rollout["next", "done"])
     steps = valid.sum(1)
-    last = (steps - 1).unsqueeze(-1)
-    success = rollout["next", "success"].squeeze(-1).gather(1, last).squeeze(-1)
+    last = (steps - 1).unsqueeze(1)
+    success = rollout["next", "success"].squeeze(2).gather(1, last).squeeze(1)
     start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
-    end = rollout["next", "position"].gather(1, last.unsqueeze(-1).expand(-1, 1, 2)).squeeze(1)
+    end = rollout["next", "position"].gather(1, last.unsqueeze(2).expand(-1, 1, 2)).squeeze(1)
     distance, heading = moved(rollout["next"])
     length_km, moving = (distance * valid).sum(1), valid & (distance > 1e-6)
     _, bearing = geodesic(*rollout["position"].unbind(-1), *rollout["target_position"].unbind(-1))
@@ -91,7 +91,7 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
         "heading_rmse_deg": (deviation**2).nanmean(1).sqrt(),
     }
     if "declared" in rollout["next"].keys():  # noqa: SIM118 - a TensorDict is no mapping
-        declared = rollout["next", "declared"].squeeze(-1).gather(1, last).squeeze(-1)
+        declared = rollout["next", "declared"].squeeze(2).gather(1, last).squeeze(1)
         measures["false_arrival"] = declared & ~success
     if env is not None:
         check_type(EnvBase, env=env)

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchrl.envs import RewardSum, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks, planet_scenario
-from magrl.envs.measures import distance_to_arrival, path_efficiency, path_measures, spl
+from magrl.envs.measures import check_zeta, distance_to_arrival, path_efficiency, path_measures, spl
 from magrl.evaluation.intervals import wilson_interval
-from magrl.evaluation.metrics import episode_measures, first_episode_mask, summarize
+from magrl.evaluation.metrics import episode_measures, first_episode_mask, moved, summarize
 from magrl.evaluation.rollout import evaluation_rollout
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move
@@ -77,6 +77,23 @@ def test_a_pause_is_neither_a_turn_nor_a_deviation() -> None:
     check(legs, point(100.0, 0.0), True, smoothness_deg=180, heading_mae_deg=0)
 
 
+def test_moves_of_less_than_a_kilometer_have_a_heading() -> None:
+    check([(0.5, 0.0), (0.5, 90.0)], point(300.0, 0.0), False, smoothness_deg=90, length_km=1)
+
+
+def test_moves_over_the_ground_are_the_true_ones() -> None:
+    """Those of the errors of motion, or else of the north reference, or else those that were commanded."""
+    steps = TensorDict(move=torch.tensor([[1.0, 0.0]]), heading=torch.tensor([[0.1]]))
+    for key, value, expected in (
+        ("heading", 0.1, (1.0, 0.1)),
+        ("true_heading", 0.2, (1.0, 0.2)),
+        ("true_course", 0.3, (1.0, 0.3)),
+        ("true_move", 4.0, (4.0, 0.3)),
+    ):
+        steps[key] = torch.full((1, 2 if key == "true_move" else 1), value)
+        assert [value.item() for value in moved(steps)] == pytest.approx(expected)
+
+
 def test_only_the_first_episode_counts() -> None:
     done = torch.tensor([[[False], [True], [False], [True]], [[False]] * 4])
     expected = [[True, True, False, False], [True] * 4]
@@ -100,8 +117,11 @@ def test_spl_by_hand() -> None:
     success = torch.tensor([True, True, False, True])
     got = spl(success, torch.tensor([300.0, 300.0, 300.0, 100.0]), torch.tensor([400.0, 290.0, 300.0, 0.0]))
     assert got.tolist() == [0.75, 1.0, 0.0, 1.0]
-    with pytest.raises(TypeError, match="length_km must be a tensor"):
-        spl(success, torch.ones(4), 5)
+    for measure in (partial(spl, success), path_efficiency):
+        with pytest.raises(TypeError, match="^length_km must be a tensor"):
+            measure(torch.ones(4), 5)
+        with pytest.raises(TypeError, match="_km must be a tensor"):
+            measure(5, torch.ones(4))
 
 
 def test_path_measures_by_hand() -> None:
@@ -113,8 +133,13 @@ def test_path_measures_by_hand() -> None:
     got = path_measures(torch.tensor([False]), start, end, target, torch.tensor([111.3195]))
     assert got["navigation_error_km"].item() == pytest.approx(110.5744, abs=1e-4)
     assert (got["spl"].item(), got["length_km"].item()) == (0, pytest.approx(111.3195))
-    with pytest.raises(ValueError, match=r"end must have the shape \(..., 2\)"):
-        path_measures(torch.tensor([True]), start, torch.zeros(1, 3), target, torch.ones(1))
+    tables = [place.expand(3, 1, 2) for place in (start, end, target)]
+    assert path_measures(torch.ones(3, 1) > 0, *tables, torch.ones(3, 1))["navigation_error_km"].shape == (3, 1)
+    for index, name in enumerate(("start", "end", "target")):
+        places = [start, end, target]
+        places[index] = torch.zeros(1, 3)
+        with pytest.raises(ValueError, match=rf"^{name} must have the shape \(..., 2\)"):
+            path_measures(torch.tensor([True]), *places, torch.ones(1))
 
 
 def test_summary_of_one_success_and_one_failure() -> None:
@@ -248,6 +273,9 @@ def test_an_episode_without_a_way_is_measured_without_nan() -> None:
     beside = state.update({"start_position": here + 0.001})
     assert arrival_km(env, beside).tolist() == [0, 0]
     assert spl(torch.tensor([True, True]), arrival_km(env, state), torch.tensor([0.0, 5.0])).tolist() == [1, 0]
+    near = GeomagneticNavEnv(num_envs=1, seed=0, arrival="distance", arrival_radius_km=25)
+    flight = episode([(0.5, 0.0)], point(20.0, 0.0), True, 1)
+    assert episode_measures(flight, near)["spl_to_arrival"].item() == 0  # already arrived, and moved
 
 
 def test_bad_values_are_named() -> None:
@@ -256,9 +284,16 @@ def test_bad_values_are_named() -> None:
     for call, message in (
         (lambda: episode_measures(TensorDict(batch_size=[2, 0])), r"each at least 1, got \(2, 0\)"),
         (lambda: summarize({"success": torch.ones(2)}), "success must be bool"),
+        (lambda: summarize({"success": torch.ones(2, 2) > 0}), "success must be bool of shape"),
+        (lambda: summarize({"success": torch.ones(0) > 0}), "success must be bool of shape"),
+        *((partial(check_zeta, zeta), f"^zeta must be a finite number above 0, got {zeta}$") for zeta in (0, -1)),
         (lambda: distance_to_arrival(places[:, :1], places, *ones), r"start .*\(2, 1\)"),
         (lambda: distance_to_arrival(places, places[:, :1], *ones), r"target .*\(2, 1\)"),
         (lambda: distance_to_arrival(places, places, ones[0][:, :2], *ones[1:]), r"weights .*\(2, 2\)"),
     ):
         with pytest.raises(ValueError, match=message):
             call()
+    with pytest.raises(TypeError, match="^rollout must be a TensorDictBase"):
+        episode_measures({})
+    with pytest.raises(TypeError, match="^env must be a EnvBase"):
+        episode_measures(episode([(5.0, 0.0)], (0.0, 165.0), False, 1), 5)

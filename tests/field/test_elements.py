@@ -78,6 +78,10 @@ def test_differences_in_declination_are_wrapped_and_others_are_not_rounded():
     turned = element_difference(here.double() + f64(360.0, 0, 0), there.double())
     torch.testing.assert_close(turned, here.double() - there.double())
     assert element_difference(f64(350.0, 200.0, 200.0), f64(0.0, 0.0, 0.0)).tolist() == [-10.0, 200.0, 200.0]
+    assert element_difference(f64(180.25, 0.0, 0.0), f64(0.0, 0.0, 0.0))[0] == -179.75
+    for name, values in {"elements": (5, f64(1.0)), "others": (f64(1.0), 5)}.items():
+        with pytest.raises(TypeError, match=f"^{name} must be a tensor"):
+            element_difference(*values)
 
 
 def test_round_trip():

@@ -50,6 +50,8 @@ def test_check_number(limits: dict, value: object, expected: str) -> None:
 def test_check_number_accepts_both_limits_and_none_where_it_is_optional() -> None:
     check_number(0, 1, low_end=0, high_end=1.0, numpy=np.float32(0.5))
     check_number(1, whole=True, optional=True, seed=None, count=np.int64(1))
+    with pytest.raises(ValueError, match="^count must be a whole number from 1 on, got 0$"):
+        check_number(1, whole=True, optional=True, seed=None, count=0)
     check_number(0, above=True, small=1e-300)
 
 
@@ -58,6 +60,8 @@ def test_check_numbers(value: object) -> None:
     check_numbers(2, x=(0, 1.5), y=[np.float64(1), 2])
     with pytest.raises(ValueError, match=f"^x must be 2 finite numbers, got {re.escape(repr(value))}$"):
         check_numbers(2, x=value)
+    with pytest.raises(ValueError, match=r"^x must be a finite number from 0 on, got -1$"):
+        check_numbers(2, 0, x=(1, -1))
 
 
 @pytest.mark.parametrize(

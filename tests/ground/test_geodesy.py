@@ -261,7 +261,7 @@ def test_nan_gives_nan_and_a_latitude_beyond_a_pole_raises(place):
     assert all(x.isnan().all() for x in move(*inputs)) == (place != 1)
     inputs[place] = f64(-90.5)
     if place % 2 == 0:
-        with pytest.raises(ValueError, match=r"latitude -90\.5 is not between -90 and 90 degrees"):
+        with pytest.raises(ValueError, match=r"^latitude -90\.5 is not between -90 and 90 degrees$"):
             geodesic(*inputs)
 
 
@@ -279,6 +279,8 @@ def test_displacements_of_moves():
         (5, (0, 1), "latitudes must be 2 finite numbers, got 5"),
         ((1, 1), (0, 1), r"latitudes \(1, 1\) must rise from south to north"),
         ((0, 91), (0, 1), r"latitudes \(0, 91\) must rise"),
+        ((-90.5, 0), (0, 1), r"latitudes \(-90\.5, 0\) must rise"),
+        ((0, 1), (5, 5), r"longitudes \(5, 5\) must rise"),
         ((0, 1), (170, -170), r"longitudes \(170, -170\) must rise .* \(170, 190\)"),
         ((0, 1), (0, 361), r"longitudes \(0, 361\) must rise .* at most 360 degrees"),
         ((0, 1), (0, math.inf), r"longitudes must be 2 finite numbers, got \(0, inf\)"),
@@ -292,7 +294,11 @@ def test_boxes_that_do_not_rise_raise(latitude, longitude, message):
 
 @pytest.mark.parametrize(
     ("latitude", "longitude", "message"),
-    [(90.5, 0.0, "latitude 90.5 is not"), (math.nan, 0.0, "latitude nan"), (0.0, math.inf, "longitude inf")],
+    [
+        (90.5, 0.0, "^latitude 90.5 is not between -90 and 90 degrees$"),
+        (math.nan, 0.0, "^latitude nan"),
+        (0.0, math.inf, "^longitude inf is not a finite number of degrees$"),
+    ],
 )
 def test_positions_off_the_earth_raise(latitude, longitude, message):
     check_positions(f64(90.0), f64(540.0))
@@ -306,6 +312,9 @@ def test_displacements_by_hand() -> None:
     error = torch.tensor([[0.0, 4.0], [0.0, -5.0], [3.0, 0.0]])
     moved = displaced(distance, heading, error)
     torch.testing.assert_close(moved, torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]]), rtol=0, atol=1e-6)
+    tables = distance.expand(2, 3), heading.expand(2, 3), error.expand(2, 3, 2)
+    assert torch.equal(displaced(*tables), moved.expand(2, 3, 2))
+    assert polar(moved.expand(2, 3, 2))[0].shape == (2, 3)
     length, course = polar(torch.tensor([[3.0, 4.0], [0.0, -2.0], [-1.0, 0.0]]))
     torch.testing.assert_close(length, torch.tensor([5.0, 2.0, 1.0]))
     torch.testing.assert_close(course, torch.tensor([math.atan2(4, 3), -math.pi / 2, math.pi]))
