@@ -114,13 +114,14 @@ class MinMaxNorm(ObservationTransform):
     def set_container(self, container: Transform | EnvBase) -> None:
         """Read the bounds that are missing from the specs of the environment that the transform is attached to."""
         super().set_container(container)
-        parent = self.parent
+        missing = [key for key in self._bounded_keys if getattr(self, f"low_{self._index(key)}") is None]
+        parent = self.parent if missing else None  # TorchRL builds a parent anew for each transform
         if parent is None:
             return
         for spec in (parent.full_observation_spec, parent.full_action_spec, parent.full_state_spec):
-            for key in self._bounded_keys:
+            for key in missing:
                 leaf = spec[key] if key in spec.keys(True, True) else None
-                if isinstance(leaf, Bounded) and getattr(self, f"low_{self._index(key)}") is None:
+                if isinstance(leaf, Bounded):
                     row = (0,) * len(parent.batch_size)
                     self._set_bounds(key, leaf.space.low[row], leaf.space.high[row])
 
