@@ -118,7 +118,7 @@ def test_spl_by_hand() -> None:
     got = spl(success, torch.tensor([300.0, 300.0, 300.0, 100.0]), torch.tensor([400.0, 290.0, 300.0, 0.0]))
     assert got.tolist() == [0.75, 1.0, 0.0, 1.0]
     for measure in (partial(spl, success), path_efficiency):
-        with pytest.raises(TypeError, match="^length_km must be a tensor"):
+        with pytest.raises(TypeError, match=r"^length_km must be a tensor"):
             measure(torch.ones(4), 5)
         with pytest.raises(TypeError, match="_km must be a tensor"):
             measure(5, torch.ones(4))
@@ -293,7 +293,7 @@ def test_bad_values_are_named() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             call()
-    with pytest.raises(TypeError, match="^rollout must be a TensorDictBase"):
+    with pytest.raises(TypeError, match=r"^rollout must be a TensorDictBase"):
         episode_measures({})
-    with pytest.raises(TypeError, match="^env must be a EnvBase"):
+    with pytest.raises(TypeError, match=r"^env must be a EnvBase"):
         episode_measures(episode([(5.0, 0.0)], (0.0, 165.0), False, 1), 5)

@@ -50,7 +50,7 @@ def test_check_number(limits: dict, value: object, expected: str) -> None:
 def test_check_number_accepts_both_limits_and_none_where_it_is_optional() -> None:
     check_number(0, 1, low_end=0, high_end=1.0, numpy=np.float32(0.5))
     check_number(1, whole=True, optional=True, seed=None, count=np.int64(1))
-    with pytest.raises(ValueError, match="^count must be a whole number from 1 on, got 0$"):
+    with pytest.raises(ValueError, match=r"^count must be a whole number from 1 on, got 0$"):
         check_number(1, whole=True, optional=True, seed=None, count=0)
     check_number(0, above=True, small=1e-300)
 

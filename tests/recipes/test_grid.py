@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from support.recipes import RECIPES
 
 from magrl.envs import Scenario, Tasks
@@ -218,6 +219,7 @@ def test_learning_of_runs(runs: str) -> None:
 
 def test_evaluations_and_the_rows_of_other_tables(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("evaluate.trajectories_figure", lambda *_, **__: Figure())
     options = {"navigators": ["secant", "geodesic"], "tasks": 3}
     text = trainings.evaluation(folder="runs/a", wandb_mode="disabled", **options)
     assert [row[0] for row in rows(text)[2:4]] == ["secant (quasi-Newton)", "geodesic (both positions, an oracle)"]
