@@ -2,9 +2,10 @@
 
 The limits are those of IGRF-14 at sea level, 1900 to 2030, on a grid of 1 by 2 degrees: a total intensity of 21 900 to
 69 400 nT, a horizontal intensity up to 41 900 nT, and a change of the vector of up to 16 nT/km between 75° S and 75° N
-and 63 nT/km up to 88°, where north turns along the way. Where the inclination is within 1.6 degrees, the horizontal
-intensity is at least 24 100 nT and the gradient of the inclination at least 1.5 degrees per 100 km. The checks leave
-room for the crust, magnetic storms, altitude and errors of sensors.
+and 63 nT/km up to 88°, where north turns along the way; B_H and B_Z alone change by up to 16.4 nT/km anywhere. Where
+the inclination is within 1.6 degrees, the horizontal intensity is at least 24 100 nT and the gradient of the
+inclination at least 1.5 degrees per 100 km. The checks leave room for the crust, magnetic storms, altitude and errors
+of sensors.
 """
 
 from __future__ import annotations
@@ -17,14 +18,16 @@ from magrl.checks import check_number, check_numbers
 
 TOTAL_NT = (20000.0, 76000.0)
 """Least and greatest total intensity: 10 % beyond those of IGRF [nT]."""
-MOST_HORIZONTAL_NT = 46000.0
-"""Greatest horizontal intensity: 10 % beyond that of IGRF [nT]."""
+MOST_HORIZONTAL_NT = 44000.0
+"""Greatest horizontal intensity: 2000 nT beyond that of IGRF [nT]."""
 EQUATOR_NT = 22000.0
 """Least horizontal intensity where the inclination is within pi/2 degrees: 10 % below that of IGRF [nT]."""
 EQUATOR_SLOPE_DEG = 0.5
 """Least gradient of the inclination where it is within pi/2 degrees: a third of that of IGRF [deg per 100 km]."""
 SLOPE_NT_KM = 60.0
 """Greatest change of the field vector along a way, up to 88 degrees of latitude [nT/km]."""
+MERIDIAN_SLOPE_NT_KM = 16.4
+"""Greatest change of B_H and B_Z, which do not depend on where north is, along a way [nT/km]."""
 DISTURBANCE_NT = 2000.0
 """Change of the field vector between two readings by the crust and a severe magnetic storm; chosen [nT]."""
 _SLACK_DEG = 1.0  # of an inclination
@@ -84,6 +87,33 @@ def _horizontal_limits(inclination: float) -> tuple[float, float]:
     steep, flat = min(inclination + _SLACK_DEG, 90.0), max(inclination - _SLACK_DEG, 0.0)
     low = EQUATOR_NT if inclination <= math.pi / 2 else TOTAL_NT[0] * math.cos(math.radians(steep))
     return low, min(MOST_HORIZONTAL_NT, TOTAL_NT[1] * math.cos(math.radians(flat)))
+
+
+def check_earth_distance(reading: Sequence[float], target: Sequence[float], most_km: float) -> None:
+    """Raise if no places on the Earth with such elements are as near to each other as the longest way.
+
+    Args:
+        reading: D [deg], I [deg], B_H [nT] at the start.
+        target: the same at the destination.
+        most_km: longest way [km].
+
+    Raises:
+        ValueError: with the least distance.
+
+    Example:
+        >>> check_earth_distance((-7.7, -7.7, 40000.0), (3.3, 74.9, 13581.0), 2500.0)
+        Traceback (most recent call last):
+        ValueError: the reading at the start is at least 3639 km from the target, and the longest way is 2500 km: \
+check the target, and the axes, the units and the calibration of the sensors
+    """
+    check_numbers(3, reading=reading, target=target)
+    here, there = ((b, b * math.tan(math.radians(i))) for _, i, b in (reading, target))  # B_H and B_Z
+    least_km = (math.dist(here, there) - DISTURBANCE_NT) / MERIDIAN_SLOPE_NT_KM
+    if least_km > most_km:
+        raise ValueError(
+            f"the reading at the start is at least {least_km:.0f} km from the target, and the longest way is "
+            f"{most_km:.0f} km: check the target, and the axes, the units and the calibration of the sensors"
+        )
 
 
 def check_earth_jump(

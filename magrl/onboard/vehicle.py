@@ -25,9 +25,11 @@ from magrl.files import DamagedFileError, load_tensors, save_tensors
 from magrl.navigators import Kalman, Navigator, RunAndTumble, Secant
 from magrl.onboard.estimator import Estimator
 from magrl.onboard.limits import check_move, move_limits, out_of_range, view_of
-from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_jump, check_earth_reading
+from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_distance, check_earth_jump, check_earth_reading
+from magrl.onboard.start import Elements, calibrated, known_elements
 from magrl.tracking import ArrivalDecision, Way
 from magrl.transforms import TrackView
+from magrl.transforms.errors.known_start import EXACT
 from magrl.transforms.track import STD_KEYS
 
 NAMED = ("anywhere", "secant", "kalman", "run_and_tumble")
@@ -40,8 +42,16 @@ simulation, it reached 5 with a right data sheet, and 31 under the conditions of
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 4
 _FORMAT, _NOT_STARTED = 2, "the vehicle has no destination yet: call start(target) first"
-_OPTIONS = ("name", "sensor_std", "bias_std", "max_move_km", "max_turn_deg", "max_steps", "arrival_km")
-_PLAIN = ("_step", "_steer", "_last", "_surprises")  # parts of the state that are numbers
+_OPTIONS = ("name", "sensor_std", "bias_std", "drift_std", "max_move_km", "max_turn_deg", "max_steps", "arrival_km")
+_PLAIN = (
+    "_step",
+    "_steer",
+    "_last",
+    "_surprises",
+    "_known",
+    "_error",
+    "_left_std",
+)  # parts of the state that are numbers
 _STATES = ("state", "memory")  # attributes in which policies and navigators keep their state
 
 
@@ -94,6 +104,7 @@ class Onboard:
             policy from :func:`magrl.load_policy`, or a navigator, of which the vehicle gets a copy.
         sensor_std: standard deviations of the noise of D [deg], I [deg], B_H [nT], new in each reading.
         bias_std: standard deviations of constant and slow errors of the same.
+        drift_std: those of the slow errors alone, which vary along the way: what a known start does not show.
         max_move_km: longest move; 50 km, or for a trained policy that of its training.
         max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.
         max_steps: steps of a way, the last of which stops.
@@ -121,8 +132,9 @@ class Onboard:
         self,
         navigator: str | TensorDictModuleBase = "anywhere",
         *,
-        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
-        bias_std: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Sequence[float] = EXACT,
+        bias_std: Sequence[float] = EXACT,
+        drift_std: Sequence[float] = EXACT,
         max_move_km: float | None = None,
         max_turn_deg: float | None = None,
         max_steps: int = 120,
@@ -130,14 +142,17 @@ class Onboard:
         confidence: float = 0.8,
     ) -> None:
         check_type((str, TensorDictModuleBase), navigator=navigator)
-        check_numbers(3, 0, sensor_std=sensor_std, bias_std=bias_std)
+        check_numbers(3, 0, sensor_std=sensor_std, bias_std=bias_std, drift_std=drift_std)
         check_number(1, whole=True, max_steps=max_steps)
         check_number(0, above=True, arrival_km=arrival_km)
         check_number(0, 1, confidence=confidence)
         self.sensor_std, self.bias_std = tuple(map(float, sensor_std)), tuple(map(float, bias_std))
+        self.drift_std = tuple(map(float, drift_std))
         self.max_steps, self.arrival_km, self.confidence = max_steps, float(arrival_km), confidence
         known = load_pretrained("anywhere") if navigator == "anywhere" else navigator
         policy = None if isinstance(known, str) else known
+        self._named = known if isinstance(known, str) else None
+        self._left_std = self.bias_std
         self.max_move_km, self.max_turn_deg = move_limits(policy, max_move_km, max_turn_deg)
         self.navigator: Any = self._aware(copy.deepcopy(policy or self._untrained(known))).cpu()
         self.name = type(self.navigator).__name__
@@ -149,9 +164,9 @@ class Onboard:
         """Return a new navigator of a name."""
         bounds = self.max_move_km, math.radians(self.max_turn_deg)
         if name == "secant":
-            return Secant(*bounds, sensor_std=tuple(map(math.hypot, self.sensor_std, self.bias_std)))
+            return Secant(*bounds, sensor_std=tuple(map(math.hypot, self.sensor_std, self._left_std)))
         if name == "kalman":
-            return Kalman(*bounds, self.sensor_std, self.max_steps, bias_std=self.bias_std, search=False)
+            return Kalman(*bounds, self.sensor_std, self.max_steps, bias_std=self._left_std, search=False)
         if name == "run_and_tumble":
             return RunAndTumble(*bounds)
         raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(NAMED)}, or give a policy")
@@ -164,8 +179,25 @@ class Onboard:
         view = replace(view, search=False)
         return FieldPolicy(replace(navigator.config, view=view), navigator.actor)
 
-    def start(self, target: Sequence[float]) -> None:
+    def start(
+        self,
+        target: Sequence[float],
+        here: Sequence[float] | None = None,
+        *,
+        here_std: Sequence[float] | None = None,
+        date: str | None = None,
+    ) -> None:
         """Begin a way to the place with some elements: D [deg], I [deg], B_H [nT].
+
+        Where the start is known, the first reading shows the constant errors of the sensors, which are subtracted from
+        all readings (:func:`magrl.transforms.calibration`); and a reading that does not fit the place raises an error.
+
+        Args:
+            target: elements of the destination.
+            here: elements at the start; or its latitude and longitude [deg], with a ``date``.
+            here_std: standard deviations of the elements at the start: by default 0 for elements, and for a position
+                those of a model of the core (:data:`magrl.onboard.start.MODEL_STD`).
+            date: date for a position, such as ``"2026-06-30"``.
 
         Raises:
             ValueError: for elements that are not possible on the Earth, or beyond the range of the policy.
@@ -175,8 +207,13 @@ class Onboard:
         check_earth_reading(declination, inclination, horizontal_intensity, what="the target")
         if text := out_of_range(self._view, target):
             raise ValueError(f"the target: {text}")
+        self._known = None if here is None else known_elements(here, here_std, date)
+        self._error, self._left_std = self._calibrated()
         self.target = tuple(map(float, target))
-        self._step, self._estimator.state = 0, None
+        self._step = 0
+        if self._named:
+            self.navigator = self._untrained(self._named)
+        self._estimator = Estimator(self.navigator)
         self._steer: float | None = None  # heading that the vehicle was to steer [deg]
         self._last, self._surprises = Values(), Values()  # the last reading with its course
         for name in _STATES:
@@ -201,8 +238,12 @@ class Onboard:
         """
         if self.target is None:
             raise RuntimeError(_NOT_STARTED)
-        self._check((declination, inclination, horizontal_intensity), heading, distance)
-        reading = float(declination), float(inclination), float(horizontal_intensity)
+        check_earth_reading(declination, inclination, horizontal_intensity)
+        raw = declination, inclination, horizontal_intensity
+        error = self._error if self._last else self._calibrated(raw)[0]
+        reading = math.remainder(raw[0] - error[0], 360), raw[1] - error[1], raw[2] - error[2]
+        self._check(reading, heading, distance)
+        self._error = error
         course = math.remainder(math.radians(heading), 2 * math.pi)
         turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
         with torch.inference_mode():
@@ -216,15 +257,22 @@ class Onboard:
         self._steer = command.heading_deg
         return command
 
-    def _check(self, reading: tuple[float, float, float], heading: float, distance: float) -> None:
+    def _calibrated(self, reading: Elements | None = None) -> tuple[Values, Values]:
+        """Return the constant error of readings, as far as it is known, and the standard deviations that are left."""
+        if self._known is None:
+            return EXACT, self.bias_std
+        return calibrated(*self._known, (self.sensor_std, self.bias_std, self.drift_std), reading)
+
+    def _check(self, reading: Elements, heading: float, distance: float) -> None:
         """Raise unless a reading, a heading and a distance are possible, and possible together."""
-        check_earth_reading(*reading)
         if not self._last:
             if distance != 0:
                 raise ValueError(f"the first step takes the reading at the start: distance must be 0, got {distance!r}")
             check_move(heading, distance, None, self.max_move_km)
             if text := out_of_range(self._view, reading):
                 raise ValueError(f"the reading at the start: {text}")
+            most_km = LONGEST_WAY_KM if self._estimator.trained else self.max_steps * self.max_move_km
+            check_earth_distance(reading, self.target, most_km)
             return
         check_move(heading, distance, self._steer, self.max_move_km)
         check_earth_jump(self._last[:3], reading, distance, self.sensor_std)
@@ -232,7 +280,7 @@ class Onboard:
     def _seen(self, reading: Sequence[float], course: float, move: tuple[float, float]) -> TensorDict:
         """Return what a policy reads, in a batch of one."""
         rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
-        rows |= dict(zip(STD_KEYS, (self.sensor_std, self.bias_std), strict=True))
+        rows |= dict(zip(STD_KEYS, (self.sensor_std, self._left_std), strict=True))
         seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
         seen |= {"step_count": torch.tensor([[self._step]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")
@@ -309,7 +357,8 @@ class Onboard:
         options = self._options()
         if other := [name for name in options if content["options"].get(name) != options[name]]:
             raise ValueError(f"{path} is of a vehicle with another {other[0]}, {content['options'].get(other[0])!r}")
-        self.start(content["state"]["target"])
+        here, here_std = content["state"]["_known"] or (None, None)
+        self.start(content["state"]["target"], here, here_std=here_std)
         for name in _PLAIN:
             setattr(self, name, content["state"][name])
         if content["state"]["_estimates"] is not None:

@@ -14,6 +14,8 @@ from magrl.transforms.errors.conditions import TRUE_KEYS as TRUE_KEYS
 from magrl.transforms.errors.conditions import Conditions as Conditions
 from magrl.transforms.errors.conditions import conditions_named as conditions_named
 from magrl.transforms.errors.conditions import with_conditions as with_conditions
+from magrl.transforms.errors.known_start import KnownStart as KnownStart
+from magrl.transforms.errors.known_start import calibration as calibration
 from magrl.transforms.errors.motion import MotionError as MotionError
 from magrl.transforms.errors.noise import RandomSensorNoise as RandomSensorNoise
 from magrl.transforms.errors.noise import SensorNoise as SensorNoise

@@ -27,21 +27,35 @@ Spec = str | Mapping[str, Any]
 
 
 def flown(
-    navigator: TensorDictModuleBase | Spec, base: GeomagneticNavEnv, errors: Noise | Conditions, confidence: float = 0.0
+    navigator: TensorDictModuleBase | Spec,
+    base: GeomagneticNavEnv,
+    errors: Noise | Conditions,
+    confidence: float = 0.0,
+    known_start: Sequence[float] | None = None,
 ) -> TensorDictBase:
     """Return the measures of an episode of each vehicle, under noise or under the conditions of a real vehicle.
 
-    Where arrivals are declared, ``confidence`` is the least probability at which the navigators declare them.
+    Args:
+        navigator: navigator.
+        base: environment without errors.
+        errors: noise of the sensors, or conditions.
+        confidence: least probability at which navigators declare arrivals, where they must be declared.
+        known_start: standard deviations of the elements at the start, where the vehicle knows them.
     """
-    return episode_measures(rollout(navigator, base, errors, confidence))
+    return episode_measures(rollout(navigator, base, errors, confidence, known_start))
 
 
 def rollout(
-    navigator: TensorDictModuleBase | Spec, base: GeomagneticNavEnv, errors: Noise | Conditions, confidence: float = 0.0
+    navigator: TensorDictModuleBase | Spec,
+    base: GeomagneticNavEnv,
+    errors: Noise | Conditions,
+    confidence: float = 0.0,
+    known_start: Sequence[float] | None = None,
 ) -> TensorDictBase:
     """Return an episode of each vehicle, as :func:`flown` measures it."""
     if isinstance(errors, Conditions):
-        env, std, bias = with_conditions(base, errors, base.seed), errors.sensor_std, errors.bias_std
+        env, std = with_conditions(base, errors, base.seed, known_start), errors.sensor_std
+        bias = errors.bias_std if known_start is None else errors.calibrated(known_start)
     else:
         env, std, bias = with_sensor_noise(base, errors, base.seed), errors, NO_NOISE
     if isinstance(navigator, str):

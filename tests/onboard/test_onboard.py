@@ -22,7 +22,7 @@ from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Secant
 from magrl.onboard import Onboard, VehicleStep, check_earth_jump, check_earth_reading, write_step
-from magrl.transforms import with_sensor_noise
+from magrl.transforms import Conditions, with_conditions, with_sensor_noise
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
 NOISE = (0.02, 0.02, 2.0)
@@ -91,6 +91,85 @@ def test_commands_are_those_of_the_environment(name: str, noise: tuple[float, fl
         state, steps = after, steps + 1
     assert steps > 5
     assert after["success"].item()
+
+
+@pytest.mark.parametrize("name", ["anywhere", "kalman", "secant"])
+def test_commands_from_a_known_start_are_those_of_the_environment(name: str, tmp_path: Path) -> None:
+    """The constant errors of sensors that the first reading shows; also for a vehicle that is restored."""
+    own = Conditions("own", sensors={"sensor_std": NOISE, "bias": (0.4, 0.1, 30.0), "drift": NOISE, "drift_length": 50})
+    known, options = (0.1, 0.1, 10.0), {"max_steps": 50, "confidence": 0.0}
+    base = GeomagneticNavEnv(num_envs=1, seed=3, start_heading="random", arrival="declared")
+    policy = make_navigator(name, base, sensor_std=own.sensor_std, bias_std=own.calibrated(known))
+    env = with_conditions(base, own, seed=1)
+    here = env.reset()["true_field"][0].tolist()
+    bare, env = env, with_declaration(with_conditions(base, own, seed=1, known_start=known))
+    restart(bare)
+    restart(env)
+    state = env.reset()
+    vehicle = Onboard(name, sensor_std=own.sensor_std, bias_std=own.bias_std, drift_std=own.drift_std, **options)
+    vehicle.start(state["target_field"][0].tolist(), here, here_std=known)
+    for step in range(6):
+        reading = (state["field"] + state["start_error"])[0].tolist()
+        command = vehicle.step(*reading, *numbers(state)[3:])
+        with torch.no_grad():
+            state = env.step(policy(state))["next"]
+        distance, turn = state["move"][0].tolist()
+        assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
+        if step == 2:
+            vehicle.save(tmp_path / "state.pt")
+            vehicle = Onboard(
+                name, sensor_std=own.sensor_std, bias_std=own.bias_std, drift_std=own.drift_std, **options
+            )
+            vehicle.restore(tmp_path / "state.pt")
+
+
+@pytest.mark.parametrize(
+    ("reading", "intensity_nt", "cause"),
+    [
+        ((8.0, -65.0), 20000.0, "the vertical axis points up"),
+        ((-8.0, 65.0), 20000.0, "D is positive where magnetic north is east"),
+        ((-8.0, -65.0), 20000.0, "the axes point left and up"),
+        ((math.radians(8.0), math.radians(65.0)), 30000.0, "it fits in radians"),
+        ((8.0, math.radians(65.0)), 30000.0, "I fits in radians"),
+        ((math.radians(8.0), 65.0), 20000.0, "D fits in radians"),
+        ((65.0, 8.0), 30000.0, "D and I are swapped"),
+        ((-172.0, 65.0), 20000.0, "the horizontal axes point backward"),
+        ((82.0, 65.0), 20000.0, "the horizontal axes are swapped"),
+        ((8.0, 65.0, 14000.0 / math.cos(math.radians(65.0))), 14000.0, "B_H is the total intensity"),
+        ((0.0, 65.0), 20000.0, "the heading is from magnetic north"),
+        ((8.0, 60.0), 20000.0, "check sensors, compass and place"),
+    ],
+)
+def test_a_first_reading_that_does_not_fit_the_start_is_refused(
+    reading: Known, intensity_nt: float, cause: str
+) -> None:
+    """Where a mistake explains it, that is named; the right reading is then taken."""
+    here = (8.0, 65.0, intensity_nt)
+    vehicle = Onboard("kalman", sensor_std=NOISE, bias_std=(0.1, 0.1, 10.0))
+    vehicle.start((5.0, 67.0, intensity_nt), here)
+    with pytest.raises(ValueError, match=rf"^the first reading, .* does not fit the start, .*: .*{cause}"):
+        vehicle.step(*(*reading, intensity_nt)[:3], heading=0.0)
+    assert vehicle.step(*here, heading=0.0).stop is None
+
+
+def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
+    """With the accuracy of the model, to which a compass that is off by half a degree is corrected in part."""
+    vehicle = Onboard("secant", bias_std=(0.5, 0.0, 0.0))
+    vehicle.start(TARGET, (60.4, 5.3), date="2026-06-30")
+    elements = elements_at(IGRF("2026-06-30"), torch.tensor([60.4, 5.3], dtype=torch.float64)).tolist()
+    vehicle.step(elements[0] + 0.5, *elements[1:], heading=0.0)
+    share = 0.25 / (0.25 + 0.26**2 + (5417 / elements[2]) ** 2)
+    assert vehicle._last[0] == pytest.approx(elements[0] + 0.5 - 0.5 * share)
+    for here, options, message in (
+        ((60.4, 5.3), {}, "need a date"),
+        (HERE, {"date": "2026-06-30"}, "elements need no date"),
+        ((60.4,), {}, "latitude and longitude, got"),
+        ((95.0, 5.3), {"date": "2026-06-30"}, "latitude must be .* from -90 up to 90, got 95.0"),
+        (HERE, {"here_std": (0.1, -1.0, 5.0)}, "here_std must be a finite number from 0 on, got -1.0"),
+        ((3.5, 73.0, 15.0), {}, "here: horizontal_intensity 15 at"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vehicle.start(TARGET, here, **options)
 
 
 @pytest.mark.parametrize("memory_size", [0, 4])
@@ -185,6 +264,8 @@ def test_a_refused_call_changes_nothing() -> None:
         ((3.5, 73.0, 15.0, 0.0), "looks like microtesla, and nanotesla are expected"),
         ((3.5, 73.0, 0.15, 0.0), "looks like gauss"),
         ((0.061, 1.274, 15000.0, 0.0), "the inclination looks like radians, and degrees are expected"),
+        ((3.3, -7.7, 44600.0, 0.0), "44600 at an inclination of -7.7 deg is not possible on the Earth"),
+        ((3.3, -7.7, 40000.0, 0.0), "at least 3676 km from the target, and the longest way is 2500 km: check"),
         ((3.5, 88.5, 1500.0, 0.0), "B_H 1500 nT is out of the range of the policy, 2000 to inf nT"),
     ],
 )

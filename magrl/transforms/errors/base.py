@@ -138,16 +138,16 @@ class EpisodeErrors(StatefulTransform):
         tensordict.set(self.error_key, self._disturb(tensordict, values, episode))
         tensordict.set(self.stream_key, episode.stream.unsqueeze(-1))
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
 
         Args:
             field: ``(..., E)`` reading.
 
         Returns:
-            Both ``(..., E)``.
+            All ``(..., E)``.
         """
-        return torch.zeros_like(field), torch.zeros_like(field)
+        return torch.zeros_like(field), torch.zeros_like(field), torch.zeros_like(field)
 
     def farthest_km(self, max_move_km: float) -> float:
         """Return the longest path on the ground of a commanded move [km].
@@ -204,7 +204,8 @@ class ReadingErrors(EpisodeErrors):
         """Compute the standard deviations that the vehicle knows, when all sizes are set."""
         count = self.in_sizes[self.reading]
         field = torch.tensor(TYPICAL_FIELD if count == 3 else (0.0,) * (count or 0), dtype=torch.float64)
-        accuracy = torch.stack(self.variances(field)).sqrt().to(torch.get_default_dtype())
+        new, constant, slow = self.variances(field)
+        accuracy = torch.stack((new, constant + slow)).sqrt().to(torch.get_default_dtype())
         self.register_buffer("_accuracy", accuracy, persistent=False)
 
     def _measure(

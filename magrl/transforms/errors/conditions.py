@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -11,8 +11,9 @@ from typing import Any
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from magrl.checks import check_choice, check_type
+from magrl.checks import check_choice, check_numbers, check_type
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
+from magrl.transforms.errors.known_start import EXACT, KnownStart, calibration
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NorthReferenceError, north_reference
 from magrl.transforms.errors.sensors import SensorErrors
@@ -98,21 +99,41 @@ class Conditions:
         return float(max(0, math.ceil(farthest_km - max_move_km)))
 
     @cached_property
-    def _accuracy(self) -> list[tuple[float, ...]]:
-        """Standard deviations of new errors, and of constant and slow ones, as a vehicle knows them."""
+    def _variances(self) -> list[torch.Tensor]:
+        """Variances of new errors, of constant ones, and of slow ones, as a vehicle knows them."""
         field = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
-        variances = zip(*(error.variances(field) for error in self.transforms()), strict=True)
-        return [tuple(round(std, 6) for std in sum(each).sqrt().tolist()) for each in variances]
+        return [sum(each) for each in zip(*(error.variances(field) for error in self.transforms()), strict=True)]
 
     @property
     def sensor_std(self) -> tuple[float, ...]:
         """Standard deviations of the errors that are new at each reading, at :data:`TYPICAL_FIELD`."""
-        return self._accuracy[0]
+        return _rounded(self._variances[0].sqrt())
 
     @property
     def bias_std(self) -> tuple[float, ...]:
         """Standard deviations of the constant and the slow errors of the readings, at :data:`TYPICAL_FIELD`."""
-        return self._accuracy[1]
+        return _rounded((self._variances[1] + self._variances[2]).sqrt())
+
+    @property
+    def drift_std(self) -> tuple[float, ...]:
+        """Standard deviations of the slow errors of the readings, which vary along the way."""
+        return _rounded(self._variances[2].sqrt())
+
+    def calibrated(self, known_std: Sequence[float] = EXACT) -> tuple[float, ...]:
+        """Return the standard deviations of the constant and slow errors that are left where the start is known.
+
+        Args:
+            known_std: standard deviations of the elements that are known at the start: D [deg], I [deg], B_H [nT].
+
+        Example:
+            >>> ship = Conditions("ship", north={"constant_deg": 0.5, "random_deg": 0.1})
+            >>> [round(std, 3) for std in ship.calibrated()], ship.bias_std[0]
+            ([0.098, 0.0, 0.0], 0.5)
+        """
+        check_numbers(3, 0, known_std=known_std)
+        reading = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
+        std = (reading.new_tensor(each) for each in (self.sensor_std, self.bias_std, self.drift_std, known_std))
+        return _rounded(calibration(reading, reading, *std).bias_std)
 
 
 _CALIBRATED = VectorErrors(hard_iron_nt=(5.0,) * 3, soft_iron=((1e-4,) * 3,) * 3, attitude_deg=(0.01, 0.01))
@@ -201,6 +222,11 @@ TRUE_KEYS = tuple(
 """Keys of the errors that a policy may not read: what is true, the errors, and the states of their random numbers."""
 
 
+def _rounded(std: torch.Tensor) -> tuple[float, ...]:
+    """Return standard deviations as a vehicle knows them."""
+    return tuple(round(each, 6) for each in std.tolist())
+
+
 def conditions_named(name: str) -> Conditions:
     """Return a preset of :data:`CONDITIONS`.
 
@@ -215,13 +241,17 @@ def conditions_named(name: str) -> Conditions:
     return CONDITIONS[name]
 
 
-def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -> EnvBase:
+def with_conditions(
+    env: EnvBase, conditions: Conditions | str, seed: int = 0, known_start: Sequence[float] | None = None
+) -> EnvBase:
     """Return an environment under conditions, or the environment itself if they have no error.
 
     Args:
         env: navigation environment; errors of motion need ``drift_km=conditions.drift_km(max_move_km)``.
         conditions: conditions, or the name of a preset.
         seed: seed of the errors.
+        known_start: where the vehicle knows the elements at its start, their standard deviations: it then calibrates
+            its readings (:class:`~magrl.transforms.KnownStart`).
 
     Raises:
         ValueError: for an unknown preset, or an environment that does not allow the farthest move.
@@ -239,6 +269,7 @@ def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -
     check_type(EnvBase, env=env)
     if conditions.perfect:
         return env
-    env = TransformedEnv(env, Compose(*conditions.transforms(seed)))
+    known = [] if known_start is None else [KnownStart(conditions.drift_std, known_start)]
+    env = TransformedEnv(env, Compose(*conditions.transforms(seed), *known))
     _ = env.action_spec  # an error before the first episode
     return env

@@ -65,15 +65,16 @@ class SensorNoise(ReadingErrors):
         self._measure(tensordict, values[0], values[0] + episode.errors * normal.to(values[0].dtype), episode.errors)
         return episode.errors
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
 
         Example:
             >>> SensorNoise((1.0, 2.0)).variances(torch.zeros(2))
-            (tensor([1., 4.]), tensor([0., 0.]))
+            (tensor([1., 4.]), tensor([0., 0.]), tensor([0., 0.]))
         """
         check_tensor(self.in_sizes[0] or 0, field=field)
-        return field.new_tensor(self.sensor_std).square().expand_as(field), torch.zeros_like(field)
+        none = torch.zeros_like(field)
+        return field.new_tensor(self.sensor_std).square().expand_as(field), none, none
 
 
 class RandomSensorNoise(SensorNoise):

@@ -136,17 +136,18 @@ class NorthReferenceError(ReadingErrors):
         self._measure(tensordict, field, torch.cat((declination, field[..., 1:]), -1))
         return torch.cat((constant, drift, error), -1)
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
 
         Example:
             >>> NorthReferenceError(2.0, random_deg=1.0).variances(torch.zeros(3))
-            (tensor([1., 0., 0.]), tensor([4., 0., 0.]))
+            (tensor([1., 0., 0.]), tensor([4., 0., 0.]), tensor([0., 0., 0.]))
         """
         constant, drift, random = (size**2 for size in self.sizes)
-        white, slow = super().variances(field)
-        white[..., 0], slow[..., 0] = random, constant + drift
-        return white, slow
+        variances = super().variances(field)
+        for variance, size in zip(variances, (random, constant, drift), strict=True):
+            variance[..., 0] = size
+        return variances
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Give the true heading to the environment."""

@@ -132,16 +132,16 @@ class SensorErrors(ReadingErrors):
         self._measure(tensordict, value, reading, torch.where(missing, OUTAGE_STD, self._accuracy[0].to(dtype)))
         return torch.cat((bias, scale, drift, reading, vector), -1)
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
 
         Example:
             >>> SensorErrors((1.0, 1.0), bias=(2.0, 0.0)).variances(torch.zeros(2))
-            (tensor([1., 1.]), tensor([4., 0.]))
+            (tensor([1., 1.]), tensor([4., 0.]), tensor([0., 0.]))
         """
         check_tensor(self.count, field=field)
         noise, bias, scale, drift, resolution = self._sizes.to(field.dtype).square()
-        slow = bias + drift + scale * field.square()
+        slow = drift.expand_as(field)  # an error of the vector varies with the heading
         if self.vector is not None:
             slow = slow + self.vector.variance(field)
-        return (noise + resolution / 12).expand_as(field), slow
+        return (noise + resolution / 12).expand_as(field), bias + scale * field.square(), slow

@@ -127,16 +127,17 @@ class MagneticWeather(ReadingErrors):
         self._measure(tensordict, field, measured_elements(vector).to(field.dtype))
         return torch.stack((start, minutes), -1)
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, and of constant and slow ones.
+    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
 
         Example:
             >>> weather = MagneticWeather("disturbed", speed_km_h=24.0)
-            >>> [round(x, 2) for x in weather.variances(torch.tensor([0.0, 60.0, 24000.0]))[1].sqrt().tolist()]
+            >>> [round(x, 2) for x in weather.variances(torch.tensor([0.0, 60.0, 24000.0]))[2].sqrt().tolist()]
             [0.07, 0.04, 40.18]
         """
         change = elements_jacobian(field_vector(field))
-        return torch.zeros_like(field), (change @ self._moments.to(field) * change).sum(-1)
+        none = torch.zeros_like(field)
+        return none, none, (change @ self._moments.to(field) * change).sum(-1)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the elements without weather and the state; the measured elements are unbounded.

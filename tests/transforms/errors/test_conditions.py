@@ -97,16 +97,15 @@ def test_the_variances_of_all_errors_add_up() -> None:
     conditions = Conditions("own", sensors=sensors, north={"constant_deg": 0.4, "random_deg": 0.4}, weather=weather)
     reading = torch.tensor([0.0, 45.0, 20000.0], dtype=torch.float64)
     variances = zip(*(part.variances(reading) for part in conditions.transforms()), strict=True)
-    white, slow = (sum(parts).sqrt() for parts in variances)
+    white, constant, slow = (sum(parts).sqrt() for parts in variances)
     moments = weather_record("disturbed").second_moments()
     (north2, east2, down2), both = moments.diagonal(), moments[0, 2]
-    nanotesla = torch.stack((east2 + 100, (north2 + down2) / 2 - both + 100, north2 + 125)).sqrt()
+    nanotesla = torch.stack((east2 + 100, (north2 + down2) / 2 - both + 100, north2 + 100)).sqrt()
     degrees = torch.tensor([20000.0, 20000 * 2**0.5, 1.0], dtype=torch.float64).reciprocal()
     degrees[:2] = torch.rad2deg(degrees[:2])
-    expected = nanotesla * degrees
-    expected[0] = torch.hypot(expected[0], torch.tensor(0.4, dtype=torch.float64))
     torch.testing.assert_close(white, torch.tensor([0.5, 0.0, 4.0], dtype=torch.float64))
-    torch.testing.assert_close(slow, expected)
+    torch.testing.assert_close(constant, torch.tensor([0.4, 0.0, 5.0], dtype=torch.float64))
+    torch.testing.assert_close(slow, nanotesla * degrees)
 
 
 def test_evaluations_repeat_and_seeds_differ() -> None:

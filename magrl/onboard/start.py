@@ -1,0 +1,156 @@
+"""Start at a known place: the elements there, and a first reading that does not fit them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from magrl.checks import check_number, check_numbers
+from magrl.field import IGRF, elements_at
+from magrl.onboard.readings import check_earth_reading
+from magrl.transforms import calibration
+
+MODEL_STD = (0.26, 0.20, 133.0)
+"""Standard deviations of D [deg], I [deg], B_H [nT] of a model of the core, which omits crust and currents.
+
+To that of D, ``MODEL_D_NT / B_H`` degrees are added in squares. Source: the error model of the World Magnetic Model
+2025 (technical report, NOAA NCEI and British Geological Survey, 2024).
+"""
+MODEL_D_NT = 5417.0
+MOST_SIGMAS = 5.0
+"""Deviation of a first reading beyond which it does not fit the known elements, in standard deviations."""
+SLACK_NT = 100.0
+"""Deviation of the field vector that always fits; chosen [nT]."""
+
+Elements = tuple[float, float, float]
+Values = tuple[float, ...]
+
+
+def known_elements(
+    here: Sequence[float], std: Sequence[float] | None = None, date: str | None = None
+) -> tuple[Elements, Elements]:
+    """Return the elements at a known place, and their standard deviations.
+
+    Args:
+        here: D [deg], I [deg], B_H [nT], which are exact by default; or latitude and longitude [deg], at which they
+            follow from IGRF, by default with the accuracy :data:`MODEL_STD`.
+        std: standard deviations of the elements.
+        date: date for IGRF, such as ``"2026-06-30"``.
+
+    Raises:
+        ValueError: for other than two or three numbers, elements that are not possible on the Earth, or a date that is
+            missing, or has no use.
+
+    Example:
+        >>> elements, std = known_elements((60.4, 5.3), date="2026-06-30")
+        >>> [round(value, 1) for value in elements], [round(value, 2) for value in std]
+        ([2.8, 73.1, 15002.9], [0.44, 0.2, 133.0])
+    """
+    if len(here) not in (2, 3):
+        raise ValueError(f"here must be D, I and B_H, or latitude and longitude, got {here!r}")
+    check_numbers(len(here), here=here)
+    if (date is None) == (len(here) == 2):
+        wanted = "a latitude and longitude need a date" if date is None else "elements need no date"
+        raise ValueError(f"here {tuple(here)}: {wanted}, got date {date!r}")
+    if date is None:
+        elements, usual = (float(here[0]), float(here[1]), float(here[2])), (0.0, 0.0, 0.0)
+    else:
+        check_number(-90, 90, latitude=here[0])
+        check_number(-360, 360, longitude=here[1])
+        declination, inclination, intensity = elements_at(IGRF(date), torch.tensor(here, dtype=torch.float64)).tolist()
+        elements = declination, inclination, intensity
+        usual = math.hypot(MODEL_STD[0], MODEL_D_NT / elements[2]), *MODEL_STD[1:]
+    check_earth_reading(*elements, what="here")
+    if std is not None:
+        check_numbers(3, 0, here_std=std)
+    return elements, usual if std is None else (std[0], std[1], std[2])
+
+
+def calibrated(
+    known: Elements, known_std: Elements, sensors: tuple[Values, Values, Values], reading: Elements | None = None
+) -> tuple[Values, Values]:
+    """Return the constant error of the readings, and the standard deviations of the slow and constant ones left.
+
+    Args:
+        known: D [deg], I [deg], B_H [nT] at the start.
+        known_std: their standard deviations.
+        sensors: standard deviations of new errors, of constant and slow ones, and of slow ones.
+        reading: first reading; without it the error is not known, and 0.
+
+    Raises:
+        ValueError: for a reading that does not fit the start; see :func:`check_start`.
+
+    Example:
+        >>> sheet = (0.0, 0.0, 0.0), (0.5, 0.1, 20.0), (0.3, 0.0, 0.0)
+        >>> error, left = calibrated((3.5, 73.0, 15000.0), (0.0, 0.0, 0.0), sheet, (4.0, 73.0, 15000.0))
+        >>> round(error[0], 2), round(left[0], 2)
+        (0.32, 0.38)
+    """
+    if reading is not None:
+        check_start(reading, known, [math.hypot(*std) for std in zip(sensors[0], sensors[1], known_std, strict=True)])
+    values = known if reading is None else reading, known, *sensors, known_std
+    found = calibration(*(torch.tensor(each, dtype=torch.float64) for each in values))
+    return tuple(found.error.tolist()), tuple(found.bias_std.tolist())
+
+
+def check_start(reading: Elements, known: Elements, std: Sequence[float]) -> None:
+    """Raise unless the first reading fits the elements at the start.
+
+    Args:
+        reading: D [deg], I [deg], B_H [nT].
+        known: the elements there.
+        std: standard deviations of the difference: of all errors of the sensors, and of the elements.
+
+    Raises:
+        ValueError: with the element that does not fit, and the mistake that would explain it, if one is known.
+
+    Example:
+        >>> check_start((3.4, 73.1, 14950.0), (3.5, 73.0, 15000.0), (0.5, 0.1, 50.0))
+        >>> check_start((3.4, -73.1, 14950.0), (3.5, 73.0, 15000.0), (0.5, 0.1, 50.0))
+        Traceback (most recent call last):
+        ValueError: the first reading, D 3.4, I -73.1, B_H 14950, does not fit the start, D 3.5, I 73, B_H 15000 (I \
+deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis points up, and down is expected
+    """
+    total = math.hypot(known[2], known[2] * math.tan(math.radians(known[1])))
+    slack = math.degrees(SLACK_NT / max(known[2], SLACK_NT)), math.degrees(SLACK_NT / total), SLACK_NT
+    most = tuple(MOST_SIGMAS * s + each for s, each in zip(std, slack, strict=True))
+
+    def misfit(elements: Sequence[float]) -> list[float]:
+        difference = [one - other for one, other in zip(elements, known, strict=True)]
+        difference[0] = math.remainder(difference[0], 360)
+        return [abs(each) for each in difference]
+
+    def fits(elements: Sequence[float]) -> bool:
+        return all(each <= limit for each, limit in zip(misfit(elements), most, strict=True))
+
+    if fits(reading):
+        return
+    index, deviation = max(enumerate(misfit(reading)), key=lambda each: each[1] / most[each[0]])
+    causes = [text for text, elements in _mistakes(*reading, declination_there=known[0]) if fits(elements)]
+    cause = causes[0] if causes else "check sensors, compass and place, or state larger errors in bias_std"
+    texts: list[Any] = [f"D {each[0]:g}, I {each[1]:g}, B_H {each[2]:g}" for each in (reading, known)]
+    raise ValueError(
+        f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({('D', 'I', 'B_H')[index]} deviates by "
+        f"{deviation:.4g}, where {most[index]:.3g} is likely): {cause}"
+    )
+
+
+def _mistakes(d: float, i: float, b: float, *, declination_there: float) -> list[tuple[str, Elements]]:
+    """Return mistakes, and what the reading would be without each of them."""
+    degrees_d, degrees_i = math.degrees(d), math.degrees(i)
+    return [
+        ("it fits with -I: the vertical axis points up, and down is expected", (d, -i, b)),
+        ("it fits with -D: D is positive where magnetic north is east of true north", (-d, i, b)),
+        ("it fits with -D and -I: the axes point left and up, and right and down are expected", (-d, -i, b)),
+        ("it fits in radians, and degrees are expected", (degrees_d, degrees_i, b)),
+        ("I fits in radians, and degrees are expected", (d, degrees_i, b)),
+        ("D fits in radians, and degrees are expected", (degrees_d, i, b)),
+        ("D and I are swapped", (i, d, b)),
+        ("it fits with D + 180: the horizontal axes point backward", (d + 180, i, b)),
+        ("it fits with 90 - D: the horizontal axes are swapped", (90 - d, i, b)),
+        ("B_H is the total intensity: the horizontal one is expected", (d, i, b * math.cos(math.radians(i)))),
+        ("D is 0: the heading is from magnetic north, and true north is expected", (d + declination_there, i, b)),
+    ]

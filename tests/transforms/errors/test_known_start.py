@@ -1,0 +1,70 @@
+"""A known start: what the first reading tells of constant errors, in theory and in an environment."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from support.errors import nav
+from torchrl.envs import Compose, TransformedEnv, check_env_specs
+
+from magrl.transforms import CONDITIONS, Conditions, KnownStart, SensorErrors, calibration, with_conditions
+
+STD = (0.02, 0.02, 2.0), (0.5, 0.1, 20.0), (0.3, 0.05, 10.0), (0.1, 0.0, 0.0)  # new, constant and slow, slow, known
+
+
+def test_calibration_is_the_best_linear_estimate_of_the_constant_error() -> None:
+    """Of many errors that are drawn, it is unbiased, and what is left has the variance that it states."""
+    draw = torch.Generator().manual_seed(0)
+    new, bias, drift, known = torch.tensor(STD, dtype=torch.float64)
+    normal = torch.randn(5, 200_000, 3, generator=draw, dtype=torch.float64)
+    constant, slow = (bias.square() - drift.square()).sqrt() * normal[0], drift * normal[1]
+    reading = constant + slow + new * normal[2] + torch.tensor([179.0, 60.0, 20000.0])
+    here = torch.tensor([-181.0, 60.0, 20000.0]) + known * normal[3]  # the same place, on the other side of 180
+    found = calibration(reading, here, new, bias, drift, known)
+    left = constant + drift * normal[4] - found.error  # later, the slow error is another
+    torch.testing.assert_close(left.square().mean(0).sqrt(), found.bias_std, rtol=0.01, atol=0)
+    assert ((left * found.error).mean(0) / (bias * bias)).abs().max() < 0.01  # nothing more to subtract
+
+
+@pytest.mark.parametrize(("bias", "expected"), [(0.0, 0.0), (0.5, 0.7)])
+def test_without_other_errors_the_whole_difference_is_constant(bias: float, expected: float) -> None:
+    none, bias_std = torch.zeros(3), torch.full((3,), bias)
+    found = calibration(torch.full((3,), 0.7), none, none, bias_std, none, none)
+    assert found.error.tolist() == pytest.approx([expected] * 3)
+    assert found.bias_std.tolist() == [0] * 3
+
+
+def test_the_error_of_the_start_is_subtracted_from_all_readings_of_an_episode() -> None:
+    errors = SensorErrors((0.01, 0.01, 1.0), bias=(0.5, 0.2, 50.0), seed=3)
+    env = TransformedEnv(nav(3, max_steps=4), Compose(errors, KnownStart()))
+    check_env_specs(env)
+    rollout = env.rollout(9, break_when_any_done=False)
+    error = rollout["next", "start_error"]
+    assert torch.equal(error[:, :4], rollout["start_error"][:, :1].expand(-1, 4, -1))
+    assert not torch.equal(error[:, 4], error[:, 3])  # another episode, other errors
+    bias = rollout["next", "sensor_error"][..., :3]
+    torch.testing.assert_close(error, bias, rtol=0, atol=5.0)
+    left = (rollout["next", "field"] - rollout["next", "true_field"])[..., :2]
+    assert left.abs().max() < 0.1 < bias[..., 0].abs().max()
+    assert rollout["next", "bias_std"].amax((0, 1)).tolist() == pytest.approx([0.01, 0.01, 1.0], rel=0.01)
+
+
+def test_conditions_state_what_is_left_where_the_start_is_known() -> None:
+    """Of the constant error of the north reference little, of slow errors all, of the model's error some."""
+    own = Conditions("own", sensors={"sensor_std": (0.0, 0.0, 2.0)}, north={"constant_deg": 0.5})
+    assert own.calibrated() == (0, 0, 0)
+    assert own.calibrated((0.5, 0, 0))[0] == pytest.approx(0.5 / 2**0.5, abs=1e-6)
+    aircraft = CONDITIONS["aircraft"]
+    assert aircraft.bias_std[0] > 2 * aircraft.calibrated()[0] > 2 * aircraft.drift_std[0] > 0
+    assert aircraft.calibrated()[1:] == aircraft.drift_std[1:] == aircraft.bias_std[1:]
+    base = nav(4)
+    env = with_conditions(base, aircraft, known_start=(0.0, 0.0, 0.0))
+    assert env.reset()["bias_std"][0].tolist() == pytest.approx(aircraft.calibrated(), abs=1e-6)
+
+
+def test_bad_standard_deviations_are_named() -> None:
+    for name in ("drift_std", "known_std"):
+        with pytest.raises(ValueError, match=rf"^{name} must be a finite number from 0 on, got -1"):
+            KnownStart(**{name: (0.0, -1.0, 0.0)})
+    with pytest.raises(ValueError, match=r"^known_std must be 3 finite numbers"):
+        CONDITIONS["ship"].calibrated((1.0,))
