@@ -100,6 +100,9 @@ class Kalman(QuasiNewton):
     def prior(self, reading: Tensor) -> GradientPrior:
         return tracking.dipole_prior(reading)
 
+    def reading_std(self, seen: TensorDictBase) -> Tensor:
+        return tracking.reading_std(super().reading_std(seen), self.bias_std)
+
     def drift(self, reading: Tensor) -> Tensor:
         return tracking.field_curvature(reading)
 

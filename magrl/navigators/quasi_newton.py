@@ -82,6 +82,10 @@ class QuasiNewton(Navigator):
         """
         raise NotImplementedError(f"{type(self).__name__} must return a GradientPrior in prior(reading)")
 
+    def reading_std(self, seen: TensorDictBase) -> Tensor:
+        """Return the standard deviations of the present reading in the filter: D, I, B_H."""
+        return self.accuracy(seen, self.sensor_std)
+
     def drift(self, reading: Tensor) -> Tensor:  # noqa: ARG002
         """Return the standard deviation of the change of the Jacobian, see :func:`magrl.tracking.predict`."""
         return self.curvature
@@ -99,7 +103,7 @@ class QuasiNewton(Navigator):
         """Return the state of the filter after the present reading, and keep it in the memory."""
         before = FieldTrack(memory["mean"], memory["covariance"])
         reading, displacement = seen["field"].double()[:, self.elements], self.displacement(seen)
-        std = self.accuracy(seen, self.sensor_std)[..., self.elements]
+        std = self.reading_std(seen)[..., self.elements]
         after = tracking.read(before, displacement, reading, std, self.drift(reading), self.scales, self.periods)
         began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
         mean = torch.where(began, before.mean, after.mean)

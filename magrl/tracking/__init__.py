@@ -33,6 +33,7 @@ from magrl.tracking.search import visit as visit
 from magrl.tracking.track import aim as aim
 from magrl.tracking.track import displacement_of as displacement_of
 from magrl.tracking.track import read as read
+from magrl.tracking.track import reading_std as reading_std
 from magrl.tracking.track import related as related
 from magrl.tracking.way import Way as Way
 from magrl.tracking.way import way_to as way_to

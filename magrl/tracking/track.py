@@ -29,6 +29,27 @@ from magrl.tracking.filter import (
 from magrl.tracking.search import arrival_ellipse, unvisited
 from magrl.tracking.way import Way
 
+SLOW_SHARE = 0.25
+"""Share of the variance of constant and slow errors that counts as new in each reading; chosen on random planets."""
+
+
+def reading_std(sensor_std: Tensor, bias_std: Tensor) -> Tensor:
+    """Return the standard deviation ``(..., E)`` of a reading in the filter.
+
+    Slow errors vary along the way, which the filter would otherwise take for a gradient. They are correlated from
+    reading to reading; :data:`SLOW_SHARE` of their variance as white noise stands for that.
+
+    Args:
+        sensor_std: ``(..., E)`` standard deviation of the errors that are new in each reading.
+        bias_std: ``(..., E)`` that of constant and slow errors.
+
+    Example:
+        >>> reading_std(torch.tensor([3.0]), torch.tensor([8.0]))
+        tensor([5.])
+    """
+    check_tensor(sensor_std=sensor_std, bias_std=bias_std)
+    return torch.hypot(sensor_std, SLOW_SHARE**0.5 * bias_std)
+
 
 def displacement_of(move: Tensor, heading: Tensor) -> Tensor:
     """Return the displacement ``(..., 2)`` [km] of a move ``(..., K)``, distance [km] first, at a heading ``(..., 1)``.

@@ -139,9 +139,11 @@ class TrackGradient(StatefulTransform):
             tensordict.set(key, entry)
 
     def _std(self, values: list[Tensor]) -> tuple[Tensor, Tensor | None]:
-        """Return the standard deviations of noise and of constant errors, of the TensorDict or as given."""
+        """Return the standard deviations of a reading and of constant errors, of the TensorDict or as given."""
         given = len(values)
-        return values[4] if given > 4 else self.sensor_std, values[5] if given > 5 else None
+        if given > 5:
+            return tracking.reading_std(values[4], values[5]), values[5]
+        return values[4] if given > 4 else self.sensor_std, None
 
     def estimates(
         self, track: FieldTrack, target: Tensor, heading: Tensor, bias_std: Tensor | None = None

@@ -71,7 +71,7 @@ def test_the_estimates_are_those_of_the_pure_functions() -> None:
 
 @pytest.mark.parametrize("row", [0, 1])
 def test_standard_deviations_may_be_keys(row: int) -> None:
-    """Each row has its own; a constant error widens the way and leaves the rest as it is."""
+    """Each row has its own; a slow error makes readings less certain, and widens the way."""
     rows = torch.tensor(STD, dtype=torch.float64) * torch.tensor([[1.0], [4.0]], dtype=torch.float64)
     first = first_reading(2).update({"sensor_std": rows, "bias_std": 10 * rows})
     after = moved(first, 40.0, 0.3, torch.tensor((0.3, 0.5, 60.0), dtype=torch.float64))
@@ -80,9 +80,10 @@ def test_standard_deviations_may_be_keys(row: int) -> None:
     alone = stepped(TrackGradient(sensor_std=rows[row].tolist()), first, after)[row]
     for key in OUT_KEYS:
         torch.testing.assert_close(plain[key], alone[key], msg=key)
+    noisier = stepped(TrackGradient(sensor_std=(26**0.5 * rows[row]).tolist()), first, after)[row]  # 1 + 10^2 / 4
     for key in (*STATE, "estimated_gradient"):
-        assert torch.equal(biased[key], plain[key])
-    known, shared = tracking.related(FieldTrack(*(plain[key] for key in STATE)), curl_relation)
+        torch.testing.assert_close(biased[key], noisier[key], msg=key)
+    known, shared = tracking.related(FieldTrack(*(noisier[key] for key in STATE)), curl_relation)
     way = tracking.way_to(known, after["target_field"][row], 300.0, shared=shared, bias_std=10 * rows[row])
     torch.testing.assert_close((biased["way"], biased["way_covariance"]), tuple(way))
 

@@ -9,6 +9,7 @@ import evaluate
 import fly
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import EnvBase
 
@@ -121,6 +122,7 @@ def test_navigators_are_told_what_they_can_tell_apart() -> None:
     env, told = nav(2), {"sensor_std": (0.3, 0.0, 3.0), "bias_std": (0.4, 0.1, 4.0)}
     kalman, secant = make_navigator("kalman", env, **told), make_navigator("secant", env, **told)
     assert [kalman.sensor_std.tolist(), kalman.bias_std.tolist()] == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0]]
+    assert kalman.reading_std(TensorDict()).tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5])
     assert secant.sensor_std.tolist() == pytest.approx([0.5, 0.1, 5.0])
 
 
