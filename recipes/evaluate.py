@@ -43,19 +43,19 @@ from tqdm import tqdm
 
 from magrl.checks import check_numbers
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
-from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize
+from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize, with_declaration, with_errors
 from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import check_distinct, check_map_date, label, make_navigator
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import NO_NOISE, Noise, agreed, trained_runs, unfinished
-from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names, with_declaration
+from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
 from magrl.training import UsageError, command
 from magrl.training.checkpoints import create_run_folder
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
-from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
+from magrl.transforms import conditions_named
 
 RECIPE = "evaluate.py"
 SHOWN = 24
@@ -94,6 +94,9 @@ class Config(ScenarioOptions):
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]; by default those of the runs, or 0."""
     conditions: str | None = None
     """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater or low-cost."""
+    known_start: Noise | None = None
+    """Where the vehicles know the field at their start and calibrate their sensors: standard deviations of what they
+    know of D [deg], I [deg], B_H [nT], such as 0 0 0; with --conditions."""
     map_date: str | None = None
     """Date of the map of map_matching, as 2015-01-01 (IGRF); by default its map is the field itself."""
     kilometers: bool = False
@@ -195,14 +198,11 @@ def make_fleet(config: Config, scenarios: Sequence[Scenario]) -> tuple[list[EnvB
         GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), drift_km=drift_km, seed=config.seed)
         for scenario in scenarios
     ]
-    if config.conditions:
-        sensor_std, envs = conditions.sensor_std, [with_conditions(base, conditions, config.seed) for base in bases]
-    else:
-        sensor_std, envs = config.noise, [with_sensor_noise(base, config.noise, config.seed) for base in bases]
-    options = {"mode": config.mode, "seed": config.seed, "map_date": config.map_date}
-    options |= {"sensor_std": sensor_std, "bias_std": conditions.bias_std}
+    errors = conditions if config.conditions else config.noise
+    flown = [with_errors(base, errors, config.seed, config.known_start) for base in bases]
+    options = {"mode": config.mode, "seed": config.seed, "map_date": config.map_date, **flown[0][1]}
     navigators = [tuple(make_navigator(text, base, **options) for base in bases) for text in config.navigators]
-    return [with_declaration(env, config.confidence) for env in envs], navigators
+    return [with_declaration(env, config.confidence) for env, _ in flown], navigators
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
@@ -250,7 +250,8 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
         "arrival": env.arrival.rule,
         "arrival_radius_km": env.arrival.radius_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        **{key: getattr(config, key) for key in ("tasks", "noise", "conditions", "map_date", "mode", "seed")},
+        **{key: getattr(config, key) for key in ("tasks", "noise", "conditions", "known_start")},
+        **{key: getattr(config, key) for key in ("map_date", "mode", "seed")},
         **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
         **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
     }
@@ -266,14 +267,15 @@ def write(config: Config, env: EnvBase, results: Results) -> None:
             writer.writerows(rows)
     write_json(config.out / "summary.json", results.summaries)
     write_json(config.out / "settings.json", settings(config, env))
+    text = "{:g} deg, {:g} deg, {:g} nT".format
     lines = {
         "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
         "Date of the map of map matching": config.map_date,
         "Conditions": config.conditions,
-        "Standard deviations of the noise on D, I and B_H": any(config.noise or ())
-        and "{:g} deg, {:g} deg, {:g} nT".format(*config.noise),
+        "Known start, standard deviations of D, I, B_H": config.known_start and text(*config.known_start),
+        "Standard deviations of the noise on D, I and B_H": any(config.noise or ()) and text(*config.noise),
     }
-    notes = "".join(f"\n{name}: {text}.\n" for name, text in lines.items() if text)
+    notes = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)
     notes += "".join(f"\nWarning: {text}.\n" for text in results.warnings)
     ahead = config.kilometers or env.arrival.rule != "objective"
     whole = comparison_table(results.summaries, config.mode, published=not config.scenario, kilometers=ahead)

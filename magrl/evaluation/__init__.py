@@ -4,3 +4,5 @@ from magrl.evaluation.metrics import episode_measures as episode_measures
 from magrl.evaluation.metrics import summarize as summarize
 from magrl.evaluation.rollout import evaluate as evaluate
 from magrl.evaluation.rollout import evaluation_rollout as evaluation_rollout
+from magrl.evaluation.scenarios import with_declaration as with_declaration
+from magrl.evaluation.scenarios import with_errors as with_errors

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -17,9 +18,9 @@ from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.metrics import episode_measures
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.runs import NO_NOISE, Noise
-from magrl.evaluation.scenarios import with_declaration
+from magrl.evaluation.scenarios import with_declaration, with_errors
 from magrl.navigators import Navigator
-from magrl.transforms import conditions_named, with_conditions, with_sensor_noise
+from magrl.transforms import conditions_named
 from magrl.transforms.errors.base import EpisodeErrors
 
 
@@ -30,6 +31,7 @@ def evaluate(
     num_envs: int | None = None,
     noise: Noise = NO_NOISE,
     conditions: str | None = None,
+    known_start: Sequence[float] | None = None,
     confidence: float = 0.0,
     seed: int = 0,
     device: torch.device | str = "cpu",
@@ -46,6 +48,8 @@ def evaluate(
             each task. Sensor noise, other errors and random start headings depend on it, the tasks do not.
         noise: standard deviations of the noise on D [deg], I [deg], B_H [nT].
         conditions: errors of a real vehicle instead of noise, a name of :data:`magrl.transforms.CONDITIONS`.
+        known_start: where the vehicles know the elements at their start, the standard deviations of these: they then
+            calibrate their sensors (:class:`magrl.transforms.KnownStart`). With ``conditions``.
         confidence: least probability at which navigators declare an arrival.
         seed: random seed of the errors, random start headings and metaheuristics.
         device: device of the environment.
@@ -76,12 +80,11 @@ def evaluate(
     flown = conditions_named(conditions or "laboratory")
     drift = {"drift_km": flown.drift_km(options.get("max_move_km", scenario.max_move_km))}
     base = GeomagneticNavEnv(scenario, num_envs=num_envs, seed=seed, device=device, **(drift | options))
+    env, sheet = with_errors(base, flown if conditions else noise, seed, known_start)
     if isinstance(policy, str):
-        std = tuple(noise) if conditions is None else flown.sensor_std
-        policy = make_navigator(policy, base, seed=seed, sensor_std=std, bias_std=flown.bias_std)
+        policy = make_navigator(policy, base, seed=seed, **sheet)
     elif hasattr(policy, "check_fits"):
         policy.check_fits(base)
-    env = with_sensor_noise(base, noise, seed) if conditions is None else with_conditions(base, flown, seed)
     if isinstance(policy, FieldPolicy | Navigator):
         env = with_declaration(env, confidence)
     restart(env)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +14,8 @@ from magrl import paper
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
-from magrl.transforms import DeclareArrival, TrackGradient
+from magrl.evaluation.runs import NO_NOISE
+from magrl.transforms import Conditions, DeclareArrival, TrackGradient, with_conditions, with_sensor_noise
 from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
@@ -116,6 +118,33 @@ def task_names(scenario: Scenario, first: int = 0) -> tuple[str, ...]:
     """
     assert scenario.tasks is not None
     return scenario.names or tuple(f"task {number}" for number in range(first, first + len(scenario.tasks.start)))
+
+
+def with_errors(
+    env: EnvBase, errors: Sequence[float] | Conditions, seed: int = 0, known_start: Sequence[float] | None = None
+) -> tuple[EnvBase, dict[str, Any]]:
+    """Return an environment with errors, and the data sheet of its vehicles: their ``sensor_std`` and ``bias_std``.
+
+    Args:
+        env: navigation environment; under conditions with their ``drift_km``.
+        errors: standard deviations of the noise on D [deg], I [deg], B_H [nT], or the conditions of a real vehicle.
+        seed: random seed of the errors.
+        known_start: standard deviations of the elements at the start, where the vehicles know these and calibrate their
+            sensors (:class:`~magrl.transforms.KnownStart`); None where they do not.
+
+    Raises:
+        ValueError: for a known start without conditions.
+
+    Example:
+        >>> with_errors(GeomagneticNavEnv(num_envs=2, seed=0), (0.05, 0.05, 5.0))[1]
+        {'sensor_std': (0.05, 0.05, 5.0), 'bias_std': (0.0, 0.0, 0.0)}
+    """
+    if isinstance(errors, Conditions):
+        sheet = {"sensor_std": errors.sensor_std, "bias_std": errors.left_std(known_start)}
+        return with_conditions(env, errors, seed, known_start), sheet
+    if known_start is not None:
+        raise ValueError(f"known_start {known_start} needs conditions: white noise has no constant error to calibrate")
+    return with_sensor_noise(env, errors, seed), {"sensor_std": tuple(errors), "bias_std": NO_NOISE}
 
 
 def with_declaration(env: EnvBase, confidence: float = 0.0) -> EnvBase:

@@ -9,8 +9,8 @@ from magrl.transforms.alignment import AlignmentReward as AlignmentReward
 from magrl.transforms.alignment import FieldGradient as FieldGradient
 from magrl.transforms.alignment import GradientHeading as GradientHeading
 from magrl.transforms.declaration import DeclareArrival as DeclareArrival
+from magrl.transforms.errors.base import true_keys as true_keys
 from magrl.transforms.errors.conditions import CONDITIONS as CONDITIONS
-from magrl.transforms.errors.conditions import TRUE_KEYS as TRUE_KEYS
 from magrl.transforms.errors.conditions import Conditions as Conditions
 from magrl.transforms.errors.conditions import conditions_named as conditions_named
 from magrl.transforms.errors.conditions import with_conditions as with_conditions
@@ -39,3 +39,6 @@ from magrl.transforms.views import ObservationView as ObservationView
 from magrl.transforms.views import TargetDifference as TargetDifference
 from magrl.transforms.views import TrackObservation as TrackObservation
 from magrl.transforms.views import TrackView as TrackView
+
+TRUE_KEYS = true_keys()
+"""Default keys of the errors of this package that a policy may not read."""

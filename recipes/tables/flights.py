@@ -10,11 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, earth_scenario
-from magrl.evaluation import episode_measures, evaluation_rollout
+from magrl.evaluation import episode_measures, evaluation_rollout, with_declaration, with_errors
 from magrl.evaluation.navigators import make_navigator
-from magrl.evaluation.runs import NO_NOISE, Noise
-from magrl.evaluation.scenarios import with_declaration
-from magrl.transforms import Conditions, with_conditions, with_sensor_noise
+from magrl.evaluation.runs import Noise
+from magrl.transforms import Conditions
 
 FAR_KM = 500.0
 """Longest distance of the paper's tasks; beyond, regions are larger and cells begin with kilometers."""
@@ -53,16 +52,12 @@ def rollout(
     known_start: Sequence[float] | None = None,
 ) -> TensorDictBase:
     """Return an episode of each vehicle, as :func:`flown` measures it."""
-    if isinstance(errors, Conditions):
-        env, std = with_conditions(base, errors, base.seed, known_start), errors.sensor_std
-        bias = errors.bias_std if known_start is None else errors.calibrated(known_start)
-    else:
-        env, std, bias = with_sensor_noise(base, errors, base.seed), errors, NO_NOISE
+    env, sheet = with_errors(base, errors, base.seed, known_start)
     if isinstance(navigator, str):
         navigator = {"name": navigator}
     if isinstance(navigator, Mapping):
         options = {key: value for key, value in navigator.items() if key != "name"}
-        navigator = make_navigator(navigator["name"], base, sensor_std=std, bias_std=bias, **options)
+        navigator = make_navigator(navigator["name"], base, **sheet, **options)
     return evaluation_rollout(with_declaration(env, confidence), navigator)
 
 

@@ -68,6 +68,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
     for call, error, message in (
         (lambda: evaluate("secant", Scenario()), ValueError, "the scenario has no tasks to fly"),
         (lambda: evaluate("secant", "figure-4-1", noise=(1, 1, 1), conditions="ship"), ValueError, "omit the noise"),
+        (lambda: evaluate("secant", "figure-4-1", known_start=(0, 0, 0)), ValueError, "needs conditions"),
         (lambda: evaluate(agent, elsewhere), ValueError, "trained"),
         (lambda: evaluate(5, "figure-4-1"), TypeError, "policy must be callable"),
     ):

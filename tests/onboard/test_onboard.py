@@ -99,7 +99,7 @@ def test_commands_from_a_known_start_are_those_of_the_environment(name: str, tmp
     own = Conditions("own", sensors={"sensor_std": NOISE, "bias": (0.4, 0.1, 30.0), "drift": NOISE, "drift_length": 50})
     known, options = (0.1, 0.1, 10.0), {"max_steps": 50, "confidence": 0.0}
     base = GeomagneticNavEnv(num_envs=1, seed=3, start_heading="random", arrival="declared")
-    policy = make_navigator(name, base, sensor_std=own.sensor_std, bias_std=own.calibrated(known))
+    policy = make_navigator(name, base, sensor_std=own.sensor_std, bias_std=own.left_std(known))
     env = with_conditions(base, own, seed=1)
     here = env.reset()["true_field"][0].tolist()
     bare, env = env, with_declaration(with_conditions(base, own, seed=1, known_start=known))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from support.errors import every_error
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, Transform, TransformedEnv
@@ -12,7 +13,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_pretrain
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import NAVIGATORS
-from magrl.transforms import CONDITIONS, TRUE_KEYS, with_conditions
+from magrl.transforms import CONDITIONS, TRUE_KEYS
 
 ORACLES = {"parallel", "geodesic"}
 METAHEURISTICS = {"ga", "pso", "afsa"}  # oracles but in the mode "flown"
@@ -28,7 +29,7 @@ def base_env(seed: int = 5) -> GeomagneticNavEnv:
 @pytest.fixture(scope="module")
 def states() -> list[TensorDict]:
     torch.manual_seed(0)
-    rollout = with_conditions(base_env(), CONDITION).rollout(6)
+    rollout = TransformedEnv(base_env(), every_error()).rollout(6)
     assert set(rollout.keys()) >= PRIVATE
     return list(rollout.exclude("action", "next").unbind(1))
 

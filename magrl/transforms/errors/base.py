@@ -172,6 +172,21 @@ class EpisodeErrors(StatefulTransform):
         return observation_spec
 
 
+def true_keys(kind: type[EpisodeErrors] = EpisodeErrors) -> tuple[str, ...]:
+    """Return the default keys of all errors that a policy may not read: what is true, the errors, and their streams.
+
+    Args:
+        kind: base class of the errors; those of a module that is not imported are left out.
+
+    Example:
+        >>> from magrl.transforms import NorthReferenceError
+        >>> true_keys(NorthReferenceError)
+        ('true_field', 'true_heading', 'north_error', 'north_stream')
+    """
+    own = [*kind.true_keys, str(kind.error_key), str(kind.stream_key)] if kind.channel else []
+    return tuple(dict.fromkeys([*own, *(key for each in kind.__subclasses__() for key in true_keys(each))]))
+
+
 class ReadingErrors(EpisodeErrors):
     """Base class of errors of a reading, which keep its true value and state its accuracy.
 

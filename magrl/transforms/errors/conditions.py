@@ -13,7 +13,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from magrl.checks import check_choice, check_numbers, check_type
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
-from magrl.transforms.errors.known_start import EXACT, KnownStart, calibration
+from magrl.transforms.errors.known_start import KnownStart, calibration
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NorthReferenceError, north_reference
 from magrl.transforms.errors.sensors import SensorErrors
@@ -119,20 +119,23 @@ class Conditions:
         """Standard deviations of the slow errors of the readings, which vary along the way."""
         return _rounded(self._variances[2].sqrt())
 
-    def calibrated(self, known_std: Sequence[float] = EXACT) -> tuple[float, ...]:
-        """Return the standard deviations of the constant and slow errors that are left where the start is known.
+    def left_std(self, known_start: Sequence[float] | None) -> tuple[float, ...]:
+        """Return the standard deviations of the constant and slow errors that a vehicle navigates with.
 
         Args:
-            known_std: standard deviations of the elements that are known at the start: D [deg], I [deg], B_H [nT].
+            known_start: standard deviations of D [deg], I [deg], B_H [nT] at the start, where the vehicle knows these
+                and calibrates its sensors; None where it does not, and :attr:`bias_std` is left.
 
         Example:
             >>> ship = Conditions("ship", north={"constant_deg": 0.5, "random_deg": 0.1})
-            >>> [round(std, 3) for std in ship.calibrated()], ship.bias_std[0]
-            ([0.098, 0.0, 0.0], 0.5)
+            >>> ship.left_std(None), [round(std, 3) for std in ship.left_std((0.0, 0.0, 0.0))]
+            ((0.5, 0.0, 0.0), [0.098, 0.0, 0.0])
         """
-        check_numbers(3, 0, known_std=known_std)
+        if known_start is None:
+            return self.bias_std
+        check_numbers(3, 0, known_start=known_start)
         reading = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
-        std = (reading.new_tensor(each) for each in (self.sensor_std, self.bias_std, self.drift_std, known_std))
+        std = (reading.new_tensor(each) for each in (self.sensor_std, self.bias_std, self.drift_std, known_start))
         return _rounded(calibration(reading, reading, *std).bias_std)
 
 
@@ -210,16 +213,6 @@ Motion:
 
 Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, 20 days of a month for the others (chosen).
 """
-
-
-TRUE_KEYS = tuple(
-    dict.fromkeys(
-        str(key)
-        for kind in (MotionError, MagneticWeather, SensorErrors, NorthReferenceError)
-        for key in (*kind.true_keys, kind.error_key, kind.stream_key)
-    )
-)
-"""Keys of the errors that a policy may not read: what is true, the errors, and the states of their random numbers."""
 
 
 def _rounded(std: torch.Tensor) -> tuple[float, ...]:

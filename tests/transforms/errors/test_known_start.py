@@ -52,19 +52,19 @@ def test_the_error_of_the_start_is_subtracted_from_all_readings_of_an_episode() 
 def test_conditions_state_what_is_left_where_the_start_is_known() -> None:
     """Of the constant error of the north reference little, of slow errors all, of the model's error some."""
     own = Conditions("own", sensors={"sensor_std": (0.0, 0.0, 2.0)}, north={"constant_deg": 0.5})
-    assert own.calibrated() == (0, 0, 0)
-    assert own.calibrated((0.5, 0, 0))[0] == pytest.approx(0.5 / 2**0.5, abs=1e-6)
+    assert own.left_std((0, 0, 0)) == (0, 0, 0)
+    assert own.left_std((0.5, 0, 0))[0] == pytest.approx(0.5 / 2**0.5, abs=1e-6)
     aircraft = CONDITIONS["aircraft"]
-    assert aircraft.bias_std[0] > 2 * aircraft.calibrated()[0] > 2 * aircraft.drift_std[0] > 0
-    assert aircraft.calibrated()[1:] == aircraft.drift_std[1:] == aircraft.bias_std[1:]
+    assert aircraft.bias_std[0] > 2 * aircraft.left_std((0, 0, 0))[0] > 2 * aircraft.drift_std[0] > 0
+    assert aircraft.left_std((0, 0, 0))[1:] == aircraft.drift_std[1:] == aircraft.bias_std[1:]
     base = nav(4)
     env = with_conditions(base, aircraft, known_start=(0.0, 0.0, 0.0))
-    assert env.reset()["bias_std"][0].tolist() == pytest.approx(aircraft.calibrated(), abs=1e-6)
+    assert env.reset()["bias_std"][0].tolist() == pytest.approx(aircraft.left_std((0, 0, 0)), abs=1e-6)
 
 
 def test_bad_standard_deviations_are_named() -> None:
     for name in ("drift_std", "known_std"):
         with pytest.raises(ValueError, match=rf"^{name} must be a finite number from 0 on, got -1"):
             KnownStart(**{name: (0.0, -1.0, 0.0)})
-    with pytest.raises(ValueError, match=r"^known_std must be 3 finite numbers"):
-        CONDITIONS["ship"].calibrated((1.0,))
+    with pytest.raises(ValueError, match=r"^known_start must be 3 finite numbers"):
+        CONDITIONS["ship"].left_std((1.0,))
