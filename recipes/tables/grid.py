@@ -20,6 +20,7 @@ import contextlib
 import inspect
 import itertools
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -242,7 +243,9 @@ def make(config: Config) -> None:
         raise UsageError(f"{config.file} declares no table {', '.join(unknown)}: choose from {', '.join(known)}")
     for name in config.tables or known:
         try:
-            text = table(**known[name] | given)
+            with tempfile.TemporaryDirectory() as folder:  # a table that is changed replaces no results
+                own = {"folder": f"{folder}/{name}"} if given and "folder" in known[name] else {}
+                text = table(**known[name] | given | own)
         except (ValueError, OSError, TypeError) as error:
             raise UsageError(f"{name}: {error}") from error
         if config.out is None:

@@ -85,11 +85,14 @@ def short(folder: str) -> str:
     return (Path(folder) / "short.md").read_text()
 
 
-def noise_levels(navigators: Sequence[str], levels: Sequence[Noise], tasks: Any = None) -> str:
-    """Return SR and SPL of navigators at several levels of noise, interquartile means over their runs."""
+def noise_levels(navigators: Sequence[str], levels: Sequence[Noise], *, folder: str, tasks: Any = None) -> str:
+    """Return SR and SPL of navigators at several levels of noise, interquartile means over their runs.
+
+    The results are in a folder for each level, which is replaced.
+    """
     by_level = {}
     for noise in levels:
-        folder = evaluated(Path(f"runs/noise-{noise[0]:g}"), navigators, noise=tuple(map(float, noise)), tasks=tasks)
+        folder = evaluated(Path(f"{folder}-{noise[0]:g}"), navigators, noise=tuple(map(float, noise)), tasks=tasks)
         by_level[level_name(noise)] = json.loads((folder / "summary.json").read_text())
     first = next(iter(by_level.values()))
     rows = [

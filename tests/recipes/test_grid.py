@@ -224,7 +224,9 @@ def test_evaluations_and_the_rows_of_other_tables(tmp_path: Path, monkeypatch) -
     text = trainings.evaluation(folder="runs/a", wandb_mode="disabled", **options)
     assert [row[0] for row in rows(text)[2:4]] == ["secant (quasi-Newton)", "geodesic (both positions, an oracle)"]
     assert trainings.short("runs/a").startswith("| navigator | needs | SR % |")
-    head, _, secant, geodesic = rows(trainings.noise_levels(levels=[(0, 0, 0), (0.1, 0.1, 10)], **options))
+    head, _, secant, geodesic = rows(
+        trainings.noise_levels(levels=[(0, 0, 0), (0.1, 0.1, 10)], folder="runs/n", **options)
+    )
     assert head == ["navigator", "needs", "runs", "no noise", "0.1°, 0.1°, 10 nT"]
     assert geodesic[3:] == ["100.0 / 100.0"] * 2
     assert secant[3].startswith("100.0 / 9")
