@@ -29,30 +29,25 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl import torchrl_logger
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
-from magrl.checks import check_number
+from magrl.checks import check_number, check_numbers
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
-from magrl.evaluation import episode_measures, export
+from magrl.evaluation import episode_measures, export, places, with_declaration, with_errors
 from magrl.evaluation.maps import trajectories_figure, write_gif
 from magrl.evaluation.navigators import make_navigator, needs
-from magrl.evaluation.places import (
-    check_declination,
-    elements_text,
-    find_elements,
-    parse_coordinates,
-    parse_elements,
-    region_around,
-)
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
+from magrl.tracking import RANGE_KM
 from magrl.training import UsageError, command
-from magrl.transforms import SensorNoise, TrackGradient, conditions_named
-from magrl.transforms.track import STD_KEYS
+from magrl.transforms import TrackGradient, conditions_named
+from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 RECIPE = "fly.py"
+RULES = {"told": "objective", "alone": "declared"}
+"""Rules of arrival of the two flights: the vehicle is told when it has arrived, or declares it within 25 km."""
 ARRIVAL_KM = 400.0
 """Distance up to which the arrival threshold is 0.01; beyond, it falls so that arrival means as many kilometers."""
 
@@ -72,6 +67,9 @@ class Config:
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
     conditions: str | None = None
     """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater or low-cost."""
+    known_start: tuple[float, float, float] | None = None
+    """Where the vehicle knows the field at its start and calibrates its sensors: standard deviations of what it knows
+    of D [deg], I [deg], B_H [nT], such as 0 0 0; with --conditions."""
     date: str = "2025-01-01"
     """Date of the field, 1900 to 2030 (IGRF-14)."""
     zeta: float | None = None
@@ -110,28 +108,31 @@ class Watched(TensorDictModuleBase):
         return self.navigator(tensordict)
 
 
-def places(config: Config, field: IGRF) -> tuple[Tensor, Tensor, float]:
+def ends(config: Config, field: IGRF) -> tuple[Tensor, Tensor, float]:
     """Return start and destination ``(2,)`` [deg] and their distance [km].
 
     Raises:
         ValueError: for a place that cannot be read or found, or ends between which no flight is possible.
     """
-    start, elements = parse_coordinates(config.start), parse_elements(config.destination)
-    target = parse_coordinates(config.destination) if elements is None else find_elements(field, elements, start)
+    start, elements = places.parse_coordinates(config.start), places.parse_elements(config.destination)
+    target = (
+        places.parse_coordinates(config.destination)
+        if elements is None
+        else places.find_elements(field, elements, start)
+    )
     distance_km = geodesic(*start, *target)[0].item()
     if math.isnan(distance_km):
         raise ValueError(f"{config.destination!r} is the antipode of the start, {config.start!r}: choose another one")
     if distance_km < 1:
         raise ValueError(f"start {config.start!r} and destination {config.destination!r} are the same place")
-    check_declination(config.start, start, field)
-    check_declination(config.destination, target, field)
+    places.check_declination(config.start, start, field)
+    places.check_declination(config.destination, target, field)
     return start, target, distance_km
 
 
 def check_settings(config: Config) -> None:
     """Raise unless noise, conditions and heading can be flown."""
-    for level in config.noise:
-        check_number(0, noise=level)
+    check_numbers(3, 0, noise=config.noise)
     if config.conditions and any(config.noise):
         raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
     if config.start_heading != "random":
@@ -149,39 +150,49 @@ def check_files(config: Config) -> None:
             check_writable(file)
 
 
-def prepare(config: Config) -> tuple[TransformedEnv, Watched]:
-    """Return the environment and the navigator, and check the files.
+def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
+    """Return environment and navigator of a vehicle that is told when it has arrived, and of one that is alone.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
     """
+    flights = {}
     try:
         check_settings(config)
-        conditions = conditions_named(config.conditions or "laboratory")
-        drift_km = conditions.drift_km(50.0)
+        drift_km = conditions_named(config.conditions or "laboratory").drift_km(50.0)
         field = IGRF(config.date)
-        start, target, distance_km = places(config, field)
-        region = region_around(start, target, field, 50.0 + drift_km)
-        scenario = Scenario(region=region, margin_deg=0, field=field, tasks=Tasks(start[None], target[None]))
-        base = GeomagneticNavEnv(
-            scenario,
-            max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
-            zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
-            start_heading="random",
-            drift_km=drift_km,
-            seed=config.seed,
-        )
-        track = TrackGradient(("field", "target_field", "move", "heading", *STD_KEYS), range_km=1000.0)
-        noise, errors = config.noise, [SensorNoise(config.noise, seed=config.seed)]
-        if config.conditions:
-            noise, errors = conditions.sensor_std, conditions.transforms(config.seed)
-        env = TransformedEnv(base, Compose(*errors, track))
-        std = {"sensor_std": noise, "bias_std": conditions.bias_std}
-        navigator = make_navigator(config.navigator, base, seed=config.seed, **std)
+        start, target, distance_km = ends(config, field)
+        region = places.region_around(start, target, field, 50.0 + drift_km)
+        tasks, ways = Tasks(start[None], target[None]), (0.0, RANGE_KM)
+        scenario = Scenario(region=region, margin_deg=0, field=field, tasks=tasks, distance_range_km=ways)
+        for name, arrival in RULES.items():
+            base = GeomagneticNavEnv(
+                scenario,
+                max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
+                zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
+                start_heading="random",
+                drift_km=drift_km,
+                seed=config.seed,
+                arrival=arrival,
+            )
+            env, navigator = equip(base, config)
+            flights[name] = env, Watched(navigator, distance_km)
         check_files(config)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
-    return env, Watched(navigator, distance_km)
+    return flights
+
+
+def equip(base: GeomagneticNavEnv, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:
+    """Return the environment with errors and estimates of the way, and the navigator."""
+    errors = conditions_named(config.conditions) if config.conditions else config.noise
+    env, sheet = with_errors(base, errors, config.seed, config.known_start)
+    navigator = make_navigator(config.navigator, base, seed=config.seed, **sheet)
+    if base.arrival.declared:
+        return with_declaration(env), navigator
+    known = STD_KEYS if config.conditions or any(config.noise) else ()
+    track = TrackGradient((*IN_KEYS, *known), range_km=1000.0)
+    return TransformedEnv(env, track, auto_unwrap=True), navigator
 
 
 def rollout(env: TransformedEnv, navigator: Watched, start_heading: float | Literal["random"]) -> TensorDictBase:
@@ -197,37 +208,48 @@ def rollout(env: TransformedEnv, navigator: Watched, start_heading: float | Lite
         return env.rollout(env.max_steps, navigator, auto_reset=False, tensordict=state)
 
 
+def outcome(steps: TensorDictBase) -> str:
+    """Return how a flight ended."""
+    last = steps["next"][0, -1]
+    if last.get("declared", torch.zeros(1, dtype=torch.bool)).item():
+        return "declared its arrival" + ("" if last["success"].item() else ", falsely")
+    if last["success"].item():
+        return "arrived"
+    return "left the region" if last["terminated"].item() else "reached the step limit"
+
+
 def fly(config: Config) -> dict[str, Any]:
-    """Fly, write the files and return the content of ``flight.json``.
+    """Fly twice, told of the arrival and alone, write the files and return the content of ``flight.json``.
 
     Raises:
         UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    env, navigator = prepare(config)
-    steps, base = rollout(env, navigator, config.start_heading), env.base_env
-    measures = {key: value[0].item() for key, value in episode_measures(steps).items()}
-    first, last = steps[0, 0], steps["next"][0, -1]
-    failure = "left the region" if last["terminated"].item() else "reached the step limit"
-    outcome = "arrived" if last["success"].item() else failure
-    name = config.navigator.partition("=")[0]
+    flights = prepare(config)
+    steps = {name: rollout(env, navigator, config.start_heading) for name, (env, navigator) in flights.items()}
+    measures = {
+        name: {"outcome": outcome(each)} | {key: value[0].item() for key, value in episode_measures(each).items()}
+        for name, each in steps.items()
+    }
+    base, first, name = flights["told"][0].base_env, steps["told"][0, 0], config.navigator.partition("=")[0]
     result = {
         **{key: value for key, value in asdict(config).items() if key not in ("out", "export", "animate")},
         "navigator": name,
         "needs": needs(name),
-        "zeta": base.zeta,
-        "max_steps": base.max_steps,
+        **{key: getattr(base, key) for key in ("zeta", "max_steps")},
         **{key: first[key].tolist() for key in ("start_position", "target_position", "target_field")},
-        "outcome": outcome,
-        **measures,
+        **measures["told"],
+        "alone": measures["alone"],
     }
     write_json(config.out / "flight.json", result)
-    title = f"{config.start} to {config.destination}: {name}, {outcome}, {measures['length_km']:.0f} km"
-    trajectories_figure({title: steps}, base.field, base.region).savefig(config.out / "flight.png", dpi=120)
+    titles = {name: f"{name}: {each['outcome']}, {each['length_km']:.0f} km" for name, each in measures.items()}
+    titles["told"] = f"{config.start} to {config.destination}: {name}, {titles['told']}"
+    figure = trajectories_figure({titles[name]: each for name, each in steps.items()}, base.field, base.region)
+    figure.savefig(config.out / "flight.png", dpi=120)
     if config.export:
-        export.write_tracks(config.export, export.tracks(steps, [title], navigator=name))
+        export.write_tracks(config.export, export.tracks(steps["told"], [titles["told"]], navigator=name))
     if config.animate:
-        write_gif(config.animate, steps, base.field, base.region, title)
+        write_gif(config.animate, steps["told"], base.field, base.region, titles["told"])
     return result
 
 
@@ -241,11 +263,14 @@ def summary(result: dict[str, Any]) -> str:
         "navigator": f"{result['navigator']}, which needs {result['needs']} beside its readings",
         "noise": noise,
         "start": ends[0],
-        "destination": f"{ends[1]}, {elements_text(torch.tensor(result['target_field']))}",
+        "destination": f"{ends[1]}, {places.elements_text(torch.tensor(result['target_field']))}",
         "steps": f"{result['steps']} of at most {result['max_steps']}",
         "path": f"{result['length_km']:.0f} km; the shortest is {result['shortest_km']:.0f} km",
         "efficiency": f"{100 * result['path_efficiency']:.1f} %",
         "distance left": f"{result['navigation_error_km']:.1f} km",
+        "alone": "{outcome}: {steps} steps, {length_km:.0f} km, {navigation_error_km:.1f} km left".format(
+            **result["alone"]
+        ),
     }
     return "\n".join(f"{name:14}{text}" for name, text in rows.items())
 

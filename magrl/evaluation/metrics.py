@@ -19,7 +19,9 @@ from magrl.envs.measures import distance_to_arrival, path_measures, spl
 from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
 from magrl.geodesy import geodesic, wrap_angle
 
+QUANTILES = {"median": 0.5, "p90": 0.9}
 WITHIN_KM = (10, 25)
+QUANTILES = {"median": 0.5, "p90": 0.9}
 """Distances of the additional success rates that do not depend on the field [km]."""
 
 
@@ -147,8 +149,9 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
     Returns:
         ``success_rate`` [%] with its Wilson 95 % interval ``success_rate_low`` and ``success_rate_high``;
         ``success_rate_within_10km`` and ``success_rate_within_25km`` [%], the share of episodes that end within that
-        distance of the destination, whatever the field there, and ``final_distance_km_median``, the median over all
-        episodes of the distance left at the end; ``spl`` [%] with its bootstrap 95 % interval
+        distance of the destination, whatever the field there, and ``final_distance_km_median`` and
+        ``final_distance_km_p90``, the median and the 90th percentile over all episodes of the distance left at the end;
+        ``spl`` [%] with its bootstrap 95 % interval
         ``spl_low`` and ``spl_high``, likewise ``path_efficiency`` over the episodes that moved, and ``spl_to_arrival``
         where it was measured; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper, and with
         the suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
@@ -175,7 +178,7 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
         raise ValueError(f"success must be bool of shape (M,) with M >= 1, got {success!r}")
     summary, error = _rate("success_rate", success), episodes["navigation_error_km"]
     summary |= {f"success_rate_within_{d}km": 100 * (error <= d).double().mean().item() for d in WITHIN_KM}
-    summary["final_distance_km_median"] = error.double().quantile(0.5).item()
+    summary |= {f"final_distance_km_{name}": error.double().quantile(q).item() for name, q in QUANTILES.items()}
     efficiency = episodes["path_efficiency"]
     summary |= _percent("spl", episodes["spl"]) | _percent("path_efficiency", efficiency[~efficiency.isnan()])
     if "spl_to_arrival" in episodes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
@@ -13,6 +14,7 @@ from magrl.envs import GeomagneticNavEnv, earth_scenario
 from magrl.evaluation import episode_measures, evaluation_rollout, with_declaration, with_errors
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.runs import Noise
+from magrl.field.model import elements_gradient_at
 from magrl.transforms import Conditions
 
 FAR_KM = 500.0
@@ -90,3 +92,25 @@ def earth_env(
     scenario = earth_scenario(regions, SEED, date, **size)
     scenario = scenario.with_tasks(scenario.random_tasks(tasks, SEED))
     return GeomagneticNavEnv(scenario, num_envs=num_envs or tasks, start_heading="random", seed=0, **options)
+
+
+def estimate_within(
+    radius_km: float,
+    base: GeomagneticNavEnv,
+    errors: Noise | Conditions,
+    known_start: Sequence[float] | None = None,
+    readings: int = 8,
+) -> float:
+    """Return the probability that an estimate of the destination is within a radius of it, mean over the tasks [%].
+
+    The estimate is that of weighted least squares from some readings at the destination, with the true gradients and
+    the data sheet: the bound of vehicles that do not search.
+    """
+    _, sheet = with_errors(base, errors, base.seed, known_start)
+    jacobian = elements_gradient_at(base.field, base.scenario.tasks.target, base.scenario.tasks.region)
+    new, constant = (jacobian.new_tensor(std).square() for std in sheet.values())
+    weight = (new / readings + constant).clamp_min(1e-12).rsqrt()[:, None] * jacobian
+    covariance = torch.linalg.pinv(weight.mT @ weight)
+    angle = torch.arange(360, dtype=jacobian.dtype).deg2rad()
+    spread = torch.linalg.eigvalsh(covariance).clamp_min(0) @ torch.stack((angle.cos(), angle.sin())).square()
+    return 100 * (1 - torch.exp(-(radius_km**2) / (2 * spread))).mean().item()

@@ -52,11 +52,13 @@ else:
 sys.path.insert(0, str(Path(__file__).parent))
 import globe
 import trainings
-from flights import DRIFT_KM, FAR_KM, Spec, earth_env, flown, rollout
+from flights import DRIFT_KM, FAR_KM, Spec, earth_env, estimate_within, flown, rollout
 
 RECIPE = "grid.py"
 LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
 """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
+DISTANCES = ("final_distance_km_median", "final_distance_km_p90")
+BOUND = ("best estimate at the destination, by the data sheet", "the gradient")
 FILE, RESULTS = Path(__file__).parent / "tables.toml", Path("docs/results")
 EAST_OF_THE_PAPER = Region((-10, 0), (175, 185))
 
@@ -88,25 +90,30 @@ def earth(
     crust: bool = False,
     declared_km: float | None = None,
     confidence: Sequence[float] = (0.0,),
+    known_start: Sequence[float] | None = None,
+    bound: bool = False,
 ) -> str:
     """Return a row for each date and navigator, with a column for each level of noise or each of some conditions.
 
     With ``declared_km``, the vehicles declare their arrival within this distance, and there is a row for each level of
-    confidence.
+    confidence, and one for the ``bound``. With ``known_start``, they know the elements at their start.
     """
     columns = columns_of(conditions)
     options: dict[str, Any] = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM} if conditions else {}
     options |= {"arrival": "declared", "arrival_radius_km": declared_km} if declared_km else {}
     measures = ["success_rate_within_25km"] * (distance_km[1] > FAR_KM) + ["success_rate", "spl", "steps"]
-    measures = ["success_rate", "spl", "false_arrival_rate", "final_distance_km_median"] if declared_km else measures
+    measures = ["success_rate", "spl", "false_arrival_rate", *DISTANCES] if declared_km else measures
     rows = []
     for date in dates:
         base = earth_env(tasks, distance_km, date, max_steps=max_steps, crust=crust, **options)
         for navigator, least in tqdm(list(itertools.product(navigators, confidence)), unit="row"):
-            summaries = [summarize(flown(navigator, base, errors, least)) for errors in columns.values()]
+            summaries = [summarize(flown(navigator, base, errors, least, known_start)) for errors in columns.values()]
             cells = [" / ".join(f"{summary[name]:.1f}" for name in measures) for summary in summaries]
             first = [*[date] * (len(dates) > 1), *names(navigator), *[f"{least:g}"] * (len(confidence) > 1)]
             rows.append([*first, *[1] * (not conditions and not declared_km), *cells])
+    if bound and declared_km:
+        shares = (estimate_within(declared_km, base, errors, known_start) for errors in columns.values())
+        rows.append([*BOUND, *(f"{share:.1f}" for share in shares)])
     head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["confidence"] * (len(confidence) > 1)]
     return markdown_table([*head, *["runs"] * (not conditions and not declared_km), *columns], rows)
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import fly as recipe
@@ -38,6 +39,15 @@ def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distanc
     assert first["zeta"] == pytest.approx(0.01 * (400 / first["shortest_km"]) ** 2, rel=1e-6)
 
 
+def test_a_vehicle_that_is_alone_declares_its_arrival(tmp_path: Path) -> None:
+    config = recipe.Config("60.4N 5.3E", "60.2N 1.1W", conditions="ship", navigator="kalman", out=tmp_path)
+    alone, calibrated = (recipe.fly(replace(config, known_start=known))["alone"] for known in (None, (0.0, 0.0, 0.0)))
+    for result in (alone, calibrated):
+        right = result["navigation_error_km"] <= 25
+        assert result["outcome"] == "declared its arrival" + ("" if right else ", falsely")
+    assert calibrated["navigation_error_km"] != alone["navigation_error_km"]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -46,6 +56,7 @@ def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distanc
         ({"destination": "60.4S 174.7W"}, "is the antipode of the start"),
         ({"destination": "86N 140E"}, "the declination is hardly defined at '86N 140E', where BH is"),
         ({"noise": (0.1, 0.0, 0.0), "conditions": "ship"}, "omit --noise"),
+        ({"known_start": (0.0, 0.0, 0.0)}, "needs conditions"),
         ({"start_heading": math.inf}, "start_heading"),
         ({"export": Path("track.txt")}, "must end in one of .geojson, .gpx, .kml"),
         ({"animate": Path("flight.mp4")}, r"an animation must end in \.gif, got flight\.mp4"),

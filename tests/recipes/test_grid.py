@@ -14,10 +14,13 @@ from support.recipes import RECIPES
 
 from magrl.envs import Scenario, Tasks
 from magrl.field import IGRF
+from magrl.field.model import elements_gradient_at
 from magrl.training import UsageError
+from magrl.transforms import CONDITIONS
 
 sys.path.insert(0, str(RECIPES / "tables"))
 import figures
+import flights
 import globe
 import grid
 import publish
@@ -109,8 +112,22 @@ def test_vehicles_that_declare_have_a_row_for_each_confidence() -> None:
     sure, bold = rows(grid.earth(["secant"], conditions=["ship"], tasks=4, declared_km=25, confidence=[1.0, 0.0]))[2:]
     assert (sure[2:], bold[2]) == (["1", sure[3]], "0")
     assert sure[3].split(" / ")[:3] == ["0.0", "0.0", "0.0"]
-    right, _, false, _ = map(float, bold[3].split(" / "))
+    right, _, false, _, _ = map(float, bold[3].split(" / "))
     assert right + false == 100
+
+
+def test_the_bound_is_that_of_readings_at_the_destination() -> None:
+    base = flights.earth_env(40, regions=4, reach_km=flights.DRIFT_KM, drift_km=flights.DRIFT_KM)
+    exact, noisy, more = (flights.estimate_within(25.0, base, (std, std, 100 * std)) for std in (0.0, 0.3, 0.6))
+    assert exact == pytest.approx(100)
+    assert exact > noisy > more
+    jacobian = elements_gradient_at(base.field, base.scenario.tasks.target, base.scenario.tasks.region)
+    readings = 0.3 / 8**0.5 * torch.randn(4000, 40, 3, dtype=torch.float64) * torch.tensor([1.0, 1.0, 100.0])
+    scale = torch.tensor([1.0, 1.0, 0.01])
+    places = torch.linalg.lstsq((scale[:, None] * jacobian).expand(4000, 40, 3, 2), (scale * readings)[..., None])[0]
+    assert noisy == pytest.approx(100 * (places.squeeze(-1).norm(dim=-1) < 25).double().mean().item(), abs=1)
+    ship = CONDITIONS["ship"]
+    assert flights.estimate_within(25.0, base, ship, (0.0, 0.0, 0.0)) > flights.estimate_within(25.0, base, ship)
 
 
 def test_reliability_counts_readings_by_their_probability() -> None:
