@@ -88,34 +88,42 @@ def earth(
     distance_km: Sequence[float] = paper.DISTANCE_KM,
     max_steps: int = 50,
     crust: bool = False,
-    declared_km: float | None = None,
-    confidence: Sequence[float] = (0.0,),
+    within_km: float | None = None,
+    arrivals: Sequence[str | float] = ("objective",),
     known_start: Sequence[float] | None = None,
-    bound: bool = False,
 ) -> str:
-    """Return a row for each date and navigator, with a column for each level of noise or each of some conditions.
+    """Return a row for each date, navigator and arrival; a column for each level of noise, or each of some conditions.
 
-    With ``declared_km``, the vehicles declare their arrival within this distance, and there is a row for each level of
-    confidence, and one for the ``bound``. With ``known_start``, they know the elements at their start.
+    An arrival is a rule of the environment, or the least confidence at which vehicles declare that they are
+    ``within_km`` of the destination. A table of declared arrivals ends with the bound of :func:`estimate_within`. With
+    ``known_start``, the vehicles know the elements at their start.
     """
     columns = columns_of(conditions)
     options: dict[str, Any] = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM} if conditions else {}
-    options |= {"arrival": "declared", "arrival_radius_km": declared_km} if declared_km else {}
+    options |= {"arrival_radius_km": within_km} if within_km else {}
     measures = ["success_rate_within_25km"] * (distance_km[1] > FAR_KM) + ["success_rate", "spl", "steps"]
-    measures = ["success_rate", "spl", "false_arrival_rate", *DISTANCES] if declared_km else measures
+    measures = ["success_rate", "spl", "false_arrival_rate", *DISTANCES] if within_km else measures
+    one_run = not conditions and not within_km
     rows = []
-    for date in dates:
-        base = earth_env(tasks, distance_km, date, max_steps=max_steps, crust=crust, **options)
-        for navigator, least in tqdm(list(itertools.product(navigators, confidence)), unit="row"):
-            summaries = [summarize(flown(navigator, base, errors, least, known_start)) for errors in columns.values()]
-            cells = [" / ".join(f"{summary[name]:.1f}" for name in measures) for summary in summaries]
-            first = [*[date] * (len(dates) > 1), *names(navigator), *[f"{least:g}"] * (len(confidence) > 1)]
-            rows.append([*first, *[1] * (not conditions and not declared_km), *cells])
-    if bound and declared_km:
-        shares = (estimate_within(declared_km, base, errors, known_start) for errors in columns.values())
-        rows.append([*BOUND, *(f"{share:.1f}" for share in shares)])
-    head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["confidence"] * (len(confidence) > 1)]
-    return markdown_table([*head, *["runs"] * (not conditions and not declared_km), *columns], rows)
+    for date, navigator, arrival in tqdm(list(itertools.product(dates, navigators, arrivals)), unit="row"):
+        rule, least = (arrival, 0.0) if isinstance(arrival, str) else ("declared", arrival)
+        base = earth_env(tasks, distance_km, date, max_steps=max_steps, crust=crust, arrival=rule, **options)
+        summaries = [summarize(flown(navigator, base, errors, least, known_start)) for errors in columns.values()]
+        cells = [" / ".join(f"{summary.get(name, 0):.1f}" for name in measures) for summary in summaries]
+        first = [*[date] * (len(dates) > 1), *names(navigator), *[arrival_name(arrival)] * (len(arrivals) > 1)]
+        rows.append([*first, *[1] * one_run, *cells])
+    if within_km:
+        shares = (estimate_within(within_km, base, errors, known_start) for errors in columns.values())
+        rows.append([*BOUND, *["—"] * (len(arrivals) > 1), *(f"{share:.1f}" for share in shares)])
+    head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["arrival"] * (len(arrivals) > 1), *["runs"] * one_run]
+    return markdown_table([*head, *columns], rows)
+
+
+def arrival_name(arrival: str | float) -> str:
+    """Return a rule of arrival, or the least confidence of declared ones, as text."""
+    if isinstance(arrival, str):
+        return "told"
+    return f"declared at {arrival:g}" if arrival else "declared"
 
 
 def columns_of(conditions: Sequence[str]) -> dict[str, Noise | Conditions]:

@@ -109,11 +109,14 @@ def test_boxes_have_mean_and_lowest_rows() -> None:
 
 
 def test_vehicles_that_declare_have_a_row_for_each_confidence() -> None:
-    sure, bold = rows(grid.earth(["secant"], conditions=["ship"], tasks=4, declared_km=25, confidence=[1.0, 0.0]))[2:]
-    assert (sure[2:], bold[2]) == (["1", sure[3]], "0")
+    options = {"conditions": ["ship"], "tasks": 4, "within_km": 25}
+    told, sure, bold, bound = rows(grid.earth(["secant"], arrivals=["distance", 1.0, 0.0], **options))[2:]
+    assert [told[2], sure[2], bold[2]] == ["told", "declared at 1", "declared"]
     assert sure[3].split(" / ")[:3] == ["0.0", "0.0", "0.0"]
     right, _, false, _, _ = map(float, bold[3].split(" / "))
     assert right + false == 100
+    assert float(told[3].split(" / ")[2]) == 0
+    assert 50 < float(bound[3]) < 100
 
 
 def test_the_bound_is_that_of_readings_at_the_destination() -> None:
