@@ -92,16 +92,6 @@ def element_indices(elements: Sequence[str], least: int) -> list[int]:
     return [element_index(name) for name in elements]
 
 
-def total_std(sensor_std: Sequence[float], bias_std: Sequence[float]) -> tuple[float, ...]:
-    """Return the standard deviations of all errors of the sensors, for a navigator that does not tell them apart.
-
-    Example:
-        >>> total_std((0.3, 0.0, 0.0), (0.4, 0.0, 5.0))
-        (0.5, 0.0, 5.0)
-    """
-    return tuple(map(math.hypot, sensor_std, bias_std))
-
-
 class Navigator(TensorDictModuleBase):
     """Base class of untrained policies: action bounds, and a memory of each vehicle for the length of an episode.
 

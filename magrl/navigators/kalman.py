@@ -12,12 +12,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl import tracking
-from magrl.checks import check_number, check_numbers, check_type
+from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators.base import Std
+from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.navigators.secant import sensor_length
-from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior, Way
+from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior
 
 NEAR_KM = 30.0
 """Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
@@ -40,9 +40,8 @@ class Kalman(QuasiNewton):
     - the detour that the remaining uncertainty of the way may cost, times a weight (:func:`trade_off`);
     - the price of the remaining steps, which rises as fewer of them are left.
 
-    The way is that to the most probable destination, given that the episode has not ended at the places where the
-    vehicle has been (:func:`~magrl.tracking.aim`). Constant errors of the readings (``bias_std``) widen the search, but
-    no move reduces them, so that they count in none of the costs.
+    It searches by default. Constant errors of the readings (``bias_std``) widen the search, but no move reduces them,
+    so that they count in none of the costs.
 
     Args:
         max_move_km: longest move [km].
@@ -52,10 +51,8 @@ class Kalman(QuasiNewton):
         caution: weight of the uncertainty; for None that of :func:`trade_off`.
         step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
-        bias_std: standard deviations of constant and slow errors of the readings.
-        zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
-        search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
-            it, the way is the estimated one.
+        search: as of :class:`QuasiNewton`, here by default.
+        **options: ``bias_std`` and ``zeta`` of :class:`QuasiNewton`.
 
     Raises:
         ValueError: for an option out of its range, or a negative standard deviation.
@@ -75,47 +72,35 @@ class Kalman(QuasiNewton):
         self,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Std = PERFECT,
         max_steps: int = 50,
         caution: float | None = None,
         step_km: float | None = None,
         range_km: float = 300.0,
-        bias_std: Sequence[float] = (0.0, 0.0, 0.0),
-        zeta: float = 0.01,
         search: bool = True,
+        **options: Any,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std)
+        super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std, search=search, **options)
         check_number(1, whole=True, max_steps=max_steps)
-        check_numbers(3, 0, bias_std=bias_std)
-        check_number(0, above=True, range_km=range_km, zeta=zeta)
-        check_type(bool, search=search)
-        self.max_steps, self.range_km, self.search = int(max_steps), float(range_km), search
+        check_number(0, above=True, range_km=range_km)
+        self.max_steps, self.range_km = int(max_steps), float(range_km)
         usual_caution, usual_step_km = trade_off(sensor_std)
-        self.zeta, self.caution = float(zeta), usual_caution if caution is None else caution
+        self.caution = usual_caution if caution is None else caution
         self.step_km = usual_step_km if step_km is None else step_km
         check_number(0, caution=self.caution)
         check_number(0, above=True, step_km=self.step_km)
-        self._register("bias_std", bias_std)
 
     def prior(self, reading: Tensor) -> GradientPrior:
         return tracking.dipole_prior(reading)
 
-    def reading_std(self, seen: TensorDictBase) -> Tensor:
-        return tracking.reading_std(super().reading_std(seen), self.bias_std)
-
     def drift(self, reading: Tensor) -> Tensor:
         return tracking.field_curvature(reading)
-
-    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
-        field = seen["field"].double()
-        weights = tracking.arrival_weights(field, seen["target_field"].double(), self.zeta)
-        return super().first_memory(seen) | {"visited": tracking.unvisited_yet(field), "weights": weights}
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         known, shared = tracking.related(track, tracking.curl_relation, self.scales)
         estimate = partial(tracking.way_to, known, seen["target_field"].double(), self.range_km, self.scales, shared)
         covariance = estimate(periods=self.periods).covariance
-        way = self._aim(known, estimate(self.bias_std, self.periods), seen, memory)
+        way = self.aim(known, estimate(self.bias_std, self.periods), seen, memory)
         moves = self._moves(way)
         left = way.unsqueeze(1) - moves
         progress = (way.norm(dim=-1, keepdim=True) - left.norm(dim=-1)) * _certainty(way, covariance)
@@ -126,15 +111,6 @@ class Kalman(QuasiNewton):
         distance = best.norm(dim=-1)
         direction = torch.where((distance > 0).unsqueeze(-1), best, way)  # standing still, face the way
         return self.steer(seen, direction, distance)
-
-    def _aim(self, known: FieldTrack, way: Way, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
-        """Return the way ``(N, 2)`` [km] to the most probable destination; remember the end of the last move."""
-        first = (memory["decisions"] == 1)[:, None, None]
-        visited = tracking.visit(memory["visited"], self.displacement(seen))
-        memory["visited"] = torch.where(first, memory["visited"], visited)
-        if not self.search:
-            return way.displacement
-        return tracking.aim(known, way, memory["visited"], memory["weights"], self.scales)
 
     def _moves(self, way: Tensor) -> Tensor:
         """Return the displacements ``(N, M, 2)`` [km] that are compared, given the way ``(N, 2)``."""
@@ -177,9 +153,7 @@ class Kalman(QuasiNewton):
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
-        search = env.arrival.rule == "objective"  # else, an episode does not end where the objective is low
-        errors = {"sensor_std": sensor_std, "bias_std": bias_std}
-        return errors | {"max_steps": env.max_steps, "zeta": env.zeta, "search": search}
+        return QuasiNewton.env_options(env, sensor_std, bias_std) | {"max_steps": env.max_steps}
 
 
 def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:

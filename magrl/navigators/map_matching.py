@@ -11,15 +11,17 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from magrl import geodesy
+from magrl import geodesy, tracking
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario
 from magrl.envs.regions import check_expansions
 from magrl.field import Date, FieldBank, FieldModel, RegionalField, elements_at, igrf_coefficients, parse_date
 from magrl.field.elements import element_difference, elements_gradient, measured_elements
 from magrl.field.model import device_of
-from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to, steer, total_std
+from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to, steer
+from magrl.navigators.quasi_newton import QuasiNewton, first_places, visit_place
 from magrl.navigators.secant import SLOPES
+from magrl.tracking import Way, reading_std
 
 FLOOR = (1e-3, 1e-3, 0.1)
 """Standard deviation of D, I [deg], B_H [nT] that every reading has at least: its rounding, and that of the map."""
@@ -55,9 +57,12 @@ class MapMatching(Navigator):
         region: where vehicle and destination may be, usually ``env.edge``; the map must hold all of it.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        sensor_std: standard deviations of the sensors: D [deg], I [deg], B_H [nT].
+        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
+        bias_std: standard deviations of constant and slow errors of the readings.
         map_error: standard deviations of the map.
         hypotheses: number of positions that are tracked.
+        zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
+        search: whether the episode ends at arrival, so that the destination is not where the vehicle has been.
 
     Raises:
         TypeError: for a region of another type.
@@ -88,23 +93,30 @@ class MapMatching(Navigator):
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
         sensor_std: Std = PERFECT,
+        bias_std: Std = PERFECT,
         map_error: Std = PERFECT,
         hypotheses: int = 4,
+        zeta: float = 0.01,
+        search: bool = False,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_type((Region, Regions), region=region)
-        check_numbers(3, 0, sensor_std=sensor_std, map_error=map_error)
+        check_numbers(3, 0, sensor_std=sensor_std, bias_std=bias_std, map_error=map_error)
         check_number(1, GRID_POINTS**2, whole=True, hypotheses=hypotheses)
+        check_number(0, above=True, zeta=zeta)
+        check_type(bool, search=search)
         self.hypotheses, bank = int(hypotheses), isinstance(field, FieldBank)
+        self.zeta, self.search = float(zeta), search
         self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if bank else [])]
         self.map = field
         self._place(copy.deepcopy(Regions.of(region)).to(device_of(field)))
-        squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, sensor_std))
-        floor, error, sensors = (x.to(self.grid.device) for x in squares)
+        squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, sensor_std, bias_std))
+        floor, error, new, constant = (x.to(self.grid.device) for x in squares)
         self.target_std = nn.Buffer((floor + error).sqrt())
-        self.std = nn.Buffer((floor + error + sensors).sqrt())
+        self.bias_std = nn.Buffer((floor + constant).sqrt())
+        self.std = nn.Buffer(reading_std((floor + error + new).sqrt(), constant.sqrt()))
         # Two elements give a position, so that the second smallest of the three counts.
         self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
 
@@ -118,7 +130,7 @@ class MapMatching(Navigator):
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
-        return {"field": env.field, "region": env.edge, "sensor_std": total_std(sensor_std, bias_std)}
+        return {"field": env.field, "region": env.edge, **QuasiNewton.env_options(env, sensor_std, bias_std)}
 
     def _place(self, region: Regions) -> None:
         """Keep the region, and the elements on a grid of it."""
@@ -139,16 +151,34 @@ class MapMatching(Navigator):
         covariance, misfit = torch.diag_embed(position), position[..., 0].clone()
         known = torch.zeros_like(position[:, 0, 0], dtype=torch.bool)
         hypotheses = {"position": position, "covariance": covariance, "misfit": misfit}
-        return {**hypotheses, "target": position[:, 0].clone(), "known": known}
+        return {**hypotheses, "target": position[:, 0].clone(), "known": known} | first_places(seen, self.zeta)
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         known = memory["known"].clone()
         for rows, read in ((~known, self._begin), (known, self._track)):
             if rows.any():
                 memory[rows] = read(seen[rows], memory[rows])
+        visit_place(seen, memory)
         here, there = best(memory["position"], memory["misfit"]), memory["target"]
         distance, bearing = geodesy.geodesic(*here.unbind(-1), *there.unbind(-1))
+        if self.search:
+            way = torch.stack((distance * torch.cos(bearing), distance * torch.sin(bearing)), -1)
+            distance, bearing = geodesy.polar(self._unvisited(way, here, seen, memory))
         return steer(seen["heading"].squeeze(-1).double(), bearing, distance, self.max_move_km, self.max_turn_rad)
+
+    def _unvisited(self, way: Tensor, here: Tensor, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
+        """Return the way ``(P, 2)`` [km] to the most probable destination where the vehicle has not been.
+
+        A constant error of the readings moves the vehicle on the map, and not the destination.
+        """
+        region, elements = self._region(seen), seen["field"].double()
+        residual, jacobian = self._residual(here.unsqueeze(1), elements, self.bias_std, region)
+        prior = torch.diag_embed(torch.full_like(here, PRIOR_KM**2)).unsqueeze(1)
+        constant = update(prior, jacobian, residual)[1].squeeze(1)
+        covariance = best(memory["covariance"], memory["misfit"]) + constant
+        gradient = jacobian.squeeze(1) * self.bias_std.unsqueeze(-1)
+        ellipse = gradient.mT @ (memory["weights"].unsqueeze(-1) * gradient)
+        return tracking.unvisited(Way(way, covariance), memory["visited"], ellipse)
 
     def _begin(self, seen: TensorDictBase, memory: TensorDictBase) -> TensorDictBase:
         """Find the vehicle by its first reading, and the destination by its elements."""
@@ -248,7 +278,7 @@ def update(covariance: Tensor, jacobian: Tensor, residual: Tensor) -> tuple[Tens
 
 
 def best(position: Tensor, misfit: Tensor) -> Tensor:
-    """Return the hypothesis of the least misfit: ``(P, 2)`` of ``(P, H, 2)``.
+    """Return the hypothesis of the least misfit: ``(P, ...)`` of ``(P, H, ...)``.
 
     Example:
         >>> best(torch.tensor([[[0.0, 1.0], [2.0, 3.0]]]), torch.tensor([[5.0, 1.0]]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -28,7 +27,7 @@ class MeanJacobian(QuasiNewton):
         position: ``(..., 2)`` places to average over, latitude, longitude [deg], usually ``env.region.grid(21)``.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
+        **options: ``sensor_std``, ``bias_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
 
     Raises:
         ValueError: for a bound out of its range, fewer than two places, or a negative standard deviation.
@@ -48,9 +47,9 @@ class MeanJacobian(QuasiNewton):
         position: Tensor,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
+        **options: Any,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std)
+        super().__init__(max_move_km, max_turn_rad, **options)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_tensor(2, position=position)

@@ -10,11 +10,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl import tracking
-from magrl.checks import check_numbers
+from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
-from magrl.navigators.base import Navigator, Std, element_indices, steer, total_std
-from magrl.tracking import FieldTrack, GradientPrior
+from magrl.navigators.base import PERFECT, Navigator, Std, element_indices, steer
+from magrl.tracking import FieldTrack, GradientPrior, Way
 
 RANGE_KM = 1000.0
 """Prior standard deviation of the way to the destination along each axis [km]."""
@@ -25,7 +25,9 @@ class QuasiNewton(Navigator):
     """Base class of quasi-Newton navigators: each move goes to where, by the estimated Jacobian, the error vanishes.
 
     The Jacobian is that of :mod:`magrl.tracking`. The filter weighs each reading by its noise and the length of the
-    move, and each element by how well it determines the way. Without noise, the first update is Broyden's.
+    move, and each element by how well it determines the way. Without noise, the first update is Broyden's. With
+    ``search``, the way is that to the most probable destination, given that the episode has not ended at the places
+    where the vehicle has been (:func:`~magrl.tracking.aim`).
 
     A subclass returns the prior of the Jacobian in :meth:`prior`.
 
@@ -34,9 +36,14 @@ class QuasiNewton(Navigator):
         max_turn_rad: largest turn [rad].
         elements: two or three of D, I, B_H.
         sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
+        bias_std: standard deviations of constant and slow errors of the readings.
+        zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
+        search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
+            it, the way is the estimated one.
 
     Raises:
-        ValueError: for a bound out of its range, fewer than two elements, or a negative standard deviation.
+        ValueError: for an option out of its range, fewer than two elements, or a negative standard deviation.
+        TypeError: for ``search`` other than a bool.
 
     Source:
         C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, Math. Comp. 19 (1965).
@@ -56,20 +63,28 @@ class QuasiNewton(Navigator):
         max_move_km: float,
         max_turn_rad: float,
         elements: Sequence[str] = NAMES,
-        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Std = PERFECT,
+        bias_std: Std = PERFECT,
+        zeta: float = 0.01,
+        search: bool = False,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
-        check_numbers(3, 0, sensor_std=sensor_std)
+        check_numbers(3, 0, sensor_std=sensor_std, bias_std=bias_std)
+        check_number(0, above=True, zeta=zeta)
+        check_type(bool, search=search)
+        self.zeta, self.search = float(zeta), search
         self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
         self.elements = element_indices(elements, 2)
         self._register("sensor_std", sensor_std)
+        self._register("bias_std", bias_std)
         self._register("scales", [tracking.ELEMENT_SCALES[i] * _FINE for i in self.elements])
         self._register("periods", [tracking.ELEMENT_PERIODS[i] for i in self.elements])
         self._register("curvature", [tracking.CURVATURE[i] for i in self.elements])
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:  # noqa: ARG004
-        return {"sensor_std": total_std(sensor_std, bias_std)}
+    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
+        search = env.arrival.rule == "objective"  # else, an episode does not end where the objective is low
+        return {"sensor_std": sensor_std, "bias_std": bias_std, "zeta": env.zeta, "search": search}
 
     def _register(self, name: str, values: Sequence[float]) -> None:
         self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
@@ -84,7 +99,7 @@ class QuasiNewton(Navigator):
 
     def reading_std(self, seen: TensorDictBase) -> Tensor:
         """Return the standard deviations of the present reading in the filter: D, I, B_H."""
-        return self.accuracy(seen, self.sensor_std)
+        return tracking.reading_std(self.accuracy(seen, self.sensor_std), self.bias_std)
 
     def drift(self, reading: Tensor) -> Tensor:  # noqa: ARG002
         """Return the standard deviation of the change of the Jacobian, see :func:`magrl.tracking.predict`."""
@@ -94,7 +109,12 @@ class QuasiNewton(Navigator):
         reading = seen["field"].double()[:, self.elements]
         track = tracking.start(reading, self.prior(reading), self.sensor_std[self.elements], self.scales)
         decisions = torch.zeros_like(seen["step_count"].squeeze(-1))
-        return {"mean": track.mean, "covariance": track.covariance, "decisions": decisions}
+        return {
+            "mean": track.mean,
+            "covariance": track.covariance,
+            "decisions": decisions,
+            **first_places(seen, self.zeta),
+        }
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         return self.move(self.read(seen, memory), seen, memory)
@@ -102,20 +122,28 @@ class QuasiNewton(Navigator):
     def read(self, seen: TensorDictBase, memory: TensorDictBase) -> FieldTrack:
         """Return the state of the filter after the present reading, and keep it in the memory."""
         before = FieldTrack(memory["mean"], memory["covariance"])
-        reading, displacement = seen["field"].double()[:, self.elements], self.displacement(seen)
+        reading, moved = seen["field"].double()[:, self.elements], displacement(seen)
         std = self.reading_std(seen)[..., self.elements]
-        after = tracking.read(before, displacement, reading, std, self.drift(reading), self.scales, self.periods)
+        after = tracking.read(before, moved, reading, std, self.drift(reading), self.scales, self.periods)
         began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
         mean = torch.where(began, before.mean, after.mean)
         covariance = torch.where(began.unsqueeze(-1), before.covariance, after.covariance)
         memory.update({"mean": mean, "covariance": covariance, "decisions": memory["decisions"] + 1})
         return FieldTrack(mean, covariance)
 
-    def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
+    def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad], each ``(N,)``, given the state of the filter."""
-        target = seen["target_field"].double()[:, self.elements]
-        way = tracking.way_to(track, target, RANGE_KM, self.scales, periods=self.periods).displacement
-        return self.steer(seen, way, way.norm(dim=-1))
+        target, bias_std = seen["target_field"].double()[:, self.elements], self.bias_std[self.elements]
+        way = tracking.way_to(track, target, RANGE_KM, self.scales, bias_std=bias_std, periods=self.periods)
+        aim = self.aim(track, way, seen, memory)
+        return self.steer(seen, aim, aim.norm(dim=-1))
+
+    def aim(self, track: FieldTrack, way: Way, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
+        """Return the way ``(N, 2)`` [km] to the most probable destination; remember the end of the last move."""
+        visit_place(seen, memory)
+        if not self.search:
+            return way.displacement
+        return tracking.aim(track, way, memory["visited"], memory["weights"][:, self.elements], self.scales)
 
     def steer(self, seen: TensorDictBase, direction: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad] of a move in a direction ``(N, 2)`` northward and eastward."""
@@ -123,7 +151,43 @@ class QuasiNewton(Navigator):
         wanted = torch.atan2(direction[:, 1], direction[:, 0])
         return steer(heading, wanted, distance, self.max_move_km, self.max_turn_rad)
 
-    @staticmethod
-    def displacement(seen: TensorDictBase) -> Tensor:
-        """Return the last displacement ``(N, 2)`` northward and eastward [km]."""
-        return tracking.displacement_of(seen["move"].double(), seen["heading"].double())
+
+def displacement(seen: TensorDictBase) -> Tensor:
+    """Return the last displacement ``(N, 2)`` northward and eastward [km].
+
+    Example:
+        >>> displacement(TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]]}, 1))
+        tensor([[30.,  0.]], dtype=torch.float64)
+    """
+    return tracking.displacement_of(seen["move"].double(), seen["heading"].double())
+
+
+def first_places(seen: TensorDictBase, zeta: float) -> dict[str, Tensor]:
+    """Return what a search remembers at the start: no visited places, and the weights of the arrival.
+
+    Args:
+        seen: first state, with ``field`` and ``target_field`` ``(N, 3)``.
+        zeta: arrival threshold on the objective.
+
+    Example:
+        >>> seen = TensorDict({"field": [[0.0, 60.0, 20000.0]], "target_field": [[2.0, 60.0, 20100.0]]}, 1)
+        >>> {name: tuple(value.shape) for name, value in first_places(seen, 0.01).items()}
+        {'visited': (1, 24, 2), 'weights': (1, 3)}
+    """
+    field, target = (seen[key].double() for key in ("field", "target_field"))
+    return {"visited": tracking.unvisited_yet(field), "weights": tracking.arrival_weights(field, target, zeta)}
+
+
+def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
+    """Remember that the vehicle has been at the end of its last move.
+
+    Example:
+        >>> seen = TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]], "step_count": [[1]]}, 1)
+        >>> memory = TensorDict({"visited": torch.full((1, 24, 2), 100.0)}, 1)
+        >>> visit_place(seen, memory)
+        >>> memory["visited"][0, :2]
+        tensor([[  0.,   0.],
+                [ 70., 100.]], dtype=torch.float64)
+    """
+    visited = tracking.visit(memory["visited"].double(), displacement(seen))
+    memory["visited"] = torch.where((seen["step_count"] == 0).unsqueeze(-1), memory["visited"].double(), visited)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import NAMES
+from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.tracking import FieldTrack, GradientPrior
 
@@ -67,6 +69,7 @@ class Secant(QuasiNewton):
         probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest move.
         elements: all three by default, each weighted by how well it determines the way; or two of them.
         sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
+        **options: ``bias_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
 
     Raises:
         ValueError: for a bound or a leg out of its range, fewer than two elements, or a negative standard deviation.
@@ -85,9 +88,10 @@ class Secant(QuasiNewton):
         max_turn_rad: float = math.pi / 2,
         probe_km: float | None = None,
         elements: Sequence[str] = NAMES,
-        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
+        sensor_std: Std = PERFECT,
+        **options: Any,
     ) -> None:
-        super().__init__(max_move_km, max_turn_rad, elements, sensor_std)
+        super().__init__(max_move_km, max_turn_rad, elements, sensor_std, **options)
         probe_km = min(probe_length(sensor_std), self.max_move_km) if probe_km is None else probe_km
         check_number(0, max_move_km, above=True, probe_km=probe_km)
         self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)

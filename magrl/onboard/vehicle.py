@@ -164,7 +164,7 @@ class Onboard:
         """Return a new navigator of a name."""
         bounds = self.max_move_km, math.radians(self.max_turn_deg)
         if name == "secant":
-            return Secant(*bounds, sensor_std=tuple(map(math.hypot, self.sensor_std, self._left_std)))
+            return Secant(*bounds, sensor_std=self.sensor_std, bias_std=self._left_std)
         if name == "kalman":
             return Kalman(*bounds, self.sensor_std, self.max_steps, bias_std=self._left_std, search=False)
         if name == "run_and_tumble":

@@ -10,10 +10,12 @@ from tensordict import TensorDict
 
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region, Scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
+from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
 from magrl.navigators import NAVIGATORS, MeanJacobian, Navigator, ParallelApproach, RunAndTumble, Secant
 from magrl.navigators.base import displacement_to, steer
 from magrl.navigators.secant import probe_length
+from magrl.transforms import Conditions, with_conditions
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +54,22 @@ def scrambled(state: TensorDict) -> TensorDict:
         value = state[key]
         state[key] = ~value if value.dtype == torch.bool else torch.full_like(value, math.nan)
     return state
+
+
+@pytest.mark.parametrize("name", ["secant", "mean_jacobian", "map_matching"])
+def test_a_navigator_that_is_told_of_its_arrival_searches(name: str) -> None:
+    """Under constant errors the destination is not where the readings fit."""
+    biased, rates = Conditions("biased", sensors={"bias": (0.15, 0.05, 20.0)}), []
+    for search in (False, True):
+        base = GeomagneticNavEnv(num_envs=40, seed=0)
+        navigator = make_navigator(name, base, bias_std=biased.bias_std)
+        assert navigator.search
+        navigator.search = search
+        rollout = evaluation_rollout(with_conditions(base, biased, seed=0), navigator)
+        rates.append(summarize(episode_measures(rollout))["success_rate"])
+    assert rates[1] > 90 > 70 > rates[0]
+    declared = GeomagneticNavEnv(num_envs=2, seed=0, arrival="declared")
+    assert not make_navigator(name, declared).search
 
 
 def test_steer_by_hand() -> None:

@@ -120,10 +120,13 @@ def test_evaluations_repeat_and_seeds_differ() -> None:
 
 def test_navigators_are_told_what_they_can_tell_apart() -> None:
     env, told = nav(2), {"sensor_std": (0.3, 0.0, 3.0), "bias_std": (0.4, 0.1, 4.0)}
-    kalman, secant = make_navigator("kalman", env, **told), make_navigator("secant", env, **told)
-    assert [kalman.sensor_std.tolist(), kalman.bias_std.tolist()] == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0]]
-    assert kalman.reading_std(TensorDict()).tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5])
-    assert secant.sensor_std.tolist() == pytest.approx([0.5, 0.1, 5.0])
+    for name in ("kalman", "secant"):
+        navigator = make_navigator(name, env, **told)
+        assert [navigator.sensor_std.tolist(), navigator.bias_std.tolist()] == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0]]
+        assert navigator.reading_std(TensorDict()).tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5])
+    matching = make_navigator("map_matching", env, **told)
+    assert matching.std.tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5], rel=1e-3)
+    assert matching.bias_std.tolist() == pytest.approx([0.4, 0.1, 4.0], rel=1e-3)
 
 
 def test_the_agent_heeds_constant_errors() -> None:
