@@ -5,7 +5,7 @@ RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
 export GOMP_SPINCOUNT ?= 3000
 
-.PHONY: train fly anywhere replay test test-slow check format docs bench mutate tables figures pictures help clean
+.PHONY: train fly anywhere prior replay test test-slow check format docs bench mutate tables figures pictures help clean
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RECIPE)/td3_gradient_guided.py $(ARGS)
@@ -15,6 +15,9 @@ fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; s
 
 anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; 15 minutes on one core
 	OMP_NUM_THREADS=1 $(RECIPE)/td3_anywhere.py --preset far $(ARGS)
+
+prior: $(VENV)/.installed  ## fit the prior of the gradients on random planets; 40 seconds on one core
+	OMP_NUM_THREADS=1 $(RECIPE)/gradient_prior.py --out magrl/tracking/learned_prior.pt $(ARGS)
 
 replay: runs/td3_gradient_guided-fast-seed0/eval.json  ## write a replay page, replay.html in the run folder
 	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 $(ARGS)

@@ -17,6 +17,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each ot
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -161,7 +162,7 @@ def train(config: Config) -> dict[str, float]:
         earth = earth_scenario(128, seed=paper.TEST_SEED, **config.regions)
         test = evaluation_env(earth, config.eval_tasks, paper.TEST_SEED, config, **options)
         view = make_view(base, config.range_km)
-        env = make_env(base, view, config)
+        env = make_env(base, replace(view, search=False), config)  # trained for the way, flown with the search
 
         # Networks: the critics also read the true way, the actor never does
         network = PolicyConfig(view, config.num_cells)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 
@@ -88,6 +88,7 @@ def make_navigator(
     mode: str = "look-ahead",
     seed: int = 0,
     map_date: Date | None = None,
+    **options: Any,
 ) -> TensorDictModuleBase:
     """Return the navigator that a text such as ``secant``, ``pso:flown`` or ``gg_td3=RUN`` names.
 
@@ -101,8 +102,10 @@ def make_navigator(
         mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
         map_date: date of the map of ``map_matching``, from IGRF; None for the environment's own field.
+        options: further options of the class of a navigator without training, such as ``caution`` of ``kalman``.
 
     Raises:
+        TypeError: for options that the class does not have, or of a trained agent.
         ValueError: for an unknown name, a trained agent without a run or trained in another field, a run or a mode for
             a navigator that takes none, or an unknown mode.
         FileNotFoundError: for a run without a policy.
@@ -114,15 +117,17 @@ def make_navigator(
     """
     name, option, source = parse_navigator(text)
     if name in TRAINED and (not option or name == OWN):
+        if options:
+            raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
         return _load(text, env)
     kind = NAVIGATORS.get(name)
     if kind is None or source or (option and "mode" not in kind.options):
         trained = [f"{agent}=RUN" for agent in TRAINED if agent != OWN]
         known = [*PRETRAINED, *trained, "policy:NAME=FILE", *NAVIGATORS]
         raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(known)}")
-    options = {"mode": option or mode, "seed": seed, "map_date": map_date}
-    own = {key: value for key, value in options.items() if key in kind.options}
-    return kind.for_env(env, sensor_std=sensor_std, bias_std=bias_std, **own).to(env.device)
+    said = {"mode": option or mode, "seed": seed, "map_date": map_date}
+    options = {key: value for key, value in said.items() if key in kind.options} | options
+    return kind.for_env(env, sensor_std=sensor_std, bias_std=bias_std, **options).to(env.device)
 
 
 def _load(text: str, env: GeomagneticNavEnv) -> TensorDictModuleBase:

@@ -12,17 +12,17 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl import tracking
-from magrl.checks import check_number
+from magrl.checks import check_number, check_numbers
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.navigators.secant import sensor_length
-from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior
+from magrl.tracking import DISTANCE_SCALE_KM, FieldTrack, GradientPrior, LearnedPrior
 
 NEAR_KM = 30.0
 """Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
-LENGTHS = (0.0, 0.02, 0.1, 0.3, 0.6, 1.0)
-"""Lengths of the moves that are compared, as fractions of the longest; the whole way, if shorter, is another."""
+LENGTHS = (0.1, 0.3, 0.6, 1.0)
+"""Lengths of the moves that are compared by default; the whole way, if it is shorter, is another."""
 ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
 """Their directions, from that of the estimated way [deg]."""
 
@@ -30,10 +30,9 @@ ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
 class Kalman(QuasiNewton):
     """Dual control by the covariance of the filter: no map, no training, no oracle.
 
-    The filter of :mod:`magrl.tracking` starts from the gradient of a dipole through the first reading. Before each
-    step, the navigator compares moves of several lengths and directions, standing still for another reading included.
-    For each it predicts the covariance of the filter after the reading at its end, which does not depend on what will
-    be read, and chooses the least sum of three costs [km]:
+    The filter of :mod:`magrl.tracking` starts from a :class:`~magrl.tracking.LearnedPrior`. Before each step, the
+    navigator compares moves of several lengths and directions. For each it predicts the covariance of the filter after
+    the reading at its end, which does not depend on what will be read, and chooses the least sum of three costs [km]:
 
     - the path: the length of the move minus the progress, that is, what it takes off the estimated way times the
       cosine of the typical error of its direction;
@@ -51,6 +50,7 @@ class Kalman(QuasiNewton):
         caution: weight of the uncertainty; for None that of :func:`trade_off`.
         step_km: price of a step [km] while many are left; for None that of :func:`trade_off`.
         range_km: prior standard deviation of the way along each axis [km].
+        lengths: of the moves that are compared, as fractions of the longest.
         search: as of :class:`QuasiNewton`, here by default.
         **options: ``bias_std`` and ``zeta`` of :class:`QuasiNewton`.
 
@@ -77,36 +77,41 @@ class Kalman(QuasiNewton):
         caution: float | None = None,
         step_km: float | None = None,
         range_km: float = 300.0,
+        lengths: Sequence[float] = LENGTHS,
         search: bool = True,
         **options: Any,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std, search=search, **options)
         check_number(1, whole=True, max_steps=max_steps)
+        check_numbers(len(lengths), 0, lengths=lengths)
+        self.lengths = tuple(lengths)
         check_number(0, above=True, range_km=range_km)
         self.max_steps, self.range_km = int(max_steps), float(range_km)
-        usual_caution, usual_step_km = trade_off(sensor_std)
+        usual_caution, usual_step_km = trade_off(tracking.reading_std(self.sensor_std, self.bias_std).tolist())
         self.caution = usual_caution if caution is None else caution
         self.step_km = usual_step_km if step_km is None else step_km
+        self.gradient_prior = LearnedPrior.pretrained()
         check_number(0, caution=self.caution)
         check_number(0, above=True, step_km=self.step_km)
 
-    def prior(self, reading: Tensor) -> GradientPrior:
-        return tracking.dipole_prior(reading)
+    def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:
+        return self.gradient_prior(reading, target)
 
     def drift(self, reading: Tensor) -> Tensor:
         return tracking.field_curvature(reading)
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         known, shared = tracking.related(track, tracking.curl_relation, self.scales)
+        curvature = self.drift(tracking.estimated_field(known, self.scales))
         estimate = partial(tracking.way_to, known, seen["target_field"].double(), self.range_km, self.scales, shared)
-        covariance = estimate(periods=self.periods).covariance
-        way = self.aim(known, estimate(self.bias_std, self.periods), seen, memory)
+        covariance = estimate(None, self.periods).covariance  # of what moves can reduce
+        way = self.aim(known, estimate(self.bias_std, self.periods, curvature), seen, memory)
         moves = self._moves(way)
         left = way.unsqueeze(1) - moves
         progress = (way.norm(dim=-1, keepdim=True) - left.norm(dim=-1)) * _certainty(way, covariance)
         cost = moves.norm(dim=-1) - progress
         cost = cost + left.norm(dim=-1) * self._price(way, seen["step_count"]) / self.max_move_km
-        cost = cost + self.caution * _detour(left, self._covariance_after(track, moves, left))
+        cost = cost + self.caution * _detour(left, self._covariance_after(track, moves, left, self.reading_std(seen)))
         best = moves[torch.arange(len(moves), device=moves.device), cost.argmin(-1)]
         distance = best.norm(dim=-1)
         direction = torch.where((distance > 0).unsqueeze(-1), best, way)  # standing still, face the way
@@ -115,7 +120,7 @@ class Kalman(QuasiNewton):
     def _moves(self, way: Tensor) -> Tensor:
         """Return the displacements ``(N, M, 2)`` [km] that are compared, given the way ``(N, 2)``."""
         whole = way.norm(dim=-1, keepdim=True).clamp_max(self.max_move_km)
-        fractions = way.new_tensor(LENGTHS) * self.max_move_km
+        fractions = way.new_tensor(self.lengths) * self.max_move_km
         lengths = torch.cat((fractions.expand(len(way), -1), whole), -1)
         bearing = torch.atan2(way[:, 1:], way[:, :1]) + torch.deg2rad(way.new_tensor(ANGLES_DEG))
         directions = torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
@@ -126,8 +131,10 @@ class Kalman(QuasiNewton):
         spare = self.max_steps - step.double() - 1.5 * way.norm(dim=-1, keepdim=True) / self.max_move_km
         return self.step_km * (self.max_steps / spare.clamp_min(1.0)).square()
 
-    def _covariance_after(self, track: FieldTrack, moves: Tensor, left: Tensor) -> Tensor:
+    def _covariance_after(self, track: FieldTrack, moves: Tensor, left: Tensor, std: Tensor) -> Tensor:
         """Return the expected covariance ``(N, M, 2, 2)`` [km^2] of the way after moves and readings at their ends.
+
+        ``std`` holds the standard deviations ``(..., 3)`` of these readings.
 
         The gradients that a reading will teach are unknown, but not their mean square: that of the present estimate
         plus what the covariance decreases. The drift of the gradients is left out, as it does not depend on the choice.
@@ -136,7 +143,7 @@ class Kalman(QuasiNewton):
         now, shared = tracking.related(track, tracking.curl_relation, self.scales)
         moved = tracking.predict(track, moves, 0 * self.curvature, self.scales)
         expected = tracking.estimated_field(moved, self.scales)
-        reading = tracking.update(moved, expected, self.sensor_std, self.scales)
+        reading = tracking.update(moved, expected, std.unsqueeze(-2), self.scales)
         after, shared_after = tracking.related(reading, tracking.curl_relation, self.scales)
         weights = _weights(after.covariance, shared_after, left / DISTANCE_SCALE_KM)
         learned = (now.covariance - after.covariance)[..., 1:, 1:]
@@ -166,14 +173,14 @@ def _weights(covariance: Tensor, shared: Tensor, way: Tensor) -> Tensor:
     return torch.diag_embed(weight) + row.unsqueeze(-1) * row.unsqueeze(-2) / rest[..., None, None]
 
 
-def trade_off(sensor_std: Sequence[float]) -> tuple[float, float]:
-    """Return the weight of the uncertainty and the price of a step [km] that suit the noise of the sensors.
+def trade_off(reading_std: Sequence[float]) -> tuple[float, float]:
+    """Return the weight of the uncertainty and the price of a step [km] that suit the errors of a reading.
 
-    The larger the noise is (:func:`~magrl.navigators.secant.sensor_length`), the less a reading teaches, and the more
-    path and steps certainty costs. The factors are from a scan over regions of the Earth.
+    The larger they are (:func:`~magrl.navigators.secant.sensor_length`), the less a reading teaches, and the more path
+    and steps certainty costs. The factors, and :data:`LENGTHS`, are from scans on random planets (docs/navigators.md).
 
     Args:
-        sensor_std: standard deviations of D [deg], I [deg], B_H [nT].
+        reading_std: standard deviations of D [deg], I [deg], B_H [nT].
 
     Raises:
         ValueError: for other than three numbers, or a negative one.
@@ -182,10 +189,10 @@ def trade_off(sensor_std: Sequence[float]) -> tuple[float, float]:
         >>> trade_off((0, 0, 0))
         (5.0, 0.1)
         >>> [round(value, 2) for value in trade_off((0.1, 0.1, 10))]
-        [0.45, 3.33]
+        [0.45, 1.67]
     """
-    noise_km = sensor_length(sensor_std)
-    return min(5.0, 3.0 / max(noise_km, 0.1)), max(0.1, 0.5 * noise_km)
+    length_km = sensor_length(reading_std)
+    return min(5.0, 3.0 / max(length_km, 0.1)), max(0.1, 0.25 * length_km, 0.025 * length_km**2)
 
 
 def _certainty(way: Tensor, covariance: Tensor) -> Tensor:

@@ -59,7 +59,7 @@ class MeanJacobian(QuasiNewton):
         self.register_buffer("mean", gradients.mean(0))
         self.register_buffer("std", gradients.std(0))
 
-    def prior(self, reading: Tensor) -> GradientPrior:
+    def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
         return GradientPrior(self.mean.expand(*reading.shape, 2), self.std, torch.zeros_like(reading[:, 0]))
 
     name, label = "mean_jacobian", "mean Jacobian"

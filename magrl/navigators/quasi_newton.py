@@ -50,7 +50,7 @@ class QuasiNewton(Navigator):
 
     Example:
         >>> class DipoleNavigator(QuasiNewton):
-        ...     def prior(self, reading):
+        ...     def prior(self, reading, target):
         ...         return tracking.dipole_prior(reading)
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
@@ -89,13 +89,13 @@ class QuasiNewton(Navigator):
     def _register(self, name: str, values: Sequence[float]) -> None:
         self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
 
-    def prior(self, reading: Tensor) -> GradientPrior:
-        """Return the expected gradient of the elements, given the first reading ``(N, E)``.
+    def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:
+        """Return the expected gradient of the elements, given the first reading and the target's values ``(N, E)``.
 
         Raises:
             NotImplementedError: in the base class.
         """
-        raise NotImplementedError(f"{type(self).__name__} must return a GradientPrior in prior(reading)")
+        raise NotImplementedError(f"{type(self).__name__} must return a GradientPrior in prior(reading, target)")
 
     def reading_std(self, seen: TensorDictBase) -> Tensor:
         """Return the standard deviations of the present reading in the filter: D, I, B_H."""
@@ -106,8 +106,8 @@ class QuasiNewton(Navigator):
         return self.curvature
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
-        reading = seen["field"].double()[:, self.elements]
-        track = tracking.start(reading, self.prior(reading), self.sensor_std[self.elements], self.scales)
+        reading, target = (seen[key].double()[:, self.elements] for key in ("field", "target_field"))
+        track = tracking.start(reading, self.prior(reading, target), self.sensor_std[self.elements], self.scales)
         decisions = torch.zeros_like(seen["step_count"].squeeze(-1))
         return {
             "mean": track.mean,
@@ -134,7 +134,8 @@ class QuasiNewton(Navigator):
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad], each ``(N,)``, given the state of the filter."""
         target, bias_std = seen["target_field"].double()[:, self.elements], self.bias_std[self.elements]
-        way = tracking.way_to(track, target, RANGE_KM, self.scales, bias_std=bias_std, periods=self.periods)
+        curvature = self.drift(tracking.estimated_field(track, self.scales))
+        way = tracking.way_to(track, target, RANGE_KM, self.scales, None, bias_std, self.periods, curvature)
         aim = self.aim(track, way, seen, memory)
         return self.steer(seen, aim, aim.norm(dim=-1))
 
@@ -156,6 +157,7 @@ def displacement(seen: TensorDictBase) -> Tensor:
     """Return the last displacement ``(N, 2)`` northward and eastward [km].
 
     Example:
+        >>> from tensordict import TensorDict
         >>> displacement(TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]]}, 1))
         tensor([[30.,  0.]], dtype=torch.float64)
     """
@@ -170,6 +172,7 @@ def first_places(seen: TensorDictBase, zeta: float) -> dict[str, Tensor]:
         zeta: arrival threshold on the objective.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> seen = TensorDict({"field": [[0.0, 60.0, 20000.0]], "target_field": [[2.0, 60.0, 20100.0]]}, 1)
         >>> {name: tuple(value.shape) for name, value in first_places(seen, 0.01).items()}
         {'visited': (1, 24, 2), 'weights': (1, 3)}
@@ -182,6 +185,7 @@ def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
     """Remember that the vehicle has been at the end of its last move.
 
     Example:
+        >>> from tensordict import TensorDict
         >>> seen = TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]], "step_count": [[1]]}, 1)
         >>> memory = TensorDict({"visited": torch.full((1, 24, 2), 100.0)}, 1)
         >>> visit_place(seen, memory)

@@ -96,7 +96,7 @@ class Secant(QuasiNewton):
         check_number(0, max_move_km, above=True, probe_km=probe_km)
         self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)
 
-    def prior(self, reading: Tensor) -> GradientPrior:
+    def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
         std = reading.new_tensor([SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
         return GradientPrior(reading.new_zeros(*reading.shape, 2), std, torch.zeros_like(reading[:, 0]))
 

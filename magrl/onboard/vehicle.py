@@ -41,13 +41,14 @@ LOST_SURPRISE = 100.0
 simulation, it reached 5 with a right data sheet, and 31 under the conditions of an aircraft."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 4
-_FORMAT, _NOT_STARTED = 2, "the vehicle has no destination yet: call start(target) first"
+_FORMAT, _NOT_STARTED = 3, "the vehicle has no destination yet: call start(target) first"
 _OPTIONS = ("name", "sensor_std", "bias_std", "drift_std", "max_move_km", "max_turn_deg", "max_steps", "arrival_km")
 _PLAIN = (
     "_step",
     "_steer",
     "_last",
     "_surprises",
+    "_northward",
     "_known",
     "_error",
     "_left_std",
@@ -216,6 +217,7 @@ class Onboard:
         self._estimator = Estimator(self.navigator)
         self._steer: float | None = None  # heading that the vehicle was to steer [deg]
         self._last, self._surprises = Values(), Values()  # the last reading with its course
+        self._northward = Values()  # the first inclination, and how far magnetic north the vehicle has come [km]
         for name in _STATES:
             if hasattr(self.navigator, name):
                 setattr(self.navigator, name, [] if isinstance(getattr(self.navigator, name), list) else None)
@@ -252,6 +254,8 @@ class Onboard:
             action = self._estimator.act(seen)
             self._surprises = surprises[-_SURPRISES:]
             self._last = (*reading, course)
+            first, north = self._northward or (reading[1], 0.0)
+            self._northward = first, north + distance * math.cos(course - math.radians(reading[0]))
             command = self._command(seen, action, course)
             self._step += 1
         self._steer = command.heading_deg
@@ -309,7 +313,9 @@ class Onboard:
         level = sum(self._surprises) / max(len(self._surprises), 1)
         if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
             return "lost", f"readings deviate {level**0.5:.0f} times as much as expected: check sensors and compass"
-        slope = tracking.steepest(self._estimator.track, 1)
+        first, north_km = self._northward
+        change = abs(self._last[1] - first) * 100 / max(abs(north_km), 1e-9) if abs(north_km) >= 100 else math.inf
+        slope = min(change, tracking.steepest(self._estimator.track, 1))
         if abs(self._last[1]) <= math.pi / 2 and slope < EQUATOR_SLOPE_DEG:
             return "lost", f"inclination {self._last[1]:g} hardly changes: it looks like radians; degrees are expected"
         if text := out_of_range(self._view, self._last[:3]):

@@ -20,6 +20,7 @@ from magrl.tracking.filter import predict as predict
 from magrl.tracking.filter import relate as relate
 from magrl.tracking.filter import start as start
 from magrl.tracking.filter import update as update
+from magrl.tracking.learned_prior import LearnedPrior as LearnedPrior
 from magrl.tracking.posterior import WayPosterior as WayPosterior
 from magrl.tracking.posterior import way_posterior as way_posterior
 from magrl.tracking.priors import curl_relation as curl_relation

@@ -111,7 +111,7 @@ def way_posterior(
         >>> way_posterior(track, torch.tensor([3.0, 4.0]), 1000.0, scales=(1.0, 1.0)).way().displacement.round()
         tensor([300., 200.])
     """
-    way = way_to(track, target, range_km, scales, shared, bias_std, periods)
+    way = way_to(track, target, range_km, scales, shared, bias_std, periods, curvature)
     points, density = _points(Way(way.displacement / DISTANCE_SCALE_KM, way.covariance / DISTANCE_SCALE_KM**2))
     unit = _units(track, scales)
     count, none = unit.shape[-1], (0.0,) * unit.shape[-1]

@@ -28,7 +28,7 @@ CURL_STD_NT = 0.01
 """Least standard deviation of :func:`curl_relation` [nT/km]; on the ellipsoid, it holds to 0.004 nT/km."""
 
 
-def dipole_prior(reading: Tensor) -> GradientPrior:
+def dipole_prior(reading: Tensor, target: Tensor | None = None) -> GradientPrior:  # noqa: ARG001
     """Return the gradient of a dipole field through a reading of D, I, B_H, and how far fields deviate from it.
 
     With the magnetic latitude phi of tan(phi) = tan(I) / 2, towards magnetic north (azimuth D) dI/ds =
@@ -36,6 +36,7 @@ def dipole_prior(reading: Tensor) -> GradientPrior:
 
     Args:
         reading: ``(..., 3)``: D [deg], I [deg], B_H [nT].
+        target: not used; priors are given the values at the target, too.
 
     Returns:
         Gradient ``(..., 3, 2)`` and standard deviations ``(..., 3, 2)`` along and across magnetic north, in deg/km,

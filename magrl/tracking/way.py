@@ -45,6 +45,7 @@ def way_to(
     shared: Tensor | None = None,
     bias_std: PerElement | None = None,
     periods: PerElement | None = None,
+    curvature: PerElement | None = None,
 ) -> Way:
     """Return the displacement to the place where the field has given values, and its uncertainty.
 
@@ -62,9 +63,11 @@ def way_to(
             state: gradients do not depend on it, but all remaining differences do.
         periods: of angles, whose remaining differences are wrapped, as :data:`~magrl.tracking.ELEMENT_PERIODS`; None
             for none.
+        curvature: standard deviation of the change of a gradient along the way, as in :func:`~magrl.tracking.predict`:
+            it adds ``c^2 |d|^4 / 4`` to S(d). None for constant gradients.
 
     Raises:
-        ValueError: for shapes that do not match, a range that is not above 0, or a negative number in ``bias_std``.
+        ValueError: for shapes that do not match, a range that is not above 0, or a negative standard deviation.
 
     Example:
         >>> gradient = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 2.0]])  # the first element grows northward
@@ -79,17 +82,20 @@ def way_to(
     target = target if periods is None else continued(target, track, scales, periods)
     target = target.to(unit.dtype) / unit
     bias = _nonnegative_or_nan("bias_std", (0.0,) * count if bias_std is None else bias_std, count, unit) / unit
-    shape = _broadcast(track.mean.shape[:-1], target.shape, bias.shape)
+    bend = _nonnegative_or_nan("curvature", (0.0,) * count if curvature is None else curvature, count, unit) / unit
+    shape = _broadcast(track.mean.shape[:-1], target.shape, bias.shape, bend.shape)
     (value, north, east), (p00, p01, p02, p11, p12, p22) = _entries(track, shape)
     p00 = p00 + _elements_first(bias, shape).square()
+    bend = _elements_first(bend, shape).square()
     ridge = (DISTANCE_SCALE_KM / range_km) ** 2
     terms = torch.stack((_elements_first(target, shape) - value, north, east))
-    expected, twice1, twice2, twice12 = p00 + (p11 + p22) / ridge, 2 * p01, 2 * p02, 2 * p12
+    expected, twice1, twice2, twice12 = p00 + (p11 + p22 + 2 * bend / ridge) / ridge, 2 * p01, 2 * p02, 2 * p12
     together = None
     for _ in range(3):
         remaining, gn, ge = _whitened(terms, expected, together)
         determinant, dn, de = _solution(remaining, gn, ge, ridge)
         expected = p00 + dn * (twice1 + p11 * dn + twice12 * de) + de * (twice2 + p22 * de)
+        expected = expected + bend * (dn * dn + de * de).square() / 4
         if shared is not None:
             u0, u1, u2 = shared.expand(*shape, 3).movedim((-1, -2), (0, 1))
             together = u0 + u1 * dn + u2 * de

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from magrl import tracking
 from magrl.checks import check_choice, check_number, check_numbers
-from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, Way
+from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, LearnedPrior, Way
 from magrl.transforms.base import (
     GivenKeys,
     StatefulTransform,
@@ -43,8 +43,9 @@ class TrackGradient(StatefulTransform):
             ``(..., 2, 2)`` [km^2].
         sensor_std: standard deviation of the readings' noise, E numbers, where it is not among the ``in_keys``; by
             default 0. The filter has a floor, :data:`~magrl.tracking.VARIANCE_FLOOR`.
-        prior: function from a first reading ``(..., E)`` to a :class:`~magrl.tracking.GradientPrior`; for other
-            elements than D, I, B_H, give one, and also ``relation``, ``scales``, ``curvature`` and ``angles``.
+        prior: function from a first reading and the values at the target, ``(..., E)`` each, to a
+            :class:`~magrl.tracking.GradientPrior`; by default :class:`~magrl.tracking.LearnedPrior`. For other elements
+            than D, I, B_H, give one, and also ``relation``, ``scales``, ``curvature`` and ``angles``.
         relation: function from the estimated field ``(..., E)`` to a :class:`~magrl.tracking.GradientRelation` that the
             gradients obey; None for none.
         scales: units of the elements in the state, E numbers; see :func:`magrl.tracking.start`.
@@ -81,7 +82,7 @@ class TrackGradient(StatefulTransform):
         out_keys: GivenKeys = None,
         *,
         sensor_std: Sequence[float] | None = None,
-        prior: Callable[[Tensor], GradientPrior] = tracking.dipole_prior,
+        prior: Callable[[Tensor, Tensor], GradientPrior] | None = None,
         relation: Callable[[Tensor], GradientRelation] | None = tracking.curl_relation,
         scales: Sequence[float] = tracking.ELEMENT_SCALES,
         curvature: Sequence[float] | Callable[[Tensor], Tensor] = tracking.field_curvature,
@@ -94,6 +95,7 @@ class TrackGradient(StatefulTransform):
             raise ValueError(f"give sensor_std or its key {self.in_keys[4]!r}, not both: got sensor_std {sensor_std}")
         check_number(0, above=True, range_km=range_km)
         check_choice(FRAMES, frame=frame)
+        prior = LearnedPrior.pretrained() if prior is None else prior
         if not callable(prior) or not (relation is None or callable(relation)):
             raise ValueError(f"prior must be a function, and relation one or None, got {prior!r} and {relation!r}")
         self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
@@ -122,16 +124,19 @@ class TrackGradient(StatefulTransform):
         return self.out_keys[:2]
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
-        reading, (sensor_std, _) = values[0], self._std(values)
-        self._write(tensordict, values, tracking.start(reading, self.prior(reading), sensor_std, self.scales))
+        (reading, target, *_), (sensor_std, _) = values, self._std(values)
+        self._write(tensordict, values, tracking.start(reading, self.prior(reading, target), sensor_std, self.scales))
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         (reading, _, move, heading, *_), (sensor_std, _) = values, self._std(values)
         track, displacement = FieldTrack(*state), tracking.displacement_of(move, heading)
-        field = tracking.estimated_field(track, self.scales)
-        curvature = self.constant_curvature if self.curvature is None else self.curvature(field)
+        curvature = self._curvature(tracking.estimated_field(track, self.scales))
         track = tracking.read(track, displacement, reading, sensor_std, curvature, self.scales, self.periods)
         self._write(tensordict, values, track)
+
+    def _curvature(self, field: Tensor) -> Tensor:
+        """Return the standard deviation ``(..., E)`` of the change of a gradient along the way."""
+        return self.constant_curvature if self.curvature is None else self.curvature(field)
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], track: FieldTrack) -> None:
         (_, target, _, heading, *_), (_, bias_std) = values, self._std(values)
@@ -159,7 +164,9 @@ class TrackGradient(StatefulTransform):
         known, shared = (track, None) if self.relation is None else tracking.related(track, self.relation, self.scales)
         field, gradient = (f(known, self.scales) for f in (tracking.estimated_field, tracking.estimated_gradient))
         field = field - self.periods.to(field.dtype) * torch.round(field / 360)
-        way, covariance = tracking.way_to(known, target, self.range_km, self.scales, shared, bias_std, self.periods)
+        way, covariance = tracking.way_to(
+            known, target, self.range_km, self.scales, shared, bias_std, self.periods, self._curvature(field)
+        )
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from magrl import paper
-from magrl.envs import GeomagneticNavEnv, earth_scenario
+from magrl.envs import GeomagneticNavEnv, earth_scenario, planet_scenario
 from magrl.evaluation import episode_measures, evaluation_rollout, with_declaration, with_errors
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.runs import Noise
@@ -72,9 +73,10 @@ def earth_env(
     num_envs: int | None = None,
     reach_km: float = 0.0,
     crust: bool = False,
+    planets: bool = False,
     **options: Any,
 ) -> GeomagneticNavEnv:
-    """Return an environment of frozen tasks in random regions of the Earth, large enough for the longest distance.
+    """Return an environment of frozen tasks in random regions, large enough for the longest distance.
 
     Args:
         tasks: number of tasks.
@@ -84,12 +86,16 @@ def earth_env(
         num_envs: number of vehicles; by default one for each task.
         reach_km: how far errors may carry a vehicle beyond its longest move [km].
         crust: whether the field is WMMHR, with the crust, in place of IGRF.
+        planets: whether the regions are those of random planets, on which options are chosen, in place of the Earth.
         options: options of the environment.
     """
     far = distance_km[1] > FAR_KM
     size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"half_size_deg": 10, "max_latitude": 70}
-    size |= {"distance_range_km": tuple(distance_km), "max_move_km": 50.0 + reach_km, "crust": crust}
-    scenario = earth_scenario(regions, SEED, date, **size)
+    size |= {"distance_range_km": tuple(distance_km), "max_move_km": 50.0 + reach_km}
+    if planets:
+        scenario = planet_scenario(regions, SEED, **size)
+    else:
+        scenario = earth_scenario(regions, SEED, date, crust=crust, **size)
     scenario = scenario.with_tasks(scenario.random_tasks(tasks, SEED))
     return GeomagneticNavEnv(scenario, num_envs=num_envs or tasks, start_heading="random", seed=0, **options)
 
@@ -114,3 +120,22 @@ def estimate_within(
     angle = torch.arange(360, dtype=jacobian.dtype).deg2rad()
     spread = torch.linalg.eigvalsh(covariance).clamp_min(0) @ torch.stack((angle.cos(), angle.sin())).square()
     return 100 * (1 - torch.exp(-(radius_km**2) / (2 * spread))).mean().item()
+
+
+def paired_difference(first: Tensor, second: Tensor, region: Tensor) -> str:
+    """Return the mean difference of two shares over the same tasks, in percent, with an interval of 95 %.
+
+    Tasks of a region are not independent: the standard error is that of the sums over each region. An interval that
+    excludes 0 is bold.
+
+    Args:
+        first: share of each task ``(tasks,)``.
+        second: the same of the other navigator.
+        region: region of each task ``(tasks,)``.
+    """
+    difference = 100 * (first - second).double().flatten()
+    mean, count = difference.mean(), int(region.max()) + 1
+    sums = torch.zeros(count, dtype=torch.float64).index_add(0, region.cpu(), difference - mean)
+    error = (sums.square().sum() * count / (count - 1)).sqrt().item() / len(difference)
+    text = f"{mean.item():+.1f} ({mean.item() - 1.96 * error:+.1f} to {mean.item() + 1.96 * error:+.1f})"
+    return f"**{text}**" if abs(mean.item()) > 1.96 * error else text

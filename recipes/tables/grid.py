@@ -28,7 +28,6 @@ from typing import Any
 
 import torch
 import tyro
-from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
 from magrl import paper
@@ -40,7 +39,6 @@ from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
 from magrl.geodesy import geodesic
-from magrl.navigators import ParallelApproach, Secant
 from magrl.training import UsageError, command
 from magrl.transforms import Conditions, conditions_named
 
@@ -52,12 +50,13 @@ else:
 sys.path.insert(0, str(Path(__file__).parent))
 import globe
 import trainings
-from flights import DRIFT_KM, FAR_KM, Spec, earth_env, estimate_within, flown, rollout
+from flights import DRIFT_KM, FAR_KM, Spec, earth_env, estimate_within, flown, paired_difference, rollout
 
 RECIPE = "grid.py"
 LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
 """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
 DISTANCES = ("final_distance_km_median", "final_distance_km_p90")
+OPTIONS = {"map_date": "map of", "step_km": "step [km]"}
 BOUND = ("best estimate at the destination, by the data sheet", "the gradient")
 FILE, RESULTS = Path(__file__).parent / "tables.toml", Path("docs/results")
 EAST_OF_THE_PAPER = Region((-10, 0), (175, 185))
@@ -88,33 +87,42 @@ def earth(
     distance_km: Sequence[float] = paper.DISTANCE_KM,
     max_steps: int = 50,
     crust: bool = False,
+    planets: bool = False,
     within_km: float | None = None,
     arrivals: Sequence[str | float] = ("objective",),
     known_start: Sequence[float] | None = None,
+    difference: Sequence[str] = (),
 ) -> str:
     """Return a row for each date, navigator and arrival; a column for each level of noise, or each of some conditions.
 
     An arrival is a rule of the environment, or the least confidence at which vehicles declare that they are
     ``within_km`` of the destination. A table of declared arrivals ends with the bound of :func:`estimate_within`. With
-    ``known_start``, the vehicles know the elements at their start.
+    ``known_start``, the vehicles know the elements at their start. A ``difference`` of two navigators is another row.
     """
     columns = columns_of(conditions)
     options: dict[str, Any] = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM} if conditions else {}
     options |= {"arrival_radius_km": within_km} if within_km else {}
+    options |= {"crust": crust, "planets": planets}
     measures = ["success_rate_within_25km"] * (distance_km[1] > FAR_KM) + ["success_rate", "spl", "steps"]
     measures = ["success_rate", "spl", "false_arrival_rate", *DISTANCES] if within_km else measures
     one_run = not conditions and not within_km
-    rows = []
+    rows, spl = [], {}
     for date, navigator, arrival in tqdm(list(itertools.product(dates, navigators, arrivals)), unit="row"):
         rule, least = (arrival, 0.0) if isinstance(arrival, str) else ("declared", arrival)
-        base = earth_env(tasks, distance_km, date, max_steps=max_steps, crust=crust, arrival=rule, **options)
-        summaries = [summarize(flown(navigator, base, errors, least, known_start)) for errors in columns.values()]
+        base = earth_env(tasks, distance_km, date, max_steps=max_steps, arrival=rule, **options)
+        episodes = [flown(navigator, base, errors, least, known_start) for errors in columns.values()]
+        spl[navigator if isinstance(navigator, str) else ""] = [found["spl"] for found in episodes]
+        summaries = [summarize(found) for found in episodes]
         cells = [" / ".join(f"{summary.get(name, 0):.1f}" for name in measures) for summary in summaries]
         first = [*[date] * (len(dates) > 1), *names(navigator), *[arrival_name(arrival)] * (len(arrivals) > 1)]
         rows.append([*first, *[1] * one_run, *cells])
     if within_km:
         shares = (estimate_within(within_km, base, errors, known_start) for errors in columns.values())
         rows.append([*BOUND, *["—"] * (len(arrivals) > 1), *(f"{share:.1f}" for share in shares)])
+    if difference and set(difference) <= spl.keys():
+        pairs = zip(*(spl[name] for name in difference), strict=True)
+        cells = [paired_difference(*pair, base.scenario.tasks.region) for pair in pairs]
+        rows.append([f"{' − '.join(map(label, difference))}, SPL", *["—"] * (1 + one_run), *cells])
     head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["arrival"] * (len(arrivals) > 1), *["runs"] * one_run]
     return markdown_table([*head, *columns], rows)
 
@@ -154,10 +162,10 @@ def reliability(
 
 
 def names(navigator: Spec) -> list[str]:
-    """Return the label of a navigator, with the date of its map if that is given, and what it needs."""
-    options = {"name": navigator} if isinstance(navigator, str) else navigator
-    name = options["name"].partition("=")[0]
-    return [label(name) + (f", map of {options['map_date']}" if "map_date" in options else ""), needs(name)]
+    """Return the label of a navigator, with the options that are given, and what it needs."""
+    name, *options = navigator.items() if isinstance(navigator, Mapping) else [("name", navigator)]
+    known = name[1].partition("=")[0]
+    return [", ".join([label(known), *(f"{OPTIONS.get(key, key)} {value}" for key, value in options)]), needs(known)]
 
 
 def random_boxes(count: int, seed: int) -> list[Scenario]:
@@ -192,13 +200,13 @@ def place(scenario: Scenario) -> str:
 def boxes(navigators: Sequence[Spec], *, boxes: int = 24, tasks: int = 500, seed: int = 1) -> str:
     """Return SR and SPL of navigators in random boxes, and in the box east of the paper's, without floors of Eq. 2-6.
 
-    A navigator with two ``elements`` estimates its way from these alone.
+    One with options estimates its way from two elements alone.
     """
     scenarios = [*random_boxes(boxes, seed), Scenario(region=EAST_OF_THE_PAPER, objective_floors=None)]
     measured = []
     for scenario in tqdm(scenarios, unit="box"):
         base = GeomagneticNavEnv(scenario.with_tasks(scenario.random_tasks(tasks, seed)), num_envs=tasks, seed=0)
-        summaries = [summarize(flown(of_two_elements(navigator, base), base, NO_NOISE)) for navigator in navigators]
+        summaries = [summarize(flown(navigator, base, NO_NOISE)) for navigator in navigators]
         measured.append([(summary["success_rate"], summary["spl"]) for summary in summaries])
     random = torch.tensor(measured[:-1], dtype=torch.float64)  # (boxes, navigators, measures)
     values = [*measured[:-1], random.mean(0).tolist(), random.amin(0).tolist(), measured[-1]]
@@ -208,19 +216,11 @@ def boxes(navigators: Sequence[Spec], *, boxes: int = 24, tasks: int = 500, seed
     return markdown_table(["box", *(f"{head}, SR / SPL" for head in heads)], rows)
 
 
-def of_two_elements(navigator: Spec, base: GeomagneticNavEnv) -> TensorDictModuleBase | Spec:
-    """Return the navigator of two ``elements``, or the same where it has all three."""
-    if isinstance(navigator, str):
-        return navigator
-    pair = tuple(navigator["elements"])
-    return Secant(elements=pair) if navigator["name"] == "secant" else ParallelApproach(base.field, pair=pair)
-
-
-def rows_of(of: Sequence[str], navigators: Sequence[str]) -> str:
-    """Return the rows of some navigators from other tables in docs/results."""
+def rows_of(of: Sequence[str], navigators: Sequence[str], *, numbers: int | None = None) -> str:
+    """Return the last rows of some navigators in other tables in docs/results, with the first numbers of each cell."""
     lines = [line for name in of for line in (RESULTS / f"{name}.md").read_text().splitlines()]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    by_label = {row[0]: row for row in cells}
+    by_label = {row[0]: [" / ".join(cell.split(" / ")[:numbers]) for cell in row] for row in cells}
     return markdown_table(by_label["navigator"], [by_label[label(name)] for name in navigators])
 
 

@@ -171,7 +171,7 @@ def test_probes_are_longer_where_the_sensors_err() -> None:
 def test_mean_jacobian_needs_no_probes(env) -> None:
     navigator = MeanJacobian(env.field, env.region.grid(21), sensor_std=NOISE)
     gradient = elements_gradient_at(env.field, env.region.grid(21)).reshape(-1, 3, 2)
-    prior = navigator.prior(torch.zeros(5, 3, dtype=torch.float64))
+    prior = navigator.prior(*torch.zeros(2, 5, 3, dtype=torch.float64))
     torch.testing.assert_close(prior.gradient, gradient.mean(0).expand(5, 3, 2))
     torch.testing.assert_close(prior.std, gradient.std(0))
     summary = flown(env, NAVIGATORS["mean_jacobian"].for_env(env))

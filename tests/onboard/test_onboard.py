@@ -202,7 +202,7 @@ def test_the_estimated_way_is_northward_and_eastward(navigator: str) -> None:
         state = env.step(state.set("action", torch.tensor([action])))["next"]
     distance, bearing = geodesic(*state["position"][0], *state["target_position"][0])
     true = (distance * torch.cos(bearing)).item(), (distance * torch.sin(bearing)).item()
-    assert math.dist(first.way_km, true) < 0.25 * distance.item()
+    assert math.dist(first.way_km, true) < 0.3 * distance.item()
 
 
 # State

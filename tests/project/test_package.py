@@ -101,7 +101,12 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
         held = {Path(name) for name in archive.namelist()}
     library = {path.relative_to(ROOT) for path in (ROOT / "magrl").rglob("*") if path.suffix == ".py"}
     data = {"py.typed", "evaluation/templates/replay.html", "evaluation/coastlines.npz", "field/wmmhr2025.cof.gz"}
-    data |= {"field/weather.npz", "agents/pretrained/anywhere.pt", "agents/pretrained/anywhere.md"}
+    data |= {
+        "field/weather.npz",
+        "tracking/learned_prior.pt",
+        "agents/pretrained/anywhere.pt",
+        "agents/pretrained/anywhere.md",
+    }
     assert {path for path in held if path.parts[0] == "magrl"} == library | {Path("magrl") / name for name in data}
     others = {path.parts[0] for path in held} - {"magrl"}
     assert len(others) == 1

@@ -119,6 +119,17 @@ def test_vehicles_that_declare_have_a_row_for_each_confidence() -> None:
     assert 50 < float(bound[3]) < 100
 
 
+def test_the_interval_of_a_difference_is_clustered_by_region() -> None:
+    """Four regions of two equal tasks each are four observations, whose mean has a variance of 20 / 3 / 4."""
+    first = torch.tensor([1.0, 1.0, 3.0, 3.0, 5.0, 5.0, 7.0, 7.0]) / 100
+    region = torch.tensor([0, 0, 1, 1, 2, 2, 3, 3])
+    assert flights.paired_difference(first, 0 * first, region) == "**+4.0 (+1.5 to +6.5)**"
+    assert flights.paired_difference(first, 0 * first + 0.02, region) == "+2.0 (-0.5 to +4.5)"
+    table = rows(grid.earth(["secant", "geodesic"], tasks=8, difference=["secant", "geodesic"]))
+    assert table[-1][0] == "secant (quasi-Newton) − geodesic (both positions, an oracle), SPL"
+    assert table[-1][3].startswith(("**-", "-"))
+
+
 def test_the_bound_is_that_of_readings_at_the_destination() -> None:
     base = flights.earth_env(40, regions=4, reach_km=flights.DRIFT_KM, drift_km=flights.DRIFT_KM)
     exact, noisy, more = (flights.estimate_within(25.0, base, (std, std, 100 * std)) for std in (0.0, 0.3, 0.6))

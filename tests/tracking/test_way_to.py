@@ -52,6 +52,15 @@ def test_a_constant_error_widens_the_way_and_nothing_else():
     torch.testing.assert_close(tuple(found), tuple(expected))
 
 
+def test_curvature_is_uncertainty_that_grows_with_the_square_of_the_way():
+    """Two exact gradients of 1 per 100 km, and a change of 0.1 per (100 km)^2: over 300 km, 0.1 * 3^2 / 2 units."""
+    gradients = f64((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    track, scales = FieldTrack(gradients, torch.zeros(2, 3, 3, dtype=F64)), (1.0, 1.0)
+    found = way_to(track, f64(3.0, 0.0), 1e6, scales, curvature=(0.1, 0.1))
+    torch.testing.assert_close(found.displacement, f64(300.0, 0.0), rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(found.covariance, 45.0**2 * torch.eye(2, dtype=F64), rtol=1e-3, atol=1e-3)
+
+
 def test_way_is_accurate_in_float32_where_gradients_are_nearly_parallel():
     """At 1e-3 rad between them, a c - b^2 would have no correct digit left."""
     gradients = f64((1.0, 0.0), (2.0, 2e-3), (3.0, 0.0))

@@ -15,6 +15,7 @@ from torchrl.envs import Compose, TransformedEnv
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.guidance import OBJECTIVE_FLOORS
+from magrl.tracking import dipole_prior
 from magrl.transforms import ObservationView, SensorNoise, TrackGradient, TrackView
 from magrl.transforms.track import IN_KEYS, STD_KEYS
 from magrl.transforms.views import track_observation
@@ -77,9 +78,11 @@ def test_numbers_at_the_extremes() -> None:
 def observed_track(turn: float) -> Tensor:
     """The observations of three readings, with world and vehicle turned by an angle [rad] to the right.
 
-    Without the relation of the gradients, in which true north has a meaning: the meridians converge there.
+    With the prior of a dipole and without the relation of the gradients: in others, true north has a meaning, as the
+    meridians converge there.
     """
-    track = TrackGradient((*IN_KEYS, "sensor_std"), relation=None, range_km=VIEW.range_km, frame="vehicle")
+    free = {"prior": dipole_prior, "relation": None}
+    track = TrackGradient((*IN_KEYS, "sensor_std"), **free, range_km=VIEW.range_km, frame="vehicle")
     observe = Compose(track, *VIEW.observation_transforms()[1:])
     state, seen, observations = None, first_reading(), []
     seen["heading"] += turn
