@@ -122,10 +122,13 @@ class MapMatching(Navigator):
 
     @classmethod
     def for_env(cls, env: GeomagneticNavEnv, *, map_date: Date | None = None, **options: Any) -> Self:
-        """Return the navigator of an environment, with its field as the map, or IGRF at ``map_date``."""
+        """Return the navigator of an environment, with its field as the map, or IGRF at ``map_date``.
+
+        With a map of another date it does not search: most errors of the map displace vehicle and destination alike.
+        """
         if map_date is not None:
             field = dated_map(env.scenario, map_date, env.max_move_km).to(env.device)
-            options = {"field": field, "map_error": aged_error(env.scenario, map_date)} | options
+            options = {"field": field, "map_error": aged_error(env.scenario, map_date), "search": False} | options
         return super().for_env(env, **options)
 
     @staticmethod

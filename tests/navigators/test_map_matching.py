@@ -126,6 +126,7 @@ def test_one_hypothesis_is_not_enough(earth: GeomagneticNavEnv) -> None:
 def test_the_error_of_an_old_map_partly_cancels(earth: GeomagneticNavEnv) -> None:
     """Both positions on the map are wrong by hundreds of kilometers; the way between them is not."""
     navigator = MapMatching.for_env(earth, map_date="2015-01-01")
+    assert (navigator.search, MapMatching.for_env(earth).search) == (False, True)
     state = navigator(earth.reset())
     here = best(navigator.memory["position"], navigator.memory["misfit"])
     there = navigator.memory["target"]
