@@ -20,8 +20,7 @@ from magrl.field.elements import element_difference, elements_gradient, measured
 from magrl.field.model import device_of
 from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to, steer
 from magrl.navigators.quasi_newton import QuasiNewton, first_places, visit_place
-from magrl.navigators.secant import SLOPES
-from magrl.tracking import Way, reading_std
+from magrl.tracking import SLOPES, Way, reading_std
 
 FLOOR = (1e-3, 1e-3, 0.1)
 """Standard deviation of D, I [deg], B_H [nT] that every reading has at least: its rounding, and that of the map."""

@@ -10,42 +10,23 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from magrl import tracking
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import NAMES
 from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.tracking import FieldTrack, GradientPrior
 
-SLOPES = (0.004, 0.015, 4.0)
-"""Typical gradient of D, I [deg/km], B_H [nT/km]: what a quasi-Newton navigator without a map expects, in size."""
 SHORTEST_PROBE_KM = 0.5
 """Length of a probing leg with perfect sensors [km]: the rounding of float32 readings does not matter there."""
-
-
-def sensor_length(sensor_std: Sequence[float]) -> float:
-    """Return the way over which the elements typically change as much as the errors of a reading [km].
-
-    A position takes two elements, so that the second smallest way of the three counts.
-
-    Args:
-        sensor_std: standard deviations of D [deg], I [deg], B_H [nT].
-
-    Raises:
-        ValueError: for other than three numbers, or a negative one.
-
-    Example:
-        >>> sensor_length((0.04, 0.03, 0.4))
-        2.0
-    """
-    check_numbers(3, 0, sensor_std=sensor_std)
-    return sorted(std / slope for std, slope in zip(sensor_std, SLOPES, strict=True))[1]
 
 
 def probe_length(sensor_std: Sequence[float]) -> float:
     """Return the length of a probing leg [km]: longer legs lengthen the path, shorter ones suffer more from noise.
 
     The loss by both legs grows with their length p, the loss by the wrong direction with (noise / p)^2, the noise as in
-    :func:`sensor_length`; their sum is smallest for p proportional to noise^(2/3). The factor is from simulations.
+    :func:`magrl.tracking.sensor_length`; their sum is smallest for p proportional to noise^(2/3). The factor is from
+    simulations.
 
     Args:
         sensor_std: standard deviations of D [deg], I [deg], B_H [nT].
@@ -54,7 +35,9 @@ def probe_length(sensor_std: Sequence[float]) -> float:
         >>> [round(probe_length(std), 1) for std in ((0, 0, 0), (0.02, 0.02, 2), (0.05, 0.05, 5), (0.1, 0.1, 10))]
         [0.5, 6.1, 11.2, 17.7]
     """
-    return max(SHORTEST_PROBE_KM, 5.0 * sensor_length(sensor_std) ** (2 / 3))
+    check_numbers(3, 0, sensor_std=sensor_std)
+    length = float(tracking.sensor_length(torch.tensor(sensor_std, dtype=torch.float64)))
+    return max(SHORTEST_PROBE_KM, 5.0 * length ** (2 / 3))
 
 
 class Secant(QuasiNewton):
@@ -97,7 +80,7 @@ class Secant(QuasiNewton):
         self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)
 
     def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
-        std = reading.new_tensor([SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
+        std = reading.new_tensor([tracking.SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
         return GradientPrior(reading.new_zeros(*reading.shape, 2), std, torch.zeros_like(reading[:, 0]))
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:

@@ -22,6 +22,7 @@ _UNNOTICED = 0.02  # probability of having been at the destination: visited plac
 _STAYED_KM = 1.0  # longest move after which the vehicle is where it was
 _FAR_KM = 1e5  # of places that are not there yet
 _LEAST_KM2 = 1e-12
+_LEAST_ELLIPSE = 1e-12  # [1/km^2]
 
 
 def unvisited(way: Way, visited: Tensor, ellipse: Tensor) -> Tensor:
@@ -59,9 +60,13 @@ def unvisited(way: Way, visited: Tensor, ellipse: Tensor) -> Tensor:
     check_tensor(2, 2, covariance=way.covariance, ellipse=ellipse)
     samples = _SAMPLES.to(way.displacement)
     ways = way.displacement.unsqueeze(-2) + samples @ _root(way.covariance).mT
-    north, east = (ways.unsqueeze(-2) - visited.unsqueeze(-3)).unbind(-1)  # (..., S, K)
-    nn, ne, ee = (ellipse[..., i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
-    nearest = (nn * north * north + 2 * ne * north * east + ee * east * east).amin(-1)
+    axes = _root(ellipse, _LEAST_ELLIPSE)  # in these axes, the ellipse is a circle of radius 1
+    (north, east), (seen_n, seen_e) = ((places @ axes).unbind(-1) for places in (ways, visited))
+    from_n, from_e = (
+        north.unsqueeze(-1) - seen_n.unsqueeze(-2),
+        east.unsqueeze(-1) - seen_e.unsqueeze(-2),
+    )  # (..., S, K)
+    nearest = (from_n.square() + from_e.square()).amin(-1)
     missed = torch.log1p((_UNNOTICED - 1) * torch.exp2(-nearest))
     score = missed - samples.square().sum(-1) / 2 - ways.norm(dim=-1) / SEARCH_KM
     best = torch.where(nearest[..., 0] < 1, score.argmax(-1), 0)[..., None, None]
@@ -149,9 +154,9 @@ def arrival_ellipse(track: FieldTrack, weights: Tensor, scales: PerElement = ELE
     return (per_km[..., None, None] * squares).sum(-3)
 
 
-def _root(covariance: Tensor) -> Tensor:
-    """Return the Cholesky factor of covariances ``(..., 2, 2)``, which may be singular by rounding."""
-    first = covariance[..., 0, 0].clamp_min(_LEAST_KM2).sqrt()
-    below = covariance[..., 0, 1] / first
-    second = (covariance[..., 1, 1] - below * below).clamp_min(_LEAST_KM2).sqrt()
+def _root(matrix: Tensor, least: float = _LEAST_KM2) -> Tensor:
+    """Return the Cholesky factor of matrices ``(..., 2, 2)``, which may be singular by rounding."""
+    first = matrix[..., 0, 0].clamp_min(least).sqrt()
+    below = matrix[..., 0, 1] / first
+    second = (matrix[..., 1, 1] - below * below).clamp_min(least).sqrt()
     return torch.stack((first, torch.zeros_like(first), below, second), -1).unflatten(-1, (2, 2))

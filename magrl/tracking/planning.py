@@ -1,0 +1,248 @@
+"""The next move of a vehicle that navigates by its own track, chosen for what it gains and for what it will teach."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_tensor
+from magrl.tracking.filter import (
+    DISTANCE_SCALE_KM,
+    ELEMENT_SCALES,
+    FieldTrack,
+    PerElement,
+    _entries,
+    _units,
+    _variance,
+)
+from magrl.tracking.priors import curl_relation
+from magrl.tracking.track import related
+
+NEAR_KM = 30.0
+"""Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
+SLOPES = (0.004, 0.015, 4.0)
+"""Typical gradient of D, I [deg/km], B_H [nT/km]: what a quasi-Newton navigator without a map expects, in size."""
+LENGTHS = (0.1, 0.3, 0.6, 1.0)
+"""Lengths of the moves that are compared by default; the whole way, if it is shorter, is another."""
+ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
+"""Their directions, from that of the way [deg]."""
+_Entries = tuple[Tensor, Tensor, Tensor]  # of a symmetric matrix: nn, ne, ee
+
+
+def sensor_length(std: Tensor) -> Tensor:
+    """Return the way over which the elements typically change as much as the errors of a reading ``(...)`` [km].
+
+    A position takes two elements, so that the second smallest way of the three counts.
+
+    Args:
+        std: ``(..., 3)`` standard deviations of D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> sensor_length(torch.tensor([0.04, 0.03, 0.4]))
+        tensor(2.)
+    """
+    check_tensor(3, std=std)
+    return (std / std.new_tensor(SLOPES)).sort(-1).values[..., 1]
+
+
+def trade_off(std: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the weight of the uncertainty and the price of a step [km], ``(...)`` each, for the errors of a reading.
+
+    The larger they are (:func:`sensor_length`), the less a reading teaches, and the more path and steps certainty
+    costs. The factors, and :data:`LENGTHS`, are from scans on random planets (docs/navigators.md).
+
+    Args:
+        std: ``(..., 3)`` standard deviations of D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> trade_off(torch.tensor([0.0, 0.0, 0.0]))
+        (tensor(5.), tensor(0.1000))
+        >>> [round(float(value), 2) for value in trade_off(torch.tensor([0.1, 0.1, 10.0]))]
+        [0.45, 1.67]
+    """
+    length = sensor_length(std)
+    step_km = torch.maximum(0.25 * length, 0.025 * length.square()).clamp_min(0.1)
+    return (3.0 / length.clamp_min(0.1)).clamp_max(5.0), step_km
+
+
+def step_price(step_km: Tensor | float, way: Tensor, step: Tensor, max_steps: int, max_move_km: float) -> Tensor:
+    """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the way run out.
+
+    Args:
+        step_km: price while many are left [km].
+        way: ``(..., 2)`` [km].
+        step: ``(...)`` number of the step.
+        max_steps: step limit of the episode.
+        max_move_km: longest move.
+
+    Example:
+        >>> step_price(1.0, torch.tensor([100.0, 0.0]), torch.tensor(22), 50, 50.0)
+        tensor(4.)
+    """
+    spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km
+    return step_km * (max_steps / spare.clamp_min(1.0)).square()
+
+
+def planned_move(
+    track: FieldTrack,
+    way: Tensor,
+    covariance: Tensor,
+    sensor_std: PerElement,
+    caution: Tensor,
+    step_km: Tensor,
+    max_move_km: float,
+    range_km: float,
+    lengths: Sequence[float] = LENGTHS,
+    scales: PerElement = ELEMENT_SCALES,
+) -> Tensor:
+    """Return the displacement ``(..., 2)`` [km] of the next move, northward and eastward.
+
+    It compares moves of several lengths and directions (:data:`ANGLES_DEG`). For each it predicts the covariance of the
+    filter after the reading at its end, which does not depend on what will be read, and takes the least sum of three
+    costs [km]:
+
+    - the path: the length of the move minus the progress, that is, what it takes off the way times the cosine of the
+      typical error of its direction;
+    - the detour that the uncertainty of the way may then cost, times ``caution``;
+    - the price of the steps that remain.
+
+    Args:
+        track: state of the filter of D, I, B_H.
+        way: ``(..., 2)`` way to aim at, northward and eastward [km].
+        covariance: ``(..., 2, 2)`` covariance of the estimated way, of what moves can reduce [km^2].
+        sensor_std: standard deviations of the next reading, ``(..., 3)`` or 3 numbers.
+        caution: ``(...)`` weight of the uncertainty, see :func:`trade_off`.
+        step_km: ``(...)`` price of a step [km], see :func:`step_price`.
+        max_move_km: longest move.
+        range_km: prior standard deviation of the way along each axis [km].
+        lengths: of the moves that are compared, as fractions of the longest.
+        scales: those of :func:`~magrl.tracking.start`.
+
+    Raises:
+        ValueError: for shapes that do not match.
+
+    Source:
+        A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
+
+    Example:
+        >>> from magrl.tracking import dipole_prior, start, way_to
+        >>> here, target = torch.tensor([[8.0, -16.0, 35000.0], [9.0, -20.0, 34500.0]], dtype=torch.float64)
+        >>> track = start(here, dipole_prior(here), (0.02, 0.02, 2.0))
+        >>> way, covariance = way_to(track, target, range_km=300.0)
+        >>> planned_move(track, way, covariance, (0.02, 0.02, 2.0), *trade_off(here), 50.0, 300.0).shape
+        torch.Size([2])
+    """
+    check_tensor(2, way=way)
+    check_tensor(2, 2, covariance=covariance)
+    moves = _moves(way, lengths, max_move_km)
+    left = way.unsqueeze(-2) - moves
+    distance, distance_left, length = way.norm(dim=-1, keepdim=True), left.norm(dim=-1), moves.norm(dim=-1)
+    cost = length - (distance - distance_left) * _certainty(way, covariance)
+    cost = cost + distance_left * (step_km / max_move_km).unsqueeze(-1)
+    cost = cost + caution.unsqueeze(-1) * _detour(
+        left, _covariance_after(track, moves, left, sensor_std, range_km, scales)
+    )
+    best = cost.argmin(-1)[..., None, None]
+    return moves.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
+
+
+def _moves(way: Tensor, lengths: Sequence[float], max_move_km: float) -> Tensor:
+    """Return the displacements ``(..., M, 2)`` [km] that are compared, given the way ``(..., 2)``."""
+    whole = way.norm(dim=-1, keepdim=True).clamp_max(max_move_km)
+    fixed = (way.new_tensor(lengths) * max_move_km).expand(*whole.shape[:-1], -1)
+    bearing = torch.atan2(way[..., 1:], way[..., :1]) + torch.deg2rad(way.new_tensor(ANGLES_DEG))
+    directions = torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
+    return (torch.cat((fixed, whole), -1)[..., None, None] * directions.unsqueeze(-3)).flatten(-3, -2)
+
+
+def _covariance_after(
+    track: FieldTrack, moves: Tensor, left: Tensor, sensor_std: PerElement, range_km: float, scales: PerElement
+) -> _Entries:
+    """Return the expected covariance of the way, three entries ``(..., M)`` [km^2], after moves and readings.
+
+    The gradients that a reading will teach are unknown, but not their mean square: that of the present estimate plus
+    what the covariance decreases. The drift of the gradients is left out, as it does not depend on the choice. It is
+    computed by entries, elements first: products of 3 x 3 matrices take five times longer.
+    """
+    unit = _units(track, scales)
+    now, shared = related(track, curl_relation, scales)
+    after = _after(track, moves, _variance(sensor_std, unit))
+    elements = (track.mean[..., :1] + track.mean[..., 1:] @ (moves.mT / DISTANCE_SCALE_KM)) * unit.unsqueeze(-1)
+    shared_after = _shared(elements.mT, after, unit)
+    dn, de = (left / DISTANCE_SCALE_KM).unbind(-1)
+    p00, p01, p02, p11, p12, p22 = after
+    variance = p00 + dn * (2 * p01 + p11 * dn + 2 * p12 * de) + de * (2 * p02 + p22 * de)
+    weight, together = variance.reciprocal(), shared_after[0] + shared_after[1] * dn + shared_after[2] * de
+    row = weight * together  # the inverse covariance of the elements: diag(weight) + row row^T / rest
+    rest = (1 - (row * together).sum(0)).reciprocal()
+    teaching = weight + row.square() * rest
+    before = _entries(track, track.mean.shape[:-1])[1][3:]
+    nn, ne, ee = ((teaching * (b.unsqueeze(-1) - a)).sum(0) for a, b in zip((p11, p12, p22), before, strict=True))
+    given = (rows.movedim((-1, -2), (0, 1)).unsqueeze(-1) for rows in (now.mean[..., 1:], shared[..., 1:]))
+    for (north, east), sign in zip((*given, shared_after[1:]), (1, -1, 1), strict=True):
+        wn, we, rn, re = weight * north, weight * east, (row * north).sum(0), (row * east).sum(0)
+        nn = nn + sign * ((wn * north).sum(0) + rn * rn * rest)
+        ne = ne + sign * ((wn * east).sum(0) + rn * re * rest)
+        ee = ee + sign * ((we * east).sum(0) + re * re * rest)
+    return _inverse(nn, ne, ee, range_km)
+
+
+def _after(track: FieldTrack, moves: Tensor, noise: Tensor) -> Sequence[Tensor]:
+    """Return the six entries ``(E, ..., M)`` of the covariance after moves ``(..., M, 2)`` and a reading."""
+    p00, p01, p02, p11, p12, p22 = (
+        entry.unsqueeze(-1) for entry in _entries(track, torch.Size((*moves.shape[:-2], noise.shape[-1])))[1]
+    )
+    dn, de = (moves / DISTANCE_SCALE_KM).unbind(-1)
+    fp01, fp02 = p01 + p11 * dn + p12 * de, p02 + p12 * dn + p22 * de
+    variance = p00 + (p01 + fp01) * dn + (p02 + fp02) * de
+    r = noise.movedim(-1, 0)
+    share = r.unsqueeze(-1) if r.ndim > 1 else r.reshape(-1, *(1 for _ in moves.shape[:-1]))
+    total = (variance + share).reciprocal()
+    share, gain_n, gain_e = share * total, fp01 * total, fp02 * total
+    block = p11 - gain_n * fp01, p12 - gain_n * fp02, p22 - gain_e * fp02
+    return variance * share, fp01 * share, fp02 * share, *block
+
+
+def _shared(elements: Tensor, covariance: Sequence[Tensor], unit: Tensor) -> Sequence[Tensor]:
+    """Return what the curl relation at places of elements ``(..., M, E)`` makes them share: 3 x ``(E, ..., M)``."""
+    relation = curl_relation(elements)
+    rows = relation.weights * (unit / DISTANCE_SCALE_KM)[..., None, :, None]
+    north, east = rows.movedim((-1, -2), (0, 1)).contiguous()
+    _, p01, p02, p11, p12, p22 = covariance
+    cross = p01 * north + p02 * east, p11 * north + p12 * east, p12 * north + p22 * east
+    scale = ((north * cross[1] + east * cross[2]).sum(0) + relation.std.square()).rsqrt()
+    return [entry * scale for entry in cross]
+
+
+def _inverse(nn: Tensor, ne: Tensor, ee: Tensor, range_km: float) -> _Entries:
+    """Return the covariance [km^2] of a normal matrix; where rounding leaves it singular, that of the range alone."""
+    ridge = (DISTANCE_SCALE_KM / range_km) ** 2
+    nn, ee = nn + ridge, ee + ridge
+    determinant = nn * ee - ne * ne
+    valid, scale = determinant != 0, DISTANCE_SCALE_KM**2 / determinant
+    entries = (ee * scale, range_km**2), (-ne * scale, 0.0), (nn * scale, range_km**2)
+    return tuple(entry.where(valid, otherwise) for entry, otherwise in entries)  # type: ignore[return-value]
+
+
+def _certainty(way: Tensor, covariance: Tensor) -> Tensor:
+    """Return the share ``(..., 1)`` of a move along a way that is progress: the cosine of its typical error."""
+    distance = way.norm(dim=-1).clamp_min(1e-9)
+    unit = way / distance.unsqueeze(-1)
+    across = torch.stack((-unit[..., 1], unit[..., 0]), -1)
+    variance = ((covariance * across.unsqueeze(-2)).sum(-1) * across).sum(-1)
+    return (distance / (distance.square() + variance).sqrt()).unsqueeze(-1)
+
+
+def _detour(left: Tensor, covariance: _Entries) -> Tensor:
+    """Return the detour ``(..., M)`` [km] for remaining ways ``(..., M, 2)`` of a covariance.
+
+    It is the hypotenuse over the way and the standard deviation across it, minus the way. Near the destination, the
+    standard deviation along the way counts as well.
+    """
+    (nn, ne, ee), distance = covariance, left.norm(dim=-1)
+    north, east = (left / distance.clamp_min(1e-9).unsqueeze(-1)).unbind(-1)
+    along = nn * north * north + 2 * ne * north * east + ee * east * east
+    across = nn + ee - along
+    return torch.sqrt(distance.square() + across + along / (1 + (distance / NEAR_KM).square())) - distance
