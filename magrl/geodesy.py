@@ -86,6 +86,33 @@ def wrap_angle(angle: Tensor) -> Tensor:
     return _wrap(angle, math.pi)
 
 
+def steer(
+    heading: Tensor, wanted: Tensor, distance_km: Tensor, max_move_km: float, max_turn_rad: float
+) -> tuple[Tensor, Tensor]:
+    """Return the action that moves a distance at a heading.
+
+    Where one turn does not reach that heading, the vehicle turns as far as it can and stays: no path is shorter.
+
+    Args:
+        heading: ``(...)`` present heading [rad].
+        wanted: ``(...)`` heading to move at [rad].
+        distance_km: ``(...)`` distance to move [km].
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+
+    Returns:
+        Distance [km] and turn [rad], each ``(...)``, within their bounds; a NaN heading gives a NaN turn.
+
+    Example:
+        >>> steer(torch.zeros(2), torch.tensor([-1.0, 2.0]), torch.tensor([70.0, 70.0]), 50.0, 1.5)
+        (tensor([50.,  0.]), tensor([-1.0000,  1.5000]))
+    """
+    turn = wrap_angle(wanted - heading)
+    within = turn.abs() <= max_turn_rad + 1e-6  # a right angle in float32 is still a right angle
+    distance = torch.where(within, distance_km.clamp(0, max_move_km), 0.0)
+    return distance, turn.clamp(-max_turn_rad, max_turn_rad)
+
+
 def _wrap(value: Tensor, half: float) -> Tensor:
     wrapped = half - torch.remainder(half - value, 2 * half)
     # In float32 the remainder of a tiny negative number rounds up to the full turn.

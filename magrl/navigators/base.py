@@ -1,4 +1,4 @@
-"""Base class of navigators (policies without training) and the steering that they share.
+"""Base class of navigators (policies without training), and what they share.
 
 A navigator reads keys of the plain :class:`magrl.envs.GeomagneticNavEnv` in physical units and writes ``action``
 ``(N, 2)``: distance [km] and turn [rad]. A navigator that reads privileged keys, or the field at places where the
@@ -20,38 +20,10 @@ from typing_extensions import Self
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import element_index
-from magrl.geodesy import wrap_angle
 
 Std = Sequence[float]
 """Standard deviations of the sensors: D [deg], I [deg], B_H [nT]."""
 PERFECT: Std = (0.0, 0.0, 0.0)
-
-
-def steer(
-    heading: Tensor, wanted: Tensor, distance_km: Tensor, max_move_km: float, max_turn_rad: float
-) -> tuple[Tensor, Tensor]:
-    """Return the action that moves a distance at a heading.
-
-    Where one turn does not reach that heading, the vehicle turns as far as it can and stays: no path is shorter.
-
-    Args:
-        heading: ``(...)`` present heading [rad].
-        wanted: ``(...)`` heading to move at [rad].
-        distance_km: ``(...)`` distance to move [km].
-        max_move_km: longest move [km].
-        max_turn_rad: largest turn [rad].
-
-    Returns:
-        Distance [km] and turn [rad], each ``(...)``, within their bounds; a NaN heading gives a NaN turn.
-
-    Example:
-        >>> steer(torch.zeros(2), torch.tensor([-1.0, 2.0]), torch.tensor([70.0, 70.0]), 50.0, 1.5)
-        (tensor([50.,  0.]), tensor([-1.0000,  1.5000]))
-    """
-    turn = wrap_angle(wanted - heading)
-    within = turn.abs() <= max_turn_rad + 1e-6  # a right angle in float32 is still a right angle
-    distance = torch.where(within, distance_km.clamp(0, max_move_km), 0.0)
-    return distance, turn.clamp(-max_turn_rad, max_turn_rad)
 
 
 def displacement_to(error: Tensor, jacobian: Tensor) -> Tensor:
@@ -110,6 +82,7 @@ class Navigator(TensorDictModuleBase):
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
+        >>> from magrl.geodesy import steer
         >>> class DueEast(Navigator):
         ...     def __init__(self):
         ...         super().__init__(max_move_km=50.0, max_turn_rad=math.pi / 2)

@@ -8,7 +8,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl import geodesy
-from magrl.navigators.base import Navigator, steer
+from magrl.geodesy import steer
+from magrl.navigators.base import Navigator
 
 
 class Geodesic(Navigator):

@@ -18,7 +18,8 @@ from magrl.envs.regions import check_expansions
 from magrl.field import Date, FieldBank, FieldModel, RegionalField, elements_at, igrf_coefficients, parse_date
 from magrl.field.elements import element_difference, elements_gradient, measured_elements
 from magrl.field.model import device_of
-from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to, steer
+from magrl.geodesy import steer
+from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to
 from magrl.navigators.quasi_newton import QuasiNewton, first_places, visit_place
 from magrl.tracking import SLOPES, Way, reading_std
 

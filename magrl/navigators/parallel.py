@@ -14,8 +14,9 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.field.bank import FieldBank
 from magrl.field.elements import NAMES, element_difference
 from magrl.field.model import FieldModel, elements_gradient_at
+from magrl.geodesy import steer
 from magrl.guidance import parallel_approach
-from magrl.navigators.base import Navigator, Std, displacement_to, element_indices, steer
+from magrl.navigators.base import Navigator, Std, displacement_to, element_indices
 from magrl.tracking import CURVATURE
 
 

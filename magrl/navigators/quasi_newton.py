@@ -13,7 +13,8 @@ from magrl import tracking
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
-from magrl.navigators.base import PERFECT, Navigator, Std, element_indices, steer
+from magrl.geodesy import steer
+from magrl.navigators.base import PERFECT, Navigator, Std, element_indices
 from magrl.tracking import FieldTrack, GradientPrior, Way
 
 RANGE_KM = 1000.0

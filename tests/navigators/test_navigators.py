@@ -12,8 +12,9 @@ from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region, Scenario, tas
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
+from magrl.geodesy import steer
 from magrl.navigators import NAVIGATORS, MeanJacobian, Navigator, ParallelApproach, RunAndTumble, Secant
-from magrl.navigators.base import displacement_to, steer
+from magrl.navigators.base import displacement_to
 from magrl.navigators.secant import probe_length
 from magrl.transforms import Conditions, with_conditions
 
