@@ -14,7 +14,7 @@ fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; s
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" $(ARGS)
 
 anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; 15 minutes on one core
-	OMP_NUM_THREADS=1 $(RECIPE)/td3_anywhere.py --preset far $(ARGS)
+	OMP_NUM_THREADS=1 $(RECIPE)/ppo_anywhere.py $(ARGS)
 
 prior: $(VENV)/.installed  ## fit the prior of the gradients on random planets; 40 seconds on one core
 	OMP_NUM_THREADS=1 $(RECIPE)/gradient_prior.py --out magrl/tracking/learned_prior.pt $(ARGS)
@@ -93,7 +93,6 @@ $(eval $(call training,td3_gradient_guided-fast-azores,1,td3_gradient_guided.py 
 $(eval $(call training,td3-fast,1,td3_gradient_guided.py --preset td3-fast))
 $(eval $(call training,td3_gradient_guided-paper,1,td3_gradient_guided.py --preset paper --precision bfloat16))
 $(eval $(call training,td3-paper,1,td3_gradient_guided.py --preset td3-paper --precision bfloat16))
-$(eval $(call training,td3_anywhere-fast,1,td3_anywhere.py))
 $(eval $(call training,td3_recurrent,1,td3_recurrent.py))
 $(eval $(call training,ppo,1,ppo.py))
 

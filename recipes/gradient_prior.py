@@ -3,7 +3,7 @@
     python recipes/gradient_prior.py                                        # prints how well it fits
     python recipes/gradient_prior.py --out magrl/tracking/learned_prior.pt  # and replaces the one of the library
 
-The fields are those on which recipes/td3_anywhere.py trains. The Earth is compared with them, and not used.
+The fields are those on which recipes/ppo_anywhere.py trains. The Earth is compared with them, and not used.
 """
 
 from __future__ import annotations

@@ -10,6 +10,9 @@ from torch import Tensor, nn
 from torchrl.modules import MLP, TanhModule, ValueOperator
 
 from magrl.checks import check_number, check_type
+from magrl.geodesy import steer
+from magrl.tracking import corrected
+from magrl.transforms import TrackView
 
 Device = torch.device | str | None
 
@@ -117,6 +120,60 @@ def action_modules(network: MLP, in_keys: Sequence[str]) -> list[TensorDictModul
     bias = nn.init.zeros_(network[-1].bias)
     squash = TanhModule(in_keys=["logits"], out_keys=["action"]).to(bias.device)
     return [TensorDictModule(network, in_keys, ["logits"]), squash]
+
+
+class CorrectedMove(nn.Module):
+    """The action of a plan and its correction, scaled to [-1, 1]; see :func:`magrl.tracking.corrected`.
+
+    Args:
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+
+    Example:
+        >>> CorrectedMove(50.0, 1.5)(torch.tensor([25.0, 0.0]), torch.zeros(2))
+        tensor([0., 0.])
+    """
+
+    def __init__(self, max_move_km: float, max_turn_rad: float) -> None:
+        super().__init__()
+        self.limits = float(max_move_km), float(max_turn_rad)
+
+    def forward(self, planned: Tensor, correction: Tensor) -> Tensor:
+        """Return the scaled action ``(..., 2)`` of a displacement forward and to the right [km] and its correction."""
+        forward, right = corrected(planned, correction).unbind(-1)
+        bearing, distance = torch.atan2(right, forward), torch.hypot(forward, right)
+        distance, turn = steer(torch.zeros_like(bearing), bearing, distance, *self.limits)
+        return torch.stack((2 * distance / self.limits[0] - 1, turn / self.limits[1]), -1)
+
+
+def make_correcting_actor(view: TrackView, num_cells: Sequence[int], *, device: Device = None) -> TensorDictSequential:
+    """Return an actor that corrects a plan: ``observation`` and ``planned_move`` to ``correction`` and ``action``.
+
+    Its correction starts at zero, so that the untrained actor flies as planned.
+
+    Args:
+        view: what it observes.
+        num_cells: width of each hidden layer.
+        device: device of the parameters.
+
+    Raises:
+        ValueError: for a size that is not a whole number from 1 to 65536.
+
+    Example:
+        >>> from magrl.transforms import TrackView
+        >>> view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=1.5)
+        >>> make_correcting_actor(view, (32, 32)).out_keys
+        ['correction', 'action']
+    """
+    network = make_mlp(view.size, 2, num_cells, layer_norm=True, device=device)
+    for parameter in network[-1].parameters():
+        nn.init.zeros_(parameter)
+    return TensorDictSequential(
+        TensorDictModule(network, ["observation"], ["correction"]),
+        TensorDictModule(
+            CorrectedMove(view.max_move_km, view.max_turn_rad), ["planned_move", "correction"], ["action"]
+        ),
+    )
 
 
 def make_critic(

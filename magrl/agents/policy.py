@@ -6,7 +6,7 @@ transforms and is used like every other navigator.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.exported import ExportedPolicy, TrainedPolicy, export_policy, rebuild
-from magrl.agents.networks import Device, make_actor
+from magrl.agents.networks import Device, make_actor, make_correcting_actor
 from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
 from magrl.checks import check_finite, check_type
 from magrl.files import DamagedFileError, load_tensors, save_tensors
@@ -64,6 +64,8 @@ class PolicyConfig:
         if isinstance(self.view, ObservationView) and self.memory_size:
             shape = self.view, self.num_cells, self.memory_size
             return make_recurrent_actor(*shape, layer_norm=self.layer_norm, device=device)
+        if isinstance(self.view, TrackView):
+            return make_correcting_actor(self.view, self.num_cells, device=device)
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
 
 
@@ -99,6 +101,22 @@ class FieldPolicy(TrainedPolicy):
         self.act = config.view.action_transform()
         self.actor = config.make_actor() if actor is None else actor
         self.state: TensorDictBase | None = None
+
+    def adapted(self, **changes: Any) -> FieldPolicy:
+        """Return the policy with other options of its view, such as ``search`` or ``step_price``; it shares weights.
+
+        Args:
+            changes: options of the view.
+
+        Raises:
+            TypeError: for an option that the view does not have.
+
+        Example:
+            >>> from magrl.agents import load_pretrained
+            >>> load_pretrained("anywhere").adapted(step_price=1.0).config.view.step_price
+            1.0
+        """
+        return FieldPolicy(replace(self.config, view=replace(self.config.view, **changes)), self.actor)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""

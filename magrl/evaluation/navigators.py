@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,7 +37,7 @@ TRAINED = {
     "gg_td3_noise": TrainedAgent("Gradient-Guided TD3, trained with noise", "Gradient-Guided TD3, trained with noise"),
     "td3": TrainedAgent("TD3", "TD3"),
     "recurrent": TrainedAgent("recurrent TD3", "recurrent TD3 (the paper's eight numbers)"),
-    "anywhere": TrainedAgent("anywhere", "anywhere (TD3 on random planets)", Navigator.needs),
+    "anywhere": TrainedAgent("anywhere", "anywhere (PPO on random planets)", Navigator.needs),
     OWN: TrainedAgent("own policy", "own policy", "training"),
 }
 """Trained agents, which take a run folder; ``anywhere`` without one is the pretrained policy."""
@@ -102,10 +101,11 @@ def make_navigator(
         mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
         map_date: date of the map of ``map_matching``, from IGRF; None for the environment's own field.
-        options: further options of the class of a navigator without training, such as ``caution`` of ``kalman``.
+        options: further options of the class of a navigator without training, such as ``caution`` of ``kalman``, or of
+            the view of an agent without a map, such as ``step_price``.
 
     Raises:
-        TypeError: for options that the class does not have, or of a trained agent.
+        TypeError: for options that the class does not have, or of another trained agent.
         ValueError: for an unknown name, a trained agent without a run or trained in another field, a run or a mode for
             a navigator that takes none, or an unknown mode.
         FileNotFoundError: for a run without a policy.
@@ -117,9 +117,7 @@ def make_navigator(
     """
     name, option, source = parse_navigator(text)
     if name in TRAINED and (not option or name == OWN):
-        if options:
-            raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
-        return _load(text, env)
+        return _load(text, env, options)
     kind = NAVIGATORS.get(name)
     if kind is None or source or (option and "mode" not in kind.options):
         trained = [f"{agent}=RUN" for agent in TRAINED if agent != OWN]
@@ -130,7 +128,7 @@ def make_navigator(
     return kind.for_env(env, sensor_std=sensor_std, bias_std=bias_std, **options).to(env.device)
 
 
-def _load(text: str, env: GeomagneticNavEnv) -> TensorDictModuleBase:
+def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> TensorDictModuleBase:
     """Return a trained agent; raise unless it fits the environment."""
     name, _, source = parse_navigator(text)
     if not source and name not in PRETRAINED:
@@ -138,9 +136,11 @@ def _load(text: str, env: GeomagneticNavEnv) -> TensorDictModuleBase:
         raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
     path = Path(source) if name == OWN and not Path(source).is_dir() else Path(source) / "policy.pt"
     policy = load_policy(path, env.device) if source else load_pretrained(name, env.device)
-    if isinstance(policy, FieldPolicy) and isinstance(view := policy.config.view, TrackView):
-        view = replace(view, zeta=env.zeta, search=env.arrival.rule == "objective")  # what counts as arrived here
-        policy = FieldPolicy(replace(policy.config, view=view), policy.actor).to(env.device)
+    if isinstance(policy, FieldPolicy) and isinstance(policy.config.view, TrackView):
+        told = env.arrival.rule == "objective"
+        policy = policy.adapted(zeta=env.zeta, max_steps=env.max_steps, search=told, **options).to(env.device)
+    elif options:
+        raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
     try:
         policy.check_fits(env)
     except ValueError as error:

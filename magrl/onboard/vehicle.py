@@ -9,7 +9,7 @@ import copy
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -177,8 +177,7 @@ class Onboard:
         view = view_of(navigator)
         if not isinstance(navigator, FieldPolicy) or not isinstance(view, TrackView):
             return navigator
-        view = replace(view, search=False)
-        return FieldPolicy(replace(navigator.config, view=view), navigator.actor)
+        return navigator.adapted(search=False, max_steps=self.max_steps)
 
     def start(
         self,

@@ -23,6 +23,7 @@ from magrl.tracking.filter import update as update
 from magrl.tracking.learned_prior import LearnedPrior as LearnedPrior
 from magrl.tracking.planning import LENGTHS as LENGTHS
 from magrl.tracking.planning import SLOPES as SLOPES
+from magrl.tracking.planning import corrected as corrected
 from magrl.tracking.planning import planned_move as planned_move
 from magrl.tracking.planning import sensor_length as sensor_length
 from magrl.tracking.planning import step_price as step_price

@@ -28,6 +28,8 @@ LENGTHS = (0.1, 0.3, 0.6, 1.0)
 """Lengths of the moves that are compared by default; the whole way, if it is shorter, is another."""
 ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
 """Their directions, from that of the way [deg]."""
+CORRECTION = 0.5
+"""Unit of the corrections of a plan: of the logarithm of the length, and of the direction [rad]."""
 _Entries = tuple[Tensor, Tensor, Tensor]  # of a symmetric matrix: nn, ne, ee
 
 
@@ -146,6 +148,26 @@ def planned_move(
     )
     best = cost.argmin(-1)[..., None, None]
     return moves.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
+
+
+def corrected(way: Tensor, correction: Tensor) -> Tensor:
+    """Return a planned displacement with a correction that does not depend on its length.
+
+    Args:
+        way: ``(..., 2)`` planned displacement [km].
+        correction: ``(..., 2)`` of the logarithm of its length, and of its direction, in units of
+            :data:`CORRECTION`.
+
+    Example:
+        >>> corrected(torch.tensor([20.0, 0.0]), torch.zeros(2))
+        tensor([20.,  0.])
+        >>> corrected(torch.tensor([20.0, 0.0]), torch.tensor([2.0, 3.0])).round()  # e times as far, to the right
+        tensor([ 4., 54.])
+    """
+    check_tensor(2, way=way, correction=correction)
+    stretch, angle = (CORRECTION * correction).unbind(-1)
+    (x, y), cos, sin = way.unbind(-1), torch.cos(angle), torch.sin(angle)
+    return torch.exp(stretch).unsqueeze(-1) * torch.stack((cos * x - sin * y, sin * x + cos * y), -1)
 
 
 def _moves(way: Tensor, lengths: Sequence[float], max_move_km: float) -> Tensor:

@@ -28,10 +28,13 @@ from magrl.transforms.errors.sensors import SensorErrors as SensorErrors
 from magrl.transforms.errors.vector import VectorErrors as VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H as SPEEDS_KM_H
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
-from magrl.transforms.rewards import DetourReward as DetourReward
 from magrl.transforms.rewards import DistanceCost as DistanceCost
+from magrl.transforms.rewards import HighestSPL as HighestSPL
+from magrl.transforms.rewards import RandomStepPrice as RandomStepPrice
+from magrl.transforms.rewards import SPLReward as SPLReward
 from magrl.transforms.rewards import TrueWay as TrueWay
 from magrl.transforms.scaling import MinMaxNorm as MinMaxNorm
+from magrl.transforms.track import PlannedMove as PlannedMove
 from magrl.transforms.track import SearchAim as SearchAim
 from magrl.transforms.track import TrackGradient as TrackGradient
 from magrl.transforms.views import AngleVector as AngleVector

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from inspect import signature
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -10,9 +11,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite
 
-from magrl.checks import check_number, check_tensor
+from magrl.checks import check_number, check_numbers
+from magrl.counters import stream_uniform
 from magrl.geodesy import geodesic
-from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward
+from magrl.transforms.base import GivenKeys, ObservationTransform, StatefulTransform, StepReward
+from magrl.transforms.errors.base import Episode, EpisodeErrors
 
 
 class TrueWay(ObservationTransform):
@@ -50,95 +53,124 @@ class TrueWay(ObservationTransform):
         return observation_spec
 
 
-def detour_reward(
-    moved_km: Tensor,
-    progress_km: Tensor,
-    task_km: Tensor,
-    arrived: Tensor,
-    lost: Tensor,
-    *,
-    arrival: float = 10.0,
-    detour: float = 10.0,
-    step: float = 0.08,
-    lost_penalty: float = 5.0,
-) -> Tensor:
-    """Return the reward of a move for arriving on a short path.
+class HighestSPL(StatefulTransform):
+    """Write the highest SPL (success weighted by path length) that an episode can still reach. Privileged.
 
-    Without the cost of a step, the return of an episode that arrives is ``arrival`` minus ``detour`` times the wasted
-    part of the path in units of the task.
-
-    Args:
-        moved_km: ``(...)`` length of the move [km].
-        progress_km: ``(...)`` by how much the move shortened the true way [km].
-        task_km: ``(...)`` distance from start to destination [km].
-        arrived: ``(...)`` bool.
-        lost: ``(...)`` bool.
-        arrival: reward for arriving.
-        detour: penalty for a detour as long as the task.
-        step: penalty for each move.
-        lost_penalty: penalty for leaving the region.
-
-    Returns:
-        ``(...)``.
-
-    Example:
-        >>> yes, no = torch.tensor(True), torch.tensor(False)
-        >>> detour_reward(torch.tensor(50.0), torch.tensor(30.0), torch.tensor(400.0), yes, no)
-        tensor(9.4200)
-    """
-    check_tensor(moved_km=moved_km, progress_km=progress_km, task_km=task_km)
-    wasted = (moved_km - progress_km) / task_km
-    return arrival * arrived - detour * wasted - step - lost_penalty * lost
-
-
-class DetourReward(StepReward):
-    """Write a reward for arriving on a short path, see :func:`detour_reward`.
-
-    In place of the reward of the environment. It reads the true way before and after the move, so it is privileged.
+    It is that of the straight way from where the vehicle is: the distance of the task over the path so far plus the
+    true way. After an arrival it is the SPL of the episode, after another end 0.
 
     Args:
         in_keys: true way ``(..., 2)`` [km], last move ``(..., K)`` with the distance [km] first, start position and
-            target position ``(..., 2)`` [deg], and the flags ``(..., 1)`` success and terminated.
-        out_keys: one reward ``(..., 1)``.
-        **weights: those of :func:`detour_reward`.
+            target position ``(..., 2)`` [deg], and the flags ``(..., 1)`` success and done.
+        out_keys: one number ``(..., 1)`` in [0, 1], which is also the state.
 
     Raises:
-        ValueError: for a negative weight, or another number of keys.
-        TypeError: for an unknown weight.
+        ValueError: for another number of keys.
 
     Example:
-        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
+        >>> from magrl.envs import GeomagneticNavEnv
         >>> from torchrl.envs import Compose, TransformedEnv
-        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueWay(), DetourReward()))
-        >>> env.rollout(3)["next", "reward"].shape
-        torch.Size([2, 3, 1])
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), Compose(TrueWay(), HighestSPL()))
+        >>> bool((env.rollout(3)["next", "highest_spl"] < 1).all())
+        True
     """
 
-    default_in_keys = ("true_way", "move", "start_position", "target_position", "success", "terminated")
-
-    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, **weights: float) -> None:
-        super().__init__(in_keys, out_keys)
-        signature(detour_reward).bind_partial(**weights)  # an unknown weight is an error before the first step
-        check_number(0, **weights)  # type: ignore[arg-type]
-        self.weights = weights
+    default_in_keys = ("true_way", "move", "start_position", "target_position", "success", "done")
+    default_out_keys = ("highest_spl",)
+    out_sizes = ((1,),)
 
     @property
     def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: the true way."""
+        """Keys that a step reads from the TensorDict before it: the true way and the number itself."""
+        return [self.in_keys[0], self.out_keys[0]]
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        tensordict.set(self.out_keys[0], torch.ones_like(values[0][..., :1]))
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        (after, move, start, target, success, done), (before, highest) = values, state
+        task_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(move.dtype)
+        path_km = task_km / highest - before.norm(dim=-1, keepdim=True) + move[..., :1]
+        whole_km = torch.where(success, path_km, path_km + after.norm(dim=-1, keepdim=True))
+        reached = task_km / torch.maximum(whole_km, task_km)
+        tensordict.set(self.out_keys[0], torch.where(done & ~success, torch.zeros_like(reached), reached))
+
+
+class SPLReward(StepReward):
+    """Write the change of :class:`HighestSPL` minus the price of a step: the return of an episode is its SPL.
+
+    It is ``scale`` times SPL minus 1, minus ``scale / 100`` times the prices of its steps. In place of the reward of
+    the environment. Privileged.
+
+    Args:
+        in_keys: highest SPL ``(..., 1)`` and price of a step ``(..., 1)`` [% of SPL].
+        out_keys: one reward ``(..., 1)``.
+        scale: reward for an SPL of 1.
+
+    Raises:
+        ValueError: for a scale that is not above 0, or another number of keys.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> after = TensorDict(highest_spl=torch.tensor([0.9]), step_price=torch.tensor([0.5]))
+        >>> SPLReward()(TensorDict(highest_spl=torch.tensor([1.0]), next=after))["next", "reward"]
+        tensor([-1.0500])
+    """
+
+    default_in_keys = ("highest_spl", "step_price")
+
+    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, scale: float = 10.0) -> None:
+        super().__init__(in_keys, out_keys)
+        check_number(0, above=True, scale=scale)
+        self.scale = float(scale)
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it: the highest SPL."""
         return self.in_keys[:1]
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        after, move, start, target, success, terminated = values
-        task_km, _ = geodesic(*start.unbind(-1), *target.unbind(-1))
-        reward = detour_reward(
-            move[..., :1],
-            state[0].norm(dim=-1, keepdim=True) - after.norm(dim=-1, keepdim=True),
-            task_km.unsqueeze(-1).to(move.dtype),
-            success,
-            terminated & ~success,
-            **self.weights,
-        )
-        tensordict.set(self.out_keys[0], reward)
+        tensordict.set(self.out_keys[0], self.scale * (values[0] - state[0] - values[1] / 100))
+
+
+class RandomStepPrice(EpisodeErrors):
+    """Draw the price of a step for each episode, log-uniform, so that one policy learns the whole range.
+
+    Args:
+        price_range: lowest and highest price [% of SPL].
+        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeErrors`.
+
+    Raises:
+        ValueError: for other than two rising numbers above 0.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from torchrl.envs import TransformedEnv
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=5, seed=0), RandomStepPrice((0.1, 1.0)))
+        >>> price = env.reset()["step_price"]
+        >>> bool(((price >= 0.1) & (price <= 1.0)).all())
+        True
+    """
+
+    default_in_keys = ("heading",)
+    default_out_keys = ("step_price",)
+    error_key, stream_key = "step_price", "step_price_stream"
+    size = draws = 1
+
+    def __init__(self, price_range: Sequence[float], **options: Any) -> None:
+        super().__init__(**options)
+        check_numbers(2, price_range=price_range)
+        low, high = map(float, price_range)
+        if not 0 < low <= high:
+            raise ValueError(f"price_range must be two rising numbers above 0, got {price_range!r}")
+        self.price_range = low, high
+
+    def _constants(self, stream: Tensor) -> Tensor:
+        low, high = self.price_range
+        return low * (high / low) ** stream_uniform(stream, 1)
+
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:  # noqa: ARG002
+        return episode.errors
 
 
 class DistanceCost(StepReward):

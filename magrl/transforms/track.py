@@ -233,6 +233,73 @@ class SearchAim(StatefulTransform):
             tensordict.set(key, value)
 
 
+class PlannedMove(StatefulTransform):
+    """Write the move that dual control plans (:func:`magrl.tracking.planned_move`), for policies that correct it.
+
+    It stands after :class:`TrackGradient`. It plans in float64, as :class:`~magrl.navigators.Kalman` does.
+
+    Args:
+        in_keys: values at the target ``(..., 3)``, heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, mean
+            ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the filter, way to aim at ``(..., 2)`` [km], and the
+            standard deviations ``(..., 3)`` of new errors of a reading and of constant and slow ones.
+        out_keys: displacement ``(..., 2)`` [km].
+        max_move_km: longest move [km].
+        max_steps: step limit.
+        range_km: prior standard deviation of the way along each axis [km].
+        frame: axes of the way and the displacement, as in :class:`TrackGradient`.
+
+    Raises:
+        ValueError: for an option out of its range, or another number of keys.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from magrl.transforms import SensorNoise
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> plan = PlannedMove(max_move_km=50.0, max_steps=50)
+        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), TrackGradient(), plan)
+        >>> TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), steps).rollout(3)["planned_move"].shape
+        torch.Size([2, 3, 2])
+    """
+
+    default_in_keys = ("target_field", "heading", "step_count", "track_mean", "track_covariance", "way", *STD_KEYS)
+    default_out_keys = ("planned_move",)
+    in_sizes = (3, 1, 1, 3, 3, 2, 3, 3)
+    out_sizes = ((2,),)
+
+    def __init__(
+        self,
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
+        *,
+        max_move_km: float,
+        max_steps: int,
+        range_km: float = 300.0,
+        frame: str = "world",
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        check_number(0, above=True, max_move_km=max_move_km, range_km=range_km)
+        check_number(1, whole=True, max_steps=max_steps)
+        check_choice(FRAMES, frame=frame)
+        self.max_move_km, self.max_steps = float(max_move_km), int(max_steps)
+        self.range_km, self.frame = float(range_km), frame
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        self._advance(tensordict, values, [])
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:  # noqa: ARG002
+        target, heading, step, mean, covariance, aim, sensor_std, bias_std = (value.double() for value in values)
+        turn = heading if self.frame == "vehicle" else 0 * heading
+        way, std = _turned(aim.unsqueeze(-2), -turn).squeeze(-2), tracking.reading_std(sensor_std, bias_std)
+        track = FieldTrack(mean, covariance)
+        known, shared = tracking.related(track, tracking.curl_relation)
+        options = self.range_km, tracking.ELEMENT_SCALES, shared, None, tracking.ELEMENT_PERIODS
+        uncertainty = tracking.way_to(known, target, *options).covariance
+        caution, step_km = tracking.trade_off(std)
+        price = tracking.step_price(step_km, way, step.squeeze(-1), self.max_steps, self.max_move_km)
+        move = tracking.planned_move(track, way, uncertainty, std, caution, price, self.max_move_km, self.range_km)
+        tensordict.set(self.out_keys[0], _turned(move.unsqueeze(-2), turn).squeeze(-2).to(values[1].dtype))
+
+
 def _turned(vectors: Tensor, heading: Tensor) -> Tensor:
     """Return vectors ``(..., K, 2)`` northward and eastward as forward and to the right of a heading ``(..., 1)``."""
     (north, east), cos, sin = vectors.unbind(-1), torch.cos(heading), torch.sin(heading)

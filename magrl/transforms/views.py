@@ -19,13 +19,16 @@ from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES, element_difference
 from magrl.transforms.base import GivenKeys, Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, SearchAim, TrackGradient
+from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, PlannedMove, SearchAim, TrackGradient
 
-OBSERVATION_SIZE = 15
+OBSERVATION_SIZE = 19
 """Numbers of :func:`track_observation`."""
-OBSERVED_KEYS = ("field", "target_field", *OUT_KEYS[2:4], "aim", OUT_KEYS[5], STD_KEYS[0], "step_count")
+OBSERVED_KEYS = ("field", "target_field", *OUT_KEYS[2:4], "aim", OUT_KEYS[5], STD_KEYS[0], "step_count", "planned_move")
+STEP_PRICE = 0.2
+"""Price of a step by default [% of SPL]."""
 _STD_UNITS = (1.0, 1.0, 100.0)
 _LEAST_STD = 0.002
+_LEAST_PRICE = 0.01
 
 
 class AngleVector(ObservationTransform):
@@ -240,6 +243,8 @@ def track_observation(
     weights: Tensor,
     sensor_std: Tensor,
     time: Tensor,
+    planned: Tensor,
+    step_price: Tensor,
 ) -> Tensor:
     """Return the observation of an agent that navigates by the estimates of its own track.
 
@@ -254,17 +259,20 @@ def track_observation(
         weights: ``(..., E)`` weights of the objective F (Eq. 2-6), divided by the arrival threshold.
         sensor_std: ``(..., E)`` standard deviation of the readings' noise: D [deg], I [deg], B_H [nT].
         time: ``(..., 1)`` share of the step limit that is over.
+        planned: ``(..., 2)`` planned displacement, forward and to the right [km].
+        step_price: ``(..., 1)`` price of a step [% of SPL].
 
     Returns:
-        ``(..., 15)``: direction (2) and length (2) of the way; logarithms of its standard deviations (2) and their
+        ``(..., 19)``: direction (2) and length (2) of the way; logarithms of its standard deviations (2) and their
         correlation; the same three of the arrival ellipse by the estimated gradient; logarithm of F over the threshold;
-        time; logarithms of the noise (3).
+        time; logarithms of the noise (3); direction (2) and logarithm of the length of the plan; that of the price.
 
     Example:
         >>> eye = torch.eye(2)
         >>> gradient = torch.tensor([[0.01, 0.0], [0.0, 0.01], [1.0, 1.0]])
         >>> ones = torch.ones(3)
-        >>> track_observation(torch.tensor([30.0, 40.0]), eye, gradient, ones, ones, ones, torch.zeros(1))[:2]
+        >>> way, rest = torch.tensor([30.0, 40.0]), (ones[:1], ones[:2], ones[:1])
+        >>> track_observation(way, eye, gradient, ones, ones, ones, *rest)[:2]
         tensor([0.6000, 0.8000])
     """
     check_tensor(2, way=way)
@@ -275,6 +283,7 @@ def track_observation(
     units = torch.tensor(_STD_UNITS, dtype=sensor_std.dtype, device=sensor_std.device)
     std, std_correlation = _axes(way_covariance, least=1e-6)
     axes, axes_correlation = _axes(ellipse, least=1e-12)
+    planned_km = planned.norm(dim=-1, keepdim=True)
     return torch.cat(
         (
             way / length.clamp_min(1e-3),
@@ -287,6 +296,9 @@ def track_observation(
             torch.log(objective + 1e-2) / 3 - 0.5,
             time,
             torch.log((sensor_std / units).clamp_min(_LEAST_STD)) / 2 + 2,
+            planned / planned_km.clamp_min(1e-3),
+            torch.log1p(planned_km / 20) - 1,
+            torch.log(step_price.clamp_min(_LEAST_PRICE) * 10) / 2,
         ),
         -1,
     )
@@ -301,17 +313,19 @@ def _axes(matrix: Tensor, least: float) -> tuple[Tensor, Tensor]:
 class TrackObservation(StatefulTransform):
     """Write the observation of an agent that navigates by its own track, see :func:`track_observation`.
 
-    It stands after :class:`~magrl.transforms.TrackGradient` and :class:`~magrl.transforms.SearchAim` in the vehicle's
-    frame; without the latter, its fifth key is that of the estimated way. The weights of the objective follow from the
-    first reading, which is kept as state in the TensorDict.
+    It stands after :class:`~magrl.transforms.TrackGradient`, :class:`~magrl.transforms.SearchAim` and
+    :class:`~magrl.transforms.PlannedMove` in the vehicle's frame; without the second, its fifth key is that of the
+    estimated way. The weights of the objective follow from the first reading, which is kept as state in the TensorDict.
 
     Args:
         in_keys: reading and target ``(..., 3)``, estimated field ``(..., 3)``, its gradient ``(..., 3, 2)``, way to aim
             at ``(..., 2)``, covariance of the estimated way ``(..., 2, 2)``, standard deviation of the noise
-            ``(..., 3)``, and the number of the step ``(..., 1)``.
-        out_keys: observation ``(..., 15)`` and the first reading ``(..., 3)``.
+            ``(..., 3)``, number of the step ``(..., 1)``, planned displacement ``(..., 2)`` [km], and optionally the
+            price of a step ``(..., 1)`` [% of SPL].
+        out_keys: observation ``(..., 19)`` and the first reading ``(..., 3)``.
         zeta: arrival threshold on the objective.
         max_steps: step limit.
+        step_price: price of a step where it is not among the ``in_keys``.
 
     Raises:
         ValueError: for an option out of its range, or another number of keys.
@@ -320,47 +334,61 @@ class TrackObservation(StatefulTransform):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.transforms import SensorNoise
         >>> from torchrl.envs import Compose, TransformedEnv
-        >>> track = TrackGradient(("field", "target_field", "move", "heading", "sensor_std"), frame="vehicle")
-        >>> aim, observation = SearchAim(zeta=0.01, frame="vehicle"), TrackObservation(zeta=0.01, max_steps=50)
-        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), track, aim, observation)
+        >>> estimates = TrackGradient((*IN_KEYS, *STD_KEYS), frame="vehicle"), SearchAim(zeta=0.01, frame="vehicle")
+        >>> plan = PlannedMove(max_move_km=50.0, max_steps=50, frame="vehicle")
+        >>> observation = TrackObservation(zeta=0.01, max_steps=50)
+        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), *estimates, plan, observation)
         >>> TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), steps).rollout(3)["observation"].shape
-        torch.Size([2, 3, 15])
+        torch.Size([2, 3, 19])
     """
 
     default_in_keys = OBSERVED_KEYS
     default_out_keys = ("observation", "first_field")
+    in_counts = (9, 10)
     out_sizes = (OBSERVATION_SIZE,), (3,)
 
-    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, zeta: float, max_steps: int) -> None:
+    def __init__(
+        self,
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
+        *,
+        zeta: float,
+        max_steps: int,
+        step_price: float = STEP_PRICE,
+    ) -> None:
         super().__init__(in_keys, out_keys)
         check_number(0, above=True, zeta=zeta)
         check_number(1, whole=True, max_steps=max_steps)
-        self.zeta, self.max_steps = zeta, max_steps
+        check_number(0, step_price=step_price)
+        self.zeta, self.max_steps, self.step_price = zeta, max_steps, step_price
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         self._advance(tensordict, values, values[:1])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        (first,), (_, target, estimate, gradient, way, covariance, sensor_std, step) = state, values
+        (first,), (_, target, estimate, gradient, way, covariance, sensor_std, step, planned, *given) = state, values
+        price = given[0] if given else torch.full_like(planned[..., :1], self.step_price)
         remaining = element_difference(target, estimate)
         weights = tracking.arrival_weights(first, target, self.zeta)
         time = (step.to(way.dtype) / self.max_steps).clamp(max=1)  # a policy may fly longer than it was trained for
-        observed = track_observation(way, covariance, gradient, remaining, weights, sensor_std, time)
+        observed = track_observation(way, covariance, gradient, remaining, weights, sensor_std, time, planned, price)
         tensordict.set(self.out_keys[0], observed).set(self.out_keys[1], first)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackView(_View):
-    """Describe what an agent without a map observes: the estimates of a Kalman filter along its own track.
+    """Describe what an agent without a map observes: the estimates of a Kalman filter along its own track, and a plan.
 
     Args:
-        zeta: arrival threshold that the agent is trained for.
-        max_steps: step limit that the agent is trained for.
+        zeta: arrival threshold.
+        max_steps: step limit.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
         range_km: prior standard deviation of the way along each axis [km].
         search: whether it observes the way to where the vehicle has not been (:class:`~magrl.transforms.SearchAim`), as
             suits environments that end the episode at arrival.
+        step_price: what a step may cost [% of SPL]; the higher, the fewer steps, and the longer the path. None where
+            the agent observes it as ``step_price``, for training.
 
     Raises:
         ValueError: for a number out of its range.
@@ -368,13 +396,14 @@ class TrackView(_View):
 
     Example:
         >>> TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=1.5).size
-        15
+        19
     """
 
     zeta: float
     max_steps: int
     range_km: float = 300.0
     search: bool = True
+    step_price: float | None = STEP_PRICE
 
     size: ClassVar[int] = OBSERVATION_SIZE
     in_keys: ClassVar[tuple[str, ...]] = (*IN_KEYS, "step_count")
@@ -384,6 +413,8 @@ class TrackView(_View):
         check_number(0, above=True, zeta=self.zeta, range_km=self.range_km)
         check_number(1, whole=True, max_steps=self.max_steps)
         check_type(bool, search=self.search)
+        if self.step_price is not None:
+            check_number(0, step_price=self.step_price)
 
     @property
     def state_keys(self) -> tuple[str, ...]:
@@ -391,8 +422,13 @@ class TrackView(_View):
         return *OUT_KEYS[:2], "first_field", *(("visited", "arrival_weights") if self.search else ())
 
     def observation_transforms(self) -> list[Transform]:
-        """Return the transforms from the public keys and standard deviations to ``observation`` ``(..., 15)``."""
+        """Return the transforms from the public keys and standard deviations to ``observation`` ``(..., 19)``."""
         track = TrackGradient((*IN_KEYS, *STD_KEYS), range_km=self.range_km, frame="vehicle")
         search = [SearchAim(zeta=self.zeta, frame="vehicle")] if self.search else []
-        observed = [key if key != "aim" or self.search else "way" for key in OBSERVED_KEYS]
-        return [track, *search, TrackObservation(observed, zeta=self.zeta, max_steps=self.max_steps)]
+        aim = "aim" if self.search else "way"
+        planned = (*IN_KEYS[1::2], "step_count", *OUT_KEYS[:2], aim, *STD_KEYS)
+        plan = PlannedMove(planned, max_move_km=self.max_move_km, max_steps=self.max_steps, frame="vehicle")
+        observed = [aim if key == "aim" else key for key in OBSERVED_KEYS]
+        price = {"step_price": self.step_price} if self.step_price is not None else {}
+        keys = observed if price else [*observed, "step_price"]
+        return [track, *search, plan, TrackObservation(keys, zeta=self.zeta, max_steps=self.max_steps, **price)]

@@ -4,8 +4,8 @@
     python recipes/tables/figures.py conditions globe --out runs  # from new flights; five minutes and one minute
 
 Figures: section-4 (field contours 4-1, trajectories 4-4, convergence 4-5, box plots 4-6), learning (return 4-2, success
-rate 4-3, SPL), noise, conditions (the cost of each error alone), globe (a map of the Earth), paper-run (learning curves
-of whole trainings).
+rate 4-3, SPL), noise, conditions (the cost of each error alone), globe (a map of the Earth), prices (SPL over
+steps, from table prices), paper-run (learning curves of whole trainings).
 """
 
 from __future__ import annotations
@@ -21,22 +21,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import torch
 import tyro
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from tqdm import tqdm
 
-from magrl.envs import PAPER_REGION, Scenario, Tasks, named_tasks
+from magrl.envs import PAPER_REGION, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import figures as plots
 from magrl.evaluation import summarize
-from magrl.evaluation.maps import coastlines
 from magrl.evaluation.navigators import label
 from magrl.evaluation.runs import NO_NOISE
-from magrl.field import IGRF, elements_at
+from magrl.field import IGRF
 from magrl.field.records import WeatherRecord, weather_record
 from magrl.files import check_writable
 from magrl.training import UsageError, command
@@ -44,8 +40,8 @@ from magrl.transforms import Conditions, VectorErrors
 
 sys.path.insert(0, str(Path(__file__).parent))
 from flights import DRIFT_KM, earth_env, flown
-from globe import Measures, earth_tasks, measured, weakest_change
-from grid import declarations
+from globe import earth_tasks, globe_map, measured
+from grid import LEVELS, RESULTS, declarations
 from trainings import level_name, matching, read_curves
 
 RECIPE = "figures.py"
@@ -67,8 +63,6 @@ SHOWN = ("gg_td3", "td3", "recurrent", "ga", "pso", "afsa", "secant", "parallel"
 BOXES = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
 STD, SPEED_KM_H = (0.05, 0.05, 5.0), 24.0
 """Noise and speed of the vehicle in figure conditions."""
-WEAK_NT, PARALLEL = 8000, 0.1
-"""Contours of the map: B_H, and the weakest change below which gradients are nearly parallel."""
 
 
 @dataclass(frozen=True)
@@ -229,37 +223,21 @@ def globe(tasks: int | None) -> Figures:
     return {"globe": globe_map(field, ends, measured(declarations()["globe"]["navigator"], field, ends, NO_NOISE))}
 
 
-def globe_map(field: IGRF, tasks: Tasks, measures: Measures) -> Figure:
-    """Return the map of the Earth (Mollweide's equal-area projection) with each task at its start."""
-    figure = Figure(figsize=(9, 4.9), layout="constrained")
-    axes = figure.add_subplot(projection="mollweide")
-    axes.plot(*np.radians(coastlines()).T[::-1], color="#8c8c8c", lw=0.6)
-    draw_field(axes, field)
-    (north, east), arrived = np.radians(tasks.start.numpy()).T, measures["success"].numpy()
-    order = np.flatnonzero(arrived)[(-measures["spl"].numpy()[arrived]).argsort(kind="stable")]  # detours on top
-    spl = 100 * measures["spl"].numpy()[order]
-    dots = axes.scatter(east[order], north[order], c=spl, s=4, lw=0, cmap="viridis", vmin=50, vmax=100)
-    axes.plot(east[~arrived], north[~arrived], "x", color="#D55E00", ms=5, mew=1.5, label="not arrived")
-    figure.colorbar(dots, shrink=0.7, pad=0.02, label="SPL of arrived tasks [%]", extend="min")
-    axes.set(xticklabels=[], yticklabels=[])
-    axes.grid(lw=0.3)
-    figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return figure
-
-
-def draw_field(axes: Axes, field: IGRF) -> None:
-    """Draw the dip poles, where B_H is weak, and where gradients are nearly parallel."""
-    latitude, longitude = torch.arange(-89.5, 90.0).double(), torch.arange(-180.0, 181.0).double()
-    places = torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
-    intensity, weakest = elements_at(field, places)[..., 2], weakest_change(field, places)
-    where = np.radians(longitude.numpy()), np.radians(latitude.numpy())
-    for values, level, look in ((intensity, WEAK_NT, "-"), (weakest, PARALLEL, ":")):
-        axes.contour(*where, values, [level], colors="black", linewidths=0.9, linestyles=look)
-    axes.plot([], [], "k-", lw=0.9, label=f"$B_H$ = {WEAK_NT} nT")
-    axes.plot([], [], "k:", lw=0.9, label=f"weakest change {PARALLEL}")
-    halves = (places[half].reshape(-1, 2)[intensity[half].argmin()] for half in (latitude < 0, latitude > 0))
-    north, east = np.radians(torch.stack(tuple(halves)).numpy()).T
-    axes.plot(east, north, "*", color="white", ms=13, mec="black", clip_on=False, zorder=4, label="dip pole")
+def prices(_: int | None) -> Figures:
+    """Return SPL over the steps from table prices, a panel for each level of noise, a point for each price."""
+    lines = (RESULTS / "prices.md").read_text().splitlines()
+    head, _, *rows = ([cell.strip() for cell in line.strip("| ").split("|")] for line in lines)
+    figure = Figure(figsize=(10, 2.8), layout="constrained")
+    for column, axes in enumerate(figure.subplots(1, len(LEVELS)), start=len(head) - len(LEVELS)):
+        for name in ("anywhere", "kalman"):
+            points = [row[column].split(" / ") for row in rows if row[0].startswith(label(name))]
+            steps, spl = zip(*sorted((float(steps), float(spl)) for _, spl, steps in points), strict=True)
+            axes.plot(steps, spl, "o-", ms=3, lw=1, label=label(name))
+        axes.set(title=head[column], xlabel="steps")
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("SPL [%]")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    return {"prices": figure}
 
 
 FIGURES: Mapping[str, Callable[[int | None], Figures]] = {
@@ -269,6 +247,7 @@ FIGURES: Mapping[str, Callable[[int | None], Figures]] = {
     "conditions": conditions,
     "globe": globe,
     "paper-run": paper_run,
+    "prices": prices,
 }
 
 

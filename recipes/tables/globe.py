@@ -9,8 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from flights import flown
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from torch import Tensor
 from torchrl.data import Unbounded
 from tqdm import tqdm
@@ -19,6 +22,7 @@ from magrl import paper
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks
 from magrl.envs.specs import state_spec
 from magrl.envs.tasks import task_set
+from magrl.evaluation.maps import coastlines
 from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.tables import markdown_table
 from magrl.field import IGRF, elements_at, elements_gradient_at
@@ -27,6 +31,8 @@ from magrl.guidance import OBJECTIVE_FLOORS
 
 EARTH = Region((-90, 90), (-180, 180))
 CHUNK = 1000  # tasks flown at a time
+WEAK_NT, PARALLEL = 8000, 0.1
+"""Contours of the map: B_H, and the weakest change below which gradients are nearly parallel."""
 STEP_KM = 25.0
 """Distance over which elements change by about their floors :data:`~magrl.guidance.OBJECTIVE_FLOORS`."""
 BANDS = {
@@ -139,3 +145,36 @@ def globe(navigator: str = "anywhere", *, tasks: int = 10_000, noise: Noise = (0
     return table(
         {name: measured(navigator, field, ends, level) for name, level in levels.items()}, properties(field, ends)
     )
+
+
+def globe_map(field: IGRF, tasks: Tasks, measures: Measures) -> Figure:
+    """Return the map of the Earth (Mollweide's equal-area projection) with each task at its start."""
+    figure = Figure(figsize=(9, 4.9), layout="constrained")
+    axes = figure.add_subplot(projection="mollweide")
+    axes.plot(*np.radians(coastlines()).T[::-1], color="#8c8c8c", lw=0.6)
+    draw_field(axes, field)
+    (north, east), arrived = np.radians(tasks.start.numpy()).T, measures["success"].numpy()
+    order = np.flatnonzero(arrived)[(-measures["spl"].numpy()[arrived]).argsort(kind="stable")]  # detours on top
+    spl = 100 * measures["spl"].numpy()[order]
+    dots = axes.scatter(east[order], north[order], c=spl, s=4, lw=0, cmap="viridis", vmin=50, vmax=100)
+    axes.plot(east[~arrived], north[~arrived], "x", color="#D55E00", ms=5, mew=1.5, label="not arrived")
+    figure.colorbar(dots, shrink=0.7, pad=0.02, label="SPL of arrived tasks [%]", extend="min")
+    axes.set(xticklabels=[], yticklabels=[])
+    axes.grid(lw=0.3)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def draw_field(axes: Axes, field: IGRF) -> None:
+    """Draw the dip poles, where B_H is weak, and where gradients are nearly parallel."""
+    latitude, longitude = torch.arange(-89.5, 90.0).double(), torch.arange(-180.0, 181.0).double()
+    places = torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
+    intensity, weakest = elements_at(field, places)[..., 2], weakest_change(field, places)
+    where = np.radians(longitude.numpy()), np.radians(latitude.numpy())
+    for values, level, look in ((intensity, WEAK_NT, "-"), (weakest, PARALLEL, ":")):
+        axes.contour(*where, values, [level], colors="black", linewidths=0.9, linestyles=look)
+    axes.plot([], [], "k-", lw=0.9, label=f"$B_H$ = {WEAK_NT} nT")
+    axes.plot([], [], "k:", lw=0.9, label=f"weakest change {PARALLEL}")
+    halves = (places[half].reshape(-1, 2)[intensity[half].argmin()] for half in (latitude < 0, latitude > 0))
+    north, east = np.radians(torch.stack(tuple(halves)).numpy()).T
+    axes.plot(east, north, "*", color="white", ms=13, mec="black", clip_on=False, zorder=4, label="dip pole")

@@ -56,7 +56,7 @@ RECIPE = "grid.py"
 LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
 """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
 DISTANCES = ("final_distance_km_median", "final_distance_km_p90")
-OPTIONS = {"map_date": "map of", "step_km": "step [km]"}
+OPTIONS = {"map_date": "map of", "step_km": "step [km]", "step_price": "step [% of SPL]"}
 BOUND = ("best estimate at the destination, by the data sheet", "the gradient")
 FILE, RESULTS = Path(__file__).parent / "tables.toml", Path("docs/results")
 EAST_OF_THE_PAPER = Region((-10, 0), (175, 185))

@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 
 import ppo
+import ppo_anywhere
 import pytest
-import td3_anywhere
 import td3_gradient_guided as recipe
 import td3_recurrent
 import torch
@@ -26,7 +26,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.training import command, parse_config
 from magrl.transforms import SensorNoise
 
-RECIPES = (recipe, td3_anywhere, td3_recurrent, ppo)
+RECIPES = (recipe, ppo_anywhere, td3_recurrent, ppo)
 NOISE = (0.05, 0.05, 5.0)
 
 
@@ -147,8 +147,8 @@ def test_actor_that_ppo_saves_is_the_stochastic_one_without_noise() -> None:
         (recipe, "--num-envs 8 --collectors 3", "num_envs 8 cannot be divided evenly among 3 collectors"),
         (td3_recurrent, "--noise 0.05 0.05", "Missing value for argument '--noise'. Expected 3 values"),
         (td3_recurrent, "--shortest-task-km 600", "shortest_task_km must be below 500, got 600.0"),
-        (td3_anywhere, "--distance-range-km 500 300", "must be two rising numbers, got (500.0, 300.0)"),
-        (td3_anywhere, "--scenario docs/examples/azores.toml", "scenario must be left out"),
+        (ppo_anywhere, "--distance-range-km 500 300", "must be two rising numbers, got (500.0, 300.0)"),
+        (ppo_anywhere, "--scenario docs/examples/azores.toml", "scenario must be left out"),
         (ppo, "--num-envs 8", "batch_size 1024 must not exceed num_envs * steps_per_batch, 128"),
     ],
 )

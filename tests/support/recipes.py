@@ -29,6 +29,8 @@ SMALL = {
     "updates_per_batch": 2,
     "updates_per_step": 1,
     "epochs": 1,
+    "steps_per_batch": 2,
+    "critic_batches": 1,
     "num_slices": 4,
     "memory_size": 8,
     "num_regions": 8,

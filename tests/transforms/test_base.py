@@ -22,13 +22,15 @@ from torchrl.envs.utils import check_env_specs
 from magrl.transforms import (
     AlignmentReward,
     AngleVector,
-    DetourReward,
     DistanceCost,
     FieldGradient,
     GradientHeading,
+    HighestSPL,
     MinMaxNorm,
     RandomSensorNoise,
+    RandomStepPrice,
     SensorErrors,
+    SPLReward,
     TargetDifference,
     TrueWay,
 )
@@ -77,7 +79,7 @@ def pendulum() -> Transform:
 
 ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     "guided": (nav, guided),
-    "rewarded": (nav, lambda: Compose(TrueWay(), DetourReward())),
+    "rewarded": (nav, lambda: Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())),
     "every error": (nav, every_error),
     "plane": (partial(PlaneEnv, (3,), torch.float64), of_a_plane),
     "scaled pendulum": (PendulumEnv, pendulum),

@@ -10,20 +10,18 @@ from support.errors import nav
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
+from magrl.evaluation import episode_measures
 from magrl.geodesy import geodesic, move
 from magrl.navigators import Secant
-from magrl.transforms import DetourReward, DistanceCost, TrueWay
-from magrl.transforms.rewards import detour_reward
+from magrl.transforms import DistanceCost, HighestSPL, RandomStepPrice, SPLReward, TrueWay
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
 
 
-def chain(**options: float) -> Compose:
-    return Compose(TrueWay(), DetourReward(**options))
-
-
 def rewarded(num_envs: int = 2, **options: object) -> TransformedEnv:
-    return TransformedEnv(nav(num_envs, **options), chain())
+    return TransformedEnv(
+        nav(num_envs, **options), Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())
+    )
 
 
 # The way
@@ -47,74 +45,59 @@ def test_way_leads_to_the_target(latitude: float) -> None:
 # The reward
 
 
-def test_reward_by_hand() -> None:
-    """50 km for 30 km of progress on a task of 400 km waste 5 %; then the same lost, and a move of length 0."""
-    moved, progress, task = torch.tensor([50.0, 50.0, 0.0]), torch.tensor([30.0, 30.0, 0.0]), torch.tensor(400.0)
-    arrived, lost = torch.tensor([True, False, False]), torch.tensor([False, True, False])
-    found = detour_reward(moved, progress, task, arrived, lost)
-    torch.testing.assert_close(found, torch.tensor([10 - 0.5 - 0.08, -5 - 0.5 - 0.08, -0.08]))
-    weights = {"arrival": 1.0, "detour": 2.0, "step": 0.5, "lost_penalty": 3.0}
-    found = detour_reward(moved, progress, task, arrived, lost, **weights)
-    torch.testing.assert_close(found, torch.tensor([1 - 0.1 - 0.5, -3 - 0.1 - 0.5, -0.5]))
+def test_highest_spl_by_hand() -> None:
+    """A task of 100 km: 60 km flown for 40 km of progress; then the arrival after 40 km more, or the end elsewhere."""
+    start, target = torch.zeros(3, 2), torch.tensor([[0.0, 0.898315]]).expand(3, 2)
+    flags = torch.tensor([[False], [True], [False]]), torch.tensor([[False], [True], [True]])
+    after = TensorDict(
+        true_way=torch.tensor([[60.0, 0.0], [3.0, 4.0], [60.0, 0.0]]),
+        move=torch.tensor([[60.0, 0.1], [100.0, 0.0], [60.0, 0.0]]),
+        start_position=start,
+        target_position=target,
+        success=flags[0],
+        done=flags[1],
+        step_price=torch.full((3, 1), 0.5),
+        batch_size=[3],
+    )
+    before = {"true_way": torch.tensor([[0.0, 100.0]]).expand(3, 2), "highest_spl": torch.ones(3, 1)}
+    step = SPLReward()(HighestSPL()(TensorDict({**before, "next": after}, [3])))["next"]
+    torch.testing.assert_close(step["highest_spl"], torch.tensor([[100 / 120], [1.0], [0.0]]), rtol=0, atol=1e-4)
+    torch.testing.assert_close(step["reward"], 10 * (step["highest_spl"] - 1) - 0.05)
 
 
-def test_return_of_an_episode_is_the_wasted_share_of_its_path() -> None:
-    """10 - 10 waste / distance - 0.08 a step for those that arrive, with lengths computed from the positions."""
-    env = rewarded(32, zeta=0.05)
-    rollout = env.rollout(50, Secant(), break_when_any_done=False, break_when_all_done=True)
-    after, returns, arrived = rollout["next"], [], 0
-    for row in range(32):
-        ended = after["done"][row, :, 0].nonzero()
-        steps = int(ended[0]) + 1 if len(ended) else after.shape[1]
-        places = torch.cat((rollout["position"][row, :1], after["position"][row, :steps]))
-        target = after["target_position"][row, 0]
-        path_km = geodesic(*places[:-1].T, *places[1:].T)[0].sum()
-        first_km, last_km = (geodesic(*places[k], *target)[0] for k in (0, -1))
-        success = bool(after["success"][row, steps - 1])
-        lost = bool(after["terminated"][row, steps - 1]) and not success
-        waste = (path_km - (first_km - last_km)) / first_km
-        expected = 10 * success - 5 * lost - 10 * waste - 0.08 * steps
-        assert after["reward"][row, :steps].sum().item() == pytest.approx(expected.item(), abs=2e-3)
-        returns.append(expected.item())
-        arrived += success
-    assert arrived > 20
-    assert max(returns) > 8
-    assert len(set(returns)) == 32
+def test_return_of_an_episode_is_its_spl_less_its_steps() -> None:
+    env = rewarded(64, max_steps=10)
+    rollout = env.rollout(10, Secant(), break_when_any_done=False, break_when_all_done=True)
+    measures = episode_measures(rollout)
+    within = torch.arange(rollout.shape[1]) < measures["steps"].unsqueeze(-1)
+    returns = (rollout["next", "reward"].squeeze(-1) * within).sum(-1)
+    price = rollout["step_price"][:, 0, 0]
+    torch.testing.assert_close(
+        returns.double(), 10 * (measures["spl"] - 1) - 0.1 * price * measures["steps"], rtol=0, atol=5e-3
+    )
+    assert 10 < measures["success"].sum() < 60
 
 
-def test_a_lost_vehicle_pays_once() -> None:
-    """And no longer, where the environment goes on with other vehicles."""
-    td = rewarded(1).rollout(2)[0, 0]["next"]
-    flags = {"success": torch.tensor([False]), "terminated": torch.tensor([True])}
-    lost = TensorDict(td.clone().update(flags))
-    steps = TensorDict(true_way=lost["true_way"].clone(), next=lost)
-    reward = DetourReward()(steps)["next", "reward"].item()
-    waste = lost["move"][0] / geodesic(*lost["start_position"], *lost["target_position"])[0]
-    assert reward == pytest.approx(-5 - 0.08 - 10 * waste.item(), abs=1e-3)
-
-
-def test_reward_replaces_that_of_the_environment_or_stands_beside_it() -> None:
-    torch.manual_seed(0)
-    plain = nav().rollout(3)["next", "reward"]
-    torch.manual_seed(0)
-    beside = TransformedEnv(nav(), Compose(TrueWay(), DetourReward(out_keys=["detour"]))).rollout(3)["next"]
-    torch.manual_seed(0)
-    assert torch.equal(rewarded().rollout(3)["next", "reward"], beside["detour"])
-    assert torch.equal(beside["reward"], plain)
+def test_prices_are_log_uniform_and_stay_for_an_episode() -> None:
+    price = TransformedEnv(nav(2000), RandomStepPrice((0.1, 10.0), seed=3)).rollout(2)["step_price"]
+    assert torch.equal(price[:, 0], price[:, 1])
+    assert abs(price.log10().mean()) < 0.05
+    assert price.log10().std() == pytest.approx(2 / 12**0.5, abs=0.02)
+    for bad in ((0.0, 1.0), (2.0, 1.0)):
+        with pytest.raises(ValueError, match="price_range must be two rising numbers above 0"):
+            RandomStepPrice(bad)
 
 
 # Specs and errors
 
 
 def test_what_is_missing_is_named() -> None:
-    """Without the way before the move there is no reward, and that of the environment must not pass for it."""
+    """Without the state before the move there is no reward, and that of the environment must not pass for it."""
     td = rewarded().rollout(2)[:, 0]
-    with pytest.raises(KeyError, match=r"DetourReward reads its state .*true_way"):
-        DetourReward()(td.exclude("true_way"))
-    with pytest.raises(KeyError, match=r"DetourReward reads .*success"):
-        DetourReward()(td.exclude(("next", "success")))
-    with pytest.raises(KeyError, match=r"DetourReward reads .*true_way"):
-        _ = TransformedEnv(nav(), DetourReward()).specs
+    with pytest.raises(KeyError, match=r"SPLReward reads its state .*highest_spl"):
+        SPLReward()(td.exclude("highest_spl"))
+    with pytest.raises(KeyError, match=r"HighestSPL reads .*success"):
+        HighestSPL()(td.exclude(("next", "success")))
 
 
 def long_move(td: TensorDict) -> TensorDict:
@@ -130,7 +113,7 @@ def test_distance_cost_is_paid_for_each_kilometer() -> None:
     assert (move[..., 0] == 30).all()
 
 
-@pytest.mark.parametrize("reward", [lambda: DistanceCost(-1.0), lambda: DetourReward(step=-1.0)])
+@pytest.mark.parametrize("reward", [lambda: DistanceCost(-1.0), lambda: SPLReward(scale=-1.0)])
 def test_a_negative_weight_is_refused(reward) -> None:
-    with pytest.raises(ValueError, match=r"(cost|step) must be .*-1\.0"):
+    with pytest.raises(ValueError, match=r"(cost|scale) must be .*-1\.0"):
         reward()

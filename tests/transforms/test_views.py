@@ -46,6 +46,8 @@ def by_hand(**change: Tensor) -> Tensor:
         "weights": float64([100.0, 25.0, 0.01]),
         "sensor_std": float64([0.1, 0.0, 5.0]),
         "time": float64([0.3]),
+        "planned": float64([-12.0, 16.0]),
+        "step_price": float64([0.4]),
     }
     return track_observation(**(values | change))
 
@@ -61,6 +63,8 @@ def test_the_numbers_by_hand() -> None:
         math.log(2.1) / 3 - 0.5,  # F over the threshold
         0.3,  # time
         *(math.log(0.1) / 2 + 2, math.log(0.002) / 2 + 2, math.log(0.05) / 2 + 2),  # noise
+        *(-0.6, 0.8, math.log(2) - 1),  # plan
+        math.log(4) / 2,  # price
     ]
     torch.testing.assert_close(by_hand(), float64(expected))
     assert len(expected) == VIEW.size
@@ -78,8 +82,8 @@ def test_numbers_at_the_extremes() -> None:
 def observed_track(turn: float) -> Tensor:
     """The observations of three readings, with world and vehicle turned by an angle [rad] to the right.
 
-    With the prior of a dipole and without the relation of the gradients: in others, true north has a meaning, as the
-    meridians converge there.
+    With the prior of a dipole, without the relation of the gradients and without the plan, which uses it: there, true
+    north has a meaning, as the meridians converge.
     """
     free = {"prior": dipole_prior, "relation": None}
     track = TrackGradient((*IN_KEYS, "sensor_std"), **free, range_km=VIEW.range_km, frame="vehicle")
@@ -91,9 +95,10 @@ def observed_track(turn: float) -> Tensor:
     for step in range(3):
         for key in ("field", "target_field"):
             seen[key][:, 0] = torch.remainder(seen[key][:, 0] + 180, 360) - 180
-        seen["sensor_std"], seen["step_count"] = float64(STD).expand(4, 3), torch.full((4, 1), step)
+        seen["sensor_std"], seen["bias_std"] = float64(STD).expand(4, 3), torch.zeros(4, 3, dtype=torch.float64)
+        seen["step_count"] = torch.full((4, 1), step)
         state = observe(seen.clone()) if state is None else observe(state.copy().set("next", seen.clone()))["next"]
-        observations.append(state["observation"])
+        observations.append(torch.cat((state["observation"][:, :15], state["observation"][:, 18:]), -1))
         seen = moved(seen, 40.0, 0.7, float64([0.3, 0.4, -60.0]) / (1 + step))
     return torch.stack(observations)
 

@@ -16,7 +16,7 @@ def load_pretrained(name: str, device: torch.device | str = "cpu") -> FieldPolic
     """Return a trained policy that comes with the library.
 
     Args:
-        name: ``"anywhere"``, which navigates without a map (``recipes/td3_anywhere.py``).
+        name: ``"anywhere"``, which navigates without a map (``recipes/ppo_anywhere.py``).
         device: device on which the policy acts.
 
     Raises:

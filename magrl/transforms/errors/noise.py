@@ -1,10 +1,10 @@
-"""White noise of sensors: what is measured is written over what is true, which is kept under a key of its own."""
+"""Noise of sensors: what is measured is written over what is true, which is kept under a key of its own."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -12,8 +12,12 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_tensor, check_type
-from magrl.counters import stream_uniform
-from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes
+from magrl.counters import normal_of, stream_uniform
+from magrl.transforms.base import Keys
+from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, gauss_markov
+
+LASTING_KM = 200.0
+"""Correlation length of lasting errors that are not constant [km]; chosen."""
 
 
 class SensorNoise(ReadingErrors):
@@ -44,7 +48,7 @@ class SensorNoise(ReadingErrors):
     """
 
     channel = 1
-    default_in_keys = ("field",)
+    default_in_keys: ClassVar[Keys] = ("field",)
     error_key, stream_key = "sensor_error", "sensor_stream"
 
     def __init__(self, sensor_std: Sequence[float], **options: Any) -> None:
@@ -78,12 +82,16 @@ class SensorNoise(ReadingErrors):
 
 
 class RandomSensorNoise(SensorNoise):
-    """White noise whose standard deviations are drawn for each vehicle and episode, for domain randomization.
+    """Noise and lasting errors whose standard deviations are drawn for each vehicle and episode (domain randomization).
+
+    A lasting error is the sum of a constant one and of a first-order Gauss-Markov process along the way
+    (:data:`LASTING_KM`), with shares of its variance that are drawn, too.
 
     Args:
-        levels: function of uniform numbers ``(..., draws)`` in [0, 1) that returns standard deviations ``(..., E)``.
+        levels: function of uniform numbers ``(..., draws)`` in [0, 1) that returns standard deviations ``(..., 2 E)``:
+            those of the errors that are new in each reading, then those of lasting ones.
         draws: how many uniform numbers it takes.
-        **options: of :class:`SensorNoise`, except ``sensor_std``.
+        **options: of :class:`SensorNoise`, except ``sensor_std``; ``in_keys`` are a reading and the last move.
 
     Raises:
         TypeError: for ``levels`` that cannot be called.
@@ -98,47 +106,77 @@ class RandomSensorNoise(SensorNoise):
         (True, False)
     """
 
-    def __init__(self, levels: Callable[[Tensor], Tensor] | None = None, *, draws: int = 7, **options: Any) -> None:
+    default_in_keys: ClassVar[Keys] = ("field", "move")
+
+    def __init__(self, levels: Callable[[Tensor], Tensor] | None = None, *, draws: int = 12, **options: Any) -> None:
         levels = sensor_levels if levels is None else levels
         if not callable(levels):
             raise TypeError(f"levels must be a function of uniform numbers, got {levels!r}")
         check_number(1, whole=True, draws=draws)
-        super().__init__(levels(torch.full((draws,), 0.5)).tolist(), **options)  # those of a typical episode
-        self.levels, self.draws = levels, draws
+        typical = levels(torch.full((draws,), 0.5)).tolist()
+        super().__init__(typical[: len(typical) // 2], **options)
+        self.levels, self.level_draws, self.count = levels, draws, self.size
+        self.in_sizes = (self.count, None)
+        self.draws, self.step_draws, self.size = draws + 1 + 2 * self.count, 2 * self.count, 5 * self.count
 
     def _constants(self, stream: Tensor) -> Tensor:
-        return self.levels(stream_uniform(stream, self.draws))
+        uniform = stream_uniform(stream, self.draws)
+        level, share, normal = uniform.split((self.level_draws, 1, self.step_draws), -1)
+        sensor_std, lasting = self.levels(level).split(self.count, -1)
+        constant_std, drift_std = lasting * share.sqrt(), lasting * (1 - share).sqrt()
+        first, second = normal_of(normal).split(self.count, -1)
+        return torch.cat((sensor_std, lasting, constant_std * first, drift_std, drift_std * second), -1)
+
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
+        value, move = values
+        normal = normal_of(stream_uniform(episode.stream, self.step_draws)).to(value.dtype)
+        noise, walk = normal.split(self.count, -1)
+        sensor_std, lasting, constant, drift_std, drift = episode.errors.split(self.count, -1)
+        if not episode.first:
+            drift = gauss_markov(drift, drift_std, move[..., :1], LASTING_KM, walk)
+        self._measure(tensordict, value, value + sensor_std * noise + constant + drift, sensor_std)
+        tensordict.set(self.bias_key, torch.hypot(tensordict.get(self.bias_key), lasting))
+        return torch.cat((sensor_std, lasting, constant, drift_std, drift), -1)
 
 
 def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
-    """Return standard deviations of D [deg], I [deg] and B_H [nT] from perfect sensors to poor ones.
+    """Return standard deviations of the errors of D [deg], I [deg] and B_H [nT] from perfect sensors to poor ones.
 
     In 15 % of cases there is no noise. Otherwise a common factor spans two decades up to 0.2 deg, 0.2 deg and 20 nT,
     half of them above 0.04 deg. Each element has a factor of its own, log-uniform from 0.4 to 2.5,
     and in 30 % of cases that of D is multiplied by a number from 1 to 7, as where the north reference is poor.
 
+    In half of the cases there are lasting errors as well, log-uniform over 1.6 decades up to 0.35 deg, 0.05 deg and
+    45 nT, with the same factors of their own.
+
     Args:
-        uniform: ``(..., 7)`` uniform numbers in [0, 1).
+        uniform: ``(..., 12)`` uniform numbers in [0, 1).
         exponent: of the uniform number in the logarithm of the common factor: with 1 it is log-uniform, with half of
             the cases above 0.02 deg; the larger, the more noise.
 
     Returns:
-        ``(..., 3)``.
+        ``(..., 6)``: those of new errors of a reading, and those of lasting ones.
 
     Raises:
         ValueError: for another number of uniform numbers, or an exponent that is not above 0.
 
     Example:
-        >>> sensor_levels(torch.tensor([0.5, 0.0, 0.5, 0.5, 0.5, 0.5, 0.5]))
-        tensor([ 0.2000,  0.2000, 20.0000])
+        >>> sensor_levels(torch.tensor([0.5, 0.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5, 0.5]))
+        tensor([ 0.2000,  0.2000, 20.0000,  0.0000,  0.0000,  0.0000])
     """
-    check_tensor(7, uniform=uniform)
+    check_tensor(12, uniform=uniform)
     check_number(0, above=True, exponent=exponent)
-    none, common, poor, factor = (uniform[..., k : k + 1] for k in (0, 1, 5, 6))
-    level = 10 ** (-2 * common**exponent) * 10 ** (0.8 * uniform[..., 2:5] - 0.4) * uniform.new_tensor((0.2, 0.2, 20.0))
+    none, common, poor, factor, exact, lasting = (uniform[..., k : k + 1] for k in (0, 1, 5, 6, 7, 8))
+    new = 10 ** (-2 * common**exponent) * _each(uniform[..., 2:5]) * uniform.new_tensor((0.2, 0.2, 20.0))
     declination = torch.where(poor < 0.3, 1 + 6 * factor, 1.0)
-    level = level * torch.cat((declination, torch.ones_like(uniform[..., :2])), -1)
-    return torch.where(none < 0.15, 0.0, level)
+    new = new * torch.cat((declination, torch.ones_like(uniform[..., :2])), -1)
+    slow = 10 ** (-1.6 * lasting) * _each(uniform[..., 9:12]) * uniform.new_tensor((0.35, 0.05, 45.0))
+    return torch.cat((torch.where(none < 0.15, 0.0, new), torch.where(exact < 0.5, 0.0, slow)), -1)
+
+
+def _each(uniform: Tensor) -> Tensor:
+    """Return the factors of the elements, log-uniform from 0.4 to 2.5."""
+    return 10 ** (0.8 * uniform - 0.4)
 
 
 def with_sensor_noise(env: EnvBase, sensor_std: Sequence[float], seed: int = 0) -> EnvBase:

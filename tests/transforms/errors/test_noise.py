@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from magrl.transforms import (
     sensor_levels,
     with_sensor_noise,
 )
+from magrl.transforms.errors.noise import LASTING_KM
 
 F64 = torch.float64
 
@@ -77,25 +79,39 @@ def test_without_noise_the_reading_is_the_value_to_the_bit() -> None:
 
 
 def test_levels_by_hand() -> None:
-    #                       none  common  own factors        D poor  by
+    #    none  common  own factors  D poor  by, then of lasting errors: none  common  own factors
     uniform = torch.tensor(
         [
-            [0.1499, 0.0, 0.5, 0.5, 0.5, 0.0, 0.5],  # perfect sensors
-            [0.15, 0.5 ** (2 / 3), 0.5, 0.5, 0.5, 0.3, 0.5],  # a tenth of the largest
-            [0.99, 1.0, 0.0, 1.0, 0.5, 0.9, 0.5],  # a hundredth, with factors 0.398, 2.512, 1
-            [0.99, 0.0, 0.5, 0.5, 0.5, 0.29, 0.5],  # a poor north reference: 1 + 6 / 2
+            [0.1499, 0.0, 0.5, 0.5, 0.5, 0.0, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5],  # perfect sensors, lasting errors
+            [0.15, 0.5 ** (2 / 3), 0.5, 0.5, 0.5, 0.3, 0.5, 0.5, 0.625, 0.0, 1.0, 0.5],  # a tenth of the largest
+            [0.99, 1.0, 0.0, 1.0, 0.5, 0.9, 0.5, 0.49, 0.0, 0.5, 0.5, 0.5],  # a hundredth, factors 0.398, 2.512, 1
+            [0.99, 0.0, 0.5, 0.5, 0.5, 0.29, 0.5, 0.0, 0.0, 0.5, 0.5, 0.5],  # a poor north reference: 1 + 6 / 2
         ],
         dtype=F64,
     )
     factor = 10**0.4
-    expected = [[0, 0, 0], [0.02, 0.02, 2.0], [0.002 / factor, 0.002 * factor, 0.2], [0.8, 0.2, 20]]
+    expected = [
+        [0, 0, 0, 0.35, 0.05, 45.0],
+        [0.02, 0.02, 2.0, 0.035 / factor, 0.005 * factor, 4.5],
+        [0.002 / factor, 0.002 * factor, 0.2, 0, 0, 0],
+        [0.8, 0.2, 20, 0, 0, 0],
+    ]
     torch.testing.assert_close(sensor_levels(uniform), torch.tensor(expected, dtype=F64))
     uniform[1, 1] = 0.5
     torch.testing.assert_close(sensor_levels(uniform, 1.0), torch.tensor(expected, dtype=F64))
 
 
+def noisy(lasting: float) -> Callable[[Tensor], Tensor]:
+    """Levels of random noise in silence, or with one lasting error."""
+
+    def levels(uniform: Tensor) -> Tensor:
+        return torch.cat((sensor_levels(uniform)[..., :3], torch.full_like(uniform[..., :3], lasting)), -1)
+
+    return levels
+
+
 def test_random_noise_has_the_level_of_its_episode() -> None:
-    env = under(RandomSensorNoise(seed=3), num_envs=2000)
+    env = under(RandomSensorNoise(noisy(0.0), seed=3), num_envs=2000)
     td = torch.stack([s.select("field", "true_field", "sensor_std") for s in flown(env, actions(6, 2000))])
     std = td["sensor_std"]
     assert torch.equal(std, std[:1].expand_as(std))
@@ -109,11 +125,24 @@ def test_random_noise_has_the_level_of_its_episode() -> None:
     assert ((again != std[0]).any(-1) | (again == 0).all(-1)).double().mean() > 0.95
 
 
+def test_lasting_errors_are_partly_constant_and_as_large_as_told() -> None:
+    """Their correlation along the way is that of a half that is constant and a half that drifts."""
+    env = under(RandomSensorNoise(noisy(30.0), seed=3), num_envs=4000)
+    keys = ("field", "true_field", "bias_std", "sensor_std", "move")
+    td = torch.stack([state.select(*keys) for state in flown(env, actions(9, 4000))])
+    assert (td["bias_std"] == 30).all()
+    silent = (td["sensor_std"][0] == 0).all(-1)
+    error, moved = (td["field"] - td["true_field"])[:, silent, 2] / 30, td["move"][:, silent, 0].cumsum(0)
+    assert error.std() == pytest.approx(1.0, rel=0.06)
+    expected = 0.5 + 0.5 * torch.exp(-moved / LASTING_KM)  # shares are uniform
+    torch.testing.assert_close((error * error[0]).mean(-1), expected.mean(-1), rtol=0, atol=0.15)
+
+
 def test_own_levels() -> None:
     """Of as many numbers as they need, which are not those of the readings."""
 
     def levels(uniform: Tensor) -> Tensor:
-        return torch.cat((uniform, uniform + 1, 0 * uniform), -1)
+        return torch.cat((uniform, uniform + 1, 0 * uniform, *[0 * uniform] * 3), -1)
 
     state = under(RandomSensorNoise(levels, draws=1), num_envs=1000).reset()
     std = state["sensor_std"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+import ppo_anywhere as recipe
 import pytest
-import td3_anywhere as recipe
 import torch
 from support.recipes import small
 from torch import Tensor
@@ -18,7 +18,7 @@ from magrl.field import igrf_coefficients
 from magrl.training import parse_config
 from magrl.transforms import RandomSensorNoise, TrackView
 
-VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
+VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2, step_price=None)
 
 
 def training_env(noise: tuple[float, float, float] = (0.0, 0.0, 0.0)):
@@ -31,7 +31,7 @@ def test_specs_of_the_training_environment() -> None:
     for noise in ((0.0, 0.0, 0.0), (0.05, 0.05, 5.0)):
         env = training_env(noise)
         check_env_specs(env, break_when_any_done="both")
-        assert env.observation_spec["observation"].shape == (6, 15)
+        assert env.observation_spec["observation"].shape == (6, 19)
         assert (type(env.transform[0]) is RandomSensorNoise) == (not any(noise))
         assert env.transform[0].seed == 5
 
@@ -42,8 +42,8 @@ def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
     assert 0.4 < td["true_way_scaled"].norm(dim=-1).mean() < 3.0
     torch.testing.assert_close(td["episode_reward"], td["reward"].cumsum(1))
     assert "episode_reward_proximity" not in td.keys()  # noqa: SIM118
-    assert PolicyConfig(VIEW, (8,)).make_actor().in_keys == ["observation"]
-    assert recipe.OBSERVED == ("observation", "true_way_scaled")
+    assert PolicyConfig(VIEW, (8,)).make_actor().in_keys == ["observation", "planned_move"]
+    assert recipe.OBSERVED == ("observation", "true_way_scaled", "highest_spl")
 
 
 @pytest.mark.usefixtures("without_figures")

@@ -1,0 +1,289 @@
+"""PPO without a map: train on random planets an agent that finds its way on Earth by the estimates of its own track.
+
+    python recipes/ppo_anywhere.py                  # preset far: destinations 150-1800 km away
+    python recipes/ppo_anywhere.py --preset fast    # destinations 300-500 km away
+    python recipes/ppo_anywhere.py --resume RUN     # resume an interrupted run exactly
+
+The agent corrects the move that dual control plans, so that it begins as the navigator `kalman`. The regions are
+patches of planets whose magnetic fields have the spectrum and the polarity of the Earth's and nothing else of it. The
+errors of the sensors and the price of a step are drawn for each episode. The test tasks are on Earth, in regions that
+no training sees.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from pydantic import model_validator
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torch.optim import Adam
+from torchrl.envs import Compose, ObservationNorm, RewardSum, TransformedEnv
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from magrl import paper
+from magrl.agents import FieldPolicy, PolicyConfig, optimize
+from magrl.agents.networks import make_mlp
+from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
+from magrl.training import Run, command, parse_config
+from magrl.training.collectors import make_collector
+from magrl.training.config import Count, Discount, LearningConfig, NonNegative, Positive, Rising, Share, Widths
+from magrl.transforms import (
+    HighestSPL,
+    RandomSensorNoise,
+    RandomStepPrice,
+    SensorNoise,
+    SPLReward,
+    TrackView,
+    TrueWay,
+    sensor_levels,
+)
+from magrl.transforms.views import STEP_PRICE
+
+RECIPE = "ppo_anywhere.py"
+LOSSES = ("loss_critic", "loss_actor")
+PRIVILEGED = ("true_way_scaled", "highest_spl")
+OBSERVED = ("observation", *PRIVILEGED)
+TRANSITION = (
+    *OBSERVED,
+    "correction",
+    "correction_log_prob",
+    *(("next", k) for k in (*OBSERVED, "reward", "done", "terminated")),
+)
+
+
+class Config(LearningConfig):
+    """Settings of a training; the defaults are those of the preset."""
+
+    preset: Literal["far", "fast"] = "far"
+    """Source of the defaults: destinations 150-1800 km away, or 300-500 km."""
+
+    # Own defaults of shared settings
+    total_frames: Count = 7_864_320
+    num_envs: Count = 4096
+    eval_every: Count = 10
+    eval_tasks_small: Count = 1000
+    gamma: Discount = 0.999
+    learning_rate: Positive = 3e-4
+    final_learning_rate: Positive = 1e-5
+
+    # Environment
+    num_regions: Count = 2048
+    """Number of training regions, two on each random planet."""
+    distance_range_km: Rising = (150.0, 1800.0)
+    """Shortest and longest distance of a task [km]."""
+    max_steps: Count = 120
+    """Moves after which an episode is truncated."""
+    range_km: Positive = 1000.0
+    """Prior standard deviation of the way to the destination along each axis [km]."""
+    noise_exponent: Positive = 1.0
+    """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
+    price_range: Rising = (0.1, 3.0)
+    """Lowest and highest price of a step [% of SPL]; each episode has its own, which the agent observes."""
+
+    # PPO
+    critic_cells: Widths = (256, 256)
+    """Width of each hidden layer of the critic."""
+    steps_per_batch: Count = 32
+    """Steps of each vehicle in a collected batch."""
+    epochs: Count = 3
+    """Passes over a collected batch."""
+    batch_size: Count = 16_384
+    """Transitions per gradient step."""
+    critic_batches: Count = 3
+    """Collected batches before the first update of the actor."""
+    gae_lambda: Share = 0.95
+    """Factor lambda of the generalized advantage estimate."""
+    clip_epsilon: Positive = 0.2
+    """Largest change of the probability ratio that is rewarded."""
+    exploration: Positive = 0.4
+    """Standard deviation of the correction at the start of the training."""
+    final_exploration: Positive = 0.15
+    """Standard deviation of the correction at its end; linear in between."""
+    advantage_floor: NonNegative = 0.2
+    """What is added to the expected loss by which advantages are divided, so that easy episodes count as well."""
+    critic_learning_rate: Positive = 1e-3
+    """Learning rate of the critic at the start."""
+    final_critic_learning_rate: Positive = 5e-5
+    """Learning rate of the critic at the end; linear in between."""
+    clip_gradient: Positive = 1.0
+    """Largest norm of the actor's gradient."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> Config:
+        if self.scenario is not None:
+            raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
+        if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
+            raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
+        return self
+
+    @property
+    def regions(self) -> dict[str, Any]:
+        """Options of the regions: large enough for the longest task, and how the distances are drawn."""
+        if self.distance_range_km[1] > 500:
+            size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
+        else:
+            size = {"half_size_deg": 10, "degree": 12, "max_latitude": 70}
+        return {"distance_range_km": self.distance_range_km, **size}
+
+
+FAR = Config()
+FAST = Config(preset="fast", distance_range_km=(300.0, 500.0), max_steps=50, noise_exponent=1.5, total_frames=1_310_720)
+PRESETS = {"far": FAR, "fast": FAST}
+
+
+def sensors(config: Config, seed: int) -> SensorNoise:
+    """Return the noise of the sensors: that of the settings, or by default levels drawn for each episode."""
+    levels = partial(sensor_levels, exponent=config.noise_exponent)
+    return SensorNoise(config.noise, seed=seed) if any(config.noise) else RandomSensorNoise(levels, seed=seed)
+
+
+def make_view(base: GeomagneticNavEnv, range_km: float) -> TrackView:
+    """Return what the agent observes in training: the estimates of its own track, a plan, and the price of a step."""
+    limits = {name: getattr(base, name) for name in ("zeta", "max_steps", "max_move_km", "max_turn_rad")}
+    return TrackView(**limits, range_km=range_km, step_price=None)
+
+
+def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> TransformedEnv:
+    """Add the sensors, the price, the agent's view, and for training only what is privileged: critic and reward."""
+    price = RandomStepPrice(config.price_range, seed=base.seed)
+    scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
+    privileged = [TrueWay(), scaled_way, HighestSPL(), SPLReward(), RewardSum(["reward"])]
+    observed = [sensors(config, base.seed), price, *view.observation_transforms(), view.action_transform()]
+    return TransformedEnv(base, Compose(*observed, *privileged))
+
+
+def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config, **options: Any) -> TransformedEnv:
+    """Return an environment of random tasks of a scenario, drawn once, with the noise of the sensors."""
+    tasks = scenario.random_tasks(num_tasks, seed)
+    base = GeomagneticNavEnv(scenario.with_tasks(tasks), num_envs=num_tasks, seed=seed, **options)
+    return TransformedEnv(base, sensors(config, seed))
+
+
+class Spread(nn.Module):
+    """The standard deviation of corrections, the same for all: a buffer that the training sets."""
+
+    def __init__(self, std: float) -> None:
+        super().__init__()
+        self.register_buffer("std", torch.tensor(std))
+
+    def forward(self, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation."""
+        return mean, self.std.expand_as(mean)
+
+
+def make_stochastic_actor(actor: TensorDictSequential, spread: Spread) -> TensorDictSequential:
+    """Return the actor of the training: normal corrections around those of ``actor``, and the moves that follow."""
+    network, corrected_move = actor.module
+    drawn = ProbabilisticActor(
+        TensorDictSequential(
+            TensorDictModule(network.module, ["observation"], ["mean"]),
+            TensorDictModule(spread, ["mean"], ["loc", "scale"]),
+        ),
+        in_keys=["loc", "scale"],
+        out_keys=["correction"],
+        distribution_class=IndependentNormal,
+        distribution_kwargs={"tanh_loc": False},
+        return_log_prob=True,
+    )
+    return TensorDictSequential(drawn, corrected_move)
+
+
+def normalized(transitions: TensorDictBase, floor: float) -> TensorDictBase:
+    """Normalize advantages relative to the expected loss of an episode, which is larger by far with poor sensors."""
+    relative = transitions["advantage"] / (transitions["state_value"].abs() + floor)
+    transitions["advantage"] = ((relative - relative.mean()) / relative.std()).clamp(-5, 5)
+    return transitions
+
+
+def train(config: Config) -> dict[str, float]:
+    """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
+    torch.manual_seed(config.seed)
+    with Run(config, recipe=RECIPE, name=f"ppo_anywhere-{config.preset}", losses=LOSSES) as run:
+        # Environments
+        options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": "random"}
+        options |= {"device": config.device}
+        planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
+        base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
+        others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)
+        validation = evaluation_env(others, config.eval_tasks_small, paper.VALIDATION_SEED, config, **options)
+        earth = earth_scenario(128, seed=paper.TEST_SEED, **config.regions)
+        test = evaluation_env(earth, config.eval_tasks, paper.TEST_SEED, config, **options)
+        view = make_view(base, config.range_km)
+        env = make_env(base, view, config)
+
+        # Networks: the critic also reads the true way and the SPL that can still be reached, the actor never does
+        network = PolicyConfig(replace(view, step_price=STEP_PRICE), config.num_cells)
+        actor = network.make_actor(env.device)
+        spread = Spread(config.exploration).to(env.device)
+        stochastic_actor = make_stochastic_actor(actor, spread)
+        value = make_mlp(view.size + 3, 1, config.critic_cells, layer_norm=True, device=env.device)
+        critic = ValueOperator(value, in_keys=list(OBSERVED))
+
+        # Advantages and loss with a clipped probability ratio
+        advantage = GAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=critic, deactivate_vmap=True)
+        loss = ClipPPOLoss(
+            stochastic_actor[0],
+            critic,
+            clip_epsilon=config.clip_epsilon,
+            entropy_bonus=False,
+            normalize_advantage=False,
+            loss_critic_type="smooth_l1",
+        )
+        loss.set_keys(action="correction", sample_log_prob="correction_log_prob")
+        weights = [list(module.parameters()) for module in (actor, critic)]
+        rates = ("learning_rate", "critic_learning_rate")
+        optimizer = Adam([{"params": each, "lr": 0.0} for each in weights], fused=True)
+
+        collector = make_collector(
+            env,
+            stochastic_actor,
+            frames_per_batch=config.num_envs * config.steps_per_batch,
+            total_frames=config.total_frames,
+        )
+        run.start(
+            policy=FieldPolicy(network, actor).to(env.device),
+            validation=validation,
+            env=base,
+            collector=collector,
+            loss=loss,
+            optimizer=optimizer,
+            spread=spread,
+        )
+        stats = run.statistics
+        for batch in run.batches():
+            spread.std.fill_(config.linear("exploration", run.remaining))
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = config.linear(rate, run.remaining)
+            if stats.iterations <= config.critic_batches:
+                optimizer.param_groups[0]["lr"] = 0.0
+            for _ in range(config.epochs):
+                with torch.no_grad():
+                    transitions = normalized(advantage(batch.select(*TRANSITION)).reshape(-1), config.advantage_floor)
+                for indices in torch.randperm(len(transitions), device=env.device).split(config.batch_size):
+                    losses = loss(transitions[indices]).rename_key_("loss_objective", "loss_actor")
+                    total = losses["loss_actor"] + losses["loss_critic"]
+                    optimize(total, optimizer, clip=weights[0], max_norm=config.clip_gradient)
+                    stats.updates += 1
+            stats.losses = losses.select(*LOSSES).to_dict()
+        return run.finish(test)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line and train."""
+    train(parse_config(Config, PRESETS, RECIPE, __doc__, args))
+
+
+if __name__ == "__main__":
+    command(RECIPE, main)
