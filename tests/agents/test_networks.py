@@ -1,12 +1,17 @@
 """Networks of actors and critics."""
 
+import math
+
 import pytest
 import torch
+from support.tracks import STD
 from tensordict import TensorDict
 
-from magrl.agents import make_actor, make_critic, make_recurrent_actor
-from magrl.agents.networks import make_mlp
+from magrl.agents import FieldPolicy, PolicyConfig, make_actor, make_critic, make_recurrent_actor
+from magrl.agents.networks import CorrectedMove, make_mlp
 from magrl.envs import GeomagneticNavEnv
+from magrl.navigators import Kalman
+from magrl.transforms import TrackView, with_sensor_noise
 
 
 def test_new_actor_is_not_saturated() -> None:
@@ -15,6 +20,27 @@ def test_new_actor_is_not_saturated() -> None:
     actions = make_actor(13, (16, 16))(TensorDict(observation=2 * torch.rand(50, 13) - 1, batch_size=[50]))["action"]
     assert actions.abs().max() < 0.95
     assert actions.std(0).min() > 0.01
+
+
+def test_an_untrained_correction_is_the_move_of_kalman() -> None:
+    """Under noise, on the way: the plans differ only where rounding decides between two moves."""
+    view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
+    env = with_sensor_noise(GeomagneticNavEnv(num_envs=200, seed=0, start_heading="random"), STD)
+    kalman, agent, state = Kalman(sensor_std=STD), FieldPolicy(PolicyConfig(view, (8,))), env.reset()
+    for _ in range(4):
+        state = kalman(agent(state).rename_key_("action", "planned"))
+        off = (state["planned"] - state["action"]).abs() / torch.tensor([50.0, math.pi / 2])
+        assert (off.amax(-1) < 0.01).double().mean() > 0.97
+        state = env.step_mdp(env.step(state))
+
+
+def test_a_correction_scales_and_turns_the_plan() -> None:
+    """Up to the longest move; where the turn is too large, the vehicle turns where it is."""
+    corrected = CorrectedMove(50.0, math.pi / 2)
+    planned = torch.tensor([[20.0, 0.0], [20.0, 0.0], [0.0, 40.0], [-10.0, 0.0]])
+    change = torch.tensor([[0.0, 1.0], [2 * math.log(2.0), 0.0], [2.0, -math.pi], [0.0, -0.1]])
+    expected = torch.tensor([[-0.2, 1 / math.pi], [0.6, 0.0], [1.0, 0.0], [-1.0, 1.0]])
+    torch.testing.assert_close(corrected(planned, change), expected)
 
 
 def test_critic_reads_its_observations_before_the_action() -> None:

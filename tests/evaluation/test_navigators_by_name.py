@@ -102,6 +102,15 @@ def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_pat
         make_navigator(f"td3={run}", elsewhere)
 
 
+def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
+    env = GeomagneticNavEnv(num_envs=50, seed=0, max_steps=80)
+    agents = [make_navigator("anywhere", env, step_price=price) for price in (0.1, 3.0)]
+    assert [agent.config.view.step_price for agent in agents] == [0.1, 3.0]
+    assert agents[0].config.view.max_steps == 80
+    first, second = (agent(env.reset())["action"] for agent in agents)
+    assert not torch.equal(first, second)
+
+
 def test_navigators_that_are_given_twice(run: Path) -> None:
     check_distinct(["secant", "ga", "ga:flown", f"td3={run}", "policy:A=a.pt", "policy:B=b.pt"])
     for texts, mode, message in (
