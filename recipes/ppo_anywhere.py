@@ -70,7 +70,7 @@ class Config(LearningConfig):
     """Source of the defaults: destinations 150-1800 km away, or 300-500 km."""
 
     # Own defaults of shared settings
-    total_frames: Count = 7_864_320
+    total_frames: Count = 5_242_880
     num_envs: Count = 4096
     eval_every: Count = 10
     eval_tasks_small: Count = 1000
@@ -85,7 +85,7 @@ class Config(LearningConfig):
     """Shortest and longest distance of a task [km]."""
     max_steps: Count = 120
     """Moves after which an episode is truncated."""
-    range_km: Positive = 1000.0
+    range_km: Positive = 300.0
     """Prior standard deviation of the way to the destination along each axis [km]."""
     noise_exponent: Positive = 1.0
     """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""

@@ -108,7 +108,8 @@ class QuasiNewton(Navigator):
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         reading, target = (seen[key].double()[:, self.elements] for key in ("field", "target_field"))
-        track = tracking.start(reading, self.prior(reading, target), self.sensor_std[self.elements], self.scales)
+        std = self.reading_std(seen)[..., self.elements]
+        track = tracking.start(reading, self.prior(reading, target), std, self.scales)
         decisions = torch.zeros_like(seen["step_count"].squeeze(-1))
         return {
             "mean": track.mean,
