@@ -1,0 +1,229 @@
+"""The samples of a log as one table: time, three axes, attitude, speed and position."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas
+import torch
+from numpy.typing import NDArray
+from pandas import DataFrame, Series
+
+from magrl.checks import check_choice, short
+from magrl.logs.units import COLUMNS, column_of
+from magrl.logs.vectors import FRAMES
+
+AXES, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "heading")
+_ANGLES = ("roll", "heading", "longitude")  # which jump by 360 degrees
+_EPOCH = 1e8  # seconds: a time beyond is since 1970, one before since the log began
+_GAP, _GAP_SHARE = 10.0, 1e-3  # of the usual step, and of the log
+Array = NDArray[np.float64]
+Streams = Mapping[str, tuple[Array, Array]]
+"""Times [s] and values of each column, in the units of :data:`~magrl.logs.units.COLUMNS`."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """Samples of a vehicle.
+
+    Args:
+        samples: columns ``time`` [s, UTC since 1970 where it is known], ``x``, ``y``, ``z`` [nT, forward, right, down],
+            and those that the log has of ``roll``, ``pitch``, ``heading`` [deg], ``speed`` [m/s], ``distance`` since
+            the sample before [km], ``latitude``, ``longitude`` [deg], ``altitude`` [m].
+        source: format and sensors.
+        north: north of the heading, "true" or "magnetic", where the log tells.
+        notes: what a reader of the log must know.
+
+    Example:
+        >>> import pandas
+        >>> log = Log(pandas.DataFrame({"time": [1.8e9], "x": [1.0], "y": [2.0], "z": [3.0]}), "by hand")
+        >>> log.date, log.tensor("x", "z"), log.tensor("roll")  # no roll: level
+        ('2027-01-15', tensor([[1., 3.]], dtype=torch.float64), tensor([[0.]], dtype=torch.float64))
+    """
+
+    samples: DataFrame
+    source: str
+    north: str | None = None
+    notes: Sequence[str] = field(default_factory=tuple)
+
+    @property
+    def date(self) -> str | None:
+        """Date of the first sample, where the time is known."""
+        first = float(self.samples["time"].iloc[0])
+        return (
+            datetime.datetime.fromtimestamp(first, datetime.timezone.utc).strftime("%Y-%m-%d")
+            if first > _EPOCH
+            else None
+        )
+
+    def tensor(self, *names: str) -> torch.Tensor:
+        """Return columns ``(N, K)`` in float64; roll and pitch that the log lacks are zeros.
+
+        Raises:
+            ValueError: for another column that the log lacks.
+        """
+        held = self.samples
+        if missing := [name for name in names if name not in held and name not in ATTITUDE[:2]]:
+            raise ValueError(
+                f"the log has no {missing[0]}, only {', '.join(held)}: name its column so, or choose another log"
+            )
+        columns = [held[name].to_numpy(float) if name in held else np.zeros(len(held)) for name in names]
+        return torch.from_numpy(np.stack(columns, -1))
+
+
+def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[str]]:
+    """Return which rows have a new time, and notes on times that repeat and on gaps.
+
+    Args:
+        time: ``(N,)``.
+        unit: its unit, for the notes.
+
+    Raises:
+        ValueError: for times that run backward, with the row, or are not finite.
+
+    Example:
+        >>> check_times(np.array([0.0, 1.0, 1.0, 2.0]))
+        (array([ True, True, False, True]), ['1 row with the time of the row before left out'])
+    """
+    if not np.isfinite(time).all():
+        raise ValueError(f"row {int(np.argmin(np.isfinite(time))) + 1} has no time")
+    step = np.diff(time)
+    if (step < 0).any():
+        row = int(np.argmax(step < 0))
+        hour = ": an hour back, as at the end of daylight saving time; log UTC" if abs(step[row] + 3600) < 60 else ""
+        raise ValueError(
+            f"time runs backward from row {row + 1} to {row + 2}, from {time[row]:.10g} to {time[row + 1]:.10g}{hour}: "
+            "sort the rows, or split the log where its clock was set"
+        )
+    new = np.concatenate(([True], step > 0))
+    notes = []
+    if repeated := int((~new).sum()):
+        notes.append(f"{_count(repeated, 'row')} with the time of the row before left out")
+    step = step[step > 0]
+    least = max(_GAP * np.median(step), _GAP_SHARE * step.sum()) if len(step) else 0.0
+    if count := int((step > least).sum()):
+        hour = ", which is daylight saving time if the log has local time" if (abs(step - 3600) < 60).any() else ""
+        notes.append(f"{_count(count, 'gap')}, the longest of {step.max():g} {unit}{hour}")
+    return new, notes
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number} {name}{'s' if number > 1 else ''}"
+
+
+def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
+    """Return the samples at the times of the magnetometer, with notes; other columns are interpolated.
+
+    Samples without attitude before its first and after its last value are left out; a position or a speed holds there.
+
+    Raises:
+        ValueError: for a log without a magnetometer, or times that run backward.
+
+    Example:
+        >>> time = np.array([0.0, 1.0, 2.0])
+        >>> axes = {name: (time, np.ones(3)) for name in "xyz"}
+        >>> samples_of({**axes, "heading": (time[:2], np.array([350.0, 370.0]))})[0]["heading"].tolist()
+        [350.0, 10.0]
+    """
+    if missing := [name for name in AXES if name not in streams or not len(streams[name][0])]:
+        raise ValueError(
+            f"the log has no magnetometer with three axes: {missing[0]} is missing among {', '.join(streams)}"
+        )
+    time = streams["x"][0]
+    new, notes = check_times(time)
+    table = {"time": time[new]} | {
+        name: _at(time[new], name, *streams[name]) for name in COLUMNS if name in streams and name != "time"
+    }
+    samples = pandas.DataFrame(table)
+    whole = np.isfinite(samples[[name for name in (*AXES, *ATTITUDE) if name in samples]]).all(axis=1)
+    if not whole.any():
+        raise ValueError("no sample has a magnetometer and an attitude at the same time: check the times of both")
+    if left := int((~whole).sum()):
+        notes.append(f"{_count(left, 'sample')} without attitude or axes left out")
+    zero = (samples[list(AXES)] == 0).all(axis=1) & whole
+    if zero.any():
+        notes.append(f"{_count(int(zero.sum()), 'sample')} of three zeros left out: the magnetometer did not answer")
+    return samples[whole & ~zero].reset_index(drop=True), notes
+
+
+def _at(time: Array, name: str, known: Array, values: Array) -> Array:
+    """Return the values of a column at other times; angles the shorter way around, a distance as a sum."""
+    if not len(known):
+        return np.full(len(time), np.nan)
+    if name == "distance":
+        total = np.interp(time, known, np.cumsum(values))
+        return np.diff(total, prepend=total[:1])
+    turning = name in _ANGLES
+    ends = {} if name in ("latitude", "longitude", "altitude", "speed") else {"left": np.nan, "right": np.nan}
+    found = np.interp(time, known, np.unwrap(values, period=360) if turning else values, **ends)
+    return (found + 180) % 360 - 180 if name in ("roll", "longitude") else found % 360 if turning else found
+
+
+def read_csv(path: Path, frame: str = "FRD") -> Log:
+    """Read a CSV file with a header; see :data:`~magrl.logs.units.COLUMNS` for names and units.
+
+    Blank cells are interpolated in time, except those of the axes, whose rows are left out. Other columns are ignored.
+
+    Args:
+        path: file; times as numbers, or as text such as ``2026-06-30T12:00:00Z``.
+        frame: axes of the file, one of :data:`~magrl.logs.vectors.FRAMES`.
+
+    Raises:
+        ValueError: for a file without rows, a missing column, or a value that is not a number, with its row.
+    """
+    check_choice(FRAMES, frame=frame)
+    raw = pandas.read_csv(path, skipinitialspace=True)
+    found: dict[str, tuple[str, float]] = {}
+    for header in raw:
+        if named := column_of(header):
+            if named[0] in found:
+                raise ValueError(
+                    f"columns {found[named[0]][0]!r} and {header!r} are both the {named[0]}: keep one of them"
+                )
+            found[named[0]] = header, named[1]
+    if missing := [name for name in ("time", *AXES) if name not in found]:
+        raise ValueError(
+            f"no column is the {missing[0]}, among {', '.join(raw)}: name them as time, mag_x_nT, mag_y_nT, mag_z_nT"
+        )
+    if not len(raw):
+        raise ValueError("the table has no row")
+    time, notes = _times(raw[found["time"][0]], found["time"][1])
+    values = {name: factor * _numbers(raw[header]) for name, (header, factor) in found.items() if name != "time"}
+    whole = np.isfinite(time) & np.isfinite(np.stack([values[name] for name in AXES])).all(0)
+    signs = dict(zip(AXES, FRAMES[frame], strict=True))
+    held = {name: whole if name in AXES else np.isfinite(each) for name, each in values.items()}
+    streams = {name: (time[held[name]], signs.get(name, 1) * each[held[name]]) for name, each in values.items()}
+    samples, more = samples_of(streams)
+    heading = found.get("heading", ("", 1))[0].lower()
+    north = "true" if "true" in heading else "magnetic" if "mag" in heading else None
+    if not whole[-1]:
+        notes.append("the last row is not complete: the log may be truncated")
+    return Log(samples, f"CSV, {len(raw)} rows", north, (*notes, *more))
+
+
+def _times(column: Series, factor: float) -> tuple[Array, list[str]]:
+    """Return times [s] of numbers or texts, and notes."""
+    if pandas.api.types.is_numeric_dtype(column):
+        return factor * column.to_numpy(float), []
+    parsed = pandas.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
+    bad = parsed.isna() & column.notna()
+    if bad.any():
+        row = int(bad.idxmax())
+        raise ValueError(f"row {row + 1}, {column.name}: {short(column[row])} is no time such as 2026-06-30T12:00:00Z")
+    zoned = column.dropna().str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True)
+    notes = [] if zoned.all() else ["the times have no time zone: they are taken as UTC"]
+    return (parsed - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float), notes
+
+
+def _numbers(column: Series) -> Array:
+    """Return the numbers of a column, NaN for blank cells."""
+    numbers = pandas.to_numeric(column, errors="coerce")
+    bad = numbers.isna() & column.notna()
+    if bad.any():
+        row = int(bad.idxmax())
+        raise ValueError(f"row {row + 1}, {column.name}: {short(column[row])} is not a number")
+    return numbers.to_numpy(float)
