@@ -28,7 +28,7 @@ LEAST_SPREAD = 0.05
 MOST_OUTLIERS = 0.1
 OUTLIER_SIGMAS = 5.0
 _BLOCKS = 100  # of consecutive samples, whose errors are not independent
-_ROUNDS = 20  # a swing converges in 4 to 8
+_ROUNDS, _SETTLED = 20, 1e-7  # of the fit: a swing converges in 4 to 8; a change of matrix and offset as a share
 _SWING = (
     "swing the vehicle: slowly through all headings, with roll and pitch to both sides as far as it goes (a vehicle in "
     "the hand: every side up once)"
@@ -260,6 +260,8 @@ def _fit(
         now = torch.cat((matrix.flatten(), offset / scale))
         change = torch.linalg.solve(normal, scores.sum(0) + variance * prior @ (now - start))
         matrix, offset = matrix - change[:9].unflatten(0, (3, 3)), offset - scale * change[9:]
+        if change.abs().max() < _SETTLED:
+            break
     blocks = torch.stack([block.sum(0) for block in scores.tensor_split(_BLOCKS)])
     inverse = torch.linalg.inv(normal)
     covariance = inverse @ (blocks.T @ blocks + variance.square() * prior) @ inverse

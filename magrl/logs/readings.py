@@ -13,7 +13,7 @@ from magrl.field.elements import NAMES, elements_jacobian, measured_elements
 from magrl.geodesy import geodesic
 from magrl.logs.calibration import Calibration
 from magrl.logs.samples import ATTITUDE, AXES, Array, Log
-from magrl.logs.vectors import NORTHS, rotation
+from magrl.logs.vectors import NORTHS, axes_of_elements, rotation
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
 SPIKE_SIGMAS = 5.0
@@ -79,6 +79,39 @@ def readings_of(
     return table.assign(samples=groups.size(), spikes=np.bincount(part[~kept], minlength=len(table)))
 
 
+def joined(table: DataFrame, every_km: float) -> DataFrame:
+    """Return the means of the rows of each move, of a table that holds D, I, B_H already; see :func:`readings_of`.
+
+    Args:
+        table: columns ``row``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` since the row before, and others.
+        every_km: least length of a move; 0 for the rows as they are.
+
+    Raises:
+        ValueError: for moves so long that one reading is left.
+
+    Returns:
+        The same columns; those others are of the row in the middle of each move.
+
+    Example:
+        >>> rows = {"row": range(1, 7), "D": 0.0, "I": 0.0, "B_H": range(6)}
+        >>> rows |= {"heading": 90.0, "distance": [0] + [2.0] * 5}
+        >>> joined(DataFrame(rows), 4.0)[["row", "B_H", "distance"]].round(9).values.tolist()
+        [[1.0, 0.5, 0.0], [3.0, 2.5, 4.0], [5.0, 4.5, 4.0]]
+    """
+    check_number(0, every_km=every_km)
+    if not every_km:
+        return table
+    heading = torch.tensor(table["heading"].to_numpy(float))
+    attitude = torch.stack((torch.zeros_like(heading), torch.zeros_like(heading), heading), -1)
+    axes = axes_of_elements(torch.tensor(table[list(NAMES)].to_numpy(float).copy()), attitude).numpy()
+    samples = table.assign(time=np.arange(len(table)), **dict(zip(AXES, axes.T, strict=True)))
+    found = readings_of(Log(samples, "readings", "true"), every_km=every_km)
+    if len(found) < 2:
+        raise ValueError(f"every_km {every_km:g} leaves one reading of {len(table)}: choose shorter moves")
+    middle = table.iloc[found["time"].astype(int)].reset_index(drop=True)
+    return middle.assign(**{name: found[name] for name in found if name in table and name != "time"})
+
+
 def _path(log: Log) -> Array:
     """Return places ``(N, 2)``, northward and eastward of the first one [km]."""
     held = log.samples
@@ -111,11 +144,14 @@ def _parts_s(time: Array, every_s: float) -> NDArray[np.int64]:
 
 
 def _spikes(field: Array, part: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which vectors ``(N, 3)`` deviate from the median of their part by more than its scatter explains."""
+    """Return which vectors ``(N, 3)`` deviate from the median of their part by more than its scatter explains.
+
+    None in a part of few samples, of which the scatter is not known.
+    """
     groups = pandas.DataFrame(field).groupby(part)
     deviation = np.abs(field - groups.transform("median").to_numpy())
     scatter = 1.4826 * pandas.DataFrame(deviation).groupby(part).transform("median").to_numpy()
-    return (deviation > SPIKE_SIGMAS * scatter + 1.0).any(-1)
+    return (deviation > SPIKE_SIGMAS * scatter + 1.0).any(-1) & (np.bincount(part)[part] >= _BLOCKS)
 
 
 def _covariance(field: Array, part: NDArray[np.int64]) -> Array:

@@ -53,12 +53,7 @@ class Log:
     @property
     def date(self) -> str | None:
         """Date of the first sample, where the time is known."""
-        first = float(self.samples["time"].iloc[0])
-        return (
-            datetime.datetime.fromtimestamp(first, datetime.timezone.utc).strftime("%Y-%m-%d")
-            if first > _EPOCH
-            else None
-        )
+        return date_of(float(self.samples["time"].iloc[0]))
 
     def tensor(self, *names: str) -> torch.Tensor:
         """Return columns ``(N, K)`` in float64; roll and pitch that the log lacks are zeros.
@@ -73,6 +68,16 @@ class Log:
             )
         columns = [held[name].to_numpy(float) if name in held else np.zeros(len(held)) for name in names]
         return torch.from_numpy(np.stack(columns, -1))
+
+
+def date_of(time: float) -> str | None:
+    """Return the date of a time in seconds since 1970; None for one since the log began.
+
+    Example:
+        >>> date_of(1.8e9), date_of(3600.0)
+        ('2027-01-15', None)
+    """
+    return datetime.datetime.fromtimestamp(time, datetime.timezone.utc).date().isoformat() if time > _EPOCH else None
 
 
 def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[str]]:
@@ -109,6 +114,24 @@ def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[s
         hour = ", which is daylight saving time if the log has local time" if (abs(step - 3600) < 60).any() else ""
         notes.append(f"{_count(count, 'gap')}, the longest of {step.max():g} {unit}{hour}")
     return new, notes
+
+
+def checked_times(column: Series) -> tuple[NDArray[np.bool_], list[str], str | None]:
+    """Return which rows have a new time, notes, and the date of the first row where it is known.
+
+    Args:
+        column: numbers in any unit, or ISO 8601 texts.
+
+    Raises:
+        ValueError: for times that are neither, missing, or run backward, with the row.
+
+    Example:
+        >>> checked_times(Series(["2026-06-30T12:00:00Z", "2026-06-30T12:10:00Z"], name="time"))[1:]
+        ([], '2026-06-30')
+    """
+    times, notes = times_of(column)
+    new, more = check_times(times, "the unit of the times")
+    return new, [*notes, *more], date_of(float(times[0]))
 
 
 def _count(number: int, name: str) -> str:
@@ -191,7 +214,7 @@ def read_csv(path: Path, frame: str = "FRD") -> Log:
         )
     if not len(raw):
         raise ValueError("the table has no row")
-    time, notes = _times(raw[found["time"][0]], found["time"][1])
+    time, notes = times_of(raw[found["time"][0]], found["time"][1])
     values = {name: factor * _numbers(raw[header]) for name, (header, factor) in found.items() if name != "time"}
     whole = np.isfinite(time) & np.isfinite(np.stack([values[name] for name in AXES])).all(0)
     signs = dict(zip(AXES, FRAMES[frame], strict=True))
@@ -205,10 +228,23 @@ def read_csv(path: Path, frame: str = "FRD") -> Log:
     return Log(samples, f"CSV, {len(raw)} rows", north, (*notes, *more))
 
 
-def _times(column: Series, factor: float) -> tuple[Array, list[str]]:
-    """Return times [s] of numbers or texts, and notes."""
-    if pandas.api.types.is_numeric_dtype(column):
-        return factor * column.to_numpy(float), []
+def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:
+    """Return times of numbers, or of texts in seconds since 1970, and notes.
+
+    Args:
+        column: numbers, or ISO 8601 texts; NaN for blank cells.
+        factor: unit of the numbers [s].
+
+    Raises:
+        ValueError: for a text that is neither, with its row.
+
+    Example:
+        >>> times_of(Series(["2026-06-30T12:00:00"], name="time"))
+        (array([1.7828208e+09]), ['the times have no time zone: they are taken as UTC'])
+    """
+    numbers = pandas.to_numeric(column, errors="coerce")
+    if numbers.notna().equals(column.notna()):
+        return factor * numbers.to_numpy(float), []
     parsed = pandas.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
     bad = parsed.isna() & column.notna()
     if bad.any():

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magrl.logs import check_times, read_log
+from magrl.logs import read_log
+from magrl.logs.samples import check_times
 
 HEADER = "time_s,mag_x_nT,mag_y_nT,mag_z_nT,heading_true_deg"
 ROWS = ("0,15000,1000,48000,350", "1,15100,1100,48100,10", "2,15200,1200,48200,30")
