@@ -5,7 +5,7 @@
     python recipes/replay_log.py way_readings.csv                                            # what would be commanded
 
 Logs are CSV files (columns such as time_s, mag_x_nT, mag_y_uT, roll_deg, heading_true_deg, speed_kn, lat, lon) and
-those of autopilots: .ulg (PX4). The axes are forward, right, down, the angles roll, pitch, heading.
+those of autopilots and ships (docs/onboard.md). The axes are forward, right, down, the angles roll, pitch, heading.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog="python -m magrl.logs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    command.add_argument("log", type=Path, help="log of the vehicle")
+    command.add_argument("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
     command.add_argument("--frame", choices=FRAMES, default="FRD", help="axes of a CSV file; default FRD")
     command.add_argument("--north", choices=NORTHS, help="north of the heading, where the log does not tell")
     command.add_argument("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
@@ -44,8 +44,9 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--calibration", type=Path, help="file of a calibration, which corrects the axes")
     command.add_argument("--calibrate", type=Path, help="calibrate by this log, a swing, and write this file (.json)")
     command.add_argument("--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H")
+    command.add_argument("--alignment-deg", type=float, default=0.5, help="misalignment of the axes [deg]; default 0.5")
     command.add_argument("--date", help="date for IGRF, such as 2026-06-30; default that of the log")
-    command.add_argument("--out", type=Path, help="readings (.csv); default beside the log, with _readings")
+    command.add_argument("--out", type=Path, help="readings (.csv); default beside the first file, with _readings")
     return command
 
 
@@ -53,7 +54,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Read the command line and the log, and print what was found."""
     options = parser().parse_args(args)
     try:
-        log = read_log(options.log, options.frame)
+        log = read_log(*options.log, frame=options.frame)
         print("\n".join(summary(log)))
         date = options.date or log.date
         lines = swing(log, options, date) if options.calibrate else way(log, options, date)
@@ -86,7 +87,8 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
         here = log.tensor("latitude", "longitude").median(0).values.tolist()
     north = options.north or log.north
     attitude = log.tensor(*ATTITUDE) if north == "true" and "heading" in log.samples else None
-    found = calibrate(log.tensor(*AXES), here, date=date if len(here) == 2 else None, attitude_deg=attitude)
+    known = {"date": date if len(here) == 2 else None, "alignment_deg": options.alignment_deg}
+    found = calibrate(log.tensor(*AXES), here, attitude_deg=attitude, **known)
     check_writable(options.calibrate)
     found.save(options.calibrate)
     offset = "{:.0f}, {:.0f}, {:.0f} nT".format(*found.offset_nt)
@@ -100,7 +102,7 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
 
 def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     """Write the readings of a log, and return them beside IGRF, with the likely mistakes."""
-    out = options.out or options.log.with_name(f"{options.log.stem}_readings.csv")
+    out = options.out or options.log[0].with_name(f"{options.log[0].stem}_readings.csv")
     known = Calibration.load(options.calibration) if options.calibration else None
     table = readings_of(log, every_km=options.every_km, every_s=options.every_s, north=options.north, calibration=known)
     first = table.iloc[0]

@@ -1,33 +1,29 @@
-"""Readers of the logs of autopilots, with packages of the extra ``logs``."""
+"""Read the log of a vehicle: CSV files, and the formats of autopilots, ROS and ships."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from importlib import import_module
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
+import pandas
+from pandas import Series
 
-from magrl.logs.samples import ATTITUDE, AXES, Array, Log, read_csv, samples_of
-from magrl.logs.units import FIELD_NT
-from magrl.logs.vectors import attitude_of
-
-MODEL_NORTH = (
-    "the heading is of an estimator that adds the declination of a model to a compass: D is that of the model, and "
-    "circular (a heading from two GNSS antennas or a gyrocompass is not)"
-)
-NOT_CALIBRATED = "the magnetometer is as it was measured, without the calibration of the autopilot"
+from magrl.checks import check_choice, short
+from magrl.logs.autopilots import read_bag, read_bin, read_nmea, read_ulg
+from magrl.logs.samples import AXES, Array, Log, Recording, samples_of, times_of
+from magrl.logs.units import column_of
+from magrl.logs.vectors import FRAMES
 
 
-def read_log(path: Path | str, frame: str = "FRD") -> Log:
-    """Read the log of a vehicle: CSV, or the log of an autopilot by its suffix.
+def read_log(*paths: Path | str, frame: str = "FRD") -> Log:
+    """Read the log of a vehicle, which may be in several files, such as one of the magnetometer and one of the heading.
 
     Args:
-        path: ``.csv``; ``.ulg`` (PX4).
-        frame: axes of a CSV file, one of :data:`~magrl.logs.vectors.FRAMES`.
+        paths: files: ``.csv``; ``.ulg`` (PX4); ``.bin`` (ArduPilot); ``.bag`` (ROS 1), or a folder (ROS 2); ``.nmea``.
+            Columns of later ones replace those of earlier ones; all have one clock.
+        frame: axes of CSV files, one of :data:`~magrl.logs.vectors.FRAMES`; the attitude is that of FRD and NED.
 
     Raises:
         ValueError: naming the file and what is wrong with it, or a suffix that is not known.
@@ -40,78 +36,69 @@ def read_log(path: Path | str, frame: str = "FRD") -> Log:
         >>> read_log(path).samples.values.tolist()
         [[0.0, 15000.0, 0.0, 48000.0, 350.0]]
     """
-    path = Path(path)
-    readers: Mapping[str, Callable[[Path], Log]] = {".csv": lambda path: read_csv(path, frame), ".ulg": read_ulg}
-    if path.suffix.lower() not in readers:
-        raise ValueError(f"the log of a vehicle must end in {', '.join(readers)}, got {str(path)!r}")
-    if path.is_file() and not path.stat().st_size:
-        raise ValueError(f"{path} is empty")
-    try:
-        return readers[path.suffix.lower()](path)
-    except ImportError:
-        raise
-    except Exception as error:  # whatever the packages raise for a foreign or damaged file
-        raise ValueError(f"cannot read {path}: {error}") from error
-
-
-def _package(module: str, package: str) -> Any:
-    """Return a module of the extra ``logs``."""
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise ImportError(f"this format needs the package {package}: pip install 'magrl[logs]'") from error
-
-
-def _attitudes(time: Array, quaternion: Array) -> dict[str, tuple[Array, Array]]:
-    """Return roll, pitch, heading [deg] of quaternions w, x, y, z ``(N, 4)``."""
-    angles = attitude_of(torch.from_numpy(np.ascontiguousarray(quaternion, float))).numpy()
-    return {name: (time, angles[:, column]) for column, name in enumerate(ATTITUDE)}
-
-
-# PX4
-
-_MAGNETOMETERS = {
-    "vehicle_magnetometer": [f"magnetometer_ga[{index}]" for index in range(3)],
-    "sensor_combined": [f"magnetometer_ga[{index}]" for index in range(3)],
-    "sensor_mag": list(AXES),
-}
-"""Topics with a magnetometer [gauss], the calibrated one first."""
-
-
-def read_ulg(path: Path) -> Log:
-    """Read a log of PX4 (ULog) with pyulog: see :func:`read_log`. Times are UTC where GNSS gives it."""
-    log = _package("pyulog", "pyulog").ULog(str(path))
-    topics = {item.name: item.data for item in reversed(log.data_list)}  # the first instance of each
-    held = [name for name, columns in _MAGNETOMETERS.items() if columns[0] in topics.get(name, ())]
-    if not held:
-        raise ValueError(f"none of {', '.join(_MAGNETOMETERS)} is among its topics, {', '.join(sorted(topics))}")
-    name, notes = held[0], ["the file is damaged or truncated"] if log.file_corruption else []
-    if name == "sensor_mag":
-        notes.append(f"{name}: {NOT_CALIBRATED}")
-    field, attitude, position = (topics.get(topic, {}) for topic in (name, "vehicle_attitude", "vehicle_gps_position"))
-    streams = {
-        axis: (_seconds(field), FIELD_NT["G"] * field[key])
-        for axis, key in zip(AXES, _MAGNETOMETERS[name], strict=True)
+    check_choice(FRAMES, frame=frame)
+    readers: Mapping[str, Callable[[Path], Recording]] = {
+        ".csv": partial(read_csv, frame=frame),
+        ".ulg": read_ulg,
+        ".bin": read_bin,
+        ".bag": read_bag,
+        "": read_bag,
+        ".nmea": read_nmea,
     }
-    if attitude:
-        streams |= _attitudes(_seconds(attitude), np.stack([attitude[f"q[{index}]"] for index in range(4)], -1))
-    fixed = np.asarray(position.get("fix_type", ())) >= 3
-    offset = 0.0
-    if fixed.any():
-        streams |= _px4_position(position, fixed)
-        offset = float(np.median(position["time_utc_usec"][fixed] / 1e6 - _seconds(position)[fixed]))
-    if not np.isfinite(position.get("heading", np.nan)).any():
-        notes.append(MODEL_NORTH)
-    samples, more = samples_of({column: (time + offset, values) for column, (time, values) in streams.items()})
-    return Log(samples, f"PX4 ULog, {name}", "true", (*notes, *more))
+    found = []
+    for path in map(Path, paths):
+        kind = "" if path.is_dir() else path.suffix.lower()
+        if kind not in readers or not path.exists():
+            known = ", ".join(filter(None, readers))
+            raise ValueError(f"a log is a file {known} or a folder of ROS 2 that exists, got {str(path)!r}")
+        try:
+            found.append(readers[kind](path))
+        except ImportError:
+            raise
+        except Exception as error:  # whatever the packages raise for a foreign or damaged file
+            raise ValueError(f"cannot read {path}: {error}") from error
+    samples, notes = samples_of({name: stream for each in found for name, stream in each.streams.items()})
+    norths = [each.north for each in found if "heading" in each.streams]
+    more = [note for each in found for note in each.notes]
+    return Log(samples, "; ".join(each.source for each in found), norths[-1] if norths else None, (*more, *notes))
 
 
-def _seconds(topic: Mapping[str, Array]) -> Array:
-    return np.asarray(topic["timestamp"]) / 1e6
+def read_csv(path: Path, frame: str = "FRD") -> Recording:
+    """Read a CSV file with a header: see :data:`~magrl.logs.units.COLUMNS` for names and units.
+
+    Times are numbers or ISO 8601 texts. Blank cells do not count; other columns are ignored.
+    """
+    raw = pandas.read_csv(path, skipinitialspace=True)
+    if not len(raw):
+        raise ValueError("the table has no row")
+    found: dict[str, tuple[str, float]] = {}
+    for header in raw:
+        if named := column_of(header):
+            if named[0] in found:
+                raise ValueError(f"{found[named[0]][0]!r} and {header!r} are both the {named[0]}: keep one of them")
+            found[named[0]] = header, named[1]
+    if "time" not in found:
+        raise ValueError(f"no column is the time, among {', '.join(raw)}: name it time, or time_ms")
+    time, notes = times_of(raw[found["time"][0]], found["time"][1])
+    values = {name: factor * _numbers(raw[header]) for name, (header, factor) in found.items() if name != "time"}
+    held = {name: np.isfinite(time) & np.isfinite(each) for name, each in values.items()}
+    axes = [held[name] for name in AXES if name in held]
+    if axes and not np.all(axes, axis=0)[-1]:
+        notes.append("the last row is not complete: the log may be truncated")
+    for name, sign in zip(AXES, FRAMES[frame], strict=True):
+        if name in held:
+            values[name], held[name] = sign * values[name], np.all(axes, axis=0)
+    heading = found.get("heading", ("", 1))[0].lower()
+    north = "true" if "true" in heading else "magnetic" if "mag" in heading else None
+    streams = {name: (time[held[name]], each[held[name]]) for name, each in values.items()}
+    return Recording(streams, f"CSV, {len(raw)} rows", north, notes)
 
 
-def _px4_position(topic: Mapping[str, Array], fixed: NDArray[np.bool_]) -> dict[str, tuple[Array, Array]]:
-    """Return latitude and longitude [deg] where GNSS has a fix; older logs have 1e-7 degrees as integers."""
-    names = {"latitude": ("latitude_deg", "lat"), "longitude": ("longitude_deg", "lon")}
-    degrees = {name: topic[new] if new in topic else topic[old] * 1e-7 for name, (new, old) in names.items()}
-    return {name: (_seconds(topic)[fixed], np.asarray(values)[fixed]) for name, values in degrees.items()}
+def _numbers(column: Series) -> Array:
+    """Return the numbers of a column, NaN for blank cells."""
+    numbers = pandas.to_numeric(column, errors="coerce")
+    bad = numbers.isna() & column.notna()
+    if bad.any():
+        row = int(bad.idxmax())
+        raise ValueError(f"row {row + 1}, {column.name}: {short(column[row])} is not a number")
+    return numbers.to_numpy(float)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas
@@ -13,9 +13,8 @@ import torch
 from numpy.typing import NDArray
 from pandas import DataFrame, Series
 
-from magrl.checks import check_choice, short
-from magrl.logs.units import COLUMNS, column_of
-from magrl.logs.vectors import FRAMES
+from magrl.checks import short
+from magrl.logs.units import COLUMNS
 
 AXES, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "heading")
 _ANGLES = ("roll", "heading", "longitude")  # which jump by 360 degrees
@@ -24,6 +23,15 @@ _GAP, _GAP_SHARE = 10.0, 1e-3  # of the usual step, and of the log
 Array = NDArray[np.float64]
 Streams = Mapping[str, tuple[Array, Array]]
 """Times [s] and values of each column, in the units of :data:`~magrl.logs.units.COLUMNS`."""
+
+
+class Recording(NamedTuple):
+    """What one file holds: columns, format and sensors, the north of its heading where it tells, and notes."""
+
+    streams: Streams
+    source: str
+    north: str | None = None
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,7 @@ class Log:
     samples: DataFrame
     source: str
     north: str | None = None
-    notes: Sequence[str] = field(default_factory=tuple)
+    notes: Sequence[str] = ()
 
     @property
     def date(self) -> str | None:
@@ -154,7 +162,8 @@ def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
     """
     if missing := [name for name in AXES if name not in streams or not len(streams[name][0])]:
         raise ValueError(
-            f"the log has no magnetometer with three axes: {missing[0]} is missing among {', '.join(streams)}"
+            f"no column is the {missing[0]} of the magnetometer, among {', '.join(streams)}: name its columns "
+            "mag_x_nT, mag_y_nT, mag_z_nT"
         )
     time = streams["x"][0]
     new, notes = check_times(time)
@@ -186,48 +195,6 @@ def _at(time: Array, name: str, known: Array, values: Array) -> Array:
     return (found + 180) % 360 - 180 if name in ("roll", "longitude") else found % 360 if turning else found
 
 
-def read_csv(path: Path, frame: str = "FRD") -> Log:
-    """Read a CSV file with a header; see :data:`~magrl.logs.units.COLUMNS` for names and units.
-
-    Blank cells are interpolated in time, except those of the axes, whose rows are left out. Other columns are ignored.
-
-    Args:
-        path: file; times as numbers, or as text such as ``2026-06-30T12:00:00Z``.
-        frame: axes of the file, one of :data:`~magrl.logs.vectors.FRAMES`.
-
-    Raises:
-        ValueError: for a file without rows, a missing column, or a value that is not a number, with its row.
-    """
-    check_choice(FRAMES, frame=frame)
-    raw = pandas.read_csv(path, skipinitialspace=True)
-    found: dict[str, tuple[str, float]] = {}
-    for header in raw:
-        if named := column_of(header):
-            if named[0] in found:
-                raise ValueError(
-                    f"columns {found[named[0]][0]!r} and {header!r} are both the {named[0]}: keep one of them"
-                )
-            found[named[0]] = header, named[1]
-    if missing := [name for name in ("time", *AXES) if name not in found]:
-        raise ValueError(
-            f"no column is the {missing[0]}, among {', '.join(raw)}: name them as time, mag_x_nT, mag_y_nT, mag_z_nT"
-        )
-    if not len(raw):
-        raise ValueError("the table has no row")
-    time, notes = times_of(raw[found["time"][0]], found["time"][1])
-    values = {name: factor * _numbers(raw[header]) for name, (header, factor) in found.items() if name != "time"}
-    whole = np.isfinite(time) & np.isfinite(np.stack([values[name] for name in AXES])).all(0)
-    signs = dict(zip(AXES, FRAMES[frame], strict=True))
-    held = {name: whole if name in AXES else np.isfinite(each) for name, each in values.items()}
-    streams = {name: (time[held[name]], signs.get(name, 1) * each[held[name]]) for name, each in values.items()}
-    samples, more = samples_of(streams)
-    heading = found.get("heading", ("", 1))[0].lower()
-    north = "true" if "true" in heading else "magnetic" if "mag" in heading else None
-    if not whole[-1]:
-        notes.append("the last row is not complete: the log may be truncated")
-    return Log(samples, f"CSV, {len(raw)} rows", north, (*notes, *more))
-
-
 def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:
     """Return times of numbers, or of texts in seconds since 1970, and notes.
 
@@ -253,13 +220,3 @@ def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:
     zoned = column.dropna().str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True)
     notes = [] if zoned.all() else ["the times have no time zone: they are taken as UTC"]
     return (parsed - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float), notes
-
-
-def _numbers(column: Series) -> Array:
-    """Return the numbers of a column, NaN for blank cells."""
-    numbers = pandas.to_numeric(column, errors="coerce")
-    bad = numbers.isna() & column.notna()
-    if bad.any():
-        row = int(bad.idxmax())
-        raise ValueError(f"row {row + 1}, {column.name}: {short(column[row])} is not a number")
-    return numbers.to_numpy(float)

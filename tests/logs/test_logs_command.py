@@ -76,7 +76,7 @@ def test_a_short_log_is_compared(folder: Path, capsys) -> None:
     ("name", "options", "message"),
     [
         ("way.csv", ["--calibration", "none.json"], "none.json is not a calibration"),
-        ("swing.txt", [], "the log of a vehicle must end in"),
+        ("swing.txt", [], "a log is a file .csv"),
         (
             "swing.csv",
             ["--calibrate", "quay.json", "--here", "1"],

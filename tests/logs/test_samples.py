@@ -83,7 +83,7 @@ def test_notes(tmp_path: Path, rows, note: str) -> None:
     ("rows", "header", "message"),
     [
         ([], HEADER, "the table has no row"),
-        ([], "", "log.csv is empty"),
+        ([], "", "cannot read .*log.csv: No columns to parse"),
         ([ROWS[1], ROWS[0]], HEADER, "time runs backward from row 1 to 2, from 1 to 0: sort the rows"),
         (["7200,1,1,1,0", "3601,1,1,1,0"], HEADER, "an hour back, as at the end of daylight saving time; log UTC"),
         (["0,x,1,1,0"], HEADER, r"row 1, mag_x_nT: 'x' is not a number"),
@@ -91,7 +91,7 @@ def test_notes(tmp_path: Path, rows, note: str) -> None:
         (
             ROWS,
             HEADER.replace("mag_z_nT", "volts"),
-            "no column is the z, among time_s.*: name them as time, mag_x",
+            "no column is the z of the magnetometer, among x, y, heading: name its columns mag_x_nT",
         ),
         (ROWS, HEADER.replace("heading_true_deg", "bx"), "'mag_x_nT' and 'bx' are both the x: keep one of them"),
         (ROWS, HEADER.replace("heading_true_deg", "speed"), "column 'speed' has no unit: .*speed_kn"),
@@ -99,14 +99,25 @@ def test_notes(tmp_path: Path, rows, note: str) -> None:
 )
 def test_files_that_are_refused(tmp_path: Path, rows, header: str, message: str) -> None:
     path = written(tmp_path, *rows, header=header)
-    path.write_text(path.read_text() if header else "")
     with pytest.raises(ValueError, match=message):
         read_log(path)
 
 
-def test_a_suffix_that_is_not_known() -> None:
-    with pytest.raises(ValueError, match=r"must end in \.csv, .*, got 'log.xlsx'"):
-        read_log("log.xlsx")
+def test_two_files_of_one_vehicle(tmp_path: Path) -> None:
+    """The magnetometer in one, the gyrocompass in the other, which decides the heading and its north."""
+    path = written(tmp_path, *ROWS).rename(tmp_path / "mag.csv")
+    gyro = written(tmp_path, "0,100", "2,200", header="time,heading_mag")
+    log = read_log(path, gyro)
+    assert log.samples["heading"].tolist() == pytest.approx([100, 150, 200])
+    assert (log.north, log.source) == ("magnetic", "CSV, 3 rows; CSV, 2 rows")
+    with pytest.raises(ValueError, match="no column is the x of the magnetometer, among heading"):
+        read_log(gyro)
+
+
+@pytest.mark.parametrize("name", ["log.xlsx", "none.csv"])
+def test_files_that_are_not_logs(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"a log is a file \.csv, .* or a folder of ROS 2 that exists, got '{name}'"):
+        read_log(name)
 
 
 def test_times_that_are_not_there() -> None:
