@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import permutations, product
 from pathlib import Path
 from typing import Any, Literal
@@ -36,7 +36,6 @@ _SWING = (
 _AXES = ("forward", "right", "down")
 _SIGNS = list(product((1.0, -1.0), repeat=3))
 Row = tuple[float, float, float]
-Residuals = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class Calibration(CheckedModel):
@@ -157,8 +156,8 @@ def calibrate(
     axes, reference = axes_nt.double(), field_vector(torch.tensor(elements, dtype=torch.float64))
     scale, known = float(reference.norm()), torch.tensor(elements_std, dtype=torch.float64)
     _check_samples(axes, scale)
-    residuals, start = _problem(axes, reference, attitude_deg)
-    matrix, offset, covariance, noise, kept = _fit(residuals, start, scale, math.radians(alignment_deg))
+    problem = _problem(axes, reference, attitude_deg)
+    matrix, offset, covariance, noise, kept = _fit(axes, *problem, scale, math.radians(alignment_deg))
     outliers = 1 - float(kept.double().mean())
     _check_fit(noise, outliers, scale)
     corrected = ((axes - offset) @ matrix.mT)[kept] / scale
@@ -185,41 +184,31 @@ def _rows(matrix: Tensor) -> tuple:
     return tuple(map(tuple, matrix.tolist()))
 
 
-def _problem(axes: Tensor, reference: Tensor, attitude_deg: Tensor | None) -> tuple[Residuals, Tensor]:
-    """Return the residuals of a fit, and the offset with which it starts."""
+def _problem(axes: Tensor, reference: Tensor, attitude_deg: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return what the samples are compared with, vectors or a length, and the offset with which the fit starts."""
     if attitude_deg is None:
-        total = float(reference.norm())
+        total = reference.norm()
         _check_directions(axes / total)
-        return _length(axes, total), _sphere_center(axes, total)
+        return total, _sphere_center(axes, float(total))
     level = reference @ rotation(attitude_deg.double())
     _check_axes(axes, level)
-    return _vector(axes, level), (axes - level).median(0).values
+    return level, (axes - level).median(0).values
 
 
-# Residuals and their derivatives with respect to the matrix, row by row, and the offset
+# The fit
 
 
-def _vector(axes: Tensor, level: Tensor) -> Residuals:
-    """Return the function that compares vectors: residuals ``(N, 3)``, derivatives ``(N, 3, 12)``."""
+def _misfit(axes: Tensor, known: Tensor, matrix: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return residuals ``(N, R)`` and their derivatives ``(N, R, 12)`` with respect to matrix and offset.
 
-    def residuals(matrix: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-        moved = axes - offset
-        return moved @ matrix.mT - level, _derivative(matrix, moved)
-
-    return residuals
-
-
-def _length(axes: Tensor, total: float) -> Residuals:
-    """Return the function that compares lengths: residuals ``(N, 1)``, derivatives ``(N, 1, 12)``."""
-
-    def residuals(matrix: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-        moved = axes - offset
-        corrected = moved @ matrix.mT
-        length = corrected.norm(dim=-1, keepdim=True)
-        along = (corrected / length).unsqueeze(-2)
-        return length - total, along @ _derivative(matrix, moved)
-
-    return residuals
+    Of the vectors, if those are known, ``(N, 3)``; of their length, if that is, ``()``.
+    """
+    moved = axes - offset
+    corrected, slope = moved @ matrix.mT, _derivative(matrix, moved)
+    if known.ndim:
+        return corrected - known, slope
+    length = corrected.norm(dim=-1, keepdim=True)
+    return length - known, (corrected / length).unsqueeze(-2) @ slope
 
 
 def _derivative(matrix: Tensor, moved: Tensor) -> Tensor:
@@ -236,11 +225,8 @@ def _sphere_center(axes: Tensor, total: float) -> Tensor:
     return total * torch.linalg.solve(normal, design.T @ (moved.square().sum(-1) - 1))[:3]
 
 
-# The fit
-
-
 def _fit(
-    residuals: Residuals, offset: Tensor, scale: float, alignment: float
+    axes: Tensor, known: Tensor, offset: Tensor, scale: float, alignment: float
 ) -> tuple[Tensor, Tensor, Tensor, float, Tensor]:
     """Return matrix, offset, their covariance ``(12, 12)``, the root mean square of residuals, and which were kept.
 
@@ -250,7 +236,7 @@ def _fit(
     prior, matrix = _prior(alignment), torch.eye(3, dtype=torch.float64)
     start = torch.cat((matrix.flatten(), offset / scale))
     for _ in range(_ROUNDS):
-        error, slope = residuals(matrix, offset)
+        error, slope = _misfit(axes, known, matrix, offset)
         size = error.norm(dim=-1)
         kept = size <= max(OUTLIER_SIGMAS * 1.4826 * float(size.median()), 1.0)
         variance = error[kept].square().mean().clamp_min(1e-6)
@@ -299,8 +285,8 @@ def _check_samples(axes: Tensor, total: float) -> None:
     if not axes.isfinite().all():
         row = int((~axes.isfinite().all(-1)).nonzero()[0])
         raise ValueError(f"sample {row + 1} is {axes[row].tolist()}: leave out samples that are not finite")
-    if unit := guess_unit(float(axes.norm(dim=-1).median()), total):
-        length = float(axes.norm(dim=-1).median())
+    length = float(axes.norm(dim=-1).median())
+    if unit := guess_unit(length, total):
         raise ValueError(
             f"the samples have a length of {length:g}, and {total:.0f} nT are known: they look like {unit}"
         )

@@ -13,7 +13,7 @@ from pandas import Series
 from magrl.checks import check_choice, short
 from magrl.logs.autopilots import read_bag, read_bin, read_nmea, read_ulg
 from magrl.logs.samples import AXES, Array, Log, Recording, samples_of, times_of
-from magrl.logs.units import column_of
+from magrl.logs.units import EARTH_NT, column_of, guess_unit
 from magrl.logs.vectors import FRAMES
 
 
@@ -58,6 +58,9 @@ def read_log(*paths: Path | str, frame: str = "FRD") -> Log:
         except Exception as error:  # whatever the packages raise for a foreign or damaged file
             raise ValueError(f"cannot read {path}: {error}") from error
     samples, notes = samples_of({name: stream for each in found for name, stream in each.streams.items()})
+    length = float(np.sqrt(np.square(samples[list(AXES)]).sum(axis=1)).median())
+    if unit := guess_unit(length, EARTH_NT):
+        notes.append(f"the total intensity is {length:g}, which looks like {unit}: name the columns mag_x_{unit}, ...")
     norths = [each.north for each in found if "heading" in each.streams]
     more = [note for each in found for note in each.notes]
     return Log(samples, "; ".join(each.source for each in found), norths[-1] if norths else None, (*more, *notes))

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 
 FIELD_NT: Mapping[str, float] = {"nT": 1.0, "mG": 100.0, "uT": 1e3, "G": 1e5, "mT": 1e6, "T": 1e9}
 """Units of a magnetic field [nT]: nanotesla, milligauss, microtesla, gauss, millitesla, tesla."""
+EARTH_NT = 48000.0
+"""Total intensity of the Earth's field, within 45 %."""
 UNITS: Mapping[str, Mapping[str, float]] = {
     "field": {name.lower(): size for name, size in FIELD_NT.items()} | {"gauss": 1e5, "tesla": 1e9, "µt": 1e3},
     "angle": {"deg": 1.0, "rad": 57.29577951308232},
@@ -60,7 +62,7 @@ def column_of(header: str) -> tuple[str, float] | None:
 
 
 def guess_unit(length: float, total_nt: float) -> str | None:
-    """Return the unit in which a field has a length, if it is not nanotesla; None where none fits within 40 %.
+    """Return the unit in which a field has a length, if it is not nanotesla; None where none fits within 45 %.
 
     Args:
         length: length of the vector, in an unknown unit.
@@ -70,5 +72,5 @@ def guess_unit(length: float, total_nt: float) -> str | None:
         >>> guess_unit(0.5, 50000.0), guess_unit(45000.0, 50000.0)
         ('G', None)
     """
-    fitting = [unit for unit, size in FIELD_NT.items() if 0.6 < length * size / total_nt < 1.4]
+    fitting = [unit for unit, size in FIELD_NT.items() if 0.55 < length * size / total_nt < 1.45]
     return fitting[0] if fitting and fitting[0] != "nT" else None

@@ -39,7 +39,7 @@ def check(log: Log, *, date: str | None = "2026-06-30") -> None:
     assert len(found) == 12
     assert (found - ELEMENTS).abs().amax(0).lt(torch.tensor([0.1, 0.05, 20.0])).all()
     assert log.date == date
-    assert log.tensor("latitude", "longitude")[5].tolist() == pytest.approx(PLACE, abs=1e-6)
+    assert log.tensor("latitude", "longitude")[0].tolist() == pytest.approx(PLACE, abs=1e-6)
 
 
 def packed(kind: str, *content: bytes) -> bytes:
@@ -60,8 +60,9 @@ def ulog(magnetometer: str = "vehicle_magnetometer", axes: str = "float[3] magne
         time = 1_000_000 + 100_000 * row
         yield packed("D", struct.pack("<HQ3f", 0, time, *field))
         yield packed("D", struct.pack("<HQ4f", 1, time, *q))
-        place = round(PLACE[0] * 1e7), round(PLACE[1] * 1e7), float("nan"), 3 if row > 1 else 0
-        yield packed("D", struct.pack("<HQQiifB", 2, time, int(UTC * 1e6) + time if row > 1 else 0, *place))
+        place = [round(x * 1e7) for x in PLACE] if row > 1 else (0, 0)  # no fix in the first two rows
+        stamp, fix = (int(UTC * 1e6) + time, 3) if row > 1 else (0, 0)
+        yield packed("D", struct.pack("<HQQiifB", 2, time, stamp, *place, float("nan"), fix))
 
 
 def test_px4(tmp_path: Path) -> None:
