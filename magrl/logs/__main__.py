@@ -28,7 +28,7 @@ from magrl.logs.samples import ATTITUDE, AXES, Log
 from magrl.logs.vectors import FRAMES, NORTHS
 
 _DIGITS = {"time": 2, "D": 4, "I": 4, "B_H": 2, "heading": 3, "distance": 4, "latitude": 6, "longitude": 6}
-_DIGITS |= {"D_std": 4, "I_std": 4, "B_H_std": 2}
+_DIGITS |= {"altitude": 4, "D_std": 4, "I_std": 4, "B_H_std": 2}
 
 
 def parser() -> argparse.ArgumentParser:

@@ -9,8 +9,8 @@ import torch
 from pandas import DataFrame
 from torch import Tensor
 
-from magrl.field import IGRF, elements_at
-from magrl.field.elements import NAMES, element_difference
+from magrl.field import IGRF
+from magrl.field.elements import NAMES, element_difference, measured_elements
 from magrl.geodesy import geodesic
 from magrl.onboard.readings import check_earth_reading
 from magrl.onboard.start import MODEL_D_NT, MODEL_STD, misfit
@@ -20,6 +20,7 @@ MOST_SPIKES = 0.2
 MOST_DRIFT, LEAST_TURN_DEG = 0.25, 20.0
 """Share of a distance and angle of a course that currents explain; chosen."""
 LENGTHS_KM = {"nautical miles": 1.852, "statute miles": 1.609344, "meters": 0.001}
+_PLACE = "latitude", "longitude", "altitude"
 _SHOWN = 5
 
 
@@ -27,7 +28,7 @@ def difference_from_igrf(readings: DataFrame, date: str) -> Tensor:
     """Return D [deg], I [deg], B_H [nT] of readings minus those of IGRF at their positions, ``(N, 3)``.
 
     Args:
-        readings: columns D, I, B_H, latitude, longitude.
+        readings: columns D, I, B_H, latitude, longitude, and optionally altitude [km].
         date: date for IGRF.
 
     Example:
@@ -36,7 +37,7 @@ def difference_from_igrf(readings: DataFrame, date: str) -> Tensor:
         >>> difference_from_igrf(pandas.DataFrame(row), "2026-06-30").round(decimals=1)
         tensor([[-0.0000, 0.0000, 0.1000]], dtype=torch.float64)
     """
-    return element_difference(_columns(readings, *NAMES), _known(_columns(readings, "latitude", "longitude"), date))
+    return element_difference(_columns(readings, *NAMES), _known(_places(readings), date))
 
 
 def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
@@ -57,9 +58,9 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     """
     if "latitude" not in readings or "longitude" not in readings:
         return []
-    place = _columns(readings, "latitude", "longitude")
+    place = _places(readings)
     found = []
-    nowhere = (place == 0).all(-1)
+    nowhere = (place[:, :2] == 0).all(-1)
     if nowhere.any():
         found.append(f"{_rows(nowhere.nonzero())} at latitude 0, longitude 0: no position was known there")
     held = readings[~nowhere.numpy()]
@@ -70,11 +71,16 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
         worst = float(place[:, 0].abs().max())
         return [*found, f"latitude {worst:g} is outside -90 to 90: latitude and longitude are swapped"]
     known = elements if date is None else _known(place, date)
-    return found + _field_mistakes(elements, known, place, date) + _move_mistakes(held, place, known[:, 0])
+    return found + _field_mistakes(elements, known, place, date) + _move_mistakes(held, place[:, :2], known[:, 0])
 
 
 def _columns(readings: DataFrame, *names: str) -> Tensor:
     return torch.tensor(readings[list(names)].to_numpy(float).copy())
+
+
+def _places(readings: DataFrame) -> Tensor:
+    """Return latitude, longitude [deg] and altitude [km] ``(N, 3)``; sea level where it is not known."""
+    return _columns(readings.assign(**{} if "altitude" in readings else {"altitude": 0.0}), *_PLACE)
 
 
 def _rows(rows: Tensor) -> str:
@@ -85,7 +91,7 @@ def _rows(rows: Tensor) -> str:
 
 
 def _known(place: Tensor, date: str) -> Tensor:
-    return elements_at(IGRF(date), place)
+    return measured_elements(IGRF(date)(*place.unbind(-1)))
 
 
 # Readings
@@ -122,14 +128,14 @@ def _misfits(elements: Tensor, known: Tensor) -> list[tuple[str, str | None] | N
 
 def _other_cause(elements: Tensor, place: Tensor, date: str) -> str:
     """Return the cause of readings that no mistake in D, I, B_H explains: other positions that fit, or none."""
-    latitude, longitude = place.unbind(-1)
+    latitude, longitude, altitude = place.unbind(-1)
     places = {
         "latitude and longitude are swapped": (longitude, latitude),
         "longitudes are positive toward the west, and east is expected": (latitude, -longitude),
         "latitudes are positive toward the south, and north is expected": (-latitude, longitude),
     }
     for cause, other in places.items():
-        there = torch.stack(other, -1)
+        there = torch.stack((*other, altitude), -1)
         if there[:, 0].abs().max() > 90:
             continue
         if sum(each is None for each in _misfits(elements, _known(there, date))) > len(place) / 2:

@@ -18,7 +18,7 @@ from magrl.transforms.errors.sensors import OUTAGE_STD
 
 SPIKE_SIGMAS = 5.0
 _BLOCKS = 10  # of the samples of a reading, whose means are nearly independent
-_PATH, _FIELD, _ANGLES = ["path_n", "path_e"], ["b_n", "b_e", "b_d"], ("heading", "latitude", "longitude")
+_PATH, _FIELD, _MEANS = ["path_n", "path_e"], ["b_n", "b_e", "b_d"], ("heading", "latitude", "longitude", "altitude")
 STD_NAMES = ("D_std", "I_std", "B_H_std")
 
 
@@ -70,7 +70,7 @@ def readings_of(
     path, time = _path(log), log.samples["time"].to_numpy(float)
     part = _parts_km(path, every_km) if every_s is None else _parts_s(time, every_s)
     samples = pandas.DataFrame(np.column_stack((time, path, field)), columns=["time", *_PATH, *_FIELD])
-    for name in _ANGLES:
+    for name in _MEANS:
         if name in log.samples:
             samples[name] = np.unwrap(log.samples[name], period=360)
     kept = ~_spikes(field, part)
@@ -185,4 +185,6 @@ def _readings(mean: DataFrame, covariance: Array, north: str) -> DataFrame:
     table["distance"] = [0.0, *np.hypot(*move.T)]
     if "latitude" in mean:
         table["latitude"], table["longitude"] = mean["latitude"], (mean["longitude"] + 180) % 360 - 180
+    if "altitude" in mean:
+        table["altitude"] = mean["altitude"]
     return table

@@ -41,7 +41,7 @@ class Log:
     Args:
         samples: columns ``time`` [s, UTC since 1970 where it is known], ``x``, ``y``, ``z`` [nT, forward, right, down],
             and those that the log has of ``roll``, ``pitch``, ``heading`` [deg], ``speed`` [m/s], ``distance`` since
-            the sample before [km], ``latitude``, ``longitude`` [deg], ``altitude`` [m].
+            the sample before [km], ``latitude``, ``longitude`` [deg], ``altitude`` [km].
         source: format and sensors.
         north: north of the heading, "true" or "magnetic", where the log tells.
         notes: what a reader of the log must know.

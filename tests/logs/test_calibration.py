@@ -77,7 +77,8 @@ def test_the_length_alone() -> None:
     assert error[2] < 15
     turned = calibrate(axes, BERGEN, alignment_deg=1.0).std
     assert turned[0] > 1.0  # one degree of each axis
-    assert calibrate(axes, (60.4, 5.3), date="2026-06-30", alignment_deg=0.01).std[2] > 133  # the crust
+    crust = calibrate(axes, (60.4, 5.3), date="2026-06-30", alignment_deg=0.01).std[2]
+    assert crust == pytest.approx(math.hypot(133, 49200 * math.radians(0.2)), rel=0.01)
 
 
 def test_spikes_are_left_out() -> None:

@@ -82,6 +82,12 @@ def test_mistakes_are_named(change, texts: list[str]) -> None:
         assert pandas.Series([text]).str.contains(pattern).all(), text
 
 
+def test_the_altitude_counts() -> None:
+    """The field of a dipole falls by a sixth over 400 km."""
+    low, high = (difference_from_igrf(log().assign(altitude=km), DATE)[:, 2] for km in (0.0, 400.0))
+    assert (high - low).mean() == pytest.approx(log()["B_H"].mean() / 6, rel=0.1)
+
+
 def test_moves_are_compared_without_a_date() -> None:
     wrong = log().assign(D=0.0, heading=log()["heading"] + 180)
     assert [text.partition(": ")[2] for text in mistakes(wrong)] == [
