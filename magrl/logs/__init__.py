@@ -1,4 +1,4 @@
-"""Logs of vehicles: from three axes and an attitude to D, I, B_H."""
+"""Logs of vehicles: readers, calibration, readings of D, I, B_H from three axes and an attitude, and mistakes."""
 
 from magrl.logs.calibration import Calibration as Calibration
 from magrl.logs.calibration import calibrate as calibrate

@@ -86,11 +86,11 @@ def joined(table: DataFrame, every_km: float) -> DataFrame:
         table: columns ``row``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` since the row before, and others.
         every_km: least length of a move; 0 for the rows as they are.
 
-    Raises:
-        ValueError: for moves so long that one reading is left.
-
     Returns:
         The same columns; those others are of the row in the middle of each move.
+
+    Raises:
+        ValueError: for moves so long that one reading is left.
 
     Example:
         >>> rows = {"row": range(1, 7), "D": 0.0, "I": 0.0, "B_H": range(6)}

@@ -179,16 +179,18 @@ def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
     zero = (samples[list(AXES)] == 0).all(axis=1) & whole
     if zero.any():
         notes.append(f"{_count(int(zero.sum()), 'sample')} of three zeros left out: the magnetometer did not answer")
-    return samples[whole & ~zero].reset_index(drop=True), notes
+    samples = samples[whole & ~zero].reset_index(drop=True)
+    if "distance" in samples:
+        samples["distance"] = samples["distance"].diff().fillna(0.0)
+    return samples, notes
 
 
 def _at(time: Array, name: str, known: Array, values: Array) -> Array:
     """Return the values of a column at other times; angles the shorter way around, a distance as a sum."""
     if not len(known):
         return np.full(len(time), np.nan)
-    if name == "distance":
-        total = np.interp(time, known, np.cumsum(values))
-        return np.diff(total, prepend=total[:1])
+    if name == "distance":  # the sum, of which a row with the time of the row before is no part
+        return np.interp(time, known, np.cumsum(values * (np.diff(known, prepend=-np.inf) > 0)))
     turning = name in _ANGLES
     ends = {} if name in ("latitude", "longitude", "altitude", "speed") else {"left": np.nan, "right": np.nan}
     found = np.interp(time, known, np.unwrap(values, period=360) if turning else values, **ends)

@@ -63,6 +63,13 @@ def test_blank_cells_are_interpolated(tmp_path: Path) -> None:
     assert samples["latitude"].tolist() == pytest.approx([10, 11, 12, 12])
 
 
+def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
+    """A row that repeats a time adds nothing; the distance of a row without axes, or of zeros, belongs to the next."""
+    rows = "0,1,1,1,0,0", "1,1,1,1,0,5", "1,1,1,1,0,5", "2,0,0,0,0,7", "3,,,,0,1", "4,1,1,1,0,2"
+    samples = read_log(written(tmp_path, *rows, header=HEADER + ",distance_km")).samples
+    assert samples["distance"].tolist() == [0, 5, 10]
+
+
 @pytest.mark.parametrize(
     ("rows", "note"),
     [
