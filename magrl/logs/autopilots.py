@@ -18,8 +18,8 @@ from magrl.logs.units import FIELD_NT, UNITS, column_of
 from magrl.logs.vectors import FRAMES, attitude_of, from_enu
 
 MODEL_NORTH = (
-    "the heading is of an estimator that adds the declination of a model to a compass: D is that of the model, and "
-    "circular (a heading from two GNSS antennas or a gyrocompass is not)"
+    "the heading is of an estimator that adds the declination of a model to a compass: D is that of the model, and is "
+    "not used (state the north as true if the estimator had another heading, such as that of two GNSS antennas)"
 )
 NOT_CALIBRATED = "the magnetometer is as it was measured, without the calibration of the autopilot"
 
@@ -79,10 +79,10 @@ def read_ulg(path: Path) -> Recording:
     if fixed.any():
         streams |= _px4_position(position, fixed)
         offset = float(np.median(position["time_utc_usec"][fixed] / 1e6 - _seconds(position)[fixed]))
-    if not np.isfinite(position.get("heading", np.nan)).any():
-        notes.append(MODEL_NORTH)
+    north = "true" if np.isfinite(position.get("heading", np.nan)).any() else "model"
+    notes += [] if north == "true" else [MODEL_NORTH]
     streams = {column: (time + offset, values) for column, (time, values) in streams.items()}
-    return Recording(streams, f"PX4 ULog, {name}", "true", notes)
+    return Recording(streams, f"PX4 ULog, {name}", north, notes)
 
 
 def _seconds(topic: Mapping[str, Array]) -> Array:
@@ -116,7 +116,7 @@ def read_bin(path: Path) -> Recording:
         fields, unit = _MESSAGES[message.get_type()]
         for name, field in fields.items():
             rows[name].append((message._timestamp, unit * getattr(message, field)))
-    return Recording(_streams(rows), "ArduPilot DataFlash, MAG", "true", [MODEL_NORTH])
+    return Recording(_streams(rows), "ArduPilot DataFlash, MAG", "model", [MODEL_NORTH])
 
 
 # ROS

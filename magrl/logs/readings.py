@@ -40,7 +40,7 @@ def readings_of(
         log: samples with a heading.
         every_km: least length of a move.
         every_s: duration of a move [s], in place of a length.
-        north: north of the heading, "true" or "magnetic"; needed where the log does not tell.
+        north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`; needed where the log does not tell.
         calibration: correction of the axes.
 
     Returns:
@@ -175,7 +175,7 @@ def _readings(mean: DataFrame, covariance: Array, north: str) -> DataFrame:
     field = torch.tensor(mean[_FIELD].to_numpy(float))
     jacobian = elements_jacobian(field)
     std = (jacobian @ torch.from_numpy(covariance) @ jacobian.mT).diagonal(dim1=-2, dim2=-1).sqrt()
-    if north == "magnetic":
+    if north != "true":
         std[:, 0] = OUTAGE_STD
     move = np.diff(mean[_PATH].to_numpy(float), axis=0)
     course = np.degrees(np.arctan2(move[:, 1], move[:, 0])) % 360

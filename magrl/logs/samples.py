@@ -43,7 +43,7 @@ class Log:
             and those that the log has of ``roll``, ``pitch``, ``heading`` [deg], ``speed`` [m/s], ``distance`` since
             the sample before [km], ``latitude``, ``longitude`` [deg], ``altitude`` [km].
         source: format and sensors.
-        north: north of the heading, "true" or "magnetic", where the log tells.
+        north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`, where the log tells.
         notes: what a reader of the log must know.
 
     Example:

@@ -16,8 +16,8 @@ from magrl.checks import check_choice, check_numbers, check_tensor
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
-NORTHS = ("true", "magnetic")
-"""North from which a heading is measured."""
+NORTHS = ("true", "magnetic", "model")
+"""North of a heading: that of a gyrocompass, of a compass, or of a compass that adds the declination of a model."""
 FRAMES: Mapping[str, Sequence[float]] = {"FRD": (1.0, 1.0, 1.0), "FLU": (1.0, -1.0, -1.0)}
 """Signs of forward, right and down in the vehicle's axes; ROS has forward, left, up."""
 
@@ -101,9 +101,9 @@ def elements_of_axes(
 ) -> MeasuredElements:
     """Return D, I, B_H of three axes and an attitude, with standard deviations and correlations to first order.
 
-    The heading decides what D is: only one from true north measures it. With a heading from magnetic north D is that of
-    the compass, which says nothing of the place: its standard deviation is
-    :data:`~magrl.transforms.errors.sensors.OUTAGE_STD`, so that a filter ignores it.
+    The heading decides what D is: only one from true north measures it. With a heading from magnetic north, D is that
+    of the compass, and with the declination of a model, that of the model. Both say nothing of the place: the standard
+    deviation is :data:`~magrl.transforms.errors.sensors.OUTAGE_STD`, so that a filter ignores D.
 
     Args:
         axes_nt: ``(..., 3)`` the field along the axes of ``frame`` [nT].
@@ -134,7 +134,7 @@ def elements_of_axes(
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     scale = torch.where(std > 0, std, 1.0)
     correlation = covariance / scale.unsqueeze(-1) / scale.unsqueeze(-2)
-    if north == "magnetic":
+    if north != "true":
         std = torch.cat((torch.full_like(std[..., :1], OUTAGE_STD), std[..., 1:]), -1)
     return MeasuredElements(measured_elements(field), std, correlation)
 

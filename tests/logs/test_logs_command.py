@@ -65,6 +65,14 @@ def test_a_calibration_is_needed_and_is_used(folder: Path, capsys) -> None:
     assert np.allclose(table["distance"][1:5], 10, atol=0.1)
 
 
+def test_a_compass_calibrates_by_the_length_alone(folder: Path, capsys) -> None:
+    """A heading that the magnetometer made would hide its iron."""
+    swing = str(folder / "raw" / "swing.csv")
+    with pytest.raises(SystemExit, match="2"):
+        main([swing, "--calibrate", str(folder / "no.json"), "--north", "model"])
+    assert "too few directions for a fit without attitude" in capsys.readouterr().err
+
+
 def test_a_short_log_is_compared(folder: Path, capsys) -> None:
     rows = (folder / "raw" / "way.csv").read_text().splitlines()[:200]
     (folder / "short.csv").write_text("\n".join(rows))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import operator
 import struct
 import sys
@@ -47,7 +48,11 @@ def packed(kind: str, *content: bytes) -> bytes:
     return struct.pack("<HB", len(body), ord(kind)) + body
 
 
-def ulog(magnetometer: str = "vehicle_magnetometer", axes: str = "float[3] magnetometer_ga") -> Iterator[bytes]:
+def ulog(
+    magnetometer: str = "vehicle_magnetometer",
+    axes: str = "float[3] magnetometer_ga",
+    heading: float = math.nan,
+) -> Iterator[bytes]:
     """A ULog file: https://docs.px4.io/main/en/dev_log/ulog_file_format.html."""
     yield b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + packed("B", bytes(40))
     topics = {magnetometer: axes, "vehicle_attitude": "float[4] q"}
@@ -62,7 +67,7 @@ def ulog(magnetometer: str = "vehicle_magnetometer", axes: str = "float[3] magne
         yield packed("D", struct.pack("<HQ4f", 1, time, *q))
         place = [round(x * 1e7) for x in PLACE] if row > 1 else (0, 0)  # no fix in the first two rows
         stamp, fix = (int(UTC * 1e6) + time, 3) if row > 1 else (0, 0)
-        yield packed("D", struct.pack("<HQQiifB", 2, time, stamp, *place, float("nan"), fix))
+        yield packed("D", struct.pack("<HQQiifB", 2, time, stamp, *place, heading, fix))
 
 
 def test_px4(tmp_path: Path) -> None:
@@ -71,8 +76,10 @@ def test_px4(tmp_path: Path) -> None:
     log = read_log(path)
     check(log)
     assert log.source == "PX4 ULog, vehicle_magnetometer"
-    assert log.north == "true"
-    assert [note for note in log.notes if "circular" in note]
+    assert log.north == "model"
+    assert [note for note in log.notes if "D is that of the model" in note]
+    path.write_bytes(b"".join(ulog(heading=0.5)))
+    assert read_log(path).north == "true", "GNSS with two antennas"
     path.write_bytes(b"".join(ulog("sensor_mag", "float x;float y;float z")))
     assert any("without the calibration of the autopilot" in note for note in read_log(path).notes)
 
@@ -114,8 +121,8 @@ def test_ardupilot(tmp_path: Path) -> None:
     path.write_bytes(b"".join(dataflash()))
     log = read_log(path)
     check(log)
-    assert log.north == "true"
-    assert "circular" in log.notes[0]
+    assert log.north == "model"
+    assert "D is that of the model" in log.notes[0]
     path.write_bytes(b"".join(dataflash())[:-400])
     assert len(read_log(path).samples) < 12
 

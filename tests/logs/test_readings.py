@@ -83,7 +83,8 @@ def test_a_magnetic_heading_and_a_calibration() -> None:
     iron = Calibration(matrix=one, offset_nt=(300.0, 0.0, 0.0), **options)
     corrected = readings_of(sailed(noise=np.array([[300.0, 0.0, 0.0]])), calibration=iron)
     assert corrected["D"].tolist() == pytest.approx([10] * 5, abs=1e-6)
-    assert (readings_of(sailed(), north="magnetic")["D_std"] == OUTAGE_STD).all()
+    for north in ("magnetic", "model"):
+        assert (readings_of(sailed(), north=north)["D_std"] == OUTAGE_STD).all()
 
 
 @pytest.mark.parametrize(
@@ -97,7 +98,7 @@ def test_a_magnetic_heading_and_a_calibration() -> None:
             "neither distances nor speeds nor positions",
         ),
         (lambda log: log, {"every_km": 0.0}, "every_km must be a finite number above 0"),
-        (lambda log: log, {"north": "grid"}, "north must be one of 'true', 'magnetic', got 'grid'"),
+        (lambda log: log, {"north": "grid"}, "north must be one of 'true', 'magnetic', 'model', got 'grid'"),
     ],
 )
 def test_logs_that_are_refused(change, options, message: str) -> None:

@@ -79,9 +79,10 @@ def test_standard_deviations_and_correlations() -> None:
     assert exact.std.abs().max() == 0
 
 
-def test_a_magnetic_heading_measures_no_declination() -> None:
+@pytest.mark.parametrize("north", ["magnetic", "model"])
+def test_a_compass_measures_no_declination(north: str) -> None:
     elements, attitude = torch.tensor([0.0, 60.0, 20000.0]), torch.tensor([0.0, 0.0, 123.0])
-    found = elements_of_axes(axes_of_elements(elements, attitude), attitude, north="magnetic")
+    found = elements_of_axes(axes_of_elements(elements, attitude), attitude, north=north)
     assert found.std.tolist() == [OUTAGE_STD, 0, 0]
     assert math.isclose(found.elements[0], 0, abs_tol=1e-3)
 
@@ -89,7 +90,7 @@ def test_a_magnetic_heading_measures_no_declination() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"north": "grid"}, "north must be one of 'true', 'magnetic', got 'grid'"),
+        ({"north": "grid"}, "north must be one of 'true', 'magnetic', 'model', got 'grid'"),
         ({"north": "true", "frame": "FRU"}, "frame must be one of 'FRD', 'FLU', got 'FRU'"),
         ({"north": "true", "axes_std_nt": (1.0, -1.0, 1.0)}, "axes_std_nt must be a finite number from 0 on, got -1"),
     ],
