@@ -1,4 +1,4 @@
-"""Safe files: tensors with atomic writes and a checksum, and strict JSON. Reading a file executes no code from it."""
+"""Safe files: tensors with atomic writes and a checksum, strict JSON, TOML. Reading a file executes no code from it."""
 
 from __future__ import annotations
 
@@ -7,14 +7,23 @@ import io
 import json
 import math
 import os
+import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from magrl.checks import check_type
+from magrl.checks import check_type, short
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+MAX_FILE_BYTES = 10_000_000
+"""Largest TOML or JSON file: a scenario with about fifty thousand tasks."""
 
 
 class DamagedFileError(ValueError):
@@ -168,3 +177,40 @@ def check_writable(path: Path) -> None:
         raise OSError(f"cannot write {path}: {error.strerror}") from error
     if not existed:
         path.unlink()
+
+
+def read_document(path: Path) -> Any:
+    """Return the content of a TOML or JSON file that a user wrote.
+
+    Raises:
+        ValueError: for another suffix, a file that is too large or not valid, or a key that is repeated.
+        OSError: for a file that cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "mine.toml"
+        >>> _ = path.write_text("speed_km_h = 15.0")
+        >>> read_document(path)
+        {'speed_km_h': 15.0}
+    """
+    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
+    if path.suffix.lower() not in parsers:
+        raise ValueError(f"the file must end in .toml or .json, got {path.suffix!r}")
+    with path.open("rb") as file:
+        content = file.read(MAX_FILE_BYTES + 1)
+    if len(content) > MAX_FILE_BYTES:
+        raise ValueError(f"the file holds more than {MAX_FILE_BYTES} bytes")
+    try:
+        return parsers[path.suffix.lower()](content.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the file is not valid {path.suffix[1:].upper()}: {error}") from error
+
+
+def _json(text: str) -> Any:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(dict(pairs)) < len(pairs):
+            names = [key for key, _ in pairs]
+            raise ValueError(f"the key {short(next(key for key in names if names.count(key) > 1))} is repeated")
+        return dict(pairs)
+
+    return json.loads(text, object_pairs_hook=unique)

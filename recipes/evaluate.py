@@ -31,7 +31,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -92,8 +92,9 @@ class Config(ScenarioOptions):
     """How metaheuristics evaluate a candidate move."""
     noise: Noise | None = None
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]; by default those of the runs, or 0."""
-    conditions: str | None = None
-    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater or low-cost."""
+    conditions: Annotated[str | None, tyro.conf.arg(aliases=("--errors",))] = None
+    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater, low-cost, or a file of own
+    errors (.toml or .json, docs/conditions.md)."""
     known_start: Noise | None = None
     """Where the vehicles know the field at their start and calibrate their sensors: standard deviations of what they
     know of D [deg], I [deg], B_H [nT], such as 0 0 0; with --conditions."""
@@ -250,8 +251,8 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
         "arrival": env.arrival.rule,
         "arrival_radius_km": env.arrival.radius_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        **{key: getattr(config, key) for key in ("tasks", "noise", "conditions", "known_start")},
-        **{key: getattr(config, key) for key in ("map_date", "mode", "seed")},
+        **{key: getattr(config, key) for key in ("tasks", "noise", "known_start", "map_date", "mode", "seed")},
+        "conditions": config.conditions and Path(config.conditions).name,
         **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
         **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
     }

@@ -21,7 +21,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -65,8 +65,9 @@ class Config:
     recipes/evaluate.py."""
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
-    conditions: str | None = None
-    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater or low-cost."""
+    conditions: Annotated[str | None, tyro.conf.arg(aliases=("--errors",))] = None
+    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater, low-cost, or a file of own
+    errors (.toml or .json, docs/conditions.md)."""
     known_start: tuple[float, float, float] | None = None
     """Where the vehicle knows the field at its start and calibrates its sensors: standard deviations of what it knows
     of D [deg], I [deg], B_H [nT], such as 0 0 0; with --conditions."""

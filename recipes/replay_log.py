@@ -31,15 +31,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from magrl.agents import load_policy
-from magrl.checks import check_number
 from magrl.evaluation.tables import markdown_table
+from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
+from magrl.logs import checked_times, joined, mistakes
 from magrl.onboard import Onboard
 from magrl.training import UsageError, command
 
 RECIPE = "replay_log.py"
-ELEMENTS = ["declination", "inclination", "horizontal"]
+ELEMENTS = [*NAMES]
+OPTIONS = {"D": "declination", "I": "inclination", "B_H": "horizontal"}
+"""Options that name the columns of the elements."""
 COMMANDED = ["move_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
 """Columns of what the navigator would have commanded and estimated."""
 FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}"}
@@ -65,9 +68,11 @@ class Config:
     arrival_km: float = 25.0
     """Distance from the destination that counts as arrived [km]."""
     every_km: float = 0.0
-    """Least length of a move: shorter ones are joined [km]."""
+    """Least length of a move: the readings of shorter ones are averaged [km]."""
+    date: str | None = None
+    """Date for a comparison with IGRF at the positions; by default that of the times, where these are dates."""
     time: str = "time"
-    """Column of the time, which is copied; it may be missing."""
+    """Column of the time, numbers or ISO 8601; it may be missing."""
     declination: str = "D"
     """Column of the declination [deg]."""
     inclination: str = "I"
@@ -87,50 +92,39 @@ class Config:
 
 
 def read_log(config: Config) -> pd.DataFrame:
-    """Return the columns of the log by the names of the options, and the number of each row in the file.
+    """Return the columns of the log, the number of each row in the file, and in ``attrs`` the notes on its times.
 
     Raises:
         UsageError: for a file that cannot be read, a missing column, or a value that is not a number.
+        ValueError: for times that run backward.
     """
     try:
         raw = pd.read_csv(config.log, dtype=str, skipinitialspace=True)
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot read {config.log}: {error}") from error
     log = pd.DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
-    if config.time in raw:
-        log["time"] = raw[config.time]
     wanted = [*ELEMENTS, "heading", "distance"]
     if config.latitude in raw or config.longitude in raw:
         wanted += ["latitude", "longitude"]
-    for option in wanted:
+    for column in wanted:
+        option = OPTIONS.get(column, column)
         name = getattr(config, option)
         if name not in raw:
             raise UsageError(f"no column of {config.log} is {name!r}: name one of {[*raw]} by --{option}")
-        log[option] = pd.to_numeric(raw[name], errors="coerce")
-        bad = ~np.isfinite(log[option])
+        log[column] = pd.to_numeric(raw[name], errors="coerce")
+        bad = ~np.isfinite(log[column])
         if bad.any():
             row = int(bad.idxmax())
             raise UsageError(f"row {row + 1} of {config.log}: {name} is {raw[name][row]!r}, which is not a number")
     if len(log) < 2:
         raise UsageError(f"{config.log} must hold at least two rows, got {len(log)}")
-    return log
-
-
-def joined(log: pd.DataFrame, every_km: float) -> pd.DataFrame:
-    """Return the rows at the ends of moves of at least some length; shorter moves are added as vectors.
-
-    The last row always stays.
-    """
-    rows, way = [], np.zeros(2)
-    for index, row in log.iterrows():
-        heading = math.radians(row["heading"])
-        way = way + row["distance"] * np.array((math.cos(heading), math.sin(heading)))
-        length = float(np.hypot(*way))
-        if index == 0 or length >= every_km or index == len(log) - 1:
-            course = math.degrees(math.atan2(way[1], way[0])) % 360 if length and every_km else row["heading"]
-            rows.append({**row, "heading": course, "distance": length if every_km else row["distance"]})
-            way = np.zeros(2)
-    return pd.DataFrame(rows)
+    log.attrs = {"notes": [], "date": config.date}
+    if config.time not in raw:
+        return log
+    log.insert(1, "time", raw[config.time])
+    new, notes, date = checked_times(log["time"])
+    log.attrs = {"notes": notes, "date": config.date or date}
+    return log[new].reset_index(drop=True)
 
 
 def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
@@ -269,8 +263,9 @@ def notes(table: pd.DataFrame) -> list[str]:
     if len(stops):
         found.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")
     if "miss_km" in table:
-        miss, stated = table[["miss_km", "error_km"]].iloc[-1]
-        found.append(f"Error of the estimated way at the end: {miss:.1f} km; stated {stated:.1f} km.")
+        halfway, end = table[["miss_km", "error_km"]].iloc[[len(table) // 2, -1]].to_numpy(float)
+        text = "Error of the estimated way {}: {:.1f} km; stated {:.1f} km.".format
+        found += [text("halfway", *halfway), text("at the end", *end)]
     return found
 
 
@@ -281,16 +276,17 @@ def main(args: Sequence[str] | None = None) -> None:
         UsageError: for a log or a setting that is wrong.
     """
     config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
-    log = read_log(config)
     try:
-        check_number(0, every_km=config.every_km)
+        log = read_log(config)
         for name in ("log.csv", "log.md", "log.png"):
             check_writable(config.out / name)
         table = with_truth(config, replay(config, joined(log, config.every_km)))
+        warnings = log.attrs["notes"] + mistakes(log, log.attrs["date"])
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
     table.drop(columns="covariance").to_csv(config.out / "log.csv", index=False)
-    (config.out / "log.md").write_text("\n".join([markdown(table), "", *notes(table), ""]))
+    lines = [markdown(table), "", *notes(table), *(f"Warning: {text}." for text in warnings), ""]
+    (config.out / "log.md").write_text("\n".join(lines))
     figure(table, f"{config.log.name}: {config.navigator}").savefig(config.out / "log.png", dpi=110)
     print((config.out / "log.md").read_text(), f"The picture is {config.out / 'log.png'}", sep="\n")
 

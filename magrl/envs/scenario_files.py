@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,14 +11,7 @@ from pydantic import BeforeValidator
 from magrl.checks import CheckedModel, check_type, short
 from magrl.envs.scenario import Scenario, numbers_validator
 from magrl.envs.tasks import Tasks
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-MAX_FILE_BYTES = 10_000_000
-"""Largest scenario file: about fifty thousand tasks."""
+from magrl.files import read_document
 
 
 def _name(value: object) -> object:
@@ -63,7 +53,7 @@ def load_scenario(path: Path | str, **changes: Any) -> Scenario:
     check_type((Path, str), path=path)
     path = Path(path)
     try:
-        scenario = _scenario(_content(path), changes)
+        scenario = _scenario(read_document(path), changes)
         scenario.build_field()
         return scenario
     except FileNotFoundError:
@@ -103,28 +93,3 @@ def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
             raise ValueError(f"tasks, entry {number}: {error}") from error
     start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
     return tuple(e.name for e in entries), Tasks(start, target)
-
-
-def _content(path: Path) -> Any:
-    """Return the parsed file."""
-    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
-    if path.suffix.lower() not in parsers:
-        raise ValueError(f"a scenario file must end in .toml or .json, got {path.suffix!r}")
-    with path.open("rb") as file:
-        content = file.read(MAX_FILE_BYTES + 1)
-    if len(content) > MAX_FILE_BYTES:
-        raise ValueError(f"the file holds more than {MAX_FILE_BYTES} bytes")
-    try:
-        return parsers[path.suffix.lower()](content.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"the file is not valid {path.suffix[1:].upper()}: {error}") from error
-
-
-def _json(text: str) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(dict(pairs)) < len(pairs):
-            names = [key for key, _ in pairs]
-            raise ValueError(f"the key {short(next(key for key in names if names.count(key) > 1))} is repeated")
-        return dict(pairs)
-
-    return json.loads(text, object_pairs_hook=unique)

@@ -47,7 +47,8 @@ def evaluate(
         num_envs: number of vehicles that fly at a time, each several tasks where there are more; by default one for
             each task. Sensor noise, other errors and random start headings depend on it, the tasks do not.
         noise: standard deviations of the noise on D [deg], I [deg], B_H [nT].
-        conditions: errors of a real vehicle instead of noise, a name of :data:`magrl.transforms.CONDITIONS`.
+        conditions: errors of a real vehicle instead of noise: a name of :data:`magrl.transforms.CONDITIONS`, or a file
+            (:func:`magrl.transforms.load_conditions`).
         known_start: where the vehicles know the elements at their start, the standard deviations of these: they then
             calibrate their sensors (:class:`magrl.transforms.KnownStart`). With ``conditions``.
         confidence: least probability at which navigators declare an arrival.

@@ -114,6 +114,24 @@ def check_start(reading: Elements, known: Elements, std: Sequence[float]) -> Non
         ValueError: the first reading, D 3.4, I -73.1, B_H 14950, does not fit the start, D 3.5, I 73, B_H 15000 (I \
 deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis points up, and down is expected
     """
+    if found := misfit(reading, known, std):
+        texts: list[Any] = [f"D {each[0]:g}, I {each[1]:g}, B_H {each[2]:g}" for each in (reading, known)]
+        cause = found[1] or "check sensors, compass and place, or state larger errors in bias_std"
+        raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({found[0]}): {cause}")
+
+
+def misfit(reading: Elements, known: Elements, std: Sequence[float]) -> tuple[str, str | None] | None:
+    """Return how a reading deviates from known elements, and the mistake that would explain it; None if it fits.
+
+    Args:
+        reading: D [deg], I [deg], B_H [nT].
+        known: the elements at its place.
+        std: standard deviations of the difference.
+
+    Example:
+        >>> misfit((3.4, -73.1, 14950.0), (3.5, 73.0, 15000.0), (0.5, 0.1, 50.0))[1]
+        'it fits with -I: the vertical axis points up, and down is expected'
+    """
     total = math.hypot(known[2], known[2] * math.tan(math.radians(known[1])))
     slack = math.degrees(SLACK_NT / max(known[2], SLACK_NT)), math.degrees(SLACK_NT / total), SLACK_NT
     most = tuple(MOST_SIGMAS * s + each for s, each in zip(std, slack, strict=True))
@@ -127,15 +145,11 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
         return all(each <= limit for each, limit in zip(misfit(elements), most, strict=True))
 
     if fits(reading):
-        return
+        return None
     index, deviation = max(enumerate(misfit(reading)), key=lambda each: each[1] / most[each[0]])
     causes = [text for text, elements in _mistakes(*reading, declination_there=known[0]) if fits(elements)]
-    cause = causes[0] if causes else "check sensors, compass and place, or state larger errors in bias_std"
-    texts: list[Any] = [f"D {each[0]:g}, I {each[1]:g}, B_H {each[2]:g}" for each in (reading, known)]
-    raise ValueError(
-        f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({('D', 'I', 'B_H')[index]} deviates by "
-        f"{deviation:.4g}, where {most[index]:.3g} is likely): {cause}"
-    )
+    text = f"{('D', 'I', 'B_H')[index]} deviates by {deviation:.4g}, where {most[index]:.3g} is likely"
+    return text, causes[0] if causes else None
 
 
 def _mistakes(d: float, i: float, b: float, *, declination_there: float) -> list[tuple[str, Elements]]:

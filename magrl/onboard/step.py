@@ -6,7 +6,7 @@ import copy
 import io
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict
@@ -16,6 +16,11 @@ from magrl.agents.policy import FieldPolicy
 from magrl.checks import check_type
 from magrl.transforms import TrackView
 from magrl.transforms.track import IN_KEYS, STD_KEYS
+
+ONNX_INPUTS = ("field", "target_field", "course", "accuracy", "step", "mean", "covariance", "first_field")
+"""Names of the tensors that a step takes, in ONNX: see :meth:`VehicleStep.forward`."""
+ONNX_OUTPUTS = ("action", "way", "way_covariance", *(f"next_{name}" for name in ONNX_INPUTS[4:]))
+"""Names of the tensors that it returns."""
 
 
 class StepState(NamedTuple):
@@ -116,29 +121,51 @@ class VehicleStep(nn.Module):
 def write_step(path: Path | str, policy: FieldPolicy) -> None:
     """Write the step of an agent that reads its own track as a file that runs without magrl and TorchRL.
 
-    :func:`torch.export.load` reads the file; its module takes and returns the tensors of :class:`VehicleStep`. PyTorch
-    reads such a file with pickle: load it only from a source that you trust.
+    :func:`torch.export.load` reads a file ``.pt2``; its module takes and returns the tensors of :class:`VehicleStep`.
+    PyTorch reads such a file with pickle: load it only from a source that you trust. A file ``.onnx`` runs without
+    PyTorch; its inputs and outputs are named :data:`ONNX_INPUTS` and :data:`ONNX_OUTPUTS`.
 
     Args:
-        path: path of the file, ``.pt2``.
+        path: path of the file, ``.pt2`` or ``.onnx``.
         policy: trained policy, such as ``load_pretrained("anywhere")``.
 
     Raises:
         ValueError: for another suffix, or a policy that does not read its own track.
+        ImportError: for ``.onnx`` without the extra ``onnx``.
         OSError: if the file cannot be written.
 
     Example:
         >>> from magrl.agents import load_pretrained
-        >>> write_step("anywhere.onnx", load_pretrained("anywhere"))
+        >>> write_step("anywhere.pt", load_pretrained("anywhere"))
         Traceback (most recent call last):
-        ValueError: a file for torch.export.load must end with .pt2, got 'anywhere.onnx'
+        ValueError: a file of a step must end with .pt2 or .onnx, got 'anywhere.pt'
     """
-    if Path(path).suffix != ".pt2":
-        raise ValueError(f"a file for torch.export.load must end with .pt2, got {str(path)!r}")
+    if Path(path).suffix not in (".pt2", ".onnx"):
+        raise ValueError(f"a file of a step must end with .pt2 or .onnx, got {str(path)!r}")
     module = VehicleStep(copy.deepcopy(policy).cpu()).eval()
     examples = torch.zeros(3), torch.ones(3), torch.zeros(2), torch.zeros(2, 3)
     with torch.no_grad():
         exported = torch.export.export(module, (*examples, *first_state()), strict=False)
-    file = io.BytesIO()
-    torch.export.save(exported, file)
-    Path(path).write_bytes(file.getvalue())
+    if Path(path).suffix == ".onnx":
+        content = _onnx(exported)
+    else:
+        file = io.BytesIO()
+        torch.export.save(exported, file)
+        content = file.getvalue()
+    Path(path).write_bytes(content)
+
+
+def _onnx(exported: torch.export.ExportedProgram) -> bytes:
+    """Return an exported step as ONNX, which lacks ``hypot``."""
+    try:
+        from onnxscript import opset18
+    except ImportError as error:
+        raise ImportError("ONNX needs the package onnxscript: pip install 'magrl[onnx]'") from error
+
+    def hypot(x: Any, y: Any) -> Any:
+        return opset18.Sqrt(opset18.Add(opset18.Mul(x, x), opset18.Mul(y, y)))
+
+    options: dict[str, Any] = {"input_names": ONNX_INPUTS, "output_names": ONNX_OUTPUTS, "dynamo": True}
+    options |= {"custom_translation_table": {torch.ops.prims.hypot.default: hypot}, "verbose": False}
+    program: Any = torch.onnx.export(exported, **options)
+    return program.model_proto.SerializeToString()

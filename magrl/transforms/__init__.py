@@ -13,6 +13,7 @@ from magrl.transforms.errors.base import true_keys as true_keys
 from magrl.transforms.errors.conditions import CONDITIONS as CONDITIONS
 from magrl.transforms.errors.conditions import Conditions as Conditions
 from magrl.transforms.errors.conditions import conditions_named as conditions_named
+from magrl.transforms.errors.conditions import load_conditions as load_conditions
 from magrl.transforms.errors.conditions import with_conditions as with_conditions
 from magrl.transforms.errors.known_start import KnownStart as KnownStart
 from magrl.transforms.errors.known_start import calibration as calibration

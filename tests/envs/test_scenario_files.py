@@ -12,8 +12,8 @@ import tomllib
 import torch
 
 from magrl.envs import GeomagneticNavEnv, Region, Regions, load_scenario
-from magrl.envs.scenario_files import MAX_FILE_BYTES
 from magrl.field import IGRF
+from magrl.files import MAX_FILE_BYTES
 
 ROOT = Path(__file__).parent.parent.parent
 AZORES = Regions.of(Region((36, 46), (-32, -22)))
@@ -152,7 +152,7 @@ def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, 
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("a.yaml", b"", "a scenario file must end in .toml or .json, got '.yaml'"),
+        ("a.yaml", b"", "the file must end in .toml or .json, got '.yaml'"),
         ("a.toml", b"[region", "the file is not valid TOML"),
         ("a.json", b'{"region": 1, "region": 2}', "the key 'region' is repeated"),
         ("a.json", b"[" * 100_000, "JSON"),

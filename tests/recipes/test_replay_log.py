@@ -42,16 +42,33 @@ def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
     pd.testing.assert_frame_equal(table[columns], other[columns])
 
 
-def test_short_moves_are_joined(tmp_path: Path) -> None:
+def test_readings_of_short_moves_are_averaged(tmp_path: Path) -> None:
+    """Each reading is at the mean of the places of its rows; the last move may have half the length."""
     path = tmp_path / "log.csv"
-    rows = ["0,60,20000,0,0", "0,60,20000,0,3", "0,60,20000,90,4", "0,60,20000,90,2"]
+    rows = ["0,60,20000,0,0", "0,60,20010,0,3", "0,60,20020,90,4", "0,60,20030,90,2"]
     path.write_text("\n".join(["D,I,B_H,heading,distance", *rows]))
     log = recipe.read_log(recipe.Config(path))
-    joined = recipe.joined(log, 5.0)
-    assert joined["row"].tolist() == [1, 3, 4]
-    assert joined["distance"].tolist() == pytest.approx([0, 5, 2])
-    assert joined["heading"].tolist() == pytest.approx([0, 53.130102, 90])
+    joined = recipe.joined(log, 4.0)
+    assert joined["row"].tolist() == [1, 3]
+    assert joined["B_H"].tolist() == pytest.approx([20005, 20025])
+    assert joined["distance"].tolist() == pytest.approx([0, (1.5**2 + 5**2) ** 0.5])
+    assert joined["heading"].tolist() == pytest.approx([0, 73.300756])
     pd.testing.assert_frame_equal(recipe.joined(log, 0.0), log, check_dtype=False)
+
+
+def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(tmp_path: Path, capsys) -> None:
+    header, *rows = LOG.read_text().splitlines()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([header, *(row for row in rows for _ in range(2))]))
+    recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "a")])
+    said = capsys.readouterr().out
+    assert "Warning: 25 rows with the time of the row before left out." in said
+    assert "IGRF" not in said
+    assert "Error of the estimated way halfway" in said
+    wrong = pd.read_csv(LOG)
+    wrong.assign(I=-wrong["I"]).to_csv(path, index=False)
+    recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "b")])
+    assert "25 of 25 readings do not fit IGRF" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -62,6 +79,8 @@ def test_short_moves_are_joined(tmp_path: Path) -> None:
         (("14271.7", "14.27"), (), r"row 2 of .*microtesla"),
         (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
         (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest move"),
+        (("0.83", "20"), (), "time runs backward from row 2 to 3, from 20 to 1.67: sort the rows"),
+        (("", ""), ("--every-km", "5000"), "every_km 5000 leaves one reading of 25: choose shorter moves"),
         (("", ""), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
         (("", ""), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
         (("", ""), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),

@@ -15,6 +15,7 @@ PACKAGES = (
     "navigators.metaheuristics",
     "agents",
     "onboard",
+    "logs",
     "evaluation",
     "training",
 )

@@ -6,12 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from magrl.checks import check_choice, check_numbers, check_type
+from magrl.files import read_document
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.errors.known_start import KnownStart, calibration
 from magrl.transforms.errors.motion import MotionError
@@ -220,16 +222,49 @@ def _rounded(std: torch.Tensor) -> tuple[float, ...]:
     return tuple(round(each, 6) for each in std.tolist())
 
 
-def conditions_named(name: str) -> Conditions:
-    """Return a preset of :data:`CONDITIONS`.
+def load_conditions(path: Path | str) -> Conditions:
+    """Read conditions from a TOML or JSON file, whose keys are the arguments of :class:`Conditions`.
+
+    The name is that of the file by default; the options of :class:`~magrl.transforms.VectorErrors` are those of
+    ``sensors.vector``.
 
     Raises:
-        ValueError: for an unknown name, listing those known.
+        ValueError: for a file that cannot be read, or an option that is unknown or out of its range, with the file.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "boat.toml"
+        >>> _ = path.write_text("north.constant_deg = 0.5" + chr(10) + "sensors.vector.hard_iron_nt = [20, 20, 20]")
+        >>> boat = load_conditions(path)
+        >>> boat.name, boat.bias_std[2]
+        ('boat', 20.0)
+    """
+    path = Path(path)
+    try:
+        content = {"name": path.stem} | read_document(path)
+        sensors = dict(content.get("sensors", {}))
+        if "vector" in sensors:
+            sensors["vector"] = VectorErrors(**sensors["vector"])
+        return Conditions(**content | {"sensors": sensors})
+    except (ValueError, TypeError, OSError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def conditions_named(name: str) -> Conditions:
+    """Return a preset of :data:`CONDITIONS`, or the conditions of a file; see :func:`load_conditions`.
+
+    Args:
+        name: name of a preset, or path of a file that ends in .toml or .json.
+
+    Raises:
+        ValueError: for an unknown name, listing those known, or a file that is wrong.
 
     Example:
         >>> conditions_named("aircraft").north
         'fiber-optic'
     """
+    if isinstance(name, str) and name.endswith((".toml", ".json")):
+        return load_conditions(name)
     check_choice(CONDITIONS, conditions=name)
     return CONDITIONS[name]
 

@@ -9,6 +9,7 @@ import evaluate
 import fly
 import pytest
 import torch
+import tyro
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import EnvBase
@@ -28,6 +29,8 @@ from magrl.transforms import (
     NorthReferenceError,
     SensorErrors,
     VectorErrors,
+    conditions_named,
+    load_conditions,
     with_conditions,
 )
 from magrl.transforms.errors.base import TYPICAL_FIELD
@@ -148,6 +151,50 @@ def test_evaluate_under_conditions(tmp_path: Path) -> None:
     assert {type(part) for part in env.transform} >= {MotionError, NorthReferenceError}
     assert navigators[0][0].bias_std.tolist() == list(CONDITIONS["ship"].bias_std)
     assert evaluate.settings(config, env)["conditions"] == "ship"
+
+
+BOAT = Path(__file__).parent.parent.parent.parent / "docs" / "examples" / "boat.toml"
+
+
+def test_own_errors_in_a_file() -> None:
+    """The errors of the example are those written in Python, and both commands take its path."""
+    boat = Conditions(
+        "survey boat",
+        15.0,
+        sensors={
+            "sensor_std": (0.02, 0.02, 5.0),
+            "vector": VectorErrors(hard_iron_nt=(20.0, 20.0, 20.0), attitude_deg=(0.05, 0.05)),
+        },
+        north={"constant_deg": 0.2, "random_deg": 0.1},
+        motion={"log_scale": 0.02, "current_km_h": 1.0},
+        weather={"record": "disturbed"},
+    )
+    read = load_conditions(BOAT)
+    for errors in (read, str(BOAT)):
+        flown = [evaluation_rollout(with_conditions(nav(2, 8.0), each, 3), Kalman()) for each in (errors, boat)]
+        torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
+    assert (read.name, read.sensor_std, read.bias_std) == (boat.name, boat.sensor_std, boat.bias_std)
+    for recipe, places in ((fly, ["60.4N 5.3E", "62.0N 6.7W"]), (evaluate, ["secant"])):
+        assert tyro.cli(recipe.Config, args=[*places, "--errors", str(BOAT)]).conditions == str(BOAT)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("speed = 3", r"mine\.toml: .*unexpected keyword argument 'speed'"),
+        ("[motion]\ncurrent = 3", r"mine\.toml: MotionError has no option 'current'"),
+        ("[sensors]\nsensor_std = [0.1, 0.1, -1]", r"mine\.toml: sensor_std must .*got -1"),
+        ("[sensors.vector]\nhard_iron_nt = 3", r"mine\.toml: hard_iron_nt must be 3 .*got 3"),
+        ("north = 'best'", r"mine\.toml: .*must be one of 'fiber-optic'"),
+        ("[north", r"mine\.toml: the file is not valid TOML"),
+        (None, r"No such file.*mine\.toml"),
+    ],
+)
+def test_files_of_errors_that_are_refused(tmp_path: Path, text: str | None, message: str) -> None:
+    if text is not None:
+        (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        conditions_named(str(tmp_path / "mine.toml"))
 
 
 def test_fly_under_conditions(tmp_path: Path) -> None:

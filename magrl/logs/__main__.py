@@ -1,0 +1,134 @@
+"""Read the log of a vehicle: what it holds, beside IGRF, and readings of D, I, B_H for a replay.
+
+    python -m magrl.logs swing.csv --calibrate quay.json --here 60.4 5.3 --date 2026-06-30    # a swing at the quay
+    python -m magrl.logs way.csv --calibration quay.json --every-km 20                       # writes way_readings.csv
+    python recipes/replay_log.py way_readings.csv                                            # what would be commanded
+
+Logs are CSV files (columns such as time_s, mag_x_nT, mag_y_uT, roll_deg, heading_true_deg, speed_kn, lat, lon) and
+those of autopilots and ships (docs/onboard.md). The axes are forward, right, down, the angles roll, pitch, heading.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas
+
+from magrl.field.elements import NAMES
+from magrl.files import check_writable
+from magrl.logs.calibration import Calibration, calibrate
+from magrl.logs.comparison import difference_from_igrf, mistakes
+from magrl.logs.readers import read_log
+from magrl.logs.readings import STD_NAMES, readings_of
+from magrl.logs.samples import ATTITUDE, AXES, Log
+from magrl.logs.vectors import FRAMES, NORTHS
+
+_DIGITS = {"time": 2, "D": 4, "I": 4, "B_H": 2, "heading": 3, "distance": 4, "latitude": 6, "longitude": 6}
+_DIGITS |= {"altitude": 4, "D_std": 4, "I_std": 4, "B_H_std": 2}
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    command = argparse.ArgumentParser(
+        prog="python -m magrl.logs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    command.add_argument("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
+    command.add_argument("--frame", choices=FRAMES, default="FRD", help="axes of a CSV file; default FRD")
+    command.add_argument("--north", choices=NORTHS, help="north of the heading, where the log does not tell")
+    command.add_argument("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
+    command.add_argument("--every-s", type=float, help="duration of a move [s], in place of a length")
+    command.add_argument("--calibration", type=Path, help="file of a calibration, which corrects the axes")
+    command.add_argument("--calibrate", type=Path, help="calibrate by this log, a swing, and write this file (.json)")
+    command.add_argument("--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H")
+    command.add_argument("--alignment-deg", type=float, default=0.5, help="misalignment of the axes [deg]; default 0.5")
+    command.add_argument("--date", help="date for IGRF, such as 2026-06-30; default that of the log")
+    command.add_argument("--out", type=Path, help="readings (.csv); default beside the first file, with _readings")
+    return command
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line and the log, and print what was found."""
+    options = parser().parse_args(args)
+    try:
+        log = read_log(*options.log, frame=options.frame)
+        print("\n".join(summary(log)))
+        date = options.date or log.date
+        lines = swing(log, options, date) if options.calibrate else way(log, options, date)
+        print("\n".join(lines))
+    except (ValueError, OSError, ImportError) as error:
+        print(f"python -m magrl.logs: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def summary(log: Log) -> list[str]:
+    """Return what a log holds: source, columns, duration, rate, field, and its notes."""
+    samples = log.samples
+    time = samples["time"].to_numpy(float)
+    rate = f"{1 / np.median(np.diff(time)):.3g} Hz" if len(time) > 1 else "one sample"
+    total = np.sqrt(np.square(samples[list(AXES)]).sum(axis=1))
+    return [
+        f"{log.source}: {len(samples)} samples in {time[-1] - time[0]:.4g} s, {rate}, date {log.date or 'unknown'}",
+        f"columns: {', '.join(samples)}; north of the heading: {log.north or 'not told'}",
+        f"total intensity as logged: {total.median():.0f} nT, from {total.min():.0f} to {total.max():.0f}",
+        *(f"note: {note}" for note in log.notes),
+    ]
+
+
+def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
+    """Calibrate by a log, write the file and return the quality of the calibration."""
+    here = options.here
+    if here is None:
+        if "latitude" not in log.samples:
+            raise ValueError("the log has no position: state the place of the swing by --here, such as --here 60.4 5.3")
+        here = log.tensor("latitude", "longitude").median(0).values.tolist()
+    north = options.north or log.north
+    attitude = log.tensor(*ATTITUDE) if north == "true" and "heading" in log.samples else None
+    known = {"date": date if len(here) == 2 else None, "alignment_deg": options.alignment_deg}
+    found = calibrate(log.tensor(*AXES), here, attitude_deg=attitude, **known)
+    check_writable(options.calibrate)
+    found.save(options.calibrate)
+    offset = "{:.0f}, {:.0f}, {:.0f} nT".format(*found.offset_nt)
+    return [
+        f"calibration by {found.method}: hard iron {offset}, residuals {found.noise_nt:.0f} nT, "
+        f"{100 * found.outliers:.1f} % outliers",
+        f"it leaves standard deviations: {_elements(found.std)}",
+        f"calibration: {options.calibrate}",
+    ]
+
+
+def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
+    """Write the readings of a log, and return them beside IGRF, with the likely mistakes."""
+    out = options.out or options.log[0].with_name(f"{options.log[0].stem}_readings.csv")
+    known = Calibration.load(options.calibration) if options.calibration else None
+    table = readings_of(log, every_km=options.every_km, every_s=options.every_s, north=options.north, calibration=known)
+    first = table.iloc[0]
+    found = [f"first reading: {_elements(first[list(NAMES)])}; {int(table['spikes'].sum())} spikes left out"]
+    if "latitude" in table and date:
+        mean = difference_from_igrf(table, date).mean(0)
+        found.append(f"minus IGRF of {date}, mean of {len(table)}: {_elements(mean)}")
+    found += [f"warning: {text}" for text in mistakes(table, date)]
+    if len(table) < 2:
+        return [*found, "one reading: no file is written; choose shorter moves by --every-km or --every-s"]
+    check_writable(out)
+    stamp = pandas.to_datetime(table["time"], unit="s", utc=True).dt.strftime("%Y-%m-%dT%H:%M:%SZ")
+    table.round(_DIGITS).assign(**({"time": stamp} if log.date else {})).to_csv(out, index=False)
+    std = np.sqrt(np.square(table[list(STD_NAMES)]).mean())
+    noise, bias = (" ".join(f"{each:.3g}" for each in values) for values in (std, known.std if known else np.zeros(3)))
+    missing = "" if known else "; --bias is that of your sensors, which no calibration tells"
+    return [
+        *found,
+        f"{len(table)} readings, moves of {table['distance'][1:].mean():.3g} km: {out}",
+        f"replay: python recipes/replay_log.py {out} --noise {noise} --bias {bias}{missing}",
+    ]
+
+
+def _elements(values: Iterable[float]) -> str:
+    return "D {:.2f} deg, I {:.2f} deg, B_H {:.0f} nT".format(*values)
+
+
+if __name__ == "__main__":
+    main()

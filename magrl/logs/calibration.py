@@ -1,0 +1,346 @@
+"""Calibration of a vector magnetometer in its vehicle: hard iron, soft iron and misalignment, and what they leave."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from itertools import permutations, product
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from magrl.checks import CheckedModel, check_number, check_tensor
+from magrl.field.elements import elements_jacobian, field_vector
+from magrl.files import DamagedFileError, write_json
+from magrl.logs.units import guess_unit
+from magrl.logs.vectors import rotation
+from magrl.onboard.start import known_elements
+
+SOFT_IRON_STD, HARD_IRON_STD = 0.05, 1.0
+"""Standard deviations of soft iron, each entry, and of hard iron, as a share of the field, before the swing; chosen."""
+MOST_STD = (10.0, 4.0, 1000.0)
+"""Standard deviations of D [deg], I [deg], B_H [nT] beyond which a calibration is refused; chosen."""
+LEAST_SAMPLES = 100
+LEAST_SPREAD = 0.05
+MOST_OUTLIERS = 0.1
+OUTLIER_SIGMAS = 5.0
+_BLOCKS = 100  # of consecutive samples, whose errors are not independent
+_ROUNDS, _SETTLED = 20, 1e-7  # of the fit: a swing converges in 4 to 8; a change of matrix and offset as a share
+_SWING = (
+    "swing the vehicle: slowly through all headings, with roll and pitch to both sides as far as it goes (a vehicle in "
+    "the hand: every side up once)"
+)
+_AXES = ("forward", "right", "down")
+_SIGNS = list(product((1.0, -1.0), repeat=3))
+Row = tuple[float, float, float]
+
+
+class Calibration(CheckedModel):
+    """Correction ``matrix (m - offset)`` of three axes m, and how accurate it is.
+
+    Args:
+        matrix: 3 x 3, in the vehicle's axes forward, right, down.
+        offset_nt: hard iron, forward, right, down [nT].
+        method: "vector", with the attitude of each sample, or "ellipsoid", by the total intensity alone.
+        std: standard deviations of D [deg], I [deg], B_H [nT] that it leaves: the ``bias_std`` of a vehicle.
+        noise_nt: root mean square of the residuals of a sample [nT].
+        samples: number of samples.
+        outliers: share of them that were left out.
+        seen: least and greatest share of the field along each axis, from -1 to 1.
+        date: date of the swing.
+        here: latitude and longitude of the swing [deg], or D, I, B_H.
+
+    Raises:
+        ValueError: naming each value that is wrong.
+
+    Example:
+        >>> one = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        >>> options = {"std": (0.1, 0.1, 9.0), "noise_nt": 30.0, "samples": 600, "outliers": 0.0, "here": (60.4, 5.3)}
+        >>> options |= {"method": "vector", "seen": ((-1.0, 1.0),) * 3}
+        >>> iron = Calibration(matrix=one, offset_nt=(500.0, 0.0, 0.0), **options)
+        >>> iron.apply(torch.tensor([15500.0, 0.0, 45000.0]))
+        tensor([15000., 0., 45000.])
+    """
+
+    matrix: tuple[Row, Row, Row]
+    offset_nt: Row
+    method: Literal["vector", "ellipsoid"]
+    std: Row
+    noise_nt: float
+    samples: int
+    outliers: float
+    seen: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    here: tuple[float, ...]
+    date: str | None = None
+
+    def apply(self, axes_nt: Tensor) -> Tensor:
+        """Return corrected axes [nT] ``(..., 3)``."""
+        check_tensor(3, axes_nt=axes_nt)
+        return (axes_nt - axes_nt.new_tensor(self.offset_nt)) @ axes_nt.new_tensor(self.matrix).mT
+
+    def save(self, path: Path | str) -> None:
+        """Write the calibration to a JSON file."""
+        write_json(Path(path), self.model_dump())
+
+    @classmethod
+    def load(cls, path: Path | str) -> Calibration:
+        """Read a file of :meth:`save`.
+
+        Raises:
+            DamagedFileError: naming the file and what is wrong with it.
+        """
+        try:
+            return cls(**json.loads(Path(path).read_text(), object_hook=_tuples))
+        except (ValueError, TypeError, OSError) as error:
+            raise DamagedFileError(f"{path} is not a calibration: {error}") from error
+
+
+def _tuples(content: dict[str, Any]) -> dict[str, Any]:
+    """Return lists of JSON, and lists in them, as tuples."""
+    rows = {
+        name: [tuple(x) if isinstance(x, list) else x for x in value]
+        for name, value in content.items()
+        if isinstance(value, list)
+    }
+    return content | {name: tuple(row) for name, row in rows.items()}
+
+
+def calibrate(
+    axes_nt: Tensor,
+    here: Sequence[float],
+    *,
+    date: str | None = None,
+    here_std: Sequence[float] | None = None,
+    attitude_deg: Tensor | None = None,
+    alignment_deg: float = 0.5,
+    tilt_deg: float = 5.0,
+) -> Calibration:
+    """Fit a calibration to the samples of a swing at one place.
+
+    With the attitude of each sample, the corrected axes are fitted to the known vector. Without it, their length is
+    fitted to the known total intensity, which does not show a misalignment of the axes: it stays as ``alignment_deg``.
+    The fit is least squares without outliers. :data:`SOFT_IRON_STD`, :data:`HARD_IRON_STD` and ``alignment_deg`` are
+    the prior: what the swing does not show stays as uncertain as it was. The standard deviations allow for errors that
+    last a hundredth of the swing, hold for a field such as that of the swing, and include those of the known elements.
+
+    Args:
+        axes_nt: ``(N, 3)`` forward, right, down [nT].
+        here: D [deg], I [deg], B_H [nT] at the place, or latitude and longitude [deg] for IGRF, as in
+            :meth:`magrl.onboard.Onboard.start`.
+        date: date for IGRF.
+        here_std: standard deviations of the elements.
+        attitude_deg: ``(N, 3)`` roll, pitch, heading from true north [deg].
+        alignment_deg: standard deviation of the misalignment of the axes before the swing [deg].
+        tilt_deg: roll and pitch up to which the standard deviations hold [deg].
+
+    Raises:
+        ValueError: for samples that are too few, in another unit, along other axes, with too many outliers, or from too
+            few directions, each with what to do.
+
+    Source:
+        V. Renaudin, M. H. Afzal and G. Lachapelle, Complete triaxis magnetometer calibration in the magnetic domain,
+        Journal of Sensors (2010); covariance: H. White, Econometrica 48 (1980), over blocks.
+
+    Example:
+        >>> directions = torch.randn(2000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        >>> axes = 50000 * directions / directions.norm(dim=-1, keepdim=True) + torch.tensor([500.0, 0.0, -200.0])
+        >>> swung = calibrate(axes, (0.0, 60.0, 25000.0))
+        >>> [round(offset) for offset in swung.offset_nt], swung.method
+        ([500, 0, -200], 'ellipsoid')
+    """
+    elements, elements_std = known_elements(here, here_std, date)
+    check_number(0, above=True, alignment_deg=alignment_deg, tilt_deg=tilt_deg)
+    axes, reference = axes_nt.double(), field_vector(torch.tensor(elements, dtype=torch.float64))
+    scale, known = float(reference.norm()), torch.tensor(elements_std, dtype=torch.float64)
+    _check_samples(axes, scale)
+    problem = _problem(axes, reference, attitude_deg)
+    matrix, offset, covariance, noise, kept = _fit(axes, *problem, scale, math.radians(alignment_deg))
+    outliers = 1 - float(kept.double().mean())
+    _check_fit(noise, outliers, scale)
+    corrected = ((axes - offset) @ matrix.mT)[kept] / scale
+    seen = torch.stack((corrected.amin(0), corrected.amax(0)), -1)
+    if attitude_deg is None:  # the known intensity is a scale: of B_H alone
+        known = torch.stack((*torch.zeros(2), torch.hypot(known[2], torch.deg2rad(known[1]) * reference[2])))
+    std = torch.hypot(_left(matrix, covariance, reference, tilt_deg), known)
+    _check_std(std, seen)
+    return Calibration(
+        matrix=_rows(matrix),
+        offset_nt=tuple(offset.tolist()),
+        method="ellipsoid" if attitude_deg is None else "vector",
+        std=tuple(std.tolist()),
+        noise_nt=noise,
+        samples=len(axes),
+        outliers=outliers,
+        seen=_rows(seen),
+        here=tuple(map(float, here)),
+        date=date,
+    )
+
+
+def _rows(matrix: Tensor) -> tuple:
+    return tuple(map(tuple, matrix.tolist()))
+
+
+def _problem(axes: Tensor, reference: Tensor, attitude_deg: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return what the samples are compared with, vectors or a length, and the offset with which the fit starts."""
+    if attitude_deg is None:
+        total = reference.norm()
+        _check_directions(axes / total)
+        return total, _sphere_center(axes, float(total))
+    level = reference @ rotation(attitude_deg.double())
+    _check_axes(axes, level)
+    return level, (axes - level).median(0).values
+
+
+# The fit
+
+
+def _misfit(axes: Tensor, known: Tensor, matrix: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return residuals ``(N, R)`` and their derivatives ``(N, R, 12)`` with respect to matrix and offset.
+
+    Of the vectors, if those are known, ``(N, 3)``; of their length, if that is, ``()``.
+    """
+    moved = axes - offset
+    corrected, slope = moved @ matrix.mT, _derivative(matrix, moved)
+    if known.ndim:
+        return corrected - known, slope
+    length = corrected.norm(dim=-1, keepdim=True)
+    return length - known, (corrected / length).unsqueeze(-2) @ slope
+
+
+def _derivative(matrix: Tensor, moved: Tensor) -> Tensor:
+    """Return the derivatives ``(N, 3, 12)`` of ``matrix @ moved`` with respect to matrix and offset."""
+    rows = torch.einsum("ij,nk->nijk", torch.eye(3, dtype=moved.dtype), moved).flatten(-2)
+    return torch.cat((rows, -matrix.expand(len(moved), 3, 3)), -1)
+
+
+def _sphere_center(axes: Tensor, total: float) -> Tensor:
+    """Return the center c of the sphere nearest to samples, ``|m|^2 - F^2 = 2 m c - |c|^2``, with a prior."""
+    moved = axes / total
+    design = torch.cat((2 * moved, -torch.ones_like(moved[:, :1])), -1)
+    normal = design.T @ design + len(axes) * 1e-6 * torch.eye(4)
+    return total * torch.linalg.solve(normal, design.T @ (moved.square().sum(-1) - 1))[:3]
+
+
+def _fit(
+    axes: Tensor, known: Tensor, offset: Tensor, scale: float, alignment: float
+) -> tuple[Tensor, Tensor, Tensor, float, Tensor]:
+    """Return matrix, offset, their covariance ``(12, 12)``, the root mean square of residuals, and which were kept.
+
+    Gauss-Newton without outliers. The covariance allows for errors that are not independent within blocks of samples.
+    """
+    unit = torch.cat((torch.ones(9), torch.full((3,), scale))).double()  # of the parameters
+    prior, matrix = _prior(alignment), torch.eye(3, dtype=torch.float64)
+    start = torch.cat((matrix.flatten(), offset / scale))
+    for _ in range(_ROUNDS):
+        error, slope = _misfit(axes, known, matrix, offset)
+        size = error.norm(dim=-1)
+        kept = size <= max(OUTLIER_SIGMAS * 1.4826 * float(size.median()), 1.0)
+        variance = error[kept].square().mean().clamp_min(1e-6)
+        design = (slope * unit)[kept]
+        normal = torch.einsum("nij,nik->jk", design, design) + variance * prior
+        scores = (design * error[kept].unsqueeze(-1)).sum(1)
+        now = torch.cat((matrix.flatten(), offset / scale))
+        change = torch.linalg.solve(normal, scores.sum(0) + variance * prior @ (now - start))
+        matrix, offset = matrix - change[:9].unflatten(0, (3, 3)), offset - scale * change[9:]
+        if change.abs().max() < _SETTLED:
+            break
+    blocks = torch.stack([block.sum(0) for block in scores.tensor_split(_BLOCKS)])
+    inverse = torch.linalg.inv(normal)
+    covariance = inverse @ (blocks.T @ blocks + variance.square() * prior) @ inverse
+    return matrix, offset, unit[:, None] * covariance * unit, float(variance.sqrt()), kept
+
+
+def _prior(alignment: float) -> Tensor:
+    """Return the inverse of the covariance of matrix and offset before the swing: soft iron, and a small rotation."""
+    swap = torch.eye(9, dtype=torch.float64).unflatten(0, (3, 3)).transpose(0, 1).flatten(0, 1)
+    same, turned = (torch.eye(9) + swap) / 2, (torch.eye(9) - swap) / 2
+    precision = torch.zeros(12, 12, dtype=torch.float64)
+    precision[:9, :9] = same / SOFT_IRON_STD**2 + turned / alignment**2
+    precision[9:, 9:] = torch.eye(3) / HARD_IRON_STD**2
+    return precision
+
+
+def _left(matrix: Tensor, covariance: Tensor, reference: Tensor, tilt_deg: float) -> Tensor:
+    """Return the standard deviations of D, I, B_H ``(3,)`` that a covariance leaves, over headings, roll and pitch."""
+    tilts = (0.0, 0.0), (tilt_deg, 0.0), (-tilt_deg, 0.0), (0.0, tilt_deg), (0.0, -tilt_deg)
+    attitude = torch.tensor([(*tilt, 30.0 * turn) for tilt in tilts for turn in range(12)], dtype=torch.float64)
+    turn = rotation(attitude)
+    moved = torch.linalg.solve(matrix, (turn.mT @ reference).mT).mT
+    spread = elements_jacobian(reference) @ turn @ _derivative(matrix, moved)
+    return (spread @ covariance @ spread.mT).mean(0).diagonal().clamp_min(0).sqrt()
+
+
+# Refusals
+
+
+def _check_samples(axes: Tensor, total: float) -> None:
+    """Raise for too few samples, non-finite ones, or those in another unit."""
+    check_tensor(3, axes_nt=axes)
+    if axes.ndim != 2 or len(axes) < LEAST_SAMPLES:
+        raise ValueError(f"axes_nt must be (N, 3) with at least {LEAST_SAMPLES} samples, got {tuple(axes.shape)}")
+    if not axes.isfinite().all():
+        row = int((~axes.isfinite().all(-1)).nonzero()[0])
+        raise ValueError(f"sample {row + 1} is {axes[row].tolist()}: leave out samples that are not finite")
+    length = float(axes.norm(dim=-1).median())
+    if unit := guess_unit(length, total):
+        raise ValueError(
+            f"the samples have a length of {length:g}, and {total:.0f} nT are known: they look like {unit}"
+        )
+
+
+def _check_axes(axes: Tensor, level: Tensor) -> None:
+    """Raise if other axes, or other signs, explain the samples much better than those stated."""
+    alike = (axes - axes.mean(0)).T @ (level - level.mean(0))
+    both = (axes - axes.mean(0)).square().sum() + (level - level.mean(0)).square().sum()
+    choices = [
+        torch.eye(3).double()[list(order)] * torch.tensor(signs) for order in permutations(range(3)) for signs in _SIGNS
+    ]
+    misfits = torch.stack([both - 2 * (alike * choice).sum() for choice in choices])
+    found = choices[int(misfits.argmin())]
+    if misfits.min() > 0.25 * (both - 2 * alike.trace()):
+        return
+    names = [("minus " if row.sum() < 0 else "") + _AXES[int(row.abs().argmax())] for row in found]
+    raise ValueError(
+        f"the axes of the samples fit {', '.join(names)}, and {', '.join(_AXES)} are expected"
+        + (": a left-handed frame; change the sign of one axis" if torch.det(found) < 0 else "")
+        + ", or the heading is not from true north"
+    )
+
+
+def _check_fit(noise: float, outliers: float, scale: float) -> None:
+    """Raise for too many outliers, or residuals that no noise explains."""
+    if outliers > MOST_OUTLIERS:
+        raise ValueError(
+            f"{100 * outliers:.0f} % of the samples deviate by more than {OUTLIER_SIGMAS:g} standard deviations: "
+            "leave out the times when loads were switched or iron was near, and swing again"
+        )
+    if noise > 0.05 * scale:
+        raise ValueError(
+            f"the samples deviate by {noise:.0f} nT from one field of {scale:.0f} nT: check the place, the times of "
+            "samples and attitude, and that the heading is from true north"
+        )
+
+
+def _check_directions(shares: Tensor) -> None:
+    """Raise if the field was seen in a plane or along a line alone, with which no ellipsoid can be fitted."""
+    least = float(torch.linalg.svdvals(shares - shares.mean(0))[-1]) / math.sqrt(len(shares))
+    if least < LEAST_SPREAD:
+        raise ValueError(
+            f"too few directions for a fit without attitude: in one direction the field changed by {100 * least:.1f} % "
+            f"of its strength, where {100 * LEAST_SPREAD:g} % are needed; {_SWING}, or log attitude and true heading"
+        )
+
+
+def _check_std(std: Tensor, seen: Tensor) -> None:
+    """Raise if a calibration leaves more than :data:`MOST_STD`."""
+    if bool((std <= torch.tensor(MOST_STD)).all()):
+        return
+    left = "D {:.2g} deg, I {:.2g} deg, B_H {:.3g} nT".format(*std.tolist())
+    shares = ", ".join(
+        f"{name} {low:.2f} to {high:.2f}" for name, (low, high) in zip(_AXES, seen.tolist(), strict=True)
+    )
+    raise ValueError(f"too few directions, which leave {left}: the field was along {shares} of its strength; {_SWING}")

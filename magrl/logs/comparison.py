@@ -1,0 +1,170 @@
+"""Readings beside IGRF at known positions: how far they deviate, and the mistakes that would explain it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import torch
+from pandas import DataFrame
+from torch import Tensor
+
+from magrl.field import IGRF
+from magrl.field.elements import NAMES, element_difference, measured_elements
+from magrl.geodesy import geodesic
+from magrl.onboard.readings import check_earth_reading
+from magrl.onboard.start import MODEL_D_NT, MODEL_STD, misfit
+
+MOST_SPIKES = 0.2
+"""Share of readings up to which those that do not fit are spikes, and not a mistake in all; chosen."""
+MOST_DRIFT, LEAST_TURN_DEG = 0.25, 20.0
+"""Share of a distance and angle of a course that currents explain; chosen."""
+LENGTHS_KM = {"nautical miles": 1.852, "statute miles": 1.609344, "meters": 0.001}
+_PLACE = "latitude", "longitude", "altitude"
+_SHOWN = 5
+
+
+def difference_from_igrf(readings: DataFrame, date: str) -> Tensor:
+    """Return D [deg], I [deg], B_H [nT] of readings minus those of IGRF at their positions, ``(N, 3)``.
+
+    Args:
+        readings: columns D, I, B_H, latitude, longitude, and optionally altitude [km].
+        date: date for IGRF.
+
+    Example:
+        >>> import pandas
+        >>> row = {"D": [2.8], "I": [73.1], "B_H": [15003.0], "latitude": [60.4], "longitude": [5.3]}
+        >>> difference_from_igrf(pandas.DataFrame(row), "2026-06-30").round(decimals=1)
+        tensor([[-0.0000, 0.0000, 0.1000]], dtype=torch.float64)
+    """
+    return element_difference(_columns(readings, *NAMES), _known(_places(readings), date))
+
+
+def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
+    """Return the likely mistakes in a log with positions, as sentences; none where it fits.
+
+    Readings are compared with IGRF, within the accuracy of a model of the core
+    (:data:`~magrl.onboard.start.MODEL_STD`), and moves with the positions.
+
+    Args:
+        readings: columns of :func:`~magrl.logs.readings_of` or ``recipes/replay_log.py``.
+        date: date for IGRF; without it, moves alone are compared.
+
+    Example:
+        >>> import pandas
+        >>> row = {"D": 2.8, "I": -73.1, "B_H": 15003.0, "latitude": 60.4, "longitude": 5.3}
+        >>> mistakes(pandas.DataFrame([row | {"heading": 0.0, "distance": 0.0}] * 2), "2026-06-30")[0][-66:]
+        'it fits with -I: the vertical axis points up, and down is expected'
+    """
+    if "latitude" not in readings or "longitude" not in readings:
+        return []
+    place = _places(readings)
+    found = []
+    nowhere = (place[:, :2] == 0).all(-1)
+    if nowhere.any():
+        found.append(f"{_rows(nowhere.nonzero())} at latitude 0, longitude 0: no position was known there")
+    held = readings[~nowhere.numpy()]
+    if not len(held):
+        return found
+    elements, place = _columns(held, *NAMES), place[~nowhere]
+    if place[:, 0].abs().max() > 90:
+        worst = float(place[:, 0].abs().max())
+        return [*found, f"latitude {worst:g} is outside -90 to 90: latitude and longitude are swapped"]
+    known = elements if date is None else _known(place, date)
+    return found + _field_mistakes(elements, known, place, date) + _move_mistakes(held, place[:, :2], known[:, 0])
+
+
+def _columns(readings: DataFrame, *names: str) -> Tensor:
+    return torch.tensor(readings[list(names)].to_numpy(float).copy())
+
+
+def _places(readings: DataFrame) -> Tensor:
+    """Return latitude, longitude [deg] and altitude [km] ``(N, 3)``; sea level where it is not known."""
+    return _columns(readings.assign(**{} if "altitude" in readings else {"altitude": 0.0}), *_PLACE)
+
+
+def _rows(rows: Tensor) -> str:
+    """Return the numbers of rows from 1 on, the first of them."""
+    numbers = [str(int(row) + 1) for row in rows.flatten()]
+    more = ", ..." if len(numbers) > _SHOWN else ""
+    return f"row{'s' * (len(numbers) > 1)} {', '.join(numbers[:_SHOWN])}{more}"
+
+
+def _known(place: Tensor, date: str) -> Tensor:
+    return measured_elements(IGRF(date)(*place.unbind(-1)))
+
+
+# Readings
+
+
+def _field_mistakes(elements: Tensor, known: Tensor, place: Tensor, date: str | None) -> list[str]:
+    """Return which readings do not fit what is known at their positions, and why."""
+    misfits = _misfits(elements, known)
+    wrong = [row for row, each in enumerate(misfits) if each is not None]
+    if date is None or not wrong:
+        return []
+    texts = [each for each in misfits if each is not None]
+    start = f"{len(wrong)} of {len(misfits)} readings do not fit IGRF, {_rows(torch.tensor(wrong))} ({texts[0][0]})"
+    if len(wrong) <= MOST_SPIKES * len(misfits):
+        return [f"{start}: spikes, or iron near the vehicle there"]
+    cause, count = Counter(text for _, text in texts).most_common(1)[0]
+    return [f"{start}: {cause if cause and 2 * count > len(wrong) else _other_cause(elements, place, date)}"]
+
+
+def _misfits(elements: Tensor, known: Tensor) -> list[tuple[str, str | None] | None]:
+    found = []
+    for reading, there in zip(elements.tolist(), known.tolist(), strict=True):
+        std = math.hypot(MODEL_STD[0], MODEL_D_NT / there[2]), *MODEL_STD[1:]
+        one = misfit(tuple(reading), tuple(there), std)
+        if one and one[1] is None:
+            try:
+                check_earth_reading(*reading)
+            except ValueError as error:
+                likely = str(error).rpartition(": ")[2]
+                one = one[0], likely if "looks like" in likely else None
+        found.append(one)
+    return found
+
+
+def _other_cause(elements: Tensor, place: Tensor, date: str) -> str:
+    """Return the cause of readings that no mistake in D, I, B_H explains: other positions that fit, or none."""
+    latitude, longitude, altitude = place.unbind(-1)
+    places = {
+        "latitude and longitude are swapped": (longitude, latitude),
+        "longitudes are positive toward the west, and east is expected": (latitude, -longitude),
+        "latitudes are positive toward the south, and north is expected": (-latitude, longitude),
+    }
+    for cause, other in places.items():
+        there = torch.stack((*other, altitude), -1)
+        if there[:, 0].abs().max() > 90:
+            continue
+        if sum(each is None for each in _misfits(elements, _known(there, date))) > len(place) / 2:
+            return f"they fit if {cause}"
+    return "no calibration, iron near the sensor, or a heading that is wrong"
+
+
+# Moves
+
+
+def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> list[str]:
+    """Return the likely mistakes in the unit of the distances and in the north of the headings."""
+    distance, bearing = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))
+    moved, heading = _columns(readings, "distance", "heading")[1:].unbind(-1)
+    going = (distance > 0) & (moved > 0)
+    if not going.any():
+        return []
+    found, ratio = [], float((distance[going] / moved[going]).median())
+    if abs(ratio - 1) > MOST_DRIFT:
+        unit = next((name for name, size in LENGTHS_KM.items() if abs(ratio / size - 1) < 0.1), None)
+        likely = f"they look like {unit}" if unit else "check the log and its unit"
+        found.append(f"the positions are {ratio:.3g} times as far apart as the distances of the moves: {likely}")
+    turn = (bearing - torch.deg2rad(heading))[going]
+    drift, east = math.degrees(torch.atan2(turn.sin().mean(), turn.cos().mean()).item()), declination.median().item()
+    text = f"the course between positions is {drift:.0f} deg to the right of the heading"
+    if abs(abs(drift) - 180) < LEAST_TURN_DEG:
+        found.append(f"{text}: the heading is reciprocal, or the vehicle goes astern")
+    elif abs(east) > 3 and abs(drift - east) < 0.3 * abs(east):
+        found.append(f"{text}, as D is {east:.0f} deg: the heading is from magnetic north, and true north is expected")
+    elif abs(drift) > LEAST_TURN_DEG:
+        found.append(f"{text}: check the compass and its axes")
+    return found

@@ -1,0 +1,190 @@
+"""From samples to readings: means of the vector over the moves of a vehicle, and how accurate they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas
+import torch
+from numpy.typing import NDArray
+from pandas import DataFrame
+
+from magrl.checks import check_choice, check_number
+from magrl.field.elements import NAMES, elements_jacobian, measured_elements
+from magrl.geodesy import geodesic
+from magrl.logs.calibration import Calibration
+from magrl.logs.samples import ATTITUDE, AXES, Array, Log
+from magrl.logs.vectors import NORTHS, axes_of_elements, rotation
+from magrl.transforms.errors.sensors import OUTAGE_STD
+
+SPIKE_SIGMAS = 5.0
+_BLOCKS = 10  # of the samples of a reading, whose means are nearly independent
+_PATH, _FIELD, _MEANS = ["path_n", "path_e"], ["b_n", "b_e", "b_d"], ("heading", "latitude", "longitude", "altitude")
+STD_NAMES = ("D_std", "I_std", "B_H_std")
+
+
+def readings_of(
+    log: Log,
+    *,
+    every_km: float = 20.0,
+    every_s: float | None = None,
+    north: str | None = None,
+    calibration: Calibration | None = None,
+) -> DataFrame:
+    """Return one reading for each move: the mean of all samples of a part of the way, at the mean of their places.
+
+    The parts are as long as the moves, so that every sample counts once. The mean is that of the vector, without
+    spikes. Places are by dead reckoning along the heading, from the distances or the speeds of the log; where it has
+    neither, from its positions.
+
+    Args:
+        log: samples with a heading.
+        every_km: least length of a move.
+        every_s: duration of a move [s], in place of a length.
+        north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`; needed where the log does not tell.
+        calibration: correction of the axes.
+
+    Returns:
+        Columns of ``recipes/replay_log.py``: ``time``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` of the move
+        since the row before, ``latitude`` and ``longitude`` where known; and ``D_std``, ``I_std``, ``B_H_std``, the
+        standard deviations of the means by the scatter of tenths of their samples, ``samples``, and ``spikes``.
+
+    Raises:
+        ValueError: for a log without a heading or a motion, or an unknown north.
+
+    Example:
+        >>> import pandas
+        >>> time, heading = np.arange(2000.0), np.zeros(2000)
+        >>> axes = {"x": 20000.0 - 0.01 * time, "y": 0 * time, "z": 40000.0 + 0 * time}
+        >>> log = Log(pandas.DataFrame({"time": time, **axes, "heading": heading, "speed": 50 + 0 * time}), "by hand")
+        >>> readings_of(log, every_km=25.0, north="true")[["B_H", "distance"]].round().values.tolist()
+        [[19998.0, 0.0], [19992.0, 25.0], [19987.0, 25.0], [19982.0, 25.0]]
+    """
+    north = north or log.north
+    if north is None:
+        raise ValueError(f"the log does not tell which north the heading has: state north, one of {', '.join(NORTHS)}")
+    check_choice(NORTHS, north=north)
+    check_number(0, above=True, every_km=every_km)
+    check_number(0, above=True, optional=True, every_s=every_s)
+    axes = log.tensor(*AXES) if calibration is None else calibration.apply(log.tensor(*AXES))
+    field = (rotation(log.tensor(*ATTITUDE)) @ axes.unsqueeze(-1)).squeeze(-1).numpy()
+    path, time = _path(log), log.samples["time"].to_numpy(float)
+    part = _parts_km(path, every_km) if every_s is None else _parts_s(time, every_s)
+    samples = pandas.DataFrame(np.column_stack((time, path, field)), columns=["time", *_PATH, *_FIELD])
+    for name in _MEANS:
+        if name in log.samples:
+            samples[name] = np.unwrap(log.samples[name], period=360)
+    kept = ~_spikes(field, part)
+    groups = samples[kept].groupby(part[kept])
+    table = _readings(groups.mean(), _covariance(field[kept], part[kept]), north)
+    return table.assign(samples=groups.size(), spikes=np.bincount(part[~kept], minlength=len(table)))
+
+
+def joined(table: DataFrame, every_km: float) -> DataFrame:
+    """Return the means of the rows of each move, of a table that holds D, I, B_H already; see :func:`readings_of`.
+
+    Args:
+        table: columns ``row``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` since the row before, and others.
+        every_km: least length of a move; 0 for the rows as they are.
+
+    Returns:
+        The same columns; those others are of the row in the middle of each move.
+
+    Raises:
+        ValueError: for moves so long that one reading is left.
+
+    Example:
+        >>> rows = {"row": range(1, 7), "D": 0.0, "I": 0.0, "B_H": range(6)}
+        >>> rows |= {"heading": 90.0, "distance": [0] + [2.0] * 5}
+        >>> joined(DataFrame(rows), 4.0)[["row", "B_H", "distance"]].round(9).values.tolist()
+        [[1.0, 0.5, 0.0], [3.0, 2.5, 4.0], [5.0, 4.5, 4.0]]
+    """
+    check_number(0, every_km=every_km)
+    if not every_km:
+        return table
+    heading = torch.tensor(table["heading"].to_numpy(float))
+    attitude = torch.stack((torch.zeros_like(heading), torch.zeros_like(heading), heading), -1)
+    axes = axes_of_elements(torch.tensor(table[list(NAMES)].to_numpy(float).copy()), attitude).numpy()
+    samples = table.assign(time=np.arange(len(table)), **dict(zip(AXES, axes.T, strict=True)))
+    found = readings_of(Log(samples, "readings", "true"), every_km=every_km)
+    if len(found) < 2:
+        raise ValueError(f"every_km {every_km:g} leaves one reading of {len(table)}: choose shorter moves")
+    middle = table.iloc[found["time"].astype(int)].reset_index(drop=True)
+    return middle.assign(**{name: found[name] for name in found if name in table and name != "time"})
+
+
+def _path(log: Log) -> Array:
+    """Return places ``(N, 2)``, northward and eastward of the first one [km]."""
+    held = log.samples
+    if "distance" in held or "speed" in held:
+        step = np.diff(held["time"], prepend=held["time"].iloc[0])
+        length = held["distance"] if "distance" in held else held["speed"] * step / 1000
+        heading = np.radians(held["heading"])
+    elif "latitude" in held and "longitude" in held:
+        place = log.tensor("latitude", "longitude")
+        distance, bearing = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))
+        length, heading = (np.concatenate(([0.0], each.numpy())) for each in (distance, bearing))
+    else:
+        raise ValueError("the log has neither distances nor speeds nor positions: readings need the moves between them")
+    return np.cumsum(np.stack((length * np.cos(heading), length * np.sin(heading)), -1), 0)
+
+
+def _parts_km(path: Array, every_km: float) -> NDArray[np.int64]:
+    """Return the part of each sample ``(N,)``; a part ends where it is ``every_km`` from its first sample."""
+    first = [0]
+    while (away := np.hypot(*(path[first[-1] :] - path[first[-1]]).T) >= every_km).any():
+        first.append(first[-1] + int(away.argmax()))
+    if len(first) > 1 and np.hypot(*(path[-1] - path[first[-1]])) < every_km / 2:
+        first.pop()
+    return np.searchsorted(first, np.arange(len(path)), side="right") - 1
+
+
+def _parts_s(time: Array, every_s: float) -> NDArray[np.int64]:
+    """Return the part of each sample ``(N,)`` by time, without parts that would be empty."""
+    return np.unique(((time - time[0]) / every_s).astype(int), return_inverse=True)[1]
+
+
+def _spikes(field: Array, part: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which vectors ``(N, 3)`` deviate from the median of their part by more than its scatter explains.
+
+    None in a part of few samples, of which the scatter is not known.
+    """
+    groups = pandas.DataFrame(field).groupby(part)
+    deviation = np.abs(field - groups.transform("median").to_numpy())
+    scatter = 1.4826 * pandas.DataFrame(deviation).groupby(part).transform("median").to_numpy()
+    return (deviation > SPIKE_SIGMAS * scatter + 1.0).any(-1) & (np.bincount(part)[part] >= _BLOCKS)
+
+
+def _covariance(field: Array, part: NDArray[np.int64]) -> Array:
+    """Return the covariance ``(3, 3)`` of the mean of a part, as a mean over the parts.
+
+    The means of tenths of a part scatter by errors that last less than a tenth; their linear trend is the field's.
+    """
+    found = []
+    for rows in np.split(field, np.flatnonzero(np.diff(part)) + 1):
+        if len(rows) < 2 * _BLOCKS:
+            continue
+        blocks = np.stack([block.mean(0) for block in np.array_split(rows, _BLOCKS)])
+        line = np.linspace(-1, 1, _BLOCKS)
+        rest = blocks - blocks.mean(0) - np.outer(line, line @ blocks / (line @ line))
+        found.append(rest.T @ rest / (_BLOCKS - 2) / _BLOCKS)
+    return np.mean(found, 0) if found else np.zeros((3, 3))
+
+
+def _readings(mean: DataFrame, covariance: Array, north: str) -> DataFrame:
+    """Return the columns of readings from the means of parts."""
+    field = torch.tensor(mean[_FIELD].to_numpy(float))
+    jacobian = elements_jacobian(field)
+    std = (jacobian @ torch.from_numpy(covariance) @ jacobian.mT).diagonal(dim1=-2, dim2=-1).sqrt()
+    if north != "true":
+        std[:, 0] = OUTAGE_STD
+    move = np.diff(mean[_PATH].to_numpy(float), axis=0)
+    course = np.degrees(np.arctan2(move[:, 1], move[:, 0])) % 360
+    table = pandas.DataFrame(torch.cat((measured_elements(field), std), -1).numpy(), columns=[*NAMES, *STD_NAMES])
+    table.insert(0, "time", mean["time"])
+    table["heading"] = [mean["heading"].iloc[0] % 360, *course]
+    table["distance"] = [0.0, *np.hypot(*move.T)]
+    if "latitude" in mean:
+        table["latitude"], table["longitude"] = mean["latitude"], (mean["longitude"] + 180) % 360 - 180
+    if "altitude" in mean:
+        table["altitude"] = mean["altitude"]
+    return table

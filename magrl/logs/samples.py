@@ -1,0 +1,224 @@
+"""The samples of a log as one table: time, three axes, attitude, speed and position."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pandas
+import torch
+from numpy.typing import NDArray
+from pandas import DataFrame, Series
+
+from magrl.checks import short
+from magrl.logs.units import COLUMNS
+
+AXES, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "heading")
+_ANGLES = ("roll", "heading", "longitude")  # which jump by 360 degrees
+_EPOCH = 1e8  # seconds: a time beyond is since 1970, one before since the log began
+_GAP, _GAP_SHARE = 10.0, 1e-3  # of the usual step, and of the log
+Array = NDArray[np.float64]
+Streams = Mapping[str, tuple[Array, Array]]
+"""Times [s] and values of each column, in the units of :data:`~magrl.logs.units.COLUMNS`."""
+
+
+class Recording(NamedTuple):
+    """What one file holds: columns, format and sensors, the north of its heading where it tells, and notes."""
+
+    streams: Streams
+    source: str
+    north: str | None = None
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Log:
+    """Samples of a vehicle.
+
+    Args:
+        samples: columns ``time`` [s, UTC since 1970 where it is known], ``x``, ``y``, ``z`` [nT, forward, right, down],
+            and those that the log has of ``roll``, ``pitch``, ``heading`` [deg], ``speed`` [m/s], ``distance`` since
+            the sample before [km], ``latitude``, ``longitude`` [deg], ``altitude`` [km].
+        source: format and sensors.
+        north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`, where the log tells.
+        notes: what a reader of the log must know.
+
+    Example:
+        >>> import pandas
+        >>> log = Log(pandas.DataFrame({"time": [1.8e9], "x": [1.0], "y": [2.0], "z": [3.0]}), "by hand")
+        >>> log.date, log.tensor("x", "z"), log.tensor("roll")  # no roll: level
+        ('2027-01-15', tensor([[1., 3.]], dtype=torch.float64), tensor([[0.]], dtype=torch.float64))
+    """
+
+    samples: DataFrame
+    source: str
+    north: str | None = None
+    notes: Sequence[str] = ()
+
+    @property
+    def date(self) -> str | None:
+        """Date of the first sample, where the time is known."""
+        return date_of(float(self.samples["time"].iloc[0]))
+
+    def tensor(self, *names: str) -> torch.Tensor:
+        """Return columns ``(N, K)`` in float64; roll and pitch that the log lacks are zeros.
+
+        Raises:
+            ValueError: for another column that the log lacks.
+        """
+        held = self.samples
+        if missing := [name for name in names if name not in held and name not in ATTITUDE[:2]]:
+            raise ValueError(
+                f"the log has no {missing[0]}, only {', '.join(held)}: name its column so, or choose another log"
+            )
+        columns = [held[name].to_numpy(float) if name in held else np.zeros(len(held)) for name in names]
+        return torch.from_numpy(np.stack(columns, -1))
+
+
+def date_of(time: float) -> str | None:
+    """Return the date of a time in seconds since 1970; None for one since the log began.
+
+    Example:
+        >>> date_of(1.8e9), date_of(3600.0)
+        ('2027-01-15', None)
+    """
+    return datetime.datetime.fromtimestamp(time, datetime.timezone.utc).date().isoformat() if time > _EPOCH else None
+
+
+def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[str]]:
+    """Return which rows have a new time, and notes on times that repeat and on gaps.
+
+    Args:
+        time: ``(N,)``.
+        unit: its unit, for the notes.
+
+    Raises:
+        ValueError: for times that run backward, with the row, or are not finite.
+
+    Example:
+        >>> check_times(np.array([0.0, 1.0, 1.0, 2.0]))
+        (array([ True, True, False, True]), ['1 row with the time of the row before left out'])
+    """
+    if not np.isfinite(time).all():
+        raise ValueError(f"row {int(np.argmin(np.isfinite(time))) + 1} has no time")
+    step = np.diff(time)
+    if (step < 0).any():
+        row = int(np.argmax(step < 0))
+        hour = ": an hour back, as at the end of daylight saving time; log UTC" if abs(step[row] + 3600) < 60 else ""
+        raise ValueError(
+            f"time runs backward from row {row + 1} to {row + 2}, from {time[row]:.10g} to {time[row + 1]:.10g}{hour}: "
+            "sort the rows, or split the log where its clock was set"
+        )
+    new = np.concatenate(([True], step > 0))
+    notes = []
+    if repeated := int((~new).sum()):
+        notes.append(f"{_count(repeated, 'row')} with the time of the row before left out")
+    step = step[step > 0]
+    least = max(_GAP * np.median(step), _GAP_SHARE * step.sum()) if len(step) else 0.0
+    if count := int((step > least).sum()):
+        hour = ", which is daylight saving time if the log has local time" if (abs(step - 3600) < 60).any() else ""
+        notes.append(f"{_count(count, 'gap')}, the longest of {step.max():g} {unit}{hour}")
+    return new, notes
+
+
+def checked_times(column: Series) -> tuple[NDArray[np.bool_], list[str], str | None]:
+    """Return which rows have a new time, notes, and the date of the first row where it is known.
+
+    Args:
+        column: numbers in any unit, or ISO 8601 texts.
+
+    Raises:
+        ValueError: for times that are neither, missing, or run backward, with the row.
+
+    Example:
+        >>> checked_times(Series(["2026-06-30T12:00:00Z", "2026-06-30T12:10:00Z"], name="time"))[1:]
+        ([], '2026-06-30')
+    """
+    times, notes = times_of(column)
+    new, more = check_times(times, "the unit of the times")
+    return new, [*notes, *more], date_of(float(times[0]))
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number} {name}{'s' if number > 1 else ''}"
+
+
+def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
+    """Return the samples at the times of the magnetometer, with notes; other columns are interpolated.
+
+    Samples without attitude before its first and after its last value are left out; a position or a speed holds there.
+
+    Raises:
+        ValueError: for a log without a magnetometer, or times that run backward.
+
+    Example:
+        >>> time = np.array([0.0, 1.0, 2.0])
+        >>> axes = {name: (time, np.ones(3)) for name in "xyz"}
+        >>> samples_of({**axes, "heading": (time[:2], np.array([350.0, 370.0]))})[0]["heading"].tolist()
+        [350.0, 10.0]
+    """
+    if missing := [name for name in AXES if name not in streams or not len(streams[name][0])]:
+        raise ValueError(
+            f"no column is the {missing[0]} of the magnetometer, among {', '.join(streams)}: name its columns "
+            "mag_x_nT, mag_y_nT, mag_z_nT"
+        )
+    time = streams["x"][0]
+    new, notes = check_times(time)
+    table = {"time": time[new]} | {
+        name: _at(time[new], name, *streams[name]) for name in COLUMNS if name in streams and name != "time"
+    }
+    samples = pandas.DataFrame(table)
+    whole = np.isfinite(samples[[name for name in (*AXES, *ATTITUDE) if name in samples]]).all(axis=1)
+    if not whole.any():
+        raise ValueError("no sample has a magnetometer and an attitude at the same time: check the times of both")
+    if left := int((~whole).sum()):
+        notes.append(f"{_count(left, 'sample')} without attitude or axes left out")
+    zero = (samples[list(AXES)] == 0).all(axis=1) & whole
+    if zero.any():
+        notes.append(f"{_count(int(zero.sum()), 'sample')} of three zeros left out: the magnetometer did not answer")
+    samples = samples[whole & ~zero].reset_index(drop=True)
+    if "distance" in samples:
+        samples["distance"] = samples["distance"].diff().fillna(0.0)
+    return samples, notes
+
+
+def _at(time: Array, name: str, known: Array, values: Array) -> Array:
+    """Return the values of a column at other times; angles the shorter way around, a distance as a sum."""
+    if not len(known):
+        return np.full(len(time), np.nan)
+    if name == "distance":  # the sum, of which a row with the time of the row before is no part
+        return np.interp(time, known, np.cumsum(values * (np.diff(known, prepend=-np.inf) > 0)))
+    turning = name in _ANGLES
+    ends = {} if name in ("latitude", "longitude", "altitude", "speed") else {"left": np.nan, "right": np.nan}
+    found = np.interp(time, known, np.unwrap(values, period=360) if turning else values, **ends)
+    return (found + 180) % 360 - 180 if name in ("roll", "longitude") else found % 360 if turning else found
+
+
+def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:
+    """Return times of numbers, or of texts in seconds since 1970, and notes.
+
+    Args:
+        column: numbers, or ISO 8601 texts; NaN for blank cells.
+        factor: unit of the numbers [s].
+
+    Raises:
+        ValueError: for a text that is neither, with its row.
+
+    Example:
+        >>> times_of(Series(["2026-06-30T12:00:00"], name="time"))
+        (array([1.7828208e+09]), ['the times have no time zone: they are taken as UTC'])
+    """
+    numbers = pandas.to_numeric(column, errors="coerce")
+    if numbers.notna().equals(column.notna()):
+        return factor * numbers.to_numpy(float), []
+    parsed = pandas.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
+    bad = parsed.isna() & column.notna()
+    if bad.any():
+        row = int(bad.idxmax())
+        raise ValueError(f"row {row + 1}, {column.name}: {short(column[row])} is no time such as 2026-06-30T12:00:00Z")
+    zoned = column.dropna().str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True)
+    notes = [] if zoned.all() else ["the times have no time zone: they are taken as UTC"]
+    return (parsed - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float), notes

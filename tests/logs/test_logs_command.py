@@ -1,0 +1,99 @@
+"""The command, and the story of docs/onboard.md from a raw log to a replay: its commands run as they are written."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from magrl.logs import Calibration
+from magrl.logs.__main__ import main
+
+ROOT = Path(__file__).parent.parent.parent
+PAGE = (ROOT / "docs" / "onboard.md").read_text()
+COMMANDS = re.findall(r"```sh\n(.*?)```", PAGE[PAGE.index("### From a raw log to a replay") :], re.DOTALL)[0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Folder with the logs of the example."""
+    made = tmp_path_factory.mktemp("raw")
+    runpy.run_path(str(ROOT / "docs" / "examples" / "make_raw_log.py"))["write"](made / "raw")
+    return made
+
+
+def test_the_story_of_the_page(folder: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(folder)
+    first, *commands = COMMANDS.splitlines()
+    assert first == ".venv/bin/python docs/examples/make_raw_log.py raw"
+    for line in commands:
+        _, *words = shlex.split(line, comments=True)
+        name = words.pop(0)
+        name, run = (words.pop(0), runpy.run_module) if name == "-m" else (str(ROOT / name), runpy.run_path)
+        monkeypatch.setattr(sys, "argv", [name, *words])
+        monkeypatch.delitem(sys.modules, f"{name}.__main__", raising=False)
+        run(name, run_name="__main__")
+    said = capsys.readouterr().out
+    assert "15 readings, moves of 19.8 km" in said
+    assert "warning" not in said
+    replay = commands[-1].removeprefix(".venv/bin/")
+    assert f"replay: {replay}" in said, "the page has the command that is printed"
+    table = pd.read_csv(folder / "runs" / "replay_log" / "log.csv")
+    assert table["miss_km"].iloc[-1] < 30
+
+
+def test_a_calibration_is_needed_and_is_used(folder: Path, capsys) -> None:
+    way = str(folder / "raw" / "way.csv")
+    main([way, "--out", str(folder / "raw.csv")])
+    said = capsys.readouterr().out
+    assert "warning: 15 of 15 readings do not fit IGRF" in said
+    assert "no calibration" in said
+    swing, quay = str(folder / "raw" / "swing.csv"), folder / "new" / "quay.json"
+    main([swing, "--calibrate", str(quay), "--here", "62.47", "6.15", "--date", "2026-07-01"])
+    assert Calibration.load(quay).date == "2026-07-01"
+    main([way, "--calibration", str(quay), "--every-s", "1800", "--out", str(folder / "half.csv")])
+    said = capsys.readouterr().out
+    assert "warning" not in said
+    table = pd.read_csv(folder / "half.csv")
+    assert len(table) == 30
+    assert np.allclose(table["distance"][1:5], 10, atol=0.1)
+
+
+def test_a_compass_calibrates_by_the_length_alone(folder: Path, capsys) -> None:
+    """A heading that the magnetometer made would hide its iron."""
+    swing = str(folder / "raw" / "swing.csv")
+    with pytest.raises(SystemExit, match="2"):
+        main([swing, "--calibrate", str(folder / "no.json"), "--north", "model"])
+    assert "too few directions for a fit without attitude" in capsys.readouterr().err
+
+
+def test_a_short_log_is_compared(folder: Path, capsys) -> None:
+    rows = (folder / "raw" / "way.csv").read_text().splitlines()[:200]
+    (folder / "short.csv").write_text("\n".join(rows))
+    main([str(folder / "short.csv")])
+    assert "one reading: no file is written" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("way.csv", ["--calibration", "none.json"], "none.json is not a calibration"),
+        ("swing.txt", [], "a log is a file .csv"),
+        (
+            "swing.csv",
+            ["--calibrate", "quay.json", "--here", "1"],
+            "here must be D, I and B_H, or latitude",
+        ),
+    ],
+)
+def test_errors_of_the_command(folder: Path, monkeypatch, capsys, name: str, options, message: str) -> None:
+    monkeypatch.chdir(folder / "raw")
+    with pytest.raises(SystemExit, match="2"):
+        main([name, *options])
+    assert message in capsys.readouterr().err

@@ -1,0 +1,135 @@
+"""CSV files with the columns that engineers write: units, times, blank cells, and errors that name the row."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magrl.logs import read_log
+from magrl.logs.samples import check_times
+
+HEADER = "time_s,mag_x_nT,mag_y_nT,mag_z_nT,heading_true_deg"
+ROWS = ("0,15000,1000,48000,350", "1,15100,1100,48100,10", "2,15200,1200,48200,30")
+
+
+def written(folder: Path, *rows: str, header: str = HEADER) -> Path:
+    path = folder / "log.csv"
+    path.write_text("\n".join([header, *rows]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "column", "value"),
+    [
+        ("t_ms,x,y,z", "2000,1,2,3", "time", 2.0),
+        ("Time [us],Bx [G],By [G],Bz [G]", "1e6,0.15,0,0.48", "z", 48000.0),
+        ("timestamp,mag_x_uT,mag_y_mG,mag_z_gauss", "1,15,10,0.48", "y", 1000.0),
+        ("utc,magx,magy,magz,Yaw (rad)", "1,15,10,0.48,3.14159265358979", "heading", 180.0),
+        ("time,x,y,z,speed_kn", "1,1,1,1,3.6", "speed", 1.852),
+        ("time,x,y,z,distance_m", "1,1,1,1,500", "distance", 0.0),
+        ("time,x,y,z,depth_m", "1,1,1,1,30", "altitude", -0.03),
+        ("time,x,y,z", "2026-06-30T12:00:00+02:00,1,1,1", "time", 1782813600.0),
+    ],
+)
+def test_columns_and_units(tmp_path: Path, header: str, row: str, column: str, value: float) -> None:
+    assert read_log(written(tmp_path, row, header=header)).samples[column].iloc[0] == pytest.approx(value)
+
+
+def test_other_axes(tmp_path: Path) -> None:
+    assert read_log(written(tmp_path, *ROWS), frame="FLU").samples.loc[0, ["x", "y", "z"]].tolist() == [
+        15000,
+        -1000,
+        -48000,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "north"), [("heading_true_deg", "true"), ("mag_heading", "magnetic"), ("heading", None)]
+)
+def test_the_north_of_a_column(tmp_path: Path, name: str, north: str | None) -> None:
+    assert read_log(written(tmp_path, *ROWS, header=HEADER.replace("heading_true_deg", name))).north == north
+
+
+def test_blank_cells_are_interpolated(tmp_path: Path) -> None:
+    """Headings through north; positions that are slower than the magnetometer; rows without axes are left out."""
+    rows = "0,1,1,1,350,10", "1,1,1,1,,", "1.5,,,,,", "1.7,0,0,0,,", "2,1,1,1,10,12", "3,1,1,1,20,"
+    samples = read_log(written(tmp_path, *rows, header=HEADER + ",lat")).samples
+    assert samples["time"].tolist() == [0, 1, 2, 3]
+    assert samples["heading"].tolist() == pytest.approx([350, 0, 10, 20])
+    assert samples["latitude"].tolist() == pytest.approx([10, 11, 12, 12])
+
+
+def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
+    """A row that repeats a time adds nothing; the distance of a row without axes, or of zeros, belongs to the next."""
+    rows = "0,1,1,1,0,0", "1,1,1,1,0,5", "1,1,1,1,0,5", "2,0,0,0,0,7", "3,,,,0,1", "4,1,1,1,0,2"
+    samples = read_log(written(tmp_path, *rows, header=HEADER + ",distance_km")).samples
+    assert samples["distance"].tolist() == [0, 5, 10]
+
+
+@pytest.mark.parametrize(
+    ("rows", "note"),
+    [
+        ([*ROWS, "3,15300"], "the last row is not complete: the log may be truncated"),
+        ([*ROWS[:2], *ROWS[1:]], "1 row with the time of the row before left out"),
+        (
+            [*ROWS, *(f"{3600 + i},1,1,1,0" for i in range(3, 99))],
+            "1 gap, the longest of 3601 s, which is",
+        ),
+        (["2026-06-30T12:00:00,1,1,1,0"], "the times have no time zone: they are taken as UTC"),
+        (["0,0.15,0,0.48,0"], "the total intensity is 0.50.*, which looks like G: name the columns mag_x_G"),
+        (["0,15,0,48,0"], "the total intensity is 50.2.*, which looks like uT"),
+        ([*ROWS, "3,0,0,0,40"], "1 sample of three zeros left out"),
+    ],
+)
+def test_notes(tmp_path: Path, rows, note: str) -> None:
+    assert any(re.match(note, text) for text in read_log(written(tmp_path, *rows)).notes)
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "message"),
+    [
+        ([], HEADER, "the table has no row"),
+        ([], "", "cannot read .*log.csv: No columns to parse"),
+        ([ROWS[1], ROWS[0]], HEADER, "time runs backward from row 1 to 2, from 1 to 0: sort the rows"),
+        (["7200,1,1,1,0", "3601,1,1,1,0"], HEADER, "an hour back, as at the end of daylight saving time; log UTC"),
+        (["0,x,1,1,0"], HEADER, r"row 1, mag_x_nT: 'x' is not a number"),
+        (["noon,1,1,1,0"], HEADER, "row 1, time_s: 'noon' is no time such as"),
+        (
+            ROWS,
+            HEADER.replace("mag_z_nT", "volts"),
+            "no column is the z of the magnetometer, among x, y, heading: name its columns mag_x_nT",
+        ),
+        (ROWS, HEADER.replace("heading_true_deg", "bx"), "'mag_x_nT' and 'bx' are both the x: keep one of them"),
+        (ROWS, HEADER.replace("heading_true_deg", "speed"), "column 'speed' has no unit: .*speed_kn"),
+    ],
+)
+def test_files_that_are_refused(tmp_path: Path, rows, header: str, message: str) -> None:
+    path = written(tmp_path, *rows, header=header)
+    with pytest.raises(ValueError, match=message):
+        read_log(path)
+
+
+def test_two_files_of_one_vehicle(tmp_path: Path) -> None:
+    """The magnetometer in one, the gyrocompass in the other, which decides the heading and its north."""
+    path = written(tmp_path, *ROWS).rename(tmp_path / "mag.csv")
+    gyro = written(tmp_path, "0,100", "2,200", header="time,heading_mag")
+    log = read_log(path, gyro)
+    assert log.samples["heading"].tolist() == pytest.approx([100, 150, 200])
+    assert (log.north, log.source) == ("magnetic", "CSV, 3 rows; CSV, 2 rows")
+    with pytest.raises(ValueError, match="no column is the x of the magnetometer, among heading"):
+        read_log(gyro)
+
+
+@pytest.mark.parametrize("name", ["log.xlsx", "none.csv"])
+def test_files_that_are_not_logs(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"a log is a file \.csv, .* or a folder of ROS 2 that exists, got '{name}'"):
+        read_log(name)
+
+
+def test_times_that_are_not_there() -> None:
+    with pytest.raises(ValueError, match="row 2 has no time"):
+        check_times(np.array([0.0, math.nan]))
