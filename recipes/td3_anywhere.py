@@ -39,6 +39,7 @@ from magrl.training.config import Count, Discount, NonNegative, Positive, Rising
 from magrl.transforms import DetourReward, RandomSensorNoise, SensorNoise, TrackView, TrueWay, sensor_levels
 
 RECIPE = "td3_anywhere.py"
+LONGEST_KM = 4400.0
 OBSERVED = ("observation", "true_way_scaled")
 TRANSITION = (*OBSERVED, "action", *(("next", k) for k in (*OBSERVED, "reward", "done", "terminated")))
 
@@ -80,6 +81,9 @@ class Config(TransitionConfig):
     def _fits(self) -> Config:
         if self.scenario is not None:
             raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
+        if self.distance_range_km[1] > LONGEST_KM:
+            message = f"must end at {LONGEST_KM:g} km or below, the side of a region"
+            raise ValueError(f"distance_range_km {message}, got {self.distance_range_km}")
         return self
 
     @property
