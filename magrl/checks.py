@@ -129,7 +129,8 @@ def check_number(
             kind = "a whole number" if whole else "a finite number"
             start = "" if low == -math.inf else f" {'above' if above else 'from'} {low:g}"
             end = f" up to {high:g}" if high < math.inf else " on" if start and not above else ""
-            raise ValueError(f"{name} must be {kind}{start}{end}, got {value!r}")
+            hint = ": give its number, value.item()" if getattr(value, "shape", None) == () else ""
+            raise ValueError(f"{name} must be {kind}{start}{end}, got {value!r}{hint}")
 
 
 def _is_finite(value: object, kind: type = Real) -> bool:

@@ -49,12 +49,11 @@ from magrl.transforms import (
     TrueWay,
     sensor_levels,
 )
-from magrl.transforms.views import STEP_PRICE
 
 RECIPE = "ppo_anywhere.py"
 LOSSES = ("loss_critic", "loss_actor")
-PRIVILEGED = ("true_way_scaled", "highest_spl")
-OBSERVED = ("observation", *PRIVILEGED)
+LONGEST_KM = 4400.0
+OBSERVED = ("observation", "true_way_scaled", "highest_spl")
 TRANSITION = (
     *OBSERVED,
     "correction",
@@ -124,6 +123,9 @@ class Config(LearningConfig):
     def _fits(self) -> Config:
         if self.scenario is not None:
             raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
+        if self.distance_range_km[1] > LONGEST_KM:
+            message = f"must end at {LONGEST_KM:g} km or below, the side of a region"
+            raise ValueError(f"distance_range_km {message}, got {self.distance_range_km}")
         if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
             raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
         return self
@@ -224,7 +226,7 @@ def train(config: Config) -> dict[str, float]:
         env = make_env(base, view, config)
 
         # Networks: the critic also reads the true way and the SPL that can still be reached, the actor never does
-        network = PolicyConfig(replace(view, step_price=STEP_PRICE), config.num_cells)
+        network = PolicyConfig(replace(view, step_price=TrackView.step_price), config.num_cells)
         actor = network.make_actor(env.device)
         spread = Spread(config.exploration).to(env.device)
         stochastic_actor = make_stochastic_actor(actor, spread)

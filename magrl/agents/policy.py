@@ -73,8 +73,9 @@ class FieldPolicy(TrainedPolicy):
     """A trained agent as a navigator of the plain environment, in physical units.
 
     A recurrent policy, and one that reads its own track (:class:`~magrl.transforms.TrackView`), keeps its own state for
-    each vehicle from the start of an episode (``step_count`` 0) on: call it once per step. The latter reads the
-    standard deviations of new errors of the sensors from ``sensor_std``, and those of constant and slow errors from
+    each vehicle from the start of an episode (``step_count`` 0) on. Another call in the same step begins with the same
+    state as the first, so that calling it twice on one state changes nothing. A policy that reads its own track reads
+    the standard deviations of new errors of the sensors from ``sensor_std``, and those of constant and slow errors from
     ``bias_std``; without these keys they are 0.
 
     Args:
@@ -100,6 +101,7 @@ class FieldPolicy(TrainedPolicy):
         self.observe = Compose(*config.view.observation_transforms())
         self.act = config.view.action_transform()
         self.actor = config.make_actor() if actor is None else actor
+        self.state_keys = STATE_KEYS if config.memory_size else config.view.state_keys
         self.state: TensorDictBase | None = None
 
     def adapted(self, **changes: Any) -> FieldPolicy:
@@ -121,35 +123,43 @@ class FieldPolicy(TrainedPolicy):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""
         seen = tensordict.select(*self.in_keys)
-        observed = self._track(seen, tensordict) if isinstance(self.config.view, TrackView) else self.observe(seen)
-        if self.config.memory_size:
-            self._recall(observed)
+        if not self.state_keys:
+            action = self.actor(self.observe(seen))["action"]
+            return tensordict.set("action", self.act.denormalize("action", action))
+        before, starts = self._state_before(seen)
+        recall = self._recall if self.config.memory_size else self._track
+        observed = recall(seen.update(tensordict.select(*STD_KEYS, strict=False)), before, starts)
         action = self.actor(observed)["action"]
-        if self.config.memory_size:
-            self.state = observed["next"].select(*STATE_KEYS).detach()
+        state = (observed["next"] if self.config.memory_size else observed).select(*self.state_keys).detach()
+        begun = {"step": seen["step_count"].clone(), "starts": starts, "before": state if before is None else before}
+        self.state = state.clone(recurse=False).update(begun)
         return tensordict.set("action", self.act.denormalize("action", action))
 
-    def _track(self, seen: TensorDictBase, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the observation after the last move, and keep the state of the track for the next."""
-        for key in STD_KEYS:
-            seen[key] = tensordict.get(key, torch.zeros_like(seen["field"]))
-        state, starts = self.state, seen["step_count"].squeeze(-1) == 0
-        if state is None or state.shape != seen.shape or state.device != seen.device or starts.all():
-            observed = self.observe(seen)
-        else:
-            observed = self.observe(state.copy().set("next", seen.copy()))["next"]
-            if starts.any():
-                observed = torch.where(starts, self.observe(seen), observed)
-        self.state = observed.select(*self.config.view.state_keys)
-        return observed
+    def _state_before(self, seen: TensorDictBase) -> tuple[TensorDictBase | None, Tensor]:
+        """Return the state that a step begins with, and who starts anew ``(..., 1)``: both as in a call before it."""
+        held, starts = self.state, seen["step_count"] == 0
+        if held is None or held.shape != seen.shape or held.device != seen.device:
+            return None, torch.ones_like(starts)
+        again = held["step"] == seen["step_count"]
+        before = torch.where(again.squeeze(-1), held["before"], held.select(*self.state_keys))
+        return before, starts | (again & held["starts"])
 
-    def _recall(self, observed: TensorDictBase) -> None:
-        """Add the recurrent state and the mask of the vehicles whose episode starts."""
-        observed["is_init"] = observed["step_count"] == 0
-        if self.state is None or self.state.shape != observed.shape or self.state.device != observed.device:
+    def _track(self, seen: TensorDictBase, state: TensorDictBase | None, starts: Tensor) -> TensorDictBase:
+        """Return the observation after the last move."""
+        for key in STD_KEYS:
+            seen[key] = seen.get(key, torch.zeros_like(seen["field"]))
+        if state is None or starts.all():
+            return self.observe(seen)
+        observed = self.observe(state.copy().set("next", seen.copy()))["next"]
+        return torch.where(starts.squeeze(-1), self.observe(seen), observed) if starts.any() else observed
+
+    def _recall(self, seen: TensorDictBase, state: TensorDictBase | None, starts: Tensor) -> TensorDictBase:
+        """Return the observation with the recurrent state and the mask of the vehicles whose episode starts."""
+        observed = self.observe(seen).set("is_init", starts)
+        if state is None:
             zeros = observed["observation"].new_zeros(*observed.shape, 1, self.config.memory_size)
-            self.state = TensorDict(dict.fromkeys(STATE_KEYS, zeros), observed.shape, device=observed.device)
-        observed.update(self.state)
+            state = TensorDict(dict.fromkeys(STATE_KEYS, zeros), observed.shape, device=observed.device)
+        return observed.update(state)
 
 
 def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | None = None) -> None:

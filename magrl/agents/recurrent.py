@@ -125,6 +125,7 @@ class RecurrentTD3Loss(TD3Loss):
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
+        >>> from magrl.agents import SoftUpdate
         >>> from magrl.agents.networks import make_critic
         >>> from magrl.envs import GeomagneticNavEnv
         >>> base = GeomagneticNavEnv(num_envs=2, seed=0)
@@ -134,6 +135,7 @@ class RecurrentTD3Loss(TD3Loss):
         >>> env = TransformedEnv(base, Compose(*recurrent_transforms(view, actor), view.action_transform()))
         >>> slices = env.rollout(3, actor).reshape(-1)  # two slices of three steps
         >>> loss = RecurrentTD3Loss(actor, critic, gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        >>> update = SoftUpdate(loss, tau=0.01)
         >>> loss.value_loss(slices)[0].requires_grad
         True
     """

@@ -62,6 +62,7 @@ class TD3Loss(TorchRLTD3Loss):
         >>> from tensordict import TensorDict
         >>> from magrl.agents.networks import make_actor, make_critic
         >>> loss = TD3Loss(make_actor(13, (8,)), make_critic(13, (8,)), gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+        >>> update = SoftUpdate(loss, tau=0.01)
         >>> obs, ended = torch.zeros(5, 13), torch.ones(5, 1, dtype=torch.bool)
         >>> after = TensorDict(observation=obs, reward=torch.ones(5, 1), terminated=ended)
         >>> batch = TensorDict(observation=obs, action=torch.zeros(5, 2), next=after, batch_size=[5])

@@ -21,12 +21,13 @@ change over about 25 km."""
 LEAST_INTENSITY_NT = 2000.0
 """Lowest horizontal intensity of a place: nearer to a magnetic pole, the declination is hardly defined."""
 _NUMBER = r"([+-]?\d+(?:\.\d*)?)"
-_COORDINATES = re.compile(rf"\s*{_NUMBER}\s*°?\s*([NS])?\s*[\s,]\s*{_NUMBER}\s*°?\s*([EW])?\s*", re.IGNORECASE)
+_ANGLE = rf"{_NUMBER}\s*°?(?:\s*(\d+(?:\.\d*)?)\s*['′](?:\s*(\d+(?:\.\d*)?)\s*[\"″])?)?"
+_COORDINATES = re.compile(rf"\s*{_ANGLE}\s*([NS])?\s*[\s,]\s*{_ANGLE}\s*([EW])?\s*", re.IGNORECASE)
 _ELEMENTS = re.compile(rf"\s*D={_NUMBER}[\s,]+I={_NUMBER}[\s,]+BH={_NUMBER}\s*", re.IGNORECASE)
 
 
 def parse_coordinates(text: str) -> Tensor:
-    """Return the place that a text such as ``60.4N 5.3E``, ``60.4, 5.3`` or ``-33.9 18.4`` names.
+    """Return the place that a text such as ``60.4N 5.3E``, ``60.4, 5.3``, ``-33.9 18.4`` or ``58°58'N 5°44'E`` names.
 
     Returns:
         ``(2,)`` latitude, longitude [deg], float64, the longitude in (-180, 180].
@@ -40,17 +41,27 @@ def parse_coordinates(text: str) -> Tensor:
     """
     found = _COORDINATES.fullmatch(text)
     if not found:
-        raise ValueError(f"a place must be written such as '60.4N 5.3E', '60.4, 5.3' or '-33.9 18.4', got {text!r}")
+        raise ValueError(
+            f"a place must be written such as '60.4N 5.3E', '-33.9 18.4' or \"58°58'N 5°44'E\", got {text!r}"
+        )
     values = []
-    for number, letter in (found.group(1, 2), found.group(3, 4)):
+    for number, minutes, seconds, letter in (found.group(1, 2, 3, 4), found.group(5, 6, 7, 8)):
         if letter and number[0] in "+-":
             raise ValueError(f"a coordinate must have a sign or a letter, not both, got {number}{letter} in {text!r}")
-        values.append(-float(number) if (letter or "").upper() in ("S", "W") else float(number))
+        size = abs(float(number)) + _sixtieths(minutes, text) + _sixtieths(seconds, text) / 60
+        values.append(-size if number[0] == "-" or (letter or "").upper() in ("S", "W") else size)
     latitude, longitude = values
     if abs(latitude) > 90 or abs(longitude) > 360:
         raise ValueError(f"a latitude must be within 90 and a longitude within 360 degrees, got {text!r}")
     place = torch.tensor(values, dtype=torch.float64)
     return torch.stack((place[0], wrap_longitude(place[1])))
+
+
+def _sixtieths(number: str | None, text: str) -> float:
+    """Return minutes in degrees, or seconds in minutes; 0 for none."""
+    if float(number or 0) >= 60:
+        raise ValueError(f"minutes and seconds must be below 60, got {number} in {text!r}")
+    return float(number or 0) / 60
 
 
 def parse_elements(text: str) -> Tensor | None:

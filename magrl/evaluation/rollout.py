@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -119,7 +120,8 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
     """Return a rollout of exactly one episode of each vehicle, without exploration or gradients.
 
     A stochastic policy acts by its deterministic sample. It is the first episode of each vehicle: tasks, start headings
-    and sensor noise are the same in every call.
+    and sensor noise are the same in every call. From its first action that is not finite on, the actions of a vehicle
+    are zeros, with a warning that names it.
 
     Args:
         env: navigation environment, with transforms or without.
@@ -145,8 +147,19 @@ def _rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
     """Return the next episode of each vehicle, without exploration or gradients."""
     if not callable(policy):
         raise TypeError(f"policy must be callable with a TensorDict, got {policy!r}")
+    failed = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        action = policy(tensordict)["action"]
+        failed.logical_or_(~torch.isfinite(action).all(-1, keepdim=True))
+        return tensordict.set("action", torch.where(failed, 0.0, action))
+
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        return env.rollout(env.max_steps, policy, break_when_any_done=False, break_when_all_done=True)
+        rollout = env.rollout(env.max_steps, act, break_when_any_done=False, break_when_all_done=True)
+    if failed.any():
+        lost = failed.squeeze(-1).nonzero().squeeze(-1)[:8].tolist()
+        warnings.warn(f"the policy wrote actions that are not finite: vehicles {lost} stopped", stacklevel=3)
+    return rollout
 
 
 def restart(env: EnvBase) -> None:

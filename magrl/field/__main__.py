@@ -4,8 +4,9 @@
     python -m magrl.field points.csv --altitude height --unit m --date 2026-07-01 --out field.parquet
 
 The table has a row for each point. Its columns are latitude and longitude [deg], altitude or depth [km], and date (ISO
-text or decimal year). Other names are given by options; an option that is not a column is the value of all points. All
-columns of the table are kept, and these are added:
+text or decimal year), or lat, lon, time, alt, and with a unit altitude_m, alt_km, depth_m. Other names are given by
+options; an option that is not a column is the value of all points. All columns of the table are kept, and these are
+added:
 
     D_deg, I_deg, B_H_nT       declination, inclination, horizontal intensity
     X_nT, Y_nT, Z_nT, F_nT     north, east and down components, total intensity
@@ -35,6 +36,14 @@ if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
 UNITS_KM = {"km": 1.0, "m": 0.001}
+COLUMNS = {
+    "latitude": ("latitude", "lat"),
+    "longitude": ("longitude", "lon", "long", "lng"),
+    "altitude": ("altitude", "alt", *(f"{name}_{unit}" for name in ("altitude", "alt") for unit in UNITS_KM)),
+    "depth": ("depth", *(f"depth_{unit}" for unit in UNITS_KM)),
+    "date": ("date", "time", "datetime"),
+}
+"""Names by which a column is found, in lower case."""
 SUFFIXES = (".csv", ".parquet")
 NO_PARQUET = "pandas reads and writes Parquet with the package pyarrow: pip install pyarrow, or use .csv"
 _DIGITS = {"deg": 6, "nT": 4, "km": 9}
@@ -48,14 +57,20 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("points", type=Path, help="table of the points: .csv or .parquet")
     command.add_argument("--out", type=Path, help="result: .csv or .parquet; by default beside the points, with _field")
     for name, meaning in (("latitude", "geodetic latitude [deg]"), ("longitude", "longitude [deg]")):
-        command.add_argument(f"--{name}", default=name, help=f"column of the {meaning}, or a number; default {name}")
+        command.add_argument(f"--{name}", help=f"column of the {meaning}, or a number; default {_usual(name)}")
     height = command.add_mutually_exclusive_group()
-    height.add_argument("--altitude", help="column of the altitude above the ellipsoid, or a number; default altitude")
+    height.add_argument(
+        "--altitude", help="column of the altitude above the ellipsoid, or a number; default altitude, alt"
+    )
     height.add_argument("--depth", help="column of the depth below the ellipsoid, or a number; default depth")
-    command.add_argument("--unit", choices=UNITS_KM, default="km", help="unit of altitude or depth; default km")
-    command.add_argument("--date", default="date", help="column of the date, or a date; default date")
+    command.add_argument("--unit", choices=UNITS_KM, help="unit of altitude or depth; default that of alt_m, or km")
+    command.add_argument("--date", help=f"column of the date, or a date; default {_usual('date')}")
     command.add_argument("--generation", type=int, choices=(13, 14), default=14, help="generation of IGRF; default 14")
     return command
+
+
+def _usual(name: str) -> str:
+    return ", ".join(COLUMNS[name])
 
 
 def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
@@ -76,10 +91,8 @@ def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
     """
     if not len(table):
         raise ValueError("the table has no row")
-    latitude = _numbers(table, options.latitude, "latitude", -90.0, 90.0, "degrees")
-    longitude = _numbers(table, options.longitude, "longitude", -360.0, 360.0, "degrees")
-    place = (latitude, longitude, _altitude_km(table, options))
-    field = IGRF(_column(table, options.date, "date", _date), options.generation)
+    place = (*_place(table, options), _altitude_km(table, options))
+    field = IGRF(_column(table, _name(table, "date", options.date), "date", _date), options.generation)
     found = _columns(*field.value_and_gradient(*map(torch.from_numpy, place)))
     if taken := sorted(found.keys() & set(table.columns)):
         raise ValueError(f"the table has columns {', '.join(taken)} already: rename them, or remove them")
@@ -99,18 +112,46 @@ def _columns(value: torch.Tensor, gradient: torch.Tensor) -> dict[str, NDArray[n
     return {name: values.numpy().round(_DIGITS[name.rpartition("_")[2]]) for name, values in found.items()}
 
 
+def _name(table: DataFrame, name: str, given: str | None) -> str:
+    """Return the column of a quantity: the given one, that of its name, or the one that has another usual name."""
+    usual = [column for column in map(str, table.columns) if column.lower() in COLUMNS[name]]
+    if given is not None or name in usual or not usual:
+        return given or name
+    if len(usual) > 1:
+        raise ValueError(f"the table has columns {' and '.join(usual)}: choose with --{name}")
+    return usual[0]
+
+
+def _place(table: DataFrame, options: argparse.Namespace) -> list[NDArray[np.float64]]:
+    """Return latitudes and longitudes [deg] ``(P,)``."""
+    names = {name: _name(table, name, getattr(options, name)) for name in ("latitude", "longitude")}
+    if names["latitude"].lower() in COLUMNS["longitude"] or names["longitude"].lower() in COLUMNS["latitude"]:
+        raise ValueError(f"--latitude {names['latitude']} --longitude {names['longitude']}: they are swapped")
+    hint = "degrees: are latitude and longitude swapped?"
+    place = [
+        _numbers(table, names[name], name, -most, most, unit)
+        for name, most, unit in (("latitude", 90.0, hint), ("longitude", 360.0, "degrees"))
+    ]
+    if all((abs(values) <= most).all() for values, most in zip(place, (math.pi / 2, math.pi), strict=True)):
+        warning = "all latitudes are within pi/2 and all longitudes within pi: are they radians? Degrees are expected"
+        print(f"python -m magrl.field: {warning}", file=sys.stderr)
+    return place
+
+
 def _altitude_km(table: DataFrame, options: argparse.Namespace) -> NDArray[np.float64]:
     """Return altitudes above the ellipsoid [km] ``(P,)``."""
     given = [name for name in _SIGNS if getattr(options, name) is not None]
-    names = given or [name for name in _SIGNS if name in table.columns]
+    names = given or [name for name in _SIGNS if _name(table, name, None) in table.columns]
     if len(names) != 1:
         which = "both columns altitude and depth" if names else f"neither altitude nor depth among {_listed(table)}"
         raise ValueError(f"the table has {which}: choose with --altitude or --depth, such as --altitude 0")
     (name,) = names
-    low, high = sorted(_SIGNS[name] * limit / UNITS_KM[options.unit] for limit in IGRF.altitude_range_km)
-    hint = ": is it in meters? Then add --unit m" if options.unit == "km" else ""
-    values = _numbers(table, getattr(options, name) or name, name, low, high, f"{options.unit}{hint}")
-    return _SIGNS[name] * UNITS_KM[options.unit] * values
+    column = _name(table, name, getattr(options, name))
+    suffix = column.lower().rpartition("_")[2]
+    unit = options.unit or (suffix if column in table.columns and suffix in UNITS_KM else "km")
+    low, high = sorted(_SIGNS[name] * limit / UNITS_KM[unit] for limit in IGRF.altitude_range_km)
+    hint = ": is it in meters? Then add --unit m" if unit == "km" else ""
+    return _SIGNS[name] * UNITS_KM[unit] * _numbers(table, column, name, low, high, f"{unit}{hint}")
 
 
 _SIGNS = {"altitude": 1.0, "depth": -1.0}

@@ -1,4 +1,4 @@
-"""Limits that a policy was made for: the longest move, the largest turn, and the range of the field."""
+"""Limits of a policy and of a vehicle: the longest move, the largest turn, the range of the field, and sensors."""
 
 from __future__ import annotations
 
@@ -15,9 +15,15 @@ from magrl.transforms import ObservationView, TrackView
 LEAST_NT = 2000.0
 """Least B_H for an agent without a map: below, it fails more often (docs/earth.md, the whole globe) [nT]."""
 
+LEAST_STD_NT = 0.2
+"""Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
+STUCK_KM = (100.0, 400.0)
+"""Path without a change of all readings, and of one of them, after which a sensor is stuck: at least this, and at least
+2 and 8 of the longest moves [km]. Coarse readings of one element can be equal that long; chosen."""
 _LONGER = 1.1  # than the longest move
 
 View = ObservationView | TrackView | None
+Path = tuple[float, float, float]
 
 
 def view_of(policy: TensorDictModuleBase) -> View:
@@ -93,6 +99,69 @@ def out_of_range(view: View, elements: Sequence[float]) -> str:
         if not least <= value <= most:
             return f"{name} {value:g} {unit} is out of the range of the policy, {least:g} to {most:g} {unit}"
     return ""
+
+
+def unchanged_km(known: Sequence[float], before: Sequence[float], after: Sequence[float], move_km: float) -> Path:
+    """Return the path since each element last changed ``(3,)`` [km].
+
+    Args:
+        known: the same before the move.
+        before: D, I, B_H before the move.
+        after: the same after it.
+        move_km: its length.
+
+    Example:
+        >>> unchanged_km((30.0, 30.0, 30.0), (3.5, 73.0, 15000.0), (3.5, 73.1, 15020.0), 20.0)
+        (50.0, 0.0, 0.0)
+    """
+    first, second, third = (
+        km + move_km if one == other else 0.0 for km, one, other in zip(known, before, after, strict=True)
+    )
+    return first, second, third
+
+
+def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
+    """Return which readings are those of a stuck sensor, as text; empty if none is.
+
+    Args:
+        unchanged: from :func:`unchanged_km`.
+        max_move_km: longest move.
+
+    Example:
+        >>> stuck((450.0, 20.0, 0.0), max_move_km=50.0)
+        'D has not changed over 450 km: its sensor is stuck'
+    """
+    every_km, one_km = (max(km, moves * max_move_km) for km, moves in zip(STUCK_KM, (2, 8), strict=True))
+    least_km = every_km if min(unchanged) >= every_km else one_km
+    held = {name: km for name, km in zip(NAMES, unchanged, strict=True) if km >= least_km}
+    if not held:
+        return ""
+    have, its = ("have", "their") if len(held) > 1 else ("has", "its")
+    return f"{', '.join(held)} {have} not changed over {min(held.values()):.0f} km: {its} sensor is stuck"
+
+
+def check_std(**std: Sequence[float]) -> None:
+    """Raise unless standard deviations of D [deg], I [deg], B_H [nT] are possible for the sensors of a vehicle.
+
+    Args:
+        std: three numbers by the name that the message uses; 0 for perfect sensors.
+
+    Raises:
+        ValueError: for other than three numbers from 0 on, or a standard deviation that looks like microtesla.
+
+    Example:
+        >>> check_std(sensor_std=(0.02, 0.02, 0.005))
+        Traceback (most recent call last):
+        ValueError: sensor_std: 0.005 nT of B_H is less than the 0.2 nT of the best sensors in a vehicle: it looks \
+like microtesla, and nanotesla are expected; give 0 for a perfect sensor
+    """
+    check_numbers(3, 0, **std)
+    for name, values in std.items():
+        if 0 < values[2] < LEAST_STD_NT:
+            raise ValueError(
+                f"{name}: {values[2]:g} nT of B_H is less than the {LEAST_STD_NT:g} nT of the best sensors in a "
+                "vehicle: it looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor"
+            )
 
 
 def check_move(heading_deg: float, distance_km: float, steer_deg: float | None, max_move_km: float) -> None:

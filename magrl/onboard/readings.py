@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 from magrl.checks import check_number, check_numbers
@@ -66,6 +67,8 @@ where it is 5513 to 23485 nT there: it looks like microtesla, and nanotesla are 
         ("horizontal_intensity [nT]", horizontal_intensity, 0.0, math.inf),
     ):
         given: dict[str, Any] = {f"{what}: {name}": value}
+        if isinstance(value, Real) and name == "declination [deg]" and 180 < value <= 360:
+            raise ValueError(f"{what}: {name} must be from -180 up to 180, got {value:g}: give {value - 360:g}")
         check_number(least, most, **given)
     low, high = _horizontal_limits(abs(inclination))
     if low <= horizontal_intensity <= high:

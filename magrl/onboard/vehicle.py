@@ -24,7 +24,7 @@ from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.files import DamagedFileError, load_tensors, save_tensors
 from magrl.navigators import Kalman, Navigator, RunAndTumble, Secant
 from magrl.onboard.estimator import Estimator
-from magrl.onboard.limits import check_move, move_limits, out_of_range, view_of
+from magrl.onboard.limits import check_move, check_std, move_limits, out_of_range, stuck, unchanged_km, view_of
 from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_distance, check_earth_jump, check_earth_reading
 from magrl.onboard.start import Elements, calibrated, known_elements
 from magrl.tracking import ArrivalDecision, Way
@@ -41,18 +41,10 @@ LOST_SURPRISE = 100.0
 simulation, it reached 5 with a right data sheet, and 31 under the conditions of an aircraft."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 4
-_FORMAT, _NOT_STARTED = 3, "the vehicle has no destination yet: call start(target) first"
+_FORMAT, _NOT_STARTED = 4, "the vehicle has no destination yet: call start(target) first"
 _OPTIONS = ("name", "sensor_std", "bias_std", "drift_std", "max_move_km", "max_turn_deg", "max_steps", "arrival_km")
-_PLAIN = (
-    "_step",
-    "_steer",
-    "_last",
-    "_surprises",
-    "_northward",
-    "_known",
-    "_error",
-    "_left_std",
-)  # parts of the state that are numbers
+# Parts of the state that are numbers
+_PLAIN = ("_step", "_steer", "_last", "_surprises", "_northward", "_unchanged", "_known", "_error", "_left_std")
 _STATES = ("state", "memory")  # attributes in which policies and navigators keep their state
 
 
@@ -143,7 +135,7 @@ class Onboard:
         confidence: float = 0.8,
     ) -> None:
         check_type((str, TensorDictModuleBase), navigator=navigator)
-        check_numbers(3, 0, sensor_std=sensor_std, bias_std=bias_std, drift_std=drift_std)
+        check_std(sensor_std=sensor_std, bias_std=bias_std, drift_std=drift_std)
         check_number(1, whole=True, max_steps=max_steps)
         check_number(0, above=True, arrival_km=arrival_km)
         check_number(0, 1, confidence=confidence)
@@ -216,6 +208,7 @@ class Onboard:
         self._estimator = Estimator(self.navigator)
         self._steer: float | None = None  # heading that the vehicle was to steer [deg]
         self._last, self._surprises = Values(), Values()  # the last reading with its course
+        self._unchanged = EXACT  # path since each element last changed [km]
         self._northward = Values()  # the first inclination, and how far magnetic north the vehicle has come [km]
         for name in _STATES:
             if hasattr(self.navigator, name):
@@ -252,6 +245,7 @@ class Onboard:
             surprises = (*self._surprises, *((self._estimator.surprise(seen),) if self._last else ()))
             action = self._estimator.act(seen)
             self._surprises = surprises[-_SURPRISES:]
+            self._unchanged = unchanged_km(self._unchanged, self._last[:3] or reading, reading, distance)
             self._last = (*reading, course)
             first, north = self._northward or (reading[1], 0.0)
             self._northward = first, north + distance * math.cos(course - math.radians(reading[0]))
@@ -309,6 +303,8 @@ class Onboard:
 
     def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return why to stop, and that as a sentence."""
+        if text := stuck(self._unchanged, self.max_move_km):
+            return "lost", text
         level = sum(self._surprises) / max(len(self._surprises), 1)
         if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
             return "lost", f"readings deviate {level**0.5:.0f} times as much as expected: check sensors and compass"

@@ -77,12 +77,11 @@ def field_curvature(elements: Tensor) -> Tensor:
 
 
 def _per_nanotesla(elements: Tensor) -> Tensor:
-    """Return the change of D, I [deg] and B_H [nT] ``(..., 3)`` by a disturbance of 1 nT."""
+    """Return the change of D, I [deg] and B_H [nT] ``(..., 3)`` by a disturbance of 1 nT, above 0 for any reading."""
     strength = elements[..., 2].clamp_min(_LEAST_NT)
     declination = math.degrees(1) / strength
-    return torch.stack(
-        (declination, declination * torch.cos(torch.deg2rad(elements[..., 1])), torch.ones_like(strength)), -1
-    )
+    inclination = declination * torch.cos(torch.deg2rad(elements[..., 1])).abs()
+    return torch.stack((declination, inclination, torch.ones_like(strength)), -1)
 
 
 def curl_relation(elements: Tensor) -> GradientRelation:

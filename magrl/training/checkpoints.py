@@ -59,7 +59,7 @@ def locked(folder: Path) -> AcquireReturnProxy:
     """Claim a run folder for this process until the end of the block of ``with``; a kill releases it too.
 
     Raises:
-        UsageError: if another process writes it.
+        UsageError: if another process writes it, or it cannot be written.
 
     Example:
         >>> import tempfile
@@ -73,6 +73,8 @@ def locked(folder: Path) -> AcquireReturnProxy:
         return FileLock(folder / ".lock").acquire(timeout=0)
     except Timeout as error:
         raise UsageError(f"another process is writing the run folder {folder}") from error
+    except OSError as error:
+        raise UsageError(f"the run folder {folder} cannot be written ({error.strerror})") from error
 
 
 class Stateful(Protocol):

@@ -35,9 +35,10 @@ def make_collector(
         **options: options of TorchRL's ``Collector``, such as ``frames_per_batch`` and ``total_frames``.
 
     Example:
+        >>> from torchrl.modules import RandomPolicy
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> collector = make_collector(env, env.rand_action, frames_per_batch=4, total_frames=8)
+        >>> collector = make_collector(env, RandomPolicy(env.action_spec), frames_per_batch=4, total_frames=8)
         >>> next(iter(collector)).shape
         torch.Size([2, 2])
         >>> collector.shutdown()

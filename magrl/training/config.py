@@ -290,6 +290,7 @@ def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
             raise ValueError("it is not of this version of magrl: start the training again in a new folder")
         if (begun := settings.pop("recipe")) != recipe:
             raise ValueError(f"the run was started by {begun}: resume it with that recipe")
+        settings.pop("name", None)
         if settings.get("scenario"):
             settings["scenario"] = folder / Path(settings["scenario"]).name
         settings = {key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()}

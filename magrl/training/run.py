@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import shutil
 import signal
@@ -99,6 +100,8 @@ class Run:
         self.name = f"{name}-{config.scenario.stem}" if config.scenario else name
         if any(config.noise):
             self.name += "-noise-" + "-".join(f"{level:g}" for level in config.noise)
+        if config.resume:  # its scenario file has another name there
+            self.name = json.loads((config.resume / "config.json").read_text()).get("name", self.name)
         self.statistics, self.best, self.stop = TrainingStatistics(), BestPolicy(), StopRequest()
         self.folder = config.out or Path("runs") / f"{self.name}-seed{config.seed}"
         self._exits = contextlib.ExitStack()
@@ -131,8 +134,8 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings as ``config.json`` holds them: no path of this machine, and the recipe's name."""
-        settings = {"recipe": self.recipe} | self.config.model_dump(mode="json")
+        """Settings as ``config.json`` holds them: no path of this machine, and the names of recipe and run."""
+        settings = {"recipe": self.recipe, "name": self.name} | self.config.model_dump(mode="json")
         source = self.config.scenario
         return settings | {"out": self.folder.name, "resume": None, "scenario": source and f"scenario{source.suffix}"}
 

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import step_mdp
 
-from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
+from magrl.agents import FieldPolicy, PolicyConfig, load_policy, load_pretrained, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.files import save_tensors
 from magrl.transforms import ObservationView
@@ -44,6 +46,29 @@ def test_a_policy_is_of_its_region(env, policy) -> None:
     azores = Scenario(region={"latitude": (33.0, 43.0), "longitude": (-33.0, -23.0)})
     with pytest.raises(ValueError, match="the policy was trained where D is"):
         policy.check_fits(GeomagneticNavEnv(azores, seed=0))
+
+
+@pytest.mark.parametrize("kind", ["track", "recurrent"])
+def test_a_second_call_on_a_state_changes_nothing(env, kind: str) -> None:
+    """Also where episodes start at different steps."""
+    recurrent = FieldPolicy(PolicyConfig(env.observation_view(observe_heading=False), CELLS, memory_size=4))
+    policy = recurrent if kind == "recurrent" else load_pretrained("anywhere")
+
+    def flown(calls: int) -> list[list[Tensor]]:
+        env.set_seed(3)
+        state, actions = env.reset(), []
+        for step in range(5):
+            actions.append([policy(state.clone())["action"] for _ in range(calls)])
+            state = step_mdp(env.step(state.set("action", actions[-1][0])))
+            begin = torch.tensor([[True], [False], [False], [False], [False]])
+            state = env.reset(state.set("_reset", begin)) if step == 1 else state
+        return actions
+
+    for (once,), (first, second) in zip(flown(1), flown(2), strict=True):
+        assert torch.equal(first, once)
+        assert torch.equal(second, once)
+    policy.state, late = None, env.rollout(3)[:, -1]  # without the start of the episode
+    assert torch.equal(*(policy(late.clone())["action"] for _ in range(2)))
 
 
 # Files

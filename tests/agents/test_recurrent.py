@@ -16,6 +16,7 @@ from magrl.agents import (
     FieldPolicy,
     PolicyConfig,
     RecurrentTD3Loss,
+    SoftUpdate,
     make_critic,
     make_recurrent_actor,
     recurrent_transforms,
@@ -54,7 +55,9 @@ def training_env(env: GeomagneticNavEnv, view: ObservationView, actor) -> Transf
 
 def make_loss(view: ObservationView, actor) -> RecurrentTD3Loss:
     critic = make_critic(view.size + 2, CELLS, observation_keys=("observation", "heading_vector"))
-    return RecurrentTD3Loss(actor, critic, gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+    loss = RecurrentTD3Loss(actor, critic, gamma=0.9, policy_noise=0.1, noise_clip=0.5)
+    SoftUpdate(loss, tau=0.1)
+    return loss
 
 
 @pytest.fixture
@@ -134,6 +137,7 @@ def test_loss_is_that_of_torchrl(view, collected) -> None:
     spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 0.1, "noise_clip": 0.5}
     stock = StockTD3Loss(TensorDictSequential(actor, beside), ours.qvalue_network, deactivate_vmap=True, **spec)
     stock.make_value_estimator(gamma=0.9)
+    SoftUpdate(stock, tau=0.1)
     for name in ("qvalue_network_params", "target_qvalue_network_params"):
         getattr(stock, name).data.update_(getattr(ours, name).data)
     prepared, begins = slices.clone(), slices["is_init"].squeeze(-1)

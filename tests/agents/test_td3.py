@@ -15,7 +15,13 @@ CELLS = (16, 16)
 
 def make_loss(size: int = 13, *, policy_noise: float = 0.1) -> TD3Loss:
     actor, critic = make_actor(size, CELLS), make_critic(size, CELLS)
-    return TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=0.5)
+    return updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=0.5))
+
+
+def updated(loss: StockTD3Loss) -> StockTD3Loss:
+    """Return a loss whose targets are updated, as TorchRL expects of every loss."""
+    SoftUpdate(loss, tau=0.1)
+    return loss
 
 
 def transitions(size: int = 13, count: int = 32) -> TensorDict:
@@ -34,8 +40,8 @@ def test_target_policy_smoothing_is_clipped() -> None:
     """With a large noise of a small clip, the target is that of the smallest and largest clipped noise."""
     torch.manual_seed(0)
     actor, critic, batch = make_actor(13, CELLS), make_critic(13, CELLS), transitions()
-    exact = TD3Loss(actor, critic, gamma=0.9, policy_noise=0.0, noise_clip=0.5)
-    near = TD3Loss(actor, critic, gamma=0.9, policy_noise=100.0, noise_clip=1e-4)
+    exact = updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=0.0, noise_clip=0.5))
+    near = updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=100.0, noise_clip=1e-4))
     near.load_state_dict(exact.state_dict())
     target, noisy = (loss.value_loss(batch.clone())[1]["target_value"] for loss in (exact, near))
     assert not torch.equal(target, noisy)
@@ -53,7 +59,7 @@ def test_loss_is_that_of_torchrl() -> None:
         optimize(ours.value_loss(batch)[0] + ours.actor_loss(batch)[0], optimizer)
         update.step()
     spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 0.1, "noise_clip": 0.5}
-    stock = StockTD3Loss(make_actor(13, CELLS), make_critic(13, CELLS), deactivate_vmap=True, **spec)
+    stock = updated(StockTD3Loss(make_actor(13, CELLS), make_critic(13, CELLS), deactivate_vmap=True, **spec))
     stock.make_value_estimator(gamma=0.9)
     stock.load_state_dict(ours.state_dict())
     batch, computed = transitions(), []
@@ -85,7 +91,7 @@ def test_bfloat16_rounds_the_hidden_layers_alone() -> None:
     torch.manual_seed(0)
     actor, critic, batch = make_actor(13, (64, 64)), make_critic(13, (64, 64)), transitions()
     options = {"gamma": 0.9, "policy_noise": 0.0, "noise_clip": 0.5}
-    exact, rounded = (TD3Loss(actor, critic, **options, precision=kind) for kind in ("float32", "bfloat16"))
+    exact, rounded = (updated(TD3Loss(actor, critic, **options, precision=kind)) for kind in ("float32", "bfloat16"))
     rounded.load_state_dict(exact.state_dict())
     for name, weights in (("value_loss", "critic_parameters"), ("actor_loss", "actor_parameters")):
         losses = [getattr(loss, name)(batch.clone())[0] for loss in (exact, rounded)]

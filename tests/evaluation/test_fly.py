@@ -28,7 +28,8 @@ def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
     (west, *_), (first, *_) = feature["geometry"]["coordinates"][:2]
     assert first < west  # the first move of secant leads ahead
     assert len(feature["geometry"]["coordinates"]) == result["steps"] + 1
-    assert Image.open(movie).n_frames > result["steps"]
+    with Image.open(movie) as picture:
+        assert picture.n_frames > result["steps"]
 
 
 def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distance(tmp_path: Path) -> None:

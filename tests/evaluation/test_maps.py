@@ -92,11 +92,11 @@ def test_ellipse_has_the_covariance_of_the_way(across: float) -> None:
 def test_gif_of_several_vehicles_shows_them_moving(env: GeomagneticNavEnv, tmp_path: Path) -> None:
     rollout = evaluation_rollout(env, Secant(probe_km=10.0))  # moves that a picture shows: equal frames are merged
     write_gif(tmp_path / "a.gif", rollout, env.field, env.region, width_px=320)
-    picture = Image.open(tmp_path / "a.gif")
-    assert picture.width == 320
-    assert picture.n_frames == 2 * int(episode_measures(rollout)["steps"].max()) + 1
-    assert (picture.info["loop"], picture.info["duration"]) == (0, maps.FRAME_MS)
-    frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(picture)]
+    with Image.open(tmp_path / "a.gif") as picture:
+        assert picture.width == 320
+        assert picture.n_frames == 2 * int(episode_measures(rollout)["steps"].max()) + 1
+        assert (picture.info["loop"], picture.info["duration"]) == (0, maps.FRAME_MS)
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(picture)]
     assert all((before != after).any() for before, after in itertools.pairwise(frames))
     assert (frames[0] == frames[-1]).all(-1).mean() > 0.9  # the map itself stands still
     with pytest.raises(ValueError, match="width_px must be a whole number from 1 on, got 0"):

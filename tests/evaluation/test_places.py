@@ -34,6 +34,8 @@ def place(*degrees: float) -> torch.Tensor:
         (" 33.9s,18.4w ", (-33.9, -18.4)),
         ("60.4° N, 5.3° E", (60.4, 5.3)),
         ("0 200", (0, -160)),
+        ("58°58'N 5°44'E", (58 + 58 / 60, 5 + 44 / 60)),
+        ("-33° 54′ 36″, 18°25.5'W", (-33.91, -18.425)),
         ("1N,181E", (1, -179)),
     ],
 )
@@ -42,7 +44,7 @@ def test_coordinates(text: str, expected: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["Bergen", "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361"]
+    "text", ["Bergen", "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361", "58°60'N 5°44'E"]
 )
 def test_coordinates_that_are_none(text: str) -> None:
     with pytest.raises(ValueError, match=r"must (be|have)"):

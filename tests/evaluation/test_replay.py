@@ -195,7 +195,8 @@ def test_the_recipe_flies_the_run_first(env: GeomagneticNavEnv, tmp_path: Path) 
     assert labels == ["TD3", "TD3 (agent)", "geodesic (both positions, an oracle)"]
     assert [task["start"] for task in data["tasks"]] == [task["start"] for task in tasks]
     assert (data["zeta"], data["title"]) == (0.5, "agent, tasks of scenario.json")
-    assert Image.open(tmp_path / "a.gif").n_frames > 1
+    with Image.open(tmp_path / "a.gif") as picture:
+        assert picture.n_frames > 1
     options = {"run": run, "navigators": (), "out": tmp_path / "none.html"}
     for change, message in (
         ({"navigators": ("dowsing",)}, "unknown navigator 'dowsing'"),

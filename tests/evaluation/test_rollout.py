@@ -1,7 +1,10 @@
 """Evaluation rollouts: every task once, errors that repeat, and policies without exploration."""
 
+import math
+
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
@@ -9,6 +12,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation import evaluate, evaluation_rollout, summarize
+from magrl.navigators import Secant
 
 
 def test_every_task_is_flown_once_however_many_vehicles_fly() -> None:
@@ -74,3 +78,20 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
     ):
         with pytest.raises(error, match=message):
             call()
+
+
+def test_a_vehicle_without_a_finite_action_fails_alone() -> None:
+    """The others fly as they do without it."""
+
+    def broken(tensordict: TensorDict) -> TensorDict:
+        hurt = (tensordict["step_count"] == 2) & (tensordict["target_position"] == target).all(-1, keepdim=True)
+        action = secant(tensordict)["action"]
+        return tensordict.set("action", torch.where(hurt, math.nan, action))
+
+    secant, target = Secant(), named_tasks("paper-100").target[3]
+    with pytest.warns(UserWarning, match=r"not finite: vehicles \[3\] stopped"):
+        episodes = evaluate(broken, "paper-100")
+    sound, others = evaluate("secant", "paper-100"), torch.arange(100) != 3
+    assert not episodes["success"][3]
+    for key in ("success", "length_km", "steps"):
+        assert torch.equal(episodes[key][others], sound[key][others]), key

@@ -61,6 +61,30 @@ def test_options_name_columns_depth_unit_and_one_date(points, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("header", "altitude"),
+    [
+        ("lat,lon,alt_m,time", "500"),
+        ("Latitude,LONGITUDE,altitude_km,DateTime", "0.5"),
+        ("lat,long,depth_m,date", "-500"),
+        ("lat,lng,alt,date", "0.5"),
+    ],
+)
+def test_usual_names_of_columns_are_found(points, header: str, altitude: str) -> None:
+    points.write_text(f"{header}\n-2,162,{altitude},2022-01-01\n")
+    main([str(points)])
+    found = pandas.read_csv(points.with_name("points_field.csv"))[["X_nT", "Y_nT", "Z_nT"]].to_numpy()
+    expected = IGRF("2022-01-01", altitude_km=0.5)(*torch.tensor([-2.0, 162.0], dtype=torch.float64))
+    np.testing.assert_allclose(found[0], expected, rtol=0, atol=1e-3)
+
+
+def test_angles_that_may_be_radians_are_named(points, capsys) -> None:
+    for rows, warned in (("1.05,0.09", True), ("1.05,0.09\n60.4,5.3", False)):
+        points.write_text(f"lat,lon\n{rows}\n")
+        main([str(points), "--altitude", "0", "--date", "2026-07-01"])
+        assert ("are they radians?" in capsys.readouterr().err) is warned
+
+
+@pytest.mark.parametrize(
     ("old", "new", "options", "message"),
     [
         ("0.5", "5000", "", "row 1, altitude: 5000 is not from -15 to 1000 km: is it in meters? Then add --unit m"),
@@ -71,7 +95,10 @@ def test_options_name_columns_depth_unit_and_one_date(points, tmp_path) -> None:
         ("1999.5", "1850-01-01", "", "1850-01-01T00:00:00 is outside IGRF-14, which is valid from 1900-01-01"),
         ("altitude", "height", "", "neither altitude nor depth among id, latitude, longitude, height, date"),
         ("id", "depth", "", "both columns altitude and depth: choose with --altitude or --depth"),
-        ("latitude", "lat", "", "'latitude' is no column of the table and no latitude: choose among id, lat"),
+        ("latitude", "phi", "", "'latitude' is no column of the table and no latitude: choose among id, phi"),
+        ("id,latitude", "Lat,lat", "", "the table has columns Lat and lat: choose with --latitude"),
+        ("60.4", "162", "", "row 2, latitude: 162 is not from -90 to 90 degrees: are latitude and longitude swapped?"),
+        ("", "", "--latitude longitude", "--latitude longitude --longitude longitude: they are swapped"),
         ("id", "D_deg", "", "the table has columns D_deg already"),
         (POINTS.partition("\n")[2], "", "", "the table has no row"),
         ("", "", "--altitude 5000", "5000 is not from -15 to 1000 km"),

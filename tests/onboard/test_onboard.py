@@ -265,6 +265,8 @@ def test_a_refused_call_changes_nothing() -> None:
         ((3.5, 73.0, 15000.0, 0.0, 1.0), "distance must be 0"),
         ((3.5, 73.0, 15.0, 0.0), "looks like microtesla, and nanotesla are expected"),
         ((3.5, 73.0, 0.15, 0.0), "looks like gauss"),
+        ((350.5, 73.0, 15000.0, 0.0), r"declination \[deg\] must be from -180 up to 180, got 350.5: give -9.5"),
+        ((torch.tensor(3.5), 73.0, 15000.0, 0.0), r"got tensor\(3.5000\): give its number, value.item\(\)"),
         ((0.061, 1.274, 15000.0, 0.0), "the inclination looks like radians, and degrees are expected"),
         ((3.3, -7.7, 44600.0, 0.0), "44600 at an inclination of -7.7 deg is not possible on the Earth"),
         ((3.3, -7.7, 40000.0, 0.0), "at least 3676 km from the target, and the longest way is 2500 km: check"),
@@ -373,6 +375,8 @@ def test_the_magnetic_equator_is_no_log_in_radians() -> None:
         ({"max_move_km": 20.0}, "max_move_km must be at least 50, which the policy commands, got 20.0"),
         ({"max_turn_deg": 45.0}, "max_turn_deg must be at least 90"),
         ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std must be a finite number from 0 on, got -0.1"),
+        ({"sensor_std": (0.02, 0.02, 0.002)}, r"sensor_std: 0.002 nT of B_H is less .*: it looks like microtesla"),
+        ({"bias_std": (0.1, 0.1, 0.02)}, "bias_std: 0.02 nT .* give 0 for a perfect sensor"),
         ({"arrival_km": -1.0}, "arrival_km must be"),
         ({"confidence": 1.5}, "confidence must be"),
         ({"max_steps": 0}, "max_steps must be"),
@@ -422,6 +426,29 @@ def test_out_of_range_on_the_way() -> None:
     region.step(9.0, -36.5, 35000.0, 180.0)
     command = region.step(9.0, -37.4, 34900.0, 180.0, 50.0)
     assert (command.stop, command.distance_km) == ("out of range", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("held", "moves", "reason"),
+    [
+        ((0, 1, 2), 4, "D, I, B_H have not changed over 120 km: their sensor is stuck"),
+        ((1,), 14, "I has not changed over 420 km: its sensor is stuck"),
+        ((), None, ""),
+    ],
+)
+def test_a_stuck_sensor(held: tuple[int, ...], moves: int | None, reason: str, tmp_path: Path) -> None:
+    """Moves of 30 km on a straight track where readings change; the path is part of the saved state."""
+    vehicle = Onboard("secant", max_move_km=50.0, sensor_std=(0.5, 0.5, 50.0))
+    vehicle.start(TARGET)
+    for step in range(15):
+        reading = [value + 1e-3 * step * (index not in held) for index, value in enumerate(HERE)]
+        command = vehicle.step(*reading, 290.0, 30.0 if step else 0.0)
+        assert (command.reason if step == moves else command.stop) == (reason if step == moves else None)
+        vehicle.save(tmp_path / "state.pt")
+        vehicle.restore(tmp_path / "state.pt")
+        if step == moves:
+            assert command.stop == "lost"
+            break
 
 
 # Confidence

@@ -78,6 +78,11 @@ def test_prior_and_drift_are_those_of_disturbances_of_the_components():
     torch.testing.assert_close(field_curvature(elements), unit * f64(*CURVATURE_NT))
 
 
+def test_standard_deviations_are_positive_beyond_the_vertical():
+    beyond, folded = (dipole_prior(f64(0.0, inclination, 9000.0)).std for inclination in (95.0, 85.0))
+    torch.testing.assert_close(beyond, folded)
+
+
 def test_planets_deviate_from_the_dipole_and_curve_as_assumed():
     """Root mean squares over planets, of the assumed ones."""
     place = places(600, 60.0)

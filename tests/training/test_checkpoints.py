@@ -16,7 +16,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.files import save_tensors
 from magrl.training import UsageError
 from magrl.training import checkpoints as module
-from magrl.training.checkpoints import PRIVATE, Checkpoints, RunningEpisodes, create_run_folder, read_checkpoint
+from magrl.training.checkpoints import PRIVATE, Checkpoints, RunningEpisodes, create_run_folder, locked, read_checkpoint
 
 # Run folders
 
@@ -41,6 +41,9 @@ def test_each_folder_in_use_has_its_message(tmp_path: Path) -> None:
         create_run_folder(foreign / "notes.txt")
     with pytest.raises(UsageError, match=r"notes\.txt/run cannot be made \(Not a directory\): choose another --out"):
         create_run_folder(foreign / "notes.txt" / "run")
+    (new / ".lock").mkdir()  # as a folder without the right to write, which does not stop root
+    with pytest.raises(UsageError, match=r"a/run cannot be written \(Is a directory\)"), locked(new):
+        pass
 
 
 # Checkpoints

@@ -15,6 +15,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.training import Run, RunConfig, UsageError, command
 from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
 from magrl.training.collectors import worker_seed
+from magrl.training.config import resumed_config
 from magrl.training.run import StopRequest, passes_paper
 
 ROOT = Path(__file__).parent.parent.parent
@@ -56,6 +57,7 @@ def test_config_and_scenario_are_written_with_the_folder(tmp_path: Path) -> None
             pass
     with locked(run.folder):
         pass
+    assert in_run(resumed_config(run.folder, RunConfig, "mine.py")).name == run.name == "mine-azores"
 
 
 def test_only_a_start_that_fails_removes_the_folder(tmp_path: Path) -> None:

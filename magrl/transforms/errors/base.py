@@ -19,6 +19,7 @@ from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number, check_numbers
 from magrl.counters import advanced, counter_stream, split
+from magrl.geodesy import wrap_longitude
 from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
@@ -191,7 +192,8 @@ class ReadingErrors(EpisodeErrors):
     """Base class of errors of a reading, which keep its true value and state its accuracy.
 
     The accuracy follows from :meth:`variances` at :data:`TYPICAL_FIELD`. Variances add up over the errors of a chain,
-    and the first error of a chain keeps the true value.
+    and the first error of a chain keeps the true value. A reading of three elements is D, I, B_H. Where an error
+    carries I beyond the vertical, the reading is that of a magnetometer: I is 180 degrees minus I, and D is reversed.
 
     Args:
         in_keys: of the transform.
@@ -229,7 +231,7 @@ class ReadingErrors(EpisodeErrors):
         """Write a reading, its true value and its accuracy; ``sensor_std`` if it is not the same in all readings."""
         if self.true_key is not None and tensordict.get(self.true_key, None) is None:
             tensordict.set(self.true_key, value)
-        tensordict.set(self.out_keys[self.reading], reading)
+        tensordict.set(self.out_keys[self.reading], _folded(reading) if reading.shape[-1] == 3 else reading)
         known, slow = self._accuracy.to(reading.dtype)
         for key, std in ((self.std_key, known if sensor_std is None else sensor_std), (self.bias_key, slow)):
             before = tensordict.get(key, None)
@@ -244,6 +246,13 @@ class ReadingErrors(EpisodeErrors):
         for key in (self.out_keys[self.reading], self.std_key, self.bias_key):
             self._add(observation_spec, leaf, key, *leaf.shape[-1:])
         return observation_spec
+
+
+def _folded(elements: Tensor) -> Tensor:
+    """Return D, I, B_H ``(..., 3)`` with I in [-90, 90]: beyond the vertical, the horizontal field is reversed."""
+    declination, inclination, horizontal = elements.unbind(-1)
+    folded = wrap_longitude(declination + 180), torch.sign(inclination) * 180 - inclination, horizontal
+    return torch.where(inclination.abs().unsqueeze(-1) > 90, torch.stack(folded, -1), elements)
 
 
 def check_sizes(count: int | None = None, *, fixed: bool = False, **sizes: Sequence[float]) -> None:

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from support.errors import STD, actions, all_errors, assert_same, every_error, flown, nav, under
+from tensordict import TensorDict
 
 from magrl.counters import advanced, counter_stream, split
 from magrl.transforms import TRUE_KEYS, NorthReferenceError, SensorErrors, SensorNoise
@@ -99,6 +100,19 @@ def test_data_without_an_environment() -> None:
     after = north(noise(steps[0].clone().set("next", move["next"])))["next"]
     for key in ("field", "heading", "true_field", "north_error"):
         assert torch.equal(after[key], steps[1][key]), key
+
+
+def test_an_inclination_beyond_the_vertical_is_read_as_by_a_magnetometer() -> None:
+    """I of 91 degrees is 89 degrees, with the horizontal field reversed."""
+    errors = SensorErrors(bias=(0.0, 2.0, 0.0), fixed=True)
+    true = torch.tensor([[170.0, 89.0, 900.0], [-20.0, 89.0, 900.0], [10.0, 80.0, 900.0], [10.0, -92.0, 900.0]])
+    read = torch.tensor([[-10.0, 89.0, 900.0], [160.0, 89.0, 900.0], [10.0, 82.0, 900.0], [10.0, -90.0, 900.0]])
+    state = errors(TensorDict({"field": true, "move": torch.zeros(4, 2), "heading": torch.zeros(4, 1)}, 4))
+    torch.testing.assert_close(state["field"], read)
+    noisy = SensorNoise((0.0, 5.0, 0.0))(TensorDict({"field": true[:1].expand(500, 3)}, 500))["field"]
+    folded = noisy[:, 0] == -10
+    assert 100 < folded.sum() < 400
+    assert (noisy[:, 1] <= 90).all()
 
 
 def test_gauss_markov_does_not_depend_on_the_steps() -> None:
