@@ -64,7 +64,8 @@ def read_ulg(path: Path) -> Recording:
     held = [name for name, columns in _MAGNETOMETERS.items() if columns[0] in topics.get(name, ())]
     if not held:
         raise ValueError(f"none of {', '.join(_MAGNETOMETERS)} is among its topics, {', '.join(sorted(topics))}")
-    name, notes = held[0], ["the file is damaged or truncated"] if log.file_corruption else []
+    name = held[0]
+    notes = ["the file is damaged or truncated"] if log.file_corruption or _ends_in_a_message(path) else []
     if name == "sensor_mag":
         notes.append(f"{name}: {NOT_CALIBRATED}")
     field, attitude, position = (topics.get(topic, {}) for topic in (name, "vehicle_attitude", "vehicle_gps_position"))
@@ -83,6 +84,14 @@ def read_ulg(path: Path) -> Recording:
     notes += [] if north == "true" else [MODEL_NORTH]
     streams = {column: (time + offset, values) for column, (time, values) in streams.items()}
     return Recording(streams, f"PX4 ULog, {name}", north, notes)
+
+
+def _ends_in_a_message(path: Path) -> bool:
+    """Return whether a ULog file ends before its last message does."""
+    content, position = path.read_bytes(), 16
+    while position + 3 <= len(content):
+        position += 3 + int.from_bytes(content[position : position + 2], "little")
+    return position != len(content)
 
 
 def _seconds(topic: Mapping[str, Array]) -> Array:

@@ -74,6 +74,9 @@ def read_csv(path: Path, frame: str = "FRD") -> Recording:
     raw = pandas.read_csv(path, skipinitialspace=True)
     if not len(raw):
         raise ValueError("the table has no row")
+    lines = path.read_bytes().rstrip().splitlines()
+    cut = lines[-1].count(b",") < lines[0].count(b",")
+    raw = raw[:-1] if cut else raw
     found: dict[str, tuple[str, float]] = {}
     for header in raw:
         if named := column_of(header):
@@ -85,9 +88,8 @@ def read_csv(path: Path, frame: str = "FRD") -> Recording:
     time, notes = times_of(raw[found["time"][0]], found["time"][1])
     values = {name: factor * _numbers(raw[header]) for name, (header, factor) in found.items() if name != "time"}
     held = {name: np.isfinite(time) & np.isfinite(each) for name, each in values.items()}
+    notes += ["the last row is not complete, and is left out: the log may be truncated"] if cut else []
     axes = [held[name] for name in AXES if name in held]
-    if axes and not np.all(axes, axis=0)[-1]:
-        notes.append("the last row is not complete: the log may be truncated")
     for name, sign in zip(AXES, FRAMES[frame], strict=True):
         if name in held:
             values[name], held[name] = sign * values[name], np.all(axes, axis=0)

@@ -63,6 +63,11 @@ def test_blank_cells_are_interpolated(tmp_path: Path) -> None:
     assert samples["latitude"].tolist() == pytest.approx([10, 11, 12, 12])
 
 
+def test_a_number_that_is_cut_does_not_count(tmp_path: Path) -> None:
+    samples = read_log(written(tmp_path, *ROWS, "3,15300,1300,4")).samples
+    assert samples["z"].tolist() == [48000, 48100, 48200]
+
+
 def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
     """A row that repeats a time adds nothing; the distance of a row without axes, or of zeros, belongs to the next."""
     rows = "0,1,1,1,0,0", "1,1,1,1,0,5", "1,1,1,1,0,5", "2,0,0,0,0,7", "3,,,,0,1", "4,1,1,1,0,2"
@@ -73,7 +78,7 @@ def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "note"),
     [
-        ([*ROWS, "3,15300"], "the last row is not complete: the log may be truncated"),
+        ([*ROWS, "3,15300"], "the last row is not complete, and is left out: the log"),
         ([*ROWS[:2], *ROWS[1:]], "1 row with the time of the row before left out"),
         (
             [*ROWS, *(f"{3600 + i},1,1,1,0" for i in range(3, 99))],
