@@ -1,4 +1,4 @@
-"""Gradient step of the recipe beside one in plain PyTorch, and in bfloat16 beside float32."""
+"""Gradient step of the recipe beside plain PyTorch and TorchRL's loss, and in bfloat16 beside float32."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional
+from torchrl.data import Bounded
+from torchrl.objectives import SoftUpdate as TorchRLSoftUpdate
+from torchrl.objectives import TD3Loss as TorchRLTD3Loss
 
 from benchmarks.timing import Row, alternate
 from magrl.agents import SoftUpdate, TD3Loss, make_actor, make_critic, optimize, saturation_penalty
@@ -56,6 +59,31 @@ class Recipe:
         if self.updates % CONFIG.policy_delay == 0:
             loss_actor, outputs = self.loss.actor_loss(batch)
             optimize(loss_actor + SATURATION * saturation_penalty(outputs["logits"]), self.actor_optimizer)
+            self.target_update.step()
+
+
+class Stock:
+    """The step of the recipe with TorchRL's loss and target update; its loss gives no outputs for the penalty."""
+
+    def __init__(self, size: int) -> None:
+        shape = {"num_cells": CONFIG.num_cells, "layer_norm": CONFIG.layer_norm}
+        options = {"policy_noise": CONFIG.policy_noise, "noise_clip": CONFIG.noise_clip, "loss_function": "l2"}
+        networks = make_actor(size, **shape), make_critic(size, **shape)
+        self.loss = TorchRLTD3Loss(*networks, action_spec=Bounded(-1.0, 1.0, (2,)), **options)
+        self.loss.make_value_estimator(gamma=CONFIG.gamma)
+        self.target_update = TorchRLSoftUpdate(self.loss, tau=CONFIG.tau)
+        self.critic_optimizer, self.actor_optimizer = (
+            torch.optim.Adam([p for p in weights.parameters() if p.requires_grad], lr=CONFIG.learning_rate, fused=True)
+            for weights in (self.loss.qvalue_network_params, self.loss.actor_network_params)
+        )
+        self.updates = 0
+
+    def update(self, batch: TensorDict) -> None:
+        """One gradient step of the critics, and every second time of the actor and the targets."""
+        optimize(self.loss.value_loss(batch)[0], self.critic_optimizer)
+        self.updates += 1
+        if self.updates % CONFIG.policy_delay == 0:
+            optimize(self.loss.actor_loss(batch)[0], self.actor_optimizer)
             self.target_update.step()
 
 
@@ -112,7 +140,7 @@ class Plain:
 def rows(repeats: int = 15) -> list[Row]:
     """Return the comparisons of the presets fast and paper; a time is the mean of ten steps."""
     torch.manual_seed(0)
-    recipe, plain = Recipe(OBSERVATION_SIZE), Plain(OBSERVATION_SIZE)
+    recipe, plain, stock = (kind(OBSERVATION_SIZE) for kind in (Recipe, Plain, Stock))
     batch = transitions(OBSERVATION_SIZE, CONFIG.batch_size)
     after = batch["next"]
     tensors = (batch["observation"], batch["action"], after["reward"], after["observation"], after["terminated"])
@@ -122,6 +150,7 @@ def rows(repeats: int = 15) -> list[Row]:
         alternate(what, magrl, baseline, goal=goal, repeats=repeats, inner=10)
         for what, magrl, baseline, goal in (
             ("gradient step: plain PyTorch", lambda: recipe.update(batch), lambda: plain.update(*tensors), "≥ 0.95"),
+            ("gradient step: TorchRL's TD3Loss", lambda: recipe.update(batch), lambda: stock.update(batch), "≥ 1"),
             (
                 "gradient step of preset paper, bfloat16: float32",
                 lambda: rounded.update(large),

@@ -7,6 +7,7 @@ for an accelerator. :func:`check_finite` and :func:`require` do read values.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Iterable
 from numbers import Integral, Real
 from typing import Any
@@ -247,11 +248,11 @@ class CheckedModel(BaseModel):
 
 
 def short(value: object, length: int = 80) -> str:
-    """Return the representation of a value, cut to a length that fits in a message.
+    """Return the representation of a value in one line, cut to a length that fits in a message.
 
     Example:
         >>> short("x" * 100, 10)
         "'xxxxxx..."
     """
-    text = repr(value)
+    text = re.sub(r"\s+", " ", repr(value))
     return text if len(text) <= length else f"{text[: length - 3]}..."

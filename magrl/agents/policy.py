@@ -100,7 +100,7 @@ class FieldPolicy(TrainedPolicy):
         self.in_keys = [*config.view.in_keys, *(["step_count"] if config.memory_size else [])]
         self.observe = Compose(*config.view.observation_transforms())
         self.act = config.view.action_transform()
-        self.actor = config.make_actor() if actor is None else actor
+        self.actor = config.make_actor().float() if actor is None else actor  # environments write float32
         self.state_keys = STATE_KEYS if config.memory_size else config.view.state_keys
         self.state: TensorDictBase | None = None
 

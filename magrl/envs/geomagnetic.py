@@ -29,7 +29,6 @@ from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
 from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
-from magrl.field.model import device_of
 from magrl.geodesy import displaced, move, polar, wrap_angle
 from magrl.transforms.errors.motion import DISPLACEMENT
 from magrl.transforms.views import ObservationView
@@ -74,7 +73,7 @@ class GeomagneticNavEnv(EnvBase):
 
     Raises:
         TypeError: for an unknown option, with the list of options.
-        ValueError: for an option out of its range, naming it and its value.
+        ValueError: for an option out of its range, naming it and its value, or the device ``"meta"``.
 
     Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
     move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
@@ -121,6 +120,8 @@ class GeomagneticNavEnv(EnvBase):
             known = sorted(own | Scenario.model_fields.keys())
             # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
             raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {known}")
+        if torch.device(device or "cpu").type == "meta":
+            raise ValueError(f"device must be one that holds numbers, such as 'cpu' or 'cuda', got {device!r}")
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.num_envs, self.drift_km, self.objective_limit = num_envs, float(drift_km), objective_limit
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
@@ -149,8 +150,8 @@ class GeomagneticNavEnv(EnvBase):
         self.tasks = scenario.tasks and Tasks(*(values.to(self.device) for values in scenario.tasks))
         field = scenario.build_field(self.drift_km)
         self.register_buffer("objective_floors", scenario.floors(field).to(self.device))
-        if isinstance(field, torch.nn.Module) and device_of(field) != self.device:
-            field = copy.deepcopy(field).to(self.device)
+        if isinstance(field, torch.nn.Module):  # a copy, which shares its buffers until one of them is moved
+            field = copy.deepcopy(field, {id(values): values for values in field.buffers()}).to(self.device)
         self.field = field
 
     def observation_view(self, **observed: bool) -> ObservationView:

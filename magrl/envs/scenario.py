@@ -73,7 +73,8 @@ def _tasks(value: object) -> object:
         except TypeError as error:
             raise ValueError(str(error)) from error
     if value is not None and not isinstance(value, Tasks):
-        raise ValueError(f"tasks must be Tasks, got {short(value)}")
+        form = "Tasks(start, target), each (M, 2) latitude and longitude [deg]"
+        raise ValueError(f"tasks must be {form}, got {short(value)}")
     return value
 
 

@@ -128,12 +128,18 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
         high: ``(2,)`` or ``(3,)`` highest.
 
     Raises:
-        ValueError: naming the vehicles whose action is not finite or beyond the bounds by more than rounding.
+        ValueError: for actions of another size; or naming the vehicles whose action is not finite or beyond the bounds
+            by more than rounding.
 
     Example:
         >>> checked_action(torch.tensor([[50.000001, 0.0]]), torch.tensor([0.0, -1.5]), torch.tensor([50.0, 1.5]))
         tensor([[50.,  0.]], dtype=torch.float64)
     """
+    if action.shape[-1] != len(low):
+        declared = len(low) > 2
+        names = "distance, turn and declare" if declared else "distance and turn"
+        hint = ": for a policy that does not declare, magrl.evaluate or DeclareArrival does" if declared else ""
+        raise ValueError(f"an action must be {len(low)} numbers, {names}, got {action.shape[-1]}{hint}")
     action = action.double()
     slack = 1e-5 * (high - low)
     sound = (action >= low - slack) & (action <= high + slack)

@@ -52,7 +52,7 @@ class LearnedPrior(nn.Module):
         super().__init__()
         check_number(1, whole=True, width=width)
         hidden = [nn.Linear(FEATURES, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh()]
-        self.network = nn.Sequential(*hidden, nn.Linear(width, 12))
+        self.network = nn.Sequential(*hidden, nn.Linear(width, 12)).float()
         for parameter in self.network[-1].parameters():
             nn.init.zeros_(parameter)
 

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import pytest
+import torch
+from torch import Tensor
 
 import magrl
 from magrl.agents import pretrained
@@ -19,6 +21,18 @@ def test_anywhere_acts_without_a_map() -> None:
     moves = GeomagneticNavEnv(num_envs=3, seed=0).rollout(5, policy)["next", "move"]
     assert moves.isfinite().all()
     assert moves[..., 0].max() > 1
+
+
+def test_anywhere_acts_alike_by_any_default_type_of_floating_point_numbers() -> None:
+    def actions() -> Tensor:
+        return GeomagneticNavEnv(num_envs=3, seed=0).rollout(5, magrl.load_pretrained("anywhere"))["action"]
+
+    expected = actions()
+    torch.set_default_dtype(torch.float64)
+    try:
+        torch.testing.assert_close(actions(), expected, rtol=0, atol=1e-3)
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_every_policy_is_small_and_has_a_card() -> None:

@@ -36,6 +36,15 @@ def near(*distances_km: float, rule: str = "declared") -> GeomagneticNavEnv:
     return GeomagneticNavEnv(scenario, num_envs=len(reach), arrival=rule, arrival_radius_km=10.0, seed=0)
 
 
+def test_actions_of_another_size_are_refused() -> None:
+    for env, size, message in (
+        (declared(), 2, "must be 3 numbers, distance, turn and declare, got 2: for a policy that does not declare"),
+        (nav(), 3, "must be 2 numbers, distance and turn, got 3$"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            env.step(env.reset().set("action", torch.zeros(2, size)))
+
+
 def test_specs() -> None:
     check_env_specs(declared(), break_when_any_done="both")
     env = declared(3)

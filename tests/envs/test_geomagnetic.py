@@ -417,11 +417,22 @@ def test_rounding_beyond_the_bounds_is_forgiven_and_cut() -> None:
         ("drift_km", -1.0),
         ("proximity_weight", float("inf")),
         ("render_mode", "human"),
+        ("device", "meta"),
     ],
 )
 def test_a_bad_option_is_named_with_its_value(option: str, value: object) -> None:
     with pytest.raises(ValueError, match=rf"{option} must.*{re.escape(repr(value))}"):
         GeomagneticNavEnv(**{option: value})
+
+
+def test_a_field_that_is_moved_stays_where_it_was_in_the_scenario() -> None:
+    """Without a second copy of its numbers."""
+    scenario = Scenario(field=Scenario().build_field())
+    env = GeomagneticNavEnv(scenario, seed=0)
+    for one, other in zip(env.field.buffers(), scenario.field.buffers(), strict=True):
+        assert one.data_ptr() == other.data_ptr()
+    env.field.to("meta")
+    assert {values.device.type for values in scenario.field.buffers()} == {"cpu"}
 
 
 def test_options_replace_those_of_the_scenario() -> None:

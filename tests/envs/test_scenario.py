@@ -137,6 +137,7 @@ BAD_VALUES: list[tuple[str, object, str]] = [
     ("objective_floors", (0.0, 0.4, 15.0), "objective_floors must be a finite number above 0, got 0.0"),
     ("field", "IGRF", "field must be called as field(latitude, longitude), got 'IGRF'"),
     ("tasks", ([[-5.0, 165.0]], INSIDE), "tasks.start must be a tensor, got the list"),
+    ("tasks", torch.zeros(9, 4), "tasks must be Tasks(start, target), each (M, 2) latitude and longitude [deg], got"),
     ("names", ("a",), "names must hold one name for each of 0 tasks, got ('a',)"),
     ("zeta", 3.0, "zeta must be below 3, got 3.0: the objective F is at most 3 at the start"),
 ]

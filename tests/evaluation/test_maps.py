@@ -59,6 +59,8 @@ def test_tracks_end_where_the_episode_did(env: GeomagneticNavEnv) -> None:
     for row, track, steps in zip(rollout, tracks, episode_measures(rollout)["steps"].tolist(), strict=False):
         expected = torch.cat((row["position"][:1], row["next", "position"][:steps])).flip(-1)
         np.testing.assert_allclose(track, expected, atol=1e-9)
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    assert all((track >= (west, south)).all() and (track <= (east, north)).all() for track in tracks)
     assert [text.get_text() for text in axes.texts if text.get_text().isalpha()] == ["home", "port"]
     with pytest.raises(ValueError, match="at least one navigator"):
         trajectories_figure({}, env.field, env.region)

@@ -69,4 +69,9 @@ def test_timed_functions_run() -> None:
     ):
         timed()
         assert env.time_of(timed, 0.0) > 0
+    stock = update.Stock(update.OBSERVATION_SIZE)
+    before = [weights.clone() for weights in stock.loss.parameters()]
+    for _ in range(2):
+        stock.update(update.transitions(update.OBSERVATION_SIZE, 4))
+    assert all((one != other).any() for one, other in zip(before, stock.loss.parameters(), strict=True))
     assert onboard.row("secant", repeats=3).magrl_ms > 0
