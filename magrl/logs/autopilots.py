@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,8 @@ _MAGNETOMETERS = {
 
 def read_ulg(path: Path) -> Recording:
     """Read a log of PX4 (ULog) with pyulog: see :func:`~magrl.logs.read_log`. Times are UTC where GNSS gives it."""
-    log = _package("pyulog", "pyulog").ULog(str(path))
+    with path.open("rb") as file:
+        log = _package("pyulog", "pyulog").ULog(file)
     topics = {item.name: item.data for item in reversed(log.data_list)}  # the first instance of each
     held = [name for name, columns in _MAGNETOMETERS.items() if columns[0] in topics.get(name, ())]
     if not held:
@@ -117,14 +119,15 @@ _MESSAGES = {
 
 def read_bin(path: Path) -> Recording:
     """Read a DataFlash log of ArduPilot with pymavlink: the first magnetometer with its offsets, attitude and GNSS."""
-    log = _package("pymavlink.DFReader", "pymavlink").DFReader_binary(str(path))
+    package = _package("pymavlink.DFReader", "pymavlink")
     rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    while message := log.recv_match(type=list(_MESSAGES)):
-        if getattr(message, "I", 0) or getattr(message, "Status", 3) < 3:  # another sensor, or no fix
-            continue
-        fields, unit = _MESSAGES[message.get_type()]
-        for name, field in fields.items():
-            rows[name].append((message._timestamp, unit * getattr(message, field)))
+    with closing(package.DFReader_binary(str(path))) as log:
+        while message := log.recv_match(type=list(_MESSAGES)):
+            if getattr(message, "I", 0) or getattr(message, "Status", 3) < 3:  # another sensor, or no fix
+                continue
+            fields, unit = _MESSAGES[message.get_type()]
+            for name, field in fields.items():
+                rows[name].append((message._timestamp, unit * getattr(message, field)))
     return Recording(_streams(rows), "ArduPilot DataFlash, MAG", "model", [MODEL_NORTH])
 
 

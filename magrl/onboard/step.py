@@ -111,9 +111,10 @@ class VehicleStep(nn.Module):
         state = {"track_mean": mean, "track_covariance": covariance, "first_field": first_field}
         before = TensorDict({key: value.unsqueeze(0) for key, value in state.items()}, [1])
         started, moved = self.observe(seen.copy()), self.observe(before.set("next", seen.copy()))["next"]
-        kept = ("observation", "way", "way_covariance", *state)
+        observed = "observation", "planned_move"
+        kept = *observed, "way", "way_covariance", *state
         now = {key: torch.where(step == 0, started[key], moved[key]) for key in kept}
-        action = self.actor(TensorDict({"observation": now["observation"]}, [1]))["action"]
+        action = self.actor(TensorDict({key: now[key] for key in observed}, [1]))["action"]
         action = self.act.denormalize("action", action)
         return action[0], *(now[key][0] for key in ("way", "way_covariance")), step + 1, *(now[key][0] for key in state)
 
