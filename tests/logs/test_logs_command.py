@@ -48,6 +48,14 @@ def test_the_story_of_the_page(folder: Path, monkeypatch, capsys) -> None:
     assert table["miss_km"].iloc[-1] < 30
 
 
+def test_a_real_log_of_px4_agrees_with_igrf(capsys) -> None:
+    main([str(ROOT / "docs" / "examples" / "px4.ulg")])
+    said = capsys.readouterr().out
+    assert "first reading: D 3.00 deg, I 63.23 deg, B_H 21661 nT" in said
+    assert "mean of 1: D -0.06 deg, I -0.20 deg, B_H 105 nT" in said
+    assert "warning" not in said
+
+
 def test_a_calibration_is_needed_and_is_used(folder: Path, capsys) -> None:
     way = str(folder / "raw" / "way.csv")
     main([way, "--out", str(folder / "raw.csv")])
