@@ -10,7 +10,9 @@ import torch
 
 from magrl.checks import check_number, check_numbers
 from magrl.field import IGRF, elements_at
-from magrl.onboard.readings import check_earth_reading
+from magrl.field.elements import element_difference
+from magrl.geodesy import move
+from magrl.onboard.readings import DISTURBANCE_NT, check_earth_distance, check_earth_reading
 from magrl.transforms import calibration
 
 MODEL_STD = (0.26, 0.20, 133.0)
@@ -24,6 +26,8 @@ MOST_SIGMAS = 5.0
 """Deviation of a first reading beyond which it does not fit the known elements, in standard deviations."""
 SLACK_NT = 100.0
 """Deviation of the field vector that always fits; chosen [nT]."""
+NEAR_KM = 200.0
+"""Distance from the start to the place where the vehicle is believed to be; chosen [km]."""
 
 Elements = tuple[float, float, float]
 Values = tuple[float, ...]
@@ -67,6 +71,40 @@ def known_elements(
     if std is not None:
         check_numbers(3, 0, here_std=std)
     return elements, usual if std is None else (std[0], std[1], std[2])
+
+
+def nearby_elements(
+    near: Sequence[float], date: str | None, target: Elements, most_km: float
+) -> tuple[Elements, Values]:
+    """Return the elements where a vehicle is believed to be, and standard deviations of those where it is.
+
+    :data:`MOST_SIGMAS` of these are the largest difference at :data:`NEAR_KM`, and a crust of
+    :data:`~magrl.onboard.readings.DISTURBANCE_NT`.
+
+    Args:
+        near: latitude and longitude [deg].
+        date: date for IGRF.
+        target: elements of the destination.
+        most_km: longest way [km].
+
+    Raises:
+        ValueError: for a place that is not on the Earth, no date, or a target that is too far.
+
+    Example:
+        >>> elements, std = nearby_elements((60.4, 5.3), "2026-06-30", (3.5, 73.0, 15000.0), 2500.0)
+        >>> [round(5 * value, 1) for value in std]
+        [9.2, 3.4, 2843.7]
+    """
+    check_numbers(2, near=near)
+    elements, _ = known_elements(near, date=date)
+    check_earth_distance(elements, target, most_km)
+    bearing = torch.arange(0, 360, 45, dtype=torch.float64).deg2rad()
+    latitude, longitude, distance = (torch.full_like(bearing, value) for value in (*near, NEAR_KM))
+    ring = torch.stack(move(latitude, longitude, bearing, distance), -1)
+    change = element_difference(elements_at(IGRF(str(date)), ring), torch.tensor(elements).double()).abs().amax(0)
+    horizontal, total = elements[2], elements[2] / math.cos(math.radians(elements[1]))
+    crust = math.degrees(DISTURBANCE_NT / horizontal), math.degrees(DISTURBANCE_NT / total), DISTURBANCE_NT
+    return elements, tuple((each + rock) / MOST_SIGMAS for each, rock in zip(change.tolist(), crust, strict=True))
 
 
 def calibrated(
@@ -116,7 +154,7 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     """
     if found := misfit(reading, known, std):
         texts: list[Any] = [f"D {each[0]:g}, I {each[1]:g}, B_H {each[2]:g}" for each in (reading, known)]
-        cause = found[1] or "check sensors, compass and place, or state larger errors in bias_std"
+        cause = found[1] or "check sensors, calibration, compass and place, or state larger errors in bias_std"
         raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({found[0]}): {cause}")
 
 

@@ -26,7 +26,7 @@ from magrl.navigators import Kalman, Navigator, RunAndTumble, Secant
 from magrl.onboard.estimator import Estimator
 from magrl.onboard.limits import check_move, check_std, move_limits, out_of_range, stuck, unchanged_km, view_of
 from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_distance, check_earth_jump, check_earth_reading
-from magrl.onboard.start import Elements, calibrated, known_elements
+from magrl.onboard.start import Elements, calibrated, check_start, known_elements, nearby_elements
 from magrl.tracking import ArrivalDecision, Way
 from magrl.transforms import TrackView
 from magrl.transforms.errors.known_start import EXACT
@@ -41,10 +41,10 @@ LOST_SURPRISE = 100.0
 simulation, it reached 5 with a right data sheet, and 31 under the conditions of an aircraft."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 4
-_FORMAT, _NOT_STARTED = 4, "the vehicle has no destination yet: call start(target) first"
+_FORMAT, _NOT_STARTED = 5, "the vehicle has no destination yet: call start(target) first"
 _OPTIONS = ("name", "sensor_std", "bias_std", "drift_std", "max_move_km", "max_turn_deg", "max_steps", "arrival_km")
 # Parts of the state that are numbers
-_PLAIN = ("_step", "_steer", "_last", "_surprises", "_northward", "_unchanged", "_known", "_error", "_left_std")
+_PLAIN = "_step", "_steer", "_last", "_surprises", "_northward", "_unchanged", "_known", "_near", "_error", "_left_std"
 _STATES = ("state", "memory")  # attributes in which policies and navigators keep their state
 
 
@@ -177,6 +177,7 @@ class Onboard:
         here: Sequence[float] | None = None,
         *,
         here_std: Sequence[float] | None = None,
+        near: Sequence[float] | None = None,
         date: str | None = None,
     ) -> None:
         """Begin a way to the place with some elements: D [deg], I [deg], B_H [nT].
@@ -195,10 +196,12 @@ class Onboard:
             ValueError: for elements that are not possible on the Earth, or beyond the range of the policy.
         """
         check_numbers(3, target=target)
-        declination, inclination, horizontal_intensity = target
-        check_earth_reading(declination, inclination, horizontal_intensity, what="the target")
+        goal = target[0], target[1], target[2]
+        check_earth_reading(*goal, what="the target")
         if text := out_of_range(self._view, target):
             raise ValueError(f"the target: {text}")
+        most_km = LONGEST_WAY_KM if self._estimator.trained else self.max_steps * self.max_move_km
+        self._near = None if near is None else nearby_elements(near, date, goal, most_km)
         self._known = None if here is None else known_elements(here, here_std, date)
         self._error, self._left_std = self._calibrated()
         self.target = tuple(map(float, target))
@@ -256,6 +259,9 @@ class Onboard:
 
     def _calibrated(self, reading: Elements | None = None) -> tuple[Values, Values]:
         """Return the constant error of readings, as far as it is known, and the standard deviations that are left."""
+        if reading and self._near:
+            std = [math.hypot(*each) for each in zip(self.sensor_std, self.bias_std, self._near[1], strict=True)]
+            check_start(reading, self._near[0], std)
         if self._known is None:
             return EXACT, self.bias_std
         return calibrated(*self._known, (self.sensor_std, self.bias_std, self.drift_std), reading)

@@ -139,7 +139,7 @@ def test_commands_from_a_known_start_are_those_of_the_environment(name: str, tmp
         ((82.0, 65.0), 20000.0, "the horizontal axes are swapped"),
         ((8.0, 65.0, 14000.0 / math.cos(math.radians(65.0))), 14000.0, "B_H is the total intensity"),
         ((0.0, 65.0), 20000.0, "the heading is from magnetic north"),
-        ((8.0, 60.0), 20000.0, "check sensors, compass and place"),
+        ((8.0, 60.0), 20000.0, "check sensors, calibration"),
     ],
 )
 def test_a_first_reading_that_does_not_fit_the_start_is_refused(
@@ -152,6 +152,23 @@ def test_a_first_reading_that_does_not_fit_the_start_is_refused(
     with pytest.raises(ValueError, match=rf"^the first reading, .* does not fit the start, .*: .*{cause}"):
         vehicle.step(*(*reading, intensity_nt)[:3], heading=0.0)
     assert vehicle.step(*here, heading=0.0).stop is None
+
+
+def test_a_place_near_the_start_checks_the_first_reading_and_nothing_else(tmp_path: Path) -> None:
+    """An uncalibrated reading in Norway is refused; one 150 km away is taken, with the command without a place."""
+    vehicle, other = (Onboard("secant", sensor_std=NOISE) for _ in range(2))
+    vehicle.start(TARGET, near=(60.4, 5.3), date="2026-06-30")
+    vehicle.save(tmp_path / "state")
+    vehicle.restore(tmp_path / "state")
+    with pytest.raises(ValueError, match=r"\(I deviates by 80.75, where 3.46 is likely\): check sensors, calibration"):
+        vehicle.step(-8.0, -7.7, 35603.0, heading=0.0)
+    other.start(TARGET)
+    reading = elements_at(IGRF("2026-06-30"), torch.tensor([59.1, 5.3], dtype=torch.float64)).tolist()
+    assert vehicle.step(*reading, heading=0.0) == other.step(*reading, heading=0.0)
+    with pytest.raises(ValueError, match="need a date"):
+        vehicle.start(TARGET, near=(60.4, 5.3))
+    with pytest.raises(ValueError, match="from the target"):
+        Onboard("secant", max_steps=20).start(TARGET, near=(-37.0, 5.3), date="2026-06-30")
 
 
 def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
