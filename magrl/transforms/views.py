@@ -24,7 +24,7 @@ from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, PlannedMove, Sea
 OBSERVATION_SIZE = 19
 """Numbers of :func:`track_observation`."""
 OBSERVED_KEYS = ("field", "target_field", *OUT_KEYS[2:4], "aim", OUT_KEYS[5], STD_KEYS[0], "step_count", "planned_move")
-STEP_PRICE = 0.2
+STEP_PRICE = 0.5
 """Price of a step by default [% of SPL]."""
 _STD_UNITS = (1.0, 1.0, 100.0)
 _LEAST_STD = 0.002
