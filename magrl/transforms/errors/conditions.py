@@ -190,27 +190,28 @@ CONDITIONS: Mapping[str, Conditions] = {
         ),
     )
 }
-"""Presets. Limits of standards are read as two standard deviations; "chosen" is what has no source.
+"""Presets. Limits of standards are read as two standard deviations; "chosen" is what has no source;
+a document that is named with it was not read, and tells what kind of device it stands for.
 
 Readings:
 
 - ``sensor_std``: chosen, the lowest level of noise of the published tables; it includes the vehicle's motion.
   Low-cost: roll and pitch to 0.4 degrees root mean square (Moog Crossbow NAV440, data sheet rev. B), as a mean of 16
   readings (chosen), at :data:`TYPICAL_FIELD`.
-- Hard iron: 5 nT, the offset error of a fluxgate (Bartington Mag-03, data sheet), as what calibration leaves
-  (chosen); low-cost 30 nT (chosen). Soft iron: 1e-4 and 5e-4 (chosen).
-- Roll and pitch: 0.01 degrees (fiber-optic gyrocompass Octans, data sheet); low-cost 0.05 degrees constant (chosen).
+- Hard iron: 5 nT (chosen, as the offset error of a fluxgate such as Bartington Mag-03, for what calibration leaves);
+  low-cost 30 nT (chosen). Soft iron: 1e-4 and 5e-4 (chosen).
+- Roll and pitch: 0.01 degrees (chosen, as of the fiber-optic gyrocompass Octans); low-cost 0.05 degrees (chosen).
 - Resolution 13 nT: PNI RM3100 at 200 cycles (support article of PNI). Drift and outages: chosen.
 
 North: see :data:`~magrl.transforms.NORTH_REFERENCES`.
 
 Motion:
 
-- Aircraft: inertial navigation to 2 nautical miles per hour for 95 % of flights (14 CFR part 121, appendix G), that is,
-  a constant error of the velocity with a root mean square of 2.1 km/h.
-- Ship: log to 2 % of the speed (IMO Resolution A.824(19), as amended by MSC.96(72)); current of half a knot (chosen).
-- Underwater: Doppler velocity log to 0.4 % (Teledyne RDI Workhorse Navigator, 300 kHz, data sheet); current and eddies
-  of 0.1 m/s (chosen).
+- Aircraft: inertial navigation to 2 nautical miles per hour for 95 % of flights (chosen, as 14 CFR part 121, appendix
+  G), that is, a constant error of the velocity with a root mean square of 2.1 km/h.
+- Ship: log to 2 % of the speed (chosen, as IMO Resolution A.824(19)); current of half a knot (chosen).
+- Underwater: Doppler velocity log to 0.4 % (chosen, as Teledyne RDI Workhorse Navigator); current and eddies of 0.1 m/s
+  (chosen).
 - Low-cost: log to 10 % (chosen), current as for the ship.
 
 Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, 20 days of a month for the others (chosen).

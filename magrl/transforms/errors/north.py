@@ -27,14 +27,15 @@ NORTH_REFERENCES: Mapping[str, Mapping[str, float]] = {
     "marine": {"constant_deg": 0.375, "drift_deg": 0.125, "random_deg": 0.25},
     "low-cost": {"constant_deg": 0.5, "random_deg": 0.75},
 }
-"""Standard deviations of units on the market. Limits of the standards are read as two standard deviations.
+"""Standard deviations, chosen in the size of units on the market. Limits of standards are read as two of them; the
+documents were not read.
 
-- ``fiber-optic``: heading accuracy 0.1° times the secant of the latitude, root mean square, as the data sheet of the
-  fiber-optic gyrocompass Octans (iXblue, now Exail) gives it; all of it taken as constant, the worst case for D.
-- ``marine``: IMO Resolution A.424(XI), Performance standards for gyro-compasses (1979), times the secant of the
+- ``fiber-optic``: 0.1° times the secant of the latitude, as of the fiber-optic gyrocompass Octans; all of it taken as
+  constant, the worst case for D.
+- ``marine``: as IMO Resolution A.424(XI), Performance standards for gyro-compasses (1979), times the secant of the
   latitude: settle point error up to 0.75°; residual steady-state error after the correction for speed and course up to
   0.25°, taken as the drift; root mean square of single indications 0.25°.
-- ``low-cost``: IMO Resolution MSC.116(73), Performance standards for marine transmitting heading devices (2000), for
+- ``low-cost``: as IMO Resolution MSC.116(73), Performance standards for marine transmitting heading devices (2000), for
   ships too small to carry a gyrocompass: static error up to 1.0°, dynamic error up to 1.5°, at all latitudes.
 """
 
