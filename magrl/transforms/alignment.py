@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -15,24 +14,26 @@ from torchrl.data import Binary, Bounded, Composite
 
 from magrl import guidance
 from magrl.checks import check_number, check_tensor
+from magrl.field import FieldBank
 from magrl.field.elements import element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import wrap_angle
-from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward
+from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward, expect_keys
 
 
 class FieldGradient(ObservationTransform):
     """Write the true horizontal gradient of a field at a position. Privileged: for rewards and oracles only.
 
     Args:
-        field: field model, usually ``env.field``, for the gradient of D, I, B_H; or, in another domain, any function of
-            a position ``(2,)`` that returns values ``(E,)`` and can be differentiated by torch.
-        in_keys: one position ``(..., 2)``: latitude, longitude [deg], or the argument of the function.
+        field: field model, usually ``env.field``, or a bank of them, for the gradient of D, I, B_H; or, in another
+            domain, any function of a position ``(2,)`` that returns values ``(E,)`` and can be differentiated by torch.
+        in_keys: one position ``(..., 2)``: latitude, longitude [deg], or the argument of the function; for a bank also
+            the region ``(..., 1)``, int64.
         out_keys: one gradient ``(..., 3, 2)``: D [deg/km], I [deg/km], B_H [nT/km], northward and eastward; of a
             function ``(..., E, 2)``: unit of the value per unit of position, along the two axes of the position.
 
     Raises:
-        ValueError: for a field that is neither, more than one key, or a function whose values are not ``(E,)``.
+        ValueError: for a field that is neither, another number of keys, or a function whose values are not ``(E,)``.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -48,12 +49,17 @@ class FieldGradient(ObservationTransform):
 
     default_in_keys = ("position",)
     default_out_keys = ("field_gradient",)
-    in_sizes = (2,)
+    in_counts, in_sizes = (1, 2), (2, 1)
 
     def __init__(
-        self, field: FieldModel | Callable[[Tensor], Tensor], in_keys: GivenKeys = None, out_keys: GivenKeys = None
+        self,
+        field: FieldModel | FieldBank | Callable[[Tensor], Tensor],
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
     ) -> None:
-        super().__init__(in_keys, out_keys)
+        indexed = getattr(field, "indexed", False)
+        super().__init__(["position", "region"] if indexed and in_keys is None else in_keys, out_keys)
+        expect_keys(self, 1 + indexed, 1)
         self.elements = hasattr(field, "value_and_gradient")
         if not self.elements and not callable(field):
             raise ValueError(
@@ -63,9 +69,10 @@ class FieldGradient(ObservationTransform):
         self.field = field
 
     def _compute(self, values: list[Tensor]) -> list[Tensor]:
-        (position,) = values
+        position, *region = values
         if self.elements:
-            return [elements_gradient_at(cast(FieldModel, self.field), position).to(torch.get_default_dtype())]
+            index = region[0].squeeze(-1) if region else None
+            return [elements_gradient_at(self.field, position, index).to(torch.get_default_dtype())]
         check_tensor(2, position=position)
         gradient = vmap(jacfwd(self.field))(position.reshape(-1, 2))
         if gradient.ndim != 3:

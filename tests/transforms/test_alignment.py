@@ -11,6 +11,8 @@ from tensordict import TensorDict
 from torchrl.data import Unbounded
 from torchrl.envs import Compose, TransformedEnv
 
+from magrl.envs import GeomagneticNavEnv, planet_scenario
+from magrl.field.elements import elements_gradient
 from magrl.field.model import elements_at
 from magrl.geodesy import move
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
@@ -31,6 +33,19 @@ def test_field_gradient_is_the_slope_between_neighbors() -> None:
         ]
         slopes.append((elements_at(field(), ends[0]) - elements_at(field(), ends[1])) / 2)
     torch.testing.assert_close(td["field_gradient"].double(), torch.stack(slopes, -1), rtol=1e-4, atol=1e-6)
+
+
+def test_field_gradient_of_a_bank_is_that_of_each_region() -> None:
+    base = GeomagneticNavEnv(planet_scenario(4, seed=0), num_envs=12, seed=0)
+    guided = Compose(FieldGradient(base.field), GradientHeading(pair="auto"), AlignmentReward())
+    td = TransformedEnv(base, guided).rollout(3)["next"]
+    assert len(td["region"].unique()) > 2
+    place = td["position"].unbind(-1)
+    for number in range(4):
+        here = td["region"].squeeze(-1) == number
+        index = torch.full_like(td["region"].squeeze(-1), number)
+        gradient = elements_gradient(*base.field.value_and_gradient(*place, index)).float()
+        assert torch.equal(td["field_gradient"][here], gradient[here])
 
 
 def heading_of(
