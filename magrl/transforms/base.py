@@ -81,10 +81,12 @@ class ObservationTransform(Transform):
         self, tensordict: TensorDictBase, keys: Keys | None = None, *, state: bool = False
     ) -> list[Tensor] | None:
         """Return the values at ``keys``, by default ``in_keys``; None if one is missing and this is tolerated."""
-        keys = self.in_keys if keys is None else keys
+        own, keys = keys is None, self.in_keys if keys is None else keys
         values = [tensordict.get(key, None) for key in keys]
         missing = [key for key, value in zip(keys, values, strict=True) if value is None]
         if not missing:
+            if own:
+                self._check_shapes(value.shape for value in values)
             return values
         if self.missing_tolerance:
             return None
@@ -118,15 +120,19 @@ class ObservationTransform(Transform):
             KeyError: for a key that is missing.
             ValueError: for a value of another shape.
         """
-        for key, size in zip(self.in_keys, self.in_sizes, strict=False):
-            shape = self._leaf(observation_spec, key).shape
-            if size is not None and shape[-1:] != (size,):
-                raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(shape)}")
+        self._check_shapes(self._leaf(observation_spec, key).shape for key in self.in_keys)
         if self.out_sizes:
             like = self._leaf(observation_spec, self.in_keys[0])
             for key, last in zip(self.out_keys, self.out_sizes, strict=True):
                 self._add(observation_spec, like, key, *last)
         return observation_spec
+
+    def _check_shapes(self, shapes: Iterable[torch.Size]) -> None:
+        """Raise unless the last dimensions of the values at ``in_keys`` are :attr:`in_sizes`."""
+        for key, size, shape in zip(self.in_keys, self.in_sizes, shapes, strict=False):
+            if size is not None and shape[-1:] != (size,):
+                hint = f": UnsqueezeTransform(-1, [{key!r}], [...]) of torchrl adds the dimension" if size == 1 else ""
+                raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(shape)}{hint}")
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
         """Load buffers that are not set yet, too."""

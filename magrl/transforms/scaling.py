@@ -174,7 +174,12 @@ class MinMaxNorm(ObservationTransform):
         return input_spec
 
     def _scaled_spec(self, key: NestedKey, spec: TensorSpec) -> TensorSpec:
-        self._bounds(key)  # an error before the first episode
+        held = self._bounds(key)[0].shape  # an error before the first episode
+        if held and any(size not in (1, actual) for size, actual in zip(held[::-1], spec.shape[::-1], strict=False)):
+            raise ValueError(
+                f"MinMaxNorm has bounds of the shape {tuple(held)} for {key!r}, which has {tuple(spec.shape)}"
+                + ": view.action_transform(declared=True) scales actions that declare" * (key == "action")
+            )
         if not isinstance(spec, Bounded):
             dtype = spec.dtype if spec.dtype.is_floating_point else torch.get_default_dtype()
             return Unbounded(spec.shape, device=spec.device, dtype=dtype)

@@ -30,6 +30,7 @@ from magrl.transforms import (
     RandomSensorNoise,
     RandomStepPrice,
     SensorErrors,
+    SensorNoise,
     SPLReward,
     TargetDifference,
     TrueWay,
@@ -242,6 +243,15 @@ def test_a_reader_before_its_writer_is_refused() -> None:
     for reader in (GradientHeading(), AlignmentReward(["heading", "gradient_heading"])):
         with pytest.raises(KeyError, match=rf"{type(reader).__name__} reads '(field_gradient|gradient_heading)'"):
             _ = TransformedEnv(nav(), Compose(reader, FieldGradient(field()), GradientHeading())).specs
+
+
+@pytest.mark.parametrize("transform", [AngleVector(["th"], ["v"]), SensorNoise((0.1,), in_keys=["th"], out_keys=["v"])])
+def test_a_value_without_its_last_dimension_is_refused(transform: Transform) -> None:
+    message = rf"{type(transform).__name__} reads 'th' as \(..., 1\), got \(\): UnsqueezeTransform\(-1, \['th'\]"
+    with pytest.raises(ValueError, match=message):
+        transform(TensorDict(th=torch.tensor(0.0)))
+    with pytest.raises(ValueError, match=message):
+        TransformedEnv(PendulumEnv(), transform.clone()).rollout(2)
 
 
 def test_keys() -> None:

@@ -138,6 +138,14 @@ def test_bounds_that_are_not_known() -> None:
         _ = TransformedEnv(nav(), MinMaxNorm(["nope"], ["y"])).specs
 
 
+def test_bounds_of_another_size_name_the_remedy() -> None:
+    base = nav(4, arrival="declared")
+    view = base.observation_view()
+    with pytest.raises(ValueError, match=r"shape \(2,\) for 'action', which has \(4, 3\): view.*declared=True"):
+        _ = TransformedEnv(base, view.action_transform()).specs
+    assert TransformedEnv(nav(4, arrival="declared"), view.action_transform(declared=True)).action_spec.shape == (4, 3)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
