@@ -94,6 +94,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         "render_fps": 4,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
+    autoreset_mode = AutoresetMode.SAME_STEP  # where TorchRL's GymWrapper reads it
 
     def __init__(
         self,

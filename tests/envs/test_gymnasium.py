@@ -16,7 +16,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, TransformedEnv
+from torchrl.envs import Compose, GymEnv, GymWrapper, TransformedEnv
 
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks
 from magrl.envs.gymnasium import ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
@@ -40,9 +40,9 @@ def make_vec(num_envs: int = NUM, **options: Any) -> gymnasium.vector.VectorEnv:
     return gymnasium.make_vec(ENV_ID, num_envs=num_envs, **{"scenario": PAPER} | options)
 
 
-def torchrl_env(num_envs: int, seed: int, *, guided: bool = True) -> TransformedEnv:
+def torchrl_env(num_envs: int, seed: int, *, guided: bool = True, **options: Any) -> TransformedEnv:
     """The environment of the recipes, built here from their parts."""
-    base = GeomagneticNavEnv(num_envs=num_envs, seed=seed, **SHORT)
+    base = GeomagneticNavEnv(num_envs=num_envs, seed=seed, **(options or SHORT))
     view = base.observation_view()
     alignment = AlignmentReward(weight=3.0, offset=math.pi / 4)
     guidance = [FieldGradient(base.field), GradientHeading(), alignment] if guided else []
@@ -109,6 +109,19 @@ def test_one_vehicle_flies_as_in_torchrl() -> None:
         if terminated or truncated:
             assert info["steps"] <= SHORT["max_steps"]
             state, (observation, info) = reference.reset(), env.reset()
+
+
+def test_a_batch_is_wrapped_by_torchrl_again() -> None:
+    """The observation at the end of an episode is its last one, and the next episode follows."""
+    wrapped, env = GymWrapper(make_vec(max_steps=3)), torchrl_env(NUM, 11, max_steps=3)
+    state, reference = wrapped.reset(seed=11), env.reset()
+    for actions in torch.from_numpy(random_actions(NUM, 0, 3)):
+        step, state = wrapped.step_and_maybe_reset(state.set("action", actions))
+        expected, reference = env.step_and_maybe_reset(reference.set("action", actions))
+        for key in ("observation", "reward", "done"):
+            assert torch.equal(step["next", key], expected["next", key]), key
+    assert step["next", "done"].all()
+    assert not torch.equal(state["observation"], step["next", "observation"])
 
 
 # Seeds and tasks
