@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +12,7 @@ from typing import Any, NamedTuple
 from tensordict.nn import TensorDictModuleBase
 
 from magrl.agents import FieldPolicy, load_policy
+from magrl.agents.exported import TrainedPolicy
 from magrl.agents.pretrained import load_pretrained
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
@@ -138,14 +141,55 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
     policy = load_policy(path, env.device) if source else load_pretrained(name, env.device)
     if isinstance(policy, FieldPolicy) and isinstance(policy.config.view, TrackView):
         told = env.arrival.rule == "objective"
-        policy = policy.adapted(zeta=env.zeta, max_steps=env.max_steps, search=told, **options).to(env.device)
+        policy = policy.adapted(zeta=env.zeta, max_steps=env.max_steps, search=told, **options)
+        policy = _limited(policy, env).to(env.device)
     elif options:
         raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
     try:
-        policy.check_fits(env)
+        check_fits(policy, env)
     except ValueError as error:
         raise ValueError(f"{text}: {error}") from error
     return policy
+
+
+def _limited(policy: FieldPolicy, env: GeomagneticNavEnv) -> FieldPolicy:
+    """Return an agent that corrects plans of the moves and turns that an environment allows, with the same weights."""
+    view = policy.config.view
+    limits = {name: min(getattr(view, name), getattr(env, name)) for name in ("max_move_km", "max_turn_rad")}
+    if (config := replace(policy.config, view=replace(view, **limits))) == policy.config:
+        return policy
+    actor = config.make_actor()
+    actor.load_state_dict(policy.actor.state_dict())
+    return FieldPolicy(config, actor)
+
+
+def check_fits(policy: TrainedPolicy, env: GeomagneticNavEnv) -> None:
+    """Raise unless an environment has the field of a trained policy, and allows its moves and turns.
+
+    Args:
+        policy: trained policy.
+        env: environment that it is to fly in.
+
+    Raises:
+        ValueError: naming both ranges of an element, or both limits.
+
+    Example:
+        >>> check_fits(load_pretrained("anywhere"), GeomagneticNavEnv(max_move_km=10, seed=0))
+        Traceback (most recent call last):
+        ValueError: the policy was trained for moves up to 50 km and turns up to 90°, the environment allows 10 km and \
+90°: evaluate with max_move_km=50 and max_turn_deg=90, or train one for these limits
+    """
+    policy.check_fits(env)
+    if isinstance(policy, FieldPolicy):
+        (move, turn), (longest, largest) = (
+            (round(each.max_move_km, 3), round(math.degrees(each.max_turn_rad), 3)) for each in (policy.view, env)
+        )
+        if move > longest or turn > largest:
+            raise ValueError(
+                f"the policy was trained for moves up to {move:g} km and turns up to {turn:g}°, the environment allows "
+                f"{longest:g} km and {largest:g}°: evaluate with max_move_km={move:g} and max_turn_deg={turn:g}, or "
+                "train one for these limits"
+            )
 
 
 def _kind(name: str) -> TrainedAgent | type[Navigator]:

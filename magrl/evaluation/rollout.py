@@ -14,10 +14,11 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from magrl.agents import FieldPolicy
+from magrl.agents.exported import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.metrics import episode_measures
-from magrl.evaluation.navigators import make_navigator
+from magrl.evaluation.navigators import check_fits, make_navigator
 from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.scenarios import with_declaration, with_errors
 from magrl.navigators import Navigator
@@ -66,8 +67,8 @@ def evaluate(
 
     Raises:
         TypeError: for a policy that is not callable, or tasks of another type.
-        ValueError: for a scenario without tasks, noise with conditions, a policy of another field, or another value
-            out of its range.
+        ValueError: for a scenario without tasks, noise with conditions, a policy of another field or of longer moves,
+            or another value out of its range.
 
     Example:
         >>> episodes = evaluate("secant", "paper-100", num_envs=30)
@@ -85,8 +86,8 @@ def evaluate(
     env, sheet = with_errors(base, flown if conditions else noise, seed, known_start)
     if isinstance(policy, str):
         policy = make_navigator(policy, base, seed=seed, **sheet)
-    elif hasattr(policy, "check_fits"):
-        policy.check_fits(base)
+    elif isinstance(policy, TrainedPolicy):
+        check_fits(policy, base)
     if isinstance(policy, FieldPolicy | Navigator):
         env = with_declaration(env, confidence)
     restart(env)

@@ -9,6 +9,7 @@ from torchrl.envs import StepCounter, TransformedEnv
 from magrl.agents import ExportedPolicy, FieldPolicy, PolicyConfig, save_policy
 from magrl.agents.program import TensorProgram
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
+from magrl.evaluation import evaluate
 from magrl.evaluation.navigators import (
     NAVIGATOR_COLORS,
     NAVIGATOR_NAMES,
@@ -109,6 +110,13 @@ def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
     assert agents[0].config.view.max_steps == 80
     first, second = (agent(env.reset())["action"] for agent in agents)
     assert not torch.equal(first, second)
+
+
+@pytest.mark.parametrize("limits", [{"max_move_km": 10, "max_steps": 250}, {"max_turn_deg": 20}])
+def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment(limits: dict[str, int]) -> None:
+    episodes = evaluate("anywhere", "paper-100", start_heading="random", **limits)
+    assert episodes["success"].double().mean() >= 0.99
+    assert episodes["spl"].mean() > 0.98
 
 
 def test_navigators_that_are_given_twice(run: Path) -> None:
