@@ -30,6 +30,7 @@ nb_output_stderr = "remove"  # warnings and logs of libraries
 
 apidoc_modules = [{"path": "../magrl", "destination": "api", "separate_modules": True, "max_depth": 1}]
 apidoc_options = ["members", "show-inheritance"]
+autodoc_mock_imports = ["stable_baselines3"]
 autodoc_default_options = {"ignore-module-all": True}  # describe a name only where it is defined
 apidoc_module_first = True
 autodoc_member_order = "bysource"

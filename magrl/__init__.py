@@ -1,6 +1,7 @@
 """Navigation by the Earth's magnetic field: a TorchRL environment, transforms and what trains on them.
 
-Importing the package registers ``magrl/GeomagneticNavigation-v0`` with Gymnasium. The names in ``magrl.__all__`` are
+Importing the package registers ``magrl/GeomagneticNavigation-v0`` and ``magrl/GeomagneticNavigationAnywhere-v0`` with
+Gymnasium. The names in ``magrl.__all__`` are
 loaded when first used, so that the import does not load torch.
 """
 
@@ -22,7 +23,16 @@ _PACKAGES = {
         "ObservationView",
         "TargetDifference",
     ),
-    "envs": ("GeomagneticNavEnv", "Region", "Scenario", "Tasks", "load_scenario", "task_set"),
+    "envs": (
+        "GeomagneticNavEnv",
+        "Region",
+        "Scenario",
+        "Tasks",
+        "earth_scenario",
+        "load_scenario",
+        "planet_scenario",
+        "task_set",
+    ),
     "agents": ("FieldPolicy", "export_policy", "load_policy", "load_pretrained", "save_policy"),
     "evaluation": ("episode_measures", "evaluate", "evaluation_rollout", "summarize"),
 }
@@ -39,7 +49,9 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from magrl.envs import Region as Region
     from magrl.envs import Scenario as Scenario
     from magrl.envs import Tasks as Tasks
+    from magrl.envs import earth_scenario as earth_scenario
     from magrl.envs import load_scenario as load_scenario
+    from magrl.envs import planet_scenario as planet_scenario
     from magrl.envs import task_set as task_set
     from magrl.evaluation import episode_measures as episode_measures
     from magrl.evaluation import evaluate as evaluate
@@ -67,9 +79,10 @@ def __dir__() -> list[str]:
     return sorted([*globals(), *_HOMES])
 
 
-if "magrl/GeomagneticNavigation-v0" not in _gymnasium.registry:
-    _gymnasium.register(
-        "magrl/GeomagneticNavigation-v0",
-        entry_point="magrl.envs.gymnasium:GeomagneticNavGymEnv",
-        vector_entry_point="magrl.envs.gymnasium:GeomagneticNavVectorEnv",
-    )
+for _name, _kind in (("GeomagneticNavigation", "GeomagneticNav"), ("GeomagneticNavigationAnywhere", "Anywhere")):
+    if f"magrl/{_name}-v0" not in _gymnasium.registry:
+        _gymnasium.register(
+            f"magrl/{_name}-v0",
+            entry_point=f"magrl.envs.gymnasium:{_kind}GymEnv",
+            vector_entry_point=f"magrl.envs.gymnasium:{_kind}VectorEnv",
+        )

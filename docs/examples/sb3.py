@@ -1,6 +1,6 @@
 """stable-baselines3 on the navigation environment: SAC or TD3, with many vehicles in one batch.
 
-    pip install -c constraints.txt -e '.[bench]'
+    pip install -c constraints.txt -e '.[recipes,sb3]'
     python docs/examples/sb3.py --algorithm sac
 
 Prints success rate, SPL (success weighted by path length) and steps on 100 test tasks. Takes one to two minutes.
@@ -12,9 +12,7 @@ import os
 
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
@@ -28,9 +26,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from magrl import Scenario, paper
 from magrl.envs.gymnasium import ENV_ID
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-from sb3_vec_env import BatchedVecEnv
+from magrl.envs.sb3 import BatchedVecEnv
 
 
 @dataclass(frozen=True)

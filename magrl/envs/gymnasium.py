@@ -1,15 +1,15 @@
 """The environment for Gymnasium: one vehicle as an ``Env``, a batch of them as a ``VectorEnv``.
 
-``import magrl`` registers ``magrl/GeomagneticNavigation-v0``. Both classes run :func:`navigation_env`, the TorchRL
-environment behind the transforms of the recipes, and only convert tensors to arrays: the same seed and the same actions
-give the same bits.
+``import magrl`` registers ``magrl/GeomagneticNavigation-v0`` and, without a map, ``GeomagneticNavigationAnywhere-v0``.
+The classes run :func:`navigation_env` and :func:`anywhere_env`, the TorchRL environment behind the transforms of the
+recipes, and only convert tensors to arrays: the same seed and the same actions give the same bits.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -25,13 +25,14 @@ from torchrl.envs import CatTensors, TransformedEnv
 
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.envs.measures import path_measures
-from magrl.envs.navigation import navigation_env
+from magrl.envs.navigation import anywhere_env, navigation_env
 from magrl.transforms.errors.base import EpisodeErrors
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
+ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v0"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 VectorStep = tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
-_NAMED: dict[str, tuple[str, ...]] = {"flat": ("observation",), "dict": PUBLIC_KEYS}
+_NAMED: dict[str, tuple[str, ...]] = {"flat": ("observation",), "track": ("observation",), "dict": PUBLIC_KEYS}
 
 
 def _box(*specs: TensorSpec) -> spaces.Space[Any]:
@@ -56,7 +57,7 @@ def _observation_space(env: TransformedEnv, keys: tuple[str, ...], *, flat: bool
         return spaces.Dict({key: _box(spec[key]) for key in keys})
     # CatTensors drops the bounds of what it joins.
     joined = [step for step in env.transform if isinstance(step, CatTensors) and step.out_keys == ["observation"]]
-    return _box(*(spec[key] for key in joined[-1].in_keys))
+    return _box(*(spec[key] for key in (joined[-1].in_keys if joined else keys)))
 
 
 def _array(tensor: Tensor) -> NDArray[Any]:
@@ -95,17 +96,15 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
     autoreset_mode = AutoresetMode.SAME_STEP  # where TorchRL's GymWrapper reads it
+    make_env: ClassVar[Callable[..., TransformedEnv]] = staticmethod(navigation_env)
+    """Function that makes the environment."""
+    default_observation: ClassVar[str] = "flat"
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        render_mode: str | None = None,
-        observation: str | Sequence[str] = "flat",
-        **options: Any,
-    ) -> None:
-        self.num_envs, self.render_mode, self._flat = num_envs, render_mode, observation == "flat"
-        self.torchrl_env = navigation_env(num_envs, render_mode=render_mode, observation=observation, **options)
+    def __init__(self, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
+        self.num_envs, self.render_mode = num_envs, render_mode
+        observation = options.get("observation", self.default_observation)
+        self._flat = observation in ("flat", "track")
+        self.torchrl_env = self.make_env(num_envs, render_mode=render_mode, **options)
         self._keys = _NAMED[observation] if isinstance(observation, str) else tuple(observation)
         self.single_observation_space = _observation_space(self.torchrl_env, self._keys, flat=self._flat)
         self.single_action_space = _box(self.torchrl_env.action_spec)
@@ -213,9 +212,11 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 as Gymnasium declares it
+    vector_class: ClassVar[type[GeomagneticNavVectorEnv]] = GeomagneticNavVectorEnv
+    """Batch of which this is the only vehicle."""
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
-        self._envs = GeomagneticNavVectorEnv(1, render_mode=render_mode, **options)
+        self._envs = self.vector_class(1, render_mode=render_mode, **options)
         self.torchrl_env, self.render_mode = self._envs.torchrl_env, render_mode
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
@@ -248,6 +249,44 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Return the running episode over the field's contours, or None without a ``render_mode``."""
         images = self._envs.render()
         return images[0] if images else None
+
+
+class AnywhereVectorEnv(GeomagneticNavVectorEnv):
+    """A batch of vehicles without a map: ``gymnasium.make_vec("magrl/GeomagneticNavigationAnywhere-v0", num_envs=N)``.
+
+    Args:
+        num_envs: vehicles in the batch.
+        **options: of :func:`anywhere_env`: ``scenario`` of any number of regions, ``observation="track"`` or
+            ``"dict"`` for raw readings, ``transforms``, and so on.
+
+    Raises:
+        TypeError, ValueError: for a bad option, as :func:`anywhere_env`.
+
+    Example:
+        >>> AnywhereVectorEnv(num_envs=4).reset(seed=0)[0].shape
+        (4, 19)
+    """
+
+    make_env = staticmethod(anywhere_env)
+    default_observation = "track"
+
+
+class AnywhereGymEnv(GeomagneticNavGymEnv):
+    """One vehicle without a map: ``gymnasium.make("magrl/GeomagneticNavigationAnywhere-v0", **options)``.
+
+    Args:
+        **options: of :func:`anywhere_env`.
+
+    Raises:
+        TypeError, ValueError: for a bad option, as :func:`anywhere_env`.
+
+    Example:
+        >>> readings, _ = AnywhereGymEnv(observation=("field", "target_field", "move", "heading")).reset(seed=0)
+        >>> readings["field"].shape
+        (3,)
+    """
+
+    vector_class = AnywhereVectorEnv
 
 
 def _measures(end: TensorDictBase, length_km: Tensor) -> dict[str, NDArray[Any]]:

@@ -1,5 +1,6 @@
 """The Gymnasium interface: the same bits as TorchRL, the conventions of Gymnasium, and stable-baselines3."""
 
+import importlib
 import importlib.util
 import math
 import subprocess
@@ -18,8 +19,9 @@ from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict
 from torchrl.envs import Compose, GymEnv, GymWrapper, TransformedEnv
 
-from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks
-from magrl.envs.gymnasium import ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
+from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks, planet_scenario
+from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
+from magrl.envs.navigation import anywhere_env
 from magrl.evaluation import episode_measures
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorNoise, TrackGradient, TrackView
 
@@ -124,6 +126,53 @@ def test_a_batch_is_wrapped_by_torchrl_again() -> None:
     assert not torch.equal(state["observation"], step["next", "observation"])
 
 
+# Without a map
+
+
+@pytest.mark.parametrize("start_heading", [None, "north"])
+def test_a_batch_without_a_map_flies_as_in_torchrl(start_heading: str | None) -> None:
+    given = {"start_heading": start_heading} if start_heading else {}
+    options = {"scenario": planet_scenario(3, seed=0, distance_range_km=(60, 200), **given), "max_steps": 8}
+    envs = gymnasium.make_vec(ANYWHERE_ID, num_envs=NUM, **options)
+    env = anywhere_env(NUM, seed=11, **options)
+    state = env.reset()
+    assert (state["heading"] == 0).all() == bool(start_heading)
+    assert (state["sensor_std"] > 0).any()
+    equal(envs.reset(seed=11)[0], state["observation"])
+    returns, ends = np.zeros(NUM), 0
+    for actions in random_actions(NUM, 0, 40):
+        step, state = env.step_and_maybe_reset(state.set("action", torch.from_numpy(actions)))
+        observations, rewards, *_, info = envs.step(actions)
+        equal(observations, state["observation"])
+        equal(rewards, step["next", "reward"].squeeze(-1))
+        returns += rewards
+        for index in np.flatnonzero(info.get("_final_info", [])):  # 10 times SPL minus 1, minus 0.5 % of SPL a step
+            final = {name: value[index] for name, value in info["final_info"].items()}
+            assert returns[index] == pytest.approx(10 * (final["spl"] - 1) - 0.05 * final["steps"], abs=2e-3)
+            returns[index], ends = 0.0, ends + 1
+    assert ends > 4 * NUM
+
+
+def test_one_vehicle_without_a_map_reads_its_sensors_alone() -> None:
+    keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
+    env = gymnasium.make(ANYWHERE_ID, observation=keys, transforms=[NOISE])
+    observation, _ = env.reset(seed=0)
+    assert set(observation) == set(keys)
+    assert env.observation_space.contains(observation)
+    np.testing.assert_allclose(observation["sensor_std"], NOISE.sensor_std)
+    assert gymnasium.make(ANYWHERE_ID, transforms=[]).reset(seed=0)[0].shape == (19,)
+
+
+@pytest.mark.parametrize("options", [{"observation": "dict"}, {"observation": "track", "reward": "base"}])
+def test_a_scenario_of_many_regions(options: dict) -> None:
+    planets = planet_scenario(3, seed=0)
+    envs = make_vec(scenario=planets, **options)
+    envs.reset(seed=0)
+    assert np.isfinite(envs.step(random_actions(NUM, 0, 1)[0])[1]).all()
+    with pytest.raises(ValueError, match="scaled to one region, the scenario has 3: take observation='track'"):
+        make_vec(scenario=planets)
+
+
 # Seeds and tasks
 
 
@@ -221,7 +270,7 @@ def test_pictures() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"observation": "pixels"}, "observation must be one of 'flat', 'dict', got 'pixels'"),
+        ({"observation": "pixels"}, "observation must be one of 'flat', 'track', 'dict', got 'pixels'"),
         ({"observation": ("field", "wings")}, "observation names 'wings', which is not among the keys"),
         ({"zetta": 1.0}, "unexpected keyword argument 'zetta'; the options are .*'zeta'"),
         ({"transforms": [5]}, r"transforms\[0\] must be a Transform, got 5"),
@@ -308,8 +357,10 @@ def test_stable_baselines3_example(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_batched_environment_under_stable_baselines3() -> None:
-    adapter = load("benchmarks/sb3_vec_env.py")
-    vec_env, envs, ended = adapter.BatchedVecEnv(make_vec(**SHORT)), make_vec(**SHORT), 0
+    pytest.importorskip("stable_baselines3")
+    from magrl.envs.sb3 import BatchedVecEnv
+
+    vec_env, envs, ended = BatchedVecEnv(make_vec(**SHORT)), make_vec(**SHORT), 0
     vec_env.seed(9)
     np.testing.assert_array_equal(vec_env.reset(), envs.reset(seed=9)[0])
     for actions in random_actions(NUM, 6, 15):
@@ -325,4 +376,11 @@ def test_batched_environment_under_stable_baselines3() -> None:
             ended += 1
     assert ended > NUM
     with pytest.raises(ValueError, match="NEXT_STEP"):
-        adapter.BatchedVecEnv(gymnasium.make_vec(ENV_ID, num_envs=1, vectorization_mode="sync", **SHORT))
+        BatchedVecEnv(gymnasium.make_vec(ENV_ID, num_envs=1, vectorization_mode="sync", **SHORT))
+
+
+def test_without_stable_baselines3_the_extra_is_named(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3.common.vec_env", None)
+    monkeypatch.delitem(sys.modules, "magrl.envs.sb3", raising=False)
+    with pytest.raises(ImportError, match=r"pip install 'magrl\[sb3\]'"):
+        importlib.import_module("magrl.envs.sb3")

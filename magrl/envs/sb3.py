@@ -1,7 +1,7 @@
-"""stable-baselines3 over a batched Gymnasium environment.
+"""stable-baselines3 over a batched Gymnasium environment (extra ``sb3``).
 
-The vector environments of stable-baselines3 step copies one after the other, or in processes. A fair comparison of
-training speed gives it what TorchRL has: one batched step for all vehicles.
+The vector environments of stable-baselines3 step copies one after the other, or in processes. This one has one batched
+step for all vehicles.
 """
 
 from __future__ import annotations
@@ -12,8 +12,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+except ImportError as error:
+    raise ImportError("magrl.envs.sb3 needs stable-baselines3: pip install 'magrl[sb3]'") from error
 
 
 class BatchedVecEnv(VecEnv):
@@ -68,7 +72,8 @@ class BatchedVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Return an image of each vehicle's episode."""
-        return self.envs.render() or ()
+        images: Any = self.envs.render()
+        return images or ()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return the same attribute for each vehicle: they share one environment."""
