@@ -27,7 +27,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torch.optim import Adam
-from torchrl.envs import Compose, ObservationNorm, RewardSum, TransformedEnv
+from torchrl.envs import Compose, ObservationNorm, RewardSum, Transform, TransformedEnv
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -38,7 +38,7 @@ from magrl.agents.networks import make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, Discount, LearningConfig, NonNegative, Positive, Rising, Share, Widths
+from magrl.training.config import Count, Discount, NonNegative, Positive, Rising, Share, VehicleConfig, Widths
 from magrl.transforms import (
     HighestSPL,
     RandomSensorNoise,
@@ -62,7 +62,7 @@ TRANSITION = (
 )
 
 
-class Config(LearningConfig):
+class Config(VehicleConfig):
     """Settings of a training; the defaults are those of the preset."""
 
     preset: Literal["far", "fast"] = "far"
@@ -137,7 +137,8 @@ class Config(LearningConfig):
             size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
         else:
             size = {"half_size_deg": 10, "degree": 12, "max_latitude": 70}
-        return {"distance_range_km": self.distance_range_km, **size}
+        reach_km = self.max_move_km + self.limits["drift_km"]
+        return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, **size}
 
 
 FAR = Config()
@@ -145,10 +146,11 @@ FAST = Config(preset="fast", distance_range_km=(300.0, 500.0), max_steps=50, noi
 PRESETS = {"far": FAR, "fast": FAST}
 
 
-def sensors(config: Config, seed: int) -> SensorNoise:
-    """Return the noise of the sensors: that of the settings, or by default levels drawn for each episode."""
+def errors(config: Config, seed: int) -> list[Transform]:
+    """Return the drift and the noise of the sensors: that of the settings, or levels drawn for each episode."""
     levels = partial(sensor_levels, exponent=config.noise_exponent)
-    return SensorNoise(config.noise, seed=seed) if any(config.noise) else RandomSensorNoise(levels, seed=seed)
+    noise = SensorNoise(config.noise, seed=seed) if any(config.noise) else RandomSensorNoise(levels, seed=seed)
+    return [*config.motion(seed), noise]
 
 
 def make_view(base: GeomagneticNavEnv, range_km: float) -> TrackView:
@@ -161,8 +163,10 @@ def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> Transf
     """Add the sensors, the price, the agent's view, and for training only what is privileged: critic and reward."""
     price = RandomStepPrice(config.price_range, seed=base.seed)
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
-    privileged = [TrueWay(), scaled_way, HighestSPL(), SPLReward(), RewardSum(["reward"])]
-    observed = [sensors(config, base.seed), price, *view.observation_transforms(), view.action_transform()]
+    way, move, *others = HighestSPL.default_in_keys
+    highest = HighestSPL([way, "true_move" if config.drift else move, *others])
+    privileged = [TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
+    observed = [*errors(config, base.seed), price, *view.observation_transforms(), view.action_transform()]
     return TransformedEnv(base, Compose(*observed, *privileged))
 
 
@@ -170,7 +174,7 @@ def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config
     """Return an environment of random tasks of a scenario, drawn once, with the noise of the sensors."""
     tasks = scenario.random_tasks(num_tasks, seed)
     base = GeomagneticNavEnv(scenario.with_tasks(tasks), num_envs=num_tasks, seed=seed, **options)
-    return TransformedEnv(base, sensors(config, seed))
+    return TransformedEnv(base, Compose(*errors(config, seed)))
 
 
 class Spread(nn.Module):
@@ -215,7 +219,7 @@ def train(config: Config) -> dict[str, float]:
     with Run(config, recipe=RECIPE, name=f"ppo_anywhere-{config.preset}", losses=LOSSES) as run:
         # Environments
         options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": "random"}
-        options |= {"device": config.device}
+        options |= {"device": config.device, **config.limits}
         planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
         base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
         others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)
@@ -248,12 +252,8 @@ def train(config: Config) -> dict[str, float]:
         rates = ("learning_rate", "critic_learning_rate")
         optimizer = Adam([{"params": each, "lr": 0.0} for each in weights], fused=True)
 
-        collector = make_collector(
-            env,
-            stochastic_actor,
-            frames_per_batch=config.num_envs * config.steps_per_batch,
-            total_frames=config.total_frames,
-        )
+        frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
+        collector = make_collector(env, stochastic_actor, **frames)
         run.start(
             policy=FieldPolicy(network, actor).to(env.device),
             validation=validation,

@@ -14,6 +14,7 @@ from typing import Annotated, Any, TypeVar
 import torch
 import tyro
 from pydantic import AfterValidator, Field, model_validator
+from torchrl.envs import Transform
 from typing_extensions import Self
 
 from magrl import paper
@@ -21,6 +22,7 @@ from magrl.checks import CheckedModel
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.measures import check_zeta
 from magrl.training.loggers import Logger, WandbMode, check_logger
+from magrl.transforms import MotionError
 
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -148,6 +150,32 @@ class LearningConfig(RunConfig):
     """Learning rate of Adam at the end; linear in between."""
     saturation_weight: NonNegative = 0.05
     """Weight of the penalty on the actor's outputs before the tanh; falls linearly to 0."""
+
+
+class VehicleConfig(LearningConfig):
+    """Settings of algorithms that can train for another vehicle.
+
+    Example:
+        >>> VehicleConfig(max_move_km=10.0, drift=0.1).limits
+        {'max_move_km': 10.0, 'max_turn_deg': 90.0, 'drift_km': 1.0}
+    """
+
+    max_move_km: Positive = 50.0
+    """Longest move [km]."""
+    max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
+    """Largest turn to either side before a move [deg]."""
+    drift: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Speed of a current as a share of the vehicle's; its direction is random in each episode."""
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Options of the environment."""
+        drift_km = self.drift * self.max_move_km
+        return {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "drift_km": drift_km}
+
+    def motion(self, seed: int) -> list[Transform]:
+        """Return the errors of motion: the current, if there is one."""
+        return [MotionError(current_km_h=self.drift, speed_km_h=1.0, seed=seed)] if self.drift else []
 
 
 class GuidanceConfig(RunConfig):

@@ -35,7 +35,11 @@ CELLS = json.loads(NOTEBOOK.read_text())["cells"]
 BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
-BUDGET = {"total_frames = 60_000": "total_frames = 128", "= 512, 1024, 8": "= 64, 64, 1", "= 400_000, 500": "= 16_384, 4"}
+BUDGET = {
+    "total_frames = 60_000": "total_frames = 128",
+    "= 512, 1024, 8": "= 64, 64, 1",
+    "= 400_000, 500": "= 16_384, 4",
+}
 BUDGET |= {'(navigator, "paper-100")': '(navigator, "figure-4-1")', "random_tasks(100, ": "random_tasks(2, "}
 """Numbers of frames and tasks in examples, and those of their tests."""
 MAKEFILE = (ROOT / "Makefile").read_text()
@@ -91,7 +95,9 @@ def test_python_examples_run(page: Path, code: str, reader: Path, monkeypatch) -
 
 def test_the_notebook_is_kept_without_outputs() -> None:
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in CELLS)
-    assert all(any(setting in code for _, code in EXAMPLES) for setting in BUDGET), "a long example is no longer shortened"
+    assert all(any(setting in code for _, code in EXAMPLES) for setting in BUDGET), (
+        "a long example is no longer shortened"
+    )
 
 
 @cache

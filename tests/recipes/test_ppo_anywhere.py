@@ -15,6 +15,7 @@ from magrl import paper
 from magrl.agents import PolicyConfig
 from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.field import igrf_coefficients
+from magrl.geodesy import geodesic
 from magrl.training import parse_config
 from magrl.transforms import RandomSensorNoise, TrackView
 
@@ -44,6 +45,23 @@ def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
     assert "episode_reward_proximity" not in td.keys()  # noqa: SIM118
     assert PolicyConfig(VIEW, (8,)).make_actor().in_keys == ["observation", "planned_move"]
     assert recipe.OBSERVED == ("observation", "true_way_scaled", "highest_spl")
+
+
+def test_the_vehicle_is_that_of_the_settings() -> None:
+    config = recipe.FAST.replace(max_move_km=10.0, max_turn_deg=20.0, drift=0.2)
+    planets = planet_scenario(4, seed=3, **config.regions)
+    base = GeomagneticNavEnv(planets, num_envs=6, seed=5, **config.limits)
+    view = recipe.make_view(base, 300.0)
+    assert (view.max_move_km, math.degrees(view.max_turn_rad)) == (10.0, pytest.approx(20.0))
+    td = recipe.make_env(base, view, config).rollout(5)["next"]
+    move, true_move = td["move"], td["true_move"]
+    assert (move[..., 1].abs() <= view.max_turn_rad + 1e-6).all()
+    drift = (true_move - move)[..., 0].abs() / move[..., 0]
+    assert 0.05 < drift.max() < 0.2 + 1e-5
+    path_km = true_move[..., 0].cumsum(1)
+    task_km = geodesic(*td["start_position"].unbind(-1), *td["target_position"].unbind(-1))[0]
+    best = task_km / (path_km + td["true_way"].norm(dim=-1))
+    torch.testing.assert_close(td["highest_spl"].squeeze(-1).double(), best.clamp(max=1), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.usefixtures("without_figures")

@@ -149,6 +149,7 @@ def test_actor_that_ppo_saves_is_the_stochastic_one_without_noise() -> None:
         (td3_recurrent, "--shortest-task-km 600", "shortest_task_km must be below 500, got 600.0"),
         (ppo_anywhere, "--distance-range-km 500 300", "must be two rising numbers, got (500.0, 300.0)"),
         (ppo_anywhere, "--distance-range-km 150 6000", "must end at 4400 km or below, the side of a region"),
+        (ppo_anywhere, "--max-turn-deg 200", "max_turn_deg must be less than or equal to 180, got 200.0"),
         (ppo_anywhere, "--scenario docs/examples/azores.toml", "scenario must be left out"),
         (ppo, "--num-envs 8", "batch_size 1024 must not exceed num_envs * steps_per_batch, 128"),
     ],
