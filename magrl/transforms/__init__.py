@@ -31,6 +31,7 @@ from magrl.transforms.errors.weather import SPEEDS_KM_H as SPEEDS_KM_H
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
 from magrl.transforms.rewards import DistanceCost as DistanceCost
 from magrl.transforms.rewards import HighestSPL as HighestSPL
+from magrl.transforms.rewards import ProgressReward as ProgressReward
 from magrl.transforms.rewards import RandomStepPrice as RandomStepPrice
 from magrl.transforms.rewards import SPLReward as SPLReward
 from magrl.transforms.rewards import TrueWay as TrueWay

@@ -27,6 +27,7 @@ from magrl.transforms import (
     GradientHeading,
     HighestSPL,
     MinMaxNorm,
+    ProgressReward,
     RandomSensorNoise,
     RandomStepPrice,
     SensorErrors,
@@ -80,7 +81,10 @@ def pendulum() -> Transform:
 
 ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     "guided": (nav, guided),
-    "rewarded": (nav, lambda: Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward())),
+    "rewarded": (
+        nav,
+        lambda: Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward(), ProgressReward(2.0)),
+    ),
     "every error": (nav, every_error),
     "plane": (partial(PlaneEnv, (3,), torch.float64), of_a_plane),
     "scaled pendulum": (PendulumEnv, pendulum),
