@@ -128,7 +128,7 @@ class ExportedPolicy(TrainedPolicy):
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]; or ``(..., 3)`` with the declaration."""
         seen = tensordict.select(*self.in_keys, strict=False)
         for key in set(STD_KEYS) & set(self.in_keys) - set(seen.keys()):
-            seen[key] = seen["step_count"].new_zeros(*seen.shape, 3, dtype=torch.float32)
+            seen[key] = torch.zeros(*seen.shape, 3, device=seen.device)
         flat = seen.reshape(-1)
         values = [flat[key] for key in self.in_keys]
         if not self.state_keys:

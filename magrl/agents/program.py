@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import operator
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr
 from typing import Any
@@ -133,7 +134,13 @@ def export_module(module: nn.Module, inputs: Sequence[Tensor]) -> torch.export.E
     Distribution.set_default_validate_args(False)
     try:
         # PyTorch prints the graph of what it cannot export, beside the error
-        with torch.no_grad(), set_interaction_type("deterministic"), redirect_stderr(io.StringIO()):
+        with (
+            torch.no_grad(),
+            set_interaction_type("deterministic"),
+            redirect_stderr(io.StringIO()),
+            warnings.catch_warnings(),
+        ):
+            warnings.filterwarnings("ignore", "The tensor attribute", UserWarning)  # of what a module keeps of its call
             shapes = {"inputs": tuple({0: batch} for _ in examples)}
             return torch.export.export(module, examples, dynamic_shapes=shapes, strict=False)
     finally:
