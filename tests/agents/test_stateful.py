@@ -194,10 +194,10 @@ def test_a_policy_declares_its_arrival(tmp_path: Path) -> None:
         evaluate(f"policy={tmp_path / 'own.pt'}", "paper-100")
     state, vehicle = base.reset(), Onboard(policy, arrival_km=5.0)
     vehicle.start(state["target_field"][0].tolist())
-    reading, stops = state["field"][0].tolist(), []
-    for step in range(5):
-        stops.append(vehicle.step(*(value + 1e-3 * step for value in reading), heading=0.0).stop)
-    assert stops == [None] * 4 + ["arrived"]
+    reading = state["field"][0].tolist()
+    commands = [vehicle.step(*(value + 1e-3 * step for value in reading), heading=0.0) for step in range(5)]
+    assert [command.stop for command in commands] == [None] * 4 + ["arrived"]
+    assert commands[-1].reason == "the policy declares its arrival"
 
 
 def test_a_policy_of_two_numbers_declares_by_its_own_estimate() -> None:
