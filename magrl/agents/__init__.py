@@ -1,9 +1,9 @@
 """Agents: networks, the TD3 losses that train them, and trained policies with their files."""
 
 from magrl.agents.exported import ExportedPolicy as ExportedPolicy
-from magrl.agents.exported import export_policy as export_policy
 from magrl.agents.networks import make_actor as make_actor
 from magrl.agents.networks import make_critic as make_critic
+from magrl.agents.pipeline import export_policy as export_policy
 from magrl.agents.policy import FieldPolicy as FieldPolicy
 from magrl.agents.policy import PolicyConfig as PolicyConfig
 from magrl.agents.policy import load_policy as load_policy

@@ -1,10 +1,10 @@
-"""Policies of any algorithm as navigators of the plain environment, with the transforms that they need."""
+"""Policies of any algorithm as navigators of the plain environment: a program, and a state from step to step."""
 
 from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,27 +12,18 @@ from typing import Any, ClassVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor, nn
-from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torch import Tensor
 
-from magrl.agents.program import TensorProgram, export_module, trace_program
-from magrl.checks import check_finite, check_type
-from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
-from magrl.field import FieldBank
+from magrl.agents.program import TensorProgram, export_module
+from magrl.checks import check_type
+from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.transforms import ObservationView
-from magrl.transforms.errors.base import EpisodeErrors
+from magrl.transforms.track import STD_KEYS
 
-Keys = set[NestedKey]
 _EXAMPLES = {key: torch.zeros(1, size) for key, size in zip(PUBLIC_KEYS, (3, 3, 2, 1), strict=True)}
-_EXAMPLES["step_count"] = torch.zeros(1, 1, dtype=torch.int64)
+_EXAMPLES |= {key: torch.zeros(1, 3) for key in STD_KEYS} | {"step_count": torch.zeros(1, 1, dtype=torch.int64)}
 READ_KEYS = tuple(_EXAMPLES)
 """Keys of the plain environment that an exported policy may read."""
-CHECKED_STEPS = 6
-"""Steps of the flight on which an export is compared with the policy."""
-TOLERANCE = 1e-4
-"""Largest difference of their actions, relative or in km and rad: float32 operations in another order."""
 
 
 class TrainedPolicy(TensorDictModuleBase):
@@ -41,27 +32,58 @@ class TrainedPolicy(TensorDictModuleBase):
     out_keys: ClassVar[list[str]] = ["action"]
     view: Any
     """What the policy observes, with the range of the field where it was trained, if it was trained in one region."""
+    declares = False
+    """Whether its action has a third number, which declares the arrival."""
+    state_keys: Sequence[str] = ()
+    """Keys of the state that it keeps for each vehicle from step to step."""
+    state: TensorDictBase | None = None
+    """State after its last call, and what that call began with; None before the first."""
 
     def check_fits(self, env: GeomagneticNavEnv) -> None:
         """Raise unless the field of an environment is within what the policy was trained in.
 
         Raises:
-            ValueError: naming the element and both ranges.
+            ValueError: naming the element and both ranges; or for a policy that declares its arrival, where the episode
+                ends otherwise.
         """
         check_type(GeomagneticNavEnv, env=env)
+        if self.declares and not env.arrival.declared:
+            raise ValueError(
+                f"the policy declares its arrival: fly it with arrival 'declared', not {env.arrival.rule!r}"
+            )
         if isinstance(self.view, ObservationView):
             self.view.check_covers(env.field, env.region.grid(81).to(env.device))
+
+    def _state_before(self, seen: TensorDictBase) -> tuple[TensorDictBase | None, Tensor]:
+        """Return the state that a step begins with, and who starts anew ``(..., 1)``: both as in a call before it."""
+        held, starts = self.state, seen["step_count"] == 0
+        if held is None or held.shape != seen.shape or held.device != seen.device:
+            return None, torch.ones_like(starts)
+        again = held["step"] == seen["step_count"]
+        before = torch.where(again.squeeze(-1), held["before"], held.select(*self.state_keys))
+        return before, starts | (again & held["starts"])
+
+    def _keep_state(
+        self, seen: TensorDictBase, before: TensorDictBase | None, starts: Tensor, state: TensorDictBase
+    ) -> None:
+        """Keep the state for the next step, and what this one began with."""
+        begun = {"step": seen["step_count"].clone(), "starts": starts, "before": state if before is None else before}
+        self.state = state.clone(recurse=False).update(begun)
 
 
 class ExportedPolicy(TrainedPolicy):
     """A trained policy of any algorithm, from the keys of the plain environment to an action in km and rad.
 
-    :func:`export_policy` makes one. It acts without exploration and keeps no state from step to step.
+    :func:`~magrl.agents.export_policy` makes one. It acts without exploration. A policy with a state keeps it for each
+    vehicle, as :class:`~magrl.agents.FieldPolicy` does.
 
     Args:
-        in_keys: public keys that it reads.
-        program: from their values ``(N, ...)`` to the action ``(N, 2)``.
+        in_keys: public keys that it reads. A standard deviation that the environment does not state is 0.
+        program: from their values ``(N, ...)`` to the action ``(N, 2)`` or ``(N, 3)``. With a state: from ``(N, 1)``
+            bool, which is True where an episode starts, their values, and the state to the action and the next state.
         view: range of the field in the region of the training; None for a policy of many regions.
+        first_state: tensors ``(1, ...)`` of the shapes of the state; none for a policy without one.
+        declares: whether the action has a third number, which declares the arrival.
 
     Raises:
         TypeError: for arguments of another type.
@@ -74,30 +96,59 @@ class ExportedPolicy(TrainedPolicy):
         torch.Size([2, 3, 2])
     """
 
-    def __init__(self, in_keys: Sequence[str], program: TensorProgram, view: ObservationView | None = None) -> None:
+    def __init__(
+        self,
+        in_keys: Sequence[str],
+        program: TensorProgram,
+        view: ObservationView | None = None,
+        first_state: Sequence[Tensor] = (),
+        declares: bool = False,
+    ) -> None:
         super().__init__()
-        check_type((list, tuple), in_keys=in_keys)
+        check_type((list, tuple), in_keys=in_keys, first_state=first_state)
         check_type(TensorProgram, program=program)
         check_type((ObservationView, type(None)), view=view)
+        check_type(bool, declares=declares)
+        states = {f"state_{index}": tensor for index, tensor in enumerate(first_state)}
+        check_type(Tensor, **states)
         if not in_keys or not all(key in READ_KEYS for key in in_keys):
             raise ValueError(f"in_keys must be among {', '.join(READ_KEYS)}, got {in_keys}")
-        if (program.num_inputs, len(program.outputs)) != (len(in_keys), 1):
+        if states and "step_count" not in in_keys:
+            raise ValueError(f"a policy with a state must read step_count, got {in_keys}")
+        inputs = len(in_keys) + len(states) + bool(states)
+        if (program.num_inputs, len(program.outputs)) != (inputs, 1 + len(states)):
             raise ValueError(
-                f"a program for {len(in_keys)} keys must take that many inputs and return the action, got "
-                f"{program.num_inputs} inputs and {len(program.outputs)} outputs"
+                f"a program for {len(in_keys)} keys and {len(states)} tensors of state must take {inputs} inputs and "
+                f"return the action and the state, got {program.num_inputs} inputs and {len(program.outputs)} outputs"
             )
         self.in_keys, self.program, self.view = list(in_keys), program, view
+        self.first_state, self.state_keys, self.declares = list(first_state), tuple(states), declares
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""
-        seen = tensordict.select(*self.in_keys).reshape(-1)
-        (action,) = self.program(*(seen[key] for key in self.in_keys))
-        return tensordict.set("action", action.reshape(*tensordict.shape, -1))
+        """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]; or ``(..., 3)`` with the declaration."""
+        seen = tensordict.select(*self.in_keys, strict=False)
+        for key in set(STD_KEYS) & set(self.in_keys) - set(seen.keys()):
+            seen[key] = torch.zeros(*seen.shape, 3, device=seen.device)
+        flat = seen.reshape(-1)
+        values = [flat[key] for key in self.in_keys]
+        if not self.state_keys:
+            (action,) = self.program(*values)
+            return tensordict.set("action", action.reshape(*seen.shape, -1))
+        before, starts = self._state_before(seen)
+        if before is None:
+            begun = (tensor.to(starts.device).expand(len(flat), *tensor.shape[1:]) for tensor in self.first_state)
+        else:
+            begun = (before.reshape(-1)[key] for key in self.state_keys)
+        action, *after = self.program(starts.reshape(-1, 1), *values, *begun)
+        state = TensorDict(dict(zip(self.state_keys, after, strict=True)), flat.shape, device=seen.device)
+        self._keep_state(seen, before, starts, state.reshape(seen.shape))
+        return tensordict.set("action", action.reshape(*seen.shape, -1))
 
     def write_torch(self, path: Path | str) -> None:
         """Write a file for :func:`torch.export.load`, which acts without magrl and TorchRL.
 
         Its module takes the values of ``in_keys`` in their order, ``(N, ...)`` each, and returns a tuple of the action.
+        With a state, it takes and returns what ``program`` does; the first state is ``first_state``.
         PyTorch reads such a file with pickle: load it only from a source that you trust.
 
         Args:
@@ -110,13 +161,16 @@ class ExportedPolicy(TrainedPolicy):
         if Path(path).suffix != ".pt2":
             raise ValueError(f"a file for torch.export.load must end with .pt2, got {str(path)!r}")
         file, examples = io.BytesIO(), [_EXAMPLES[key] for key in self.in_keys]
+        if self.first_state:
+            examples = [torch.ones(1, 1, dtype=torch.bool), *examples, *self.first_state]
         torch.export.save(export_module(copy.deepcopy(self.program).cpu(), examples), file)
         Path(path).write_bytes(file.getvalue())
 
     def content(self) -> dict[str, Any]:
         """Return all that rebuilds the policy as numbers, text and tensors on the CPU."""
         view = None if self.view is None else asdict(self.view)
-        return {"in_keys": self.in_keys, "view": view, "program": self.program.content()}
+        held = {"first_state": [tensor.cpu().clone() for tensor in self.first_state], "declares": self.declares}
+        return {"in_keys": self.in_keys, "view": view, "program": self.program.content(), **held}
 
 
 def rebuild(content: Any) -> ExportedPolicy:
@@ -128,152 +182,11 @@ def rebuild(content: Any) -> ExportedPolicy:
     Example:
         >>> rebuild({"in_keys": ["move"]})
         Traceback (most recent call last):
-        ValueError: an exported policy must hold exactly in_keys, program, view
+        ValueError: an exported policy must hold exactly declares, first_state, in_keys, program, view
     """
-    parts = {"in_keys", "program", "view"}
+    parts = {"in_keys", "program", "view", "first_state", "declares"}
     if not isinstance(content, dict) or set(content) != parts:
         raise ValueError(f"an exported policy must hold exactly {', '.join(sorted(parts))}")
     view = content["view"] and ObservationView(**content["view"])
-    return ExportedPolicy(content["in_keys"], TensorProgram(**content["program"]), view)
-
-
-def export_policy(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
-    """Return a policy of any algorithm as a navigator of the plain environment, and compare both in flight.
-
-    Of the transforms of the environment, those are taken along that the policy needs: they lead from public keys to
-    what it observes, and from its action to kilometers and radians. Errors of sensors and of motion stay behind.
-    Neither the policy nor the environment is changed.
-
-    Args:
-        actor: policy that was trained in the environment; a stochastic one acts by its deterministic sample.
-        env: navigation environment of the training, with its transforms.
-
-    Raises:
-        TypeError: for an actor that is no TensorDict module, or another environment.
-        ValueError: for a policy that reads a privileged key, that PyTorch cannot export, or whose export does not act
-            like it, such as one with a transform that keeps a state.
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule as Mod
-        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> act = Mod(lambda field, goal: (goal - field)[:, :2].sigmoid(), ["field", "target_field"], ["action"])
-        >>> export_policy(act, env).in_keys
-        ['field', 'target_field']
-    """
-    check_type(TensorDictModuleBase, actor=actor)
-    base = getattr(env, "base_env", env)
-    check_type(GeomagneticNavEnv, env=base)
-    try:
-        return _exported(copy.deepcopy(actor).to("cpu").eval(), copy.deepcopy(env).to("cpu"))
-    except (ValueError, FloatingPointError) as error:
-        raise ValueError(f"the policy cannot be exported: {error}") from error
-
-
-def _exported(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
-    """Return an export that acts like the policy in the environment, both of which may change."""
-    parts = _transforms(env)
-    for part in parts:
-        if hasattr(part, "to_observation_norm"):  # running statistics
-            part.freeze()
-    with torch.random.fork_rng(), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        start, base = env.reset(), getattr(env, "base_env", env)
-        pipeline = _Pipeline(actor, parts, start)
-        program = trace_program(pipeline, [start[key] for key in pipeline.in_keys])
-        view = None if isinstance(base.field, FieldBank) else base.observation_view()
-        policy = ExportedPolicy(pipeline.in_keys, program, view)
-        steps = env.rollout(min(base.max_steps, CHECKED_STEPS), actor, break_when_any_done=False)
-        _compare(policy, steps, pipeline.after)
-    return policy
-
-
-def _transforms(env: EnvBase) -> list[Transform]:
-    """Return the transforms from the plain environment outward, without errors, which are of the world."""
-    skipped = (Compose, EpisodeErrors, InitTracker, TensorDictPrimer)
-    return [part for part in env.modules() if isinstance(part, Transform) and not isinstance(part, skipped)]
-
-
-class _Pipeline(nn.Module):
-    """Transforms that a policy needs, the policy, and the transforms of its action, over plain tensors."""
-
-    def __init__(self, actor: TensorDictModuleBase, parts: Sequence[Transform], start: TensorDictBase) -> None:
-        super().__init__()
-        before, needed = _leading_to(_keys(actor.in_keys), reversed(parts), "out_keys", "in_keys")
-        for key in sorted(needed - set(READ_KEYS), key=str):
-            reason = _reason(key, _keys(actor.out_keys), set(start.keys(True, True)))
-            raise ValueError(f"it reads {key!r}, {reason}; it may read {', '.join(READ_KEYS)}")
-        self.in_keys = [key for key in READ_KEYS if key in needed]
-        fixed = (part.to_observation_norm() if hasattr(part, "to_observation_norm") else part for part in before)
-        self.before, self.actor = nn.ModuleList(fixed), actor
-        self.after = nn.ModuleList(_leading_to({"action"}, parts, "in_keys_inv", "out_keys_inv")[0])
-        for module in self.modules():  # a switch in a buffer, as that of ObservationNorm, is no constant to a trace
-            for name, switch in list(module.named_buffers(recurse=False)):
-                if switch.dtype == torch.bool and not switch.ndim:
-                    delattr(module, name)
-                    setattr(module, name, bool(switch))
-
-    def forward(self, *inputs: Tensor) -> tuple[Tensor]:
-        seen = TensorDict(dict(zip(self.in_keys, inputs, strict=True)), batch_size=inputs[0].shape[:1])
-        for part in (*self.before, self.actor):
-            seen = part(seen)
-        return (_physical_action(seen, self.after),)
-
-
-def _leading_to(needed: Keys, parts: Iterable[Transform], written: str, read: str) -> tuple[list[Transform], Keys]:
-    """Return the transforms that compute some keys, in the order in which they act, and the keys that they start from.
-
-    Args:
-        needed: keys to compute.
-        parts: transforms, from the last to act to the first.
-        written: attribute that holds the keys that a transform writes.
-        read: attribute that holds the keys that it reads.
-    """
-    chain: list[Transform] = []
-    for part in parts:
-        writes = _keys(getattr(part, written))
-        if needed & writes:
-            needed = needed - writes | _keys(getattr(part, read))
-            chain.insert(0, part)
-    return chain, needed
-
-
-def _physical_action(acted: TensorDictBase, transforms: Iterable[Any]) -> Tensor:
-    """Return the action of the environment that transforms make of the action of a policy."""
-    for part in transforms:
-        acted = part.inv(acted)
-    return acted["action"]
-
-
-def _reason(key: NestedKey, written: Keys, known: Keys) -> str:
-    """Return why a policy cannot read a key."""
-    if key == "is_init" or unravel_key(("next", key)) in written:
-        return "so it keeps a state from step to step"
-    if key in PRIVILEGED_KEYS:
-        return "which a vehicle that navigates by the field does not know"
-    return "which the plain environment does not have" if key in known else "which no transform writes"
-
-
-def _keys(keys: Any) -> Keys:
-    return {unravel_key(key) for key in keys or ()}
-
-
-def _compare(policy: ExportedPolicy, steps: TensorDictBase, after: Iterable[Any]) -> None:
-    """Raise unless a policy acts as in a rollout of the environment with its transforms.
-
-    The policy acts on one step of one vehicle at a time, so that its action depends on nothing else.
-
-    Args:
-        policy: exported policy.
-        steps: ``(N, T)`` from the first step of an episode on.
-        after: transforms of the action.
-    """
-    check_finite([("action", steps["action"])], "the policy")
-    wanted = _physical_action(steps.clone(), after)
-    singles = steps.select(*policy.in_keys).reshape(-1).split(1)
-    got = torch.cat([policy(single)["action"] for single in singles]).view_as(wanted)
-    differ = ~torch.isclose(got, wanted.to(got.dtype), TOLERANCE, TOLERANCE)
-    if differ.any():
-        raise ValueError(
-            f"its export acts otherwise than itself: from step {differ.any(-1).any(0).int().argmax()} on the actions "
-            f"differ by up to {(got - wanted).abs().flatten(0, 1).amax(0).tolist()} (km, rad). The policy and its "
-            "transforms must depend on their in_keys at one step and of one vehicle only"
-        )
+    rest = content["first_state"], content["declares"]
+    return ExportedPolicy(content["in_keys"], TensorProgram(**content["program"]), view, *rest)

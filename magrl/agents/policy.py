@@ -16,8 +16,9 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
-from magrl.agents.exported import ExportedPolicy, TrainedPolicy, export_policy, rebuild
+from magrl.agents.exported import ExportedPolicy, TrainedPolicy, rebuild
 from magrl.agents.networks import Device, make_actor, make_correcting_actor
+from magrl.agents.pipeline import export_policy
 from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
 from magrl.checks import check_finite, check_type
 from magrl.files import DamagedFileError, load_tensors, save_tensors
@@ -102,7 +103,6 @@ class FieldPolicy(TrainedPolicy):
         self.act = config.view.action_transform()
         self.actor = config.make_actor().float() if actor is None else actor  # environments write float32
         self.state_keys = STATE_KEYS if config.memory_size else config.view.state_keys
-        self.state: TensorDictBase | None = None
 
     def adapted(self, **changes: Any) -> FieldPolicy:
         """Return the policy with other options of its view, such as ``search`` or ``step_price``; it shares weights.
@@ -131,18 +131,8 @@ class FieldPolicy(TrainedPolicy):
         observed = recall(seen.update(tensordict.select(*STD_KEYS, strict=False)), before, starts)
         action = self.actor(observed)["action"]
         state = (observed["next"] if self.config.memory_size else observed).select(*self.state_keys).detach()
-        begun = {"step": seen["step_count"].clone(), "starts": starts, "before": state if before is None else before}
-        self.state = state.clone(recurse=False).update(begun)
+        self._keep_state(seen, before, starts, state)
         return tensordict.set("action", self.act.denormalize("action", action))
-
-    def _state_before(self, seen: TensorDictBase) -> tuple[TensorDictBase | None, Tensor]:
-        """Return the state that a step begins with, and who starts anew ``(..., 1)``: both as in a call before it."""
-        held, starts = self.state, seen["step_count"] == 0
-        if held is None or held.shape != seen.shape or held.device != seen.device:
-            return None, torch.ones_like(starts)
-        again = held["step"] == seen["step_count"]
-        before = torch.where(again.squeeze(-1), held["before"], held.select(*self.state_keys))
-        return before, starts | (again & held["starts"])
 
     def _track(self, seen: TensorDictBase, state: TensorDictBase | None, starts: Tensor) -> TensorDictBase:
         """Return the observation after the last move."""

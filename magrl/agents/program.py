@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import operator
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr
 from typing import Any
@@ -23,11 +24,16 @@ Step = list[Any]
 """Name of an operation, positional arguments, named arguments."""
 PYTHON = {f.__name__: f for f in (operator.getitem, operator.add, operator.sub, operator.mul, operator.floordiv)}
 """Operations on lists of tensors and on sizes of batches."""
+RECURRENT = ("lstm.input", "gru.input")
+_WHOLE = (*RECURRENT, "lerp.Tensor", "hypot.default", "exp2.default", "linalg_vector_norm.default")
+WHOLE = {name: getattr(getattr(torch.ops.aten, name.split(".")[0]), name.split(".")[1]) for name in _WHOLE}
+"""Operations beside the core set. They are kept whole, because PyTorch rounds their parts otherwise."""
+_TRAIN = 6  # argument of recurrent layers that switches on dropout, which is random
 TEXTS = ("none", "floor", "trunc", "tanh")
 """Texts that operations may take: modes of a division and of a GELU."""
 _LAYOUT = ("layout", "pin_memory", "non_blocking")  # says nothing about values
 _TYPES = {"dtype": torch.dtype, "memory_format": torch.memory_format}
-_EXAMPLES = 3  # more than one: PyTorch traces a batch of one as a special case
+_EXAMPLES = 7  # not one, which PyTorch traces as a special case, and no usual size of a vector
 
 
 class TensorProgram(nn.Module):
@@ -99,7 +105,10 @@ def trace_program(module: nn.Module, inputs: Sequence[Tensor]) -> TensorProgram:
         (tensor([[2.]]),)
     """
     try:
-        exported = export_module(module, inputs).run_decompositions()
+        table = torch.export.default_decompositions()
+        for operation in WHOLE.values():
+            table.pop(operation, None)
+        exported = export_module(module, inputs).run_decompositions(table)
     except Exception as error:  # whatever torch.export and the module raise
         reason = str(error).strip().partition("\n")[0] or type(error).__name__
         raise ValueError(f"PyTorch cannot export it: {reason}") from error
@@ -125,7 +134,13 @@ def export_module(module: nn.Module, inputs: Sequence[Tensor]) -> torch.export.E
     Distribution.set_default_validate_args(False)
     try:
         # PyTorch prints the graph of what it cannot export, beside the error
-        with torch.no_grad(), set_interaction_type("deterministic"), redirect_stderr(io.StringIO()):
+        with (
+            torch.no_grad(),
+            set_interaction_type("deterministic"),
+            redirect_stderr(io.StringIO()),
+            warnings.catch_warnings(),
+        ):
+            warnings.filterwarnings("ignore", "The tensor attribute", UserWarning)  # of what a module keeps of its call
             shapes = {"inputs": tuple({0: batch} for _ in examples)}
             return torch.export.export(module, examples, dynamic_shapes=shapes, strict=False)
     finally:
@@ -143,16 +158,25 @@ def _program(exported: torch.export.ExportedProgram) -> TensorProgram:
         if node.name in needed:
             needed.update(source.name for source in node.all_input_nodes)
     sources = {spec.arg.name: spec.target for spec in signature.input_specs if spec.target and spec.arg.name in needed}
-    value = {name: index for index, name in enumerate((*signature.user_inputs, *sources))}
+    calls = [node for node in exported.graph.nodes if node.name in needed and node.op == "call_function"]
+    constant = {node.name: node.target(*node.args, **node.kwargs) for node in calls if _is_constant(node)}
+    value = {name: index for index, name in enumerate((*signature.user_inputs, *sources, *constant))}
     steps = []
-    for node in exported.graph.nodes:
-        if node.name in needed and node.op == "call_function":
+    for node in calls:
+        if node.name not in constant:
             named = {key: _plain(item, value) for key, item in node.kwargs.items() if key not in _LAYOUT}
             steps.append([_name(node.target), _plain(node.args, value), named])
             value[node.name] = len(value)
     held = exported.state_dict | exported.constants
-    tensors, outputs = [held[name] for name in sources.values()], [value[name] for name in signature.user_outputs]
+    tensors = [*(held[name] for name in sources.values()), *constant.values()]
+    outputs = [value[name] for name in signature.user_outputs]
     return TensorProgram(len(signature.user_inputs), steps, tensors, outputs)
+
+
+def _is_constant(node: torch.fx.Node) -> bool:
+    """Return whether a step outside the core set makes the same tensor in every call, such as ``triu_indices``."""
+    tags = getattr(node.target, "tags", (torch.Tag.core,))
+    return not node.all_input_nodes and not {torch.Tag.core, torch.Tag.nondeterministic_seeded} & set(tags)
 
 
 def _name(target: Any) -> str:
@@ -179,6 +203,8 @@ def _call(step: Any, known: int) -> Callable[[Sequence[Any]], Any]:
     if not isinstance(step, list) or [type(part) for part in step[1:]] != [list, dict]:
         raise ValueError(f"a step must be a name, arguments and named arguments, got {short(step)}")
     name, args, named = step
+    if name in RECURRENT and args[_TRAIN : _TRAIN + 1] != [False]:
+        raise ValueError(f"{name} with dropout draws random numbers")
     operation, arguments = _operation(name), _argument(args, known)
     options = {str(key): _argument(item, known) for key, item in named.items()}
     return lambda values: operation(*arguments(values), **{key: item(values) for key, item in options.items()})
@@ -192,6 +218,8 @@ def _operation(name: object) -> Callable[..., Any]:
     """
     if str(name) in PYTHON:
         return PYTHON[str(name)]
+    if str(name) in WHOLE:
+        return WHOLE[str(name)]
     family, _, overload = str(name).partition(".")
     packet = getattr(torch.ops.aten, family, None)
     if not isinstance(packet, torch._ops.OpOverloadPacket) or overload not in packet.overloads():

@@ -13,7 +13,6 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from magrl.agents import FieldPolicy
 from magrl.agents.exported import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
@@ -88,8 +87,8 @@ def evaluate(
         policy = make_navigator(policy, base, seed=seed, **sheet)
     elif isinstance(policy, TrainedPolicy):
         check_fits(policy, base)
-    if isinstance(policy, FieldPolicy | Navigator):
-        env = with_declaration(env, confidence)
+    if isinstance(policy, TrainedPolicy | Navigator):
+        env = with_declaration(env, confidence, policy)
     restart(env)
     episodes = [_next_episodes(env, policy) for _ in range(math.ceil(count / num_envs))]
     return torch.cat(episodes)[:count]  # a last batch that is not full has flown the first tasks again

@@ -147,7 +147,7 @@ def with_errors(
     return with_sensor_noise(env, errors, seed), {"sensor_std": tuple(errors), "bias_std": NO_NOISE}
 
 
-def with_declaration(env: EnvBase, confidence: float = 0.0) -> EnvBase:
+def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = None) -> EnvBase:
     """Return an environment in which navigators of two numbers declare their arrival, where it must be declared.
 
     They declare by a filter of their own track (:class:`~magrl.transforms.DeclareArrival`).
@@ -155,6 +155,7 @@ def with_declaration(env: EnvBase, confidence: float = 0.0) -> EnvBase:
     Args:
         env: navigation environment with all errors of the sensors.
         confidence: least probability of a right declaration at which they declare.
+        navigator: navigator; one with its own declaration (``declares``) needs no other.
 
     Example:
         >>> env = with_declaration(GeomagneticNavEnv(num_envs=2, arrival="declared", seed=0))
@@ -162,7 +163,7 @@ def with_declaration(env: EnvBase, confidence: float = 0.0) -> EnvBase:
         torch.Size([2, 2])
     """
     base: GeomagneticNavEnv = getattr(env, "base_env", env)
-    if not base.arrival.declared:
+    if not base.arrival.declared or getattr(navigator, "declares", False):
         return env
     told = STD_KEYS if STD_KEYS[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
     farthest = torch.tensor(base.scenario.distance_range_km).max().item()

@@ -39,8 +39,8 @@ class Estimator:
         self.state_keys = view.state_keys if isinstance(view, TrackView) else track.state_keys
         self.state: Any = None
 
-    def act(self, seen: TensorDictBase) -> tuple[float, float]:
-        """Return distance and turn.
+    def act(self, seen: TensorDictBase) -> list[float]:
+        """Return distance and turn, and of a policy that declares its arrival the declaration.
 
         Args:
             seen: public keys and standard deviations after a move, in a batch of one.
@@ -52,8 +52,7 @@ class Estimator:
             action = self.navigator.act.denormalize("action", self.navigator.actor(observed)["action"])
         else:
             action = self.navigator(seen)["action"]
-        distance, turn = action[0].tolist()
-        return distance, turn
+        return action[0].tolist()
 
     def decide(self, seen: TensorDictBase, steps_left: Tensor, radius_km: float) -> ArrivalDecision:
         """Return the decision about the arrival, in a batch of one; see :func:`magrl.tracking.arrival_decision`."""

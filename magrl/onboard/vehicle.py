@@ -288,26 +288,25 @@ class Onboard:
         seen |= {"step_count": torch.tensor([[self._step]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")
 
-    def _command(self, seen: TensorDictBase, action: tuple[float, float], course: float) -> Command:
+    def _command(self, seen: TensorDictBase, action: list[float], course: float) -> Command:
         """Return the command: to stop, to go to the estimated place where it is near, or what the navigator wants."""
         left = torch.tensor([self.max_steps - 1 - self._step])
         decision = self._estimator.decide(seen, left, self.arrival_km)
         way = decision.posterior.way()
         probability, radius = decision.probability.item(), decision.posterior.radius(self.confidence).item()
-        stop, reason = self._stop(way, decision, radius)
+        stop, reason = self._stop(way, decision, radius, declared=action[2:] > [0.0])
         if stop:
-            action = 0.0, 0.0
+            action = [0.0, 0.0]
         elif way.displacement.norm() < self.arrival_km:
             limits = self.arrival_km, self.max_move_km, math.radians(self.max_turn_deg)
-            distance, turn = tracking.approach(way.displacement, seen["heading"], *limits)[0].tolist()
-            action = distance, turn
+            action = tracking.approach(way.displacement, seen["heading"], *limits)[0].tolist()
         steer = math.degrees(course + action[1]) % 360.0
         north, east = way.displacement[0].tolist()
         (nn, ne), (en, ee) = way.covariance[0].tolist()
         estimates = (north, east), ((nn, ne), (en, ee)), probability, stop, reason, radius
         return Command(action[0], math.degrees(action[1]), steer, *estimates)
 
-    def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
+    def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float, declared: bool) -> tuple[str | None, str]:
         """Return why to stop, and that as a sentence."""
         if text := stuck(self._unchanged, self.max_move_km):
             return "lost", text
@@ -324,8 +323,9 @@ class Onboard:
         way_km, error_km = way.displacement.norm().item(), way.covariance[0].trace().sqrt().item()
         if self._estimator.trained and way_km - 2 * error_km > LONGEST_WAY_KM:
             return "out of range", f"the way is {way_km:.0f} ± {error_km:.0f} km, the policy's {LONGEST_WAY_KM:g} km"
+        wanted = ("arrived", "the policy declares its arrival") if declared else (None, "")
         if not decision.declare.item() or level > LOST_SURPRISE:
-            return None, ""
+            return wanted
         if decision.probability.item() >= self.confidence:
             within = f"within {self.arrival_km:g} km with an estimated probability of {decision.probability.item():.2f}"
             return "arrived", within
@@ -334,7 +334,7 @@ class Onboard:
             return "nearest", f"out of steps: {near}"
         if decision.attainable.item() < self.confidence:
             return "nearest", f"as near as these sensors allow: {near}"
-        return None, ""
+        return wanted
 
     def save(self, path: Path | str) -> None:
         """Write the state of the way to a file, for :meth:`restore`.

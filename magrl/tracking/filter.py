@@ -297,7 +297,7 @@ def _elements_first(values: Tensor, shape: torch.Size) -> Tensor:
 
 def _broadcast(shape: torch.Size, *others: tuple[int, ...]) -> torch.Size:
     """Return the shape ``(..., E)`` of all; torch.broadcast_shapes takes longer than ten sums of 1024 vehicles."""
-    return shape if all(x in (shape, shape[-1:]) for x in others) else torch.broadcast_shapes(shape, *others)
+    return shape if all(x == shape[-len(x) :] for x in others) else torch.broadcast_shapes(shape, *others)
 
 
 def _variance(sensor_std: PerElement, unit: Tensor) -> Tensor:

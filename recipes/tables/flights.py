@@ -61,7 +61,7 @@ def rollout(
     if isinstance(navigator, Mapping):
         options = {key: value for key, value in navigator.items() if key != "name"}
         navigator = make_navigator(navigator["name"], base, **sheet, **options)
-    return evaluation_rollout(with_declaration(env, confidence), navigator)
+    return evaluation_rollout(with_declaration(env, confidence, navigator), navigator)
 
 
 def earth_env(

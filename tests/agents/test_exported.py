@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
-from torchrl.envs import CatTensors, Compose, InitTracker, ObservationNorm, RewardSum, TransformedEnv
+from torchrl.envs import CatTensors, Compose, ObservationNorm, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
@@ -118,18 +118,31 @@ def squashed(x: torch.Tensor) -> torch.Tensor:
     return x[..., :2].sigmoid()
 
 
+class Counter(nn.Module):
+    """A module that counts its calls, which is a state outside the TensorDict."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros(1))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        self.count += 1
+        return squashed(x) / self.count
+
+
 @pytest.mark.parametrize(
     ("actor", "transforms", "message"),
     [
         (acting(squashed, "position"), [], "'position', which a vehicle that navigates by the field does not know"),
         (acting(squashed, "sonar"), [], "'sonar', which no transform writes; it may read field, target_field, move"),
-        (acting(lambda x: squashed(torch.cat((x, x), -1)), "is_init"), [InitTracker()], "'is_init', so it keeps a sta"),
+        (TensorDictModule(lambda x, m: (squashed(x + m), m), ["field", "m"], ["action", ("next", "m")]), [], "TensorD"),
+        (acting(Counter(), "field"), [], "it changes .*count as it acts"),
         (acting(lambda x: squashed(x + torch.rand_like(x)), "field"), [], "rand.* draws random numbers"),
         (acting(lambda x: squashed(x.sort(0)[0] / 9), "field"), [], "from step 0 on the actions differ by up"),
         (acting(lambda x: squashed(x) if x.sum() > 0 else squashed(-x), "field"), [], "PyTorch cannot export it: "),
         (acting(lambda x: torch.linalg.inv(x.unsqueeze(-1) @ x.unsqueeze(-2))[..., :2, 0], "field"), [], "linalg_inv"),
     ],
-    ids=["privileged", "unknown", "state", "random", "batch", "branch", "operation"],
+    ids=["privileged", "unknown", "first", "state", "random", "batch", "branch", "operation"],
 )
 def test_what_cannot_be_saved_is_refused_with_its_reason(actor, transforms, message: str, tmp_path: Path) -> None:
     base = GeomagneticNavEnv(num_envs=5, seed=3)
@@ -175,9 +188,9 @@ class Touch:
         (lambda c: c["program"]["tensors"].__setitem__(0, 5), "tensor 0 must be a Tensor, got 5"),
         (lambda c: c["program"].update(outputs=[10**6]), "outputs must be numbers of values"),
         (lambda c: c.update(in_keys=["position"]), "in_keys must be among field, target_field"),
-        (lambda c: c.update(in_keys=["field"]), "a program for 1 keys must take that many inputs"),
+        (lambda c: c.update(in_keys=["field"]), "a program for 1 keys and 0 tensors of state must take 1 inputs"),
         (lambda c: c.update(view={"field_low": 1}), "does not hold a valid policy"),
-        (lambda c: c.update(more=1), "an exported policy must hold exactly in_keys, program, view"),
+        (lambda c: c.update(more=1), "an exported policy must hold exactly declares, first_state, in_keys"),
     ],
 )
 def test_damaged_and_foreign_content_is_refused(saved: Path, tmp_path: Path, change, message: str) -> None:
