@@ -20,9 +20,10 @@ from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.transforms import ObservationView
 from magrl.transforms.track import STD_KEYS
 
-_EXAMPLES = {key: torch.zeros(1, size) for key, size in zip(PUBLIC_KEYS, (3, 3, 2, 1), strict=True)}
-_EXAMPLES |= {key: torch.zeros(1, 3) for key in STD_KEYS} | {"step_count": torch.zeros(1, 1, dtype=torch.int64)}
-READ_KEYS = tuple(_EXAMPLES)
+EXAMPLES = {key: torch.zeros(1, size) for key, size in zip(PUBLIC_KEYS, (3, 3, 2, 1), strict=True)}
+EXAMPLES |= {key: torch.zeros(1, 3) for key in STD_KEYS} | {"step_count": torch.zeros(1, 1, dtype=torch.int64)}
+"""A value of each key of the plain environment that a policy may read, for traces: ``(1, ...)`` zeros."""
+READ_KEYS = tuple(EXAMPLES)
 """Keys of the plain environment that an exported policy may read."""
 
 
@@ -160,7 +161,7 @@ class ExportedPolicy(TrainedPolicy):
         """
         if Path(path).suffix != ".pt2":
             raise ValueError(f"a file for torch.export.load must end with .pt2, got {str(path)!r}")
-        file, examples = io.BytesIO(), [_EXAMPLES[key] for key in self.in_keys]
+        file, examples = io.BytesIO(), [EXAMPLES[key] for key in self.in_keys]
         if self.first_state:
             examples = [torch.ones(1, 1, dtype=torch.bool), *examples, *self.first_state]
         torch.export.save(export_module(copy.deepcopy(self.program).cpu(), examples), file)

@@ -64,7 +64,7 @@ def export_policy(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
     base = getattr(env, "base_env", env)
     check_type(GeomagneticNavEnv, env=base)
     try:
-        return _exported(_copied(actor).to("cpu").eval(), copy.deepcopy(env).to("cpu"))
+        return _exported(copied(actor).to("cpu").eval(), copy.deepcopy(env).to("cpu"))
     except (ValueError, FloatingPointError) as error:
         raise ValueError(f"the policy cannot be exported: {error}") from error
 
@@ -78,7 +78,17 @@ class _Values(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-def _copied(actor: TensorDictModuleBase) -> TensorDictModuleBase:
+def copied(actor: TensorDictModuleBase) -> TensorDictModuleBase:
+    """Return a copy of a policy.
+
+    Raises:
+        ValueError: for a policy that cannot be copied, with the reason.
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule
+        >>> copied(TensorDictModule(nn.Identity(), ["move"], ["action"])).in_keys
+        ['move']
+    """
     try:
         with _Values():
             return copy.deepcopy(actor)

@@ -17,8 +17,10 @@ from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.exported import ExportedPolicy, TrainedPolicy, rebuild
+from magrl.agents.network import Network, trace_network
 from magrl.agents.networks import Device, make_actor, make_correcting_actor
 from magrl.agents.pipeline import export_policy
+from magrl.agents.program import TensorProgram
 from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
 from magrl.checks import check_finite, check_type
 from magrl.files import DamagedFileError, load_tensors, save_tensors
@@ -36,13 +38,13 @@ class PolicyConfig:
 
     Args:
         view: what the policy observes, and its scaling: values scaled to a region, or estimates of its own track.
-        num_cells: width of each hidden layer.
+        num_cells: width of each hidden layer; None for a network of one's own.
         layer_norm: whether hidden layers are normalized.
         memory_size: width of the LSTM; 0 for a policy without memory.
 
     Raises:
         TypeError: for a view of another type.
-        ValueError: for widths that are not positive whole numbers.
+        ValueError: for widths that are not positive whole numbers, or a memory in a network of one's own.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -52,16 +54,28 @@ class PolicyConfig:
     """
 
     view: ObservationView | TrackView
-    num_cells: tuple[int, ...]
+    num_cells: tuple[int, ...] | None = None
     layer_norm: bool = True
     memory_size: int = 0
 
     def __post_init__(self) -> None:
         check_type(ObservationView if self.memory_size else (ObservationView, TrackView), view=self.view)
-        self.make_actor("meta")  # checks the sizes
+        if self.num_cells is not None:
+            self.make_actor("meta")  # checks the sizes
+        elif self.memory_size:
+            raise ValueError(
+                f"memory_size {self.memory_size} needs num_cells: export a network of your own with a memory by "
+                "save_policy(path, actor, env)"
+            )
 
     def make_actor(self, device: Device = None) -> TensorDictSequential:
-        """Return an actor of this shape, with new weights."""
+        """Return an actor of this shape, with new weights.
+
+        Raises:
+            ValueError: for a network of one's own.
+        """
+        if self.num_cells is None:
+            raise ValueError("num_cells must be given, or the actor: FieldPolicy(PolicyConfig(view), actor)")
         if isinstance(self.view, ObservationView) and self.memory_size:
             shape = self.view, self.num_cells, self.memory_size
             return make_recurrent_actor(*shape, layer_norm=self.layer_norm, device=device)
@@ -81,10 +95,12 @@ class FieldPolicy(TrainedPolicy):
 
     Args:
         config: what the policy observes, and the shape of its network.
-        actor: trained actor of that shape; one with new weights by default.
+        actor: trained actor of that shape; one with new weights by default. With a network of one's own: a module
+            without a state from what the view writes to ``action`` ``(N, 2)`` in [-1, 1].
 
     Raises:
         TypeError: for a configuration of another type.
+        ValueError: for a configuration without ``num_cells`` and without an actor.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -94,7 +110,7 @@ class FieldPolicy(TrainedPolicy):
         torch.Size([2, 2, 2])
     """
 
-    def __init__(self, config: PolicyConfig, actor: TensorDictSequential | None = None) -> None:
+    def __init__(self, config: PolicyConfig, actor: TensorDictModuleBase | None = None) -> None:
         super().__init__()
         check_type(PolicyConfig, config=config)
         self.config, self.view = config, config.view
@@ -187,7 +203,10 @@ def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | N
     if isinstance(policy, ExportedPolicy):
         save_tensors({"format": POLICY_FORMAT, "exported": policy.content()}, Path(path))
         return
-    weights = {key: value.cpu() for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
+    if policy.config.num_cells is None:
+        weights = trace_network(policy.actor, policy.view).content()
+    else:
+        weights = {key: value.cpu() for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
     kind = next(name for name, view in VIEWS.items() if isinstance(policy.config.view, view))
     config = asdict(policy.config) | {"kind": kind}
     save_tensors({"format": POLICY_FORMAT, "config": config, "weights": weights}, Path(path))
@@ -238,6 +257,8 @@ def _rebuild(config: Any, weights: Any, name: str) -> FieldPolicy:
     if set(config) != names or kind not in VIEWS or not isinstance(weights, dict):
         raise ValueError(f"the configuration of a policy must hold exactly {sorted(names)} and a kind of {list(VIEWS)}")
     rebuilt = PolicyConfig(**{**config, "view": VIEWS[kind](**config["view"])})
+    if rebuilt.num_cells is None:
+        return FieldPolicy(rebuilt, Network(weights.get("in_keys", []), TensorProgram(**weights.get("program", {}))))
     check_finite(weights.items(), name)
     # Before anything is allocated: a few bytes may ask for any number of cells
     shapes = {key: tuple(value.shape) for key, value in rebuilt.make_actor("meta").state_dict().items()}

@@ -111,7 +111,7 @@ class VehicleStep(nn.Module):
         state = {"track_mean": mean, "track_covariance": covariance, "first_field": first_field}
         before = TensorDict({key: value.unsqueeze(0) for key, value in state.items()}, [1])
         started, moved = self.observe(seen.copy()), self.observe(before.set("next", seen.copy()))["next"]
-        observed = "observation", "planned_move"
+        observed = tuple(self.actor.in_keys)
         kept = *observed, "way", "way_covariance", *state
         now = {key: torch.where(step == 0, started[key], moved[key]) for key in kept}
         action = self.actor(TensorDict({key: now[key] for key in observed}, [1]))["action"]
