@@ -39,6 +39,7 @@ BUDGET = {
     "total_frames = 60_000": "total_frames = 128",
     "= 512, 1024, 8": "= 64, 64, 1",
     "= 400_000, 500": "= 16_384, 4",
+    "= 100_000, 1024, 1000": "= 128, 4, 2",
 }
 BUDGET |= {'(navigator, "paper-100")': '(navigator, "figure-4-1")', "random_tasks(100, ": "random_tasks(2, "}
 """Numbers of frames and tasks in examples, and those of their tests."""
