@@ -53,7 +53,8 @@ def outcome() -> Callable:
     def read(folder: Path) -> tuple[list[dict[str, str]], dict[str, torch.Tensor]]:
         with (folder / "train.csv").open() as file:
             rows = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
-        weights = load_policy(folder / "policy.pt").actor.state_dict()
+        policy = load_policy(folder / "policy.pt")
+        weights = getattr(policy, "actor", policy).state_dict()
         return rows, {key: value for key, value in weights.items() if isinstance(value, torch.Tensor)}
 
     return read

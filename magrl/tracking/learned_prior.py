@@ -16,7 +16,7 @@ from typing_extensions import Self
 from magrl.checks import check_number, check_tensor
 from magrl.field.elements import element_difference
 from magrl.tracking.filter import GradientPrior
-from magrl.tracking.priors import DIPOLE_STD_NT, _per_nanotesla, dipole_prior
+from magrl.tracking.priors import DIPOLE_STD_NT, dipole_prior, per_nanotesla
 
 FILE = Path(__file__).with_suffix(".pt")
 """Weights of :meth:`LearnedPrior.pretrained`."""
@@ -109,7 +109,7 @@ class LearnedPrior(nn.Module):
     def _unit(reading: Tensor) -> Tensor:
         """Return the standard deviations ``(..., 3, 2)`` of a dipole's gradients, the units of the network."""
         std = torch.tensor(DIPOLE_STD_NT, dtype=reading.dtype, device=reading.device) / 100
-        return std * _per_nanotesla(reading).unsqueeze(-1)
+        return std * per_nanotesla(reading).unsqueeze(-1)
 
 
 def features(reading: Tensor, target: Tensor) -> Tensor:
@@ -122,7 +122,7 @@ def features(reading: Tensor, target: Tensor) -> Tensor:
     check_tensor(3, reading=reading, target=target)
     declination, inclination = torch.deg2rad(reading[..., :2]).unbind(-1)
     strengths = torch.stack((reading[..., 2], reading[..., 2] / torch.cos(inclination).clamp_min(1e-3)), -1)
-    difference = element_difference(target, reading) / _per_nanotesla(reading) / _DIFFERENCE_NT
+    difference = element_difference(target, reading) / per_nanotesla(reading) / _DIFFERENCE_NT
     angles = (torch.sin(inclination), torch.cos(inclination), torch.sin(declination), torch.cos(declination))
     strengths = (strengths - strengths.new_tensor(_FIELD_NT)) / strengths.new_tensor(_FIELD_RANGE_NT)
     found = torch.cat((torch.stack(angles, -1), strengths, difference, difference.abs()), -1)

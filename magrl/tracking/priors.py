@@ -55,7 +55,7 @@ def dipole_prior(reading: Tensor, target: Tensor | None = None) -> GradientPrior
     slopes = torch.stack((torch.zeros_like(dip_slope), dip_slope, strength_slope), -1)
     northward = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
     std = torch.tensor(DIPOLE_STD_NT, dtype=slopes.dtype, device=slopes.device) / 100
-    std = std * _per_nanotesla(reading).unsqueeze(-1)
+    std = std * per_nanotesla(reading).unsqueeze(-1)
     return GradientPrior(slopes.unsqueeze(-1) * northward.unsqueeze(-2), std, azimuth)
 
 
@@ -73,10 +73,10 @@ def field_curvature(elements: Tensor) -> Tensor:
         tensor([0.0240, 0.0170, 8.5000])
     """
     check_tensor(3, elements=elements)
-    return torch.tensor(CURVATURE_NT, dtype=elements.dtype, device=elements.device) * _per_nanotesla(elements)
+    return torch.tensor(CURVATURE_NT, dtype=elements.dtype, device=elements.device) * per_nanotesla(elements)
 
 
-def _per_nanotesla(elements: Tensor) -> Tensor:
+def per_nanotesla(elements: Tensor) -> Tensor:
     """Return the change of D, I [deg] and B_H [nT] ``(..., 3)`` by a disturbance of 1 nT, above 0 for any reading."""
     strength = elements[..., 2].clamp_min(_LEAST_NT)
     declination = math.degrees(1) / strength

@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
@@ -162,7 +163,7 @@ class Run:
     def start(
         self,
         *,
-        policy: FieldPolicy,
+        policy: TensorDictModuleBase,
         validation: EnvBase,
         env: GeomagneticNavEnv,
         collector: BaseCollector,
@@ -171,7 +172,7 @@ class Run:
         """Take the parts of the training, and restore them from the newest checkpoint of a run that is resumed.
 
         Args:
-            policy: agent as a navigator, for evaluations.
+            policy: agent for evaluations: a navigator, or any module that acts in ``validation`` and can be exported.
             validation: environment of the validation tasks.
             env: environment inside the collector; with several collectors, each has its own.
             collector: source of batches.
@@ -181,6 +182,7 @@ class Run:
             UsageError: if no checkpoint can be read, or it is of other settings.
         """
         self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
+        self._network = policy.actor if isinstance(policy, FieldPolicy) else policy
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
         parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}
         if isinstance(collector, Collector):  # other processes start new episodes
@@ -256,7 +258,7 @@ class Run:
         episodes = episode_measures(evaluation_rollout(self.validation, self.policy))
         summary = summarize(episodes)
         score = selection_score(summary["spl"], episodes["success"], episodes["steps"], self.validation.max_steps)
-        self.best.offer(score, self.policy.actor)
+        self.best.offer(score, self._network)
         row = self.statistics.row() | {"seconds": self.log.seconds}
         self.log.row(row | {f"eval_{key}": summary[key] for key in EVALUATED})
         earned = f"{row['return']:.0f}" if math.isfinite(row["return"]) else "not known yet"
@@ -279,8 +281,8 @@ class Run:
         from magrl.evaluation import figures, maps  # matplotlib is slow to import, and collecting processes do without
 
         seconds = self.log.seconds
-        self.policy.actor.load_state_dict(self.best.weights or self.policy.actor.state_dict())
-        save_policy(self.folder / "policy.pt", self.policy)
+        self._network.load_state_dict(self.best.weights or self._network.state_dict())
+        save_policy(self.folder / "policy.pt", self.policy, self.validation)
         if self.log.rows:
             self.log.figure("training", figures.training_figure(self.log.rows))
         if not self.complete:

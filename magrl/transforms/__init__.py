@@ -29,6 +29,7 @@ from magrl.transforms.errors.sensors import SensorErrors as SensorErrors
 from magrl.transforms.errors.vector import VectorErrors as VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H as SPEEDS_KM_H
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
+from magrl.transforms.readings import ReadingObservation as ReadingObservation
 from magrl.transforms.rewards import DistanceCost as DistanceCost
 from magrl.transforms.rewards import HighestSPL as HighestSPL
 from magrl.transforms.rewards import ProgressReward as ProgressReward

@@ -13,7 +13,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_pretrain
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import NAVIGATORS
-from magrl.transforms import CONDITIONS, TRUE_KEYS
+from magrl.transforms import CONDITIONS, TRUE_KEYS, ReadingObservation
 
 ORACLES = {"parallel", "geodesic"}
 METAHEURISTICS = {"ga", "pso", "afsa"}  # oracles but in the mode "flown"
@@ -80,11 +80,13 @@ def written(transforms: list[Transform], states: list[TensorDict]) -> list[Tenso
     return found
 
 
-@pytest.mark.parametrize("kind", ["view", "track", "errors"])
+@pytest.mark.parametrize("kind", ["view", "track", "readings", "errors"])
 def test_observations_do_not_depend_on_private_keys(kind: str, states: list[TensorDict]) -> None:
-    """Those of both views, with all that they carry along, and the standard deviations that a vehicle is told."""
+    """Those of the views, with all that they carry along, and the standard deviations that a vehicle is told."""
 
     def transforms() -> list[Transform]:
+        if kind == "readings":
+            return [ReadingObservation()]
         views = {"view": base_env().observation_view(), "track": load_pretrained("anywhere").config.view}
         return CONDITION.transforms(1) if kind == "errors" else views[kind].observation_transforms()
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import ppo
 import ppo_anywhere
+import ppo_recurrent
 import pytest
 import td3_gradient_guided as recipe
 import td3_recurrent
@@ -26,7 +27,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.training import command, parse_config
 from magrl.transforms import SensorNoise
 
-RECIPES = (recipe, ppo_anywhere, td3_recurrent, ppo)
+RECIPES = (recipe, ppo_anywhere, td3_recurrent, ppo_recurrent, ppo)
 NOISE = (0.05, 0.05, 5.0)
 
 

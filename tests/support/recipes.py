@@ -31,6 +31,8 @@ SMALL = {
     "epochs": 1,
     "steps_per_batch": 2,
     "critic_batches": 1,
+    "memory_batches": 1,
+    "sequences_per_update": 8,
     "num_slices": 4,
     "memory_size": 8,
     "num_regions": 8,

@@ -30,6 +30,7 @@ from magrl.transforms import (
     ProgressReward,
     RandomSensorNoise,
     RandomStepPrice,
+    ReadingObservation,
     SensorErrors,
     SensorNoise,
     SPLReward,
@@ -83,7 +84,9 @@ ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     "guided": (nav, guided),
     "rewarded": (
         nav,
-        lambda: Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward(), ProgressReward(2.0)),
+        lambda: Compose(
+            ReadingObservation(), RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward(), ProgressReward(2.0)
+        ),
     ),
     "every error": (nav, every_error),
     "plane": (partial(PlaneEnv, (3,), torch.float64), of_a_plane),

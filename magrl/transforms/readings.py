@@ -1,0 +1,74 @@
+"""What a vehicle reads and does at each step: the observation of policies with a memory of their own."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from magrl.field.elements import element_difference
+from magrl.tracking.learned_prior import features
+from magrl.tracking.priors import per_nanotesla
+from magrl.transforms.base import StatefulTransform
+
+_MOVE_KM = 50.0
+_LEAST_MOVE_KM = 0.5
+_DIFFERENCE_NT = 2000.0
+_RATE = 1.25  # unit of a change [nT/km]
+
+
+class ReadingObservation(StatefulTransform):
+    """Write the reading, the last move and the change of the reading along it, scaled; nothing is estimated.
+
+    A single observation does not hold the direction to the destination: a policy needs a memory, such as TorchRL's
+    :class:`~torchrl.modules.GRUModule`. Directions are from true north. The state is the reading before the step.
+
+    Args:
+        in_keys: reading and target ``(..., 3)``: D [deg], I [deg], B_H [nT]; last move ``(..., 2)`` with the distance
+            [km] first; heading ``(..., 1)`` [rad].
+        out_keys: one observation ``(..., 20)``: reading and remaining differences (:func:`magrl.tracking.features`,
+            12), the change of D, I, B_H per kilometer of the last move (3), how far along it the differences would be
+            least, and how well it fits them (2), cosine and sine of the heading, and the distance of the move.
+
+    Raises:
+        ValueError: for another number of keys.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from torchrl.envs import TransformedEnv
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), ReadingObservation())
+        >>> env.rollout(3)["observation"].shape
+        torch.Size([2, 3, 20])
+    """
+
+    default_in_keys = ("field", "target_field", "move", "heading")
+    default_out_keys = ("observation",)
+    out_sizes = ((20,),)
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it: the reading."""
+        return self.in_keys[:1]
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        self._advance(tensordict, values, values[:1])
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        (reading, target, move, heading), (before,) = values, state
+        moved = move[..., :1]
+        unit = per_nanotesla(reading)
+        left = element_difference(target, reading) / unit / _DIFFERENCE_NT
+        rate = element_difference(reading, before) / unit / moved.clamp_min(_LEAST_MOVE_KM) / _RATE
+        along, steep, far = ((a * b).sum(-1, keepdim=True) for a, b in ((left, rate), (rate, rate), (left, left)))
+        fit = along / (steep * far + 1e-6).sqrt()
+        observed = (
+            features(reading, target),
+            torch.asinh(rate),
+            torch.asinh(4 * along / (steep + 1e-2)),
+            fit,
+            torch.cos(heading),
+            torch.sin(heading),
+            moved / _MOVE_KM,
+        )
+        tensordict.set(self.out_keys[0], torch.cat(observed, -1))

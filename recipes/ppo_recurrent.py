@@ -1,0 +1,286 @@
+"""Recurrent PPO on raw readings: train an agent without a map and without a filter.
+
+    python recipes/ppo_recurrent.py                          # ten million steps
+    python recipes/ppo_recurrent.py --total-frames 2000000   # two million
+    python recipes/ppo_recurrent.py --resume RUN             # resume an interrupted run exactly
+
+The agent reads what its sensors measure and what it does, step by step, and estimates the way to the destination with a
+gated recurrent unit (GRU). In training alone, that estimate is compared with the true way. PPO learns the moves, given
+the memory, as corrections of those along the estimate. It trains on random planets as ppo_anywhere.py does, whose agent
+is given a Kalman filter: the difference between the two is what the filter is worth.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from ppo_anywhere import Spread, errors, evaluation_env
+from pydantic import model_validator
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torch.optim import Adam
+from torchrl.envs import Compose, EnvBase, InitTracker, ObservationNorm, RewardSum, TransformedEnv
+from torchrl.modules import GRUModule, IndependentNormal, ProbabilisticActor, ValueOperator, set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from magrl import paper
+from magrl.agents import optimize
+from magrl.agents.networks import make_mlp
+from magrl.envs import GeomagneticNavEnv, earth_scenario, planet_scenario
+from magrl.geodesy import steer
+from magrl.training import Run, command, parse_config
+from magrl.training.collectors import make_collector
+from magrl.training.config import Count, Discount, NonNegative, Positive, Rising, Share, VehicleConfig, Widths
+from magrl.transforms import HighestSPL, MinMaxNorm, RandomStepPrice, ReadingObservation, SPLReward, TrueWay
+
+RECIPE = "ppo_recurrent.py"
+LOSSES = ("loss_way", "loss_critic", "loss_actor")
+REMEMBERED = ("observation", "hidden", "is_init", "true_way", "heading")
+BELIEF = ("memory", "observation", "way_estimate")
+JUDGED = ("observation", "true_way_scaled", "highest_spl")
+TRANSITION = (
+    *dict.fromkeys((*BELIEF, *JUDGED)),
+    "correction",
+    "correction_log_prob",
+    *(("next", k) for k in (*JUDGED, "reward", "done", "terminated")),
+)
+
+
+class Config(VehicleConfig):
+    """Settings of a training."""
+
+    # Own defaults of shared settings
+    total_frames: Count = 9_994_240
+    num_envs: Count = 1024
+    eval_every: Count = 10
+    num_cells: Widths = (128,)
+    gamma: Discount = 0.99
+    learning_rate: Positive = 3e-4
+    final_learning_rate: Positive = 1e-5
+
+    # Environment
+    num_regions: Count = 1024
+    """Number of training regions, two on each random planet."""
+    distance_range_km: Rising = (300.0, 500.0)
+    """Shortest and longest distance of a task [km]."""
+    max_steps: Count = 50
+    """Moves after which an episode is truncated."""
+    noise_exponent: Positive = 1.0
+    """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
+    step_price: Positive = 0.5
+    """Price of a step [% of SPL]."""
+
+    # Memory
+    memory_size: Count = 128
+    """Width of the GRU."""
+    sequences_per_update: Count = 128
+    """Sequences per gradient step of the memory."""
+    memory_batches: Count = 20
+    """Collected batches before the first update of the moves: until then, the vehicle moves along its estimate."""
+    memory_learning_rate: Positive = 1e-3
+    """Learning rate of the memory at the start."""
+    final_memory_learning_rate: Positive = 3e-5
+    """Learning rate of the memory at the end; linear in between."""
+
+    # PPO
+    critic_cells: Widths = (256, 256)
+    """Width of each hidden layer of the critic."""
+    steps_per_batch: Count = 32
+    """Steps of each vehicle in a collected batch."""
+    epochs: Count = 2
+    """Passes over a collected batch."""
+    batch_size: Count = 4096
+    """Transitions per gradient step."""
+    gae_lambda: Share = 0.95
+    """Factor lambda of the generalized advantage estimate."""
+    clip_epsilon: Positive = 0.2
+    """Largest change of the probability ratio that is rewarded."""
+    exploration: Positive = 0.3
+    """Standard deviation of the correction at the start of the training, in units of the longest move."""
+    final_exploration: Positive = 0.15
+    """Standard deviation of the correction at its end; linear in between."""
+    critic_learning_rate: Positive = 1e-3
+    """Learning rate of the critic at the start."""
+    final_critic_learning_rate: Positive = 3e-5
+    """Learning rate of the critic at the end; linear in between."""
+    clip_gradient: NonNegative = 1.0
+    """Largest norm of the gradients."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> Config:
+        if self.scenario is not None:
+            raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
+        return self
+
+    @property
+    def regions(self) -> dict[str, Any]:
+        """Options of the regions, and how far a move leads."""
+        reach_km = self.max_move_km + self.limits["drift_km"]
+        return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, "max_latitude": 70}
+
+
+class Command(nn.Module):
+    """The action, scaled to [-1, 1], of a correction of the move along the estimate."""
+
+    def __init__(self, max_move_km: float, max_turn_rad: float) -> None:
+        super().__init__()
+        self.limits = max_move_km, max_turn_rad
+
+    def forward(self, estimate: Tensor, correction: Tensor, heading: Tensor) -> Tensor:
+        """``(..., 2)`` northward and eastward, in units of the longest move, and heading ``(..., 1)`` [rad]."""
+        north, east = (estimate + correction).unbind(-1)
+        wanted = torch.atan2(east, north), self.limits[0] * torch.hypot(north, east)
+        distance, turn = steer(heading.squeeze(-1), *wanted, *self.limits)
+        return torch.stack((2 * distance / self.limits[0] - 1, turn / self.limits[1]), -1)
+
+
+def make_memory(size: int, config: Config) -> TensorDictSequential:
+    """Return the network from readings to what is remembered of them and the estimate of the way, ``(..., 2)``.
+
+    The estimate is northward and eastward, and 1 long where the destination is farther than the longest move. It is
+    shorter where the direction is not known well, so that the vehicle starts with short moves.
+    """
+    width, device = config.memory_size, config.device
+    encoder = nn.Sequential(nn.Linear(size, width, device=device), nn.SiLU())
+    keys = {"in_keys": ["encoded", "hidden"], "out_keys": ["memory", ("next", "hidden")]}
+    head = make_mlp(width + size, 2, config.num_cells, layer_norm=True, device=device)
+    return TensorDictSequential(
+        TensorDictModule(encoder, ["observation"], ["encoded"]),
+        GRUModule(input_size=width, hidden_size=width, device=device, **keys),
+        TensorDictModule(head, ["memory", "observation"], ["way_estimate"]),
+    )
+
+
+def make_correction(size: int, spread: Spread, config: Config) -> ProbabilisticActor:
+    """Return the policy of PPO: normal corrections of the estimate, given the memory, at first around zero."""
+    mean = make_mlp(config.memory_size + size + 2, 2, config.num_cells, layer_norm=True, device=config.device)
+    for parameter in mean[-1].parameters():
+        nn.init.zeros_(parameter)
+    return ProbabilisticActor(
+        TensorDictSequential(
+            TensorDictModule(mean, list(BELIEF), ["mean"]), TensorDictModule(spread, ["mean"], ["loc", "scale"])
+        ),
+        in_keys=["loc", "scale"],
+        out_keys=["correction"],
+        distribution_class=IndependentNormal,
+        distribution_kwargs={"tanh_loc": False},
+        return_log_prob=True,
+    )
+
+
+def with_view(env: EnvBase, memory: TensorDictSequential) -> TransformedEnv:
+    """Add what the agent observes, its first state, and the scaling of its action."""
+    view = [InitTracker(), memory[1].make_tensordict_primer(), ReadingObservation(), MinMaxNorm(in_keys_inv=["action"])]
+    return TransformedEnv(env, Compose(*view), auto_unwrap=True)
+
+
+def make_env(base: GeomagneticNavEnv, memory: TensorDictSequential, config: Config) -> TransformedEnv:
+    """Add the sensors, the agent's view, and for training only what is privileged: critic, estimate and reward."""
+    price = RandomStepPrice((config.step_price, config.step_price), seed=base.seed)
+    scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
+    way, move, *others = HighestSPL.default_in_keys
+    highest = HighestSPL([way, "true_move" if config.drift else move, *others])
+    privileged = [price, TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
+    return with_view(TransformedEnv(base, Compose(*errors(config, base.seed), *privileged)), memory)
+
+
+def loss_way(sequences: TensorDictBase, memory: TensorDictSequential, max_move_km: float) -> Tensor:
+    """Return the mean squared error of the estimates of the way along sequences ``(N, T)``."""
+    with set_recurrent_mode(True):
+        memory(sequences)
+    forward, right = sequences["true_way"].unbind(-1)
+    cos, sin = torch.cos(sequences["heading"]).squeeze(-1), torch.sin(sequences["heading"]).squeeze(-1)
+    way = torch.stack((forward * cos - right * sin, forward * sin + right * cos), -1)
+    wanted = way / way.norm(dim=-1, keepdim=True).clamp_min(max_move_km)
+    return (sequences["way_estimate"] - wanted).square().sum(-1).mean()
+
+
+def train(config: Config) -> dict[str, float]:
+    """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
+    torch.manual_seed(config.seed)
+    with Run(config, recipe=RECIPE, name="ppo_recurrent", losses=LOSSES) as run:
+        # Environments
+        options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": "random"}
+        options |= {"device": config.device, **config.limits}
+        planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
+        base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
+        others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)
+        earth = earth_scenario(128, seed=paper.TEST_SEED, **config.regions)
+        tasks = (others, config.eval_tasks_small, paper.VALIDATION_SEED), (earth, config.eval_tasks, paper.TEST_SEED)
+
+        # Networks: the critic reads the true way and the SPL that can still be reached, the actor never does
+        size = ReadingObservation.out_sizes[0][0]
+        spread = Spread(config.exploration).to(base.device)
+        memory, correction = make_memory(size, config), make_correction(size, spread, config)
+        limits = Command(base.max_move_km, base.max_turn_rad)
+        command_keys = ["way_estimate", "correction", "heading"]
+        actor = TensorDictSequential(memory, correction, TensorDictModule(limits, command_keys, ["action"]))
+        value = make_mlp(size + 3, 1, config.critic_cells, layer_norm=True, device=base.device)
+        critic = ValueOperator(value, in_keys=list(JUDGED))
+        validation, test = (with_view(evaluation_env(*each, config, **options), memory) for each in tasks)
+
+        # Advantages and loss with a clipped probability ratio
+        advantage = GAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=critic, deactivate_vmap=True)
+        loss = ClipPPOLoss(
+            correction,
+            critic,
+            clip_epsilon=config.clip_epsilon,
+            entropy_bonus=False,
+            normalize_advantage=True,
+            loss_critic_type="smooth_l1",
+        )
+        loss.set_keys(action="correction", sample_log_prob="correction_log_prob")
+        weights = [list(module.parameters()) for module in (memory, correction, critic)]
+        rates = ("memory_learning_rate", "learning_rate", "critic_learning_rate")
+        optimizers = [Adam(each, lr=0.0, fused=True) for each in weights]
+
+        frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
+        env = make_env(base, memory, config)
+        run.start(
+            policy=actor,
+            validation=validation,
+            env=base,
+            collector=make_collector(env, actor, **frames),
+            memory=memory,
+            loss=loss,
+            spread=spread,
+            **dict(zip(("memory_optimizer", "actor_optimizer", "critic_optimizer"), optimizers, strict=True)),
+        )
+        stats = run.statistics
+        for batch in run.batches():
+            spread.std.fill_(config.linear("exploration", run.remaining))
+            for optimizer, rate in zip(optimizers, rates, strict=True):
+                optimizer.param_groups[0]["lr"] = config.linear(rate, run.remaining)
+            if stats.iterations <= config.memory_batches:
+                optimizers[1].param_groups[0]["lr"] = 0.0
+            for _ in range(config.epochs):
+                with torch.no_grad():
+                    transitions = advantage(batch.select(*TRANSITION)).reshape(-1)
+                for rows in torch.randperm(len(batch), device=base.device).split(config.sequences_per_update):
+                    error = loss_way(batch[rows].select(*REMEMBERED), memory, base.max_move_km)
+                    optimize(error, optimizers[0], clip=weights[0], max_norm=config.clip_gradient)
+                for rows in torch.randperm(len(transitions), device=base.device).split(config.batch_size):
+                    losses = loss(transitions[rows])  # given the memory, as it was when the moves were made
+                    total = losses["loss_objective"] + losses["loss_critic"]
+                    optimize(total, *optimizers[1:], clip=weights[1], max_norm=config.clip_gradient)
+                    stats.updates += 1
+            found = error, losses["loss_critic"], losses["loss_objective"]
+            stats.losses = dict(zip(LOSSES, found, strict=True))
+        return run.finish(test)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line and train."""
+    train(parse_config(Config, {"default": Config()}, RECIPE, __doc__, args))
+
+
+if __name__ == "__main__":
+    command(RECIPE, main)
