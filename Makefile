@@ -62,11 +62,13 @@ RUNS_noise := $(GUIDED) $(addprefix td3_gradient_guided-fast-noise-0.05-0.05-5-s
 RUNS_seeds := $(GUIDED) $(addprefix td3_gradient_guided-fast-seed,$(FIVE))
 RUNS_own-world := $(addprefix td3_gradient_guided-fast-azores-seed,$(FIVE))
 RUNS_algorithms := $(GUIDED) $(addprefix ppo-seed,$(FIVE))
+RUNS_sequences := $(foreach name,ppo_recurrent ppo_recurrent-short,$(addprefix $(name)-seed,0 1 2))
+RUNS_sequences-learning := $(RUNS_sequences)
 RUNS_paper-run := $(WHOLE)
 RUNS_paper-run-100 := $(WHOLE)
 RUNS_paper-run-1000 := $(WHOLE)
 TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' recipes/tables/tables.toml)
-FIGURES ?= section-4 learning noise conditions globe paper-run
+FIGURES ?= section-4 learning sequences noise conditions globe paper-run
 needed = $(VENV)/.installed $(sort $(foreach name,$(1),$(RUNS_$(name):%=runs/%/eval.json)))
 
 tables: $(call needed,$(TABLES))  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
@@ -95,6 +97,8 @@ $(eval $(call training,td3_gradient_guided-paper,1,td3_gradient_guided.py --pres
 $(eval $(call training,td3-paper,1,td3_gradient_guided.py --preset td3-paper --precision bfloat16))
 $(eval $(call training,td3_recurrent,1,td3_recurrent.py))
 $(eval $(call training,ppo,1,ppo.py))
+$(eval $(call training,ppo_recurrent,1,ppo_recurrent.py))
+$(eval $(call training,ppo_recurrent-short,1,ppo_recurrent.py --total-frames 1998848))
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## /  \1\t/p' $(MAKEFILE_LIST) | expand -t 14

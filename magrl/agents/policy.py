@@ -30,6 +30,7 @@ from magrl.transforms.track import STD_KEYS
 POLICY_FORMAT = 2
 VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}
 """What policies observe, by the kind that their files name."""
+LIMITS = ("max_move_km", "max_turn_rad")
 
 
 @dataclass(frozen=True)
@@ -128,13 +129,22 @@ class FieldPolicy(TrainedPolicy):
 
         Raises:
             TypeError: for an option that the view does not have.
+            ValueError: for another longest move or largest turn, where the policy does not correct a plan.
 
         Example:
             >>> from magrl.agents import load_pretrained
             >>> load_pretrained("anywhere").adapted(step_price=1.0).config.view.step_price
             1.0
         """
-        return FieldPolicy(replace(self.config, view=replace(self.config.view, **changes)), self.actor)
+        config = replace(self.config, view=replace(self.config.view, **changes))
+        limits = [(name, getattr(self.view, name), getattr(config.view, name)) for name in LIMITS]
+        if changed := [f"{name} is {old:g}, not {new:g}" for name, old, new in limits if new != old]:
+            if not (isinstance(self.view, TrackView) and config.num_cells):
+                raise ValueError(f"the actions of this policy are scaled to the limits of its training: {changed[0]}")
+            actor = config.make_actor()
+            actor.load_state_dict(self.actor.state_dict(), assign=True)
+            return FieldPolicy(config, actor)
+        return FieldPolicy(config, self.actor)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""

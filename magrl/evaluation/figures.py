@@ -70,10 +70,10 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
     return figure
 
 
-def _look(name: str) -> dict[str, Any]:
-    """Return color and label of a navigator."""
-    navigator_label(name)  # raises for an unknown name
-    return {"color": NAVIGATOR_COLORS[name], "label": NAVIGATOR_NAMES[name]}
+def _look(name: str, index: int = 0) -> dict[str, Any]:
+    """Return color and label of a navigator; those without a color of their own have one by their index."""
+    text = navigator_label(name)  # raises for an unknown name
+    return {"color": NAVIGATOR_COLORS.get(name, f"C{index}"), "label": NAVIGATOR_NAMES.get(name, text)}
 
 
 def _four_panels(labels: Mapping[str, str]) -> tuple[Figure, dict[str, Axes]]:
@@ -106,8 +106,8 @@ def learning_curves(
     """
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
-    for name, runs in curves.items():
-        look, known = _look(name), [np.array(run)[:, np.isfinite(run[1])] for run in runs]
+    for index, (name, runs) in enumerate(curves.items()):
+        look, known = _look(name, index), [np.array(run)[:, np.isfinite(run[1])] for run in runs]
         known = [run for run in known if run.shape[1]]
         if not known:
             continue

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -141,8 +140,8 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
     policy = load_policy(path, env.device) if source else load_pretrained(name, env.device)
     if isinstance(policy, FieldPolicy) and isinstance(policy.config.view, TrackView):
         told = env.arrival.rule == "objective"
-        policy = policy.adapted(zeta=env.zeta, max_steps=env.max_steps, search=told, **options)
-        policy = _limited(policy, env).to(env.device)
+        given = {"zeta": env.zeta, "max_steps": env.max_steps, "search": told, **options}
+        policy = policy.adapted(**given, **_limits(policy, env)).to(env.device)
     elif options:
         raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
     try:
@@ -152,15 +151,10 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
     return policy
 
 
-def _limited(policy: FieldPolicy, env: GeomagneticNavEnv) -> FieldPolicy:
-    """Return an agent that corrects plans of the moves and turns that an environment allows, with the same weights."""
-    view = policy.config.view
-    limits = {name: min(getattr(view, name), getattr(env, name)) for name in ("max_move_km", "max_turn_rad")}
-    if (config := replace(policy.config, view=replace(view, **limits))) == policy.config:
-        return policy
-    actor = config.make_actor()
-    actor.load_state_dict(policy.actor.state_dict())
-    return FieldPolicy(config, actor)
+def _limits(policy: FieldPolicy, env: GeomagneticNavEnv) -> dict[str, float]:
+    """Return the limits of moves and turns that a policy and an environment share, if the policy can keep to others."""
+    names = ("max_move_km", "max_turn_rad") if policy.config.num_cells else ()
+    return {name: min(getattr(policy.view, name), getattr(env, name)) for name in names}
 
 
 def check_fits(policy: TrainedPolicy, env: GeomagneticNavEnv) -> None:

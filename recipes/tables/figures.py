@@ -19,6 +19,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -109,15 +110,15 @@ def section_4(_: int | None) -> Figures:
     }
 
 
-def learning(_: int | None) -> Figures:
-    """Return the learning curves of the runs of table learning."""
-    runs = declarations()["learning"]["runs"]
+def learning(_: int | None, *, table: str = "learning", shown: Mapping[str, tuple[str, str]] = LEARNING) -> Figures:
+    """Return the learning curves of the runs of a table: by figure, the column and label that are ``shown``."""
+    runs = declarations()[table]["runs"]
     found = {name: [read_curves(run) for run in matching(pattern)] for name, pattern in runs.items()}
     return {
         figure: plots.learning_curves(
             {name: [(list(c["frames"]), list(c[column])) for c in curves] for name, curves in found.items()}, title
         )
-        for figure, (column, title) in LEARNING.items()
+        for figure, (column, title) in shown.items()
     }
 
 
@@ -243,6 +244,7 @@ def prices(_: int | None) -> Figures:
 FIGURES: Mapping[str, Callable[[int | None], Figures]] = {
     "section-4": section_4,
     "learning": learning,
+    "sequences": partial(learning, table="sequences-learning", shown={"sequences": LEARNING["learning-spl"]}),
     "noise": noise,
     "conditions": conditions,
     "globe": globe,

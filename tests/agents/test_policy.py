@@ -71,6 +71,17 @@ def test_a_second_call_on_a_state_changes_nothing(env, kind: str) -> None:
     assert torch.equal(*(policy(late.clone())["action"] for _ in range(2)))
 
 
+def test_adapted_limits_are_those_of_the_moves() -> None:
+    """The corrections of a plan do not depend on them; other actions are scaled to those of the training."""
+    policy, env = load_pretrained("anywhere"), GeomagneticNavEnv(num_envs=50, seed=0, start_heading="random")
+    action = env.rollout(2, policy.adapted(max_move_km=10.0, max_turn_rad=0.5))["action"]
+    assert 5 < action[..., 0].max() <= 10 + 1e-4
+    assert 0.45 < action[..., 1].abs().max() <= 0.5 + 1e-4
+    region = FieldPolicy(PolicyConfig(env.observation_view(), CELLS))
+    with pytest.raises(ValueError, match="limits of its training: max_move_km is 50, not 10"):
+        region.adapted(max_move_km=10.0)
+
+
 # Files
 
 
