@@ -29,7 +29,6 @@ from magrl.transforms.errors.sensors import SensorErrors as SensorErrors
 from magrl.transforms.errors.vector import VectorErrors as VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H as SPEEDS_KM_H
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
-from magrl.transforms.readings import ReadingObservation as ReadingObservation
 from magrl.transforms.rewards import DistanceCost as DistanceCost
 from magrl.transforms.rewards import HighestSPL as HighestSPL
 from magrl.transforms.rewards import ProgressReward as ProgressReward
@@ -37,6 +36,7 @@ from magrl.transforms.rewards import RandomStepPrice as RandomStepPrice
 from magrl.transforms.rewards import SPLReward as SPLReward
 from magrl.transforms.rewards import TrueWay as TrueWay
 from magrl.transforms.scaling import MinMaxNorm as MinMaxNorm
+from magrl.transforms.sequences import ReadingObservation as ReadingObservation
 from magrl.transforms.track import PlannedMove as PlannedMove
 from magrl.transforms.track import SearchAim as SearchAim
 from magrl.transforms.track import TrackGradient as TrackGradient
