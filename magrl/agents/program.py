@@ -22,10 +22,15 @@ from magrl.checks import check_finite, check_type, short
 
 Step = list[Any]
 """Name of an operation, positional arguments, named arguments."""
-PYTHON = {f.__name__: f for f in (operator.getitem, operator.add, operator.sub, operator.mul, operator.floordiv)}
+PYTHON = {
+    f.__name__: f for f in (operator.getitem, operator.add, operator.sub, operator.mul, operator.floordiv, operator.mod)
+}
 """Operations on lists of tensors and on sizes of batches."""
 RECURRENT = ("lstm.input", "gru.input")
-_WHOLE = (*RECURRENT, "lerp.Tensor", "hypot.default", "exp2.default", "linalg_vector_norm.default")
+_ACTIVATIONS = ("silu.default", "celu.default", "softplus.default", "mish.default", "log_sigmoid_forward.default")
+_FUNCTIONS = ("lerp.Tensor", "lerp.Scalar", "hypot.default", "exp2.default", "addcmul.default", "logaddexp.default")
+_REDUCTIONS = ("linalg_vector_norm.default", "std.correction")
+_WHOLE = (*RECURRENT, *_ACTIVATIONS, *_FUNCTIONS, *_REDUCTIONS)
 WHOLE = {name: getattr(getattr(torch.ops.aten, name.split(".")[0]), name.split(".")[1]) for name in _WHOLE}
 """Operations beside the core set. They are kept whole, because PyTorch rounds their parts otherwise."""
 _TRAIN = 6  # argument of recurrent layers that switches on dropout, which is random

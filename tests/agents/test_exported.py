@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
 from magrl.agents import ExportedPolicy, load_policy, save_policy
+from magrl.agents.program import trace_program
 from magrl.envs import GeomagneticNavEnv
 from magrl.files import save_tensors
 from magrl.transforms import (
@@ -88,6 +89,24 @@ def test_a_policy_acts_alike_after_saving(saved: Path) -> None:
     torch.testing.assert_close(policy(seen)["action"], wanted, rtol=1e-5, atol=1e-5)
     assert wanted.std(0).min() > 1e-3
     assert torch.equal(policy(seen[0, 0])["action"], policy(seen[:1, 0])["action"][0])
+
+
+class Functions(nn.Module):
+    """The usual activations, and functions of several tensors, whose parts PyTorch rounds otherwise."""
+
+    def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        x, y = inputs
+        names = ("silu", "celu", "elu", "selu", "gelu", "softplus", "mish", "logsigmoid", "leaky_relu", "hardswish")
+        activated = [getattr(nn.functional, name)(x) for name in names]
+        several = [torch.lerp(x, y, 0.3), torch.hypot(x, y), torch.addcmul(x, x, y), torch.logaddexp(x, y), x.std(-1)]
+        return (*activated, *several, nn.functional.cosine_similarity(x, y.roll(1, 0), -1), x.norm(dim=-1))
+
+
+def test_programs_compute_usual_functions_to_the_bit() -> None:
+    x, y = torch.randn(2, 200, 7, generator=torch.Generator().manual_seed(0)).unbind(0)
+    program = trace_program(Functions(), (x[:3], y[:3]))
+    for found, expected in zip(program(x, y), Functions()(x, y), strict=True):
+        assert torch.equal(found, expected)
 
 
 def test_an_export_acts_with_torch_alone(saved: Path, tmp_path: Path, monkeypatch) -> None:
