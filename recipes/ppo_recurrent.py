@@ -38,7 +38,7 @@ from magrl.envs import GeomagneticNavEnv, earth_scenario, planet_scenario
 from magrl.geodesy import steer
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, Discount, NonNegative, Positive, Rising, Share, VehicleConfig, Widths
+from magrl.training.config import Count, Discount, Positive, Rising, Share, VehicleConfig, Widths
 from magrl.transforms import HighestSPL, MinMaxNorm, RandomStepPrice, ReadingObservation, SPLReward, TrueWay
 
 RECIPE = "ppo_recurrent.py"
@@ -111,7 +111,7 @@ class Config(VehicleConfig):
     """Learning rate of the critic at the start."""
     final_critic_learning_rate: Positive = 3e-5
     """Learning rate of the critic at the end; linear in between."""
-    clip_gradient: NonNegative = 1.0
+    clip_gradient: Positive = 1.0
     """Largest norm of the gradients."""
 
     @model_validator(mode="after")
