@@ -184,7 +184,7 @@ def learning(runs: Mapping[str, str]) -> str:
             ([mean_success(curve) for curve in found], ".1f"),
             ([float(curve["eval_spl"][-1]) for curve in found], ".2f"),
         )
-        rows.append([name, len(found), *(reached(*column) for column in columns)])
+        rows.append([name.removeprefix("policy:"), len(found), *(reached(*column) for column in columns)])
     return markdown_table(["", "runs", *LEARNING], rows)
 
 
