@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -110,16 +111,22 @@ def estimate_within(
     """Return the probability that an estimate of the destination is within a radius of it, mean over the tasks [%].
 
     The estimate is that of weighted least squares from some readings at the destination, with the true gradients and
-    the data sheet: the bound of vehicles that do not search.
+    the data sheet at the start: the bound of vehicles that do not search.
     """
-    _, sheet = with_errors(base, errors, base.seed, known_start)
+    env, sheet = with_errors(base, errors, base.seed, known_start)
     jacobian = elements_gradient_at(base.field, base.scenario.tasks.target, base.scenario.tasks.region)
-    new, constant = (jacobian.new_tensor(std).square() for std in sheet.values())
-    weight = (new / readings + constant).clamp_min(1e-12).rsqrt()[:, None] * jacobian
+    start = env.reset()
+    new, constant = (start.get(key, jacobian.new_tensor(std)).to(jacobian).square() for key, std in sheet.items())
+    weight = (new / readings + constant).clamp_min(1e-12).rsqrt().unsqueeze(-1) * jacobian
     covariance = torch.linalg.pinv(weight.mT @ weight)
     angle = torch.arange(360, dtype=jacobian.dtype).deg2rad()
     spread = torch.linalg.eigvalsh(covariance).clamp_min(0) @ torch.stack((angle.cos(), angle.sin())).square()
     return 100 * (1 - torch.exp(-(radius_km**2) / (2 * spread))).mean().item()
+
+
+def number(value: float) -> str:
+    """Return a measure as text; it has no value where nothing arrives."""
+    return "—" if math.isnan(value) else f"{value:.1f}"
 
 
 def paired_difference(first: Tensor, second: Tensor, region: Tensor) -> str:

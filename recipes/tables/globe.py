@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from flights import flown
+from flights import flown, number
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -119,7 +119,7 @@ def cell(measures: Measures, chosen: Tensor) -> str:
     """Return SR, SPL and steps of some tasks, ``(M,)`` bool."""
     rate, spl = (100 * measures[key][chosen].double().mean().item() for key in ("success", "spl"))
     steps = measures["steps"][measures["success"] & chosen].double().mean().item()
-    return f"{rate:.1f} / {spl:.1f} / " + ("—" if math.isnan(steps) else f"{steps:.1f}")
+    return " / ".join(map(number, (rate, spl, steps)))
 
 
 def table(results: Mapping[str, Measures], known: Measures) -> str:

@@ -50,7 +50,7 @@ else:
 sys.path.insert(0, str(Path(__file__).parent))
 import globe
 import trainings
-from flights import DRIFT_KM, FAR_KM, Spec, earth_env, estimate_within, flown, paired_difference, rollout
+from flights import DRIFT_KM, FAR_KM, Spec, earth_env, estimate_within, flown, number, paired_difference, rollout
 
 RECIPE = "grid.py"
 LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
@@ -113,7 +113,7 @@ def earth(
         episodes = [flown(navigator, base, errors, least, known_start) for errors in columns.values()]
         spl[navigator if isinstance(navigator, str) else ""] = [found["spl"] for found in episodes]
         summaries = [summarize(found) for found in episodes]
-        cells = [" / ".join(f"{summary.get(name, 0):.1f}" for name in measures) for summary in summaries]
+        cells = [" / ".join(number(summary.get(name, 0.0)) for name in measures) for summary in summaries]
         first = [*[date] * (len(dates) > 1), *names(navigator), *[arrival_name(arrival)] * (len(arrivals) > 1)]
         rows.append([*first, *[1] * one_run, *cells])
     if within_km:

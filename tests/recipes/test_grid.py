@@ -85,6 +85,7 @@ def test_earth_has_a_row_for_each_date_and_navigator(tmp_path: Path, monkeypatch
     assert [row[0] for row in found[2:]] == [dates[0]] * 2 + [dates[1]] * 2
     assert found[2][4].startswith("100.0 / 100.0 / ")
     assert found[3][1] == "map matching (Kalman filter), map of 2015-01-01"
+    assert rows(grid.earth(["geodesic"], tasks=2, max_steps=1))[2][3] == "0.0 / 0.0 / —"
     far = rows(grid.earth(["geodesic"], tasks=2, distance_km=(1200, 1300), max_steps=60))
     assert far[2][3].count("/") == 3, "beyond 500 km, kilometers come first"
     grid.make(grid.Config(("conditions",), navigators=("geodesic",), tasks=2, out=tmp_path / "new"))
