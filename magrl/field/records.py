@@ -96,16 +96,20 @@ class WeatherRecord:
             )
         return found
 
-    def second_moments(self) -> Tensor:
+    def second_moments(self, span_h: float = 0.0) -> Tensor:
         """Return the mean products of the variation northward, eastward and downward, ``(3, 3)`` [nT^2], without gaps.
 
-        Those of the minutes at which an episode may start.
+        Those of the minutes at which an episode may start, and of the time after them that it takes.
+
+        Args:
+            span_h: time that an episode takes [h].
 
         Example:
             >>> weather_record("disturbed").second_moments().diagonal().sqrt().round()
             tensor([40., 29., 11.], dtype=torch.float64)
         """
-        last = None if self.last is None else self.last + 1
+        check_number(0, span_h=span_h)
+        last = None if self.last is None else self.last + 1 + math.ceil(60 * span_h)
         held = self.variation[self.first : last].double()
         return (held.unsqueeze(-1) * held.unsqueeze(-2)).nanmean(0)
 

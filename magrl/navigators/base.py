@@ -150,22 +150,23 @@ class Navigator(TensorDictModuleBase):
         raise NotImplementedError
 
     @staticmethod
-    def accuracy(seen: TensorDictBase, std: Tensor) -> Tensor:
+    def accuracy(seen: TensorDictBase, std: Tensor, key: str = "sensor_std") -> Tensor:
         """Return the standard deviations of the present reading, D, I, B_H.
 
         Args:
-            seen: public keys of ``P`` vehicles, and ``sensor_std`` ``(P, 3)`` where readings come with it.
+            seen: public keys of ``P`` vehicles, and the standard deviations ``(P, 3)`` where readings come with them.
             std: ``(3,)`` those of the data sheet.
+            key: ``sensor_std`` of errors that are new in each reading, or ``bias_std`` of constant and slow ones.
 
         Returns:
             ``std``, or ``(P, 3)`` the larger of both: during an outage, a reading is worse than the data sheet.
         """
-        own = seen.get("sensor_std", None)
+        own = seen.get(key, None)
         return std if own is None else torch.maximum(std, own.to(std))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]."""
-        seen = tensordict.select(*self.in_keys).update(tensordict.select("sensor_std", strict=False))
+        seen = tensordict.select(*self.in_keys).update(tensordict.select("sensor_std", "bias_std", strict=False))
         self.memory = memory = self._recall(seen)
         step = seen["step_count"].squeeze(-1)
         if "done" in self.in_keys:  # a rollout steps all vehicles until the last one is done

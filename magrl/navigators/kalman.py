@@ -92,7 +92,7 @@ class Kalman(QuasiNewton):
         curvature = self.drift(tracking.estimated_field(known, self.scales))
         estimate = partial(tracking.way_to, known, seen["target_field"].double(), self.range_km, self.scales, shared)
         covariance = estimate(None, self.periods).covariance  # of what moves can reduce
-        way = self.aim(known, estimate(self.bias_std, self.periods, curvature), seen, memory)
+        way = self.aim(known, estimate(self.lasting_std(seen), self.periods, curvature), seen, memory)
         step = seen["step_count"].squeeze(-1)
         prices = self.caution, tracking.step_price(self.step_km, way, step, self.max_steps, self.max_move_km)
         std, limits = self.reading_std(seen), (self.max_move_km, self.range_km)

@@ -175,11 +175,12 @@ class MapMatching(Navigator):
         A constant error of the readings moves the vehicle on the map, and not the destination.
         """
         region, elements = self._region(seen), seen["field"].double()
-        residual, jacobian = self._residual(here.unsqueeze(1), elements, self.bias_std, region)
+        std = self.accuracy(seen, self.bias_std, "bias_std")
+        residual, jacobian = self._residual(here.unsqueeze(1), elements, std, region)
         prior = torch.diag_embed(torch.full_like(here, PRIOR_KM**2)).unsqueeze(1)
         constant = update(prior, jacobian, residual)[1].squeeze(1)
         covariance = best(memory["covariance"], memory["misfit"]) + constant
-        gradient = jacobian.squeeze(1) * self.bias_std.unsqueeze(-1)
+        gradient = jacobian.squeeze(1) * std.unsqueeze(-1)
         ellipse = gradient.mT @ (memory["weights"].unsqueeze(-1) * gradient)
         return tracking.unvisited(Way(way, covariance), memory["visited"], ellipse)
 

@@ -100,7 +100,11 @@ class QuasiNewton(Navigator):
 
     def reading_std(self, seen: TensorDictBase) -> Tensor:
         """Return the standard deviations of the present reading in the filter: D, I, B_H."""
-        return tracking.reading_std(self.accuracy(seen, self.sensor_std), self.bias_std)
+        return tracking.reading_std(self.accuracy(seen, self.sensor_std), self.lasting_std(seen))
+
+    def lasting_std(self, seen: TensorDictBase) -> Tensor:
+        """Return the standard deviations of the constant and slow errors of the present reading: D, I, B_H."""
+        return self.accuracy(seen, self.bias_std, "bias_std")
 
     def drift(self, reading: Tensor) -> Tensor:  # noqa: ARG002
         """Return the standard deviation of the change of the Jacobian, see :func:`magrl.tracking.predict`."""
@@ -135,7 +139,7 @@ class QuasiNewton(Navigator):
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad], each ``(N,)``, given the state of the filter."""
-        target, bias_std = seen["target_field"].double()[:, self.elements], self.bias_std[self.elements]
+        target, bias_std = (x[..., self.elements] for x in (seen["target_field"].double(), self.lasting_std(seen)))
         curvature = self.drift(tracking.estimated_field(track, self.scales))
         way = tracking.way_to(track, target, RANGE_KM, self.scales, None, bias_std, self.periods, curvature)
         aim = self.aim(track, way, seen, memory)

@@ -28,6 +28,8 @@ TRIP_KM = 800.0
 """Path before the decision [km]: another kilometer has to make a right declaration about 1/800 more likely."""
 STEP_KM = 1.0
 """Path that a reading costs [km]."""
+DRIFT_SHARE = 0.5
+"""Share of the variance of slow errors that the readings of a track do not average; chosen on random planets."""
 RANGE_KM = 500.0
 """Prior standard deviation of the way along each axis [km]."""
 SHORT = 0.25
@@ -62,6 +64,7 @@ def arrival_decision(
     target: Tensor,
     sensor_std: PerElement,
     bias_std: PerElement,
+    drift_std: PerElement,
     steps_left: Tensor,
     radius_km: float,
     range_km: float = RANGE_KM,
@@ -71,13 +74,15 @@ def arrival_decision(
     It compares the probability of being right now with that after 1 to 32 more readings at the estimated place, times
     the share of the path that remains useful: a path of :data:`TRIP_KM` over itself, the way there and
     :data:`STEP_KM` for each reading. Readings there reduce the variance of the field at the vehicle, but not that of a
-    constant error. Without steps left, going on is worth nothing.
+    constant error. Slow errors change with the heading and the time: the readings of a track have averaged a part of
+    them, and :data:`DRIFT_SHARE` of their variance is left. Without steps left, going on is worth nothing.
 
     Args:
         track: state of the filter of D, I, B_H.
         target: ``(..., 3)`` D [deg], I [deg], B_H [nT] at the target.
         sensor_std: standard deviations of new errors of a reading, ``(..., 3)`` or 3 numbers.
         bias_std: the same of constant and slow errors.
+        drift_std: the same of slow errors alone, at most ``bias_std``.
         steps_left: ``(...)`` number of steps that are left after this one.
         radius_km: distance from the target within which a declaration is right [km].
         range_km: prior standard deviation of the way along each axis [km].
@@ -90,7 +95,7 @@ def arrival_decision(
         >>> from magrl.tracking import dipole_prior, start
         >>> here = torch.tensor([8.0, -16.0, 35000.0])
         >>> track = start(here, dipole_prior(here), (0.02, 0.02, 2.0))
-        >>> std = (0.02, 0.02, 2.0), (0.0, 0.0, 0.0)
+        >>> std = (0.02, 0.02, 2.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         >>> decision = arrival_decision(track, here, *std, torch.tensor(9), radius_km=25.0, range_km=300.0)
         >>> decision.probability.round(decimals=2), decision.declare  # another reading is worth more
         (tensor(0.8300), tensor(False))
@@ -98,11 +103,14 @@ def arrival_decision(
     check_number(0, above=True, radius_km=radius_km)
     known, shared = related(track, curl_relation)
     curvature = field_curvature(estimated_field(known))
-    posterior = way_posterior(known, target, range_km, ELEMENT_SCALES, shared, bias_std, ELEMENT_PERIODS, curvature)
-    probability, way = posterior.within(radius_km), posterior.way().displacement
     unit, count = _units(known, ELEMENT_SCALES), 3
+    lasting = {"bias_std": bias_std, "drift_std": drift_std}
+    bias, drift = (_nonnegative_or_nan(name, std, count, unit).square() for name, std in lasting.items())
+    bias = bias - (1 - DRIFT_SHARE) * torch.minimum(drift, bias)
+    posterior = way_posterior(known, target, range_km, ELEMENT_SCALES, shared, bias.sqrt(), ELEMENT_PERIODS, curvature)
+    probability, way = posterior.within(radius_km), posterior.way().displacement
     noise = _variance(sensor_std, unit).unsqueeze(-2)
-    bias = (_nonnegative_or_nan("bias_std", bias_std, count, unit) / unit).square().unsqueeze(-2)
+    bias = (bias / unit.square()).unsqueeze(-2)
     readings = torch.tensor(READINGS, dtype=unit.dtype, device=unit.device)
     there = _variance_at(known, way / DISTANCE_SCALE_KM).unsqueeze(-2)
     later = _within(known, 1 / (1 / there + readings.unsqueeze(-1) / noise) + bias, radius_km)

@@ -34,7 +34,7 @@ class DeclareArrival(ObservationTransform):
         range_km: prior standard deviation of the way along each axis [km].
         in_keys: values at the target ``(..., 3)``, mean ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the
             filter, heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, and optionally the standard deviations
-            ``(..., 3)`` of new errors of a reading, and of constant and slow ones.
+            ``(..., 3)`` of new errors of a reading, of constant and slow ones, and of slow ones alone.
         out_keys: probability ``(..., 1)`` that the target is within the radius, the probability ``(..., 1)`` at which
             going on is worth as much, and the mean way ``(..., 2)`` northward and eastward [km].
         action_key: action, ``(..., 2)`` to the policy and ``(..., 3)`` to the environment.
@@ -58,8 +58,8 @@ class DeclareArrival(ObservationTransform):
 
     default_in_keys = ("target_field", *OUT_KEYS[:2], "heading", "step_count")
     default_out_keys = ("arrival_probability", "arrival_worth", "arrival_way")
-    in_counts = (5, 7)
-    in_sizes = (3, 3, 3, 1, 1, 3, 3)
+    in_counts = (5, 8)
+    in_sizes = (3, 3, 3, 1, 1, 3, 3, 3)
     out_sizes = ((1,), (1,), (2,))
     invertible = True
 
@@ -83,10 +83,11 @@ class DeclareArrival(ObservationTransform):
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
         target, mean, covariance, _, step, *std = values
-        sensor_std, bias_std = std or (torch.zeros_like(target), torch.zeros_like(target))
+        new, lasting, slow = std or [torch.zeros_like(target)] * 3
         left = self.max_steps - 1 - step.squeeze(-1)
         track = FieldTrack(mean, covariance)
-        decision = tracking.arrival_decision(track, target, sensor_std, bias_std, left, self.radius_km, self.range_km)
+        options = left, self.radius_km, self.range_km
+        decision = tracking.arrival_decision(track, target, new, lasting, slow, *options)
         return decision.probability.unsqueeze(-1), decision.worth.unsqueeze(-1), decision.posterior.way().displacement
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -19,6 +19,7 @@ from magrl.transforms.base import (
 )
 
 STD_KEYS = ("sensor_std", "bias_std")
+DRIFT_KEY = "drift_std"
 """Standard deviations of a reading's new errors, and of constant or slow ones: D [deg], I [deg], B_H [nT]."""
 FRAMES = ("world", "vehicle")
 IN_KEYS = ("field", "target_field", "move", "heading")

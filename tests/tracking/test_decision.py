@@ -21,11 +21,11 @@ def vehicle(north_km: float, std: float = 0.0) -> tuple[FieldTrack, torch.Tensor
     return FieldTrack(mean.unsqueeze(0), covariance.unsqueeze(0)), target.unsqueeze(0)
 
 
-def decide(north_km: float, std: float, bias: float, left: int = 50):
+def decide(north_km: float, std: float, bias: float, left: int = 50, drift: float = 0.0):
     track, target = vehicle(north_km, std)
     noise = tuple(0.1 * scale for scale in ELEMENT_SCALES)
-    slow = tuple(bias * scale for scale in ELEMENT_SCALES)
-    return arrival_decision(track, target, noise, slow, torch.tensor([left]), 25.0)
+    lasting = (tuple(each * scale for scale in ELEMENT_SCALES) for each in (bias, drift))
+    return arrival_decision(track, target, noise, *lasting, torch.tensor([left]), 25.0)
 
 
 def test_what_a_constant_error_leaves_is_all_that_can_be_attained() -> None:
@@ -38,6 +38,15 @@ def test_what_a_constant_error_leaves_is_all_that_can_be_attained() -> None:
     assert not not_yet.declare.item()
     assert done.probability > not_yet.probability
     assert decide(0.0, 0.3, 0.2, left=0).declare.item()
+
+
+def test_readings_average_a_part_of_a_slow_error() -> None:
+    """A constant error of 0.1 and a slow one of 0.2, half of whose variance is left: 0.01 + 0.02."""
+    found = decide(0.0, 0.0, 0.05**0.5, drift=0.2)
+    alike = decide(0.0, 0.0, 0.03**0.5)
+    assert found.probability.item() == pytest.approx(alike.probability.item(), rel=1e-6)
+    assert found.attainable.item() == pytest.approx(alike.attainable.item(), rel=1e-6)
+    assert found.probability > decide(0.0, 0.0, 0.05**0.5).probability + 0.05
 
 
 @pytest.mark.parametrize(("north_km", "declare"), [(5.0, True), (60.0, False), (400.0, False)])

@@ -25,8 +25,8 @@ from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 """D [deg], I [deg], B_H [nT] at middle latitudes, for which data sheets state the errors that depend on the field.
 
-What a vehicle knows of its accuracy is the same everywhere. Stated for the true field, or for a reading to which an
-error is still added, it would give that field or that reading away.
+What a vehicle knows of its accuracy is the same everywhere, or follows from what it reads. Stated for the true field,
+or for a reading to which an error is still added, it would give that field or that reading away.
 """
 
 
@@ -200,8 +200,8 @@ class ReadingErrors(EpisodeErrors):
         out_keys: of the transform.
         seed: seed of the errors.
         **keys: of :class:`EpisodeErrors`; ``true_key``, of the true value, or None to leave it out, privileged; and
-            ``std_key`` and ``bias_key``, of the standard deviations of the errors that are new in each reading, and of
-            those of constant and slow ones, both ``(..., E)``.
+            ``std_key``, ``bias_key`` and ``drift_key``, of the standard deviations of the errors that are new in each
+            reading, of those of constant and slow ones, and of those of slow ones alone, all ``(..., E)``.
 
     Example:
         >>> ReadingErrors(["field"], ["measured"]).true_key
@@ -215,6 +215,7 @@ class ReadingErrors(EpisodeErrors):
     true_key: NestedKey | None = "true_field"
     std_key: NestedKey = "sensor_std"
     bias_key: NestedKey = "bias_std"
+    drift_key: NestedKey = "drift_std"
     _accuracy: Tensor
 
     def _set_accuracy(self) -> None:
@@ -222,18 +223,18 @@ class ReadingErrors(EpisodeErrors):
         count = self.in_sizes[self.reading]
         field = torch.tensor(TYPICAL_FIELD if count == 3 else (0.0,) * (count or 0), dtype=torch.float64)
         new, constant, slow = self.variances(field)
-        accuracy = torch.stack((new, constant + slow)).sqrt().to(torch.get_default_dtype())
+        accuracy = torch.stack((new, constant + slow, slow)).sqrt().to(torch.get_default_dtype())
         self.register_buffer("_accuracy", accuracy, persistent=False)
 
     def _measure(
-        self, tensordict: TensorDictBase, value: Tensor, reading: Tensor, sensor_std: Tensor | None = None
+        self, tensordict: TensorDictBase, value: Tensor, reading: Tensor, accuracy: Sequence[Tensor] | None = None
     ) -> None:
-        """Write a reading, its true value and its accuracy; ``sensor_std`` if it is not the same in all readings."""
+        """Write a reading, its true value and its accuracy: its three standard deviations, if not always the same."""
         if self.true_key is not None and tensordict.get(self.true_key, None) is None:
             tensordict.set(self.true_key, value)
         tensordict.set(self.out_keys[self.reading], _folded(reading) if reading.shape[-1] == 3 else reading)
-        known, slow = self._accuracy.to(reading.dtype)
-        for key, std in ((self.std_key, known if sensor_std is None else sensor_std), (self.bias_key, slow)):
+        known = self._accuracy.to(reading.dtype).unbind() if accuracy is None else accuracy
+        for key, std in zip((self.std_key, self.bias_key, self.drift_key), known, strict=True):
             before = tensordict.get(key, None)
             tensordict.set(key, std.expand_as(reading).clone() if before is None else torch.hypot(before, std))
 
@@ -243,7 +244,7 @@ class ReadingErrors(EpisodeErrors):
         leaf = observation_spec[self.in_keys[self.reading]]
         if self.true_key is not None and self.true_key not in observation_spec.keys(True, True):
             observation_spec[self.true_key] = leaf.clone()
-        for key in (self.out_keys[self.reading], self.std_key, self.bias_key):
+        for key in (self.out_keys[self.reading], self.std_key, self.bias_key, self.drift_key):
             self._add(observation_spec, leaf, key, *leaf.shape[-1:])
         return observation_spec
 

@@ -66,7 +66,9 @@ class SensorNoise(ReadingErrors):
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         uniform = stream_uniform(episode.stream, self.step_draws)
         normal = math.sqrt(2) * torch.erfinv(2 * uniform - 1 + 2.0**-53)  # the shift keeps it finite and centered
-        self._measure(tensordict, values[0], values[0] + episode.errors * normal.to(values[0].dtype), episode.errors)
+        none = torch.zeros_like(episode.errors)
+        reading = values[0] + episode.errors * normal.to(values[0].dtype)
+        self._measure(tensordict, values[0], reading, (episode.errors, none, none))
         return episode.errors
 
     def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -134,8 +136,8 @@ class RandomSensorNoise(SensorNoise):
         sensor_std, lasting, constant, drift_std, drift = episode.errors.split(self.count, -1)
         if not episode.first:
             drift = gauss_markov(drift, drift_std, move[..., :1], LASTING_KM, walk)
-        self._measure(tensordict, value, value + sensor_std * noise + constant + drift, sensor_std)
-        tensordict.set(self.bias_key, torch.hypot(tensordict.get(self.bias_key), lasting))
+        reading = value + sensor_std * noise + constant + drift
+        self._measure(tensordict, value, reading, (sensor_std, lasting, drift_std))
         return torch.cat((sensor_std, lasting, constant, drift_std, drift), -1)
 
 

@@ -40,6 +40,9 @@ documents were not read.
 """
 
 
+_STEEPEST_DEG = 82.0  # inclination of a dipole at a latitude of 74 degrees
+
+
 class NorthReferenceError(ReadingErrors):
     """Measure directions from the vehicle's own north, which lies at an error b clockwise of true north.
 
@@ -49,7 +52,8 @@ class NorthReferenceError(ReadingErrors):
     b has a constant part, a drift (first-order Gauss-Markov) and a part that is new at each reading, each normal, cut
     at four standard deviations. The measured ``heading`` takes the place of the true one, which is kept in
     ``true_heading`` and given back to the environment for its step. ``sensor_std`` of D grows by the random part,
-    ``bias_std`` by the others (without the factor of the latitude, which a vehicle does not know).
+    ``bias_std`` by the others, and ``drift_std`` by the drift. A vehicle does not know its latitude: where b grows with
+    the latitude, these grow with that at which the field of a dipole has the inclination that the vehicle reads.
 
     It stands after the transforms of the field's errors, and after those that read the true heading.
 
@@ -134,7 +138,9 @@ class NorthReferenceError(ReadingErrors):
         tensordict.set(self.true_heading_key, heading)
         tensordict.set(self.out_keys[0], wrap_angle(heading - torch.deg2rad(error)))
         declination = wrap_longitude(field[..., :1] - error)
-        self._measure(tensordict, field, torch.cat((declination, field[..., 1:]), -1))
+        growth = _secant(field[..., 1:2]) if position else torch.ones_like(declination)
+        accuracy = growth * self._accuracy.to(field.dtype).reshape(3, *[1] * (field.ndim - 1), -1)
+        self._measure(tensordict, field, torch.cat((declination, field[..., 1:]), -1), accuracy.unbind())
         return torch.cat((constant, drift, error), -1)
 
     def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -160,6 +166,12 @@ class NorthReferenceError(ReadingErrors):
         observation_spec = super().transform_observation_spec(observation_spec)
         observation_spec[self.true_heading_key] = observation_spec[self.in_keys[0]].clone()
         return observation_spec
+
+
+def _secant(inclination: Tensor) -> Tensor:
+    """Return the secant of the latitude at which an axial dipole has an inclination [deg]: tan I = 2 tan(latitude)."""
+    tangent = torch.tan(torch.deg2rad(inclination.clamp(-_STEEPEST_DEG, _STEEPEST_DEG))) / 2
+    return torch.hypot(torch.ones_like(tangent), tangent)
 
 
 def north_reference(name: str, *, speed_km_h: float, **options: Any) -> NorthReferenceError:

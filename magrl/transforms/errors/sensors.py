@@ -129,7 +129,8 @@ class SensorErrors(ReadingErrors):
         reading = torch.where(resolution > 0, torch.round(reading / resolution) * resolution, reading)
         missing = (uniform[..., -1:] < self.outage_rate) & (not first)
         reading = torch.where(missing, last, reading)
-        self._measure(tensordict, value, reading, torch.where(missing, OUTAGE_STD, self._accuracy[0].to(dtype)))
+        sensor_std, *lasting = self._accuracy.to(dtype)
+        self._measure(tensordict, value, reading, (torch.where(missing, OUTAGE_STD, sensor_std), *lasting))
         return torch.cat((bias, scale, drift, reading, vector), -1)
 
     def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:

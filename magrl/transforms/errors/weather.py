@@ -26,14 +26,18 @@ SPEEDS_KM_H = {"aircraft": 341.0, "ship": 24.0, "underwater": 6.1}
 """
 
 
+WAY_KM = 500.0
+"""Way whose weather a vehicle expects [km]."""
+
+
 class MagneticWeather(ReadingErrors):
     """Add the variation of the field in time to what a vehicle measures, as an observatory recorded it.
 
     Each episode starts at a minute of the record that is a pure function of (seed, vehicle, episode). A step takes
     ``distance / speed + reading_s``. The variation of the minute in which the step ends is added to the field vector;
     between the minutes of the record nothing is interpolated. All vehicles of a batch are in the weather of the record,
-    wherever they are. ``bias_std`` grows by the root mean square of the variation, at
-    :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
+    wherever they are. ``bias_std`` and ``drift_std`` grow by the root mean square of the variation over the time of
+    :data:`WAY_KM`, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
     ``field`` becomes what is measured, and ``true_field`` what it was: arrival, objective and reward belong to the
     environment and know no weather. In ``Compose``, the weather stands before the errors of the sensors.
@@ -89,7 +93,8 @@ class MagneticWeather(ReadingErrors):
         self.speed_km_h, self.reading_s, self.span_h = float(speed_km_h), float(reading_s), span_h
         self._found: dict[float, Tensor] = {}
         self.register_buffer("variation", self.record.variation, persistent=False)
-        self.register_buffer("_moments", self.record.second_moments(), persistent=False)
+        moments = self.record.second_moments(WAY_KM / self.speed_km_h)
+        self.register_buffer("_moments", moments, persistent=False)
         self._set_accuracy()
         if span_h is not None:
             self._starts()
@@ -133,7 +138,7 @@ class MagneticWeather(ReadingErrors):
         Example:
             >>> weather = MagneticWeather("disturbed", speed_km_h=24.0)
             >>> [round(x, 2) for x in weather.variances(torch.tensor([0.0, 60.0, 24000.0]))[2].sqrt().tolist()]
-            [0.07, 0.04, 40.18]
+            [0.06, 0.05, 41.2]
         """
         change = elements_jacobian(field_vector(field))
         none = torch.zeros_like(field)

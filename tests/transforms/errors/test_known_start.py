@@ -59,7 +59,9 @@ def test_conditions_state_what_is_left_where_the_start_is_known() -> None:
     assert aircraft.left_std((0, 0, 0))[1:] == aircraft.drift_std[1:] == aircraft.bias_std[1:]
     base = nav(4)
     env = with_conditions(base, aircraft, known_start=(0.0, 0.0, 0.0))
-    assert env.reset()["bias_std"][0].tolist() == pytest.approx(aircraft.left_std((0, 0, 0)), abs=1e-6)
+    left = env.reset()["bias_std"]
+    assert left[0, 1:].tolist() == pytest.approx(aircraft.left_std((0, 0, 0))[1:], abs=1e-6)
+    assert left[0, 0].item() == pytest.approx(aircraft.left_std((0, 0, 0))[0], rel=0.01)  # grows with the latitude
 
 
 def test_bad_standard_deviations_are_named() -> None:

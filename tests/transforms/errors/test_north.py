@@ -59,11 +59,14 @@ def test_parts_of_the_error_have_their_sizes() -> None:
 
 @pytest.mark.parametrize("name", NORTH_REFERENCES)
 def test_references_on_the_market(name: str) -> None:
-    """The total of the standards' limits, read as two standard deviations."""
+    """The total of the standards' limits, read as two standard deviations; tan(latitude) is tan(I) / 2 of a dipole."""
     error = north_reference(name, speed_km_h=20.0)
     total = {"fiber-optic": 0.1, "marine": math.hypot(0.375, 0.125, 0.25), "low-cost": math.hypot(0.5, 0.75)}
     state = TransformedEnv(nav(), error).reset()
-    assert math.hypot(state["sensor_std"][0, 0], state["bias_std"][0, 0]) == pytest.approx(total[name])
+    secant = 1 / torch.cos(torch.atan(torch.tan(torch.deg2rad(state["field"][0, 1])) / 2))
+    growth = 1 if name == "low-cost" else secant.item()
+    assert math.hypot(state["sensor_std"][0, 0], state["bias_std"][0, 0]) == pytest.approx(growth * total[name])
+    assert state["drift_std"][0, 0].item() == pytest.approx(growth * (0.125 if name == "marine" else 0))
     assert ("position" in error.in_keys) == (name != "low-cost")
 
 
