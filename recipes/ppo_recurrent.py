@@ -2,6 +2,7 @@
 
     python recipes/ppo_recurrent.py                          # ten million steps
     python recipes/ppo_recurrent.py --total-frames 2000000   # two million
+    python recipes/ppo_recurrent.py --no-observe-heading     # without a compass: the eight numbers of the paper's state
     python recipes/ppo_recurrent.py --resume RUN             # resume an interrupted run exactly
 
 The agent reads what its sensors measure and what it does, step by step, and estimates the way to the destination with a
@@ -75,6 +76,9 @@ class Config(VehicleConfig):
     """Moves after which an episode is truncated."""
     noise_exponent: Positive = 1.0
     """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
+    observe_heading: bool = True
+    """Whether the agent reads its heading; if not, episodes start northward, and the way is relative to the heading.
+    """
     step_price: Positive = 0.5
     """Price of a step [% of SPL]."""
 
@@ -128,25 +132,28 @@ class Config(VehicleConfig):
 
 
 class Command(nn.Module):
-    """The action, scaled to [-1, 1], of a correction of the move along the estimate."""
+    """The action, scaled to [-1, 1], of a correction of the move along the estimate.
+
+    Both are northward and eastward where the heading is given, and otherwise forward and to the right.
+    """
 
     def __init__(self, max_move_km: float, max_turn_rad: float) -> None:
         super().__init__()
         self.limits = max_move_km, max_turn_rad
 
-    def forward(self, estimate: Tensor, correction: Tensor, heading: Tensor) -> Tensor:
-        """``(..., 2)`` northward and eastward, in units of the longest move, and heading ``(..., 1)`` [rad]."""
-        north, east = (estimate + correction).unbind(-1)
-        wanted = torch.atan2(east, north), self.limits[0] * torch.hypot(north, east)
-        distance, turn = steer(heading.squeeze(-1), *wanted, *self.limits)
+    def forward(self, estimate: Tensor, correction: Tensor, heading: Tensor | None = None) -> Tensor:
+        """``(..., 2)`` in units of the longest move, and heading ``(..., 1)`` [rad]."""
+        ahead, aside = (estimate + correction).unbind(-1)
+        now = torch.zeros_like(ahead) if heading is None else heading.squeeze(-1)
+        distance, turn = steer(now, torch.atan2(aside, ahead), self.limits[0] * torch.hypot(ahead, aside), *self.limits)
         return torch.stack((2 * distance / self.limits[0] - 1, turn / self.limits[1]), -1)
 
 
 def make_memory(size: int, config: Config) -> TensorDictSequential:
     """Return the network from readings to what is remembered of them and the estimate of the way, ``(..., 2)``.
 
-    The estimate is northward and eastward, and 1 long where the destination is farther than the longest move. It is
-    shorter where the direction is not known well, so that the vehicle starts with short moves.
+    The estimate is 1 long where the destination is farther than the longest move. It is shorter where the direction is
+    not known well, so that the vehicle starts with short moves.
     """
     width, device = config.memory_size, config.device
     encoder = nn.Sequential(nn.Linear(size, width, device=device), nn.SiLU())
@@ -176,9 +183,10 @@ def make_correction(size: int, spread: Spread, config: Config) -> ProbabilisticA
     )
 
 
-def with_view(env: EnvBase, memory: TensorDictSequential) -> TransformedEnv:
+def with_view(env: EnvBase, memory: TensorDictSequential, config: Config) -> TransformedEnv:
     """Add what the agent observes, its first state, and the scaling of its action."""
-    view = [InitTracker(), memory[1].make_tensordict_primer(), ReadingObservation(), MinMaxNorm(in_keys_inv=["action"])]
+    observed = ReadingObservation(ReadingObservation.default_in_keys[: 3 + config.observe_heading])
+    view = [InitTracker(), memory[1].make_tensordict_primer(), observed, MinMaxNorm(in_keys_inv=["action"])]
     return TransformedEnv(env, Compose(*view), auto_unwrap=True)
 
 
@@ -189,16 +197,18 @@ def make_env(base: GeomagneticNavEnv, memory: TensorDictSequential, config: Conf
     way, move, *others = HighestSPL.default_in_keys
     highest = HighestSPL([way, "true_move" if config.drift else move, *others])
     privileged = [price, TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
-    return with_view(TransformedEnv(base, Compose(*errors(config, base.seed), *privileged)), memory)
+    return with_view(TransformedEnv(base, Compose(*errors(config, base.seed), *privileged)), memory, config)
 
 
 def loss_way(sequences: TensorDictBase, memory: TensorDictSequential, max_move_km: float) -> Tensor:
     """Return the mean squared error of the estimates of the way along sequences ``(N, T)``."""
     with set_recurrent_mode(True):
         memory(sequences)
-    forward, right = sequences["true_way"].unbind(-1)
-    cos, sin = torch.cos(sequences["heading"]).squeeze(-1), torch.sin(sequences["heading"]).squeeze(-1)
-    way = torch.stack((forward * cos - right * sin, forward * sin + right * cos), -1)
+    way = sequences["true_way"]
+    if "heading" in sequences:
+        (forward, right), heading = way.unbind(-1), sequences["heading"].squeeze(-1)
+        cos, sin = torch.cos(heading), torch.sin(heading)
+        way = torch.stack((forward * cos - right * sin, forward * sin + right * cos), -1)
     wanted = way / way.norm(dim=-1, keepdim=True).clamp_min(max_move_km)
     return (sequences["way_estimate"] - wanted).square().sum(-1).mean()
 
@@ -208,7 +218,8 @@ def train(config: Config) -> dict[str, float]:
     torch.manual_seed(config.seed)
     with Run(config, recipe=RECIPE, name="ppo_recurrent", losses=LOSSES) as run:
         # Environments
-        options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": "random"}
+        heading = "random" if config.observe_heading else "north"
+        options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": heading}
         options |= {"device": config.device, **config.limits}
         planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
         base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
@@ -221,11 +232,12 @@ def train(config: Config) -> dict[str, float]:
         spread = Spread(config.exploration).to(base.device)
         memory, correction = make_memory(size, config), make_correction(size, spread, config)
         limits = Command(base.max_move_km, base.max_turn_rad)
-        command_keys = ["way_estimate", "correction", "heading"]
+        command_keys = ["way_estimate", "correction", *["heading"] * config.observe_heading]
+        remembered = REMEMBERED if config.observe_heading else REMEMBERED[:-1]
         actor = TensorDictSequential(memory, correction, TensorDictModule(limits, command_keys, ["action"]))
         value = make_mlp(size + 3, 1, config.critic_cells, layer_norm=True, device=base.device)
         critic = ValueOperator(value, in_keys=list(JUDGED))
-        validation, test = (with_view(evaluation_env(*each, config, **options), memory) for each in tasks)
+        validation, test = (with_view(evaluation_env(*each, config, **options), memory, config) for each in tasks)
 
         # Advantages and loss with a clipped probability ratio
         advantage = GAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=critic, deactivate_vmap=True)
@@ -265,7 +277,7 @@ def train(config: Config) -> dict[str, float]:
                 with torch.no_grad():
                     transitions = advantage(batch.select(*TRANSITION)).reshape(-1)
                 for rows in torch.randperm(len(batch), device=base.device).split(config.sequences_per_update):
-                    error = loss_way(batch[rows].select(*REMEMBERED), memory, base.max_move_km)
+                    error = loss_way(batch[rows].select(*remembered), memory, base.max_move_km)
                     optimize(error, optimizers[0], clip=weights[0], max_norm=config.clip_gradient)
                 for rows in torch.randperm(len(transitions), device=base.device).split(config.batch_size):
                     losses = loss(transitions[rows])  # given the memory, as it was when the moves were made

@@ -22,14 +22,16 @@ class ReadingObservation(StatefulTransform):
     """Write the reading, the last move and the change of the reading along it, scaled; nothing is estimated.
 
     A single observation does not hold the direction to the destination: a policy needs a memory, such as TorchRL's
-    :class:`~torchrl.modules.GRUModule`. Directions are from true north. The state is the reading before the step.
+    :class:`~torchrl.modules.GRUModule`. The state is the reading before the step.
 
     Args:
         in_keys: reading and target ``(..., 3)``: D [deg], I [deg], B_H [nT]; last move ``(..., 2)`` with the distance
-            [km] first; heading ``(..., 1)`` [rad].
+            [km] first and the turn [rad] second; and the heading ``(..., 1)`` [rad], or no fourth key for a vehicle
+            without a compass.
         out_keys: one observation ``(..., 20)``: reading and remaining differences (:func:`magrl.tracking.features`,
             12), the change of D, I, B_H per kilometer of the last move (3), how far along it the differences would be
-            least, and how well it fits them (2), cosine and sine of the heading, and the distance of the move.
+            least, and how well it fits them (2), cosine and sine of the heading, or else of the last turn, and the
+            distance of the move.
 
     Raises:
         ValueError: for another number of keys.
@@ -44,6 +46,7 @@ class ReadingObservation(StatefulTransform):
 
     default_in_keys = ("field", "target_field", "move", "heading")
     default_out_keys = ("observation",)
+    in_counts = (3, 4)
     out_sizes = ((20,),)
 
     @property
@@ -55,8 +58,8 @@ class ReadingObservation(StatefulTransform):
         self._advance(tensordict, values, values[:1])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        (reading, target, move, heading), (before,) = values, state
-        moved = move[..., :1]
+        (reading, target, move, *heading), (before,) = values, state
+        moved, angle = move[..., :1], heading[0] if heading else move[..., 1:2]
         unit = per_nanotesla(reading)
         left = element_difference(target, reading) / unit / _DIFFERENCE_NT
         rate = element_difference(reading, before) / unit / moved.clamp_min(_LEAST_MOVE_KM) / _RATE
@@ -67,8 +70,8 @@ class ReadingObservation(StatefulTransform):
             torch.asinh(rate),
             torch.asinh(4 * along / (steep + 1e-2)),
             fit,
-            torch.cos(heading),
-            torch.sin(heading),
+            torch.cos(angle),
+            torch.sin(angle),
             moved / _MOVE_KM,
         )
         tensordict.set(self.out_keys[0], torch.cat(observed, -1))

@@ -59,6 +59,9 @@ def test_the_estimate_of_the_true_way_has_no_loss() -> None:
     assert recipe.loss_way(sequences, Exact(), 50.0) < 1e-10
     assert sequences["way_estimate"][:3].norm(dim=-1).max() < 0.2
     torch.testing.assert_close(sequences["way_estimate"][3:].norm(dim=-1), torch.ones(3, 4))
+    ahead = Exact()(sequences.clone().set("heading", 0 * sequences["heading"]))["way_estimate"]
+    in_their_frame = sequences.exclude("heading").set("way_estimate", ahead)
+    assert recipe.loss_way(in_their_frame, lambda _: None, 50.0) < 1e-10
     loss = recipe.loss_way(sequences, memory, 50.0)
     loss.backward()
     assert loss > 0.01
@@ -73,11 +76,13 @@ def test_a_vehicle_moves_along_its_estimate() -> None:
     heading = torch.tensor([[0.25 * torch.pi], [0.0], [0.0], [0.0]])
     expected = torch.tensor([[0.0, 0.5], [2 * 0.5**0.5 - 1, 0.5], [1.0, 0.0], [-1.0, 1.0]])
     torch.testing.assert_close(command(estimate, correction, heading), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(command(estimate, correction), command(estimate, correction, 0 * heading))
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_the_saved_policy_flies_as_the_trained_actor(tmp_path, monkeypatch) -> None:
-    """The test tasks, whose sensors err; it is given readings, moves and headings."""
+@pytest.mark.parametrize("compass", [True, False])
+def test_the_saved_policy_flies_as_the_trained_actor(tmp_path, monkeypatch, compass: bool) -> None:
+    """The test tasks, whose sensors err; it is given readings, moves and, with a compass, headings."""
     plain, flown = [], []
 
     def noted_env(*args, **options):
@@ -91,8 +96,8 @@ def test_the_saved_policy_flies_as_the_trained_actor(tmp_path, monkeypatch) -> N
     make_env = recipe.evaluation_env
     monkeypatch.setattr(recipe, "evaluation_env", noted_env)
     monkeypatch.setattr("magrl.training.run.evaluation_rollout", noted_rollout)
-    recipe.train(small(recipe, tmp_path / "run", noise=(0.05, 0.05, 5.0)))
+    recipe.train(small(recipe, tmp_path / "run", noise=(0.05, 0.05, 5.0), observe_heading=compass))
     policy = load_policy(tmp_path / "run" / "policy.pt")
-    assert policy.in_keys == ["field", "target_field", "move", "heading", "step_count"]
+    assert policy.in_keys == ["field", "target_field", "move", *["heading"] * compass, "step_count"]
     found = evaluation_rollout(plain[-1](), policy)
     assert torch.equal(found["next", "position"], flown[-1]["next", "position"])

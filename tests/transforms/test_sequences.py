@@ -15,13 +15,13 @@ GRADIENT = torch.tensor([[0.01, -0.002], [0.004, 0.008], [3.0, -5.0]])  # D, I [
 START, WAY = torch.tensor([3.0, 60.0, 20000.0]), torch.tensor([120.0, -200.0])
 
 
-def flight(heading: float, km: float) -> TensorDict:
+def flight(heading: float, km: float, keys: slice = slice(None)) -> TensorDict:
     """The observations at a start and after a move."""
     there = {"target_field": (START + GRADIENT @ WAY)[None], "heading": torch.tensor([[heading]])}
     displacement = km * torch.tensor([math.cos(heading), math.sin(heading)])
     first = TensorDict(field=START[None], move=torch.zeros(1, 2), **there, batch_size=1)
     after = TensorDict(field=(START + GRADIENT @ displacement)[None], move=torch.tensor([[km, 0.3]]), **there)
-    observe = ReadingObservation()
+    observe = ReadingObservation(ReadingObservation.default_in_keys[keys])
     return observe(observe(first).set("next", after))
 
 
@@ -50,6 +50,12 @@ def test_the_change_of_the_reading_is_along_the_move() -> None:
         nearest_km = torch.dot(rate, left) / rate.square().sum()
         torch.testing.assert_close(400 * torch.sinh(seen[15]), nearest_km, rtol=0.05, atol=0)
         torch.testing.assert_close(seen[17:], torch.tensor([*direction, 0.4]))
+
+
+def test_without_a_compass_the_last_turn_takes_the_place_of_the_heading() -> None:
+    with_heading, without = (flight(0.5, 20.0, keys)["next", "observation"][0] for keys in (slice(4), slice(3)))
+    assert torch.equal(without[:17], with_heading[:17])
+    torch.testing.assert_close(without[17:], torch.tensor([math.cos(0.3), math.sin(0.3), 0.4]))
 
 
 def test_another_distance_has_the_same_rate() -> None:
