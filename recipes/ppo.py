@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from pydantic import model_validator
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.optim import Adam
@@ -30,7 +29,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, GuidanceConfig, LearningConfig, NonNegative, Positive, Share
+from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, PPOConfig
 from magrl.transforms import AlignmentReward, DistanceCost, FieldGradient, GradientHeading, ObservationView, SensorNoise
 
 RECIPE = "ppo.py"
@@ -43,7 +42,7 @@ TRANSITION = (
 )
 
 
-class Config(LearningConfig, GuidanceConfig):
+class Config(PPOConfig, GuidanceConfig):
     """Settings of a training."""
 
     # Own defaults of shared settings
@@ -63,28 +62,10 @@ class Config(LearningConfig, GuidanceConfig):
     """Layer normalization in the actor."""
 
     # PPO
-    steps_per_batch: Count = 16
-    """Steps of each vehicle in a collected batch."""
-    epochs: Count = 8
-    """Passes over a collected batch."""
-    batch_size: Count = 1024
-    """Transitions per gradient step."""
-    gae_lambda: Share = 0.95
-    """Factor lambda of the generalized advantage estimate."""
-    clip_epsilon: Positive = 0.2
-    """Largest change of the probability ratio that is rewarded."""
     entropy_weight: NonNegative = 0.0
     """Weight of the entropy of the action."""
     scale: Positive = 0.5
     """Standard deviation of the action before the tanh at the start."""
-    clip_gradient: Positive = 1.0
-    """Largest norm of the gradient."""
-
-    @model_validator(mode="after")
-    def _fits(self) -> Config:
-        if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
-            raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
-        return self
 
 
 def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> TransformedEnv:

@@ -22,7 +22,6 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from pydantic import model_validator
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
@@ -38,7 +37,7 @@ from magrl.agents.networks import make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, Discount, NonNegative, Positive, Rising, Share, VehicleConfig, Widths
+from magrl.training.config import Count, Discount, NonNegative, PlanetConfig, Positive, Rising
 from magrl.transforms import (
     HighestSPL,
     RandomSensorNoise,
@@ -52,7 +51,6 @@ from magrl.transforms import (
 
 RECIPE = "ppo_anywhere.py"
 LOSSES = ("loss_critic", "loss_actor")
-LONGEST_KM = 4400.0
 OBSERVED = ("observation", "true_way_scaled", "highest_spl")
 TRANSITION = (
     *OBSERVED,
@@ -62,7 +60,7 @@ TRANSITION = (
 )
 
 
-class Config(VehicleConfig):
+class Config(PlanetConfig):
     """Settings of a training; the defaults are those of the preset."""
 
     preset: Literal["far", "fast"] = "far"
@@ -71,74 +69,22 @@ class Config(VehicleConfig):
     # Own defaults of shared settings
     total_frames: Count = 5_242_880
     num_envs: Count = 4096
-    eval_every: Count = 10
     eval_tasks_small: Count = 1000
     gamma: Discount = 0.999
-    learning_rate: Positive = 3e-4
-    final_learning_rate: Positive = 1e-5
-
-    # Environment
     num_regions: Count = 2048
-    """Number of training regions, two on each random planet."""
     distance_range_km: Rising = (150.0, 1800.0)
-    """Shortest and longest distance of a task [km]."""
     max_steps: Count = 120
-    """Moves after which an episode is truncated."""
+    epochs: Count = 3
+    batch_size: Count = 16_384
+
     range_km: Positive = 300.0
     """Prior standard deviation of the way to the destination along each axis [km]."""
-    noise_exponent: Positive = 1.0
-    """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
     price_range: Rising = (0.1, 3.0)
     """Lowest and highest price of a step [% of SPL]; each episode has its own, which the agent observes."""
-
-    # PPO
-    critic_cells: Widths = (256, 256)
-    """Width of each hidden layer of the critic."""
-    steps_per_batch: Count = 32
-    """Steps of each vehicle in a collected batch."""
-    epochs: Count = 3
-    """Passes over a collected batch."""
-    batch_size: Count = 16_384
-    """Transitions per gradient step."""
     critic_batches: Count = 3
     """Collected batches before the first update of the actor."""
-    gae_lambda: Share = 0.95
-    """Factor lambda of the generalized advantage estimate."""
-    clip_epsilon: Positive = 0.2
-    """Largest change of the probability ratio that is rewarded."""
-    exploration: Positive = 0.4
-    """Standard deviation of the correction at the start of the training."""
-    final_exploration: Positive = 0.15
-    """Standard deviation of the correction at its end; linear in between."""
     advantage_floor: NonNegative = 0.2
     """What is added to the expected loss by which advantages are divided, so that easy episodes count as well."""
-    critic_learning_rate: Positive = 1e-3
-    """Learning rate of the critic at the start."""
-    final_critic_learning_rate: Positive = 5e-5
-    """Learning rate of the critic at the end; linear in between."""
-    clip_gradient: Positive = 1.0
-    """Largest norm of the actor's gradient."""
-
-    @model_validator(mode="after")
-    def _fits(self) -> Config:
-        if self.scenario is not None:
-            raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
-        if self.distance_range_km[1] > LONGEST_KM:
-            message = f"must end at {LONGEST_KM:g} km or below, the side of a region"
-            raise ValueError(f"distance_range_km {message}, got {self.distance_range_km}")
-        if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
-            raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
-        return self
-
-    @property
-    def regions(self) -> dict[str, Any]:
-        """Options of the regions: large enough for the longest task, and how the distances are drawn."""
-        if self.distance_range_km[1] > 500:
-            size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
-        else:
-            size = {"half_size_deg": 10, "degree": 12, "max_latitude": 70}
-        reach_km = self.max_move_km + self.limits["drift_km"]
-        return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, **size}
 
 
 FAR = Config()

@@ -18,11 +18,9 @@ import os
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from ppo_anywhere import Spread, errors, evaluation_env
-from pydantic import model_validator
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
@@ -39,7 +37,7 @@ from magrl.envs import GeomagneticNavEnv, earth_scenario, planet_scenario
 from magrl.geodesy import steer
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, Discount, Positive, Rising, Share, VehicleConfig, Widths
+from magrl.training.config import Count, Discount, PlanetConfig, Positive, Widths
 from magrl.transforms import HighestSPL, MinMaxNorm, RandomStepPrice, ReadingObservation, SPLReward, TrueWay
 
 RECIPE = "ppo_recurrent.py"
@@ -55,30 +53,21 @@ TRANSITION = (
 )
 
 
-class Config(VehicleConfig):
+class Config(PlanetConfig):
     """Settings of a training."""
 
     # Own defaults of shared settings
     total_frames: Count = 9_994_240
     num_envs: Count = 1024
-    eval_every: Count = 10
     num_cells: Widths = (128,)
     gamma: Discount = 0.99
-    learning_rate: Positive = 3e-4
-    final_learning_rate: Positive = 1e-5
+    epochs: Count = 2
+    batch_size: Count = 4096
+    exploration: Positive = 0.3
+    final_critic_learning_rate: Positive = 3e-5
 
-    # Environment
-    num_regions: Count = 1024
-    """Number of training regions, two on each random planet."""
-    distance_range_km: Rising = (300.0, 500.0)
-    """Shortest and longest distance of a task [km]."""
-    max_steps: Count = 50
-    """Moves after which an episode is truncated."""
-    noise_exponent: Positive = 1.0
-    """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
     observe_heading: bool = True
-    """Whether the agent reads its heading; if not, episodes start northward, and the way is relative to the heading.
-    """
+    """Whether the agent reads its heading; if not, episodes start northward, and the way is relative to it."""
     step_price: Positive = 0.5
     """Price of a step [% of SPL]."""
 
@@ -93,42 +82,6 @@ class Config(VehicleConfig):
     """Learning rate of the memory at the start."""
     final_memory_learning_rate: Positive = 3e-5
     """Learning rate of the memory at the end; linear in between."""
-
-    # PPO
-    critic_cells: Widths = (256, 256)
-    """Width of each hidden layer of the critic."""
-    steps_per_batch: Count = 32
-    """Steps of each vehicle in a collected batch."""
-    epochs: Count = 2
-    """Passes over a collected batch."""
-    batch_size: Count = 4096
-    """Transitions per gradient step."""
-    gae_lambda: Share = 0.95
-    """Factor lambda of the generalized advantage estimate."""
-    clip_epsilon: Positive = 0.2
-    """Largest change of the probability ratio that is rewarded."""
-    exploration: Positive = 0.3
-    """Standard deviation of the correction at the start of the training, in units of the longest move."""
-    final_exploration: Positive = 0.15
-    """Standard deviation of the correction at its end; linear in between."""
-    critic_learning_rate: Positive = 1e-3
-    """Learning rate of the critic at the start."""
-    final_critic_learning_rate: Positive = 3e-5
-    """Learning rate of the critic at the end; linear in between."""
-    clip_gradient: Positive = 1.0
-    """Largest norm of the gradients."""
-
-    @model_validator(mode="after")
-    def _fits(self) -> Config:
-        if self.scenario is not None:
-            raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
-        return self
-
-    @property
-    def regions(self) -> dict[str, Any]:
-        """Options of the regions, and how far a move leads."""
-        reach_km = self.max_move_km + self.limits["drift_km"]
-        return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, "max_latitude": 70}
 
 
 class Command(nn.Module):

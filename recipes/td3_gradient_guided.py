@@ -33,7 +33,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_cr
 from magrl.envs import GeomagneticNavEnv
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import CollectorBackend, make_collector, worker_seed
-from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, TransitionConfig
+from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, TD3Config
 from magrl.transforms import AlignmentReward, DistanceCost, FieldGradient, GradientHeading, ObservationView, SensorNoise
 
 RECIPE = "td3_gradient_guided.py"
@@ -41,7 +41,7 @@ TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "r
 ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 
 
-class Config(TransitionConfig, GuidanceConfig):
+class Config(TD3Config, GuidanceConfig):
     """Settings of a training; the defaults are those of the preset."""
 
     preset: Literal["fast", "paper", "td3-fast", "td3-paper"] = "fast"

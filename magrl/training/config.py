@@ -42,6 +42,8 @@ def _check_rising(values: tuple[float, float]) -> tuple[float, float]:
     return values
 
 
+LONGEST_KM = 4400.0
+"""Longest distance of a task on a random planet: the side of a region [km]."""
 Rising = Annotated[tuple[Positive, Positive], AfterValidator(_check_rising)]
 
 
@@ -195,13 +197,95 @@ class GuidanceConfig(RunConfig):
     """Factor on the rewards that the critics learn from; reported rewards are unscaled."""
 
 
-class TD3Config(LearningConfig):
-    """Settings that all TD3 recipes share.
+class PPOConfig(LearningConfig):
+    """Settings that all PPO recipes share.
 
     Example:
-        >>> TD3Config(exploration_noise=0.05)
+        >>> PPOConfig(batch_size=8192, num_envs=256)
         Traceback (most recent call last):
-        ValueError: final_exploration_noise 0.1 must not exceed exploration_noise 0.05
+        ValueError: batch_size 8192 must not exceed num_envs * steps_per_batch, 4096
+    """
+
+    steps_per_batch: Count = 16
+    """Steps of each vehicle in a collected batch."""
+    epochs: Count = 8
+    """Passes over a collected batch."""
+    batch_size: Count = 1024
+    """Transitions per gradient step."""
+    gae_lambda: Share = 0.95
+    """Factor lambda of the generalized advantage estimate."""
+    clip_epsilon: Positive = 0.2
+    """Largest change of the probability ratio that is rewarded."""
+    clip_gradient: Positive = 1.0
+    """Largest norm of the gradients."""
+
+    @model_validator(mode="after")
+    def _collects_a_batch(self) -> Self:
+        if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
+            raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
+        return self
+
+
+class PlanetConfig(VehicleConfig, PPOConfig):
+    """Settings of PPO recipes that train on random planets and learn corrections of moves.
+
+    Example:
+        >>> PlanetConfig(distance_range_km=(150.0, 6000.0))
+        Traceback (most recent call last):
+        ValueError: distance_range_km must end at 4400 km or below, the side of a region, got (150.0, 6000.0)
+    """
+
+    eval_every: Count = 10
+    learning_rate: Positive = 3e-4
+    final_learning_rate: Positive = 1e-5
+    steps_per_batch: Count = 32
+
+    num_regions: Count = 1024
+    """Number of training regions, two on each random planet."""
+    distance_range_km: Rising = (300.0, 500.0)
+    """Shortest and longest distance of a task [km]."""
+    max_steps: Count = 50
+    """Moves after which an episode is truncated."""
+    noise_exponent: Positive = 1.0
+    """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
+    critic_cells: Widths = (256, 256)
+    """Width of each hidden layer of the critic."""
+    exploration: Positive = 0.4
+    """Standard deviation of the correction at the start of the training."""
+    final_exploration: Positive = 0.15
+    """Standard deviation of the correction at its end; linear in between."""
+    critic_learning_rate: Positive = 1e-3
+    """Learning rate of the critic at the start."""
+    final_critic_learning_rate: Positive = 5e-5
+    """Learning rate of the critic at the end; linear in between."""
+
+    @model_validator(mode="after")
+    def _fits_planets(self) -> Self:
+        if self.scenario is not None:
+            raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
+        if self.distance_range_km[1] > LONGEST_KM:
+            message = f"must end at {LONGEST_KM:g} km or below, the side of a region"
+            raise ValueError(f"distance_range_km {message}, got {self.distance_range_km}")
+        return self
+
+    @property
+    def regions(self) -> dict[str, Any]:
+        """Options of the regions: large enough for the longest task, and how the distances are drawn."""
+        if self.distance_range_km[1] > 500:
+            size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
+        else:
+            size = {"half_size_deg": 10, "degree": 12, "max_latitude": 70}
+        reach_km = self.max_move_km + self.limits["drift_km"]
+        return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, **size}
+
+
+class TD3Config(LearningConfig):
+    """Settings of TD3 recipes.
+
+    Example:
+        >>> TD3Config(buffer_size=100)
+        Traceback (most recent call last):
+        ValueError: buffer_size 100 does not hold one batch of 1024
     """
 
     buffer_size: Count = 200_000
@@ -218,24 +302,6 @@ class TD3Config(LearningConfig):
     """Standard deviation of the noise of target policy smoothing."""
     noise_clip: NonNegative = 0.5
     """Largest noise of target policy smoothing."""
-
-    @model_validator(mode="after")
-    def _explores_less_at_the_end(self) -> Self:
-        start, end = self.exploration_noise, self.final_exploration_noise
-        if end > start:
-            raise ValueError(f"final_exploration_noise {end:g} must not exceed exploration_noise {start:g}")
-        return self
-
-
-class TransitionConfig(TD3Config):
-    """Settings of TD3 recipes that replay single transitions.
-
-    Example:
-        >>> TransitionConfig(buffer_size=100)
-        Traceback (most recent call last):
-        ValueError: buffer_size 100 does not hold one batch of 1024
-    """
-
     updates_per_batch: Count = 8
     """Gradient steps after each step of all vehicles."""
     batch_size: Count = 1024
@@ -244,7 +310,10 @@ class TransitionConfig(TD3Config):
     """Steps with random actions before the policy acts."""
 
     @model_validator(mode="after")
-    def _batch_fits(self) -> Self:
+    def _fits_its_buffer(self) -> Self:
+        start, end = self.exploration_noise, self.final_exploration_noise
+        if end > start:
+            raise ValueError(f"final_exploration_noise {end:g} must not exceed exploration_noise {start:g}")
         if self.buffer_size < self.batch_size:
             raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
         if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
