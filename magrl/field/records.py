@@ -105,8 +105,9 @@ class WeatherRecord:
             span_h: time that an episode takes [h].
 
         Example:
-            >>> weather_record("disturbed").second_moments().diagonal().sqrt().round()
-            tensor([40., 29., 11.], dtype=torch.float64)
+            >>> record = WeatherRecord(torch.tensor([[1.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), last=0)
+            >>> record.second_moments()[0, 0].item(), record.second_moments(span_h=1 / 60)[0, 0].item()
+            (1.0, 5.0)
         """
         check_number(0, span_h=span_h)
         last = None if self.last is None else self.last + 1 + math.ceil(60 * span_h)
