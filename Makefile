@@ -95,7 +95,6 @@ $(eval $(call training,td3_gradient_guided-fast-azores,1,td3_gradient_guided.py 
 $(eval $(call training,td3-fast,1,td3_gradient_guided.py --preset td3-fast))
 $(eval $(call training,td3_gradient_guided-paper,1,td3_gradient_guided.py --preset paper --precision bfloat16))
 $(eval $(call training,td3-paper,1,td3_gradient_guided.py --preset td3-paper --precision bfloat16))
-$(eval $(call training,td3_recurrent,1,td3_recurrent.py))
 $(eval $(call training,ppo,1,ppo.py))
 $(eval $(call training,ppo_recurrent,1,ppo_recurrent.py))
 $(eval $(call training,ppo_recurrent-short,1,ppo_recurrent.py --total-frames 1998848))

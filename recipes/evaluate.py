@@ -77,7 +77,7 @@ class Config(ScenarioOptions):
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
     """Navigators: anywhere, kalman, secant, run_and_tumble, mean_jacobian, map_matching, parallel, geodesic, ga, pso,
-    afsa; with a run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, recurrent=RUN, anywhere=RUN; a policy of any algorithm
+    afsa; with a run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN; a policy of any algorithm
     policy=FILE or policy:LABEL=FILE."""
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""

@@ -9,9 +9,6 @@ from magrl.agents.policy import PolicyConfig as PolicyConfig
 from magrl.agents.policy import load_policy as load_policy
 from magrl.agents.policy import save_policy as save_policy
 from magrl.agents.pretrained import load_pretrained as load_pretrained
-from magrl.agents.recurrent import RecurrentTD3Loss as RecurrentTD3Loss
-from magrl.agents.recurrent import make_recurrent_actor as make_recurrent_actor
-from magrl.agents.recurrent import recurrent_transforms as recurrent_transforms
 from magrl.agents.td3 import SoftUpdate as SoftUpdate
 from magrl.agents.td3 import TD3Loss as TD3Loss
 from magrl.agents.td3 import optimize as optimize

@@ -1,4 +1,4 @@
-"""Networks of the feedforward agent: a deterministic actor and a critic, as TensorDict modules."""
+"""Networks of agents: a deterministic actor and a critic, as TensorDict modules."""
 
 from __future__ import annotations
 
@@ -105,21 +105,9 @@ def make_actor(
         torch.Size([5, 2])
     """
     network = make_mlp(observation_size, 2, num_cells, layer_norm=layer_norm, device=device)
-    return TensorDictSequential(*action_modules(network, ["observation"]))
-
-
-def action_modules(network: MLP, in_keys: Sequence[str]) -> list[TensorDictModule | TanhModule]:
-    """Return the modules of a policy network, which writes ``logits``, and of their tanh, ``action``.
-
-    The output bias of the network is set to zero.
-
-    Example:
-        >>> [module.out_keys for module in action_modules(make_mlp(4, 2, (8,), layer_norm=False), ["observation"])]
-        [['logits'], ['action']]
-    """
     bias = nn.init.zeros_(network[-1].bias)
     squash = TanhModule(in_keys=["logits"], out_keys=["action"]).to(bias.device)
-    return [TensorDictModule(network, in_keys, ["logits"]), squash]
+    return TensorDictSequential(TensorDictModule(network, ["observation"], ["logits"]), squash)
 
 
 class CorrectedMove(nn.Module):
@@ -181,16 +169,14 @@ def make_critic(
     num_cells: Sequence[int],
     *,
     layer_norm: bool = True,
-    observation_keys: Sequence[str] = ("observation",),
     device: Device = None,
 ) -> ValueOperator:
-    """Return a critic: observations and ``action`` ``(..., 2)`` to ``state_action_value`` ``(..., 1)``.
+    """Return a critic: ``observation`` ``(..., K)`` and ``action`` ``(..., 2)`` to ``state_action_value`` ``(..., 1)``.
 
     Args:
-        observation_size: number of entries of all observations together.
+        observation_size: number of entries K of the observation.
         num_cells: width of each hidden layer.
         layer_norm: whether hidden layers are normalized.
-        observation_keys: keys that are concatenated, before the action.
         device: device of the parameters.
 
     Raises:
@@ -203,4 +189,4 @@ def make_critic(
         torch.Size([5, 1])
     """
     network = make_mlp(observation_size + 2, 1, num_cells, layer_norm=layer_norm, device=device)
-    return ValueOperator(network, in_keys=[*observation_keys, "action"])
+    return ValueOperator(network, in_keys=["observation", "action"])

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase
@@ -21,13 +21,12 @@ from magrl.agents.network import Network, trace_network
 from magrl.agents.networks import Device, make_actor, make_correcting_actor
 from magrl.agents.pipeline import export_policy
 from magrl.agents.program import TensorProgram
-from magrl.agents.recurrent import STATE_KEYS, make_recurrent_actor
 from magrl.checks import check_finite, check_type
 from magrl.files import DamagedFileError, load_tensors, save_tensors
 from magrl.transforms import ObservationView, TrackView
 from magrl.transforms.track import STD_KEYS
 
-POLICY_FORMAT = 2
+POLICY_FORMAT = 3
 VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}
 """What policies observe, by the kind that their files name."""
 LIMITS = ("max_move_km", "max_turn_rad")
@@ -41,33 +40,26 @@ class PolicyConfig:
         view: what the policy observes, and its scaling: values scaled to a region, or estimates of its own track.
         num_cells: width of each hidden layer; None for a network of one's own.
         layer_norm: whether hidden layers are normalized.
-        memory_size: width of the LSTM; 0 for a policy without memory.
 
     Raises:
         TypeError: for a view of another type.
-        ValueError: for widths that are not positive whole numbers, or a memory in a network of one's own.
+        ValueError: for widths that are not positive whole numbers.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
         >>> view = GeomagneticNavEnv(seed=0).observation_view()
-        >>> PolicyConfig(view, (32, 32)).memory_size
-        0
+        >>> PolicyConfig(view, (32, 32)).layer_norm
+        True
     """
 
     view: ObservationView | TrackView
     num_cells: tuple[int, ...] | None = None
     layer_norm: bool = True
-    memory_size: int = 0
 
     def __post_init__(self) -> None:
-        check_type(ObservationView if self.memory_size else (ObservationView, TrackView), view=self.view)
+        check_type((ObservationView, TrackView), view=self.view)
         if self.num_cells is not None:
             self.make_actor("meta")  # checks the sizes
-        elif self.memory_size:
-            raise ValueError(
-                f"memory_size {self.memory_size} needs num_cells: export a network of your own with a memory by "
-                "save_policy(path, actor, env)"
-            )
 
     def make_actor(self, device: Device = None) -> TensorDictSequential:
         """Return an actor of this shape, with new weights.
@@ -77,9 +69,6 @@ class PolicyConfig:
         """
         if self.num_cells is None:
             raise ValueError("num_cells must be given, or the actor: FieldPolicy(PolicyConfig(view), actor)")
-        if isinstance(self.view, ObservationView) and self.memory_size:
-            shape = self.view, self.num_cells, self.memory_size
-            return make_recurrent_actor(*shape, layer_norm=self.layer_norm, device=device)
         if isinstance(self.view, TrackView):
             return make_correcting_actor(self.view, self.num_cells, device=device)
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
@@ -88,11 +77,11 @@ class PolicyConfig:
 class FieldPolicy(TrainedPolicy):
     """A trained agent as a navigator of the plain environment, in physical units.
 
-    A recurrent policy, and one that reads its own track (:class:`~magrl.transforms.TrackView`), keeps its own state for
-    each vehicle from the start of an episode (``step_count`` 0) on. Another call in the same step begins with the same
-    state as the first, so that calling it twice on one state changes nothing. A policy that reads its own track reads
-    the standard deviations of new errors of the sensors from ``sensor_std``, and those of constant and slow errors from
-    ``bias_std``; without these keys they are 0.
+    A policy that reads its own track (:class:`~magrl.transforms.TrackView`) keeps its own state for each vehicle from
+    the start of an episode (``step_count`` 0) on. Another call in the same step begins with the same state as the
+    first, so that calling it twice on one state changes nothing. Such a policy reads the standard deviations of new
+    errors of the sensors from ``sensor_std``, and those of constant and slow errors from ``bias_std``; without these
+    keys they are 0.
 
     Args:
         config: what the policy observes, and the shape of its network.
@@ -115,11 +104,11 @@ class FieldPolicy(TrainedPolicy):
         super().__init__()
         check_type(PolicyConfig, config=config)
         self.config, self.view = config, config.view
-        self.in_keys = [*config.view.in_keys, *(["step_count"] if config.memory_size else [])]
+        self.in_keys = list(config.view.in_keys)
         self.observe = Compose(*config.view.observation_transforms())
         self.act = config.view.action_transform()
         self.actor = config.make_actor().float() if actor is None else actor  # environments write float32
-        self.state_keys = STATE_KEYS if config.memory_size else config.view.state_keys
+        self.state_keys = config.view.state_keys
 
     def adapted(self, **changes: Any) -> FieldPolicy:
         """Return the policy with other options of its view, such as ``search`` or ``step_price``; it shares weights.
@@ -153,11 +142,9 @@ class FieldPolicy(TrainedPolicy):
             action = self.actor(self.observe(seen))["action"]
             return tensordict.set("action", self.act.denormalize("action", action))
         before, starts = self._state_before(seen)
-        recall = self._recall if self.config.memory_size else self._track
-        observed = recall(seen.update(tensordict.select(*STD_KEYS, strict=False)), before, starts)
+        observed = self._track(seen.update(tensordict.select(*STD_KEYS, strict=False)), before, starts)
         action = self.actor(observed)["action"]
-        state = (observed["next"] if self.config.memory_size else observed).select(*self.state_keys).detach()
-        self._keep_state(seen, before, starts, state)
+        self._keep_state(seen, before, starts, observed.select(*self.state_keys).detach())
         return tensordict.set("action", self.act.denormalize("action", action))
 
     def _track(self, seen: TensorDictBase, state: TensorDictBase | None, starts: Tensor) -> TensorDictBase:
@@ -168,14 +155,6 @@ class FieldPolicy(TrainedPolicy):
             return self.observe(seen)
         observed = self.observe(state.copy().set("next", seen.copy()))["next"]
         return torch.where(starts.squeeze(-1), self.observe(seen), observed) if starts.any() else observed
-
-    def _recall(self, seen: TensorDictBase, state: TensorDictBase | None, starts: Tensor) -> TensorDictBase:
-        """Return the observation with the recurrent state and the mask of the vehicles whose episode starts."""
-        observed = self.observe(seen).set("is_init", starts)
-        if state is None:
-            zeros = observed["observation"].new_zeros(*observed.shape, 1, self.config.memory_size)
-            state = TensorDict(dict.fromkeys(STATE_KEYS, zeros), observed.shape, device=observed.device)
-        return observed.update(state)
 
 
 def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | None = None) -> None:

@@ -1,4 +1,4 @@
-"""TD3: TorchRL's loss with a separate network for each role, for feedforward and recurrent actors.
+"""TD3: TorchRL's loss with a separate network for each role, for feedforward actors.
 
 Source: Fujimoto, van Hoof and Meger, Addressing function approximation error in actor-critic methods, ICML 2018.
 """

@@ -215,7 +215,7 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
         "smoothness_deg": "path smoothness [°]",
         "navigation_error_km": "navigation error [km]",
     }
-    short = {"gg_td3": "GG TD3", "recurrent": "recurrent"}  # the full names would overlap
+    short = {"gg_td3": "GG TD3"}  # the full name would overlap
     names = [short.get(name, _look(name)["label"]) for name in measures]
     figure, panels = _four_panels(labels)
     for key, axes in panels.items():

@@ -38,7 +38,6 @@ TRAINED = {
     "gg_td3": TrainedAgent("Gradient-Guided TD3", "Gradient-Guided TD3"),
     "gg_td3_noise": TrainedAgent("Gradient-Guided TD3, trained with noise", "Gradient-Guided TD3, trained with noise"),
     "td3": TrainedAgent("TD3", "TD3"),
-    "recurrent": TrainedAgent("recurrent TD3", "recurrent TD3 (the paper's eight numbers)"),
     "anywhere": TrainedAgent("anywhere", "anywhere (PPO on random planets)", Navigator.needs),
     OWN: TrainedAgent("own policy", "own policy", "training"),
 }

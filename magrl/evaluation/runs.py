@@ -57,7 +57,7 @@ def read_run(folder: Path) -> TrainedRun:
         settings = dict(json.loads(path.read_text()))
         kinds: dict[Any, str] = {True: "gg_td3", False: "td3"}
         guided = kinds.get(settings.get("guided"))
-        kind = {"td3_recurrent.py": "recurrent", "ppo_anywhere.py": "anywhere"}.get(settings.get("recipe", ""), guided)
+        kind = "anywhere" if settings.get("recipe") == "ppo_anywhere.py" else guided
         first, second, third = (float(level) for level in settings.get("noise", NO_NOISE))
         scenario = folder / Path(settings["scenario"]).name if settings.get("scenario") else None
         zeta = float(settings.get("zeta", 0.01))

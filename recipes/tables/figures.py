@@ -59,7 +59,7 @@ PAPER_RUN = {
     "success_rate": "success rate over\nthe last 200 episodes [%]",
     "eval_spl": "SPL on the\nvalidation tasks [%]",
 }
-SHOWN = ("gg_td3", "td3", "recurrent", "ga", "pso", "afsa", "secant", "parallel")
+SHOWN = ("gg_td3", "td3", "ga", "pso", "afsa", "secant", "parallel")
 """Navigators in the figures of Section 4."""
 BOXES = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
 STD, SPEED_KM_H = (0.05, 0.05, 5.0), 24.0

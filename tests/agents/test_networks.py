@@ -7,7 +7,7 @@ import torch
 from support.tracks import STD
 from tensordict import TensorDict
 
-from magrl.agents import FieldPolicy, PolicyConfig, make_actor, make_critic, make_recurrent_actor
+from magrl.agents import FieldPolicy, PolicyConfig, make_actor
 from magrl.agents.networks import CorrectedMove, make_mlp
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators import Kalman
@@ -43,13 +43,6 @@ def test_a_correction_scales_and_turns_the_plan() -> None:
     torch.testing.assert_close(corrected(planned, change), expected)
 
 
-def test_critic_reads_its_observations_before_the_action() -> None:
-    critic = make_critic(3, (8,), observation_keys=("observation", "heading_vector"))
-    data = TensorDict(observation=torch.rand(5, 1), heading_vector=torch.rand(5, 2), action=torch.rand(5, 2))
-    joined = torch.cat((data["observation"], data["heading_vector"], data["action"]), -1)
-    assert torch.equal(critic(data)["state_action_value"], critic.module(joined))
-
-
 def test_first_and_last_layer_keep_float32() -> None:
     """A difference of inputs that bfloat16 rounds off, and outputs between two of its numbers."""
     network = make_mlp(1, 1, (1,), layer_norm=False)
@@ -66,8 +59,3 @@ def test_first_and_last_layer_keep_float32() -> None:
 def test_bad_sizes_are_refused(size: int, cells: tuple) -> None:
     with pytest.raises(ValueError, match="must be a whole number from 1 up to 65536"):
         make_actor(size, cells)
-
-
-def test_a_memory_has_a_size() -> None:
-    with pytest.raises(ValueError, match="memory_size"):
-        make_recurrent_actor(GeomagneticNavEnv(seed=0).observation_view(), (8,), 0)

@@ -48,11 +48,9 @@ def test_a_policy_is_of_its_region(env, policy) -> None:
         policy.check_fits(GeomagneticNavEnv(azores, seed=0))
 
 
-@pytest.mark.parametrize("kind", ["track", "recurrent"])
-def test_a_second_call_on_a_state_changes_nothing(env, kind: str) -> None:
+def test_a_second_call_on_a_state_changes_nothing(env) -> None:
     """Also where episodes start at different steps."""
-    recurrent = FieldPolicy(PolicyConfig(env.observation_view(observe_heading=False), CELLS, memory_size=4))
-    policy = recurrent if kind == "recurrent" else load_pretrained("anywhere")
+    policy = load_pretrained("anywhere")
 
     def flown(calls: int) -> list[list[Tensor]]:
         env.set_seed(3)
@@ -85,14 +83,12 @@ def test_adapted_limits_are_those_of_the_moves() -> None:
 # Files
 
 
-@pytest.mark.parametrize(("layer_norm", "memory_size"), [(True, 0), (False, 0), (True, 4)])
-def test_save_and_load_give_the_same_actions(env, tmp_path: Path, layer_norm: bool, memory_size: int) -> None:
-    view = env.observation_view(observe_heading=not memory_size)
-    policy = FieldPolicy(PolicyConfig(view, CELLS, layer_norm, memory_size))
+@pytest.mark.parametrize("layer_norm", [True, False])
+def test_save_and_load_give_the_same_actions(env, tmp_path: Path, layer_norm: bool) -> None:
+    policy = FieldPolicy(PolicyConfig(env.observation_view(), CELLS, layer_norm))
     save_policy(tmp_path / "policy.pt", policy)
     loaded = load_policy(tmp_path / "policy.pt")
     assert loaded.config == policy.config
-    assert ("step_count" in loaded.in_keys) == (memory_size > 0)
     for state in env.rollout(3).unbind(1):
         assert torch.equal(loaded(state.clone())["action"], policy(state.clone())["action"])
 
@@ -104,11 +100,10 @@ def config(**change) -> Callable:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c | {"format": 1}, r"a policy of format 1; this version reads format 2: train it again"),
+        (lambda c: c | {"format": 1}, r"a policy of format 1; this version reads format 3: train it again"),
         (lambda c: c | {"extra": 1}, "must hold format, config and weights"),
         (lambda c: c | {"config": {"num_cells": (16,)}}, "must hold exactly"),
         (config(num_cells=(8, 8)), "do not have the shapes"),
-        (config(memory_size=8), "do not have the shapes"),
         (config(view={}), "does not hold a valid policy"),
         (lambda c: c | {"weights": {k: v * math.nan for k, v in c["weights"].items()}}, "is not finite"),
     ],

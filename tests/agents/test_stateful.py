@@ -207,8 +207,6 @@ def test_a_network_of_ones_own_is_given() -> None:
     view = GeomagneticNavEnv(seed=0).observation_view()
     with pytest.raises(ValueError, match=r"or the actor: FieldPolicy\(PolicyConfig\(view\), actor\)"):
         FieldPolicy(PolicyConfig(view))
-    with pytest.raises(ValueError, match="memory_size 4 needs num_cells"):
-        PolicyConfig(view, memory_size=4)
 
 
 @pytest.mark.slow  # PyTorch traces the filter for half a minute

@@ -38,10 +38,10 @@ def test_settings_of_a_run(trained) -> None:
 
 def test_runs_among_navigators(trained, tmp_path: Path) -> None:
     """A name that is that of another kind is refused; ``_noise`` tells trainings of one kind apart."""
-    guided, recurrent = trained("a"), trained("b", recipe="td3_recurrent.py", guided=None)
-    texts = [f"gg_td3_noise={guided}", f"recurrent={recurrent}", "secant", f"td3={tmp_path}/c"]
-    assert [run.folder for run in trained_runs(texts)] == [guided, recurrent]
-    for name, folder, kind in (("td3", guided, "gg_td3"), ("td3", recurrent, "recurrent")):
+    guided, other = trained("a"), trained("b", recipe="ppo_anywhere.py", guided=None)
+    texts = [f"gg_td3_noise={guided}", f"anywhere={other}", "secant", f"td3={tmp_path}/c"]
+    assert [run.folder for run in trained_runs(texts)] == [guided, other]
+    for name, folder, kind in (("td3", guided, "gg_td3"), ("td3", other, "anywhere")):
         with pytest.raises(ValueError, match=rf"was trained as {kind}, not {name}: write {kind}={folder}"):
             trained_runs([f"{name}={folder}"])
     assert trained_runs([f"policy:OWN={guided}"])[0].kind == "gg_td3"

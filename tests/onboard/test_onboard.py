@@ -56,10 +56,9 @@ def episode(policy: TensorDictModuleBase, env: EnvBase, limit: int = 50) -> tupl
         state = env.step(state)["next"]
 
 
-def region_policy(memory_size: int = 0) -> FieldPolicy:
+def region_policy() -> FieldPolicy:
     torch.manual_seed(0)
-    view = environment().observation_view(observe_heading=not memory_size)
-    return FieldPolicy(PolicyConfig(view, (8,), memory_size=memory_size))
+    return FieldPolicy(PolicyConfig(environment().observation_view(), (8,)))
 
 
 # The same commands as in the environment
@@ -191,10 +190,9 @@ def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
             vehicle.start(TARGET, here, **options)
 
 
-@pytest.mark.parametrize("memory_size", [0, 4])
-def test_commands_of_own_policies(memory_size: int) -> None:
-    """One that reads the turn and the field of a region, and one with a memory of its own."""
-    policy, vehicle = region_policy(memory_size), Onboard(region_policy(memory_size))
+def test_commands_of_own_policies() -> None:
+    """One that reads the turn and the field of a region."""
+    policy, vehicle = region_policy(), Onboard(region_policy())
     target, known, actions = episode(policy, environment(), limit=6)
     vehicle.start(target)
     for step, action in zip(known, actions, strict=False):
@@ -227,10 +225,10 @@ def test_the_estimated_way_is_northward_and_eastward(navigator: str) -> None:
 # State
 
 
-@pytest.mark.parametrize("navigator", ["anywhere", "kalman", "recurrent"])
+@pytest.mark.parametrize("navigator", ["anywhere", "kalman"])
 def test_a_restored_vehicle_goes_on_bit_for_bit(navigator: str, tmp_path: Path) -> None:
     def vehicle() -> Onboard:
-        return Onboard(region_policy(4) if navigator == "recurrent" else navigator, sensor_std=NOISE)
+        return Onboard(navigator, sensor_std=NOISE)
 
     first, second = vehicle(), vehicle()
     target, known, _ = episode(Secant(), environment(), limit=6)

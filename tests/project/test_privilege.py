@@ -48,8 +48,6 @@ def policy(kind: str) -> TensorDictModuleBase:
     env = base_env()
     if kind == "feedforward":
         return FieldPolicy(PolicyConfig(env.observation_view(), (8,)))
-    if kind == "recurrent":
-        return FieldPolicy(PolicyConfig(env.observation_view(observe_heading=False), (8,), memory_size=4))
     if kind == "exported":
         view = env.observation_view()
         steps = Compose(*view.observation_transforms(), view.action_transform())
@@ -62,7 +60,7 @@ def policy(kind: str) -> TensorDictModuleBase:
     [
         *sorted(set(NAVIGATORS) - ORACLES - METAHEURISTICS),
         *(f"{name}:flown" for name in sorted(METAHEURISTICS)),
-        *("feedforward", "recurrent", "exported", "anywhere"),
+        *("feedforward", "exported", "anywhere"),
     ],
 )
 def test_actions_do_not_depend_on_private_keys(kind: str, states: list[TensorDict]) -> None:

@@ -15,7 +15,6 @@ import ppo_anywhere
 import ppo_recurrent
 import pytest
 import td3_gradient_guided as recipe
-import td3_recurrent
 import torch
 from support.recipes import small
 from tensordict import TensorDict
@@ -27,7 +26,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.training import command, parse_config
 from magrl.transforms import SensorNoise
 
-RECIPES = (recipe, ppo_anywhere, td3_recurrent, ppo_recurrent, ppo)
+RECIPES = (recipe, ppo_anywhere, ppo_recurrent, ppo)
 NOISE = (0.05, 0.05, 5.0)
 
 
@@ -105,13 +104,10 @@ def test_training_without_a_gradient_step_or_a_success(tmp_path: Path, capsys) -
 def first_state(module, noise: tuple[float, ...]) -> TensorDict:
     """Return the first observation of a recipe's training environment."""
     config, base = module.Config(noise=noise), GeomagneticNavEnv(num_envs=4, seed=5)
-    if module is not td3_recurrent:
-        return module.make_env(base, base.observation_view(), config).reset()
-    view = base.observation_view(observe_heading=False)
-    return module.make_env(base, view, PolicyConfig(view, (8,), memory_size=4).make_actor(), config).reset()
+    return module.make_env(base, base.observation_view(), config).reset()
 
 
-@pytest.mark.parametrize("module", [recipe, td3_recurrent, ppo], ids=names)
+@pytest.mark.parametrize("module", [recipe, ppo], ids=names)
 def test_noise_is_observed_and_the_guidance_is_by_the_truth(module) -> None:
     perfect, noisy = first_state(module, (0.0, 0.0, 0.0)), first_state(module, NOISE)
     assert "true_field" not in perfect.keys()  # noqa: SIM118
@@ -146,8 +142,7 @@ def test_actor_that_ppo_saves_is_the_stochastic_one_without_noise() -> None:
         (recipe, "--buffer-size 16", "buffer_size 16 does not hold one batch of 1024"),
         (recipe, "--final-exploration-noise 0.3", "final_exploration_noise 0.3 must not exceed exploration_noise 0.2"),
         (recipe, "--num-envs 8 --collectors 3", "num_envs 8 cannot be divided evenly among 3 collectors"),
-        (td3_recurrent, "--noise 0.05 0.05", "Missing value for argument '--noise'. Expected 3 values"),
-        (td3_recurrent, "--shortest-task-km 600", "shortest_task_km must be below 500, got 600.0"),
+        (ppo, "--noise 0.05 0.05", "Missing value for argument '--noise'. Expected 3 values"),
         (ppo_anywhere, "--distance-range-km 500 300", "must be two rising numbers, got (500.0, 300.0)"),
         (ppo_anywhere, "--distance-range-km 150 6000", "must end at 4400 km or below, the side of a region"),
         (ppo_anywhere, "--max-turn-deg 200", "max_turn_deg must be less than or equal to 180, got 200.0"),

@@ -33,7 +33,6 @@ SMALL = {
     "critic_batches": 1,
     "memory_batches": 1,
     "sequences_per_update": 8,
-    "num_slices": 4,
     "memory_size": 8,
     "num_regions": 8,
     "max_steps": 5,

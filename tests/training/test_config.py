@@ -66,7 +66,7 @@ MINE = '"recipe": "td3_gradient_guided.py"'
         (None, "holds no config.json"),
         ("", "cannot resume"),
         ("[]", "not of this version of magrl: start the training again in a new folder"),
-        ('{"recipe": "td3_recurrent.py"}', r"the run was started by td3_recurrent\.py: resume it with that recipe"),
+        ('{"recipe": "ppo.py"}', r"the run was started by ppo\.py: resume it with that recipe"),
         (f'{{{MINE}, "wings": 2}}', "unknown key 'wings'"),
         (f'{{{MINE}, "gamma": 2.0}}', "gamma must be less than 1, got 2.0"),
         (f'{{{MINE}, "scenario": "scenario.toml"}}', "there is no scenario file at"),
