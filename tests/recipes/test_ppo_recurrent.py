@@ -80,7 +80,7 @@ def test_a_vehicle_moves_along_its_estimate() -> None:
 
 
 @pytest.mark.usefixtures("without_figures")
-@pytest.mark.parametrize("compass", [True, False])
+@pytest.mark.parametrize("compass", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_saved_policy_flies_as_the_trained_actor(tmp_path, monkeypatch, compass: bool) -> None:
     """The test tasks, whose sensors err; it is given readings, moves and, with a compass, headings."""
     plain, flown = [], []
