@@ -292,6 +292,18 @@ def test_bad_options_are_refused_with_their_value() -> None:
             Secant(**options)
 
 
+def test_the_larger_bias_of_readings_and_data_sheet_counts() -> None:
+    """A navigator that is told nothing flies by what comes with the readings."""
+    bias = (0.5, 0.1, 20.0)
+    env = GeomagneticNavEnv(num_envs=4, seed=0, start_heading="random")
+    own = Conditions("own", sensors={"sensor_std": (0.02, 0.02, 2.0), "bias": bias})
+    flights = []
+    for told in (Secant(sensor_std=own.sensor_std), Secant(sensor_std=own.sensor_std, bias_std=bias)):
+        env.set_seed(0)
+        flights.append(with_conditions(env, own).rollout(6, told, break_when_any_done=False)["next", "position"])
+    assert torch.equal(*flights)
+
+
 def test_maps_and_pairs_are_checked(env) -> None:
     with pytest.raises(ValueError, match=r"two places.*\(1, 2\)"):
         MeanJacobian(env.field, torch.zeros(1, 2))

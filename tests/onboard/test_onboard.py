@@ -97,7 +97,9 @@ def test_commands_are_those_of_the_environment(name: str, noise: tuple[float, fl
 @pytest.mark.parametrize("name", ["anywhere", "kalman", "secant"])
 def test_commands_from_a_known_start_are_those_of_the_environment(name: str, tmp_path: Path) -> None:
     """The constant errors of sensors that the first reading shows; also for a vehicle that is restored."""
-    own = Conditions("own", sensors={"sensor_std": NOISE, "bias": (0.4, 0.1, 30.0), "drift": NOISE, "drift_length": 50})
+    own = Conditions(
+        "own", sensors={"sensor_std": NOISE, "bias": (0.4, 0.1, 30.0), "drift": (0.2, 0.1, 20.0), "drift_length": 50}
+    )
     known, options = (0.1, 0.1, 10.0), {"max_steps": 50, "confidence": 0.0}
     base = GeomagneticNavEnv(num_envs=1, seed=3, start_heading="random", arrival="declared")
     policy = make_navigator(name, base, sensor_std=own.sensor_std, bias_std=own.left_std(known))
@@ -112,6 +114,7 @@ def test_commands_from_a_known_start_are_those_of_the_environment(name: str, tmp
     for step in range(6):
         reading = (state["field"] + state["start_error"])[0].tolist()
         command = vehicle.step(*reading, *numbers(state)[3:])
+        assert command.way_km == pytest.approx(state["arrival_way"][0].tolist(), rel=1e-3, abs=0.01)
         with torch.no_grad():
             state = env.step(policy(state))["next"]
         distance, turn = state["move"][0].tolist()

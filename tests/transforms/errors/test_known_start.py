@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from support.errors import nav
@@ -59,9 +61,14 @@ def test_conditions_state_what_is_left_where_the_start_is_known() -> None:
     assert aircraft.left_std((0, 0, 0))[1:] == aircraft.drift_std[1:] == aircraft.bias_std[1:]
     base = nav(4)
     env = with_conditions(base, aircraft, known_start=(0.0, 0.0, 0.0))
-    left = env.reset()["bias_std"]
-    assert left[0, 1:].tolist() == pytest.approx(aircraft.left_std((0, 0, 0))[1:], abs=1e-6)
-    assert left[0, 0].item() == pytest.approx(aircraft.left_std((0, 0, 0))[0], rel=0.01)  # grows with the latitude
+    state, none = env.reset(), torch.zeros(3)
+    latitude = math.atan(
+        math.tan(math.radians(state["field"][0, 1])) / 2
+    )  # of a dipole: a gyrocompass errs by its secant
+    bias = math.hypot(0.1 / math.cos(latitude), aircraft.drift_std[0]), *aircraft.bias_std[1:]
+    sheet = (torch.tensor(std) for std in (aircraft.sensor_std, bias, aircraft.drift_std))
+    left = calibration(none, none, *sheet, none).bias_std
+    assert state["bias_std"][0].tolist() == pytest.approx(left.tolist(), abs=1e-6)
 
 
 def test_bad_standard_deviations_are_named() -> None:
