@@ -299,7 +299,7 @@ class Onboard:
         if stop:
             action = [0.0, 0.0]
         elif way.displacement.norm() < self.arrival_km:
-            limits = self.arrival_km, self.max_move_km, math.radians(self.max_turn_deg)
+            limits = decision.stop_km.unsqueeze(-1), self.max_move_km, math.radians(self.max_turn_deg)
             action = tracking.approach(way.displacement, seen["heading"], *limits)[0].tolist()
         steer = math.degrees(course + action[1]) % 360.0
         north, east = way.displacement[0].tolist()

@@ -26,31 +26,34 @@ from magrl.tracking.track import related
 
 TRIP_KM = 800.0
 """Path before the decision [km]: another kilometer has to make a right declaration about 1/800 more likely."""
-STEP_KM = 1.0
+STEP_KM = 0.5
 """Path that a reading costs [km]."""
 DRIFT_SHARE = 0.5
 """Share of the variance of slow errors that the readings of a track do not average; chosen on random planets."""
 RANGE_KM = 500.0
 """Prior standard deviation of the way along each axis [km]."""
+STOPS = (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8)
+"""Distances from the estimated place to which a vehicle may come to read, as shares of the radius."""
 SHORT = 0.25
-"""Distance from the estimated place at which an approach ends, as a share of the radius."""
+"""The least distance at which it stops, as a share of the radius: estimates vary by more."""
 READINGS = (1, 2, 4, 8, 16, 32)
-"""Numbers of further readings at the estimated place that are compared with declaring now."""
+"""Numbers of further readings there that are compared with declaring now."""
 
 
 class ArrivalDecision(NamedTuple):
-    """Probability ``(...)`` of being right now, that at which going on is worth as much, the highest that readings at
-    the place can reach, and the posterior of the way.
+    """Probability ``(...)`` of being right now, that at which going on is worth as much, the highest that more readings
+    can reach, the distance [km] from the estimated place at which to stop for them, and the posterior of the way.
 
     Example:
         >>> there = WayPosterior(torch.zeros(1, 2), torch.ones(1))
-        >>> ArrivalDecision(torch.tensor(0.9), torch.tensor(0.8), torch.tensor(0.9), there).declare
+        >>> ArrivalDecision(*torch.tensor([0.9, 0.8, 0.9, 10.0]), there).declare
         tensor(True)
     """
 
     probability: Tensor
     worth: Tensor
     attainable: Tensor
+    stop_km: Tensor
     posterior: WayPosterior
 
     @property
@@ -69,13 +72,14 @@ def arrival_decision(
     radius_km: float,
     range_km: float = RANGE_KM,
 ) -> ArrivalDecision:
-    """Return whether to declare that the target is within a radius, or to go to the estimated place and read on.
+    """Return whether to declare that the target is within a radius, or where to stop and read on.
 
-    It compares the probability of being right now with that after 1 to 32 more readings at the estimated place, times
-    the share of the path that remains useful: a path of :data:`TRIP_KM` over itself, the way there and
-    :data:`STEP_KM` for each reading. Readings there reduce the variance of the field at the vehicle, but not that of a
-    constant error. Slow errors change with the heading and the time: the readings of a track have averaged a part of
-    them, and :data:`DRIFT_SHARE` of their variance is left. Without steps left, going on is worth nothing.
+    It compares the probability of being right now with that after a way toward the estimated place, to one of
+    :data:`STOPS` before it, and 1 to 32 readings there, times the share of the path that remains useful: a path of
+    :data:`TRIP_KM` over itself, the way and :data:`STEP_KM` for each reading. Readings reduce the variance of the field
+    at the vehicle, but not that of a constant error. Slow errors change with the heading and the time: the readings of
+    a track have averaged a part of them, and :data:`DRIFT_SHARE` of their variance is left. Without steps left, going
+    on is worth nothing.
 
     Args:
         track: state of the filter of D, I, B_H.
@@ -113,30 +117,35 @@ def arrival_decision(
     bias = (bias / unit.square()).unsqueeze(-2)
     readings = torch.tensor(READINGS, dtype=unit.dtype, device=unit.device)
     there = _variance_at(known, way / DISTANCE_SCALE_KM).unsqueeze(-2)
-    later = _within(known, 1 / (1 / there + readings.unsqueeze(-1) / noise) + bias, radius_km)
-    later = later.where(readings <= steps_left.unsqueeze(-1), 0.0)
-    cost = way.norm(dim=-1, keepdim=True) + STEP_KM * readings
-    worth = (later * (TRIP_KM / (TRIP_KM + cost))).amax(-1)
-    return ArrivalDecision(probability, worth, torch.maximum(probability, later.amax(-1)), posterior)
+    stops = radius_km * torch.tensor(STOPS, dtype=unit.dtype, device=unit.device)
+    distance = way.norm(dim=-1, keepdim=True)
+    apart = way.unsqueeze(-2) * (stops / distance.clamp_min(1e-6)).unsqueeze(-1)
+    later = _within(known, 1 / (1 / there + readings.unsqueeze(-1) / noise) + bias, apart, radius_km)
+    possible = (readings <= steps_left.unsqueeze(-1)).unsqueeze(-1) & (stops <= distance).unsqueeze(-2)
+    later = later.where(possible, 0.0)
+    cost = (distance - stops).unsqueeze(-2) + STEP_KM * readings.unsqueeze(-1)
+    worth, best = (later * (TRIP_KM / (TRIP_KM + cost))).flatten(-2).max(-1)
+    attainable = torch.maximum(probability, later.flatten(-2).amax(-1))
+    stop_km = stops[best % len(STOPS)].clamp_min(SHORT * radius_km)
+    return ArrivalDecision(probability, worth, attainable, stop_km, posterior)
 
 
 def approach(
-    way: Tensor, heading: Tensor, radius_km: float, max_move_km: Tensor | float, max_turn_rad: Tensor | float
+    way: Tensor, heading: Tensor, stop_km: Tensor, max_move_km: Tensor | float, max_turn_rad: Tensor | float
 ) -> Tensor:
-    """Return the action ``(..., 2)``, distance [km] and turn [rad], that goes to the estimated place.
+    """Return the action ``(..., 2)``, distance [km] and turn [rad], that goes toward the estimated place.
 
-    It ends :data:`SHORT` of the radius before it, as estimates vary by more. Where the turn is larger than the largest,
-    the vehicle turns where it is.
+    Where the turn is larger than the largest, the vehicle turns where it is.
 
     Args:
         way: ``(..., 2)`` northward and eastward [km].
         heading: ``(..., 1)`` [rad].
-        radius_km: distance within which the vehicle has arrived.
+        stop_km: ``(..., 1)`` distance from the place at which the move ends.
         max_move_km: longest move.
         max_turn_rad: largest turn.
 
     Example:
-        >>> approach(torch.tensor([0.0, 30.0]), torch.tensor([0.0]), 40.0, 50.0, 1.6).round(decimals=2)
+        >>> approach(torch.tensor([0.0, 30.0]), torch.tensor([0.0]), torch.tensor([10.0]), 50.0, 1.6).round(decimals=2)
         tensor([20.0000,  1.5700])
     """
     check_tensor(2, way=way)
@@ -144,7 +153,7 @@ def approach(
     turn = wrap_angle(torch.atan2(east, north) - heading)
     limit = torch.as_tensor(max_turn_rad, dtype=way.dtype, device=way.device)
     longest = torch.as_tensor(max_move_km, dtype=way.dtype, device=way.device)
-    distance = (torch.hypot(north, east) - SHORT * radius_km).clamp_min(0).clamp_max(longest)
+    distance = (torch.hypot(north, east) - stop_km).clamp_min(0).clamp_max(longest)
     return torch.cat((distance.where(turn.abs() <= limit, 0.0), torch.minimum(torch.maximum(turn, -limit), limit)), -1)
 
 
@@ -156,15 +165,16 @@ def _variance_at(track: FieldTrack, way: Tensor) -> Tensor:
     return (variance + de * (2 * p[..., 0, 2] + p[..., 2, 2] * de)).clamp_min(1e-12)
 
 
-def _within(track: FieldTrack, variance: Tensor, radius_km: float) -> Tensor:
-    """Return the probability ``(..., K)`` of a place within a radius, for variances ``(..., K, E)`` of the field there.
+def _within(track: FieldTrack, variance: Tensor, apart: Tensor, radius_km: float) -> Tensor:
+    """Return the probability ``(..., K, J)`` that a place is within a radius of the vehicle.
 
-    The estimated place is then that of the vehicle, with the covariance of the least squares solution.
+    It is that of variances ``(..., K, E)`` of the field there and displacements ``(..., J, 2)`` [km] to the estimate of
+    the place. The error of the estimate has the covariance of the least squares solution.
     """
     gradient = track.mean[..., 1:]
     squares = gradient.unsqueeze(-1) * gradient.unsqueeze(-2) + track.covariance[..., 1:, 1:]  # (..., E, 2, 2)
     nn, ne, ee = (
-        (squares[..., i, j].unsqueeze(-2) / variance).sum(-1).unsqueeze(-1) for i, j in ((0, 0), (0, 1), (1, 1))
+        (squares[..., i, j].unsqueeze(-2) / variance).sum(-1)[..., None, None] for i, j in ((0, 0), (0, 1), (1, 1))
     )
     x, y = _NORMAL.to(nn).unbind(-1)
     first = nn.clamp_min(1e-12).rsqrt()  # N = L L^T; the points solve L^T d = normal
@@ -172,7 +182,8 @@ def _within(track: FieldTrack, variance: Tensor, radius_km: float) -> Tensor:
     second = (ee - below * below).clamp_min(1e-12).rsqrt()
     east = second * y
     north = first * (x - below * east)
-    return (torch.hypot(north, east) * DISTANCE_SCALE_KM <= radius_km).to(variance.dtype).mean(-1)
+    dn, de = (part[..., None, :, None] / DISTANCE_SCALE_KM for part in apart.unbind(-1))
+    return (torch.hypot(dn + north, de + east) * DISTANCE_SCALE_KM <= radius_km).to(variance.dtype).mean(-1)
 
 
-_NORMAL = torch.special.ndtri(_sobol(512, seed=2).clamp(1e-6, 1 - 1e-6))  # standard normal
+_NORMAL = torch.special.ndtri(_sobol(128, seed=2).clamp(1e-6, 1 - 1e-6))  # standard normal

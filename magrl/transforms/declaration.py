@@ -23,7 +23,8 @@ class DeclareArrival(ObservationTransform):
     For an environment whose action has a third number that declares the arrival. To the policy, the action has the
     first two. Where the vehicle is probably within the radius, and further readings are not worth their cost
     (:func:`magrl.tracking.arrival_decision`), it stays where it is and declares. Before, where its estimated distance
-    is less than the radius, it goes to the estimated place. Elsewhere it moves as the policy wants.
+    is less than the radius, it goes toward the estimated place and stops where readings are worth most. Elsewhere it
+    moves as the policy wants.
 
     In ``Compose``, it stands behind :class:`TrackGradient`. It reads nothing privileged.
 
@@ -36,7 +37,8 @@ class DeclareArrival(ObservationTransform):
             filter, heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, and optionally the standard deviations
             ``(..., 3)`` of new errors of a reading, of constant and slow ones, and of slow ones alone.
         out_keys: probability ``(..., 1)`` that the target is within the radius, the probability ``(..., 1)`` at which
-            going on is worth as much, and the mean way ``(..., 2)`` northward and eastward [km].
+            going on is worth as much, the mean way ``(..., 2)`` northward and eastward [km], and the distance
+            ``(..., 1)`` from its end at which to stop [km].
         action_key: action, ``(..., 2)`` to the policy and ``(..., 3)`` to the environment.
 
     Raises:
@@ -57,10 +59,10 @@ class DeclareArrival(ObservationTransform):
     """
 
     default_in_keys = ("target_field", *OUT_KEYS[:2], "heading", "step_count")
-    default_out_keys = ("arrival_probability", "arrival_worth", "arrival_way")
+    default_out_keys = ("arrival_probability", "arrival_worth", "arrival_way", "arrival_stop")
     in_counts = (5, 8)
     in_sizes = (3, 3, 3, 1, 1, 3, 3, 3)
-    out_sizes = ((1,), (1,), (2,))
+    out_sizes = ((1,), (1,), (2,), (1,))
     invertible = True
 
     def __init__(
@@ -88,15 +90,17 @@ class DeclareArrival(ObservationTransform):
         track = FieldTrack(mean, covariance)
         options = left, self.radius_km, self.range_km
         decision = tracking.arrival_decision(track, target, new, lasting, slow, *options)
-        return decision.probability.unsqueeze(-1), decision.worth.unsqueeze(-1), decision.posterior.way().displacement
+        numbers = (x.unsqueeze(-1) for x in (decision.probability, decision.worth, decision.stop_km))
+        probability, worth, stop_km = numbers
+        return probability, worth, decision.posterior.way().displacement, stop_km
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         values = self._read(tensordict, [*self.out_keys, self.in_keys[3], *self.in_keys_inv])
         if values is None:
             return tensordict
-        probability, worth, way, heading, action = values
+        probability, worth, way, stop_km, heading, action = values
         high = self.parent.full_action_spec[self.in_keys_inv[0]].space.high
-        approach = tracking.approach(way, heading, self.radius_km, *high[..., :2].split(1, -1)).to(action.dtype)
+        approach = tracking.approach(way, heading, stop_km, *high[..., :2].split(1, -1)).to(action.dtype)
         near = way.norm(dim=-1, keepdim=True) < self.radius_km
         declare = (probability >= worth) & (probability >= self.confidence)
         action = torch.where(near, approach, action).masked_fill(declare, 0.0)

@@ -61,7 +61,14 @@ def test_a_vehicle_near_the_border_goes_nearer_if_readings_there_help() -> None:
     assert not decide(20.0, 0.1, 0.0).declare.item()
 
 
+@pytest.mark.parametrize(("bias", "share"), [(0.0, 0.8), (0.2, 0.25)])
+def test_it_goes_no_nearer_than_readings_are_worth(bias: float, share: float) -> None:
+    """24 km away: one that is sure stops at once; a constant error of 20 km needs the nearest place that it may go to,
+    which is not the estimated one, as each new estimate is another way."""
+    assert decide(24.0, 0.0, bias).stop_km.item() == pytest.approx(share * 25)
+
+
 def test_the_approach_turns_where_it_is_if_the_way_is_behind() -> None:
     way = f64((0.0, 30.0), (-30.0, 0.0), (0.0, -80.0))
-    action = approach(way, torch.zeros(3, 1, dtype=F64), 20.0, 50.0, math.pi / 2)
-    assert action.tolist() == [pytest.approx(row) for row in ([25, math.pi / 2], [0, math.pi / 2], [50, -math.pi / 2])]
+    action = approach(way, torch.zeros(3, 1, dtype=F64), f64(4.0).expand(3, 1), 50.0, math.pi / 2)
+    assert action.tolist() == [pytest.approx(row) for row in ([26, math.pi / 2], [0, math.pi / 2], [50, -math.pi / 2])]

@@ -114,8 +114,9 @@ def test_it_goes_to_the_estimated_place_where_that_is_near() -> None:
     state = env.reset().set("action", torch.tensor([[50.0, -1.0]]).expand(2, 2))
     state["arrival_way"] = torch.tensor([[0.0, 20.0], [0.0, 30.0]])
     state["arrival_probability"], state["arrival_worth"] = torch.zeros(2, 1), torch.ones(2, 1)
+    state["arrival_stop"] = torch.tensor([[12.0], [12.0]])
     sent = env.transform.inv(state)["action"]
-    assert sent.tolist() == [pytest.approx([20.0 - 0.25 * 25.0, math.pi / 2, -1.0]), [50.0, -1.0, -1.0]]
+    assert sent.tolist() == [pytest.approx([20.0 - 12.0, math.pi / 2, -1.0]), [50.0, -1.0, -1.0]]
     state["arrival_probability"] += 1
     assert env.transform.inv(state)["action"].tolist() == [[0.0, 0.0, 1.0]] * 2
 
