@@ -25,6 +25,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 import tyro
@@ -39,6 +40,7 @@ from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
 from magrl.geodesy import geodesic
+from magrl.tracking import decision
 from magrl.training import UsageError, command
 from magrl.transforms import Conditions, conditions_named
 
@@ -161,6 +163,30 @@ def reliability(
     return markdown_table(["navigator", "errors", *(f"{low}–{low + 10} %" for low in range(0, 100, 10))], rows)
 
 
+def decisions(
+    navigators: Sequence[Spec],
+    *,
+    rules: Sequence[Mapping[str, Any]],
+    conditions: Sequence[str],
+    tasks: int = 1000,
+    max_steps: int = 80,
+) -> str:
+    """Return a row for each change of the constants of :mod:`magrl.tracking.decision`, on random planets.
+
+    Vehicles declare that they are within 25 km.
+    """
+    drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM}
+    base = earth_env(tasks, max_steps=max_steps, planets=True, arrival="declared", arrival_radius_km=25.0, **drift)
+    columns, rows = columns_of(()) | columns_of(conditions), []
+    for navigator, rule in tqdm(list(itertools.product(navigators, rules)), unit="row"):
+        with mock.patch.multiple(decision, **rule):
+            found = [summarize(flown(navigator, base, errors)) for errors in columns.values()]
+        cells = [" / ".join(number(summary[name]) for name in ("success_rate", "spl", "steps")) for summary in found]
+        changed = (f"{key} {value}" for key, value in rule.items())
+        rows.append([", ".join([names(navigator)[0], *changed]), *cells])
+    return markdown_table(["navigator", *columns], rows)
+
+
 def names(navigator: Spec) -> list[str]:
     """Return the label of a navigator, with the options that are given, and what it needs."""
     name, *options = navigator.items() if isinstance(navigator, Mapping) else [("name", navigator)]
@@ -230,6 +256,7 @@ KINDS: Mapping[str, Callable[..., str]] = {
     "rows": rows_of,
     "globe": globe.globe,
     "reliability": reliability,
+    "decisions": decisions,
     "evaluation": trainings.evaluation,
     "short": trainings.short,
     "noise_levels": trainings.noise_levels,

@@ -15,6 +15,7 @@ from support.recipes import RECIPES
 from magrl.envs import Scenario, Tasks
 from magrl.field import IGRF
 from magrl.field.model import elements_gradient_at
+from magrl.tracking import decision
 from magrl.training import UsageError
 from magrl.transforms import CONDITIONS
 
@@ -150,6 +151,16 @@ def test_reliability_counts_readings_by_their_probability() -> None:
     assert [row[1] for row in table][-1] == "ship"
     assert len(table) == len(grid.LEVELS) + 1
     assert all(float(row[2]) < 20 for row in table)
+
+
+def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone() -> None:
+    """To whom a kilometer costs much declares at once: fewer are right, after fewer steps."""
+    rules = [{"TRIP_KM": 1}, {"TRIP_KM": decision.TRIP_KM}]
+    table = rows(grid.decisions(["kalman"], rules=rules, conditions=[], tasks=10, max_steps=20))[2:]
+    assert [row[0] for row in table] == ["Kalman (dual control), TRIP_KM 1", "Kalman (dual control), TRIP_KM 800.0"]
+    hasty, usual = ([float(number) for number in row[3].split(" / ")] for row in table)
+    assert hasty[0] < usual[0]
+    assert decision.TRIP_KM == 800
 
 
 # The globe
