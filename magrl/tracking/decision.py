@@ -24,12 +24,13 @@ from magrl.tracking.posterior import WayPosterior, _sobol, way_posterior
 from magrl.tracking.priors import curl_relation, field_curvature
 from magrl.tracking.track import related
 
+# Chosen on random planets: docs/results/decision-options.md.
 TRIP_KM = 800.0
 """Path before the decision [km]: another kilometer has to make a right declaration about 1/800 more likely."""
 STEP_KM = 0.5
 """Path that a reading costs [km]."""
 DRIFT_SHARE = 0.5
-"""Share of the variance of slow errors that the readings of a track do not average; chosen on random planets."""
+"""Share of the variance of slow errors that the readings of a track do not average."""
 RANGE_KM = 500.0
 """Prior standard deviation of the way along each axis [km]."""
 STOPS = (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8)

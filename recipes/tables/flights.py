@@ -14,10 +14,10 @@ from torch import Tensor
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, earth_scenario, planet_scenario
 from magrl.evaluation import episode_measures, evaluation_rollout, with_declaration, with_errors
-from magrl.evaluation.navigators import make_navigator
-from magrl.evaluation.runs import Noise
+from magrl.evaluation.navigators import label, make_navigator, needs
+from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.field.model import elements_gradient_at
-from magrl.transforms import Conditions
+from magrl.transforms import Conditions, conditions_named
 
 FAR_KM = 500.0
 """Longest distance of the paper's tasks; beyond, regions are larger and cells begin with kilometers."""
@@ -25,6 +25,9 @@ DRIFT_KM = 40.0
 """How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
 SEED = 3 * paper.FIRST_RESERVED_SEED
 """Seed of regions and tasks, beyond those of trainings and of frozen sets."""
+LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
+"""Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
+OPTIONS = {"map_date": "map of", "step_km": "step [km]", "step_price": "step [% of SPL]"}
 Spec = str | Mapping[str, Any]
 """Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
 
@@ -146,3 +149,16 @@ def paired_difference(first: Tensor, second: Tensor, region: Tensor) -> str:
     error = (sums.square().sum() * count / (count - 1)).sqrt().item() / len(difference)
     text = f"{mean.item():+.1f} ({mean.item() - 1.96 * error:+.1f} to {mean.item() + 1.96 * error:+.1f})"
     return f"**{text}**" if abs(mean.item()) > 1.96 * error else text
+
+
+def columns_of(conditions: Sequence[str]) -> dict[str, Noise | Conditions]:
+    """Return some conditions by name, or the levels of noise."""
+    columns: dict[str, Noise | Conditions] = {name: conditions_named(name) for name in conditions}
+    return columns or {", ".join(f"{level:g}" for level in noise): noise for noise in LEVELS}
+
+
+def names(navigator: Spec) -> list[str]:
+    """Return the label of a navigator, with the options that are given, and what it needs."""
+    name, *options = navigator.items() if isinstance(navigator, Mapping) else [("name", navigator)]
+    known = name[1].partition("=")[0]
+    return [", ".join([label(known), *(f"{OPTIONS.get(key, key)} {value}" for key, value in options)]), needs(known)]

@@ -25,7 +25,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import torch
 import tyro
@@ -34,15 +33,11 @@ from tqdm import tqdm
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
 from magrl.evaluation import summarize
-from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import check_distinct, label, needs
-from magrl.evaluation.runs import NO_NOISE, Noise
+from magrl.evaluation.navigators import check_distinct, label
+from magrl.evaluation.runs import NO_NOISE
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
-from magrl.geodesy import geodesic
-from magrl.tracking import decision
 from magrl.training import UsageError, command
-from magrl.transforms import Conditions, conditions_named
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -50,15 +45,24 @@ else:
     import tomli as tomllib
 
 sys.path.insert(0, str(Path(__file__).parent))
+import declarations
 import globe
 import trainings
-from flights import DRIFT_KM, FAR_KM, Spec, earth_env, estimate_within, flown, number, paired_difference, rollout
+from flights import (
+    DRIFT_KM,
+    FAR_KM,
+    Spec,
+    columns_of,
+    earth_env,
+    estimate_within,
+    flown,
+    names,
+    number,
+    paired_difference,
+)
 
 RECIPE = "grid.py"
-LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
-"""Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
 DISTANCES = ("final_distance_km_median", "final_distance_km_p90")
-OPTIONS = {"map_date": "map of", "step_km": "step [km]", "step_price": "step [% of SPL]"}
 BOUND = ("best estimate at the destination, by the data sheet", "the gradient")
 FILE, RESULTS = Path(__file__).parent / "tables.toml", Path("docs/results")
 EAST_OF_THE_PAPER = Region((-10, 0), (175, 185))
@@ -136,64 +140,6 @@ def arrival_name(arrival: str | float) -> str:
     return f"declared at {arrival:g}" if arrival else "declared"
 
 
-def columns_of(conditions: Sequence[str]) -> dict[str, Noise | Conditions]:
-    """Return some conditions by name, or the levels of noise."""
-    columns: dict[str, Noise | Conditions] = {name: conditions_named(name) for name in conditions}
-    return columns or {", ".join(f"{level:g}" for level in noise): noise for noise in LEVELS}
-
-
-def reliability(
-    navigators: Sequence[Spec], *, conditions: Sequence[str], tasks: int = 1000, max_steps: int = 80
-) -> str:
-    """Return, for ten bins of the probability of being within 25 km, the share of readings at which that was so [%]."""
-    drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM}
-    base = earth_env(tasks, max_steps=max_steps, arrival="declared", arrival_radius_km=25.0, **drift)
-    rows = []
-    for navigator, (name, errors) in itertools.product(navigators, (columns_of(()) | columns_of(conditions)).items()):
-        flight = rollout(navigator, base, errors)
-        kept = first_episode_mask(flight["next", "done"]).squeeze(-1)
-        probability, places = flight["arrival_probability"][kept].squeeze(-1), flight["position"][kept].unbind(-1)
-        distance, _ = geodesic(*places, *flight["target_position"][kept].unbind(-1))
-        cells = []
-        for low in range(0, 100, 10):
-            inside = (100 * probability >= low) & (100 * probability < low + 10 + (low == 90))
-            right = 100 * (distance[inside] <= 25).double().mean().item()
-            cells.append(f"{right:.0f}" if inside.sum() >= 100 else "—")
-        rows.append([names(navigator)[0], name, *cells])
-    return markdown_table(["navigator", "errors", *(f"{low}–{low + 10} %" for low in range(0, 100, 10))], rows)
-
-
-def decisions(
-    navigators: Sequence[Spec],
-    *,
-    rules: Sequence[Mapping[str, Any]],
-    conditions: Sequence[str],
-    tasks: int = 1000,
-    max_steps: int = 80,
-) -> str:
-    """Return a row for each change of the constants of :mod:`magrl.tracking.decision`, on random planets.
-
-    Vehicles declare that they are within 25 km.
-    """
-    drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM}
-    base = earth_env(tasks, max_steps=max_steps, planets=True, arrival="declared", arrival_radius_km=25.0, **drift)
-    columns, rows = columns_of(()) | columns_of(conditions), []
-    for navigator, rule in tqdm(list(itertools.product(navigators, rules)), unit="row"):
-        with mock.patch.multiple(decision, **rule):
-            found = [summarize(flown(navigator, base, errors)) for errors in columns.values()]
-        cells = [" / ".join(number(summary[name]) for name in ("success_rate", "spl", "steps")) for summary in found]
-        changed = (f"{key} {value}" for key, value in rule.items())
-        rows.append([", ".join([names(navigator)[0], *changed]), *cells])
-    return markdown_table(["navigator", *columns], rows)
-
-
-def names(navigator: Spec) -> list[str]:
-    """Return the label of a navigator, with the options that are given, and what it needs."""
-    name, *options = navigator.items() if isinstance(navigator, Mapping) else [("name", navigator)]
-    known = name[1].partition("=")[0]
-    return [", ".join([label(known), *(f"{OPTIONS.get(key, key)} {value}" for key, value in options)]), needs(known)]
-
-
 def random_boxes(count: int, seed: int) -> list[Scenario]:
     """Return scenarios in random boxes, uniform over the sphere and rounded to a degree, that a vehicle can use.
 
@@ -255,8 +201,8 @@ KINDS: Mapping[str, Callable[..., str]] = {
     "boxes": boxes,
     "rows": rows_of,
     "globe": globe.globe,
-    "reliability": reliability,
-    "decisions": decisions,
+    "reliability": declarations.reliability,
+    "decisions": declarations.decisions,
     "evaluation": trainings.evaluation,
     "short": trainings.short,
     "noise_levels": trainings.noise_levels,
@@ -267,7 +213,7 @@ KINDS: Mapping[str, Callable[..., str]] = {
 """Function of each kind of table; its arguments are the options in the file."""
 
 
-def declarations(file: Path = FILE) -> dict[str, dict[str, Any]]:
+def declared(file: Path = FILE) -> dict[str, dict[str, Any]]:
     """Return the kind and the options of each table in a file."""
     return tomllib.loads(file.read_text())
 
@@ -278,7 +224,7 @@ def make(config: Config) -> None:
     Raises:
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
     """
-    known = declarations(config.file)
+    known = declared(config.file)
     changes = {"navigators": config.navigators, "tasks": config.tasks}
     given = {key: value for key, value in changes.items() if value is not None}
     if unknown := [name for name in config.tables if name not in known]:

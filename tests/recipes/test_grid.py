@@ -20,6 +20,7 @@ from magrl.training import UsageError
 from magrl.transforms import CONDITIONS
 
 sys.path.insert(0, str(RECIPES / "tables"))
+import declarations
 import figures
 import flights
 import globe
@@ -36,7 +37,7 @@ def rows(table: str) -> list[list[str]]:
 
 
 def test_every_table_declares_options_of_its_kind() -> None:
-    known = grid.declarations()
+    known = grid.declared()
     assert {"earth", "conditions", "globe", "readme", "learning", "alone", "paper-run"} <= known.keys()
     for name, options in known.items():
         grid.inspect.signature(grid.KINDS[options.pop("kind")]).bind(**options)
@@ -79,7 +80,7 @@ def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
 
 def test_earth_has_a_row_for_each_date_and_navigator(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(grid, "earth_env", functools.partial(grid.earth_env, regions=4))
-    monkeypatch.setattr(grid, "LEVELS", grid.LEVELS[::4])
+    monkeypatch.setattr(flights, "LEVELS", flights.LEVELS[::4])
     dates = ["1900-01-01", "2025-01-01"]
     found = rows(grid.earth(["geodesic", {"name": "map_matching", "map_date": "2015-01-01"}], tasks=2, dates=dates))
     assert found[0] == ["date", "navigator", "needs", "runs", "0, 0, 0", "0.5, 0.1, 20"]
@@ -147,16 +148,16 @@ def test_the_bound_is_that_of_readings_at_the_destination() -> None:
 
 
 def test_reliability_counts_readings_by_their_probability() -> None:
-    table = rows(grid.reliability(["secant"], conditions=["ship"], tasks=30, max_steps=12))[2:]
+    table = rows(declarations.reliability(["secant"], conditions=["ship"], tasks=30, max_steps=12))[2:]
     assert [row[1] for row in table][-1] == "ship"
-    assert len(table) == len(grid.LEVELS) + 1
+    assert len(table) == len(flights.LEVELS) + 1
     assert all(float(row[2]) < 20 for row in table)
 
 
 def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone() -> None:
     """To whom a kilometer costs much declares at once: fewer are right, after fewer steps."""
     rules = [{"TRIP_KM": 1}, {"TRIP_KM": decision.TRIP_KM}]
-    table = rows(grid.decisions(["kalman"], rules=rules, conditions=[], tasks=10, max_steps=20))[2:]
+    table = rows(declarations.decisions(["kalman"], rules=rules, conditions=[], tasks=10, max_steps=20))[2:]
     assert [row[0] for row in table] == ["Kalman (dual control), TRIP_KM 1", "Kalman (dual control), TRIP_KM 800.0"]
     hasty, usual = ([float(number) for number in row[3].split(" / ")] for row in table)
     assert hasty[0] < usual[0]

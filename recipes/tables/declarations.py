@@ -1,0 +1,62 @@
+"""Tables of declared arrivals: how reliable the stated probability is, and the constants of the rule."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+from unittest import mock
+
+from flights import DRIFT_KM, Spec, columns_of, earth_env, flown, names, number, rollout
+from tqdm import tqdm
+
+from magrl.evaluation import summarize
+from magrl.evaluation.metrics import first_episode_mask
+from magrl.evaluation.tables import markdown_table
+from magrl.geodesy import geodesic
+from magrl.tracking import decision
+
+
+def reliability(
+    navigators: Sequence[Spec], *, conditions: Sequence[str], tasks: int = 1000, max_steps: int = 80
+) -> str:
+    """Return, for ten bins of the probability of being within 25 km, the share of readings at which that was so [%]."""
+    drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM}
+    base = earth_env(tasks, max_steps=max_steps, arrival="declared", arrival_radius_km=25.0, **drift)
+    rows = []
+    for navigator, (name, errors) in itertools.product(navigators, (columns_of(()) | columns_of(conditions)).items()):
+        flight = rollout(navigator, base, errors)
+        kept = first_episode_mask(flight["next", "done"]).squeeze(-1)
+        probability, places = flight["arrival_probability"][kept].squeeze(-1), flight["position"][kept].unbind(-1)
+        distance, _ = geodesic(*places, *flight["target_position"][kept].unbind(-1))
+        cells = []
+        for low in range(0, 100, 10):
+            inside = (100 * probability >= low) & (100 * probability < low + 10 + (low == 90))
+            right = 100 * (distance[inside] <= 25).double().mean().item()
+            cells.append(f"{right:.0f}" if inside.sum() >= 100 else "—")
+        rows.append([names(navigator)[0], name, *cells])
+    return markdown_table(["navigator", "errors", *(f"{low}–{low + 10} %" for low in range(0, 100, 10))], rows)
+
+
+def decisions(
+    navigators: Sequence[Spec],
+    *,
+    rules: Sequence[Mapping[str, Any]],
+    conditions: Sequence[str],
+    tasks: int = 1000,
+    max_steps: int = 80,
+) -> str:
+    """Return a row for each change of the constants of :mod:`magrl.tracking.decision`, on random planets.
+
+    Vehicles declare that they are within 25 km.
+    """
+    drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM}
+    base = earth_env(tasks, max_steps=max_steps, planets=True, arrival="declared", arrival_radius_km=25.0, **drift)
+    columns, rows = columns_of(()) | columns_of(conditions), []
+    for navigator, rule in tqdm(list(itertools.product(navigators, rules)), unit="row"):
+        with mock.patch.multiple(decision, **rule):
+            found = [summarize(flown(navigator, base, errors)) for errors in columns.values()]
+        cells = [" / ".join(number(summary[name]) for name in ("success_rate", "spl", "steps")) for summary in found]
+        changed = (f"{key} {value}" for key, value in rule.items())
+        rows.append([", ".join([names(navigator)[0], *changed]), *cells])
+    return markdown_table(["navigator", *columns], rows)
