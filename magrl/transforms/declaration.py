@@ -90,17 +90,16 @@ class DeclareArrival(ObservationTransform):
         track = FieldTrack(mean, covariance)
         options = left, self.radius_km, self.range_km
         decision = tracking.arrival_decision(track, target, new, lasting, slow, *options)
-        numbers = (x.unsqueeze(-1) for x in (decision.probability, decision.worth, decision.stop_km))
-        probability, worth, stop_km = numbers
-        return probability, worth, decision.posterior.way().displacement, stop_km
+        probability, worth, stop = (x.unsqueeze(-1) for x in (decision.probability, decision.worth, decision.stop_km))
+        return probability, worth, decision.posterior.way().displacement, stop
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         values = self._read(tensordict, [*self.out_keys, self.in_keys[3], *self.in_keys_inv])
         if values is None:
             return tensordict
-        probability, worth, way, stop_km, heading, action = values
+        probability, worth, way, stop, heading, action = values
         high = self.parent.full_action_spec[self.in_keys_inv[0]].space.high
-        approach = tracking.approach(way, heading, stop_km, *high[..., :2].split(1, -1)).to(action.dtype)
+        approach = tracking.approach(way, heading, stop, *high[..., :2].split(1, -1)).to(action.dtype)
         near = way.norm(dim=-1, keepdim=True) < self.radius_km
         declare = (probability >= worth) & (probability >= self.confidence)
         action = torch.where(near, approach, action).masked_fill(declare, 0.0)
