@@ -109,7 +109,7 @@ def steer(
     """
     turn = wrap_angle(wanted - heading)
     within = turn.abs() <= max_turn_rad + 1e-6  # a right angle in float32 is still a right angle
-    distance = torch.where(within, distance_km.clamp(0, max_move_km), 0.0)
+    distance = torch.where(within, distance_km.clamp(0.0, max_move_km), 0.0)
     return distance, turn.clamp(-max_turn_rad, max_turn_rad)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from magrl.checks import check_type
 from magrl.transforms import TrackView
 from magrl.transforms.track import IN_KEYS, STD_KEYS
 
+_FLOAT = 1  # float32, among the types of ONNX
 ONNX_INPUTS = ("field", "target_field", "course", "accuracy", "step", "mean", "covariance", "first_field")
 """Names of the tensors that a step takes, in ONNX: see :meth:`VehicleStep.forward`."""
 ONNX_OUTPUTS = ("action", "way", "way_covariance", *(f"next_{name}" for name in ONNX_INPUTS[4:]))
@@ -157,7 +159,7 @@ def write_step(path: Path | str, policy: FieldPolicy) -> None:
 
 
 def _onnx(exported: torch.export.ExportedProgram) -> bytes:
-    """Return an exported step as ONNX, which lacks ``hypot``."""
+    """Return an exported step as ONNX, which lacks ``hypot``; its runtime lacks the arc tangent of float64."""
     try:
         from onnxscript import opset18
     except ImportError as error:
@@ -166,7 +168,16 @@ def _onnx(exported: torch.export.ExportedProgram) -> bytes:
     def hypot(x: Any, y: Any) -> Any:
         return opset18.Sqrt(opset18.Add(opset18.Mul(x, x), opset18.Mul(y, y)))
 
+    def atan2(y: Any, x: Any) -> Any:
+        north, east = opset18.Cast(x, to=_FLOAT), opset18.Cast(y, to=_FLOAT)
+        nowhere = opset18.And(opset18.Equal(north, 0.0), opset18.Equal(east, 0.0))
+        ahead = opset18.Atan(opset18.Div(east, opset18.Where(nowhere, 1.0, north)))
+        half_turn = opset18.Where(opset18.Less(east, 0.0), -math.pi, math.pi)
+        behind = opset18.Less(north, 0.0)
+        return opset18.CastLike(opset18.Where(behind, opset18.Add(ahead, half_turn), ahead), x)
+
     options: dict[str, Any] = {"input_names": ONNX_INPUTS, "output_names": ONNX_OUTPUTS, "dynamo": True}
-    options |= {"custom_translation_table": {torch.ops.prims.hypot.default: hypot}, "verbose": False}
+    written = {torch.ops.prims.hypot.default: hypot, torch.ops.aten.atan2.default: atan2}
+    options |= {"custom_translation_table": written, "verbose": False}
     program: Any = torch.onnx.export(exported, **options)
     return program.model_proto.SerializeToString()
