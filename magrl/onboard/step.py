@@ -164,17 +164,18 @@ def _onnx(exported: torch.export.ExportedProgram) -> bytes:
         from onnxscript import opset18
     except ImportError as error:
         raise ImportError("ONNX needs the package onnxscript: pip install 'magrl[onnx]'") from error
+    ops: Any = opset18
 
     def hypot(x: Any, y: Any) -> Any:
-        return opset18.Sqrt(opset18.Add(opset18.Mul(x, x), opset18.Mul(y, y)))
+        return ops.Sqrt(ops.Add(ops.Mul(x, x), ops.Mul(y, y)))
 
     def atan2(y: Any, x: Any) -> Any:
-        north, east = opset18.Cast(x, to=_FLOAT), opset18.Cast(y, to=_FLOAT)
-        nowhere = opset18.And(opset18.Equal(north, 0.0), opset18.Equal(east, 0.0))
-        ahead = opset18.Atan(opset18.Div(east, opset18.Where(nowhere, 1.0, north)))
-        half_turn = opset18.Where(opset18.Less(east, 0.0), -math.pi, math.pi)
-        behind = opset18.Less(north, 0.0)
-        return opset18.CastLike(opset18.Where(behind, opset18.Add(ahead, half_turn), ahead), x)
+        north, east = ops.Cast(x, to=_FLOAT), ops.Cast(y, to=_FLOAT)
+        nowhere = ops.And(ops.Equal(north, 0.0), ops.Equal(east, 0.0))
+        ahead = ops.Atan(ops.Div(east, ops.Where(nowhere, 1.0, north)))
+        half_turn = ops.Where(ops.Less(east, 0.0), -math.pi, math.pi)
+        behind = ops.Less(north, 0.0)
+        return ops.CastLike(ops.Where(behind, ops.Add(ahead, half_turn), ahead), x)
 
     options: dict[str, Any] = {"input_names": ONNX_INPUTS, "output_names": ONNX_OUTPUTS, "dynamo": True}
     written = {torch.ops.prims.hypot.default: hypot, torch.ops.aten.atan2.default: atan2}
