@@ -18,7 +18,7 @@ from magrl.checks import check_type
 from magrl.transforms import TrackView
 from magrl.transforms.track import IN_KEYS, STD_KEYS
 
-_FLOAT = 1  # float32, among the types of ONNX
+_FLOAT32 = 1  # number of the type in ONNX
 ONNX_INPUTS = ("field", "target_field", "course", "accuracy", "step", "mean", "covariance", "first_field")
 """Names of the tensors that a step takes, in ONNX: see :meth:`VehicleStep.forward`."""
 ONNX_OUTPUTS = ("action", "way", "way_covariance", *(f"next_{name}" for name in ONNX_INPUTS[4:]))
@@ -170,7 +170,7 @@ def _onnx(exported: torch.export.ExportedProgram) -> bytes:
         return ops.Sqrt(ops.Add(ops.Mul(x, x), ops.Mul(y, y)))
 
     def atan2(y: Any, x: Any) -> Any:
-        north, east = ops.Cast(x, to=_FLOAT), ops.Cast(y, to=_FLOAT)
+        north, east = ops.Cast(x, to=_FLOAT32), ops.Cast(y, to=_FLOAT32)
         nowhere = ops.And(ops.Equal(north, 0.0), ops.Equal(east, 0.0))
         ahead = ops.Atan(ops.Div(east, ops.Where(nowhere, 1.0, north)))
         half_turn = ops.Where(ops.Less(east, 0.0), -math.pi, math.pi)
@@ -178,7 +178,7 @@ def _onnx(exported: torch.export.ExportedProgram) -> bytes:
         return ops.CastLike(ops.Where(behind, ops.Add(ahead, half_turn), ahead), x)
 
     options: dict[str, Any] = {"input_names": ONNX_INPUTS, "output_names": ONNX_OUTPUTS, "dynamo": True}
-    written = {torch.ops.prims.hypot.default: hypot, torch.ops.aten.atan2.default: atan2}
-    options |= {"custom_translation_table": written, "verbose": False}
+    translations = {torch.ops.prims.hypot.default: hypot, torch.ops.aten.atan2.default: atan2}
+    options |= {"custom_translation_table": translations, "verbose": False}
     program: Any = torch.onnx.export(exported, **options)
     return program.model_proto.SerializeToString()

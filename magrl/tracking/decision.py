@@ -24,7 +24,7 @@ from magrl.tracking.posterior import WayPosterior, _sobol, way_posterior
 from magrl.tracking.priors import curl_relation, field_curvature
 from magrl.tracking.track import related
 
-# Chosen on random planets: docs/results/decision-options.md.
+# Compared with others on random planets: docs/results/decision-options.md.
 TRIP_KM = 800.0
 """Path before the decision [km]: another kilometer has to make a right declaration about 1/800 more likely."""
 STEP_KM = 0.5

@@ -42,7 +42,7 @@ from magrl.transforms import Conditions, VectorErrors
 sys.path.insert(0, str(Path(__file__).parent))
 from flights import DRIFT_KM, LEVELS, earth_env, flown
 from globe import earth_tasks, globe_map, measured
-from grid import RESULTS, declared
+from grid import RESULTS, declared_tables
 from trainings import level_name, matching, read_curves
 
 RECIPE = "figures.py"
@@ -98,7 +98,7 @@ def section_4(_: int | None) -> Figures:
     contours = Figure(figsize=(7, 7.4), layout="constrained")
     field, task = Scenario().build_field(), named_tasks("figure-4-1")
     draw_tracks(contours.subplots(), field, PAPER_REGION, [task.start], task.target)
-    folder = Path(declared()["comparison"]["folder"])
+    folder = Path(declared_tables()["comparison"]["folder"])
     paths, episodes = (columns_by_navigator(folder / f"{name}.csv") for name in ("paths", "episodes"))
     tracks = {name: (columns["latitude"], columns["longitude"]) for name, columns in paths.items()}
     boxes = {name: {key: columns[key] for key in BOXES} for name, columns in episodes.items()}
@@ -112,7 +112,7 @@ def section_4(_: int | None) -> Figures:
 
 def learning(_: int | None, *, table: str = "learning", shown: Mapping[str, tuple[str, str]] = LEARNING) -> Figures:
     """Return the learning curves of the runs of a table: by figure, the column and label that are ``shown``."""
-    runs = declared()[table]["runs"]
+    runs = declared_tables()[table]["runs"]
     found = {name: [read_curves(run) for run in matching(pattern)] for name, pattern in runs.items()}
     return {
         figure: plots.learning_curves(
@@ -124,7 +124,7 @@ def learning(_: int | None, *, table: str = "learning", shown: Mapping[str, tupl
 
 def noise(_: int | None) -> Figures:
     """Return SR and SPL over the noise, from the evaluations of table noise."""
-    levels = declared()["noise"]["levels"]
+    levels = declared_tables()["noise"]["levels"]
     found = {level_name(std): Path(f"runs/noise-{std[0]:g}/summary.json").read_text() for std in levels}
     return {"noise": plots.noise_figure({name: json.loads(text) for name, text in found.items()}, "look-ahead")}
 
@@ -133,7 +133,7 @@ def paper_run(_: int | None) -> Figures:
     """Return the curves of the runs of table paper-run, over the moves of the vehicle."""
     figure = Figure(figsize=(8, 8.4), layout="constrained")
     panels = figure.subplots(len(PAPER_RUN), sharex=True)
-    runs = {name: read_curves(run) for name, run in declared()["paper-run"]["runs"].items()}
+    runs = {name: read_curves(run) for name, run in declared_tables()["paper-run"]["runs"].items()}
     for axes, (column, title) in zip(panels, PAPER_RUN.items(), strict=True):
         for name, curves in runs.items():
             axes.plot(curves["frames"], curves[column], label=name, lw=1.2)
@@ -197,7 +197,7 @@ def conditions(tasks: int | None) -> Figures:
     base = earth_env(tasks or 200, reach_km=DRIFT_KM, drift_km=DRIFT_KM)
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = list(figure.subplots(3, 4, sharey=True).flat)
-    for navigator in tqdm(declared()["conditions"]["navigators"], unit="navigator"):
+    for navigator in tqdm(declared_tables()["conditions"]["navigators"], unit="navigator"):
         alone = summarize(flown(navigator, base, sensors()))["spl"]
         look = {"color": plots.NAVIGATOR_COLORS[navigator], "label": label(navigator).partition(" (")[0]}
         for axes, (make, sizes) in zip(panels, PANELS.values(), strict=False):
@@ -221,7 +221,7 @@ def conditions(tasks: int | None) -> Figures:
 def globe(tasks: int | None) -> Figures:
     """Return the map of the tasks of table globe, with perfect sensors."""
     field, ends = IGRF("2025-01-01"), earth_tasks(tasks or 10_000)
-    return {"globe": globe_map(field, ends, measured(declared()["globe"]["navigator"], field, ends, NO_NOISE))}
+    return {"globe": globe_map(field, ends, measured(declared_tables()["globe"]["navigator"], field, ends, NO_NOISE))}
 
 
 def prices(_: int | None) -> Figures:

@@ -103,7 +103,8 @@ def earth(
 
     An arrival is a rule of the environment, or the least confidence at which vehicles declare that they are
     ``within_km`` of the destination. A table of declared arrivals ends with the bound of :func:`estimate_within`. With
-    ``known_start``, the vehicles know the elements at their start. A ``difference`` of two navigators is another row.
+    ``known_start``, the vehicles know the elements at their start. A ``difference`` of two navigators, by the last of
+    the arrivals, is another row.
     """
     columns = columns_of(conditions)
     options: dict[str, Any] = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM} if conditions else {}
@@ -128,7 +129,8 @@ def earth(
     if difference and set(difference) <= spl.keys():
         pairs = zip(*(spl[name] for name in difference), strict=True)
         cells = [paired_difference(*pair, base.scenario.tasks.region) for pair in pairs]
-        rows.append([f"{' − '.join(map(label, difference))}, SPL", *["—"] * (1 + one_run), *cells])
+        rule = [arrival_name(arrivals[-1])] * (len(arrivals) > 1)
+        rows.append([f"{' − '.join(map(label, difference))}, SPL", "—", *rule, *["—"] * one_run, *cells])
     head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["arrival"] * (len(arrivals) > 1), *["runs"] * one_run]
     return markdown_table([*head, *columns], rows)
 
@@ -213,7 +215,7 @@ KINDS: Mapping[str, Callable[..., str]] = {
 """Function of each kind of table; its arguments are the options in the file."""
 
 
-def declared(file: Path = FILE) -> dict[str, dict[str, Any]]:
+def declared_tables(file: Path = FILE) -> dict[str, dict[str, Any]]:
     """Return the kind and the options of each table in a file."""
     return tomllib.loads(file.read_text())
 
@@ -224,7 +226,7 @@ def make(config: Config) -> None:
     Raises:
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
     """
-    known = declared(config.file)
+    known = declared_tables(config.file)
     changes = {"navigators": config.navigators, "tasks": config.tasks}
     given = {key: value for key, value in changes.items() if value is not None}
     if unknown := [name for name in config.tables if name not in known]:

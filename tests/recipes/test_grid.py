@@ -37,7 +37,7 @@ def rows(table: str) -> list[list[str]]:
 
 
 def test_every_table_declares_options_of_its_kind() -> None:
-    known = grid.declared()
+    known = grid.declared_tables()
     assert {"earth", "conditions", "globe", "readme", "learning", "alone", "paper-run"} <= known.keys()
     for name, options in known.items():
         grid.inspect.signature(grid.KINDS[options.pop("kind")]).bind(**options)
@@ -113,7 +113,9 @@ def test_boxes_have_mean_and_lowest_rows() -> None:
 
 def test_vehicles_that_declare_have_a_row_for_each_confidence() -> None:
     options = {"conditions": ["ship"], "tasks": 4, "within_km": 25}
-    told, sure, bold, bound = rows(grid.earth(["secant"], arrivals=["distance", 1.0, 0.0], **options))[2:]
+    options |= {"arrivals": ["distance", 1.0, 0.0], "difference": ["secant", "secant"]}
+    told, sure, bold, bound, difference = rows(grid.earth(["secant"], **options))[2:]
+    assert difference[1:] == ["—", "declared", "+0.0 (+0.0 to +0.0)"]  # each column has a cell
     assert [told[2], sure[2], bold[2]] == ["told", "declared at 1", "declared"]
     assert sure[3].split(" / ")[:3] == ["0.0", "0.0", "0.0"]
     right, _, false, _, _ = map(float, bold[3].split(" / "))
@@ -155,12 +157,13 @@ def test_reliability_counts_readings_by_their_probability() -> None:
 
 
 def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone() -> None:
-    """To whom a kilometer costs much declares at once: fewer are right, after fewer steps."""
+    """Vehicles to which a kilometer costs much declare at once: fewer of them are right, after fewer steps."""
     rules = [{"TRIP_KM": 1}, {"TRIP_KM": decision.TRIP_KM}]
     table = rows(declarations.decisions(["kalman"], rules=rules, conditions=[], tasks=10, max_steps=20))[2:]
     assert [row[0] for row in table] == ["Kalman (dual control), TRIP_KM 1", "Kalman (dual control), TRIP_KM 800.0"]
     hasty, usual = ([float(number) for number in row[3].split(" / ")] for row in table)
     assert hasty[0] < usual[0]
+    assert hasty[2] < usual[2]
     assert decision.TRIP_KM == 800
 
 
