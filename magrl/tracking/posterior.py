@@ -25,7 +25,7 @@ from magrl.tracking.filter import (
 )
 from magrl.tracking.way import Way, way_to
 
-_NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances of the points around the vehicle
+_NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out
 _SPREAD = 1.5  # standard deviations of the points around the estimated way, over those of the way
 _LEAST_VARIANCE = 1e-8  # of a remaining difference, in squared scaled units
 _LEAST_AREA = 1e-6  # of the points around the way, in squared scaled units: a standard deviation of 0.1 km
@@ -164,13 +164,17 @@ def _sobol(count: int, seed: int) -> Tensor:
 
 
 def _around(count: int) -> Tensor:
-    """Return points ``(count, 2)`` around the vehicle in scaled units, whose density is that of the inverse square."""
+    """Return points ``(count, 2)`` around the vehicle in scaled units.
+
+    Their density is that of the inverse square of the distance, and constant within the nearest.
+    """
     share, turn = _sobol(count, seed=1).unbind(-1)
-    radius, bearing = _NEAR_KM / DISTANCE_SCALE_KM * torch.exp(share * _LOG_RANGE), 2 * math.pi * turn
-    return torch.stack((radius * torch.cos(bearing), radius * torch.sin(bearing)), -1)
+    beyond, bearing = share * _MASS - 0.5, 2 * math.pi * turn
+    radius = torch.where(beyond < 0, (2 * beyond + 1).clamp_min(0).sqrt(), torch.exp(beyond))
+    return _NEAR_KM / DISTANCE_SCALE_KM * torch.stack((radius * torch.cos(bearing), radius * torch.sin(bearing)), -1)
 
 
-_LOG_RANGE = math.log(_FAR_KM / _NEAR_KM)
+_MASS = 0.5 + math.log(_FAR_KM / _NEAR_KM)  # of the density within the nearest distance and beyond, over 2 pi
 _NORMAL = torch.special.ndtri(_sobol(128, seed=0).clamp(1e-6, 1 - 1e-6))  # standard normal
 _AROUND = _around(384)
-_AROUND_DENSITY = len(_AROUND) / (2 * math.pi * _LOG_RANGE)
+_AROUND_DENSITY = len(_AROUND) / (2 * math.pi * _MASS)

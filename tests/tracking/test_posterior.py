@@ -65,6 +65,15 @@ def test_its_probabilities_are_the_shares_of_fields_drawn_from_the_state() -> No
     assert squares.mean().item() == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.parametrize(("long_km", "expected"), [(20.0, 0.7887), (25.0, 0.6827), (40.0, 0.4680)])
+def test_a_long_and_narrow_ellipse_around_the_vehicle_is_normal(long_km: float, expected: float) -> None:
+    """Constant errors of 0.3 km on one axis and of more on the other, with known gradients: P(|z| < 25 / long_km)."""
+    mean = torch.cat((torch.zeros(2, 1, dtype=F64), torch.eye(2, dtype=F64)), -1)
+    track = FieldTrack(mean, 1e-12 * torch.eye(3, dtype=F64).expand(2, 3, 3))
+    posterior = way_posterior(track, f64(0.0, 0.0), 5000.0, ONE[:2], bias_std=(0.003, long_km / 100))
+    assert posterior.within(25.0).item() == pytest.approx(expected, abs=0.015)
+
+
 def test_both_precisions_agree() -> None:
     track, target = random_track(50, 3), randn(50, 3, seed=7)
     exact = way_posterior(track, target, 200.0, ONE).way()
