@@ -2,12 +2,14 @@
 
     python recipes/ppo_anywhere.py                  # preset far: destinations 150-1800 km away
     python recipes/ppo_anywhere.py --preset fast    # destinations 300-500 km away
+    python recipes/ppo_anywhere.py --arrival declared --max-steps 80 --price-range 0.01 0.1
     python recipes/ppo_anywhere.py --resume RUN     # resume an interrupted run exactly
 
 The agent corrects the move that dual control plans, so that it begins as the navigator `kalman`. The regions are
 patches of planets whose magnetic fields have the spectrum and the polarity of the Earth's and nothing else of it. The
 errors of the sensors and the price of a step are drawn for each episode. The test tasks are on Earth, in regions that
-no training sees.
+no training sees. With --arrival declared, vehicles declare their arrival by the rule of `DeclareArrival`, and a false
+arrival has an SPL of 0.
 """
 
 from __future__ import annotations
@@ -35,10 +37,12 @@ from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, optimize
 from magrl.agents.networks import make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
+from magrl.evaluation import with_declaration
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, Discount, NonNegative, PlanetConfig, Positive, Rising
 from magrl.transforms import (
+    DeclareArrival,
     HighestSPL,
     RandomSensorNoise,
     RandomStepPrice,
@@ -48,6 +52,7 @@ from magrl.transforms import (
     TrueWay,
     sensor_levels,
 )
+from magrl.transforms.track import DRIFT_KEY, STD_KEYS
 
 RECIPE = "ppo_anywhere.py"
 LOSSES = ("loss_critic", "loss_actor")
@@ -77,6 +82,10 @@ class Config(PlanetConfig):
     epochs: Count = 3
     batch_size: Count = 16_384
 
+    arrival: Literal["objective", "declared"] = "objective"
+    """Rule of arrival: by the objective, or declared by the vehicle within ``arrival_km``."""
+    arrival_km: Positive = 25.0
+    """Distance from the destination within which a declaration is right [km]."""
     range_km: Positive = 300.0
     """Prior standard deviation of the way to the destination along each axis [km]."""
     price_range: Rising = (0.1, 3.0)
@@ -105,6 +114,15 @@ def make_view(base: GeomagneticNavEnv, range_km: float) -> TrackView:
     return TrackView(**limits, range_km=range_km, step_price=None)
 
 
+def declaration(base: GeomagneticNavEnv) -> list[Transform]:
+    """Return what declares the arrival by the estimates of the agent's view, where it must be declared."""
+    if not base.arrival.declared:
+        return []
+    farthest = max(base.scenario.distance_range_km)
+    keys = (*DeclareArrival.default_in_keys, *STD_KEYS, DRIFT_KEY)
+    return [DeclareArrival(base.arrival.radius_km, max_steps=base.max_steps, range_km=farthest, in_keys=keys)]
+
+
 def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> TransformedEnv:
     """Add the sensors, the price, the agent's view, and for training only what is privileged: critic and reward."""
     price = RandomStepPrice(config.price_range, seed=base.seed)
@@ -112,15 +130,15 @@ def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> Transf
     way, move, *others = HighestSPL.default_in_keys
     highest = HighestSPL([way, "true_move" if config.drift else move, *others])
     privileged = [TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
-    observed = [*errors(config, base.seed), price, *view.observation_transforms(), view.action_transform()]
-    return TransformedEnv(base, Compose(*observed, *privileged))
+    observed = [*errors(config, base.seed), price, *view.observation_transforms(), *declaration(base)]
+    return TransformedEnv(base, Compose(*observed, view.action_transform(), *privileged))
 
 
 def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config, **options: Any) -> TransformedEnv:
     """Return an environment of random tasks of a scenario, drawn once, with the noise of the sensors."""
     tasks = scenario.random_tasks(num_tasks, seed)
     base = GeomagneticNavEnv(scenario.with_tasks(tasks), num_envs=num_tasks, seed=seed, **options)
-    return TransformedEnv(base, Compose(*errors(config, seed)))
+    return with_declaration(TransformedEnv(base, Compose(*errors(config, seed))))
 
 
 class Spread(nn.Module):
@@ -165,7 +183,8 @@ def train(config: Config) -> dict[str, float]:
     with Run(config, recipe=RECIPE, name=f"ppo_anywhere-{config.preset}", losses=LOSSES) as run:
         # Environments
         options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": "random"}
-        options |= {"device": config.device, **config.limits}
+        options |= {"device": config.device, "arrival": config.arrival, "arrival_radius_km": config.arrival_km}
+        options |= config.limits
         planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
         base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
         others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)

@@ -120,7 +120,8 @@ class RunConfig(CheckedModel):
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"the scenario says {name} = {said!r}, the training {own!r}: add {option} {said}")
         if scenario.arrival == "declared":
-            raise ValueError('the scenario says arrival = "declared": the recipes train no agent that declares')
+            trains = "only ppo_anywhere.py --arrival declared trains for that"
+            raise ValueError(f'the scenario says arrival = "declared": {trains}')
         return self
 
     def load_scenario(self) -> Scenario:

@@ -22,9 +22,9 @@ from magrl.transforms import RandomSensorNoise, TrackView
 VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2, step_price=None)
 
 
-def training_env(noise: tuple[float, float, float] = (0.0, 0.0, 0.0)):
+def training_env(noise: tuple[float, float, float] = (0.0, 0.0, 0.0), **rules):
     scenario = planet_scenario(8, seed=3, **recipe.FAST.regions)
-    base = GeomagneticNavEnv(scenario, num_envs=6, start_heading="random", seed=5)
+    base = GeomagneticNavEnv(scenario, num_envs=6, start_heading="random", seed=5, **rules)
     return recipe.make_env(base, VIEW, recipe.Config(noise=noise))
 
 
@@ -45,6 +45,19 @@ def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
     assert "episode_reward_proximity" not in td.keys()  # noqa: SIM118
     assert PolicyConfig(VIEW, (8,)).make_actor().in_keys == ["observation", "planned_move"]
     assert recipe.OBSERVED == ("observation", "true_way_scaled", "highest_spl")
+
+
+def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None:
+    env = training_env(arrival="declared", arrival_radius_km=25.0, max_steps=80)
+    check_env_specs(env)
+    assert env.action_spec.shape == (6, 2)
+    actor = PolicyConfig(recipe.make_view(env.base_env, 300.0), (8,)).make_actor()
+    td = env.rollout(80, actor, break_when_any_done=False)["next"]
+    first = td["done"].cumsum(1) - td["done"].long() == 0
+    assert ((td["declared"] & first).sum(1) == 1).all()
+    right = td["success"] & first
+    assert right.any()
+    torch.testing.assert_close(td["highest_spl"][td["declared"] & first] > 0, td["success"][td["declared"] & first])
 
 
 def test_the_vehicle_is_that_of_the_settings() -> None:

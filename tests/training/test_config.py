@@ -43,7 +43,7 @@ def test_scenario_and_settings_must_agree(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"zeta = 0\.02, the training 0\.01: add --zeta 0\.02"):
         RunConfig(scenario=path)
     path.write_text(OWN + 'arrival = "declared"\n')
-    with pytest.raises(ValueError, match="the recipes train no agent that declares"):
+    with pytest.raises(ValueError, match="only ppo_anywhere"):
         RunConfig(scenario=path)
     path.write_text(OWN.replace("[40, 50]", "[75, 85]"))
     with pytest.raises(ValueError, match=r"mine.toml: region.latitude \(75.0, 85.0\): with margin_deg 5"):
