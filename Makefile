@@ -62,6 +62,9 @@ RUNS_noise := $(GUIDED) $(addprefix td3_gradient_guided-fast-noise-0.05-0.05-5-s
 RUNS_seeds := $(GUIDED) $(addprefix td3_gradient_guided-fast-seed,$(FIVE))
 RUNS_own-world := $(addprefix td3_gradient_guided-fast-azores-seed,$(FIVE))
 RUNS_algorithms := $(GUIDED) $(addprefix ppo-seed,$(FIVE))
+DECLARED := $(addprefix ppo_anywhere-declared-seed,0 1 2)
+RUNS_declared-training := $(DECLARED)
+RUNS_declared-training-conditions := $(DECLARED)
 RUNS_sequences := $(foreach name,ppo_recurrent ppo_recurrent-short,$(addprefix $(name)-seed,0 1 2))
 RUNS_sequences-learning := $(RUNS_sequences)
 RUNS_paper-run := $(WHOLE)
@@ -96,6 +99,8 @@ $(eval $(call training,td3-fast,1,td3_gradient_guided.py --preset td3-fast))
 $(eval $(call training,td3_gradient_guided-paper,1,td3_gradient_guided.py --preset paper --precision bfloat16))
 $(eval $(call training,td3-paper,1,td3_gradient_guided.py --preset td3-paper --precision bfloat16))
 $(eval $(call training,ppo,1,ppo.py))
+$(eval $(call training,ppo_anywhere-declared,1,ppo_anywhere.py --preset fast --arrival declared --max-steps 80 \
+	--price-range 0.03 1 --total-frames 2621440))
 $(eval $(call training,ppo_recurrent,1,ppo_recurrent.py))
 $(eval $(call training,ppo_recurrent-short,1,ppo_recurrent.py --total-frames 1998848))
 
