@@ -103,7 +103,7 @@ def arrival_decision(
         >>> std = (0.02, 0.02, 2.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         >>> decision = arrival_decision(track, here, *std, torch.tensor(9), radius_km=25.0, range_km=300.0)
         >>> decision.probability.round(decimals=2), decision.declare  # another reading is worth more
-        (tensor(0.8300), tensor(False))
+        (tensor(0.9000), tensor(False))
     """
     check_number(0, above=True, radius_km=radius_km)
     known, shared = related(track, curl_relation)
