@@ -52,7 +52,7 @@ from magrl.transforms import (
     TrueWay,
     sensor_levels,
 )
-from magrl.transforms.track import DRIFT_KEY, STD_KEYS
+from magrl.transforms.track import STD_KEYS
 
 RECIPE = "ppo_anywhere.py"
 LOSSES = ("loss_critic", "loss_actor")
@@ -119,7 +119,7 @@ def declaration(base: GeomagneticNavEnv) -> list[Transform]:
     if not base.arrival.declared:
         return []
     farthest = max(base.scenario.distance_range_km)
-    keys = (*DeclareArrival.default_in_keys, *STD_KEYS, DRIFT_KEY)
+    keys = (*DeclareArrival.default_in_keys, *STD_KEYS)
     return [DeclareArrival(base.arrival.radius_km, max_steps=base.max_steps, range_km=farthest, in_keys=keys)]
 
 

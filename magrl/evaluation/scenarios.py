@@ -16,7 +16,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.evaluation.runs import NO_NOISE
 from magrl.transforms import Conditions, DeclareArrival, TrackGradient, with_conditions, with_sensor_noise
-from magrl.transforms.track import DRIFT_KEY, IN_KEYS, STD_KEYS
+from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
@@ -172,7 +172,7 @@ def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = 
         max_steps=base.max_steps,
         confidence=confidence,
         range_km=farthest,
-        in_keys=(*DeclareArrival.default_in_keys, *told, *[DRIFT_KEY] * bool(told)),
+        in_keys=(*DeclareArrival.default_in_keys, *told),
     )
     track = TrackGradient((*IN_KEYS, *told))
     return TransformedEnv(env, Compose(track, declare), auto_unwrap=True)

@@ -20,6 +20,7 @@ from typing_extensions import Self
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import element_index
+from magrl.transforms.track import STD_KEYS
 
 Std = Sequence[float]
 """Standard deviations of the sensors: D [deg], I [deg], B_H [nT]."""
@@ -156,7 +157,8 @@ class Navigator(TensorDictModuleBase):
         Args:
             seen: public keys of ``P`` vehicles, and the standard deviations ``(P, 3)`` where readings come with them.
             std: ``(3,)`` those of the data sheet.
-            key: ``sensor_std`` of errors that are new in each reading, or ``bias_std`` of constant and slow ones.
+            key: ``sensor_std`` of errors that are new in each reading, ``bias_std`` of constant and slow ones, or
+                ``drift_std`` of slow ones alone.
 
         Returns:
             ``std``, or ``(P, 3)`` the larger of both: during an outage, a reading is worse than the data sheet.
@@ -166,7 +168,7 @@ class Navigator(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]."""
-        seen = tensordict.select(*self.in_keys).update(tensordict.select("sensor_std", "bias_std", strict=False))
+        seen = tensordict.select(*self.in_keys).update(tensordict.select(*STD_KEYS, strict=False))
         self.memory = memory = self._recall(seen)
         step = seen["step_count"].squeeze(-1)
         if "done" in self.in_keys:  # a rollout steps all vehicles until the last one is done

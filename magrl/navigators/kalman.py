@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -16,7 +15,7 @@ from magrl.checks import check_number, check_numbers
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
-from magrl.tracking import LENGTHS, FieldTrack, GradientPrior, LearnedPrior
+from magrl.tracking import CAUTION, LENGTHS, FieldTrack, GradientPrior, LearnedPrior
 
 
 class Kalman(QuasiNewton):
@@ -26,16 +25,16 @@ class Kalman(QuasiNewton):
     :func:`magrl.tracking.planned_move`, which weighs the path, the detour that the remaining uncertainty of the way may
     cost, and the price of the remaining steps, which rises as fewer of them are left.
 
-    It searches by default. Constant errors of the readings (``bias_std``) widen the search, but no move reduces them,
-    so that they count in none of the costs.
+    It searches by default. Constant errors of the readings (``bias_std``) widen the posterior of the way and the
+    search.
 
     Args:
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
         sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
         max_steps: step limit of the episode.
-        caution: weight of the uncertainty; for None that of :func:`magrl.tracking.trade_off`.
-        step_km: price of a step [km] while many are left; for None that of :func:`magrl.tracking.trade_off`.
+        caution: weight of the uncertainty of the way.
+        step_km: price of a step [km] while many are left; for None that of :func:`magrl.tracking.reading_price`.
         range_km: prior standard deviation of the way along each axis [km].
         lengths: of the moves that are compared, as fractions of the longest.
         search: as of :class:`QuasiNewton`, here by default.
@@ -61,7 +60,7 @@ class Kalman(QuasiNewton):
         max_turn_rad: float = math.pi / 2,
         sensor_std: Std = PERFECT,
         max_steps: int = 50,
-        caution: float | None = None,
+        caution: float = CAUTION,
         step_km: float | None = None,
         range_km: float = 300.0,
         lengths: Sequence[float] = LENGTHS,
@@ -73,12 +72,11 @@ class Kalman(QuasiNewton):
         check_numbers(len(lengths), 0, lengths=lengths)
         self.lengths = tuple(lengths)
         check_number(0, above=True, range_km=range_km)
+        check_number(0, caution=caution)
+        if step_km is not None:
+            check_number(0, above=True, step_km=step_km)
         self.max_steps, self.range_km = int(max_steps), float(range_km)
-        prices = tracking.trade_off(tracking.reading_std(self.sensor_std, self.bias_std))
-        for name, given, usual in zip(("caution", "step_km"), (caution, step_km), prices, strict=True):
-            number: dict[str, Any] = {name: float(usual) if given is None else given}
-            check_number(0, above=name == "step_km", **number)
-            self.register_buffer(name, torch.tensor(number[name], dtype=torch.float64), persistent=False)
+        self.caution, self.step_km = float(caution), step_km
         self.gradient_prior = LearnedPrior.pretrained()
 
     def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:
@@ -90,15 +88,16 @@ class Kalman(QuasiNewton):
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         known, shared = tracking.related(track, tracking.curl_relation, self.scales)
         curvature = self.drift(tracking.estimated_field(known, self.scales))
-        estimate = partial(tracking.way_to, known, seen["target_field"].double(), self.range_km, self.scales, shared)
-        covariance = estimate(None, self.periods).covariance  # of what moves can reduce
-        way = self.aim(known, estimate(self.lasting_std(seen), self.periods, curvature), seen, memory)
+        options = self.range_km, self.scales, shared, self.lasting_std(seen), self.periods, curvature
+        posterior = tracking.way_posterior(known, seen["target_field"].double(), *options, fine=False)
+        aim, std = self.aim(known, posterior.way(), seen, memory), self.reading_std(seen)
+        step_km = tracking.reading_price(std) if self.step_km is None else torch.full_like(aim[..., 0], self.step_km)
         step = seen["step_count"].squeeze(-1)
-        prices = self.caution, tracking.step_price(self.step_km, way, step, self.max_steps, self.max_move_km)
-        std, limits = self.reading_std(seen), (self.max_move_km, self.range_km)
-        best = tracking.planned_move(track, way, covariance, std, *prices, *limits, self.lengths, self.scales)
+        price = tracking.step_price(step_km, aim, step, self.max_steps, self.max_move_km)
+        costs = self.caution, self.lengths, self.scales
+        best = tracking.planned_move(track, aim, posterior, std, price, self.max_move_km, self.range_km, *costs)
         distance = best.norm(dim=-1)
-        direction = torch.where((distance > 0).unsqueeze(-1), best, way)  # standing still, face the way
+        direction = torch.where((distance > 0).unsqueeze(-1), best, aim)  # standing still, face the way
         return self.steer(seen, direction, distance)
 
     name, label = "kalman", "Kalman"

@@ -21,7 +21,7 @@ from magrl.field.model import device_of
 from magrl.geodesy import steer
 from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to
 from magrl.navigators.quasi_newton import QuasiNewton, first_places, visit_place
-from magrl.tracking import SLOPES, Way, reading_std
+from magrl.tracking import SLOPES, Way
 
 FLOOR = (1e-3, 1e-3, 0.1)
 """Standard deviation of D, I [deg], B_H [nT] that every reading has at least: its rounding, and that of the map."""
@@ -35,6 +35,8 @@ PRIOR_KM = 1000.0
 """Prior standard deviation of a position along each axis [km]."""
 FORGET_KM = 30.0
 """Distance along which the error of a map changes the position as much as it moves it in all [km]; from a scan."""
+LASTING_SHARE = 0.25
+"""Share of the variance of constant and slow errors that counts as new in each reading."""
 _DEGREE_KM = 111.2
 
 
@@ -116,7 +118,7 @@ class MapMatching(Navigator):
         floor, error, new, constant = (x.to(self.grid.device) for x in squares)
         self.target_std = nn.Buffer((floor + error).sqrt())
         self.bias_std = nn.Buffer((floor + constant).sqrt())
-        self.std = nn.Buffer(reading_std((floor + error + new).sqrt(), constant.sqrt()))
+        self.std = nn.Buffer((floor + error + new + LASTING_SHARE * constant).sqrt())
         # Two elements give a position, so that the second smallest of the three counts.
         self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
 

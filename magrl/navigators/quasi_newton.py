@@ -100,7 +100,8 @@ class QuasiNewton(Navigator):
 
     def reading_std(self, seen: TensorDictBase) -> Tensor:
         """Return the standard deviations of the present reading in the filter: D, I, B_H."""
-        return tracking.reading_std(self.accuracy(seen, self.sensor_std), self.lasting_std(seen))
+        slow = self.accuracy(seen, torch.zeros_like(self.sensor_std), "drift_std")
+        return tracking.reading_std(self.accuracy(seen, self.sensor_std), slow)
 
     def lasting_std(self, seen: TensorDictBase) -> Tensor:
         """Return the standard deviations of the constant and slow errors of the present reading: D, I, B_H."""

@@ -12,7 +12,7 @@ from magrl import tracking
 from magrl.onboard.limits import view_of
 from magrl.tracking import ArrivalDecision, FieldTrack
 from magrl.transforms import TrackGradient, TrackView
-from magrl.transforms.track import DRIFT_KEY, IN_KEYS, OUT_KEYS, STD_KEYS
+from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS
 
 
 class Estimator:
@@ -57,7 +57,7 @@ class Estimator:
     def decide(self, seen: TensorDictBase, steps_left: Tensor, radius_km: float) -> ArrivalDecision:
         """Return the decision about the arrival, in a batch of one; see :func:`magrl.tracking.arrival_decision`."""
         track = FieldTrack(*(self.state[key] for key in OUT_KEYS[:2]))
-        target, new, lasting, slow = (seen[key] for key in ("target_field", *STD_KEYS, DRIFT_KEY))
+        target, new, lasting, slow = (seen[key] for key in ("target_field", *STD_KEYS))
         return tracking.arrival_decision(track, target, new, lasting, slow, steps_left, radius_km)
 
     @property

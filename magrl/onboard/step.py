@@ -63,7 +63,7 @@ class VehicleStep(nn.Module):
     Example:
         >>> from magrl.agents import load_pretrained
         >>> act = VehicleStep(load_pretrained("anywhere"))
-        >>> here, there, exact = torch.tensor([3.5, 73, 15000]), torch.tensor([-11.6, 75.4, 13240]), torch.zeros(2, 3)
+        >>> here, there, exact = torch.tensor([3.5, 73, 15000]), torch.tensor([-11.6, 75.4, 13240]), torch.zeros(3, 3)
         >>> action, way, covariance, *state = act(here, there, torch.zeros(2), exact, *first_state())
         >>> action.shape, state[0]
         (torch.Size([2]), tensor(1))
@@ -95,7 +95,8 @@ class VehicleStep(nn.Module):
             field: ``(3,)`` reading of D [deg], I [deg], B_H [nT] after the move.
             target_field: ``(3,)`` the same at the destination.
             course: ``(2,)`` distance [km] and heading [rad] of the move; in the first step 0 and the heading.
-            accuracy: ``(2, 3)`` standard deviations of noise and of constant errors, in the units of the reading.
+            accuracy: ``(3, 3)`` standard deviations of noise, of constant and slow errors, and of slow ones alone, in
+                the units of the reading.
             step: ``()`` int64, and with the next three the :class:`StepState`.
             mean: ``(3, 3)`` mean of the filter.
             covariance: ``(3, 3, 3)`` covariance of the filter.
@@ -146,7 +147,7 @@ def write_step(path: Path | str, policy: FieldPolicy) -> None:
     if Path(path).suffix not in (".pt2", ".onnx"):
         raise ValueError(f"a file of a step must end with .pt2 or .onnx, got {str(path)!r}")
     module = VehicleStep(copy.deepcopy(policy).cpu()).eval()
-    examples = torch.zeros(3), torch.ones(3), torch.zeros(2), torch.zeros(2, 3)
+    examples = torch.zeros(3), torch.ones(3), torch.zeros(2), torch.zeros(3, 3)
     with torch.no_grad():
         exported = torch.export.export(module, (*examples, *first_state()), strict=False)
     if Path(path).suffix == ".onnx":

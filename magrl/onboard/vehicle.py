@@ -30,7 +30,7 @@ from magrl.onboard.start import Elements, calibrated, check_start, known_element
 from magrl.tracking import ArrivalDecision, Way
 from magrl.transforms import TrackView
 from magrl.transforms.errors.known_start import EXACT
-from magrl.transforms.track import DRIFT_KEY, STD_KEYS
+from magrl.transforms.track import STD_KEYS
 
 NAMED = ("anywhere", "secant", "kalman", "run_and_tumble")
 """Navigators by name; any other is given as a module."""
@@ -284,7 +284,7 @@ class Onboard:
     def _seen(self, reading: Sequence[float], course: float, move: tuple[float, float]) -> TensorDict:
         """Return what a policy reads, in a batch of one."""
         rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
-        rows |= dict(zip((*STD_KEYS, DRIFT_KEY), (self.sensor_std, self._left_std, self.drift_std), strict=True))
+        rows |= dict(zip(STD_KEYS, (self.sensor_std, self._left_std, self.drift_std), strict=True))
         seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
         seen |= {"step_count": torch.tensor([[self._step]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")

@@ -21,13 +21,14 @@ from magrl.tracking.filter import relate as relate
 from magrl.tracking.filter import start as start
 from magrl.tracking.filter import update as update
 from magrl.tracking.learned_prior import LearnedPrior as LearnedPrior
+from magrl.tracking.planning import CAUTION as CAUTION
 from magrl.tracking.planning import LENGTHS as LENGTHS
 from magrl.tracking.planning import SLOPES as SLOPES
 from magrl.tracking.planning import corrected as corrected
 from magrl.tracking.planning import planned_move as planned_move
+from magrl.tracking.planning import reading_price as reading_price
 from magrl.tracking.planning import sensor_length as sensor_length
 from magrl.tracking.planning import step_price as step_price
-from magrl.tracking.planning import trade_off as trade_off
 from magrl.tracking.posterior import WayPosterior as WayPosterior
 from magrl.tracking.posterior import way_posterior as way_posterior
 from magrl.tracking.priors import curl_relation as curl_relation

@@ -20,7 +20,7 @@ from magrl.tracking.filter import (
     _variance,
     estimated_field,
 )
-from magrl.tracking.posterior import WayPosterior, _sobol, way_posterior
+from magrl.tracking.posterior import WayPosterior, _normal, way_posterior
 from magrl.tracking.priors import curl_relation, field_curvature
 from magrl.tracking.track import related
 
@@ -187,4 +187,4 @@ def _within(track: FieldTrack, variance: Tensor, apart: Tensor, radius_km: float
     return (torch.hypot(dn + north, de + east) * DISTANCE_SCALE_KM <= radius_km).to(variance.dtype).mean(-1)
 
 
-_NORMAL = torch.special.ndtri(_sobol(128, seed=2).clamp(1e-6, 1 - 1e-6))  # standard normal
+_NORMAL = _normal(128, seed=2)

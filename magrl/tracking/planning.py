@@ -17,9 +17,15 @@ from magrl.tracking.filter import (
     _units,
     _variance,
 )
+from magrl.tracking.posterior import WayPosterior
 from magrl.tracking.priors import curl_relation
 from magrl.tracking.track import related
 
+CAUTION = 0.3
+"""Weight of the uncertainty of the way after a reading; this and :data:`LENGTHS` are from scans on random planets
+(docs/navigators.md)."""
+PRICE_RANGE_KM = (0.3, 20.0)
+"""Lowest and highest price of a step [km]."""
 NEAR_KM = 30.0
 """Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
 SLOPES = (0.004, 0.015, 4.0)
@@ -49,24 +55,19 @@ def sensor_length(std: Tensor) -> Tensor:
     return (std / std.new_tensor(SLOPES)).sort(-1).values[..., 1]
 
 
-def trade_off(std: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the weight of the uncertainty and the price of a step [km], ``(...)`` each, for the errors of a reading.
+def reading_price(std: Tensor) -> Tensor:
+    """Return the price of a step ``(...)`` [km] for the errors of a reading.
 
-    The larger they are (:func:`sensor_length`), the less a reading teaches, and the more path and steps certainty
-    costs. The factors, and :data:`LENGTHS`, are from scans on random planets (docs/navigators.md).
+    The larger they are (:func:`sensor_length`), the less a reading teaches, and the more steps certainty costs.
 
     Args:
         std: ``(..., 3)`` standard deviations of D [deg], I [deg], B_H [nT].
 
     Example:
-        >>> trade_off(torch.tensor([0.0, 0.0, 0.0]))
-        (tensor(5.), tensor(0.1000))
-        >>> [round(float(value), 2) for value in trade_off(torch.tensor([0.1, 0.1, 10.0]))]
-        [0.45, 1.67]
+        >>> reading_price(torch.tensor([0.0, 0.0, 0.0])), reading_price(torch.tensor([0.04, 0.03, 0.4]))
+        (tensor(0.3000), tensor(2.))
     """
-    length = sensor_length(std)
-    step_km = torch.maximum(0.25 * length, 0.025 * length.square()).clamp_min(0.1)
-    return (3.0 / length.clamp_min(0.1)).clamp_max(5.0), step_km
+    return sensor_length(std).clamp(*PRICE_RANGE_KM)
 
 
 def step_price(step_km: Tensor | float, way: Tensor, step: Tensor, max_steps: int, max_move_km: float) -> Tensor:
@@ -89,36 +90,35 @@ def step_price(step_km: Tensor | float, way: Tensor, step: Tensor, max_steps: in
 
 def planned_move(
     track: FieldTrack,
-    way: Tensor,
-    covariance: Tensor,
+    aim: Tensor,
+    posterior: WayPosterior,
     sensor_std: PerElement,
-    caution: Tensor,
     step_km: Tensor,
     max_move_km: float,
     range_km: float,
+    caution: float = CAUTION,
     lengths: Sequence[float] = LENGTHS,
     scales: PerElement = ELEMENT_SCALES,
 ) -> Tensor:
     """Return the displacement ``(..., 2)`` [km] of the next move, northward and eastward.
 
-    It compares moves of several lengths and directions (:data:`ANGLES_DEG`). For each it predicts the covariance of the
-    filter after the reading at its end, which does not depend on what will be read, and takes the least sum of three
-    costs [km]:
+    It compares moves of several lengths and directions (:data:`ANGLES_DEG`) and takes the least sum of three costs
+    [km]:
 
-    - the path: the length of the move minus the progress, that is, what it takes off the way times the cosine of the
-      typical error of its direction;
-    - the detour that the uncertainty of the way may then cost, times ``caution``;
+    - the path: the length of the move minus the mean progress, over the posterior of the way;
+    - the detour that the uncertainty of the way may then cost, times ``caution``: the covariance of the filter after
+      the reading at the end of the move does not depend on what will be read;
     - the price of the steps that remain.
 
     Args:
         track: state of the filter of D, I, B_H.
-        way: ``(..., 2)`` way to aim at, northward and eastward [km].
-        covariance: ``(..., 2, 2)`` covariance of the estimated way, of what moves can reduce [km^2].
+        aim: ``(..., 2)`` way to aim at, northward and eastward [km]; the posterior is shifted to have its mean there.
+        posterior: posterior of the way.
         sensor_std: standard deviations of the next reading, ``(..., 3)`` or 3 numbers.
-        caution: ``(...)`` weight of the uncertainty, see :func:`trade_off`.
         step_km: ``(...)`` price of a step [km], see :func:`step_price`.
         max_move_km: longest move.
         range_km: prior standard deviation of the way along each axis [km].
+        caution: weight of the uncertainty.
         lengths: of the moves that are compared, as fractions of the longest.
         scales: those of :func:`~magrl.tracking.start`.
 
@@ -129,24 +129,23 @@ def planned_move(
         A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
 
     Example:
-        >>> from magrl.tracking import dipole_prior, start, way_to
+        >>> from magrl.tracking import dipole_prior, start, way_posterior
         >>> here, target = torch.tensor([[8.0, -16.0, 35000.0], [9.0, -20.0, 34500.0]], dtype=torch.float64)
         >>> track = start(here, dipole_prior(here), (0.02, 0.02, 2.0))
-        >>> way, covariance = way_to(track, target, range_km=300.0)
-        >>> planned_move(track, way, covariance, (0.02, 0.02, 2.0), *trade_off(here), 50.0, 300.0).shape
+        >>> posterior = way_posterior(track, target, range_km=300.0)
+        >>> aim, price = posterior.way().displacement, torch.tensor(1.0)
+        >>> planned_move(track, aim, posterior, (0.02, 0.02, 2.0), price, max_move_km=50.0, range_km=300.0).shape
         torch.Size([2])
     """
-    check_tensor(2, way=way)
-    check_tensor(2, 2, covariance=covariance)
-    moves = _moves(way, lengths, max_move_km)
-    left = way.unsqueeze(-2) - moves
-    distance, distance_left, length = way.norm(dim=-1, keepdim=True), left.norm(dim=-1), moves.norm(dim=-1)
-    cost = length - (distance - distance_left) * _certainty(way, covariance)
-    cost = cost + distance_left * (step_km / max_move_km).unsqueeze(-1)
-    cost = cost + caution.unsqueeze(-1) * _detour(
-        left, _covariance_after(track, moves, left, sensor_std, range_km, scales)
-    )
-    best = cost.argmin(-1)[..., None, None]
+    check_tensor(2, aim=aim)
+    moves = _moves(aim, lengths, max_move_km)
+    left = aim.unsqueeze(-2) - moves
+    mean = (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
+    aimed = posterior._replace(points=posterior.points + (aim - mean).unsqueeze(-2))
+    distance = aimed.mean_distance(moves).to(aim.dtype)  # the distance now is the same for all moves
+    cost = moves.norm(dim=-1) + distance * (1 + step_km / max_move_km).unsqueeze(-1)
+    after = _covariance_after(track, moves, left, sensor_std, range_km, scales)
+    best = (cost + caution * _detour(left, after)).argmin(-1)[..., None, None]
     return moves.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 
 
@@ -246,15 +245,6 @@ def _inverse(nn: Tensor, ne: Tensor, ee: Tensor, range_km: float) -> _Entries:
     valid, scale = determinant != 0, DISTANCE_SCALE_KM**2 / determinant
     entries = (ee * scale, range_km**2), (-ne * scale, 0.0), (nn * scale, range_km**2)
     return tuple(entry.where(valid, otherwise) for entry, otherwise in entries)  # type: ignore[return-value]
-
-
-def _certainty(way: Tensor, covariance: Tensor) -> Tensor:
-    """Return the share ``(..., 1)`` of a move along a way that is progress: the cosine of its typical error."""
-    distance = way.norm(dim=-1).clamp_min(1e-9)
-    unit = way / distance.unsqueeze(-1)
-    across = torch.stack((-unit[..., 1], unit[..., 0]), -1)
-    variance = ((covariance * across.unsqueeze(-2)).sum(-1) * across).sum(-1)
-    return (distance / (distance.square() + variance).sqrt()).unsqueeze(-1)
 
 
 def _detour(left: Tensor, covariance: _Entries) -> Tensor:

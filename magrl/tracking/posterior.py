@@ -25,11 +25,13 @@ from magrl.tracking.filter import (
 )
 from magrl.tracking.way import Way, way_to
 
+_AT_ONCE = 13  # moves whose distances to all points are held at once
 _NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out
 _SPREAD = 1.5  # standard deviations of the points around the estimated way, over those of the way
 _LEAST_VARIANCE = 1e-8  # of a remaining difference, in squared scaled units
 _LEAST_AREA = 1e-6  # of the points around the way, in squared scaled units: a standard deviation of 0.1 km
 _LEAST_SHARE = 1e-6  # of a variance, left by a relation
+_LEAST_WEIGHT = 1e-12  # below, products of weights would be denormal numbers, which are slow
 
 
 class WayPosterior(NamedTuple):
@@ -50,6 +52,22 @@ class WayPosterior(NamedTuple):
         apart = self.points - mean.unsqueeze(-2)
         products = apart.unsqueeze(-1) * apart.unsqueeze(-2)
         return Way(mean, (products * self.weights[..., None, None]).sum(-3))
+
+    def mean_distance(self, moves: Tensor) -> Tensor:
+        """Return the mean distances ``(..., K)`` [km] of the place after moves ``(..., K, 2)`` [km], as float32.
+
+        Example:
+            >>> posterior = WayPosterior(torch.tensor([[30.0, 0.0], [0.0, 40.0]]), torch.tensor([0.5, 0.5]))
+            >>> posterior.mean_distance(torch.tensor([[0.0, 0.0], [30.0, 0.0]]))
+            tensor([35., 25.])
+        """
+        points, moves = self.points.float(), moves.float()
+        # |d - m|^2 as one matrix product
+        left = torch.cat((moves, moves.square().sum(-1, keepdim=True), torch.ones_like(moves[..., :1])), -1)
+        right = torch.cat((-2 * points, torch.ones_like(points[..., :1]), points.square().sum(-1, keepdim=True)), -1)
+        weights = self.weights.float().unsqueeze(-1)
+        parts = [((some @ right.mT).clamp_min_(0).sqrt_() @ weights).squeeze(-1) for some in left.split(_AT_ONCE, -2)]
+        return torch.cat(parts, -1)
 
     def within(self, radius_km: float) -> Tensor:
         """Return the probability ``(...)`` that the place is within a radius [km] of the vehicle."""
@@ -80,12 +98,14 @@ def way_posterior(
     bias_std: PerElement | None = None,
     periods: PerElement | None = None,
     curvature: PerElement | None = None,
+    fine: bool = True,
 ) -> WayPosterior:
     """Return the posterior of the displacement to the place where the field has given values.
 
     Its density is ``|S(d)|^-1/2 exp(-1/2 ((r - g·d)^T S(d)^-1 (r - g·d) + |d|^2 / range^2))``, in the notation of
-    :func:`~magrl.tracking.way_to`. It is exact for the filter's normal state. The points are 128 around the way of
-    :func:`~magrl.tracking.way_to` and 384 around the vehicle, weighted by the density over that of the points.
+    :func:`~magrl.tracking.way_to`. It is exact for the filter's normal state. A quarter of the points are around the
+    way of :func:`~magrl.tracking.way_to`, the others around the vehicle, weighted by the density over that of the
+    points.
 
     Args:
         track: state.
@@ -97,6 +117,7 @@ def way_posterior(
         periods: of angles, whose remaining differences are wrapped; None for none.
         curvature: standard deviation of the change of a gradient along the way, as in :func:`~magrl.tracking.predict`:
             it adds ``c^2 |d|^4 / 4`` to S(d). None for constant gradients.
+        fine: whether there are 512 points, as probabilities need, or 128, which suffice for means.
 
     Raises:
         ValueError: for shapes that do not match, a range that is not above 0, or a negative standard deviation.
@@ -112,55 +133,83 @@ def way_posterior(
         tensor([300., 200.])
     """
     way = way_to(track, target, range_km, scales, shared, bias_std, periods, curvature)
-    points, density = _points(Way(way.displacement / DISTANCE_SCALE_KM, way.covariance / DISTANCE_SCALE_KM**2))
+    center, spread = way.displacement / DISTANCE_SCALE_KM, way.covariance / DISTANCE_SCALE_KM**2
+    points, density = _points(Way(center, spread), _FINE if fine else _COARSE)
     unit = _units(track, scales)
-    count, none = unit.shape[-1], (0.0,) * unit.shape[-1]
-    bias = _nonnegative_or_nan("bias_std", none if bias_std is None else bias_std, count, unit) / unit
-    bend = _nonnegative_or_nan("curvature", none if curvature is None else curvature, count, unit) / unit
+    elements, none = unit.shape[-1], (0.0,) * unit.shape[-1]
+    bias = _nonnegative_or_nan("bias_std", none if bias_std is None else bias_std, elements, unit) / unit
+    bend = _nonnegative_or_nan("curvature", none if curvature is None else curvature, elements, unit) / unit
     target = target if periods is None else continued(target, track, scales, periods)
-
-    # (..., E, M) from here on
-    value, gn, ge = (track.mean[..., i, None] for i in range(3))
-    p00, p01, p02, p11, p12, p22 = (
-        track.covariance[..., i, j, None] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    )
-    dn, de = (x.unsqueeze(-2) for x in points.unbind(-1))
+    remaining = target.to(unit.dtype) / unit
+    rows = _polynomials(track, remaining, bias.square(), bend.square() / 4, shared)
+    dn, de = points.unbind(-1)
     square = dn * dn + de * de
-    residual = (target.to(unit.dtype) / unit).unsqueeze(-1) - value - gn * dn - ge * de
-    variance = p00 + dn * (2 * p01 + p11 * dn + 2 * p12 * de) + de * (2 * p02 + p22 * de)
-    variance = variance + bias.square().unsqueeze(-1) + bend.square().unsqueeze(-1) * (square * square / 4)
+    powers = torch.stack((torch.ones_like(dn), dn, de, dn * dn, dn * de, de * de, square * square), -2)
+    residual, variance, *together = (rows @ powers).split(elements, -2)  # (..., E, M) each
     variance = variance.clamp_min(_LEAST_VARIANCE)
-    exponent = (residual.square() / variance + variance.log()).sum(-2)
+    weighted = residual / variance
+    exponent, volume = (residual * weighted).sum(-2), variance.prod(-2)
+    for shares in together:
+        left = (1 - (shares.square() / variance).sum(-2)).clamp_min(_LEAST_SHARE)
+        exponent, volume = exponent + (weighted * shares).sum(-2).square() / left, volume * left
+    exponent = exponent + square * (DISTANCE_SCALE_KM / range_km) ** 2
+    weights = torch.softmax(-exponent / 2 - volume.log() / 2 - density.log(), -1)
+    return WayPosterior(points * DISTANCE_SCALE_KM, weights.where(weights > _LEAST_WEIGHT, 0.0))
+
+
+def _polynomials(track: FieldTrack, target: Tensor, bias: Tensor, bend: Tensor, shared: Tensor | None) -> Tensor:
+    """Return coefficients ``(..., K, 7)`` of 1, n, e, n^2, n e, e^2 and (n^2 + e^2)^2 for displacements (n, e).
+
+    They give the residual r - g·d of each element, its variance, and what the elements share; in scaled units.
+    """
+    value, north, east = track.mean.unbind(-1)
+    p00, p01, p02, p11, p12, p22 = (
+        track.covariance[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    )
+    zero = torch.zeros_like(value)
+    rows: list[tuple[Tensor, ...]] = [
+        (target - value, -north, -east, zero, zero, zero, zero),
+        (p00 + bias, 2 * p01, 2 * p02, p11, 2 * p12, p22, bend),
+    ]
     if shared is not None:
-        u0, u1, u2 = (shared[..., i, None] for i in range(3))
-        together = u0 + u1 * dn + u2 * de
-        left = (1 - (together.square() / variance).sum(-2)).clamp_min(_LEAST_SHARE)
-        exponent = exponent + (residual * together / variance).sum(-2).square() / left + left.log()
-    exponent = exponent + square.squeeze(-2) * (DISTANCE_SCALE_KM / range_km) ** 2
-    return WayPosterior(points * DISTANCE_SCALE_KM, torch.softmax(-exponent / 2 - density.log(), -1))
+        rows.append((*shared.unbind(-1), zero, zero, zero, zero))
+    return torch.cat([torch.stack(torch.broadcast_tensors(*row), -1) for row in rows], -2)
 
 
-def _points(way: Way) -> tuple[Tensor, Tensor]:
-    """Return points ``(..., M, 2)`` around a way and the vehicle, and their density ``(..., M)``, unnormalized."""
-    center, covariance = way.displacement.unsqueeze(-2), way.covariance * _SPREAD**2
+def _points(way: Way, unit_points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Return points ``(..., M, 2)`` around a way and the vehicle, and their density ``(..., M)``, unnormalized.
+
+    They are laid out along and across the way, so that they turn with it.
+    """
+    normal, around = (points.to(way.displacement) for points in unit_points)
+    (north, east), distance = way.displacement.unbind(-1), way.displacement.norm(dim=-1)
+    heads = distance > 0
+    cos, sin = torch.where(heads, north / distance, 1.0), torch.where(heads, east / distance, 0.0)
+    turn = torch.stack((torch.stack((cos, -sin), -1), torch.stack((sin, cos), -1)), -2)  # columns: along, across
+    covariance = turn.mT @ way.covariance @ turn * _SPREAD**2
     first = covariance[..., 0, 0].clamp_min(_LEAST_AREA).sqrt().unsqueeze(-1)  # Cholesky factor
     below = covariance[..., 0, 1].unsqueeze(-1) / first
     second = (covariance[..., 1, 1].unsqueeze(-1) - below * below).clamp_min(_LEAST_AREA).sqrt()
-    normal, around = _NORMAL.to(center), _AROUND.to(center)
     x, y = normal.unbind(-1)
-    near = center + torch.stack((first * x, below * x + second * y), -1)
+    near = torch.stack((distance.unsqueeze(-1) + first * x, below * x + second * y), -1)
     points = torch.cat((near, around.expand(*near.shape[:-2], *around.shape)), -2)
-    dn, de = (points - center).unbind(-1)
-    z0 = dn / first
-    z1 = (de - below * z0) / second
+    along, across = points.unbind(-1)
+    z0 = (along - distance.unsqueeze(-1)) / first
+    z1 = (across - below * z0) / second
     bell = torch.exp(-(z0 * z0 + z1 * z1) / 2) * (len(normal) / (2 * math.pi)) / (first * second)
     nearest = (_NEAR_KM / DISTANCE_SCALE_KM) ** 2
-    return points, bell + _AROUND_DENSITY / points.square().sum(-1).clamp_min(nearest)
+    inverse_square = len(around) / (2 * math.pi * _MASS) / points.square().sum(-1).clamp_min(nearest)
+    return points @ turn.mT, bell + inverse_square
 
 
 def _sobol(count: int, seed: int) -> Tensor:
     """Return quasi-random points ``(count, 2)`` between 0 and 1."""
     return torch.quasirandom.SobolEngine(2, scramble=True, seed=seed).draw(count, dtype=torch.float64)
+
+
+def _normal(count: int, seed: int = 0) -> Tensor:
+    """Return quasi-random points ``(count, 2)`` of a standard normal."""
+    return torch.special.ndtri(_sobol(count, seed).clamp(1e-6, 1 - 1e-6))
 
 
 def _around(count: int) -> Tensor:
@@ -175,6 +224,4 @@ def _around(count: int) -> Tensor:
 
 
 _MASS = 0.5 + math.log(_FAR_KM / _NEAR_KM)  # of the density within the nearest distance and beyond, over 2 pi
-_NORMAL = torch.special.ndtri(_sobol(128, seed=0).clamp(1e-6, 1 - 1e-6))  # standard normal
-_AROUND = _around(384)
-_AROUND_DENSITY = len(_AROUND) / (2 * math.pi * _MASS)
+_FINE, _COARSE = (_normal(128), _around(384)), (_normal(32), _around(96))

@@ -30,10 +30,10 @@ from magrl.tracking.search import arrival_ellipse, unvisited
 from magrl.tracking.way import Way
 
 SLOW_SHARE = 0.25
-"""Share of the variance of constant and slow errors that counts as new in each reading; chosen on random planets."""
+"""Share of the variance of slow errors that counts as new in each reading; chosen on random planets."""
 
 
-def reading_std(sensor_std: Tensor, bias_std: Tensor) -> Tensor:
+def reading_std(sensor_std: Tensor, drift_std: Tensor) -> Tensor:
     """Return the standard deviation ``(..., E)`` of a reading in the filter.
 
     Slow errors vary along the way, which the filter would otherwise take for a gradient. They are correlated from
@@ -41,14 +41,14 @@ def reading_std(sensor_std: Tensor, bias_std: Tensor) -> Tensor:
 
     Args:
         sensor_std: ``(..., E)`` standard deviation of the errors that are new in each reading.
-        bias_std: ``(..., E)`` that of constant and slow errors.
+        drift_std: ``(..., E)`` that of slow errors.
 
     Example:
         >>> reading_std(torch.tensor([3.0]), torch.tensor([8.0]))
         tensor([5.])
     """
-    check_tensor(sensor_std=sensor_std, bias_std=bias_std)
-    return torch.hypot(sensor_std, SLOW_SHARE**0.5 * bias_std)
+    check_tensor(sensor_std=sensor_std, drift_std=drift_std)
+    return torch.hypot(sensor_std, SLOW_SHARE**0.5 * drift_std)
 
 
 def displacement_of(move: Tensor, heading: Tensor) -> Tensor:

@@ -18,9 +18,9 @@ from magrl.transforms.base import (
     StatefulTransform,
 )
 
-STD_KEYS = ("sensor_std", "bias_std")
-DRIFT_KEY = "drift_std"
-"""Standard deviations of a reading's new errors, and of constant or slow ones: D [deg], I [deg], B_H [nT]."""
+STD_KEYS = ("sensor_std", "bias_std", "drift_std")
+"""Standard deviations of a reading's new errors, of constant and slow ones, and of slow ones alone: D [deg], I [deg],
+B_H [nT]."""
 FRAMES = ("world", "vehicle")
 IN_KEYS = ("field", "target_field", "move", "heading")
 OUT_KEYS = ("track_mean", "track_covariance", "estimated_field", "estimated_gradient", "way", "way_covariance")
@@ -35,9 +35,9 @@ class TrackGradient(StatefulTransform):
 
     Args:
         in_keys: readings ``(..., E)``, values at the target ``(..., E)``, the last move ``(..., K)`` (its first number
-            is the distance [km]), the heading after the move ``(..., 1)`` [rad], and optionally the standard deviation
-            of the readings' noise ``(..., E)`` and that of their constant error ``(..., E)``, which only widens the
-            covariance of the way.
+            is the distance [km]), the heading after the move ``(..., 1)`` [rad], and optionally standard deviations
+            ``(..., E)``: that of the readings' noise, alone or with those of constant and slow errors, which widen the
+            covariance of the way, and of slow errors alone, of which a part counts as noise.
         out_keys: the state, in the scaled units of :class:`~magrl.tracking.FieldTrack`: mean ``(..., E, 3)`` and
             covariance ``(..., E, 3, 3)``, always northward and eastward; then the estimates: the field ``(..., E)``,
             its gradient ``(..., E, 2)`` [element unit / km], the way to the target ``(..., 2)`` [km] and its covariance
@@ -71,7 +71,7 @@ class TrackGradient(StatefulTransform):
 
     default_in_keys = IN_KEYS
     default_out_keys = OUT_KEYS
-    in_counts = (4, 5, 6)
+    in_counts = (4, 5, 7)
     scales: Tensor
     sensor_std: Tensor
     periods: Tensor
@@ -102,7 +102,7 @@ class TrackGradient(StatefulTransform):
         self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
         self.curvature = curvature if callable(curvature) else None
         count = len(scales)
-        self.in_sizes = (count, count, None, 1, count, count)
+        self.in_sizes = (count, count, None, 1, count, count, count)
         self.out_sizes = (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
         if not set(angles) <= set(range(count)):
             raise ValueError(f"angles must be indices of the {count} elements, got {angles!r}")
@@ -146,10 +146,10 @@ class TrackGradient(StatefulTransform):
 
     def _std(self, values: list[Tensor]) -> tuple[Tensor, Tensor | None]:
         """Return the standard deviations of a reading and of constant errors, of the TensorDict or as given."""
-        given = len(values)
-        if given > 5:
-            return tracking.reading_std(values[4], values[5]), values[5]
-        return values[4] if given > 4 else self.sensor_std, None
+        std = values[4:]
+        if len(std) > 1:
+            return tracking.reading_std(std[0], std[2]), std[1]
+        return std[0] if std else self.sensor_std, None
 
     def estimates(
         self, track: FieldTrack, target: Tensor, heading: Tensor, bias_std: Tensor | None = None
@@ -165,9 +165,8 @@ class TrackGradient(StatefulTransform):
         known, shared = (track, None) if self.relation is None else tracking.related(track, self.relation, self.scales)
         field, gradient = (f(known, self.scales) for f in (tracking.estimated_field, tracking.estimated_gradient))
         field = field - self.periods.to(field.dtype) * torch.round(field / 360)
-        way, covariance = tracking.way_to(
-            known, target, self.range_km, self.scales, shared, bias_std, self.periods, self._curvature(field)
-        )
+        options = self.range_km, self.scales, shared, bias_std, self.periods, self._curvature(field)
+        way, covariance = tracking.way_posterior(known, target, *options, fine=False).way()
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)
@@ -242,7 +241,8 @@ class PlannedMove(StatefulTransform):
     Args:
         in_keys: values at the target ``(..., 3)``, heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, mean
             ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the filter, way to aim at ``(..., 2)`` [km], and the
-            standard deviations ``(..., 3)`` of new errors of a reading and of constant and slow ones.
+            standard deviations ``(..., 3)`` of new errors of a reading, of constant and slow ones, and of slow ones
+            alone.
         out_keys: displacement ``(..., 2)`` [km].
         max_move_km: longest move [km].
         max_steps: step limit.
@@ -264,7 +264,7 @@ class PlannedMove(StatefulTransform):
 
     default_in_keys = ("target_field", "heading", "step_count", "track_mean", "track_covariance", "way", *STD_KEYS)
     default_out_keys = ("planned_move",)
-    in_sizes = (3, 1, 1, 3, 3, 2, 3, 3)
+    in_sizes = (3, 1, 1, 3, 3, 2, 3, 3, 3)
     out_sizes = ((2,),)
 
     def __init__(
@@ -288,16 +288,17 @@ class PlannedMove(StatefulTransform):
         self._advance(tensordict, values, [])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:  # noqa: ARG002
-        target, heading, step, mean, covariance, aim, sensor_std, bias_std = (value.double() for value in values)
+        target, heading, step, mean, covariance, aim, sensor_std, bias_std, drift_std = (x.double() for x in values)
         turn = heading if self.frame == "vehicle" else 0 * heading
-        way, std = _turned(aim.unsqueeze(-2), -turn).squeeze(-2), tracking.reading_std(sensor_std, bias_std)
+        aim, std = _turned(aim.unsqueeze(-2), -turn).squeeze(-2), tracking.reading_std(sensor_std, drift_std)
         track = FieldTrack(mean, covariance)
         known, shared = tracking.related(track, tracking.curl_relation)
-        options = self.range_km, tracking.ELEMENT_SCALES, shared, None, tracking.ELEMENT_PERIODS
-        uncertainty = tracking.way_to(known, target, *options).covariance
-        caution, step_km = tracking.trade_off(std)
-        price = tracking.step_price(step_km, way, step.squeeze(-1), self.max_steps, self.max_move_km)
-        move = tracking.planned_move(track, way, uncertainty, std, caution, price, self.max_move_km, self.range_km)
+        curvature = tracking.field_curvature(tracking.estimated_field(known))
+        options = self.range_km, tracking.ELEMENT_SCALES, shared, bias_std, tracking.ELEMENT_PERIODS, curvature
+        posterior = tracking.way_posterior(known, target, *options, fine=False)
+        step_km = tracking.reading_price(std)
+        price = tracking.step_price(step_km, aim, step.squeeze(-1), self.max_steps, self.max_move_km)
+        move = tracking.planned_move(track, aim, posterior, std, price, self.max_move_km, self.range_km)
         tensordict.set(self.out_keys[0], _turned(move.unsqueeze(-2), turn).squeeze(-2).to(values[1].dtype))
 
 

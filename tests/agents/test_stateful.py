@@ -176,7 +176,7 @@ def test_a_network_of_ones_own_between_view_and_action(tmp_path: Path) -> None:
         commands.append(vehicle.step(*reading))
     assert commands[0] == commands[1]
     here, there, course = (torch.tensor(x) for x in (reading[:3], target, (0.0, math.radians(290))))
-    action = VehicleStep(loaded)(here, there, course, torch.zeros(2, 3), *first_state())[0]
+    action = VehicleStep(loaded)(here, there, course, torch.zeros(3, 3), *first_state())[0]
     assert action[0].item() == pytest.approx(commands[0].distance_km, abs=1e-3)
 
 

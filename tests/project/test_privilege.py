@@ -19,7 +19,7 @@ ORACLES = {"parallel", "geodesic"}
 METAHEURISTICS = {"ga", "pso", "afsa"}  # oracles but in the mode "flown"
 CONDITION = CONDITIONS["low-cost"]
 PRIVATE = {*PRIVILEGED_KEYS, *TRUE_KEYS}
-TOLD = ["sensor_std", "bias_std"]
+TOLD = ["sensor_std", "bias_std", "drift_std"]
 
 
 def base_env(seed: int = 5) -> GeomagneticNavEnv:

@@ -8,7 +8,7 @@ from support.tracks import F64, STD, f64
 from torch import Tensor
 
 from magrl import tracking
-from magrl.tracking import FieldTrack, planning
+from magrl.tracking import FieldTrack, WayPosterior, planning
 
 RANGE_KM = 300.0
 NOISE = f64(*STD)
@@ -48,15 +48,13 @@ def test_a_crossing_move_is_worth_more_than_one_along_the_way() -> None:
     assert across < 0.5 * along
 
 
-def test_the_detour_and_the_certainty_by_hand() -> None:
-    """400 km and 300 km across; the direction to a place in 300 km is off by 400 km: 0.6 is the cosine."""
+def test_the_detour_by_hand() -> None:
+    """400 km and 300 km across."""
     way, zero = f64(400.0, 0.0), f64(0.0)[0]
     torch.testing.assert_close(planning._detour(way, (zero, zero, zero + 300.0**2)), f64(100.0)[0])
     torch.testing.assert_close(planning._detour(0 * way, (zero, zero, zero + 300.0**2)), f64(300.0)[0])
     along = 40.0**2 * 2 + zero, zero, zero
     torch.testing.assert_close(planning._detour(way * 30 / 400, along), f64(20.0)[0])  # half of it: 50 - 30
-    ways, north = f64((0.0, 300.0), (300.0, 0.0)), torch.diag(f64(400.0**2, 0.0))
-    torch.testing.assert_close(planning._certainty(ways, north.expand(2, 2, 2)), f64((0.6,), (1.0,)))
 
 
 def test_the_moves_that_are_compared_and_the_price_of_a_step() -> None:
@@ -70,21 +68,21 @@ def test_the_moves_that_are_compared_and_the_price_of_a_step() -> None:
     assert price.tolist() == pytest.approx([2 * (50 / 35) ** 2, 2 * 2**2, 2 * 50**2, 2 * 50**2])  # 15 are for the way
 
 
-def test_more_noise_means_less_caution_and_dearer_steps() -> None:
-    caution, price = tracking.trade_off(f64((0, 0, 0), (0.02, 0.02, 2), STD, (0.1, 0.1, 10)))
-    assert caution.tolist() == sorted(caution.tolist(), reverse=True)
-    assert price.tolist() == sorted(price.tolist())
-    assert (float(caution[1]), float(price[1])) == pytest.approx((2.25, 1 / 3))  # 0.02 deg of I is 4/3 km
+def test_more_noise_means_dearer_steps_within_limits() -> None:
+    price = tracking.reading_price(f64((0, 0, 0), (0.03, 0.03, 2), (0.3, 0.03, 8), (1e4, 1e4, 1e5)))
+    assert price.tolist() == pytest.approx([0.3, 2.0, 2.0, 20.0])  # the second smallest of the three elements counts
 
 
 def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
-    ways, covariance = f64((90.0, -120.0), (0.0, 30.0)), 400.0 * torch.eye(2, dtype=F64).expand(2, 2, 2)
-    prices = f64(0.5, 2.0), f64(1.0, 0.1)
+    ways, prices = f64((90.0, -120.0), (0.0, 30.0)), f64(1.0, 0.1)
+    apart, weights = f64((0.0, 20.0), (0.0, -20.0), (20.0, 0.0), (-20.0, 0.0)), f64(0.4, 0.2, 0.2, 0.2)
 
     def plan(index: slice | int) -> Tensor:
         track = FieldTrack(*(torch.stack(parts)[index] for parts in zip(SURE, UNSURE, strict=True)))
-        weights = (price[index] for price in prices)
-        return tracking.planned_move(track, ways[index], covariance[index], NOISE, *weights, 50.0, RANGE_KM)
+        aim = ways[index]
+        points = aim.unsqueeze(-2) + apart + 100.0  # of which only the shape counts
+        posterior = WayPosterior(points, weights.expand(points.shape[:-1]))
+        return tracking.planned_move(track, aim, posterior, NOISE, prices[index], 50.0, RANGE_KM)
 
     torch.testing.assert_close(plan(0), f64(30.0, -40.0))
     torch.testing.assert_close(plan(slice(None)), torch.stack((plan(0), plan(1))))

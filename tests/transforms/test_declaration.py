@@ -19,7 +19,7 @@ from magrl.field import FieldModel
 from magrl.geodesy import move
 from magrl.navigators import Kalman, Secant
 from magrl.transforms import DeclareArrival, SensorErrors, TrackGradient
-from magrl.transforms.track import DRIFT_KEY, IN_KEYS, STD_KEYS
+from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 STD, BIAS = (0.05, 0.05, 5.0), (0.1, 0.1, 10.0)
 
@@ -95,7 +95,7 @@ def test_every_navigator_can_be_flown(navigator) -> None:
 
 
 def test_the_accuracy_decides_and_confidence_prevents_false_arrivals() -> None:
-    keys = (*DeclareArrival.default_in_keys, *STD_KEYS, DRIFT_KEY)
+    keys = (*DeclareArrival.default_in_keys, *STD_KEYS)
     rates = []
     for confidence in (0.0, 0.7):
         declare = DeclareArrival(25.0, max_steps=50, confidence=confidence, in_keys=keys)

@@ -95,7 +95,8 @@ def observed_track(turn: float) -> Tensor:
     for step in range(3):
         for key in ("field", "target_field"):
             seen[key][:, 0] = torch.remainder(seen[key][:, 0] + 180, 360) - 180
-        seen["sensor_std"], seen["bias_std"] = float64(STD).expand(4, 3), torch.zeros(4, 3, dtype=torch.float64)
+        seen["sensor_std"] = float64(STD).expand(4, 3)
+        seen["bias_std"] = seen["drift_std"] = torch.zeros(4, 3, dtype=torch.float64)
         seen["step_count"] = torch.full((4, 1), step)
         state = observe(seen.clone()) if state is None else observe(state.copy().set("next", seen.clone()))["next"]
         observations.append(torch.cat((state["observation"][:, :15], state["observation"][:, 18:]), -1))

@@ -140,10 +140,11 @@ def test_navigators_are_told_what_they_can_tell_apart() -> None:
     for name in ("kalman", "secant"):
         navigator = make_navigator(name, env, **told)
         assert [navigator.sensor_std.tolist(), navigator.bias_std.tolist()] == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0]]
-        assert navigator.reading_std(TensorDict()).tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5])
-        here = TensorDict(bias_std=torch.tensor([[0.8, 0.0, 4.0]]), batch_size=1)  # larger at this latitude
-        assert navigator.reading_std(here)[0].tolist() == pytest.approx([0.5, 0.05, 13**0.5])
-        assert navigator.lasting_std(here)[0].tolist() == pytest.approx([0.8, 0.1, 4.0])
+        assert torch.equal(navigator.reading_std(TensorDict()), navigator.sensor_std)
+        here = {"bias_std": torch.tensor([[0.9, 0.0, 4.0]]), "drift_std": torch.tensor([[0.8, 0.0, 0.0]])}
+        here = TensorDict(here, batch_size=1)  # larger at this latitude
+        assert navigator.reading_std(here)[0].tolist() == pytest.approx([0.5, 0.0, 3.0])
+        assert navigator.lasting_std(here)[0].tolist() == pytest.approx([0.9, 0.1, 4.0])
     matching = make_navigator("map_matching", env, **told)
     assert matching.std.tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5], rel=1e-3)
     assert matching.bias_std.tolist() == pytest.approx([0.4, 0.1, 4.0], rel=1e-3)
