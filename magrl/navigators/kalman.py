@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -38,6 +38,7 @@ class Kalman(QuasiNewton):
         range_km: prior standard deviation of the way along each axis [km].
         lengths: of the moves that are compared, as fractions of the longest.
         search: as of :class:`QuasiNewton`, here by default.
+        prior: of the gradients: learned on random planets, or that of a dipole, so that nothing is trained.
         **options: ``bias_std`` and ``zeta`` of :class:`QuasiNewton`.
 
     Raises:
@@ -65,6 +66,7 @@ class Kalman(QuasiNewton):
         range_km: float = 300.0,
         lengths: Sequence[float] = LENGTHS,
         search: bool = True,
+        prior: Literal["learned", "dipole"] = "learned",
         **options: Any,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad, sensor_std=sensor_std, search=search, **options)
@@ -77,10 +79,12 @@ class Kalman(QuasiNewton):
             check_number(0, above=True, step_km=step_km)
         self.max_steps, self.range_km = int(max_steps), float(range_km)
         self.caution, self.step_km = float(caution), step_km
-        self.gradient_prior = LearnedPrior.pretrained()
+        if prior not in ("learned", "dipole"):
+            raise ValueError(f"prior must be 'learned' or 'dipole', got {prior!r}")
+        self.learned_prior = LearnedPrior.pretrained() if prior == "learned" else None
 
     def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:
-        return self.gradient_prior(reading, target)
+        return tracking.dipole_prior(reading) if self.learned_prior is None else self.learned_prior(reading, target)
 
     def drift(self, reading: Tensor) -> Tensor:
         return tracking.field_curvature(reading)
@@ -90,7 +94,8 @@ class Kalman(QuasiNewton):
         curvature = self.drift(tracking.estimated_field(known, self.scales))
         options = self.range_km, self.scales, shared, self.lasting_std(seen), self.periods, curvature
         posterior = tracking.way_posterior(known, seen["target_field"].double(), *options, fine=False)
-        aim, std = self.aim(known, posterior.way(), seen, memory), self.reading_std(seen)
+        way = tracking.Way(*(part.double() for part in posterior.way()))
+        aim, std = self.aim(known, way, seen, memory), self.reading_std(seen)
         step_km = tracking.reading_price(std) if self.step_km is None else torch.full_like(aim[..., 0], self.step_km)
         step = seen["step_count"].squeeze(-1)
         price = tracking.step_price(step_km, aim, step, self.max_steps, self.max_move_km)

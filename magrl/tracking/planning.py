@@ -138,11 +138,11 @@ def planned_move(
         torch.Size([2])
     """
     check_tensor(2, aim=aim)
+    aim = aim.to(track.mean.dtype)
     moves = _moves(aim, lengths, max_move_km)
     left = aim.unsqueeze(-2) - moves
-    mean = (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
-    aimed = posterior._replace(points=posterior.points + (aim - mean).unsqueeze(-2))
-    distance = aimed.mean_distance(moves).to(aim.dtype)  # the distance now is the same for all moves
+    shift = aim - (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
+    distance = posterior.mean_distance(moves - shift.unsqueeze(-2)).to(aim.dtype)  # that of now is the same for all
     cost = moves.norm(dim=-1) + distance * (1 + step_km / max_move_km).unsqueeze(-1)
     after = _covariance_after(track, moves, left, sensor_std, range_km, scales)
     best = (cost + caution * _detour(left, after)).argmin(-1)[..., None, None]

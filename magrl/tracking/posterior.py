@@ -50,23 +50,24 @@ class WayPosterior(NamedTuple):
         """Return the mean and the covariance."""
         mean = (self.points * self.weights.unsqueeze(-1)).sum(-2)
         apart = self.points - mean.unsqueeze(-2)
-        products = apart.unsqueeze(-1) * apart.unsqueeze(-2)
-        return Way(mean, (products * self.weights[..., None, None]).sum(-3))
+        north, east = apart.unbind(-1)
+        nn, ne, ee = ((self.weights * product).sum(-1) for product in (north * north, north * east, east * east))
+        return Way(mean, torch.stack((nn, ne, ne, ee), -1).unflatten(-1, (2, 2)))
 
     def mean_distance(self, moves: Tensor) -> Tensor:
         """Return the mean distances ``(..., K)`` [km] of the place after moves ``(..., K, 2)`` [km], as float32.
 
         Example:
             >>> posterior = WayPosterior(torch.tensor([[30.0, 0.0], [0.0, 40.0]]), torch.tensor([0.5, 0.5]))
-            >>> posterior.mean_distance(torch.tensor([[0.0, 0.0], [30.0, 0.0]]))
+            >>> posterior.mean_distance(torch.tensor([[0.0, 0.0], [30.0, 0.0]])).round()
             tensor([35., 25.])
         """
         points, moves = self.points.float(), moves.float()
-        # |d - m|^2 as one matrix product
-        left = torch.cat((moves, moves.square().sum(-1, keepdim=True), torch.ones_like(moves[..., :1])), -1)
+        # |d - m|^2 as one matrix product, with 0.01 km^2 for its rounding
+        left = torch.cat((moves, moves.square().sum(-1, keepdim=True) + 0.01, torch.ones_like(moves[..., :1])), -1)
         right = torch.cat((-2 * points, torch.ones_like(points[..., :1]), points.square().sum(-1, keepdim=True)), -1)
         weights = self.weights.float().unsqueeze(-1)
-        parts = [((some @ right.mT).clamp_min_(0).sqrt_() @ weights).squeeze(-1) for some in left.split(_AT_ONCE, -2)]
+        parts = [((some @ right.mT).sqrt_() @ weights).squeeze(-1) for some in left.split(_AT_ONCE, -2)]
         return torch.cat(parts, -1)
 
     def within(self, radius_km: float) -> Tensor:
@@ -117,7 +118,7 @@ def way_posterior(
         periods: of angles, whose remaining differences are wrapped; None for none.
         curvature: standard deviation of the change of a gradient along the way, as in :func:`~magrl.tracking.predict`:
             it adds ``c^2 |d|^4 / 4`` to S(d). None for constant gradients.
-        fine: whether there are 512 points, as probabilities need, or 128, which suffice for means.
+        fine: whether there are 512 points, as probabilities need, or 256 in single precision, which suffice for means.
 
     Raises:
         ValueError: for shapes that do not match, a range that is not above 0, or a negative standard deviation.
@@ -133,15 +134,16 @@ def way_posterior(
         tensor([300., 200.])
     """
     way = way_to(track, target, range_km, scales, shared, bias_std, periods, curvature)
+    dtype, unit_points = (way.displacement.dtype, _FINE) if fine else (torch.float32, _COARSE)
     center, spread = way.displacement / DISTANCE_SCALE_KM, way.covariance / DISTANCE_SCALE_KM**2
-    points, density = _points(Way(center, spread), _FINE if fine else _COARSE)
+    points, density = _points(Way(center.to(dtype), spread.to(dtype)), unit_points)
     unit = _units(track, scales)
     elements, none = unit.shape[-1], (0.0,) * unit.shape[-1]
     bias = _nonnegative_or_nan("bias_std", none if bias_std is None else bias_std, elements, unit) / unit
     bend = _nonnegative_or_nan("curvature", none if curvature is None else curvature, elements, unit) / unit
     target = target if periods is None else continued(target, track, scales, periods)
     remaining = target.to(unit.dtype) / unit
-    rows = _polynomials(track, remaining, bias.square(), bend.square() / 4, shared)
+    rows = _polynomials(track, remaining, bias.square(), bend.square() / 4, shared).to(dtype)
     dn, de = points.unbind(-1)
     square = dn * dn + de * de
     powers = torch.stack((torch.ones_like(dn), dn, de, dn * dn, dn * de, de * de, square * square), -2)
@@ -224,4 +226,4 @@ def _around(count: int) -> Tensor:
 
 
 _MASS = 0.5 + math.log(_FAR_KM / _NEAR_KM)  # of the density within the nearest distance and beyond, over 2 pi
-_FINE, _COARSE = (_normal(128), _around(384)), (_normal(32), _around(96))
+_FINE, _COARSE = (_normal(128), _around(384)), (_normal(64), _around(192))

@@ -166,7 +166,8 @@ class TrackGradient(StatefulTransform):
         field, gradient = (f(known, self.scales) for f in (tracking.estimated_field, tracking.estimated_gradient))
         field = field - self.periods.to(field.dtype) * torch.round(field / 360)
         options = self.range_km, self.scales, shared, bias_std, self.periods, self._curvature(field)
-        way, covariance = tracking.way_posterior(known, target, *options, fine=False).way()
+        posterior = tracking.way_posterior(known, target, *options, fine=False)
+        way, covariance = (part.to(target.dtype) for part in posterior.way())
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)

@@ -97,14 +97,14 @@ def earth(
     within_km: float | None = None,
     arrivals: Sequence[str | float] = ("objective",),
     known_start: Sequence[float] | None = None,
-    difference: Sequence[str] = (),
+    differences: Sequence[tuple[Spec, Spec]] = (),
 ) -> str:
     """Return a row for each date, navigator and arrival; a column for each level of noise, or each of some conditions.
 
     An arrival is a rule of the environment, or the least confidence at which vehicles declare that they are
     ``within_km`` of the destination. A table of declared arrivals ends with the bound of :func:`estimate_within`. With
-    ``known_start``, the vehicles know the elements at their start. A ``difference`` of two navigators, by the last of
-    the arrivals, is another row.
+    ``known_start``, the vehicles know the elements at their start. Each of the ``differences`` of two
+    navigators, by the last of the arrivals, is another row.
     """
     columns = columns_of(conditions)
     options: dict[str, Any] = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM} if conditions else {}
@@ -118,7 +118,7 @@ def earth(
         rule, least = (arrival, 0.0) if isinstance(arrival, str) else ("declared", arrival)
         base = earth_env(tasks, distance_km, date, max_steps=max_steps, arrival=rule, **options)
         episodes = [flown(navigator, base, errors, least, known_start) for errors in columns.values()]
-        spl[navigator if isinstance(navigator, str) else ""] = [found["spl"] for found in episodes]
+        spl[names(navigator)[0]] = [found["spl"] for found in episodes]
         summaries = [summarize(found) for found in episodes]
         cells = [" / ".join(number(summary.get(name, 0.0)) for name in measures) for summary in summaries]
         first = [*[date] * (len(dates) > 1), *names(navigator), *[arrival_name(arrival)] * (len(arrivals) > 1)]
@@ -126,11 +126,12 @@ def earth(
     if within_km:
         shares = (estimate_within(within_km, base, errors, known_start) for errors in columns.values())
         rows.append([*BOUND, *["—"] * (len(arrivals) > 1), *(f"{share:.1f}" for share in shares)])
-    if difference and set(difference) <= spl.keys():
-        pairs = zip(*(spl[name] for name in difference), strict=True)
-        cells = [paired_difference(*pair, base.scenario.tasks.region) for pair in pairs]
-        rule = [arrival_name(arrivals[-1])] * (len(arrivals) > 1)
-        rows.append([f"{' − '.join(map(label, difference))}, SPL", "—", *rule, *["—"] * one_run, *cells])
+    for two in ([names(navigator)[0] for navigator in pair] for pair in differences):
+        if set(two) <= spl.keys():
+            pairs = zip(*(spl[name] for name in two), strict=True)
+            cells = [paired_difference(*pair, base.scenario.tasks.region) for pair in pairs]
+            rule = [arrival_name(arrivals[-1])] * (len(arrivals) > 1)
+            rows.append([f"{' − '.join(two)}, SPL", "—", *rule, *["—"] * one_run, *cells])
     head = [*["date"] * (len(dates) > 1), "navigator", "needs", *["arrival"] * (len(arrivals) > 1), *["runs"] * one_run]
     return markdown_table([*head, *columns], rows)
 

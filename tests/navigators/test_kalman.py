@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 from support.tracks import STD
 from torchrl.envs import TransformedEnv
@@ -27,6 +25,6 @@ def test_it_arrives_without_a_map_with_and_without_noise(std: tuple[float, ...],
 
 
 def test_bad_options_are_refused() -> None:
-    for options in ({"bias_std": (0.1, -0.1, 1.0)}, {"max_steps": 0}, {"zeta": math.nan}, {"range_km": 0.0}):
+    for options in ({"bias_std": (0.1, -0.1, 1.0)}, {"max_steps": 0}, {"prior": "igrf"}, {"range_km": 0.0}):
         with pytest.raises(ValueError, match=next(iter(options))):
             Kalman(**options)

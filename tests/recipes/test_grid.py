@@ -113,7 +113,7 @@ def test_boxes_have_mean_and_lowest_rows() -> None:
 
 def test_vehicles_that_declare_have_a_row_for_each_confidence() -> None:
     options = {"conditions": ["ship"], "tasks": 4, "within_km": 25}
-    options |= {"arrivals": ["distance", 1.0, 0.0], "difference": ["secant", "secant"]}
+    options |= {"arrivals": ["distance", 1.0, 0.0], "differences": [("secant", "secant")]}
     told, sure, bold, bound, difference = rows(grid.earth(["secant"], **options))[2:]
     assert difference[1:] == ["—", "declared", "+0.0 (+0.0 to +0.0)"]  # each column has a cell
     assert [told[2], sure[2], bold[2]] == ["told", "declared at 1", "declared"]
@@ -130,7 +130,7 @@ def test_the_interval_of_a_difference_is_clustered_by_region() -> None:
     region = torch.tensor([0, 0, 1, 1, 2, 2, 3, 3])
     assert flights.paired_difference(first, 0 * first, region) == "**+4.0 (+1.5 to +6.5)**"
     assert flights.paired_difference(first, 0 * first + 0.02, region) == "+2.0 (-0.5 to +4.5)"
-    table = rows(grid.earth(["secant", "geodesic"], tasks=8, difference=["secant", "geodesic"]))
+    table = rows(grid.earth(["secant", "geodesic"], tasks=8, differences=[("secant", "geodesic")]))
     assert table[-1][0] == "secant (quasi-Newton) − geodesic (both positions, an oracle), SPL"
     assert table[-1][3].startswith(("**-", "-"))
 
