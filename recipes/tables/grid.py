@@ -33,7 +33,7 @@ from tqdm import tqdm
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
 from magrl.evaluation import summarize
-from magrl.evaluation.navigators import check_distinct, label
+from magrl.evaluation.navigators import check_distinct
 from magrl.evaluation.runs import NO_NOISE
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
@@ -191,12 +191,12 @@ def boxes(navigators: Sequence[Spec], *, boxes: int = 24, tasks: int = 500, seed
     return markdown_table(["box", *(f"{head}, SR / SPL" for head in heads)], rows)
 
 
-def rows_of(of: Sequence[str], navigators: Sequence[str], *, numbers: int | None = None) -> str:
+def rows_of(of: Sequence[str], navigators: Sequence[Spec], *, numbers: int | None = None) -> str:
     """Return the last rows of some navigators in other tables in docs/results, with the first numbers of each cell."""
     lines = [line for name in of for line in (RESULTS / f"{name}.md").read_text().splitlines()]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     by_label = {row[0]: [" / ".join(cell.split(" / ")[:numbers]) for cell in row] for row in cells}
-    return markdown_table(by_label["navigator"], [by_label[label(name)] for name in navigators])
+    return markdown_table(by_label["navigator"], [by_label[names(navigator)[0]] for navigator in navigators])
 
 
 KINDS: Mapping[str, Callable[..., str]] = {
