@@ -28,6 +28,7 @@ from magrl.tracking.way import Way, way_to
 _AT_ONCE = 13  # moves whose distances to all points are held at once
 _NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out
 _SPREAD = 1.5  # standard deviations of the points around the estimated way, over those of the way
+_UNSURE = 4  # weight of the variance of the likeliest way in its share of the aim
 _LEAST_VARIANCE = 1e-8  # of a remaining difference, in squared scaled units
 _LEAST_AREA = 1e-6  # of the points around the way, in squared scaled units: a standard deviation of 0.1 km
 _LEAST_SHARE = 1e-6  # of a variance, left by a relation
@@ -53,6 +54,26 @@ class WayPosterior(NamedTuple):
         north, east = apart.unbind(-1)
         nn, ne, ee = ((self.weights * product).sum(-1) for product in (north * north, north * east, east * east))
         return Way(mean, torch.stack((nn, ne, ne, ee), -1).unflatten(-1, (2, 2)))
+
+    def aim(self, likeliest: Way) -> Way:
+        """Return the way to aim at: between the mean and the likeliest way, the nearer to the latter the surer it is.
+
+        The share of the likeliest way d of covariance C is ``|d|^2 / (|d|^2 + 4 tr C)``. Where the posterior has two
+        maxima, its mean lies between them, and no move makes progress there. The covariance is that of the posterior.
+
+        Args:
+            likeliest: that of :func:`~magrl.tracking.way_to`, ``(..., 2)`` and ``(..., 2, 2)``.
+
+        Example:
+            >>> posterior = WayPosterior(torch.tensor([[0.0, 10.0], [0.0, 30.0]]), torch.tensor([0.25, 0.75]))
+            >>> posterior.aim(Way(torch.tensor([0.0, 30.0]), 50 * torch.eye(2))).displacement.round(decimals=1)
+            tensor([ 0.0000, 28.5000])
+        """
+        mean, covariance = self.way()
+        square = likeliest.displacement.square().sum(-1, keepdim=True)
+        variance = likeliest.covariance.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+        share = square / (square + _UNSURE * variance).clamp_min(1e-6)
+        return Way(mean + share * (likeliest.displacement - mean), covariance)
 
     def mean_distance(self, moves: Tensor) -> Tensor:
         """Return the mean distances ``(..., K)`` [km] of the place after moves ``(..., K, 2)`` [km], as float32.

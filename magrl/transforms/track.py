@@ -167,7 +167,8 @@ class TrackGradient(StatefulTransform):
         field = field - self.periods.to(field.dtype) * torch.round(field / 360)
         options = self.range_km, self.scales, shared, bias_std, self.periods, self._curvature(field)
         posterior = tracking.way_posterior(known, target, *options, fine=False)
-        way, covariance = (part.to(target.dtype) for part in posterior.way())
+        aim = posterior.aim(tracking.way_to(known, target, *options))
+        way, covariance = (part.to(target.dtype) for part in aim)
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from support.tracks import F64, f64, randn, random_track
 
-from magrl.tracking import FieldTrack, GradientRelation, relate, way_posterior
+from magrl.tracking import FieldTrack, GradientRelation, Way, WayPosterior, relate, way_posterior
 
 ONE = (1.0, 1.0, 1.0)
 
@@ -80,3 +80,13 @@ def test_both_precisions_agree() -> None:
     exact = way_posterior(track, target, 200.0, ONE).way()
     low = way_posterior(FieldTrack(*(x.float() for x in track)), target.float(), 200.0, ONE).way()
     torch.testing.assert_close(low.displacement.double(), exact.displacement, rtol=1e-3, atol=0.1)
+
+
+def test_the_aim_lies_between_the_mean_and_the_likeliest_way() -> None:
+    """At the likeliest way where it is certain, at the mean where it is uncertain or leads nowhere; never undefined."""
+    posterior = WayPosterior(f64((100.0, 0.0), (0.0, 60.0)), f64(0.5, 0.5))
+    ways, sizes = f64((100.0, 0.0), (100.0, 0.0), (100.0, 0.0), (0.0, 0.0), (0.0, 0.0)), f64(0.0, 1e9, 1250.0, 1.0, 0.0)
+    aim = posterior.aim(Way(ways, sizes[:, None, None] * torch.eye(2, dtype=F64)))
+    expected = f64((100.0, 0.0), (50.0, 30.0), (75.0, 15.0), (50.0, 30.0), (50.0, 30.0))
+    torch.testing.assert_close(aim.displacement, expected, rtol=0, atol=1e-3)
+    torch.testing.assert_close(aim.covariance, posterior.way().covariance)
