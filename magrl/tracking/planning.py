@@ -32,6 +32,8 @@ SLOPES = (0.004, 0.015, 4.0)
 """Typical gradient of D, I [deg/km], B_H [nT/km]: what a quasi-Newton navigator without a map expects, in size."""
 LENGTHS = (0.1, 0.3, 0.6, 1.0)
 """Lengths of the moves that are compared by default; the whole way, if it is shorter, is another."""
+SHORTEST = 1 / 40
+"""The least length of a move that is compared, as a share of the way."""
 ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
 """Their directions, from that of the way [deg]."""
 CORRECTION = 0.5
@@ -119,7 +121,7 @@ def planned_move(
         max_move_km: longest move.
         range_km: prior standard deviation of the way along each axis [km].
         caution: weight of the uncertainty.
-        lengths: of the moves that are compared, as fractions of the longest.
+        lengths: of the moves that are compared, as fractions of the longest; at least :data:`SHORTEST` of the way.
         scales: those of :func:`~magrl.tracking.start`.
 
     Raises:
@@ -171,8 +173,9 @@ def corrected(way: Tensor, correction: Tensor) -> Tensor:
 
 def _moves(way: Tensor, lengths: Sequence[float], max_move_km: float) -> Tensor:
     """Return the displacements ``(..., M, 2)`` [km] that are compared, given the way ``(..., 2)``."""
-    whole = way.norm(dim=-1, keepdim=True).clamp_max(max_move_km)
-    fixed = (way.new_tensor(lengths) * max_move_km).expand(*whole.shape[:-1], -1)
+    distance = way.norm(dim=-1, keepdim=True)
+    whole, least = (x.clamp_max(max_move_km) for x in (distance, SHORTEST * distance))
+    fixed = torch.maximum(way.new_tensor(lengths) * max_move_km, least)
     bearing = torch.atan2(way[..., 1:], way[..., :1]) + torch.deg2rad(way.new_tensor(ANGLES_DEG))
     directions = torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
     return (torch.cat((fixed, whole), -1)[..., None, None] * directions.unsqueeze(-3)).flatten(-3, -2)

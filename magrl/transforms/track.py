@@ -40,8 +40,8 @@ class TrackGradient(StatefulTransform):
             covariance of the way, and of slow errors alone, of which a part counts as noise.
         out_keys: the state, in the scaled units of :class:`~magrl.tracking.FieldTrack`: mean ``(..., E, 3)`` and
             covariance ``(..., E, 3, 3)``, always northward and eastward; then the estimates: the field ``(..., E)``,
-            its gradient ``(..., E, 2)`` [element unit / km], the way to the target ``(..., 2)`` [km] and its covariance
-            ``(..., 2, 2)`` [km^2].
+            its gradient ``(..., E, 2)`` [element unit / km], the way to aim at ``(..., 2)`` [km] and the covariance of
+            that to the target ``(..., 2, 2)`` [km^2] (:meth:`magrl.tracking.WayPosterior.aim`).
         sensor_std: standard deviation of the readings' noise, E numbers, where it is not among the ``in_keys``; by
             default 0. The filter has a floor, :data:`~magrl.tracking.VARIANCE_FLOOR`.
         prior: function from a first reading and the values at the target, ``(..., E)`` each, to a
@@ -154,7 +154,7 @@ class TrackGradient(StatefulTransform):
     def estimates(
         self, track: FieldTrack, target: Tensor, heading: Tensor, bias_std: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the estimates of the field, its gradient, the way to the target and its covariance, as written.
+        """Return the estimates of the field, its gradient, the way to aim at and its covariance, as written.
 
         Args:
             track: state of the filter.

@@ -64,6 +64,8 @@ def test_the_moves_that_are_compared_and_the_price_of_a_step() -> None:
     assert (moves - way).norm(dim=-1).min() < 1e-9  # the way itself
     assert moves.norm(dim=-1).min() == pytest.approx(5.0)
     assert moves.norm(dim=-1).max() == pytest.approx(50.0)
+    for far, shortest in ((20, 10.0), (500, 50.0)):  # 400 km, 10000 km
+        assert planning._moves(far * way, tracking.LENGTHS, 50.0).norm(dim=-1).min() == pytest.approx(shortest)
     price = tracking.step_price(2.0, 25 * way, torch.tensor([0, 10, 34, 49]), max_steps=50, max_move_km=50.0)
     assert price.tolist() == pytest.approx([2 * (50 / 35) ** 2, 2 * 2**2, 2 * 50**2, 2 * 50**2])  # 15 are for the way
 
