@@ -13,7 +13,7 @@ train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two c
 fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; seconds
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" $(ARGS)
 
-anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; 20 minutes on one core
+anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; an hour on one core
 	OMP_NUM_THREADS=1 $(RECIPE)/ppo_anywhere.py $(ARGS)
 
 prior: $(VENV)/.installed  ## fit the prior of the gradients on random planets; 40 seconds on one core
