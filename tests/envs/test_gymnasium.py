@@ -155,12 +155,13 @@ def test_a_batch_without_a_map_flies_as_in_torchrl(start_heading: str | None) ->
 
 def test_one_vehicle_without_a_map_reads_its_sensors_alone() -> None:
     keys = ("field", "target_field", "move", "heading", "sensor_std", "bias_std")
-    env = gymnasium.make(ANYWHERE_ID, observation=keys, transforms=[NOISE])
+    planets = planet_scenario(3, seed=0)
+    env = gymnasium.make(ANYWHERE_ID, scenario=planets, observation=keys, transforms=[NOISE])
     observation, _ = env.reset(seed=0)
     assert set(observation) == set(keys)
     assert env.observation_space.contains(observation)
     np.testing.assert_allclose(observation["sensor_std"], NOISE.sensor_std)
-    assert gymnasium.make(ANYWHERE_ID, transforms=[]).reset(seed=0)[0].shape == (19,)
+    assert gymnasium.make(ANYWHERE_ID, scenario=planets, transforms=[]).reset(seed=0)[0].shape == (19,)
 
 
 @pytest.mark.parametrize("options", [{"observation": "dict"}, {"observation": "track", "reward": "base"}])

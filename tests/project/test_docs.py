@@ -38,7 +38,11 @@ EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if c
 BUDGET = {
     "total_frames = 60_000": "total_frames = 128",
     "= 512, 1024, 8": "= 64, 64, 1",
-    "= 400_000, 500": "= 16_384, 4",
+    "= 400_000, 500": "= 256, 4",
+    "num_envs=512)": "num_envs=8)",
+    '"batch_size": 2048': '"batch_size": 256',
+    "anywhere_env(1000": "anywhere_env(8",
+    '"sac.pt"), "test-1000"': '"sac.pt"), "figure-4-1"',
     "= 100_000, 1024, 1000": "= 128, 4, 2",
 }
 BUDGET |= {'(navigator, "paper-100")': '(navigator, "figure-4-1")', "random_tasks(100, ": "random_tasks(2, "}

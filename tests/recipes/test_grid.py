@@ -78,9 +78,14 @@ def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
 # Flights
 
 
-def test_earth_has_a_row_for_each_date_and_navigator(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(grid, "earth_env", functools.partial(grid.earth_env, regions=4))
+@pytest.fixture(autouse=True)
+def few_regions_and_levels(monkeypatch) -> None:
     monkeypatch.setattr(flights, "LEVELS", flights.LEVELS[::4])
+    for module in (grid, declarations):
+        monkeypatch.setattr(module, "earth_env", functools.partial(flights.earth_env, regions=4))
+
+
+def test_earth_has_a_row_for_each_date_and_navigator(tmp_path: Path) -> None:
     dates = ["1900-01-01", "2025-01-01"]
     found = rows(grid.earth(["geodesic", {"name": "map_matching", "map_date": "2015-01-01"}], tasks=2, dates=dates))
     assert found[0] == ["date", "navigator", "needs", "runs", "0, 0, 0", "0.5, 0.1, 20"]
@@ -156,12 +161,13 @@ def test_reliability_counts_readings_by_their_probability() -> None:
     assert all(float(row[2]) < 20 for row in table)
 
 
-def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone() -> None:
+def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone(monkeypatch) -> None:
     """Vehicles to which a kilometer costs much declare at once: fewer of them are right, after fewer steps."""
+    monkeypatch.setattr(flights, "LEVELS", [(0.05, 0.05, 5.0)])
     rules = [{"TRIP_KM": 1}, {"TRIP_KM": decision.TRIP_KM}]
     table = rows(declarations.decisions(["kalman"], rules=rules, conditions=[], tasks=10, max_steps=20))[2:]
     assert [row[0] for row in table] == ["Kalman (dual control), TRIP_KM 1", "Kalman (dual control), TRIP_KM 800.0"]
-    hasty, usual = ([float(number) for number in row[3].split(" / ")] for row in table)
+    hasty, usual = ([float(number) for number in row[1].split(" / ")] for row in table)
     assert hasty[0] < usual[0]
     assert hasty[2] < usual[2]
     assert decision.TRIP_KM == 800

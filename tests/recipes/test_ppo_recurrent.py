@@ -79,8 +79,9 @@ def test_a_vehicle_moves_along_its_estimate() -> None:
     torch.testing.assert_close(command(estimate, correction), command(estimate, correction, 0 * heading))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_figures")
-@pytest.mark.parametrize("compass", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("compass", [True, False])
 def test_the_saved_policy_flies_as_the_trained_actor(tmp_path, monkeypatch, compass: bool) -> None:
     """The test tasks, whose sensors err; it is given readings, moves and, with a compass, headings."""
     plain, flown = [], []

@@ -189,7 +189,7 @@ def test_own_errors_in_a_file() -> None:
     )
     read = load_conditions(BOAT)
     for errors in (read, str(BOAT)):
-        flown = [evaluation_rollout(with_conditions(nav(2, 8.0), each, 3), Kalman()) for each in (errors, boat)]
+        flown = [with_conditions(nav(2, 8.0), each, 3).rollout(4, Kalman()) for each in (errors, boat)]
         torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
     assert (read.name, read.sensor_std, read.bias_std) == (boat.name, boat.sensor_std, boat.bias_std)
     for recipe, places in ((fly, ["60.4N 5.3E", "62.0N 6.7W"]), (evaluate, ["secant"])):
