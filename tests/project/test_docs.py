@@ -159,6 +159,8 @@ def rows(header: str, first: str) -> dict[str, list[str]]:
 def test_tables_are_those_that_were_measured(page: Path) -> None:
     for name, table in re.findall(r"<!-- table: (\S+) -->\n(.*?)<!-- end -->", TEXTS[page], re.DOTALL):
         assert table.strip() == (ROOT / name).read_text().strip(), name
+        lines = re.findall(r"^\| \w.*", table, re.MULTILINE)
+        assert len(set(lines)) == len(lines), f"{name} has a row twice"
 
 
 def test_options_of_the_environment_and_fields_of_the_scenario() -> None:
