@@ -114,8 +114,8 @@ def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
 
 @pytest.mark.parametrize("limits", [{"max_move_km": 10, "max_steps": 250}, {"max_turn_deg": 20}])
 def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment(limits: dict[str, int]) -> None:
-    episodes = evaluate("anywhere", "figure-4-1", start_heading="random", **limits)
-    assert episodes["success"].all()
+    episodes = evaluate("anywhere", "paper-100", start_heading="random", **limits)
+    assert episodes["success"].double().mean() >= 0.99
     assert episodes["spl"].mean() > 0.98
 
 
