@@ -72,7 +72,7 @@ class Config(PlanetConfig):
     """Source of the defaults: destinations 150-1800 km away, or 300-500 km."""
 
     # Own defaults of shared settings
-    total_frames: Count = 5_242_880
+    total_frames: Count = 2_621_440
     num_envs: Count = 4096
     eval_tasks_small: Count = 1000
     gamma: Discount = 0.999
