@@ -28,7 +28,7 @@ from magrl.transforms import (
     TrueWay,
 )
 from magrl.transforms.errors.base import ReadingErrors
-from magrl.transforms.views import STEP_PRICE
+from magrl.transforms.track import STEP_PRICE
 
 OBSERVATIONS = ("flat", "track", "dict")
 REWARDS = ("guided", "base", "spl")

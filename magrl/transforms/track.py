@@ -21,6 +21,8 @@ from magrl.transforms.base import (
 STD_KEYS = ("sensor_std", "bias_std", "drift_std")
 """Standard deviations of a reading's new errors, of constant and slow ones, and of slow ones alone: D [deg], I [deg],
 B_H [nT]."""
+STEP_PRICE = 0.1
+"""Default price of a step [% of SPL]."""
 FRAMES = ("world", "vehicle")
 IN_KEYS = ("field", "target_field", "move", "heading")
 OUT_KEYS = ("track_mean", "track_covariance", "estimated_field", "estimated_gradient", "way", "way_covariance")
@@ -250,6 +252,8 @@ class PlannedMove(StatefulTransform):
         max_steps: step limit.
         range_km: prior standard deviation of the way along each axis [km].
         frame: axes of the way and the displacement, as in :class:`TrackGradient`.
+        step_price: price of a step where it is not among the ``in_keys``. A way of ``range_km`` is 100 %; the plan
+            takes the higher of it and :func:`magrl.tracking.reading_price`.
 
     Raises:
         ValueError: for an option out of its range, or another number of keys.
@@ -266,7 +270,8 @@ class PlannedMove(StatefulTransform):
 
     default_in_keys = ("target_field", "heading", "step_count", "track_mean", "track_covariance", "way", *STD_KEYS)
     default_out_keys = ("planned_move",)
-    in_sizes = (3, 1, 1, 3, 3, 2, 3, 3, 3)
+    in_counts = (9, 10)
+    in_sizes = (3, 1, 1, 3, 3, 2, 3, 3, 3, 1)
     out_sizes = ((2,),)
 
     def __init__(
@@ -278,19 +283,22 @@ class PlannedMove(StatefulTransform):
         max_steps: int,
         range_km: float = 300.0,
         frame: str = "world",
+        step_price: float = STEP_PRICE,
     ) -> None:
         super().__init__(in_keys, out_keys)
         check_number(0, above=True, max_move_km=max_move_km, range_km=range_km)
         check_number(1, whole=True, max_steps=max_steps)
         check_choice(FRAMES, frame=frame)
+        check_number(0, step_price=step_price)
         self.max_move_km, self.max_steps = float(max_move_km), int(max_steps)
-        self.range_km, self.frame = float(range_km), frame
+        self.range_km, self.frame, self.step_price = float(range_km), frame, float(step_price)
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         self._advance(tensordict, values, [])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:  # noqa: ARG002
-        target, heading, step, mean, covariance, aim, sensor_std, bias_std, drift_std = (x.double() for x in values)
+        target, heading, step, mean, covariance, aim, sensor_std, bias_std, drift_std = (x.double() for x in values[:9])
+        given = values[9].double().squeeze(-1) if values[9:] else self.step_price
         turn = heading if self.frame == "vehicle" else 0 * heading
         aim, std = _turned(aim.unsqueeze(-2), -turn).squeeze(-2), tracking.reading_std(sensor_std, drift_std)
         track = FieldTrack(mean, covariance)
@@ -298,7 +306,7 @@ class PlannedMove(StatefulTransform):
         curvature = tracking.field_curvature(tracking.estimated_field(known))
         options = self.range_km, tracking.ELEMENT_SCALES, shared, bias_std, tracking.ELEMENT_PERIODS, curvature
         posterior = tracking.way_posterior(known, target, *options, fine=False)
-        step_km = tracking.reading_price(std)
+        step_km = tracking.reading_price(std).clamp_min(given * self.range_km / 100)
         price = tracking.step_price(step_km, aim, step.squeeze(-1), self.max_steps, self.max_move_km)
         move = tracking.planned_move(track, aim, posterior, std, price, self.max_move_km, self.range_km)
         tensordict.set(self.out_keys[0], _turned(move.unsqueeze(-2), turn).squeeze(-2).to(values[1].dtype))

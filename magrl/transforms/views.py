@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -19,13 +19,19 @@ from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES, element_difference
 from magrl.transforms.base import GivenKeys, Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, PlannedMove, SearchAim, TrackGradient
+from magrl.transforms.track import (
+    IN_KEYS,
+    OUT_KEYS,
+    STD_KEYS,
+    STEP_PRICE,
+    PlannedMove,
+    SearchAim,
+    TrackGradient,
+)
 
 OBSERVATION_SIZE = 19
 """Numbers of :func:`track_observation`."""
 OBSERVED_KEYS = ("field", "target_field", *OUT_KEYS[2:4], "aim", OUT_KEYS[5], STD_KEYS[0], "step_count", "planned_move")
-STEP_PRICE = 0.5
-"""Price of a step by default [% of SPL]."""
 _STD_UNITS = (1.0, 1.0, 100.0)
 _LEAST_STD = 0.002
 _LEAST_PRICE = 0.01
@@ -426,9 +432,10 @@ class TrackView(_View):
         track = TrackGradient((*IN_KEYS, *STD_KEYS), range_km=self.range_km, frame="vehicle")
         search = [SearchAim(zeta=self.zeta, frame="vehicle")] if self.search else []
         aim = "aim" if self.search else "way"
-        planned = (*IN_KEYS[1::2], "step_count", *OUT_KEYS[:2], aim, *STD_KEYS)
-        plan = PlannedMove(planned, max_move_km=self.max_move_km, max_steps=self.max_steps, frame="vehicle")
-        observed = [aim if key == "aim" else key for key in OBSERVED_KEYS]
-        price = {"step_price": self.step_price} if self.step_price is not None else {}
-        keys = observed if price else [*observed, "step_price"]
-        return [track, *search, plan, TrackObservation(keys, zeta=self.zeta, max_steps=self.max_steps, **price)]
+        price, priced = (STEP_PRICE, ["step_price"]) if self.step_price is None else (self.step_price, [])
+        planned = [*IN_KEYS[1::2], "step_count", *OUT_KEYS[:2], aim, *STD_KEYS, *priced]
+        observed = [*(aim if key == "aim" else key for key in OBSERVED_KEYS), *priced]
+        options: dict[str, Any] = {"max_steps": self.max_steps, "step_price": price}
+        limits: dict[str, Any] = {"max_move_km": self.max_move_km, "range_km": self.range_km, "frame": "vehicle"}
+        plan = PlannedMove(planned, **limits, **options)
+        return [track, *search, plan, TrackObservation(observed, zeta=self.zeta, **options)]

@@ -22,11 +22,13 @@ def test_new_actor_is_not_saturated() -> None:
     assert actions.std(0).min() > 0.01
 
 
-def test_an_untrained_correction_is_the_move_of_kalman() -> None:
+@pytest.mark.parametrize(("price", "step_km"), [(0.1, None), (4.0, 12.0)])
+def test_an_untrained_correction_is_the_move_of_kalman(price: float, step_km: float | None) -> None:
     """Under noise, on the way: the plans differ only where rounding decides between two moves."""
-    view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
+    view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2, step_price=price)
     env = with_sensor_noise(GeomagneticNavEnv(num_envs=200, seed=0, start_heading="random"), STD)
-    kalman, agent, state = Kalman(sensor_std=STD), FieldPolicy(PolicyConfig(view, (8,))), env.reset()
+    kalman = Kalman(sensor_std=STD, step_km=step_km)
+    agent, state = FieldPolicy(PolicyConfig(view, (8,))), env.reset()
     for _ in range(4):
         state = kalman(agent(state).rename_key_("action", "planned"))
         off = (state["planned"] - state["action"]).abs() / torch.tensor([50.0, math.pi / 2])
