@@ -13,7 +13,7 @@ train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two c
 fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; seconds
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" $(ARGS)
 
-anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; an hour on one core
+anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; half an hour on one core
 	OMP_NUM_THREADS=1 $(RECIPE)/ppo_anywhere.py $(ARGS)
 
 prior: $(VENV)/.installed  ## fit the prior of the gradients on random planets; 40 seconds on one core
@@ -63,7 +63,7 @@ RUNS_seeds := $(GUIDED) $(addprefix td3_gradient_guided-fast-seed,$(FIVE))
 RUNS_own-world := $(addprefix td3_gradient_guided-fast-azores-seed,$(FIVE))
 RUNS_algorithms := $(GUIDED) $(addprefix ppo-seed,$(FIVE))
 DECLARED := $(addprefix ppo_anywhere-declared-seed,0 1 2)
-RUNS_anywhere-seeds := $(addprefix ppo_anywhere-far-seed,0 1)
+RUNS_anywhere-seeds := $(addprefix ppo_anywhere-far-seed,$(FIVE)) ppo_anywhere-far-two-threads-seed0
 RUNS_declared-training := $(DECLARED)
 RUNS_declared-training-conditions := $(DECLARED)
 RUNS_sequences := $(foreach name,ppo_recurrent ppo_recurrent-short,$(addprefix $(name)-seed,0 1 2))
@@ -101,6 +101,7 @@ $(eval $(call training,td3_gradient_guided-paper,1,td3_gradient_guided.py --pres
 $(eval $(call training,td3-paper,1,td3_gradient_guided.py --preset td3-paper --precision bfloat16))
 $(eval $(call training,ppo,1,ppo.py))
 $(eval $(call training,ppo_anywhere-far,1,ppo_anywhere.py))
+$(eval $(call training,ppo_anywhere-far-two-threads,2,ppo_anywhere.py))
 $(eval $(call training,ppo_anywhere-declared,1,ppo_anywhere.py --preset fast --arrival declared --max-steps 80 \
 	--price-range 0.03 1 --total-frames 2621440))
 $(eval $(call training,ppo_recurrent,1,ppo_recurrent.py))

@@ -28,10 +28,11 @@ from magrl.transforms import (
     TrueWay,
 )
 from magrl.transforms.errors.base import ReadingErrors
-from magrl.transforms.track import STEP_PRICE
 
 OBSERVATIONS = ("flat", "track", "dict")
 REWARDS = ("guided", "base", "spl")
+STEP_PRICE = 0.5
+"""Price of a step in the reward ``"spl"`` [% of SPL]."""
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
 
@@ -58,7 +59,7 @@ def navigation_env(
         transforms: own transforms: errors of sensors, estimates, rewards. They are cloned, and act after the guidance.
         reward: ``"guided"`` adds the alignment term to the paper's base reward, by the true field and heading; over
             several regions by the pair of elements that crosses best. ``"base"`` is that reward alone. ``"spl"`` is
-            :class:`~magrl.transforms.SPLReward`, with the price of a step of the view.
+            :class:`~magrl.transforms.SPLReward`, at a price of a step of 0.5 %.
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
         alignment_weight: zeta_3 of Eq. 3-6 [1/rad], of the guided reward.
         alignment_offset: heading deviation at which the alignment term turns into a penalty [rad].

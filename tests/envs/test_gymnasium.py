@@ -146,9 +146,9 @@ def test_a_batch_without_a_map_flies_as_in_torchrl(start_heading: str | None) ->
         equal(observations, state["observation"])
         equal(rewards, step["next", "reward"].squeeze(-1))
         returns += rewards
-        for index in np.flatnonzero(info.get("_final_info", [])):  # 10 times SPL minus 1, minus 0.1 % of SPL a step
+        for index in np.flatnonzero(info.get("_final_info", [])):  # 10 times SPL minus 1, minus 0.5 % of SPL a step
             final = {name: value[index] for name, value in info["final_info"].items()}
-            assert returns[index] == pytest.approx(10 * (final["spl"] - 1) - 0.01 * final["steps"], abs=2e-3)
+            assert returns[index] == pytest.approx(10 * (final["spl"] - 1) - 0.05 * final["steps"], abs=2e-3)
             returns[index], ends = 0.0, ends + 1
     assert ends > 4 * NUM
 
