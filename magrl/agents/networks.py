@@ -13,7 +13,6 @@ from magrl.checks import check_number, check_type
 from magrl.geodesy import steer
 from magrl.tracking import corrected
 from magrl.transforms import TrackView
-from magrl.transforms.track import STD_KEYS
 
 Device = torch.device | str | None
 
@@ -119,7 +118,7 @@ class CorrectedMove(nn.Module):
         max_turn_rad: largest turn [rad].
 
     Example:
-        >>> CorrectedMove(50.0, 1.5)(torch.tensor([25.0, 0.0]), torch.zeros(2), torch.zeros(3))
+        >>> CorrectedMove(50.0, 1.5)(torch.tensor([25.0, 0.0]), torch.zeros(2))
         tensor([0., 0.])
     """
 
@@ -127,18 +126,18 @@ class CorrectedMove(nn.Module):
         super().__init__()
         self.limits = float(max_move_km), float(max_turn_rad)
 
-    def forward(self, planned: Tensor, correction: Tensor, sensor_std: Tensor) -> Tensor:
+    def forward(self, planned: Tensor, correction: Tensor) -> Tensor:
         """Return the scaled action ``(..., 2)`` of a displacement forward and to the right [km] and its correction."""
-        forward, right = corrected(planned, correction, sensor_std).unbind(-1)
+        forward, right = corrected(planned, correction).unbind(-1)
         bearing, distance = torch.atan2(right, forward), torch.hypot(forward, right)
         distance, turn = steer(torch.zeros_like(bearing), bearing, distance, *self.limits)
         return torch.stack((2 * distance / self.limits[0] - 1, turn / self.limits[1]), -1)
 
 
 def make_correcting_actor(view: TrackView, num_cells: Sequence[int], *, device: Device = None) -> TensorDictSequential:
-    """Return an actor that corrects a plan, from ``observation``, ``planned_move`` and ``sensor_std``.
+    """Return an actor that corrects a plan: ``observation`` and ``planned_move`` to ``correction`` and ``action``.
 
-    It writes ``correction`` and ``action``. Its correction starts at zero, so that an untrained actor flies as planned.
+    Its correction starts at zero, so that the untrained actor flies as planned.
 
     Args:
         view: what it observes.
@@ -160,7 +159,7 @@ def make_correcting_actor(view: TrackView, num_cells: Sequence[int], *, device: 
     return TensorDictSequential(
         TensorDictModule(network, ["observation"], ["correction"]),
         TensorDictModule(
-            CorrectedMove(view.max_move_km, view.max_turn_rad), ["planned_move", "correction", STD_KEYS[0]], ["action"]
+            CorrectedMove(view.max_move_km, view.max_turn_rad), ["planned_move", "correction"], ["action"]
         ),
     )
 

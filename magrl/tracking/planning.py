@@ -151,28 +151,22 @@ def planned_move(
     return moves.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 
 
-def corrected(way: Tensor, correction: Tensor, sensor_std: Tensor) -> Tensor:
+def corrected(way: Tensor, correction: Tensor) -> Tensor:
     """Return a planned displacement with a correction that does not depend on its length.
-
-    The correction is scaled by 1 minus the lowest price of a step over that of the readings (:func:`reading_price`):
-    where they have no error, the plan is kept.
 
     Args:
         way: ``(..., 2)`` planned displacement [km].
         correction: ``(..., 2)`` of the logarithm of its length, and of its direction, in units of
             :data:`CORRECTION`.
-        sensor_std: ``(..., 3)`` standard deviations of the readings: D [deg], I [deg], B_H [nT].
 
     Example:
-        >>> way, correction, std = torch.tensor([20.0, 0.0]), torch.tensor([2.0, 3.0]), torch.tensor([0.4, 0.3, 4.0])
-        >>> corrected(way, correction, 0 * std)
+        >>> corrected(torch.tensor([20.0, 0.0]), torch.zeros(2))
         tensor([20.,  0.])
-        >>> corrected(way, correction, std).round()  # 2.7 times as far, to the right
-        tensor([ 5., 53.])
+        >>> corrected(torch.tensor([20.0, 0.0]), torch.tensor([2.0, 3.0])).round()  # e times as far, to the right
+        tensor([ 4., 54.])
     """
     check_tensor(2, way=way, correction=correction)
-    share = 1 - PRICE_RANGE_KM[0] / reading_price(sensor_std).unsqueeze(-1)
-    stretch, angle = (CORRECTION * share * correction).unbind(-1)
+    stretch, angle = (CORRECTION * correction).unbind(-1)
     (x, y), cos, sin = way.unbind(-1), torch.cos(angle), torch.sin(angle)
     return torch.exp(stretch).unsqueeze(-1) * torch.stack((cos * x - sin * y, sin * x + cos * y), -1)
 
