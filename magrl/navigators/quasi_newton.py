@@ -19,7 +19,6 @@ from magrl.tracking import FieldTrack, GradientPrior, Way
 
 RANGE_KM = 1000.0
 """Prior standard deviation of the way to the destination along each axis [km]."""
-_FINE = 1e-4  # units of the filter in float64: its smallest variance is then below the rounding of float32 readings
 
 
 class QuasiNewton(Navigator):
@@ -78,7 +77,7 @@ class QuasiNewton(Navigator):
         self.elements = element_indices(elements, 2)
         self._register("sensor_std", sensor_std)
         self._register("bias_std", bias_std)
-        self._register("scales", [tracking.ELEMENT_SCALES[i] * _FINE for i in self.elements])
+        self._register("scales", [tracking.ELEMENT_SCALES[i] for i in self.elements])
         self._register("periods", [tracking.ELEMENT_PERIODS[i] for i in self.elements])
         self._register("curvature", [tracking.CURVATURE[i] for i in self.elements])
 

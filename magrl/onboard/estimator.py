@@ -56,8 +56,8 @@ class Estimator:
 
     def decide(self, seen: TensorDictBase, steps_left: Tensor, radius_km: float) -> ArrivalDecision:
         """Return the decision about the arrival, in a batch of one; see :func:`magrl.tracking.arrival_decision`."""
-        track = FieldTrack(*(self.state[key] for key in OUT_KEYS[:2]))
         target, new, lasting, slow = (seen[key] for key in ("target_field", *STD_KEYS))
+        track = FieldTrack(*(self.state[key].to(target.dtype) for key in OUT_KEYS[:2]))
         return tracking.arrival_decision(track, target, new, lasting, slow, steps_left, radius_km)
 
     @property

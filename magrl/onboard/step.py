@@ -46,7 +46,8 @@ def first_state() -> StepState:
         >>> first_state().covariance.shape
         torch.Size([3, 3, 3])
     """
-    return StepState(torch.tensor(0), torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3).clone(), torch.zeros(3))
+    eye = torch.eye(3, dtype=torch.float64)
+    return StepState(torch.tensor(0), 0 * eye, eye.expand(3, 3, 3).clone(), torch.zeros(3))
 
 
 class VehicleStep(nn.Module):
@@ -98,8 +99,8 @@ class VehicleStep(nn.Module):
             accuracy: ``(3, 3)`` standard deviations of noise, of constant and slow errors, and of slow ones alone, in
                 the units of the reading.
             step: ``()`` int64, and with the next three the :class:`StepState`.
-            mean: ``(3, 3)`` mean of the filter.
-            covariance: ``(3, 3, 3)`` covariance of the filter.
+            mean: ``(3, 3)`` mean of the filter, float64.
+            covariance: ``(3, 3, 3)`` covariance of the filter, float64.
             first_field: ``(3,)`` first reading.
 
         Returns:

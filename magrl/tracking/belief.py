@@ -8,6 +8,7 @@ from torch import Tensor
 from magrl.tracking.filter import (
     ELEMENT_PERIODS,
     ELEMENT_SCALES,
+    VARIANCE_FLOOR,
     FieldTrack,
     PerElement,
     _units,
@@ -28,8 +29,7 @@ def surprise(
 ) -> float:
     """Return the mean over D, I, B_H of the squared innovation of a reading over its variance S.
 
-    It is 1 on average where the filter is right. The noise has the floor of :data:`~magrl.tracking.ELEMENT_SCALES`,
-    whatever the scales are.
+    It is 1 on average where the filter is right. The noise has the floor :data:`~magrl.tracking.VARIANCE_FLOOR`.
 
     Args:
         track: state of one vehicle before the move.
@@ -48,7 +48,8 @@ def surprise(
     predicted = predict(track, displacement, curvature, scales)
     unit, usual = _units(predicted, scales), _units(predicted, ELEMENT_SCALES)
     innovation = continued(reading, predicted, scales, ELEMENT_PERIODS) / unit - predicted.mean[:, 0]
-    variance = predicted.covariance[:, 0, 0] + _variance(sensor_std, usual) * (usual / unit).square()
+    noise = _variance(sensor_std, usual).clamp_min(VARIANCE_FLOOR)
+    variance = predicted.covariance[:, 0, 0] + noise * (usual / unit).square()
     return (innovation.square() / variance).mean().item()
 
 

@@ -37,7 +37,8 @@ CURVATURE = (0.015, 0.018, 12.0)
 Earth's field. The error of a linear step grows with it."""
 
 VARIANCE_FLOOR = 1e-4
-"""Smallest variance of a reading, in squared scaled units: a standard deviation of 0.003°, 0.015°, 1 nT."""
+"""Smallest variance of a reading in float32, in squared scaled units: a standard deviation of 0.003°, 0.015°, 1 nT. In
+float64 it is 1e-8 of that, about the rounding of readings in float32."""
 
 PerElement = Tensor | Sequence[float]  # a value of each element: (..., E), or E numbers
 
@@ -303,7 +304,7 @@ def _broadcast(shape: torch.Size, *others: tuple[int, ...]) -> torch.Size:
 def _variance(sensor_std: PerElement, unit: Tensor) -> Tensor:
     """Return the variance of a reading ``(..., E)`` in squared scaled units, not below the floor."""
     std = _nonnegative_or_nan("sensor_std", sensor_std, unit.shape[-1], unit)
-    return (std / unit).square().clamp_min(VARIANCE_FLOOR)
+    return (std / unit).square().clamp_min(VARIANCE_FLOOR * (1e-8 if unit.dtype == torch.float64 else 1.0))
 
 
 def _nonnegative_or_nan(name: str, values: PerElement, count: int, like: Tensor) -> Tensor:

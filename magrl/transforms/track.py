@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import Composite
 
 from magrl import tracking
 from magrl.checks import check_choice, check_number, check_numbers
@@ -32,8 +33,8 @@ class TrackGradient(StatefulTransform):
     """Estimate the field, its gradient and the way to the target from the readings along the track.
 
     The filter of :mod:`magrl.tracking`: it starts at a reset from the first reading and a prior of the gradient; each
-    step moves it by the last move and corrects it by the reading at its end. Its state is in the TensorDict. Nothing
-    that it writes is privileged unless an input is.
+    step moves it by the last move and corrects it by the reading at its end. Its state is in the TensorDict
+    (float64). Nothing that it writes is privileged unless an input is.
 
     Args:
         in_keys: readings ``(..., E)``, values at the target ``(..., E)``, the last move ``(..., K)`` (its first number
@@ -127,11 +128,11 @@ class TrackGradient(StatefulTransform):
         return self.out_keys[:2]
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
-        (reading, target, *_), (sensor_std, _) = values, self._std(values)
+        (reading, target, *_), (sensor_std, _) = (x.double() for x in values), self._std(values)
         self._write(tensordict, values, tracking.start(reading, self.prior(reading, target), sensor_std, self.scales))
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        (reading, _, move, heading, *_), (sensor_std, _) = values, self._std(values)
+        (reading, _, move, heading, *_), (sensor_std, _) = (x.double() for x in values), self._std(values)
         track, displacement = FieldTrack(*state), tracking.displacement_of(move, heading)
         curvature = self._curvature(tracking.estimated_field(track, self.scales))
         track = tracking.read(track, displacement, reading, sensor_std, curvature, self.scales, self.periods)
@@ -142,9 +143,17 @@ class TrackGradient(StatefulTransform):
         return self.constant_curvature if self.curvature is None else self.curvature(field)
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], track: FieldTrack) -> None:
-        (_, target, _, heading, *_), (_, bias_std) = values, self._std(values)
-        for key, entry in zip(self.out_keys, (*track, *self.estimates(track, target, heading, bias_std)), strict=True):
+        (_, target, _, heading, *_), (_, bias_std) = (x.double() for x in values), self._std(values)
+        estimates = (x.to(values[0].dtype) for x in self.estimates(track, target, heading, bias_std))
+        for key, entry in zip(self.out_keys, (*track, *estimates), strict=True):
             tensordict.set(key, entry)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add what is written; the state is in float64."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        for key, size in zip(self.state_keys, self.out_sizes, strict=False):
+            self._add(observation_spec, observation_spec[self.in_keys[0]], key, *size, dtype=torch.float64)
+        return observation_spec
 
     def _std(self, values: list[Tensor]) -> tuple[Tensor, Tensor | None]:
         """Return the standard deviations of a reading and of constant errors, of the TensorDict or as given."""
@@ -229,11 +238,11 @@ class SearchAim(StatefulTransform):
         self._write(tensordict, values, tracking.visit(visited, displacement), weights)
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], visited: Tensor, weights: Tensor) -> None:
-        _, _, _, heading, mean, covariance, *way = values
+        heading, mean, covariance, *way = (x.double() for x in values[3:])
         north_east = torch.eye(2, dtype=heading.dtype, device=heading.device)
         axes = _turned(north_east, heading).mT if self.frame == "vehicle" else None
-        aim = tracking.aim(FieldTrack(mean, covariance), Way(*way), visited, weights, axes=axes)
-        for key, value in zip(self.out_keys, (aim, visited, weights), strict=True):
+        aim = tracking.aim(FieldTrack(mean, covariance), Way(*way), visited.double(), weights.double(), axes=axes)
+        for key, value in zip(self.out_keys, (aim.to(visited.dtype), visited, weights), strict=True):
             tensordict.set(key, value)
 
 

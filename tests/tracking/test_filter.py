@@ -30,13 +30,14 @@ from magrl.tracking import (
 )
 
 NAN = math.nan
+FLOOR = 1e-8 * VARIANCE_FLOOR  # in float64
 
 
 def textbook_start(reading, gradient, std, noise, azimuth, scale):
     """State and covariance of one element as in any textbook, in NumPy; distances in units of 100 km."""
     turn = np.array([[math.cos(azimuth), -math.sin(azimuth)], [math.sin(azimuth), math.cos(azimuth)]])
     covariance = np.zeros((3, 3))
-    covariance[0, 0] = max((noise / scale) ** 2, VARIANCE_FLOOR)
+    covariance[0, 0] = max((noise / scale) ** 2, FLOOR)
     covariance[1:, 1:] = turn @ np.diag((std * 100 / scale) ** 2) @ turn.T
     return np.array([reading, *(gradient * 100)]) / scale, covariance
 
@@ -78,7 +79,7 @@ def test_filter_is_the_textbook_filter():
         for (n, e), (x, p) in expected.items():
             if step:
                 x, p = textbook_predict(x, p, moves[step - 1, n].numpy(), curvature[e] / scales[e])
-                r = max((noise[e] / scales[e]) ** 2, VARIANCE_FLOOR)
+                r = max((noise[e] / scales[e]) ** 2, FLOOR)
                 x, p = expected[n, e] = textbook_update(x, p, float(readings[step, n, e]) / scales[e], r)
             np.testing.assert_allclose(track.mean[n, e].numpy(), x, rtol=0, atol=1e-10)
             np.testing.assert_allclose(track.covariance[n, e].numpy(), p, rtol=0, atol=1e-10)
@@ -172,7 +173,9 @@ def test_prior_is_narrow_along_the_azimuth():
     half, cos2, sin2 = math.sqrt(3) / 4, 0.75, 0.25
     block = f64((cos2 + 9 * sin2, (1 - 9) * half), ((1 - 9) * half, sin2 + 9 * cos2))
     torch.testing.assert_close(found[1:, 1:], block)
-    torch.testing.assert_close(found[0], f64(VARIANCE_FLOOR, 0.0, 0.0))
+    torch.testing.assert_close(found[0], f64(FLOOR, 0.0, 0.0), rtol=1e-7, atol=0)
+    rounded = start(torch.zeros(1), GradientPrior(torch.zeros(1, 2), std.float(), turn.float()), (0.0,), (1.0,))
+    assert rounded.covariance[0, 0, 0] == pytest.approx(VARIANCE_FLOOR)
 
 
 def test_a_relation_conditions_the_joint_normal_distribution():
