@@ -68,4 +68,5 @@ class Estimator:
     def surprise(self, seen: TensorDictBase) -> float:
         """Return how badly a reading fits the track before it, see :func:`magrl.tracking.surprise`."""
         displacement = tracking.displacement_of(seen["move"], seen["heading"])[0]
-        return tracking.surprise(self.track, displacement, seen["field"][0], seen["sensor_std"][0])
+        std = tracking.reading_std(seen["sensor_std"], seen["drift_std"])[0]
+        return tracking.surprise(self.track, displacement, seen["field"][0], std)
