@@ -161,7 +161,7 @@ def write_step(path: Path | str, policy: FieldPolicy) -> None:
 
 
 def _onnx(exported: torch.export.ExportedProgram) -> bytes:
-    """Return an exported step as ONNX, which lacks ``hypot``; its runtime lacks the arc tangent of float64."""
+    """Return an exported step as ONNX, which lacks ``hypot``; its runtime lacks tangents of float64."""
     try:
         from onnxscript import opset18
     except ImportError as error:
@@ -179,8 +179,12 @@ def _onnx(exported: torch.export.ExportedProgram) -> bytes:
         behind = ops.Less(north, 0.0)
         return ops.CastLike(ops.Where(behind, ops.Add(ahead, half_turn), ahead), x)
 
+    def tan(x: Any) -> Any:
+        return ops.Div(ops.Sin(x), ops.Cos(x))
+
+    aten = torch.ops.aten
+    translations = {torch.ops.prims.hypot.default: hypot, aten.atan2.default: atan2, aten.tan.default: tan}
     options: dict[str, Any] = {"input_names": ONNX_INPUTS, "output_names": ONNX_OUTPUTS, "dynamo": True}
-    translations = {torch.ops.prims.hypot.default: hypot, torch.ops.aten.atan2.default: atan2}
     options |= {"custom_translation_table": translations, "verbose": False}
     program: Any = torch.onnx.export(exported, **options)
     return program.model_proto.SerializeToString()

@@ -87,7 +87,7 @@ class DeclareArrival(ObservationTransform):
         target, mean, covariance, _, step, *std = values
         new, lasting, slow = std or [torch.zeros_like(target)] * 3
         left = self.max_steps - 1 - step.squeeze(-1)
-        track = FieldTrack(mean.to(target.dtype), covariance.to(target.dtype))
+        track = FieldTrack(mean.to(target.dtype), covariance.to(target.dtype))  # float32 suffices for probabilities
         options = left, self.radius_km, self.range_km
         decision = tracking.arrival_decision(track, target, new, lasting, slow, *options)
         probability, worth, stop = (x.unsqueeze(-1) for x in (decision.probability, decision.worth, decision.stop_km))

@@ -19,15 +19,7 @@ from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES, element_difference
 from magrl.transforms.base import GivenKeys, Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.track import (
-    IN_KEYS,
-    OUT_KEYS,
-    STD_KEYS,
-    STEP_PRICE,
-    PlannedMove,
-    SearchAim,
-    TrackGradient,
-)
+from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, STEP_PRICE, PlannedMove, SearchAim, TrackGradient
 
 OBSERVATION_SIZE = 19
 """Numbers of :func:`track_observation`."""

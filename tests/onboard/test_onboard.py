@@ -508,8 +508,9 @@ import math, sys, torch
 for name in ("torchrl", "tensordict", "magrl"):
     sys.modules[name] = None
 module, episode = torch.export.load(sys.argv[1]).module(), torch.load(sys.argv[2])
-target, accuracy = torch.tensor(episode["target"]), torch.tensor(((0.02, 0.02, 2.0), (0.0, 0.0, 0.0)))
-state = torch.tensor(0), torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3).clone(), torch.zeros(3)
+target, accuracy = torch.tensor(episode["target"]), torch.tensor(((0.02, 0.02, 2.0), (0.0,) * 3, (0.0,) * 3))
+eye = torch.eye(3, dtype=torch.float64)
+state = torch.tensor(0), 0 * eye, eye.expand(3, 3, 3).clone(), torch.zeros(3)
 for (*reading, heading, distance), action in zip(episode["known"], episode["actions"]):
     course = torch.tensor([distance, math.remainder(math.radians(heading), 2 * math.pi)])
     moved, _, _, *state = module(torch.tensor(reading), target, course, accuracy, *state)
@@ -529,7 +530,7 @@ def test_the_step_in_onnx(tmp_path: Path) -> None:
     write_step(tmp_path / "step.onnx", policy)
     session, module = InferenceSession(tmp_path / "step.onnx"), VehicleStep(policy)
     slope = torch.tensor([[-0.002, 0.012], [0.008, -0.001], [-6.0, 0.5]])  # per km northward and eastward
-    target, accuracy = torch.tensor([-11.6, 75.4, 13240.0]), torch.tensor((NOISE, (0.0, 0.0, 0.0)))
+    target, accuracy = torch.tensor([-11.6, 75.4, 13240.0]), torch.tensor((NOISE, (0.0,) * 3, (0.0,) * 3))
     generator, place = torch.Generator().manual_seed(0), torch.zeros(2)
     state, other = first_state(), [value.numpy() for value in first_state()]
     for step in range(121):
