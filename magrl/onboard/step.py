@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from magrl.agents.policy import FieldPolicy
-from magrl.checks import check_type
+from magrl.checks import check_tensor, check_type
 from magrl.transforms import TrackView
 from magrl.transforms.track import IN_KEYS, STD_KEYS
 
@@ -107,6 +107,7 @@ class VehicleStep(nn.Module):
             Distance [km] and turn [rad] ``(2,)``, the way to the destination forward and to the right ``(2,)`` [km],
             its covariance ``(2, 2)`` [km^2], and the parts of the next state.
         """
+        check_tensor(3, 3, accuracy=accuracy)
         distance, heading = course.split(1)
         keys = *IN_KEYS, *STD_KEYS
         values = (field, target_field, torch.cat((distance, torch.zeros_like(distance))), heading, *accuracy.unbind())
