@@ -50,7 +50,7 @@ mutate: $(VENV)/.installed-mutation  ## run mutation tests of the mathematics; t
 	$(RUN)/mutmut results
 
 # Tables and figures. Runs that exist are used again; `make -j2` trains two at a time. Each run has one thread, but for
-# td3_gradient_guided-fast-seed*, which show how little the number of threads matters.
+# td3_gradient_guided-fast-seed* and *-two-threads-*, which show how little the number of threads matters.
 FIVE := 0 1 2 3 4
 GUIDED := $(addprefix td3_gradient_guided-fast-one-thread-seed,$(FIVE) 5 6 7 8 9 $(addprefix 1,$(FIVE) 5 6 7 8 9))
 PLAIN := $(addprefix td3-fast-seed,$(FIVE))

@@ -38,7 +38,7 @@ Earth's field. The error of a linear step grows with it."""
 
 VARIANCE_FLOOR = 1e-4
 """Smallest variance of a reading in float32, in squared scaled units: a standard deviation of 0.003°, 0.015°, 1 nT. In
-float64 it is 1e-8 of that, about the rounding of readings in float32."""
+float64 it is 1e-8 of that, below the rounding of readings in float32."""
 
 PerElement = Tensor | Sequence[float]  # a value of each element: (..., E), or E numbers
 
