@@ -91,10 +91,10 @@ class Kalman(QuasiNewton):
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         known, shared = tracking.related(track, tracking.curl_relation, self.scales)
-        curvature = self.drift(tracking.estimated_field(known, self.scales))
-        options = self.range_km, self.scales, shared, self.lasting_std(seen), self.periods, curvature
+        field = tracking.estimated_field(known, self.scales)
+        options = self.range_km, self.scales, shared, self.lasting_std(seen), self.periods, self.drift(field)
         target = seen["target_field"].double()
-        posterior = tracking.way_posterior(known, target, *options, fine=False)
+        posterior = tracking.way_posterior(known, target, *options, tracking.common_error(field), fine=False)
         way = tracking.Way(*(part.double() for part in posterior.aim(tracking.way_to(known, target, *options))))
         aim, std = self.aim(known, way, seen, memory), self.reading_std(seen)
         step_km = tracking.reading_price(std) if self.step_km is None else torch.full_like(aim[..., 0], self.step_km)

@@ -31,6 +31,7 @@ from magrl.tracking.planning import sensor_length as sensor_length
 from magrl.tracking.planning import step_price as step_price
 from magrl.tracking.posterior import WayPosterior as WayPosterior
 from magrl.tracking.posterior import way_posterior as way_posterior
+from magrl.tracking.priors import common_error as common_error
 from magrl.tracking.priors import curl_relation as curl_relation
 from magrl.tracking.priors import dipole_prior as dipole_prior
 from magrl.tracking.priors import field_curvature as field_curvature

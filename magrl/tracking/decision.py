@@ -21,7 +21,7 @@ from magrl.tracking.filter import (
     estimated_field,
 )
 from magrl.tracking.posterior import WayPosterior, _normal, way_posterior
-from magrl.tracking.priors import curl_relation, field_curvature
+from magrl.tracking.priors import common_error, curl_relation, field_curvature
 from magrl.tracking.track import related
 
 # Compared with others on random planets: docs/results/decision-options.md.
@@ -107,21 +107,24 @@ def arrival_decision(
     """
     check_number(0, above=True, radius_km=radius_km)
     known, shared = related(track, curl_relation)
-    curvature = field_curvature(estimated_field(known))
+    field = estimated_field(known)
+    curvature, common = field_curvature(field), common_error(field)
     unit, count = _units(known, ELEMENT_SCALES), 3
     lasting = {"bias_std": bias_std, "drift_std": drift_std}
     bias, drift = (_nonnegative_or_nan(name, std, count, unit).square() for name, std in lasting.items())
     bias = bias - (1 - DRIFT_SHARE) * torch.minimum(drift, bias)
-    posterior = way_posterior(known, target, range_km, ELEMENT_SCALES, shared, bias.sqrt(), ELEMENT_PERIODS, curvature)
+    options = ELEMENT_SCALES, shared, bias.sqrt(), ELEMENT_PERIODS, curvature, common
+    posterior = way_posterior(known, target, range_km, *options)
     probability, way = posterior.within(radius_km), posterior.way().displacement
     noise = _variance(sensor_std, unit).unsqueeze(-2)
-    bias = (bias / unit.square()).unsqueeze(-2)
+    bias, alike = (x.unsqueeze(-2) for x in (bias / unit.square(), common * bias.sqrt() / unit))
     readings = torch.tensor(READINGS, dtype=unit.dtype, device=unit.device)
     there = _variance_at(known, way / DISTANCE_SCALE_KM).unsqueeze(-2)
     stops = radius_km * torch.tensor(STOPS, dtype=unit.dtype, device=unit.device)
     distance = way.norm(dim=-1, keepdim=True)
     apart = way.unsqueeze(-2) * (stops / distance.clamp_min(1e-6)).unsqueeze(-1)
-    later = _within(known, 1 / (1 / there + readings.unsqueeze(-1) / noise) + bias, apart, radius_km)
+    variance = 1 / (1 / there + readings.unsqueeze(-1) / noise) + bias - alike.square()
+    later = _within(known, variance, alike, apart, radius_km)
     possible = (readings <= steps_left.unsqueeze(-1)).unsqueeze(-1) & (stops <= distance).unsqueeze(-2)
     later = later.where(possible, 0.0)
     cost = (distance - stops).unsqueeze(-2) + STEP_KM * readings.unsqueeze(-1)
@@ -166,17 +169,21 @@ def _variance_at(track: FieldTrack, way: Tensor) -> Tensor:
     return (variance + de * (2 * p[..., 0, 2] + p[..., 2, 2] * de)).clamp_min(1e-12)
 
 
-def _within(track: FieldTrack, variance: Tensor, apart: Tensor, radius_km: float) -> Tensor:
+def _within(track: FieldTrack, variance: Tensor, alike: Tensor, apart: Tensor, radius_km: float) -> Tensor:
     """Return the probability ``(..., K, J)`` that a place is within a radius of the vehicle.
 
-    It is that of variances ``(..., K, E)`` of the field there and displacements ``(..., J, 2)`` [km] to the estimate of
-    the place. The error of the estimate has the covariance of the least squares solution.
+    It is that of covariances diag(variance) + alike alike^T ``(..., K, E)`` of the field there and displacements
+    ``(..., J, 2)`` [km] to the estimate of the place. The error of the estimate has the covariance of the least squares
+    solution.
     """
     gradient = track.mean[..., 1:]
     squares = gradient.unsqueeze(-1) * gradient.unsqueeze(-2) + track.covariance[..., 1:, 1:]  # (..., E, 2, 2)
     nn, ne, ee = (
         (squares[..., i, j].unsqueeze(-2) / variance).sum(-1)[..., None, None] for i, j in ((0, 0), (0, 1), (1, 1))
     )
+    row = alike / variance
+    north, east = (row @ gradient * (1 + (alike * row).sum(-1, keepdim=True)).rsqrt()).split(1, -1)
+    nn, ne, ee = (a - b.unsqueeze(-1) for a, b in ((nn, north * north), (ne, north * east), (ee, east * east)))
     x, y = _NORMAL.to(nn).unbind(-1)
     first = nn.clamp_min(1e-12).rsqrt()  # N = L L^T; the points solve L^T d = normal
     below = ne * first

@@ -8,6 +8,7 @@ gradient and a long way explain the same difference as a large gradient and a sh
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -120,6 +121,7 @@ def way_posterior(
     bias_std: PerElement | None = None,
     periods: PerElement | None = None,
     curvature: PerElement | None = None,
+    common: Tensor | None = None,
     fine: bool = True,
 ) -> WayPosterior:
     """Return the posterior of the displacement to the place where the field has given values.
@@ -139,6 +141,8 @@ def way_posterior(
         periods: of angles, whose remaining differences are wrapped; None for none.
         curvature: standard deviation of the change of a gradient along the way, as in :func:`~magrl.tracking.predict`:
             it adds ``c^2 |d|^4 / 4`` to S(d). None for constant gradients.
+        common: ``(..., E)`` from :func:`~magrl.tracking.common_error`, how constant errors are correlated; without it,
+            they are independent.
         fine: whether there are 512 points, as probabilities need, or 256 in single precision, which suffice for means.
 
     Raises:
@@ -164,17 +168,15 @@ def way_posterior(
     bend = _nonnegative_or_nan("curvature", none if curvature is None else curvature, elements, unit) / unit
     target = target if periods is None else continued(target, track, scales, periods)
     remaining = target.to(unit.dtype) / unit
-    rows = _polynomials(track, remaining, bias.square(), bend.square() / 4, shared).to(dtype)
+    alike = None if common is None else bias * common.to(unit.dtype)
+    own = bias.square() if alike is None else bias.square() - alike.square()
+    rows = _polynomials(track, remaining, own, bend.square() / 4, shared).to(dtype)
     dn, de = points.unbind(-1)
     square = dn * dn + de * de
     powers = torch.stack((torch.ones_like(dn), dn, de, dn * dn, dn * de, de * de, square * square), -2)
     residual, variance, *together = (rows @ powers).split(elements, -2)  # (..., E, M) each
-    variance = variance.clamp_min(_LEAST_VARIANCE)
-    weighted = residual / variance
-    exponent, volume = (residual * weighted).sum(-2), variance.prod(-2)
-    for shares in together:
-        left = (1 - (shares.square() / variance).sum(-2)).clamp_min(_LEAST_SHARE)
-        exponent, volume = exponent + (weighted * shares).sum(-2).square() / left, volume * left
+    alike = None if alike is None else alike.to(dtype).unsqueeze(-1)
+    exponent, volume = _misfit(residual, variance.clamp_min(_LEAST_VARIANCE), alike, together)
     exponent = exponent + square * (DISTANCE_SCALE_KM / range_km) ** 2
     weights = torch.softmax(-exponent / 2 - volume.log() / 2 - density.log(), -1)
     return WayPosterior(points * DISTANCE_SCALE_KM, weights.where(weights > _LEAST_WEIGHT, 0.0))
@@ -197,6 +199,27 @@ def _polynomials(track: FieldTrack, target: Tensor, bias: Tensor, bend: Tensor, 
     if shared is not None:
         rows.append((*shared.unbind(-1), zero, zero, zero, zero))
     return torch.cat([torch.stack(torch.broadcast_tensors(*row), -1) for row in rows], -2)
+
+
+def _misfit(
+    residual: Tensor, variance: Tensor, alike: Tensor | None, together: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return r^T S^-1 r and the determinant of S = diag(variance) + a a^T - t t^T, for columns ``(..., E, M)``.
+
+    By the rule of Sherman and Morrison, which is also that of each determinant.
+    """
+    square, determinant = (residual * (residual / variance)).sum(-2), variance.prod(-2)
+    if alike is not None:
+        row = alike / variance
+        more = 1 + (alike * row).sum(-2)
+        square, determinant = square - (residual * row).sum(-2).square() / more, determinant * more
+    for shares in together:
+        column = shares / variance
+        if alike is not None:
+            column = column - row * ((shares * row).sum(-2) / more).unsqueeze(-2)
+        left = (1 - (shares * column).sum(-2)).clamp_min(_LEAST_SHARE)
+        square, determinant = square + (residual * column).sum(-2).square() / left, determinant * left
+    return square, determinant
 
 
 def _points(way: Way, unit_points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

@@ -76,6 +76,30 @@ def field_curvature(elements: Tensor) -> Tensor:
     return torch.tensor(CURVATURE_NT, dtype=elements.dtype, device=elements.device) * per_nanotesla(elements)
 
 
+def common_error(elements: Tensor) -> Tensor:
+    """Return how constant and slow errors of D, I and B_H are correlated, as shares of their standard deviations.
+
+    An error of the field vector has a part along magnetic north, which changes B_H by that and I by -sin(I) of it, and
+    a downward part, which changes I by cos(I) of it. Where the two are independent and of the same size, as those of
+    hard iron, the correlation of I and B_H is -sin(I). Errors of the level and most weather have a stronger one. With
+    shares c, the covariance of errors with the standard deviations b is ``diag(b^2 (1 - c^2)) + (c b) (c b)^T``.
+
+    Args:
+        elements: ``(..., 3)``: D [deg], I [deg], B_H [nT] at the place.
+
+    Returns:
+        ``(..., 3)``.
+
+    Example:
+        >>> common_error(torch.tensor([0.0, -30.0, 20000.0])).round(decimals=2)
+        tensor([0.0000, 0.7100, 0.7100])
+    """
+    check_tensor(3, elements=elements)
+    sin = torch.sin(torch.deg2rad(elements[..., 1]))
+    root = sin.abs().sqrt()
+    return torch.stack((torch.zeros_like(sin), root, -root * sin.sign()), -1)
+
+
 def per_nanotesla(elements: Tensor) -> Tensor:
     """Return the change of D, I [deg] and B_H [nT] ``(..., 3)`` by a disturbance of 1 nT, above 0 for any reading."""
     strength = elements[..., 2].clamp_min(_LEAST_NT)

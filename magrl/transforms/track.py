@@ -49,9 +49,11 @@ class TrackGradient(StatefulTransform):
             default 0. The filter has a floor, :data:`~magrl.tracking.VARIANCE_FLOOR`.
         prior: function from a first reading and the values at the target, ``(..., E)`` each, to a
             :class:`~magrl.tracking.GradientPrior`; by default :class:`~magrl.tracking.LearnedPrior`. For other elements
-            than D, I, B_H, give one, and also ``relation``, ``scales``, ``curvature`` and ``angles``.
+            than D, I, B_H, give one, and also ``relation``, ``common``, ``scales``, ``curvature`` and ``angles``.
         relation: function from the estimated field ``(..., E)`` to a :class:`~magrl.tracking.GradientRelation` that the
             gradients obey; None for none.
+        common: function from the estimated field ``(..., E)`` to how constant errors are correlated, ``(..., E)``, as
+            :func:`~magrl.tracking.common_error`; None for independent ones.
         scales: units of the elements in the state, E numbers; see :func:`magrl.tracking.start`.
         curvature: standard deviation of the change of a gradient along the way, E numbers or a function from the
             estimated field ``(..., E)`` to them; see :func:`magrl.tracking.predict`.
@@ -88,6 +90,7 @@ class TrackGradient(StatefulTransform):
         sensor_std: Sequence[float] | None = None,
         prior: Callable[[Tensor, Tensor], GradientPrior] | None = None,
         relation: Callable[[Tensor], GradientRelation] | None = tracking.curl_relation,
+        common: Callable[[Tensor], Tensor] | None = tracking.common_error,
         scales: Sequence[float] = tracking.ELEMENT_SCALES,
         curvature: Sequence[float] | Callable[[Tensor], Tensor] = tracking.field_curvature,
         angles: Sequence[int] = (0,),
@@ -100,9 +103,16 @@ class TrackGradient(StatefulTransform):
         check_number(0, above=True, range_km=range_km)
         check_choice(FRAMES, frame=frame)
         prior = LearnedPrior.pretrained() if prior is None else prior
-        if not callable(prior) or not (relation is None or callable(relation)):
-            raise ValueError(f"prior must be a function, and relation one or None, got {prior!r} and {relation!r}")
-        self.prior, self.relation, self.range_km, self.frame = prior, relation, float(range_km), frame
+        if not callable(prior) or not all(f is None or callable(f) for f in (relation, common)):
+            wanted = "prior must be a function, relation one or None, and common one or None"
+            raise ValueError(f"{wanted}, got {prior!r}, {relation!r} and {common!r}")
+        self.prior, self.relation, self.common, self.range_km, self.frame = (
+            prior,
+            relation,
+            common,
+            float(range_km),
+            frame,
+        )
         self.curvature = curvature if callable(curvature) else None
         count = len(scales)
         self.in_sizes = (count, count, None, 1, count, count, count)
@@ -177,7 +187,8 @@ class TrackGradient(StatefulTransform):
         field, gradient = (f(known, self.scales) for f in (tracking.estimated_field, tracking.estimated_gradient))
         field = field - self.periods.to(field.dtype) * torch.round(field / 360)
         options = self.range_km, self.scales, shared, bias_std, self.periods, self._curvature(field)
-        posterior = tracking.way_posterior(known, target, *options, fine=False)
+        common = None if self.common is None or bias_std is None else self.common(field)
+        posterior = tracking.way_posterior(known, target, *options, common, fine=False)
         aim = posterior.aim(tracking.way_to(known, target, *options))
         way, covariance = (part.to(target.dtype) for part in aim)
         if self.frame == "vehicle":
@@ -312,8 +323,9 @@ class PlannedMove(StatefulTransform):
         aim, std = _turned(aim.unsqueeze(-2), -turn).squeeze(-2), tracking.reading_std(sensor_std, drift_std)
         track = FieldTrack(mean, covariance)
         known, shared = tracking.related(track, tracking.curl_relation)
-        curvature = tracking.field_curvature(tracking.estimated_field(known))
-        options = self.range_km, tracking.ELEMENT_SCALES, shared, bias_std, tracking.ELEMENT_PERIODS, curvature
+        field = tracking.estimated_field(known)
+        curvature, common = tracking.field_curvature(field), tracking.common_error(field)
+        options = self.range_km, tracking.ELEMENT_SCALES, shared, bias_std, tracking.ELEMENT_PERIODS, curvature, common
         posterior = tracking.way_posterior(known, target, *options, fine=False)
         step_km = tracking.reading_price(std).clamp_min(given * self.range_km / 100)
         price = tracking.step_price(step_km, aim, step.squeeze(-1), self.max_steps, self.max_move_km)

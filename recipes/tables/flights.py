@@ -17,6 +17,7 @@ from magrl.evaluation import episode_measures, evaluation_rollout, with_declarat
 from magrl.evaluation.navigators import label, make_navigator, needs
 from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.field.model import elements_gradient_at
+from magrl.tracking import common_error
 from magrl.transforms import Conditions, conditions_named
 
 FAR_KM = 500.0
@@ -120,8 +121,10 @@ def estimate_within(
     jacobian = elements_gradient_at(base.field, base.scenario.tasks.target, base.scenario.tasks.region)
     start = env.reset()
     new, constant = (start.get(key, jacobian.new_tensor(std)).to(jacobian).square() for key, std in sheet.items())
-    weight = (new / readings + constant).clamp_min(1e-12).rsqrt().unsqueeze(-1) * jacobian
-    covariance = torch.linalg.pinv(weight.mT @ weight)
+    alike = common_error(start["target_field"].to(jacobian)) * constant.sqrt()
+    own = torch.diag_embed((new / readings + constant - alike.square()).clamp_min(1e-12))
+    noise = own + alike.unsqueeze(-1) * alike.unsqueeze(-2)
+    covariance = torch.linalg.pinv(jacobian.mT @ torch.linalg.solve(noise, jacobian))
     angle = torch.arange(360, dtype=jacobian.dtype).deg2rad()
     spread = torch.linalg.eigvalsh(covariance).clamp_min(0) @ torch.stack((angle.cos(), angle.sin())).square()
     return 100 * (1 - torch.exp(-(radius_km**2) / (2 * spread))).mean().item()

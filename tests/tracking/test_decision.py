@@ -29,8 +29,13 @@ def decide(north_km: float, std: float, bias: float, left: int = 50, drift: floa
 
 
 def test_what_a_constant_error_leaves_is_all_that_can_be_attained() -> None:
-    """An error of 0.2 units is one of 20 km on each axis: P = 1 - exp(-25^2 / (2 * 20^2)), however long one reads."""
-    expected = 1 - math.exp(-(25**2) / (2 * 20**2))
+    """An error of 0.2 units is one of 20 km eastward, by D, and of 10 km northward, however long one reads.
+
+    B_H is the same everywhere and shows its own error, with which that of I is correlated by -sin(60°).
+    """
+    north = torch.linspace(-25, 25, 2001, dtype=F64)
+    inside = torch.special.erf((625 - north.square()).sqrt() / (20 * 2**0.5))
+    expected = torch.trapezoid(inside * torch.exp(-((north / 10) ** 2) / 2) / (10 * (2 * math.pi) ** 0.5), north).item()
     for std in (0.0, 0.3):
         assert decide(0.0, std, 0.2).attainable.item() == pytest.approx(expected, abs=0.03)
     done, not_yet = decide(0.0, 0.0, 0.2), decide(0.0, 0.3, 0.2)

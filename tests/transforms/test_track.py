@@ -52,9 +52,9 @@ def stepped(track: TrackGradient, first: TensorDict, after: TensorDict) -> Tenso
     return track(track(first.clone()).set("next", after.clone()))["next"]
 
 
-def aim(known: FieldTrack, target: Tensor, **options: Tensor) -> tuple[Tensor, ...]:
+def aim(known: FieldTrack, target: Tensor, common: Tensor | None = None, **options: Tensor) -> tuple[Tensor, ...]:
     """The way to aim at and its covariance, by the pure functions."""
-    posterior = tracking.way_posterior(known, target, 300.0, **options, fine=False)
+    posterior = tracking.way_posterior(known, target, 300.0, **options, common=common, fine=False)
     return tuple(posterior.aim(tracking.way_to(known, target, 300.0, **options)))
 
 
@@ -97,8 +97,9 @@ def test_standard_deviations_may_be_keys(row: int) -> None:
     for key in (*STATE, "estimated_gradient"):
         torch.testing.assert_close(biased[key], noisier[key], msg=key)
     known, shared = tracking.related(FieldTrack(*(noisier[key] for key in STATE)), curl_relation)
-    bend = tracking.field_curvature(tracking.estimated_field(known))
-    way = aim(known, after["target_field"][row], shared=shared, bias_std=20 * rows[row], curvature=bend)
+    field = tracking.estimated_field(known)
+    options = {"bias_std": 20 * rows[row], "curvature": tracking.field_curvature(field), "shared": shared}
+    way = aim(known, after["target_field"][row], tracking.common_error(field), **options)
     for found, expected in zip((biased["way"], biased["way_covariance"]), way, strict=True):
         torch.testing.assert_close(found.float(), expected.float())
 
