@@ -26,6 +26,8 @@ CAUTION = 0.3
 (docs/navigators.md)."""
 PRICE_RANGE_KM = (0.3, 20.0)
 """Lowest and highest price of a step [km]."""
+CHEAP_KM = 2.0
+"""Price up to which a step is cheap [km]."""
 NEAR_KM = 30.0
 """Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
 SLOPES = (0.004, 0.015, 4.0)
@@ -75,6 +77,9 @@ def reading_price(std: Tensor) -> Tensor:
 def step_price(step_km: Tensor | float, way: Tensor, step: Tensor, max_steps: int, max_move_km: float) -> Tensor:
     """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the way run out.
 
+    With r steps of the limit for each that is left, it is the larger of ``p r^2`` and ``min(p, 2) r^4``: where a step
+    is cheap, a vehicle that has used half of the limit is in search of the destination, and small moves teach little.
+
     Args:
         step_km: price while many are left [km].
         way: ``(..., 2)`` [km].
@@ -84,10 +89,11 @@ def step_price(step_km: Tensor | float, way: Tensor, step: Tensor, max_steps: in
 
     Example:
         >>> step_price(1.0, torch.tensor([100.0, 0.0]), torch.tensor(22), 50, 50.0)
-        tensor(4.)
+        tensor(16.)
     """
     spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km
-    return step_km * (max_steps / spare.clamp_min(1.0)).square()
+    rise, price = (max_steps / spare.clamp_min(1.0)).square(), torch.as_tensor(step_km)
+    return torch.maximum(price, price.clamp_max(CHEAP_KM) * rise) * rise
 
 
 def planned_move(

@@ -67,7 +67,9 @@ def test_the_moves_that_are_compared_and_the_price_of_a_step() -> None:
     for far, shortest in ((20, 10.0), (500, 50.0)):  # 400 km, 10000 km
         assert planning._moves(far * way, tracking.LENGTHS, 50.0).norm(dim=-1).min() == pytest.approx(shortest)
     price = tracking.step_price(2.0, 25 * way, torch.tensor([0, 10, 34, 49]), max_steps=50, max_move_km=50.0)
-    assert price.tolist() == pytest.approx([2 * (50 / 35) ** 2, 2 * 2**2, 2 * 50**2, 2 * 50**2])  # 15 are for the way
+    assert price.tolist() == pytest.approx([2 * (50 / 35) ** 4, 2 * 2**4, 2 * 50**4, 2 * 50**4])  # 15 are for the way
+    price = tracking.step_price(f64(0.5, 8.0, 8.0), f64(0.0, 0.0), torch.tensor([25, 20, 30]), 50, 50.0)
+    assert price.tolist() == pytest.approx([0.5 * 2**4, 8 * (5 / 3) ** 2, 2 * 2.5**4])
 
 
 def test_more_noise_means_dearer_steps_within_limits() -> None:
