@@ -171,7 +171,7 @@ def test_a_network_of_ones_own_between_view_and_action(tmp_path: Path) -> None:
     target, reading = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0, 290.0)
     commands = []
     for navigator in (policy, loaded):
-        vehicle = Onboard(navigator)
+        vehicle = Onboard(navigator, max_steps=view.max_steps)
         vehicle.start(target)
         commands.append(vehicle.step(*reading))
     assert commands[0] == commands[1]
