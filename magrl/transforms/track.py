@@ -106,13 +106,8 @@ class TrackGradient(StatefulTransform):
         if not callable(prior) or not all(f is None or callable(f) for f in (relation, common)):
             wanted = "prior must be a function, relation one or None, and common one or None"
             raise ValueError(f"{wanted}, got {prior!r}, {relation!r} and {common!r}")
-        self.prior, self.relation, self.common, self.range_km, self.frame = (
-            prior,
-            relation,
-            common,
-            float(range_km),
-            frame,
-        )
+        self.prior, self.relation, self.common = prior, relation, common
+        self.range_km, self.frame = float(range_km), frame
         self.curvature = curvature if callable(curvature) else None
         count = len(scales)
         self.in_sizes = (count, count, None, 1, count, count, count)

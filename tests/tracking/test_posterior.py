@@ -6,6 +6,7 @@ import torch
 from support.tracks import F64, f64, randn, random_track
 
 from magrl.tracking import FieldTrack, GradientRelation, Way, WayPosterior, relate, way_posterior
+from magrl.tracking.posterior import _misfit
 
 ONE = (1.0, 1.0, 1.0)
 
@@ -44,6 +45,16 @@ def test_it_is_the_integral_of_its_density(related: bool, common: torch.Tensor |
         assert np.linalg.norm(found.displacement[n].numpy() - expected) < 0.1 * size
         assert found.covariance[n].trace().sqrt().item() == pytest.approx(size, rel=0.1)
         assert posterior.within(50.0)[n].item() == pytest.approx(within, abs=0.03)
+
+
+def test_the_misfit_is_that_of_the_whole_covariance() -> None:
+    residual, variance = randn(2, 3, 5, seed=1), randn(2, 3, 5, seed=2).square() + 1
+    alike, shares = randn(2, 3, 1, seed=3), 0.4 * randn(2, 3, 5, seed=4)
+    one, two, three = (x.expand(2, 3, 5).mT.unsqueeze(-1) for x in (residual, alike, shares))
+    whole = torch.diag_embed(variance.mT) + two @ two.mT - three @ three.mT
+    square, determinant = _misfit(residual, variance, alike, [shares])
+    torch.testing.assert_close(square, (one.mT @ torch.linalg.solve(whole, one)).squeeze((-1, -2)))
+    torch.testing.assert_close(determinant, torch.linalg.det(whole))
 
 
 def test_its_probabilities_are_the_shares_of_fields_drawn_from_the_state() -> None:
