@@ -88,7 +88,7 @@ class Config(PlanetConfig):
     """Distance from the destination within which a declaration is right [km]."""
     range_km: Positive = 300.0
     """Prior standard deviation of the way to the destination along each axis [km]."""
-    price_range: Rising = (0.1, 10.0)
+    price_range: Rising = (0.1, 30.0)
     """Lowest and highest price of a step [% of SPL]; each episode has its own, which the agent observes."""
     critic_batches: Count = 3
     """Collected batches before the first update of the actor."""

@@ -13,6 +13,7 @@ from magrl.checks import check_choice, check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.envs.random_regions import planet_scenario
 from magrl.envs.scenario import Scenario
+from magrl.tracking import STEP_PRICE
 from magrl.transforms import (
     AlignmentReward,
     DeclareArrival,
@@ -31,8 +32,6 @@ from magrl.transforms.errors.base import ReadingErrors
 
 OBSERVATIONS = ("flat", "track", "dict")
 REWARDS = ("guided", "base", "spl")
-STEP_PRICE = 0.5
-"""Price of a step in the reward ``"spl"`` [% of SPL]."""
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
 

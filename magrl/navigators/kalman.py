@@ -15,7 +15,7 @@ from magrl.checks import check_number, check_numbers
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
-from magrl.tracking import CAUTION, LENGTHS, FieldTrack, GradientPrior, LearnedPrior
+from magrl.tracking import CAUTION, LENGTHS, STEP_PRICE, FieldTrack, GradientPrior, LearnedPrior
 
 
 class Kalman(QuasiNewton):
@@ -34,7 +34,7 @@ class Kalman(QuasiNewton):
         sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
         max_steps: step limit of the episode.
         caution: weight of the uncertainty of the way.
-        step_km: price of a step [km] while many are left; for None that of :func:`magrl.tracking.reading_price`.
+        step_price: price of a step while many are left [% of SPL]; a way of ``range_km`` is 100 %.
         range_km: prior standard deviation of the way along each axis [km].
         lengths: of the moves that are compared, as fractions of the longest.
         search: as of :class:`QuasiNewton`, here by default.
@@ -62,7 +62,7 @@ class Kalman(QuasiNewton):
         sensor_std: Std = PERFECT,
         max_steps: int = 50,
         caution: float = CAUTION,
-        step_km: float | None = None,
+        step_price: float = STEP_PRICE,
         range_km: float = 300.0,
         lengths: Sequence[float] = LENGTHS,
         search: bool = True,
@@ -75,10 +75,9 @@ class Kalman(QuasiNewton):
         self.lengths = tuple(lengths)
         check_number(0, above=True, range_km=range_km)
         check_number(0, caution=caution)
-        if step_km is not None:
-            check_number(0, above=True, step_km=step_km)
+        check_number(0, above=True, step_price=step_price)
         self.max_steps, self.range_km = int(max_steps), float(range_km)
-        self.caution, self.step_km = float(caution), step_km
+        self.caution, self.step_price = float(caution), float(step_price)
         if prior not in ("learned", "dipole"):
             raise ValueError(f"prior must be 'learned' or 'dipole', got {prior!r}")
         self.learned_prior = LearnedPrior.pretrained() if prior == "learned" else None
@@ -97,10 +96,9 @@ class Kalman(QuasiNewton):
         posterior = tracking.way_posterior(known, target, *options, tracking.common_error(field), fine=False)
         way = tracking.Way(*(part.double() for part in posterior.aim(tracking.way_to(known, target, *options))))
         aim, std = self.aim(known, way, seen, memory), self.reading_std(seen)
-        step_km = tracking.reading_price(std) if self.step_km is None else torch.full_like(aim[..., 0], self.step_km)
-        step = seen["step_count"].squeeze(-1)
-        price = tracking.step_price(step_km, aim, step, self.max_steps, self.max_move_km)
-        costs = self.caution, self.lengths, self.scales
+        limits = self.max_steps, self.max_move_km
+        price = tracking.step_price(self.step_price, self.range_km, aim, seen["step_count"].squeeze(-1), *limits)
+        costs = self.caution, self.lengths, self.scales, self.lasting_std(seen), self.drift(field)
         best = tracking.planned_move(track, aim, posterior, std, price, self.max_move_km, self.range_km, *costs)
         distance = best.norm(dim=-1)
         direction = torch.where((distance > 0).unsqueeze(-1), best, aim)  # standing still, face the way

@@ -24,9 +24,9 @@ from magrl.tracking.learned_prior import LearnedPrior as LearnedPrior
 from magrl.tracking.planning import CAUTION as CAUTION
 from magrl.tracking.planning import LENGTHS as LENGTHS
 from magrl.tracking.planning import SLOPES as SLOPES
+from magrl.tracking.planning import STEP_PRICE as STEP_PRICE
 from magrl.tracking.planning import corrected as corrected
 from magrl.tracking.planning import planned_move as planned_move
-from magrl.tracking.planning import reading_price as reading_price
 from magrl.tracking.planning import sensor_length as sensor_length
 from magrl.tracking.planning import step_price as step_price
 from magrl.tracking.posterior import WayPosterior as WayPosterior

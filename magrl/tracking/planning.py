@@ -14,6 +14,7 @@ from magrl.tracking.filter import (
     FieldTrack,
     PerElement,
     _entries,
+    _nonnegative_or_nan,
     _units,
     _variance,
 )
@@ -24,8 +25,8 @@ from magrl.tracking.track import related
 CAUTION = 0.3
 """Weight of the uncertainty of the way after a reading; this and :data:`LENGTHS` are from scans on random planets
 (docs/navigators.md)."""
-PRICE_RANGE_KM = (0.3, 20.0)
-"""Lowest and highest price of a step [km]."""
+STEP_PRICE = 0.5
+"""Default price of a step [% of SPL]."""
 CHEAP_KM = 2.0
 """Price up to which a step is cheap [km]."""
 NEAR_KM = 30.0
@@ -59,40 +60,28 @@ def sensor_length(std: Tensor) -> Tensor:
     return (std / std.new_tensor(SLOPES)).sort(-1).values[..., 1]
 
 
-def reading_price(std: Tensor) -> Tensor:
-    """Return the price of a step ``(...)`` [km] for the errors of a reading.
-
-    The larger they are (:func:`sensor_length`), the less a reading teaches, and the more steps certainty costs.
-
-    Args:
-        std: ``(..., 3)`` standard deviations of D [deg], I [deg], B_H [nT].
-
-    Example:
-        >>> reading_price(torch.tensor([0.0, 0.0, 0.0])), reading_price(torch.tensor([0.04, 0.03, 0.4]))
-        (tensor(0.3000), tensor(2.))
-    """
-    return sensor_length(std).clamp(*PRICE_RANGE_KM)
-
-
-def step_price(step_km: Tensor | float, way: Tensor, step: Tensor, max_steps: int, max_move_km: float) -> Tensor:
+def step_price(
+    percent: Tensor | float, range_km: float, way: Tensor, step: Tensor, max_steps: int, max_move_km: float
+) -> Tensor:
     """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the way run out.
 
     With r steps of the limit for each that is left, it is the larger of ``p r^2`` and ``min(p, 2) r^4``: where a step
     is cheap, a vehicle that has used half of the limit is in search of the destination, and small moves teach little.
 
     Args:
-        step_km: price while many are left [km].
+        percent: price p while many are left [% of SPL].
+        range_km: way that counts as 100 % [km].
         way: ``(..., 2)`` [km].
         step: ``(...)`` number of the step.
         max_steps: step limit of the episode.
         max_move_km: longest move.
 
     Example:
-        >>> step_price(1.0, torch.tensor([100.0, 0.0]), torch.tensor(22), 50, 50.0)
+        >>> step_price(0.5, 200.0, torch.tensor([100.0, 0.0]), torch.tensor(22), 50, 50.0)
         tensor(16.)
     """
     spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km
-    rise, price = (max_steps / spare.clamp_min(1.0)).square(), torch.as_tensor(step_km)
+    rise, price = (max_steps / spare.clamp_min(1.0)).square(), torch.as_tensor(percent) * range_km / 100
     return torch.maximum(price, price.clamp_max(CHEAP_KM) * rise) * rise
 
 
@@ -107,6 +96,8 @@ def planned_move(
     caution: float = CAUTION,
     lengths: Sequence[float] = LENGTHS,
     scales: PerElement = ELEMENT_SCALES,
+    bias_std: PerElement | None = None,
+    curvature: PerElement | None = None,
 ) -> Tensor:
     """Return the displacement ``(..., 2)`` [km] of the next move, northward and eastward.
 
@@ -129,9 +120,11 @@ def planned_move(
         caution: weight of the uncertainty.
         lengths: of the moves that are compared, as fractions of the longest; at least :data:`SHORTEST` of the way.
         scales: those of :func:`~magrl.tracking.start`.
+        bias_std: standard deviation of a constant error of the readings, which no reading reduces.
+        curvature: standard deviation of the change of a gradient along the way, as in :func:`~magrl.tracking.way_to`.
 
     Raises:
-        ValueError: for shapes that do not match.
+        ValueError: for shapes that do not match, or a negative standard deviation.
 
     Source:
         A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
@@ -152,7 +145,8 @@ def planned_move(
     shift = aim - (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
     distance = posterior.mean_distance(moves - shift.unsqueeze(-2)).to(aim.dtype)  # that of now is the same for all
     cost = moves.norm(dim=-1) + distance * (1 + step_km / max_move_km).unsqueeze(-1)
-    after = _covariance_after(track, moves, left, sensor_std, range_km, scales)
+    lasting = bias_std, curvature
+    after = _covariance_after(track, moves, left, sensor_std, range_km, scales, *lasting)
     best = (cost + caution * _detour(left, after)).argmin(-1)[..., None, None]
     return moves.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 
@@ -188,7 +182,14 @@ def _moves(way: Tensor, lengths: Sequence[float], max_move_km: float) -> Tensor:
 
 
 def _covariance_after(
-    track: FieldTrack, moves: Tensor, left: Tensor, sensor_std: PerElement, range_km: float, scales: PerElement
+    track: FieldTrack,
+    moves: Tensor,
+    left: Tensor,
+    sensor_std: PerElement,
+    range_km: float,
+    scales: PerElement,
+    bias_std: PerElement | None = None,
+    curvature: PerElement | None = None,
 ) -> _Entries:
     """Return the expected covariance of the way, three entries ``(..., M)`` [km^2], after moves and readings.
 
@@ -204,6 +205,15 @@ def _covariance_after(
     dn, de = (left / DISTANCE_SCALE_KM).unbind(-1)
     p00, p01, p02, p11, p12, p22 = after
     variance = p00 + dn * (2 * p01 + p11 * dn + 2 * p12 * de) + de * (2 * p02 + p22 * de)
+    lasting, bend = (
+        (torch.zeros_like(unit) if std is None else _nonnegative_or_nan(name, std, unit.shape[-1], unit) / unit)
+        .square()
+        .expand(track.mean.shape[:-1])
+        .movedim(-1, 0)
+        .unsqueeze(-1)
+        for name, std in (("bias_std", bias_std), ("curvature", curvature))
+    )
+    variance = variance + lasting + bend * (dn * dn + de * de).square() / 4
     weight, together = variance.reciprocal(), shared_after[0] + shared_after[1] * dn + shared_after[2] * de
     row = weight * together  # the inverse covariance of the elements: diag(weight) + row row^T / rest
     rest = (1 - (row * together).sum(0)).reciprocal()

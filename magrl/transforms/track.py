@@ -13,7 +13,7 @@ from torchrl.data import Composite
 
 from magrl import tracking
 from magrl.checks import check_choice, check_number, check_numbers
-from magrl.tracking import FieldTrack, GradientPrior, GradientRelation, LearnedPrior, Way
+from magrl.tracking import STEP_PRICE, FieldTrack, GradientPrior, GradientRelation, LearnedPrior, Way
 from magrl.transforms.base import (
     GivenKeys,
     StatefulTransform,
@@ -22,8 +22,6 @@ from magrl.transforms.base import (
 STD_KEYS = ("sensor_std", "bias_std", "drift_std")
 """Standard deviations of a reading's new errors, of constant and slow ones, and of slow ones alone: D [deg], I [deg],
 B_H [nT]."""
-STEP_PRICE = 0.1
-"""Default price of a step [% of SPL]."""
 FRAMES = ("world", "vehicle")
 IN_KEYS = ("field", "target_field", "move", "heading")
 OUT_KEYS = ("track_mean", "track_covariance", "estimated_field", "estimated_gradient", "way", "way_covariance")
@@ -267,8 +265,7 @@ class PlannedMove(StatefulTransform):
         max_steps: step limit.
         range_km: prior standard deviation of the way along each axis [km].
         frame: axes of the way and the displacement, as in :class:`TrackGradient`.
-        step_price: price of a step where it is not among the ``in_keys``. A way of ``range_km`` is 100 %; the plan
-            takes the higher of it and :func:`magrl.tracking.reading_price`.
+        step_price: price of a step where it is not among the ``in_keys`` [% of SPL]; a way of ``range_km`` is 100 %.
 
     Raises:
         ValueError: for an option out of its range, or another number of keys.
@@ -304,7 +301,7 @@ class PlannedMove(StatefulTransform):
         check_number(0, above=True, max_move_km=max_move_km, range_km=range_km)
         check_number(1, whole=True, max_steps=max_steps)
         check_choice(FRAMES, frame=frame)
-        check_number(0, step_price=step_price)
+        check_number(0, above=True, step_price=step_price)
         self.max_move_km, self.max_steps = float(max_move_km), int(max_steps)
         self.range_km, self.frame, self.step_price = float(range_km), frame, float(step_price)
 
@@ -322,9 +319,9 @@ class PlannedMove(StatefulTransform):
         curvature, common = tracking.field_curvature(field), tracking.common_error(field)
         options = self.range_km, tracking.ELEMENT_SCALES, shared, bias_std, tracking.ELEMENT_PERIODS, curvature, common
         posterior = tracking.way_posterior(known, target, *options, fine=False)
-        step_km = tracking.reading_price(std).clamp_min(given * self.range_km / 100)
-        price = tracking.step_price(step_km, aim, step.squeeze(-1), self.max_steps, self.max_move_km)
-        move = tracking.planned_move(track, aim, posterior, std, price, self.max_move_km, self.range_km)
+        price = tracking.step_price(given, self.range_km, aim, step.squeeze(-1), self.max_steps, self.max_move_km)
+        limits = self.max_move_km, self.range_km
+        move = tracking.planned_move(track, aim, posterior, std, price, *limits, bias_std=bias_std, curvature=curvature)
         tensordict.set(self.out_keys[0], _turned(move.unsqueeze(-2), turn).squeeze(-2).to(values[1].dtype))
 
 

@@ -17,9 +17,10 @@ from magrl import tracking
 from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES, element_difference
+from magrl.tracking import STEP_PRICE
 from magrl.transforms.base import GivenKeys, Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, STEP_PRICE, PlannedMove, SearchAim, TrackGradient
+from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, PlannedMove, SearchAim, TrackGradient
 
 OBSERVATION_SIZE = 19
 """Numbers of :func:`track_observation`."""
@@ -357,7 +358,7 @@ class TrackObservation(StatefulTransform):
         super().__init__(in_keys, out_keys)
         check_number(0, above=True, zeta=zeta)
         check_number(1, whole=True, max_steps=max_steps)
-        check_number(0, step_price=step_price)
+        check_number(0, above=True, step_price=step_price)
         self.zeta, self.max_steps, self.step_price = zeta, max_steps, step_price
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
@@ -412,7 +413,7 @@ class TrackView(_View):
         check_number(1, whole=True, max_steps=self.max_steps)
         check_type(bool, search=self.search)
         if self.step_price is not None:
-            check_number(0, step_price=self.step_price)
+            check_number(0, above=True, step_price=self.step_price)
 
     @property
     def state_keys(self) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ SEED = 3 * paper.FIRST_RESERVED_SEED
 """Seed of regions and tasks, beyond those of trainings and of frozen sets."""
 LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
 """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
-OPTIONS = {"map_date": "map of", "prior": "prior of a", "step_km": "step [km]", "step_price": "step [% of SPL]"}
+OPTIONS = {"map_date": "map of", "prior": "prior of a", "step_price": "step [% of SPL]"}
 Spec = str | Mapping[str, Any]
 """Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
 
