@@ -6,12 +6,15 @@ import pytest
 import torch
 from support.tracks import STD
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
 
 from magrl.agents import FieldPolicy, PolicyConfig, make_actor
 from magrl.agents.networks import CorrectedMove, make_mlp
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators import Kalman
-from magrl.transforms import TrackView, with_sensor_noise
+from magrl.transforms import SensorErrors, TrackView
+
+BIAS, NONE = (0.1, 0.1, 10.0), (0.0, 0.0, 0.0)
 
 
 def test_new_actor_is_not_saturated() -> None:
@@ -22,12 +25,13 @@ def test_new_actor_is_not_saturated() -> None:
     assert actions.std(0).min() > 0.01
 
 
-@pytest.mark.parametrize(("std", "price"), [(STD, 0.5), (STD, 4.0), ((0.0,) * 3, 0.5)])
-def test_an_untrained_correction_is_the_move_of_kalman(std: tuple, price: float) -> None:
-    """On the way, with noise and without: the plans differ only where rounding decides between two moves."""
+@pytest.mark.parametrize(("std", "bias", "price"), [(STD, NONE, 0.5), (STD, BIAS, 4.0), (NONE, NONE, 0.5)])
+def test_an_untrained_correction_is_the_move_of_kalman(std: tuple, bias: tuple, price: float) -> None:
+    """With noise, constant errors, and without: the plans differ only where rounding decides between two moves."""
     view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2, step_price=price)
-    env = with_sensor_noise(GeomagneticNavEnv(num_envs=200, seed=0, start_heading="random"), std)
-    kalman = Kalman(sensor_std=std, step_price=price)
+    base = GeomagneticNavEnv(num_envs=200, seed=0, start_heading="random")
+    env = TransformedEnv(base, SensorErrors(std, bias=bias, seed=0))
+    kalman = Kalman(step_price=price)  # it reads the standard deviations
     agent, state = FieldPolicy(PolicyConfig(view, (8,))), env.reset()
     for _ in range(4):
         state = kalman(agent(state).rename_key_("action", "planned"))
