@@ -145,8 +145,7 @@ def planned_move(
     shift = aim - (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
     distance = posterior.mean_distance(moves - shift.unsqueeze(-2)).to(aim.dtype)  # that of now is the same for all
     cost = moves.norm(dim=-1) + distance * (1 + step_km / max_move_km).unsqueeze(-1)
-    lasting = bias_std, curvature
-    after = _covariance_after(track, moves, left, sensor_std, range_km, scales, *lasting)
+    after = _covariance_after(track, moves, left, sensor_std, range_km, scales, bias_std, curvature)
     best = (cost + caution * _detour(left, after)).argmin(-1)[..., None, None]
     return moves.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 
@@ -188,8 +187,8 @@ def _covariance_after(
     sensor_std: PerElement,
     range_km: float,
     scales: PerElement,
-    bias_std: PerElement | None = None,
-    curvature: PerElement | None = None,
+    bias_std: PerElement | None,
+    curvature: PerElement | None,
 ) -> _Entries:
     """Return the expected covariance of the way, three entries ``(..., M)`` [km^2], after moves and readings.
 
@@ -205,15 +204,8 @@ def _covariance_after(
     dn, de = (left / DISTANCE_SCALE_KM).unbind(-1)
     p00, p01, p02, p11, p12, p22 = after
     variance = p00 + dn * (2 * p01 + p11 * dn + 2 * p12 * de) + de * (2 * p02 + p22 * de)
-    lasting, bend = (
-        (torch.zeros_like(unit) if std is None else _nonnegative_or_nan(name, std, unit.shape[-1], unit) / unit)
-        .square()
-        .expand(track.mean.shape[:-1])
-        .movedim(-1, 0)
-        .unsqueeze(-1)
-        for name, std in (("bias_std", bias_std), ("curvature", curvature))
-    )
-    variance = variance + lasting + bend * (dn * dn + de * de).square() / 4
+    variance = variance + _square("bias_std", bias_std, track, unit)
+    variance = variance + _square("curvature", curvature, track, unit) * (dn * dn + de * de).square() / 4
     weight, together = variance.reciprocal(), shared_after[0] + shared_after[1] * dn + shared_after[2] * de
     row = weight * together  # the inverse covariance of the elements: diag(weight) + row row^T / rest
     rest = (1 - (row * together).sum(0)).reciprocal()
@@ -254,6 +246,14 @@ def _shared(elements: Tensor, covariance: Sequence[Tensor], unit: Tensor) -> Seq
     cross = p01 * north + p02 * east, p11 * north + p12 * east, p12 * north + p22 * east
     scale = ((north * cross[1] + east * cross[2]).sum(0) + relation.std.square()).rsqrt()
     return [entry * scale for entry in cross]
+
+
+def _square(name: str, std: PerElement | None, track: FieldTrack, unit: Tensor) -> Tensor | float:
+    """Return the squares of standard deviations as ``(E, ..., 1)``, in squared scaled units; 0 for None."""
+    if std is None:
+        return 0.0
+    values = _nonnegative_or_nan(name, std, unit.shape[-1], unit) / unit
+    return values.square().expand(track.mean.shape[:-1]).movedim(-1, 0).unsqueeze(-1)
 
 
 def _inverse(nn: Tensor, ne: Tensor, ee: Tensor, range_km: float) -> _Entries:

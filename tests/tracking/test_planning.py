@@ -18,8 +18,11 @@ SLOPES = f64((20.0, 0.3, 0.2), (40.0, -0.2, 0.9), (200.0, 0.5, 0.5))
 SURE = FieldTrack(SLOPES, 1e-8 * torch.eye(3, dtype=F64).expand(3, 3, 3))
 
 
-def predicted(track: FieldTrack, moves: Tensor, left: Tensor, **lasting: Tensor) -> Tensor:
-    nn, ne, ee = planning._covariance_after(track, moves, left, NOISE, RANGE_KM, tracking.ELEMENT_SCALES, **lasting)
+def predicted(
+    track: FieldTrack, moves: Tensor, left: Tensor, bias_std: Tensor | None = None, curvature: Tensor | None = None
+) -> Tensor:
+    options = NOISE, RANGE_KM, tracking.ELEMENT_SCALES, bias_std, curvature
+    nn, ne, ee = planning._covariance_after(track, moves, left, *options)
     return torch.stack((nn, ne, ne, ee), -1).unflatten(-1, (2, 2))
 
 
