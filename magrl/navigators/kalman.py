@@ -96,8 +96,8 @@ class Kalman(QuasiNewton):
         posterior = tracking.way_posterior(known, target, *options, tracking.common_error(field), fine=False)
         way = tracking.Way(*(part.double() for part in posterior.aim(tracking.way_to(known, target, *options))))
         aim, std = self.aim(known, way, seen, memory), self.reading_std(seen)
-        limits = self.max_steps, self.max_move_km
-        price = tracking.step_price(self.step_price, self.range_km, aim, seen["step_count"].squeeze(-1), *limits)
+        step, limits = seen["step_count"].squeeze(-1), (self.max_steps, self.max_move_km)
+        price = tracking.step_price(self.step_price, self.range_km, aim, step, std, *limits)
         costs = self.caution, self.lengths, self.scales, self.lasting_std(seen), self.drift(field)
         best = tracking.planned_move(track, aim, posterior, std, price, self.max_move_km, self.range_km, *costs)
         distance = best.norm(dim=-1)

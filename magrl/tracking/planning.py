@@ -29,6 +29,8 @@ STEP_PRICE = 0.5
 """Default price of a step [% of SPL]."""
 CHEAP_KM = 2.0
 """Price up to which a step is cheap [km]."""
+RESERVE_KM = 5.0
+"""Accuracy [km] of the mean of the readings for which steps are kept in reserve."""
 NEAR_KM = 30.0
 """Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
 SLOPES = (0.004, 0.015, 4.0)
@@ -61,26 +63,39 @@ def sensor_length(std: Tensor) -> Tensor:
 
 
 def step_price(
-    percent: Tensor | float, range_km: float, way: Tensor, step: Tensor, max_steps: int, max_move_km: float
+    percent: Tensor | float,
+    range_km: float,
+    way: Tensor,
+    step: Tensor,
+    sensor_std: PerElement,
+    max_steps: int,
+    max_move_km: float,
 ) -> Tensor:
     """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the way run out.
 
-    With r steps of the limit for each that is left, it is the larger of ``p r^2`` and ``min(p, 2) r^4``: where a step
-    is cheap, a vehicle that has used half of the limit is in search of the destination, and small moves teach little.
+    The search at the end takes more readings where one is less accurate: as many steps are kept in reserve as readings
+    whose mean is accurate to :data:`RESERVE_KM`. With r steps of the limit for each that is left beyond these, the
+    price is the larger of ``p r^2`` and ``min(p, 2) r^4``: where a step is cheap, a vehicle that has used half of the
+    limit is in search of the destination, and small moves teach little.
 
     Args:
         percent: price p while many are left [% of SPL].
         range_km: way that counts as 100 % [km].
         way: ``(..., 2)`` [km].
         step: ``(...)`` number of the step.
+        sensor_std: standard deviations of a reading, ``(..., 3)`` or 3 numbers.
         max_steps: step limit of the episode.
         max_move_km: longest move.
 
     Example:
-        >>> step_price(0.5, 200.0, torch.tensor([100.0, 0.0]), torch.tensor(22), 50, 50.0)
+        >>> way = torch.tensor([100.0, 0.0])
+        >>> step_price(0.5, 200.0, way, torch.tensor(22), (0.0, 0.0, 0.0), 50, 50.0)
+        tensor(16.)
+        >>> step_price(0.5, 200.0, way, torch.tensor(18), (0.1, 0.15, 20.0), 50, 50.0)  # a reading is accurate to 10 km
         tensor(16.)
     """
-    spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km
+    length = sensor_length(torch.as_tensor(sensor_std, dtype=way.dtype, device=way.device))
+    spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km - (length / RESERVE_KM).square()
     rise, price = (max_steps / spare.clamp_min(1.0)).square(), torch.as_tensor(percent) * range_km / 100
     return torch.maximum(price, price.clamp_max(CHEAP_KM) * rise) * rise
 

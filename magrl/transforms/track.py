@@ -319,8 +319,8 @@ class PlannedMove(StatefulTransform):
         curvature, common = tracking.field_curvature(field), tracking.common_error(field)
         options = self.range_km, tracking.ELEMENT_SCALES, shared, bias_std, tracking.ELEMENT_PERIODS, curvature, common
         posterior = tracking.way_posterior(known, target, *options, fine=False)
-        price = tracking.step_price(given, self.range_km, aim, step.squeeze(-1), self.max_steps, self.max_move_km)
-        limits = self.max_move_km, self.range_km
+        step, limits = step.squeeze(-1), (self.max_move_km, self.range_km)
+        price = tracking.step_price(given, self.range_km, aim, step, std, self.max_steps, self.max_move_km)
         move = tracking.planned_move(track, aim, posterior, std, price, *limits, bias_std=bias_std, curvature=curvature)
         tensordict.set(self.out_keys[0], _turned(move.unsqueeze(-2), turn).squeeze(-2).to(values[1].dtype))
 
