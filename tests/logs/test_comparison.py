@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pandas
 import pytest
@@ -14,6 +16,7 @@ from magrl.logs import difference_from_igrf, mistakes
 DATE = "2026-06-30"
 
 
+@cache  # a frame that is not changed
 def log() -> pandas.DataFrame:
     """Fifteen readings from Newfoundland, where D is -16 degrees, with the noise of sensors and of the crust."""
     place, rows = torch.tensor([48.0, -50.0], dtype=torch.float64), []

@@ -15,7 +15,7 @@ ONE = (1.0, 1.0, 1.0)
 @pytest.mark.parametrize(("size", "common"), [(0.1, None), (0.4, f64(0.5, 0.0, -0.9))])
 @pytest.mark.parametrize("related", [False, True])
 def test_it_is_the_integral_of_its_density(related: bool, size: float, common: torch.Tensor | None, fine: bool) -> None:
-    """On a grid of 6 km over 2400 km, with errors that are constant and a gradient that changes along the way."""
+    """On a grid of 8 km over 2400 km, with errors that are constant and a gradient that changes along the way."""
     (track, shared), target = (random_track(4, 3), None), randn(4, 3, seed=7)
     if related:
         relation = GradientRelation(100 * randn(4, 3, 2, seed=5), randn(4, seed=6), randn(4, seed=7).abs() + 0.1)
@@ -23,7 +23,7 @@ def test_it_is_the_integral_of_its_density(related: bool, size: float, common: t
     bias, bend = size * f64(1.0, 0.0, 2.0), f64(0.05, 0.0, 0.1)
     posterior = way_posterior(track, target, 200.0, ONE, shared, bias, curvature=bend, common=common, fine=fine)
     alike = bias.numpy() * (0 if common is None else common.numpy())
-    axis = np.arange(-1200, 1200, 6) / 100
+    axis = np.arange(-1200, 1200, 8) / 100
     way = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1)
     lever = np.concatenate((np.ones((*way.shape[:2], 1)), way), -1)
     for n in range(4):
