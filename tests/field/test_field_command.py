@@ -132,6 +132,7 @@ def test_missing_file_and_missing_engine_raise(points, monkeypatch, capsys) -> N
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow  # another process imports PyTorch
 def test_help_ends_without_a_traceback_when_the_pipe_is_closed() -> None:
     done = subprocess.run(
         f"{sys.executable} -W ignore -m magrl.field points.csv --help | head -n 1",
