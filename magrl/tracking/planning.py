@@ -31,6 +31,8 @@ CHEAP_KM = 2.0
 """Price up to which a step is cheap [km]."""
 RESERVE_KM = 5.0
 """Accuracy [km] of the mean of the readings for which steps are kept in reserve."""
+MISSING_KM = 1000.0
+"""Accuracy [km] of a reading beyond which it is a missing one, which says nothing about the sensors."""
 NEAR_KM = 30.0
 """Distance at which the uncertainty along the way starts to matter beside that across it [km]."""
 SLOPES = (0.004, 0.015, 4.0)
@@ -95,7 +97,8 @@ def step_price(
         tensor(16.)
     """
     length = sensor_length(torch.as_tensor(sensor_std, dtype=way.dtype, device=way.device))
-    spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km - (length / RESERVE_KM).square()
+    reserve = torch.where(length < MISSING_KM, (length / RESERVE_KM).square(), 0.0)
+    spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km - reserve
     rise, price = (max_steps / spare.clamp_min(1.0)).square(), torch.as_tensor(percent) * range_km / 100
     return torch.maximum(price, price.clamp_max(CHEAP_KM) * rise) * rise
 
