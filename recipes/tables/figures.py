@@ -197,7 +197,8 @@ def conditions(tasks: int | None) -> Figures:
     base = earth_env(tasks or 200, reach_km=DRIFT_KM, drift_km=DRIFT_KM)
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = list(figure.subplots(3, 4, sharey=True).flat)
-    for navigator in tqdm(declared_tables()["conditions"]["navigators"], unit="navigator"):
+    names = [navigator for navigator in declared_tables()["conditions"]["navigators"] if isinstance(navigator, str)]
+    for navigator in tqdm(names, unit="navigator"):
         alone = summarize(flown(navigator, base, sensors()))["spl"]
         look = {"color": plots.NAVIGATOR_COLORS[navigator], "label": label(navigator).partition(" (")[0]}
         for axes, (make, sizes) in zip(panels, PANELS.values(), strict=False):
