@@ -30,7 +30,7 @@ STEP_PRICE = 0.5
 CHEAP_KM = 2.0
 """Price up to which a step is cheap [km]."""
 RESERVE_KM = 5.0
-"""Accuracy [km] of the mean of the readings for which steps are kept in reserve."""
+"""Accuracy [km] of the mean of the readings for which steps are kept in reserve; chosen on random planets."""
 MISSING_KM = 1000.0
 """Accuracy [km] of a reading beyond which it is a missing one, which says nothing about the sensors."""
 NEAR_KM = 30.0
