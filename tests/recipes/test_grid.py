@@ -237,6 +237,14 @@ def test_map_shows_the_dip_poles_and_the_failures() -> None:
     assert axes.collections[-1].get_array() == pytest.approx(np.array([90.0]))
 
 
+def test_each_error_has_a_line_for_each_navigator(monkeypatch) -> None:
+    monkeypatch.setattr(figures, "flown", lambda navigator, *_: navigator)
+    monkeypatch.setattr(figures, "summarize", lambda navigator: {"spl": float(len(navigator))})
+    *panels, last = figures.conditions(2)["conditions"].axes
+    assert [[len(line.get_xdata()) for line in axes.lines] for axes in panels] == [[5] * 5] * len(figures.PANELS)
+    assert [text.get_text() for text in last.get_legend().texts][:2] == ["anywhere", "Kalman"]
+
+
 # Trainings
 
 
