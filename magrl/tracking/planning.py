@@ -30,7 +30,10 @@ STEP_PRICE = 0.5
 CHEAP_KM = 2.0
 """Price up to which a step is cheap [km]."""
 RESERVE_KM = 5.0
-"""Accuracy [km] of the mean of the readings for which steps are kept in reserve; chosen on random planets."""
+"""Accuracy [km] of the mean of the readings for which steps are kept in reserve; this and :data:`RESERVE_SHARE` are
+chosen on random planets."""
+RESERVE_SHARE = 0.2
+"""Largest share of the limit that is kept in reserve."""
 MISSING_KM = 1000.0
 """Accuracy [km] of a reading beyond which it is a missing one, which says nothing about the sensors."""
 NEAR_KM = 30.0
@@ -76,9 +79,9 @@ def step_price(
     """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the way run out.
 
     The search at the end takes more readings where one is less accurate: as many steps are kept in reserve as readings
-    whose mean is accurate to :data:`RESERVE_KM`. With r steps of the limit for each that is left beyond these, the
-    price is the larger of ``p r^2`` and ``min(p, 2) r^4``: where a step is cheap, a vehicle that has used half of the
-    limit is in search of the destination, and small moves teach little.
+    whose mean is accurate to :data:`RESERVE_KM`, at most :data:`RESERVE_SHARE` of the limit. With r steps of the limit
+    for each that is left beyond these, the price is the larger of ``p r^2`` and ``min(p, 2) r^4``: where a step is
+    cheap, a vehicle that has used half of the limit is in search of the destination, and small moves teach little.
 
     Args:
         percent: price p while many are left [% of SPL].
@@ -97,7 +100,8 @@ def step_price(
         tensor(16.)
     """
     length = sensor_length(torch.as_tensor(sensor_std, dtype=way.dtype, device=way.device))
-    reserve = torch.where(length < MISSING_KM, (length / RESERVE_KM).square(), 0.0)
+    reserve = (length / RESERVE_KM).square().clamp_max(RESERVE_SHARE * max_steps)
+    reserve = torch.where(length < MISSING_KM, reserve, 0.0)
     spare = max_steps - step - 1.5 * way.norm(dim=-1) / max_move_km - reserve
     rise, price = (max_steps / spare.clamp_min(1.0)).square(), torch.as_tensor(percent) * range_km / 100
     return torch.maximum(price, price.clamp_max(CHEAP_KM) * rise) * rise

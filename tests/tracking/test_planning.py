@@ -78,7 +78,7 @@ def test_the_moves_that_are_compared_and_the_price_of_a_step() -> None:
     assert price.tolist() == pytest.approx([0.5 * 2**4, 8 * (5 / 3) ** 2, 2 * 2.5**4])
     std = f64((0.0, 0.0, 0.0), (1.0, 0.15, 20.0), (1.0, 1.0, 1000.0), (1e4, 1e4, 1e4))  # the last is missing
     price = tracking.step_price(0.5, 400.0, f64(0.0, 0.0), torch.tensor(21), std, 50, 50.0)
-    assert price.tolist() == pytest.approx([2 * (50 / 29) ** 4, 2 * 2**4, 2 * 50**4, 2 * (50 / 29) ** 4])
+    assert price.tolist() == pytest.approx([2 * (50 / 29) ** 4, 2 * 2**4, 2 * (50 / 19) ** 4, 2 * (50 / 29) ** 4])
 
 
 def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
