@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import gc
 import itertools
 import os
 import sys
@@ -22,6 +23,11 @@ torch.set_num_threads(1)
 settings.register_profile("ci", derandomize=True, max_examples=25, deadline=None, database=None)
 settings.register_profile("search", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+def pytest_collection_finish() -> None:
+    """Exclude the imported modules from garbage collections, which would search them again and again."""
+    gc.freeze()
 
 
 @pytest.fixture
