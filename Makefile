@@ -72,7 +72,7 @@ RUNS_paper-run := $(WHOLE)
 RUNS_paper-run-100 := $(WHOLE)
 RUNS_paper-run-1000 := $(WHOLE)
 TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' recipes/tables/tables.toml)
-FIGURES ?= section-4 learning sequences noise conditions globe paper-run
+FIGURES ?= section-4 learning sequences noise conditions globe paper-run prices
 needed = $(VENV)/.installed $(sort $(foreach name,$(1),$(RUNS_$(name):%=runs/%/eval.json)))
 
 tables: $(call needed,$(TABLES))  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings

@@ -181,7 +181,7 @@ class Onboard:
         near: Sequence[float] | None = None,
         date: str | None = None,
     ) -> None:
-        """Begin a way to the place with some elements: D [deg], I [deg], B_H [nT].
+        """Begin an episode to a destination given by its elements: D [deg], I [deg], B_H [nT].
 
         Where the start is known, the first reading shows the constant errors of the sensors, which are subtracted from
         all readings (:func:`magrl.transforms.calibration`); and a reading that does not fit the place raises an error.
@@ -191,6 +191,8 @@ class Onboard:
             here: elements at the start; or its latitude and longitude [deg], with a ``date``.
             here_std: standard deviations of the elements at the start: by default 0 for elements, and for a position
                 those of a model of the core (:data:`magrl.onboard.start.MODEL_STD`).
+            near: latitude and longitude [deg] of the start, known to 200 km: checks the first reading and the distance of
+                the target, and is not used to navigate.
             date: date for a position, such as ``"2026-06-30"``.
 
         Raises:

@@ -79,13 +79,14 @@ def step_price(
     """Return the price of a step ``(...)`` [km]: it rises as the steps beyond those of the way run out.
 
     The search at the end takes more readings where one is less accurate: as many steps are kept in reserve as readings
-    whose mean is accurate to :data:`RESERVE_KM`, at most :data:`RESERVE_SHARE` of the limit. With r steps of the limit
-    for each that is left beyond these, the price is the larger of ``p r^2`` and ``min(p, 2) r^4``: where a step is
-    cheap, a vehicle that has used half of the limit is in search of the destination, and small moves teach little.
+    whose mean is accurate to :data:`RESERVE_KM`, at most :data:`RESERVE_SHARE` of the limit. With a price p [km]
+    while many are left, and r steps of the limit for each that is left beyond the reserve, it is the larger of
+    ``p r^2`` and ``min(p, 2 km) r^4``: where a step is cheap, a vehicle that has used half of the limit is in search of
+    the destination, and small moves teach little.
 
     Args:
-        percent: price p while many are left [% of SPL].
-        range_km: way that counts as 100 % [km].
+        percent: price while many are left [% of SPL], of which ``range_km`` is 100 %.
+        range_km: see ``percent`` [km].
         way: ``(..., 2)`` [km].
         step: ``(...)`` number of the step.
         sensor_std: standard deviations of a reading, ``(..., 3)`` or 3 numbers.
