@@ -191,8 +191,8 @@ class Onboard:
             here: elements at the start; or its latitude and longitude [deg], with a ``date``.
             here_std: standard deviations of the elements at the start: by default 0 for elements, and for a position
                 those of a model of the core (:data:`magrl.onboard.start.MODEL_STD`).
-            near: latitude and longitude [deg] of the start, known to 200 km: checks the first reading and the distance of
-                the target, and is not used to navigate.
+            near: latitude and longitude [deg] of the start, known to 200 km: by these, the first reading and the
+                distance of the target are checked; nothing navigates by them.
             date: date for a position, such as ``"2026-06-30"``.
 
         Raises:
