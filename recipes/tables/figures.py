@@ -198,9 +198,10 @@ def conditions(tasks: int | None) -> Figures:
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = list(figure.subplots(3, 4, sharey=True).flat)
     names = [navigator for navigator in declared_tables()["conditions"]["navigators"] if isinstance(navigator, str)]
-    for navigator in tqdm(names, unit="navigator"):
+    for index, navigator in enumerate(tqdm(names, unit="navigator")):
         alone = summarize(flown(navigator, base, sensors()))["spl"]
-        look = {"color": plots.NAVIGATOR_COLORS[navigator], "label": label(navigator).partition(" (")[0]}
+        look = {"color": plots.NAVIGATOR_COLORS[navigator], "ls": ("-", "--")[index % 2]}
+        look["label"] = label(navigator).partition(" (")[0]
         for axes, (make, sizes) in zip(panels, PANELS.values(), strict=False):
             spl = [summarize(flown(navigator, base, make(size)))["spl"] for size in sizes]
             axes.plot([alone, *spl], marker="o", ms=3, lw=1.3, **look)
