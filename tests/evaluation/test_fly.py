@@ -7,9 +7,15 @@ from pathlib import Path
 
 import fly as recipe
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from magrl.training import UsageError
+
+
+@pytest.fixture
+def without_figure(monkeypatch) -> None:
+    monkeypatch.setattr(recipe, "trajectories_figure", lambda *_: Figure())
 
 
 def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
@@ -32,6 +38,7 @@ def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
         assert picture.n_frames > result["steps"]
 
 
+@pytest.mark.usefixtures("without_figure")
 def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distance(tmp_path: Path) -> None:
     config = recipe.Config("60.4N 5.3E", "62.0N 6.8W", noise=(0.05, 0.05, 5.0), out=tmp_path)
     first, second = recipe.fly(config), recipe.fly(config)
@@ -40,6 +47,7 @@ def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distanc
     assert first["zeta"] == pytest.approx(0.01 * (400 / first["shortest_km"]) ** 2, rel=1e-6)
 
 
+@pytest.mark.usefixtures("without_figure")
 def test_a_vehicle_that_is_alone_declares_its_arrival(tmp_path: Path) -> None:
     config = recipe.Config("60.4N 5.3E", "60.2N 1.1W", conditions="ship", navigator="kalman", out=tmp_path)
     alone, calibrated = (recipe.fly(replace(config, known_start=known))["alone"] for known in (None, (0.0, 0.0, 0.0)))
