@@ -12,12 +12,9 @@ from pathlib import Path
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # read when torch is imported
 
 import pytest
-import torch
 from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
-
-torch.set_num_threads(1)
 
 # Every run checks the same examples, so that a failure is a change in the code. HYPOTHESIS_PROFILE=search draws others.
 settings.register_profile("ci", derandomize=True, max_examples=25, deadline=None, database=None)
@@ -26,7 +23,10 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
 def pytest_collection_finish() -> None:
-    """Exclude the imported modules from garbage collections, which would search them again and again."""
+    """Use one thread, and exclude the imported modules from garbage collections, which would search them each time."""
+    import torch  # here, so that the process that starts the others does not wait for it
+
+    torch.set_num_threads(1)
     gc.freeze()
 
 
@@ -54,14 +54,16 @@ def signalled(monkeypatch) -> Callable:
 @pytest.fixture(scope="session")
 def outcome() -> Callable:
     """Return a function that reads a run folder: the curves without their timing, and the weights of the policy."""
+    from torch import Tensor
+
     from magrl.agents import load_policy
 
-    def read(folder: Path) -> tuple[list[dict[str, str]], dict[str, torch.Tensor]]:
+    def read(folder: Path) -> tuple[list[dict[str, str]], dict[str, Tensor]]:
         with (folder / "train.csv").open() as file:
             rows = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
         policy = load_policy(folder / "policy.pt")
         weights = getattr(policy, "actor", policy).state_dict()
-        return rows, {key: value for key, value in weights.items() if isinstance(value, torch.Tensor)}
+        return rows, {key: value for key, value in weights.items() if isinstance(value, Tensor)}
 
     return read
 
@@ -72,7 +74,7 @@ def same_outcome(outcome: Callable) -> Callable:
 
     def same(one: Path, other: Path) -> bool:
         (rows, weights), (expected, expected_weights) = outcome(one), outcome(other)
-        equal = all(torch.equal(weights[key], expected_weights[key]) for key in weights | expected_weights)
+        equal = all(weights[key].equal(expected_weights[key]) for key in weights | expected_weights)
         return rows == expected and equal
 
     return same
