@@ -85,8 +85,8 @@ def step_price(
     the destination, and small moves teach little.
 
     Args:
-        percent: price while many are left [% of SPL], of which ``range_km`` is 100 %.
-        range_km: see ``percent`` [km].
+        percent: price while many are left [% of SPL]: p is this share of ``range_km``.
+        range_km: way that counts as 100 % [km].
         way: ``(..., 2)`` [km].
         step: ``(...)`` number of the step.
         sensor_std: standard deviations of a reading, ``(..., 3)`` or 3 numbers.
