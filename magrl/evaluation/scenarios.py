@@ -15,7 +15,7 @@ from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.evaluation.runs import NO_NOISE
-from magrl.transforms import Conditions, DeclareArrival, TrackGradient, with_conditions, with_sensor_noise
+from magrl.transforms import Conditions, DeclareArrival, NoiseScale, TrackGradient, with_conditions, with_sensor_noise
 from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
@@ -150,7 +150,8 @@ def with_errors(
 def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = None) -> EnvBase:
     """Return an environment in which navigators of two numbers declare their arrival, where it must be declared.
 
-    They declare by a filter of their own track (:class:`~magrl.transforms.DeclareArrival`).
+    They declare by a filter of their own track (:class:`~magrl.transforms.DeclareArrival`). Where readings come with
+    standard deviations, that of the noise is scaled by what the readings show (:class:`~magrl.transforms.NoiseScale`).
 
     Args:
         env: navigation environment with all errors of the sensors.
@@ -174,5 +175,5 @@ def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = 
         range_km=farthest,
         in_keys=(*DeclareArrival.default_in_keys, *told),
     )
-    track = TrackGradient((*IN_KEYS, *told))
-    return TransformedEnv(env, Compose(track, declare), auto_unwrap=True)
+    track = [*[NoiseScale()] * bool(told), TrackGradient((*IN_KEYS, *told))]
+    return TransformedEnv(env, Compose(*track, declare), auto_unwrap=True)

@@ -11,7 +11,7 @@ from torchrl.envs import Compose
 from magrl import tracking
 from magrl.onboard.limits import view_of
 from magrl.tracking import ArrivalDecision, FieldTrack
-from magrl.transforms import TrackGradient, TrackView
+from magrl.transforms import NoiseScale, TrackGradient, TrackView
 from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS
 
 
@@ -36,7 +36,9 @@ class Estimator:
         self.trained = isinstance(view, TrackView)
         track = TrackGradient((*IN_KEYS, *STD_KEYS))
         self.observe = navigator.observe if self.trained else Compose(track)
-        self.state_keys = view.state_keys if isinstance(view, TrackView) else track.state_keys
+        self.noise = NoiseScale()
+        state_keys = view.state_keys if isinstance(view, TrackView) else track.state_keys
+        self.state_keys = (*state_keys, *self.noise.out_keys)
         self.state: Any = None
 
     def act(self, seen: TensorDictBase) -> list[float]:
@@ -46,17 +48,19 @@ class Estimator:
             seen: public keys and standard deviations after a move, in a batch of one.
         """
         now = seen.copy()
-        observed = self.observe(now) if self.state is None else self.observe(self.state.set("next", now))["next"]
+        observed = self.observe(self.noise(now if self.state is None else self.state.set("next", now)))
+        observed = observed if self.state is None else observed["next"]
         self.state = observed.select(*self.state_keys)
         if self.trained:
             action = self.navigator.act.denormalize("action", self.navigator.actor(observed)["action"])
         else:
-            action = self.navigator(seen)["action"]
+            action = self.navigator(observed)["action"]
         return action[0].tolist()
 
     def decide(self, seen: TensorDictBase, steps_left: Tensor, radius_km: float) -> ArrivalDecision:
         """Return the decision about the arrival, in a batch of one; see :func:`magrl.tracking.arrival_decision`."""
-        target, new, lasting, slow = (seen[key] for key in ("target_field", *STD_KEYS))
+        target, lasting, slow = (seen[key] for key in ("target_field", *STD_KEYS[1:]))
+        new = self.state[self.noise.out_keys[0]]
         track = FieldTrack(*(self.state[key].to(target.dtype) for key in OUT_KEYS[:2]))
         return tracking.arrival_decision(track, target, new, lasting, slow, steps_left, radius_km)
 

@@ -41,7 +41,7 @@ LOST_SURPRISE = 100.0
 simulation, it reached 5 with a right data sheet, and 31 under the conditions of an aircraft."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 4
-_FORMAT, _NOT_STARTED = 6, "the vehicle has no destination yet: call start(target) first"
+_FORMAT, _NOT_STARTED = 7, "the vehicle has no destination yet: call start(target) first"
 _OPTIONS = ("name", "sensor_std", "bias_std", "drift_std", "max_move_km", "max_turn_deg", "max_steps", "arrival_km")
 # Parts of the state that are numbers
 _PLAIN = "_step", "_steer", "_last", "_surprises", "_northward", "_unchanged", "_known", "_near", "_error", "_left_std"

@@ -1,5 +1,7 @@
 """Estimation of a field and its gradient along a dead-reckoned track."""
 
+from magrl.tracking.belief import NoiseEstimate as NoiseEstimate
+from magrl.tracking.belief import noise_estimate as noise_estimate
 from magrl.tracking.belief import steepest as steepest
 from magrl.tracking.belief import surprise as surprise
 from magrl.tracking.decision import RANGE_KM as RANGE_KM

@@ -1,6 +1,8 @@
-"""How well a reading fits the track, and how steep the field may be."""
+"""How well readings fit the track, what this says of their noise, and how steep the field may be."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +19,85 @@ from magrl.tracking.filter import (
     estimated_field,
     predict,
 )
+from magrl.tracking.planning import MISSING_KM, sensor_length
 from magrl.tracking.priors import field_curvature
+from magrl.tracking.track import reading_std
+
+# Compared with others on random planets: docs/results/data-sheet-options.md.
+SHEET_READINGS = 4.0
+"""Number of readings that count as much as the data sheet, where its noise is estimated."""
+SHARED = 0.5
+"""Weight of an element's readings in the estimates of the other elements."""
+DEAD_BAND = 0.4
+"""Deviation of the logarithm of the variance up to which the data sheet is kept; beyond, it is subtracted."""
+LARGEST_SCORE, LARGEST_RATIO = 8.0, 64.0  # of one reading (three standard deviations), and of variances
+
+
+class NoiseEstimate(NamedTuple):
+    """Logarithm ``(..., E)`` of the variance of the noise over that of the data sheet, and the effective number
+    ``(..., E)`` of readings from which it is known.
+
+    Example:
+        >>> NoiseEstimate(torch.tensor([0.3, 1.8]), torch.tensor([9.0, 9.0])).factor.round(decimals=2)
+        tensor([1.0000, 2.0100])
+    """
+
+    log_ratio: Tensor
+    readings: Tensor
+
+    @property
+    def factor(self) -> Tensor:
+        """Factor ``(..., E)`` of the standard deviation on the data sheet; 1 within :data:`DEAD_BAND`."""
+        beyond = (self.log_ratio.abs() - DEAD_BAND).clamp_min(0)
+        return (self.log_ratio.sign() * beyond / 2).exp()
+
+
+def noise_estimate(
+    before: NoiseEstimate,
+    track: FieldTrack,
+    displacement: Tensor,
+    reading: Tensor,
+    sensor_std: Tensor,
+    drift_std: Tensor,
+) -> NoiseEstimate:
+    """Return the estimate of the noise of D, I, B_H after another reading.
+
+    The squared innovation over its variance S is 1 on average. Its mean over the track is weighted by the squared share
+    of S that is noise: an innovation that comes from an unknown gradient says little of the noise. Elements share a
+    part of the evidence (:data:`SHARED`), as a data sheet is often wrong for all of them. A missing reading, and an
+    element without noise, change nothing.
+
+    Args:
+        before: estimate before the reading; zeros at the start.
+        track: state of the filter before the move.
+        displacement: ``(..., 2)`` northward and eastward [km].
+        reading: ``(..., 3)`` at its end.
+        sensor_std: ``(..., 3)`` standard deviations of its noise on the data sheet.
+        drift_std: ``(..., 3)`` those of slow errors.
+
+    Source:
+        R. K. Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Transactions on Automatic
+        Control 15 (1970).
+
+    Example:
+        >>> track = FieldTrack(torch.zeros(3, 3), torch.zeros(3, 3, 3))
+        >>> none, std = torch.zeros(3), torch.tensor([0.3, 1.5, 100.0])
+        >>> reading = torch.tensor([0.6, 1.5, 100.0])  # D deviates by two standard deviations
+        >>> noise_estimate(NoiseEstimate(none, none), track, torch.zeros(2), reading, std, none)
+        NoiseEstimate(log_ratio=tensor([0.5000, 0.2500, 0.2500]), readings=tensor([2., 2., 2.]))
+    """
+    innovation, variance, unit = _innovation(track, displacement, reading, ELEMENT_SCALES)
+    noise = (sensor_std / unit).square() * before.log_ratio.exp()
+    slow = reading_std(torch.zeros_like(drift_std), drift_std) / unit
+    total = (variance + noise + slow.square()).clamp_min(VARIANCE_FLOOR**2)
+    known = sensor_length(sensor_std).unsqueeze(-1) < MISSING_KM
+    share = torch.where(known, noise / total, 0.0).square()
+    score = (share * (innovation.square() / total - 1)).clamp_max(LARGEST_SCORE)
+    share, score = (SHARED * x.sum(-1, keepdim=True) + (1 - SHARED) * x for x in (share, score))
+    readings = before.readings + share
+    limit = torch.tensor(LARGEST_RATIO).log().item()
+    log_ratio = before.log_ratio + score / (SHEET_READINGS + readings)
+    return NoiseEstimate(log_ratio.clamp(-limit, limit), readings)
 
 
 def surprise(
@@ -44,13 +124,10 @@ def surprise(
         1.3333333333333333
     """
     track = FieldTrack(*(tensor.double() for tensor in track))
-    curvature = field_curvature(estimated_field(track, scales))
-    predicted = predict(track, displacement, curvature, scales)
-    unit, usual = _units(predicted, scales), _units(predicted, ELEMENT_SCALES)
-    innovation = continued(reading, predicted, scales, ELEMENT_PERIODS) / unit - predicted.mean[:, 0]
+    innovation, variance, unit = _innovation(track, displacement, reading, scales)
+    usual = _units(track, ELEMENT_SCALES)
     noise = _variance(sensor_std, usual).clamp_min(VARIANCE_FLOOR)
-    variance = predicted.covariance[:, 0, 0] + noise * (usual / unit).square()
-    return (innovation.square() / variance).mean().item()
+    return (innovation.square() / (variance + noise * (usual / unit).square())).mean().item()
 
 
 def steepest(track: FieldTrack, element: int, scales: PerElement = ELEMENT_SCALES) -> float:
@@ -71,3 +148,13 @@ def steepest(track: FieldTrack, element: int, scales: PerElement = ELEMENT_SCALE
     """
     largest = torch.linalg.eigvalsh(track.covariance[element, 1:, 1:].double())[-1].clamp_min(0).sqrt()
     return ((track.mean[element, 1:].norm() + 2 * largest) * _units(track, scales)[element]).item()
+
+
+def _innovation(
+    track: FieldTrack, displacement: Tensor, reading: Tensor, scales: PerElement
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the innovation ``(..., E)`` of a reading, the variance of its prediction, and the units of both."""
+    predicted = predict(track, displacement, field_curvature(estimated_field(track, scales)), scales)
+    unit = _units(predicted, scales)
+    innovation = continued(reading, predicted, scales, ELEMENT_PERIODS) / unit - predicted.mean[..., 0]
+    return innovation, predicted.covariance[..., 0, 0], unit

@@ -17,6 +17,7 @@ from magrl.tracking import STEP_PRICE, FieldTrack, GradientPrior, GradientRelati
 from magrl.transforms.base import (
     GivenKeys,
     StatefulTransform,
+    several_keys,
 )
 
 STD_KEYS = ("sensor_std", "bias_std", "drift_std")
@@ -188,6 +189,65 @@ class TrackGradient(StatefulTransform):
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
             way = _turned(way.unsqueeze(-2), heading).squeeze(-2)
         return field, gradient, way, covariance
+
+
+class NoiseScale(StatefulTransform):
+    """Scale the standard deviation of the noise on the data sheet by what the readings along the track show.
+
+    Where the data sheet is too small, estimates are too sure, and arrivals are declared too soon; where it is too
+    large, readings are wasted. See :func:`magrl.tracking.noise_estimate`. It stands before :class:`TrackGradient`, so
+    that this and all that follow read the scaled value. Its state is in the TensorDict.
+
+    Args:
+        in_keys: reading ``(..., 3)``, the last move ``(..., K)`` (distance [km] first), heading ``(..., 1)`` [rad], and
+            the standard deviations ``(..., 3)`` of the noise on the data sheet and of slow errors.
+        out_keys: the standard deviation of the noise ``(..., 3)``, by default in place of that of the data sheet; and
+            the state: logarithms of the ratios of the variances ``(..., 3)``, and the effective numbers of readings
+            ``(..., 3)``.
+        track_keys: mean and covariance of the filter of :class:`TrackGradient`, which are read before a step.
+
+    Raises:
+        ValueError: for another number of keys, or shapes that do not match.
+        KeyError: for a step from a TensorDict without the state.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from magrl.transforms import SensorNoise
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), NoiseScale(), TrackGradient((*IN_KEYS, *STD_KEYS)))
+        >>> TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), steps).rollout(3)["noise_log_ratio"].shape
+        torch.Size([2, 3, 3])
+    """
+
+    default_in_keys = (IN_KEYS[0], *IN_KEYS[2:], STD_KEYS[0], STD_KEYS[2])
+    default_out_keys = (STD_KEYS[0], "noise_log_ratio", "noise_readings")
+    in_sizes = (3, None, 1, 3, 3)
+    out_sizes = ((3,),) * 3
+
+    def __init__(
+        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, track_keys: Sequence[NestedKey] = OUT_KEYS[:2]
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        self.track_keys = several_keys(track_keys)
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        none = torch.zeros_like(values[3])
+        self._write(tensordict, values[3], tracking.NoiseEstimate(none, none))
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        reading, move, heading, *std = (x.double() for x in values)
+        *before, mean, covariance = (x.double() for x in state)
+        track, displacement = FieldTrack(mean, covariance), tracking.displacement_of(move, heading)
+        estimate = tracking.noise_estimate(tracking.NoiseEstimate(*before), track, displacement, reading, *std)
+        self._write(tensordict, values[3], estimate)
+
+    def _write(self, tensordict: TensorDictBase, std: Tensor, estimate: tracking.NoiseEstimate) -> None:
+        for key, value in zip(self.out_keys, (std * estimate.factor, *estimate), strict=True):
+            tensordict.set(key, value.to(std.dtype))
+
+    def _state(self, tensordict: TensorDictBase) -> list[Tensor] | None:
+        state, track = super()._state(tensordict), self._read(tensordict, self.track_keys, state=True)
+        return None if state is None or track is None else [*state, *track]
 
 
 class SearchAim(StatefulTransform):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 from unittest import mock
@@ -12,9 +13,10 @@ from tqdm import tqdm
 
 from magrl.evaluation import summarize
 from magrl.evaluation.metrics import first_episode_mask
+from magrl.evaluation.runs import Noise
 from magrl.evaluation.tables import markdown_table
 from magrl.geodesy import geodesic
-from magrl.tracking import decision
+from magrl.tracking import belief, decision
 
 
 def reliability(
@@ -60,3 +62,30 @@ def decisions(
         changed = (f"{key} {value}" for key, value in rule.items())
         rows.append([", ".join([names(navigator)[0], *changed]), *cells])
     return markdown_table(["navigator", *columns], rows)
+
+
+def data_sheets(
+    navigators: Sequence[Spec],
+    *,
+    noise: Noise,
+    stated: Sequence[Sequence[float]],
+    rules: Sequence[Mapping[str, Any]],
+    confidence: float = 0.9,
+    tasks: int = 1000,
+    max_steps: int = 80,
+    planets: bool = False,
+) -> str:
+    """Return a row for each change of the constants of :mod:`magrl.tracking.belief`, a column for each data sheet.
+
+    A data sheet states the true noise times the factors of D, I and B_H. Vehicles declare with a least confidence that
+    they are within 25 km. An infinite ``DEAD_BAND`` keeps the data sheet.
+    """
+    base = earth_env(tasks, max_steps=max_steps, planets=planets, arrival="declared", arrival_radius_km=25.0)
+    measures, rows = ("success_rate", "spl", "false_arrival_rate", "steps"), []
+    for navigator, rule in tqdm(list(itertools.product(navigators, rules)), unit="row"):
+        with mock.patch.multiple(belief, **rule):
+            found = [summarize(flown(navigator, base, noise, confidence, stated=factors)) for factors in stated]
+        cells = [" / ".join(number(summary[name]) for name in measures) for summary in found]
+        changed = ("as stated" if value == math.inf else f"{key} {value}" for key, value in rule.items())
+        rows.append([", ".join([names(navigator)[0], *changed]), *cells])
+    return markdown_table(["navigator", *(" ".join(f"{x:g}" for x in factors) for factors in stated)], rows)

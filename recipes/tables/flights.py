@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import ObservationNorm, TransformedEnv
 
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, earth_scenario, planet_scenario
@@ -39,6 +40,7 @@ def flown(
     errors: Noise | Conditions,
     confidence: float = 0.0,
     known_start: Sequence[float] | None = None,
+    stated: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> TensorDictBase:
     """Return the measures of an episode of each vehicle, under noise or under the conditions of a real vehicle.
 
@@ -48,8 +50,9 @@ def flown(
         errors: noise of the sensors, or conditions.
         confidence: least probability at which navigators declare arrivals, where they must be declared.
         known_start: standard deviations of the elements at the start, where the vehicle knows them.
+        stated: noise on the data sheet over the true noise of D, I and B_H.
     """
-    return episode_measures(rollout(navigator, base, errors, confidence, known_start))
+    return episode_measures(rollout(navigator, base, errors, confidence, known_start, stated))
 
 
 def rollout(
@@ -58,9 +61,13 @@ def rollout(
     errors: Noise | Conditions,
     confidence: float = 0.0,
     known_start: Sequence[float] | None = None,
+    stated: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> TensorDictBase:
     """Return an episode of each vehicle, as :func:`flown` measures it."""
     env, sheet = with_errors(base, errors, base.seed, known_start)
+    if any(factor != 1 for factor in stated):
+        env = TransformedEnv(env, ObservationNorm(0.0, torch.tensor(stated), in_keys=["sensor_std"]), auto_unwrap=True)
+        sheet["sensor_std"] = tuple(a * b for a, b in zip(sheet["sensor_std"], stated, strict=True))
     if isinstance(navigator, str):
         navigator = {"name": navigator}
     if isinstance(navigator, Mapping):

@@ -206,6 +206,7 @@ KINDS: Mapping[str, Callable[..., str]] = {
     "globe": globe.globe,
     "reliability": declarations.reliability,
     "decisions": declarations.decisions,
+    "data_sheets": declarations.data_sheets,
     "evaluation": trainings.evaluation,
     "short": trainings.short,
     "noise_levels": trainings.noise_levels,

@@ -12,7 +12,7 @@ import pytest
 import torch
 from onnxruntime import InferenceSession
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, ObservationNorm, TransformedEnv
 
 from magrl.agents import FieldPolicy, PolicyConfig, load_pretrained
 from magrl.envs import GeomagneticNavEnv
@@ -65,14 +65,24 @@ def region_policy() -> FieldPolicy:
 
 
 @pytest.mark.parametrize(
-    ("name", "noise"), [("anywhere", NONE), ("anywhere", NOISE), ("kalman", NONE), ("secant", NOISE)]
+    ("name", "noise", "stated"),
+    [
+        ("anywhere", NONE, 1.0),
+        ("anywhere", NOISE, 1.0),
+        ("kalman", NONE, 1.0),
+        ("secant", NOISE, 1.0),
+        ("anywhere", (0.1, 0.1, 10.0), 2.5),
+        ("kalman", (0.05, 0.05, 5.0), 0.4),
+    ],
 )
-def test_commands_are_those_of_the_environment(name: str, noise: tuple[float, float, float]) -> None:
-    """Over a whole episode, with the declaration at its end."""
-    env = environment(noise, arrival="declared")
-    policy = make_navigator(name, getattr(env, "base_env", env), sensor_std=noise)
+def test_commands_are_those_of_the_environment(name: str, noise: Known, stated: float) -> None:
+    """Over a whole episode, with the declaration at its end; also with a wrong data sheet."""
+    env, sheet = environment(noise, arrival="declared"), tuple(stated * std for std in noise)
+    policy = make_navigator(name, getattr(env, "base_env", env), sensor_std=sheet)
+    if stated != 1:
+        env = TransformedEnv(env, ObservationNorm(0.0, stated, in_keys=["sensor_std"]), auto_unwrap=True)
     env = with_declaration(env)
-    vehicle = Onboard(name, sensor_std=noise, max_steps=50, confidence=0.0)
+    vehicle = Onboard(name, sensor_std=sheet, max_steps=50, confidence=0.0)
     restart(env)
     state, over, steps = env.reset(), False, 0
     vehicle.start(state["target_field"][0].tolist())

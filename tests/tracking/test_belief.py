@@ -1,9 +1,44 @@
-"""How well a reading fits the track."""
+"""How well readings fit the track, and what this says of their noise."""
 
 import pytest
-from support.tracks import f64
+import torch
+from support.tracks import F64, SCALES, STD, f64, randn, started
 
-from magrl.tracking import FieldTrack, surprise
+from magrl.tracking import FieldTrack, NoiseEstimate, noise_estimate, read, surprise
+
+HERE = f64(8.0, -16.0, 35000.0)
+
+
+def estimated(true: torch.Tensor, stated: torch.Tensor, readings: int = 40, vehicles: int = 200) -> torch.Tensor:
+    """Mean factor of the data sheet after readings at one place."""
+    track, zeros = started(HERE.expand(vehicles, 3), tuple(stated.tolist())), torch.zeros(vehicles, 3, dtype=F64)
+    estimate, still = NoiseEstimate(zeros, zeros), zeros[:, :2]
+    for reading in HERE + true * randn(readings, vehicles, 3):
+        estimate = noise_estimate(estimate, track, still, reading, stated, 0 * stated)
+        track = read(track, still, reading, stated * estimate.factor)
+    return estimate.factor.mean(0)
+
+
+@pytest.mark.parametrize(("true", "low", "high"), [(0.4, 0.45, 0.6), (1.0, 0.97, 1.03), (3.0, 2.2, 2.8)])
+def test_readings_show_the_noise(true: float, low: float, high: float) -> None:
+    """A deviation is found, less the dead band; the noise as stated stays as it is."""
+    factor = estimated(true * f64(*STD), f64(*STD))
+    assert (factor > low).all()
+    assert (factor < high).all()
+
+
+def test_an_element_with_more_noise_stands_out() -> None:
+    factor = estimated(f64(4.0, 1.0, 1.0) * f64(*STD), f64(*STD))
+    assert factor[0] > 1.5 * factor[1:].max()
+
+
+def test_what_says_nothing_of_the_noise_changes_nothing() -> None:
+    """A missing reading; an element without noise; an innovation that comes from an unknown gradient."""
+    track, before = started(HERE), NoiseEstimate(0.1 * f64(1.0, 2.0, 3.0), f64(1.0, 1.0, 1.0))
+    none, far = f64(0.0, 0.0, 0.0), HERE + 10 * SCALES
+    for std, way in ((f64(1e4, 1e4, 1e4), 0.0), (none, 0.0), (1e-3 * f64(*STD), 500.0)):
+        after = noise_estimate(before, track, f64(way, way), far, std, none)
+        torch.testing.assert_close(torch.stack(after), torch.stack(before), atol=1e-3, rtol=0)
 
 
 def test_the_surprise_does_not_depend_on_the_units_of_the_state() -> None:

@@ -12,7 +12,7 @@ import torch
 from support.readings import first_reading, moved
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, ObservationNorm, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from magrl import tracking
@@ -21,6 +21,7 @@ from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic, wrap_angle
 from magrl.tracking import FieldTrack, GradientPrior, curl_relation
 from magrl.transforms import (
+    NoiseScale,
     SearchAim,
     SensorErrors,
     SensorNoise,
@@ -240,15 +241,32 @@ def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
 def searching(frame: str) -> TransformedEnv:
     base = GeomagneticNavEnv(num_envs=64, seed=3, start_heading="random")
     errors = SensorErrors((0.02, 0.02, 2.0), bias=(0.3, 0.0, 0.0), seed=1)
-    track = TrackGradient((*IN_KEYS, *STD_KEYS), frame=frame)
-    return TransformedEnv(base, Compose(errors, track, SearchAim(zeta=0.01, frame=frame)))
+    track = NoiseScale(), TrackGradient((*IN_KEYS, *STD_KEYS), frame=frame)
+    return TransformedEnv(base, Compose(errors, *track, SearchAim(zeta=0.01, frame=frame)))
 
 
 def test_specs() -> None:
     env = searching("vehicle")
     check_env_specs(env, break_when_any_done="both")
-    state = {*STATE, "visited", "arrival_weights"}
-    assert state == {*OUT_KEYS, "aim", "visited", "arrival_weights"} & set(env.full_state_spec.keys())
+    state = {*STATE, "visited", "arrival_weights", *NoiseScale.default_out_keys[1:]}
+    assert state == {*OUT_KEYS, "aim", *STD_KEYS, *state} & set(env.full_state_spec.keys())
+
+
+def test_the_filter_weighs_readings_by_the_noise_that_they_show() -> None:
+    """A data sheet that states a twentieth of the noise, to vehicles that stay where they are."""
+    base, stay = GeomagneticNavEnv(num_envs=64, seed=3), torch.zeros(64, 2)
+    variances = []
+    for scaled in ([], [NoiseScale()]):
+        noise, sheet = SensorNoise((0.1, 0.1, 10.0), seed=1), ObservationNorm(0.0, 0.05, in_keys=["sensor_std"])
+        env = TransformedEnv(base, Compose(noise, sheet, *scaled, TrackGradient((*IN_KEYS, *STD_KEYS))))
+        state = env.reset()
+        for _ in range(12):
+            state = env.step_mdp(env.step(state.set("action", stay)))
+        variances.append(state[STATE[1]][:, :, 0, 0].mean(0))
+    assert (variances[1] > 5 * variances[0]).all()
+    assert (state["sensor_std"] > 0.2 * torch.tensor((0.1, 0.1, 10.0))).all()
+    with pytest.raises(KeyError, match=r"NoiseScale reads its state \['track_mean'"):
+        env.step(state.exclude(*STATE))
 
 
 def test_both_frames_give_the_same_way() -> None:
