@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -37,6 +38,8 @@ STOPS = (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8)
 """Distances from the estimated place to which a vehicle may come to read, as shares of the radius."""
 SHORT = 0.25
 """The least distance at which it stops, as a share of the radius: estimates vary by more."""
+TURN_DEG = 90.0
+"""Turn before each further reading there, so that errors which turn with the vehicle, such as iron, average out."""
 READINGS = (1, 2, 4, 8, 16, 32)
 """Numbers of further readings there that are compared with declaring now."""
 
@@ -139,7 +142,8 @@ def approach(
 ) -> Tensor:
     """Return the action ``(..., 2)``, distance [km] and turn [rad], that goes toward the estimated place.
 
-    Where the turn is larger than the largest, the vehicle turns where it is.
+    Where the turn is larger than the largest, the vehicle turns where it is. Where it has come near enough and reads
+    on, it turns by :data:`TURN_DEG` to the right.
 
     Args:
         way: ``(..., 2)`` northward and eastward [km].
@@ -151,6 +155,8 @@ def approach(
     Example:
         >>> approach(torch.tensor([0.0, 30.0]), torch.tensor([0.0]), torch.tensor([10.0]), 50.0, 1.6).round(decimals=2)
         tensor([20.0000,  1.5700])
+        >>> approach(torch.tensor([0.0, 8.0]), torch.tensor([0.0]), torch.tensor([10.0]), 50.0, 3.0).round(decimals=2)
+        tensor([0.0000, 1.5700])
     """
     check_tensor(2, way=way)
     north, east = way.split(1, -1)
@@ -158,6 +164,7 @@ def approach(
     limit = torch.as_tensor(max_turn_rad, dtype=way.dtype, device=way.device)
     longest = torch.as_tensor(max_move_km, dtype=way.dtype, device=way.device)
     distance = (torch.hypot(north, east) - stop_km).clamp_min(0).clamp_max(longest)
+    turn = turn.where(distance > 0, math.radians(TURN_DEG))
     return torch.cat((distance.where(turn.abs() <= limit, 0.0), torch.minimum(torch.maximum(turn, -limit), limit)), -1)
 
 

@@ -163,7 +163,7 @@ def paired_difference(first: Tensor, second: Tensor, region: Tensor) -> str:
 
 def columns_of(conditions: Sequence[str]) -> dict[str, Noise | Conditions]:
     """Return some conditions by name, or the levels of noise."""
-    columns: dict[str, Noise | Conditions] = {name: conditions_named(name) for name in conditions}
+    columns: dict[str, Noise | Conditions] = {found.name: found for found in map(conditions_named, conditions)}
     return columns or {", ".join(f"{level:g}" for level in noise): noise for noise in LEVELS}
 
 

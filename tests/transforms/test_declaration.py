@@ -109,16 +109,24 @@ def test_the_accuracy_decides_and_confidence_prevents_false_arrivals() -> None:
 
 
 def test_it_goes_to_the_estimated_place_where_that_is_near() -> None:
-    """20 km to the east of a vehicle that heads north, at a probability that is worth no declaration; and 30 km."""
-    env = declaring(2)
-    state = env.reset().set("action", torch.tensor([[50.0, -1.0]]).expand(2, 2))
-    state["arrival_way"] = torch.tensor([[0.0, 20.0], [0.0, 30.0]])
-    state["arrival_probability"], state["arrival_worth"] = torch.zeros(2, 1), torch.ones(2, 1)
-    state["arrival_stop"] = torch.tensor([[12.0], [12.0]])
+    """20 km to the east of a vehicle that heads north, at a probability that is worth no declaration; and 30 km.
+
+    Where it is near enough, 10 km to the west, it turns to read on another heading.
+    """
+    env = declaring(3)
+    state = env.reset().set("action", torch.tensor([[50.0, -1.0]]).expand(3, 2))
+    state["arrival_way"] = torch.tensor([[0.0, 20.0], [0.0, 30.0], [0.0, -10.0]])
+    state["arrival_probability"], state["arrival_worth"] = torch.zeros(3, 1), torch.ones(3, 1)
+    state["arrival_stop"] = torch.full((3, 1), 12.0)
     sent = env.transform.inv(state)["action"]
-    assert sent.tolist() == [pytest.approx([20.0 - 12.0, math.pi / 2, -1.0]), [50.0, -1.0, -1.0]]
+    quarter = math.pi / 2
+    assert sent.tolist() == [
+        pytest.approx([20.0 - 12.0, quarter, -1.0]),
+        [50.0, -1.0, -1.0],
+        pytest.approx([0.0, quarter, -1.0]),
+    ]
     state["arrival_probability"] += 1
-    assert env.transform.inv(state)["action"].tolist() == [[0.0, 0.0, 1.0]] * 2
+    assert env.transform.inv(state)["action"].tolist() == [[0.0, 0.0, 1.0]] * 3
 
 
 def test_nothing_privileged_decides() -> None:
