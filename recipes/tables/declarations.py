@@ -83,7 +83,7 @@ def data_sheets(
     base = earth_env(tasks, max_steps=max_steps, planets=planets, arrival="declared", arrival_radius_km=25.0)
     measures, rows = ("success_rate", "spl", "false_arrival_rate", "steps"), []
     for navigator, rule in tqdm(list(itertools.product(navigators, rules)), unit="row"):
-        with mock.patch.multiple(belief, **rule):
+        with mock.patch.multiple(belief, **{"DEAD_BAND": belief.DEAD_BAND, **rule}):
             found = [summarize(flown(navigator, base, noise, confidence, stated=factors)) for factors in stated]
         cells = [" / ".join(number(summary[name]) for name in measures) for summary in found]
         changed = ("as stated" if value == math.inf else f"{key} {value}" for key, value in rule.items())
