@@ -23,8 +23,8 @@ class DeclareArrival(ObservationTransform):
     For an environment whose action has a third number that declares the arrival. To the policy, the action has the
     first two. Where the vehicle is probably within the radius, and further readings are not worth their cost
     (:func:`magrl.tracking.arrival_decision`), it stays where it is and declares. Before, where its estimated distance
-    is less than the radius, it goes toward the estimated place and stops where readings are worth most. Elsewhere it
-    moves as the policy wants.
+    is less than the radius, it goes toward the estimated place (:func:`magrl.tracking.approach`), stops where readings
+    are worth most, and turns between them. Elsewhere it moves as the policy wants.
 
     In ``Compose``, it stands behind :class:`TrackGradient`. It reads nothing privileged.
 
