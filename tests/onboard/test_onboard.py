@@ -68,7 +68,6 @@ def region_policy() -> FieldPolicy:
     ("name", "noise", "stated"),
     [
         ("anywhere", NONE, 1.0),
-        ("kalman", NONE, 1.0),
         ("secant", NOISE, 1.0),
         ("anywhere", (0.1, 0.1, 10.0), 2.5),
         ("kalman", (0.05, 0.05, 5.0), 0.4),
