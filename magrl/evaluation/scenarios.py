@@ -175,5 +175,5 @@ def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = 
         range_km=farthest,
         in_keys=(*DeclareArrival.default_in_keys, *told),
     )
-    track = [*[NoiseScale()] * bool(told), TrackGradient((*IN_KEYS, *told))]
-    return TransformedEnv(env, Compose(*track, declare), auto_unwrap=True)
+    scale = [NoiseScale()] if told else []
+    return TransformedEnv(env, Compose(*scale, TrackGradient((*IN_KEYS, *told)), declare), auto_unwrap=True)

@@ -16,7 +16,7 @@ from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS
 
 
 class Estimator:
-    """The estimates of one vehicle, by the filter of an environment with :class:`~magrl.transforms.DeclareArrival`.
+    """The estimates of one vehicle, by the filter of :func:`~magrl.evaluation.scenarios.with_declaration`.
 
     A trained policy that reads its own track observes this filter. Beside any other navigator it runs on its own.
 
@@ -48,8 +48,10 @@ class Estimator:
             seen: public keys and standard deviations after a move, in a batch of one.
         """
         now = seen.copy()
-        observed = self.observe(self.noise(now if self.state is None else self.state.set("next", now)))
-        observed = observed if self.state is None else observed["next"]
+        if self.state is None:
+            observed = self.observe(self.noise(now))
+        else:
+            observed = self.observe(self.noise(self.state.set("next", now)))["next"]
         self.state = observed.select(*self.state_keys)
         if self.trained:
             action = self.navigator.act.denormalize("action", self.navigator.actor(observed)["action"])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from magrl.checks import check_tensor
 from magrl.tracking.filter import (
     ELEMENT_PERIODS,
     ELEMENT_SCALES,
@@ -19,7 +21,7 @@ from magrl.tracking.filter import (
     estimated_field,
     predict,
 )
-from magrl.tracking.planning import MISSING_KM, sensor_length
+from magrl.tracking.planning import MISSING_KM, SLOPES
 from magrl.tracking.priors import field_curvature
 from magrl.tracking.track import reading_std
 
@@ -30,7 +32,10 @@ SHARED = 0.5
 """Weight of an element's readings in the estimates of the other elements."""
 DEAD_BAND = 0.4
 """Deviation of the logarithm of the variance up to which the data sheet is kept; beyond, it is subtracted."""
-LARGEST_SCORE, LARGEST_RATIO = 8.0, 64.0  # of one reading (three standard deviations), and of variances
+LARGEST_SCORE = 8.0
+"""Largest score of one element in a reading, that of three standard deviations: a spike counts no more."""
+LARGEST_RATIO = 64.0
+"""Largest ratio of the variances: with the dead band, the standard deviation is scaled by at most 6.5."""
 
 
 class NoiseEstimate(NamedTuple):
@@ -62,10 +67,11 @@ def noise_estimate(
 ) -> NoiseEstimate:
     """Return the estimate of the noise of D, I, B_H after another reading.
 
-    The squared innovation over its variance S is 1 on average. Its mean over the track is weighted by the squared share
-    of S that is noise: an innovation that comes from an unknown gradient says little of the noise. Elements share a
-    part of the evidence (:data:`SHARED`), as a data sheet is often wrong for all of them. A missing reading, and an
-    element without noise, change nothing.
+    A step of recursive scoring. With the variance ``S = P + R + slow errors`` of the innovation ν, the score of log R
+    is ``(R / S) (ν^2 / S - 1)``, and its information ``(R / S)^2``, both up to a factor. An innovation that comes from
+    an unknown gradient says little of the noise. Elements share a part of the evidence (:data:`SHARED`), as a data
+    sheet is often wrong for all of them. An element without noise, or with so much that its reading is missing
+    (:data:`~magrl.tracking.planning.MISSING_KM`), gives no evidence.
 
     Args:
         before: estimate before the reading; zeros at the start.
@@ -75,9 +81,12 @@ def noise_estimate(
         sensor_std: ``(..., 3)`` standard deviations of its noise on the data sheet.
         drift_std: ``(..., 3)`` those of slow errors.
 
+    Raises:
+        ValueError: for shapes that do not match.
+
     Source:
         R. K. Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Transactions on Automatic
-        Control 15 (1970).
+        Control 15 (1970): noise from innovations; here by scoring, for one track.
 
     Example:
         >>> track = FieldTrack(torch.zeros(3, 3), torch.zeros(3, 3, 3))
@@ -86,16 +95,17 @@ def noise_estimate(
         >>> noise_estimate(NoiseEstimate(none, none), track, torch.zeros(2), reading, std, none)
         NoiseEstimate(log_ratio=tensor([0.5000, 0.2500, 0.2500]), readings=tensor([2., 2., 2.]))
     """
+    check_tensor(3, reading=reading, sensor_std=sensor_std, drift_std=drift_std)
     innovation, variance, unit = _innovation(track, displacement, reading, ELEMENT_SCALES)
     noise = (sensor_std / unit).square() * before.log_ratio.exp()
     slow = reading_std(torch.zeros_like(drift_std), drift_std) / unit
-    total = (variance + noise + slow.square()).clamp_min(VARIANCE_FLOOR**2)
-    known = sensor_length(sensor_std).unsqueeze(-1) < MISSING_KM
-    share = torch.where(known, noise / total, 0.0).square()
-    score = (share * (innovation.square() / total - 1)).clamp_max(LARGEST_SCORE)
-    share, score = (SHARED * x.sum(-1, keepdim=True) + (1 - SHARED) * x for x in (share, score))
-    readings = before.readings + share
-    limit = torch.tensor(LARGEST_RATIO).log().item()
+    total = variance + noise + slow.square()
+    known = (sensor_std > 0) & (sensor_std / sensor_std.new_tensor(SLOPES) < MISSING_KM)
+    gain = torch.where(known, noise / total, 0.0)
+    score = (gain * (innovation.square() / total - 1)).clamp_max(LARGEST_SCORE).where(known, 0.0)
+    score, weight = (SHARED * x.sum(-1, keepdim=True) + (1 - SHARED) * x for x in (score, gain.square()))
+    readings = before.readings + weight
+    limit = math.log(LARGEST_RATIO)
     log_ratio = before.log_ratio + score / (SHEET_READINGS + readings)
     return NoiseEstimate(log_ratio.clamp(-limit, limit), readings)
 

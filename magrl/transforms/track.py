@@ -192,11 +192,12 @@ class TrackGradient(StatefulTransform):
 
 
 class NoiseScale(StatefulTransform):
-    """Scale the standard deviation of the noise on the data sheet by what the readings along the track show.
+    """Scale the standard deviations of the noise of D, I, B_H on the data sheet by what the readings show.
 
     Where the data sheet is too small, estimates are too sure, and arrivals are declared too soon; where it is too
     large, readings are wasted. See :func:`magrl.tracking.noise_estimate`. It stands before :class:`TrackGradient`, so
-    that this and all that follow read the scaled value. Its state is in the TensorDict.
+    that this and all that follow read the scaled value; a navigator takes the larger of this and its own data sheet.
+    An element without noise keeps 0. Its state is in the TensorDict.
 
     Args:
         in_keys: reading ``(..., 3)``, the last move ``(..., K)`` (distance [km] first), heading ``(..., 1)`` [rad], and
@@ -208,7 +209,7 @@ class NoiseScale(StatefulTransform):
 
     Raises:
         ValueError: for another number of keys, or shapes that do not match.
-        KeyError: for a step from a TensorDict without the state.
+        KeyError: for a step from a TensorDict without the state or the track.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -229,6 +230,8 @@ class NoiseScale(StatefulTransform):
     ) -> None:
         super().__init__(in_keys, out_keys)
         self.track_keys = several_keys(track_keys)
+        if len(self.track_keys) != 2:
+            raise ValueError(f"track_keys must be those of the mean and the covariance, got {track_keys!r}")
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         none = torch.zeros_like(values[3])

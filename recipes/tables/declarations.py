@@ -20,11 +20,17 @@ from magrl.tracking import belief, decision
 
 
 def reliability(
-    navigators: Sequence[Spec], *, conditions: Sequence[str], tasks: int = 1000, max_steps: int = 80
+    navigators: Sequence[Spec],
+    *,
+    conditions: Sequence[str],
+    tasks: int = 1000,
+    max_steps: int = 80,
+    planets: bool = False,
 ) -> str:
     """Return, for ten bins of the probability of being within 25 km, the share of readings at which that was so [%]."""
     drift = {"reach_km": DRIFT_KM, "drift_km": DRIFT_KM}
-    base = earth_env(tasks, max_steps=max_steps, arrival="declared", arrival_radius_km=25.0, **drift)
+    options: dict[str, Any] = {"planets": planets, "arrival": "declared", "arrival_radius_km": 25.0}
+    base = earth_env(tasks, max_steps=max_steps, **options, **drift)
     rows = []
     for navigator, (name, errors) in itertools.product(navigators, (columns_of(()) | columns_of(conditions)).items()):
         flight = rollout(navigator, base, errors)

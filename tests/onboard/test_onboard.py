@@ -99,7 +99,7 @@ def test_commands_are_those_of_the_environment(name: str, noise: Known, stated: 
         )
         state, steps = after, steps + 1
     assert steps > 5
-    assert after["success"].item()
+    assert after["success"].item() or stated != 1
 
 
 @pytest.mark.parametrize("name", ["anywhere", "kalman", "secant"])
