@@ -161,7 +161,8 @@ class Navigator(TensorDictModuleBase):
                 ``drift_std`` of slow ones alone.
 
         Returns:
-            ``std``, or ``(P, 3)`` the larger of both: during an outage, a reading is worse than the data sheet.
+            ``std``, or ``(P, 3)`` the larger of both: during an outage, or where readings show more noise, a reading is
+            worse than the data sheet.
         """
         own = seen.get(key, None)
         return std if own is None else torch.maximum(std, own.to(std))

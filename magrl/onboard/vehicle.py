@@ -95,7 +95,8 @@ class Onboard:
     Args:
         navigator: ``"anywhere"`` for the pretrained agent, ``"secant"``, ``"kalman"`` or ``"run_and_tumble"``; or a
             policy from :func:`magrl.load_policy`, or a navigator, of which the vehicle gets a copy.
-        sensor_std: standard deviations of the noise of D [deg], I [deg], B_H [nT], new in each reading.
+        sensor_std: standard deviations of the noise of D [deg], I [deg], B_H [nT], new in each reading. Those that are
+            not 0 are corrected by what the readings show (:class:`~magrl.transforms.NoiseScale`).
         bias_std: standard deviations of constant and slow errors of the same.
         drift_std: those of the slow errors alone, which vary along the way: what a known start does not show, and what
             readings average in part.
