@@ -33,7 +33,7 @@ SHARED = 0.5
 DEAD_BAND = 0.4
 """Deviation of the logarithm of the variance up to which the data sheet is kept; beyond, it is subtracted."""
 LARGEST_SCORE = 8.0
-"""Largest score of one element in a reading, that of three standard deviations: a spike counts no more."""
+"""Largest evidence of one element in a reading, that of three standard deviations: a spike counts no more."""
 LARGEST_RATIO = 64.0
 """Largest ratio of the variances: with the dead band, the standard deviation is scaled by at most 6.5."""
 
@@ -67,11 +67,12 @@ def noise_estimate(
 ) -> NoiseEstimate:
     """Return the estimate of the noise of D, I, B_H after another reading.
 
-    A step of recursive scoring. With the variance ``S = P + R + slow errors`` of the innovation ν, the score of log R
-    is ``(R / S) (ν^2 / S - 1)``, and its information ``(R / S)^2``, both up to a factor. An innovation that comes from
-    an unknown gradient says little of the noise. Elements share a part of the evidence (:data:`SHARED`), as a data
-    sheet is often wrong for all of them. An element without noise, or with so much that its reading is missing
-    (:data:`~magrl.tracking.planning.MISSING_KM`), gives no evidence.
+    With the variance ``S = P + R + slow errors`` of the innovation ν, ``ν^2 / S - 1`` is 0 on average where R, with the
+    estimate so far, is right. The logarithm of R moves by it with the weight ``(R / S)^2``, over the sum of these
+    weights and of :data:`SHEET_READINGS`: an innovation that comes from an unknown gradient says little of the noise.
+    Elements share a part of the evidence (:data:`SHARED`), as a data sheet is often wrong for all of them. An element
+    without noise, or with so much that its reading is missing (:data:`~magrl.tracking.planning.MISSING_KM`), gives no
+    evidence.
 
     Args:
         before: estimate before the reading; zeros at the start.
@@ -86,7 +87,7 @@ def noise_estimate(
 
     Source:
         R. K. Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Transactions on Automatic
-        Control 15 (1970): noise from innovations; here by scoring, for one track.
+        Control 15 (1970): noise from innovations, here recursively and for one track.
 
     Example:
         >>> track = FieldTrack(torch.zeros(3, 3), torch.zeros(3, 3, 3))
@@ -101,9 +102,9 @@ def noise_estimate(
     slow = reading_std(torch.zeros_like(drift_std), drift_std) / unit
     total = variance + noise + slow.square()
     known = (sensor_std > 0) & (sensor_std / sensor_std.new_tensor(SLOPES) < MISSING_KM)
-    gain = torch.where(known, noise / total, 0.0)
-    score = (gain * (innovation.square() / total - 1)).clamp_max(LARGEST_SCORE).where(known, 0.0)
-    score, weight = (SHARED * x.sum(-1, keepdim=True) + (1 - SHARED) * x for x in (score, gain.square()))
+    weight = torch.where(known, noise / total, 0.0).square()
+    score = (weight * (innovation.square() / total - 1)).clamp_max(LARGEST_SCORE).where(known, 0.0)
+    score, weight = (SHARED * x.sum(-1, keepdim=True) + (1 - SHARED) * x for x in (score, weight))
     readings = before.readings + weight
     limit = math.log(LARGEST_RATIO)
     log_ratio = before.log_ratio + score / (SHEET_READINGS + readings)

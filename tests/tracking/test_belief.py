@@ -32,13 +32,13 @@ def test_readings_show_the_noise(true: float, low: float, high: float) -> None:
 def test_the_estimate_by_hand() -> None:
     """With P, R and a quarter of the variance of slow errors of 1, 2 and 1 each, in scaled units: R / S = 1 / 2.
 
-    The innovations are 0, 2 and 100 standard deviations of S: scores of -1/2, 3/2, and 8 in place of 5000.
+    The innovations are 0, 2 and 100 standard deviations of S: evidence of -1/4, 3/4, and 8 in place of 2500.
     """
     track = FieldTrack(f64(0.0).expand(3, 3), torch.eye(3, dtype=F64).expand(3, 3, 3))
     before, sheet, slow = NoiseEstimate(f64(2.0).log().expand(3), f64(1.0).expand(3)), SCALES, 2 * SCALES
     reading = f64(0.0, 2.0, 100.0) * 2 * SCALES
     after = noise_estimate(before, track, f64(0.0, 0.0), reading, sheet, slow)
-    scores, weights = (0.5 * x.sum() + 0.5 * x for x in (f64(-0.5, 1.5, 8.0), f64(0.25, 0.25, 0.25)))
+    scores, weights = (0.5 * x.sum() + 0.5 * x for x in (f64(-0.25, 0.75, 8.0), f64(0.25, 0.25, 0.25)))
     torch.testing.assert_close(after.readings, 1 + weights)
     torch.testing.assert_close(after.log_ratio, f64(2.0).log() + scores / (4 + 1 + weights))
     for _ in range(40):
