@@ -503,27 +503,33 @@ def test_the_rule_of_arrival(arrival_km: float, stop: str | None) -> None:
 
 @pytest.mark.slow
 def test_the_exported_step_is_the_vehicle_without_torchrl(tmp_path: Path) -> None:
-    """Bit for bit over an episode, in a process that can import neither TorchRL nor tensordict nor magrl."""
+    """Bit for bit over an episode, in a process that can import neither TorchRL nor tensordict nor magrl.
+
+    It is given the noise that the vehicle has corrected.
+    """
     policy = load_pretrained("anywhere")
     write_step(tmp_path / "step.pt2", policy)
     vehicle = Onboard(policy, sensor_std=NOISE, confidence=1.0)
     target, known, _ = episode(Secant(), environment(), limit=9)
     vehicle.start(target)
-    commands = [vehicle.step(*step) for step in known]
-    actions = [(command.distance_km, math.radians(command.turn_deg)) for command in commands]
-    mean = vehicle._estimator.track.mean
-    torch.save({"known": known, "target": target, "actions": actions, "mean": mean}, tmp_path / "episode.pt")
+    actions, noise = [], []
+    for step in known:
+        command = vehicle.step(*step)
+        actions.append((command.distance_km, math.radians(command.turn_deg)))
+        noise.append(vehicle._estimator.state["sensor_std"][0])
+    content = {"known": known, "target": target, "actions": actions, "noise": noise}
+    torch.save(content | {"mean": vehicle._estimator.track.mean}, tmp_path / "episode.pt")
     code = """
 import math, sys, torch
 for name in ("torchrl", "tensordict", "magrl"):
     sys.modules[name] = None
 module, episode = torch.export.load(sys.argv[1]).module(), torch.load(sys.argv[2])
-target, accuracy = torch.tensor(episode["target"]), torch.tensor(((0.02, 0.02, 2.0), (0.0,) * 3, (0.0,) * 3))
+target, none = torch.tensor(episode["target"]), torch.zeros(3)
 eye = torch.eye(3, dtype=torch.float64)
 state = torch.tensor(0), 0 * eye, eye.expand(3, 3, 3).clone(), torch.zeros(3)
-for (*reading, heading, distance), action in zip(episode["known"], episode["actions"]):
+for (*reading, heading, distance), action, noise in zip(*(episode[key] for key in ("known", "actions", "noise"))):
     course = torch.tensor([distance, math.remainder(math.radians(heading), 2 * math.pi)])
-    moved, _, _, *state = module(torch.tensor(reading), target, course, accuracy, *state)
+    moved, _, _, *state = module(torch.tensor(reading), target, course, torch.stack((noise, none, none)), *state)
     assert torch.equal(moved, torch.tensor(action)), (moved, action)
 assert torch.equal(state[1], episode["mean"])
 print(len(episode["actions"]), "equal")
