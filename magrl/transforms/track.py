@@ -208,7 +208,7 @@ class NoiseScale(StatefulTransform):
         track_keys: mean and covariance of the filter of :class:`TrackGradient`, which are read before a step.
 
     Raises:
-        ValueError: for another number of keys, or shapes that do not match.
+        ValueError: for another number of keys, shapes that do not match, or a place behind :class:`TrackGradient`.
         KeyError: for a step from a TensorDict without the state or the track.
 
     Example:
@@ -232,6 +232,12 @@ class NoiseScale(StatefulTransform):
         self.track_keys = several_keys(track_keys)
         if len(self.track_keys) != 2:
             raise ValueError(f"track_keys must be those of the mean and the covariance, got {track_keys!r}")
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Raise if the track is written before, by which the filter would not read the scaled value."""
+        if known := [key for key in self.track_keys if key in observation_spec.keys(True, True)]:
+            raise ValueError(f"NoiseScale stands before the transform that writes {known}: change their order")
+        return super().transform_observation_spec(observation_spec)
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         none = torch.zeros_like(values[3])

@@ -235,6 +235,25 @@ def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
     assert medians == pytest.approx([24.8, 12.4, 29.0, 21.9], abs=1.0)  # of chance, 90
 
 
+def test_the_scaled_noise_is_that_of_the_pure_function() -> None:
+    """Also where slow errors explain the deviation of a reading."""
+    first = first_reading().update({key: torch.tensor(STD).double().expand(4, 3) for key in STD_KEYS})
+    track, after = TrackGradient((*IN_KEYS, *STD_KEYS)), moved(first, 40.0, 0.3, torch.tensor((0.5, 0.2, 50.0)))
+    factors = []
+    for slow in (0.0, 50.0):
+        std = [first[key] * factor for key, factor in zip(STD_KEYS, (1, 1, slow), strict=True)]
+        after.update(dict(zip(STD_KEYS, std, strict=True)))
+        before = track(NoiseScale()(first.clone()))
+        written = NoiseScale()(before.clone().set("next", after.clone()))["next"]
+        way = tracking.displacement_of(after["move"], after["heading"])
+        none = tracking.NoiseEstimate(0 * std[0], 0 * std[0])
+        state = FieldTrack(*(before[key] for key in STATE))
+        estimate = tracking.noise_estimate(none, state, way, after["field"], std[0], std[2])
+        torch.testing.assert_close(written["sensor_std"], std[0] * estimate.factor)
+        factors.append(written["noise_log_ratio"])
+    assert (factors[1].abs() < factors[0].abs() / 2).all()
+
+
 # The search
 
 
@@ -263,6 +282,8 @@ def test_the_filter_weighs_readings_by_the_noise_that_they_show() -> None:
         for _ in range(12):
             state = env.step_mdp(env.step(state.set("action", stay)))
         variances.append(state[STATE[1]][:, :, 0, 0].mean(0))
+    with pytest.raises(ValueError, match=r"NoiseScale stands before the transform that writes \['track_mean'"):
+        _ = TransformedEnv(base, Compose(noise.clone(), TrackGradient(), NoiseScale())).specs
     assert (variances[1] > 5 * variances[0]).all()
     assert (state["sensor_std"] > 0.2 * torch.tensor((0.1, 0.1, 10.0))).all()
     with pytest.raises(KeyError, match=r"NoiseScale reads its state \['track_mean'"):
