@@ -154,11 +154,17 @@ def test_the_bound_is_that_of_readings_at_the_destination() -> None:
     assert flights.estimate_within(25.0, base, ship, (0.0, 0.0, 0.0)) > flights.estimate_within(25.0, base, ship)
 
 
-def test_reliability_counts_readings_by_their_probability() -> None:
-    table = rows(declarations.reliability(["secant"], conditions=["ship"], tasks=30, max_steps=12))[2:]
-    assert [row[1] for row in table][-1] == "ship"
-    assert len(table) == len(flights.LEVELS) + 1
-    assert all(float(row[2]) < 20 for row in table)
+def test_reliability_counts_readings_by_their_probability(monkeypatch) -> None:
+    """With an interval over regions, of which one alone says nothing."""
+    monkeypatch.setattr(flights, "LEVELS", [])
+    options = {"conditions": ["ship"], "tasks": 60, "max_steps": 25}
+    [many], [one] = (rows(declarations.reliability(["secant"], regions=n, **options))[2:] for n in (128, 1))
+    assert many[1] == "ship"
+    (least, _), (most, half) = (map(float, many[k].split(" ± ")) for k in (2, -1))
+    assert least < 20
+    assert 80 < most <= 100
+    assert half > 0
+    assert one[-1].endswith("± 0")
 
 
 def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone(monkeypatch) -> None:
