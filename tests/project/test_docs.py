@@ -44,6 +44,8 @@ BUDGET = {
     "anywhere_env(1000": "anywhere_env(8",
     '"sac.pt"), "test-1000"': '"sac.pt"), "figure-4-1"',
     "= 100_000, 1024, 1000": "= 128, 4, 2",
+    "earth_scenario(64, ": "earth_scenario(2, max_steps=5, ",
+    "earth_scenario(128, ": "earth_scenario(2, max_steps=5, ",
 }
 BUDGET |= {'(navigator, "paper-100")': '(navigator, "figure-4-1")', "random_tasks(100, ": "random_tasks(2, "}
 """Numbers of frames and tasks in examples, and those of their tests."""

@@ -117,7 +117,7 @@ def test_boxes_have_mean_and_lowest_rows() -> None:
 
 
 def test_vehicles_that_declare_have_a_row_for_each_confidence() -> None:
-    options = {"conditions": ["ship"], "tasks": 4, "within_km": 25}
+    options = {"conditions": ["ship"], "tasks": 4, "within_km": 25, "max_steps": 20}
     options |= {"arrivals": ["distance", 1.0, 0.0], "differences": [("secant", "secant")]}
     told, sure, bold, bound, difference = rows(grid.earth(["secant"], **options))[2:]
     assert difference[1:] == ["—", "declared", "+0.0 (+0.0 to +0.0)"]  # each column has a cell

@@ -48,11 +48,11 @@ def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
 
 
 def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None:
-    env = training_env(arrival="declared", arrival_radius_km=25.0, max_steps=80)
+    env = training_env(arrival="declared", arrival_radius_km=25.0, max_steps=40)
     check_env_specs(env)
     assert env.action_spec.shape == (6, 2)
     actor = PolicyConfig(recipe.make_view(env.base_env, 300.0), (8,)).make_actor()
-    td = env.rollout(80, actor, break_when_any_done=False)["next"]
+    td = env.rollout(40, actor, break_when_any_done=False)["next"]
     first = td["done"].cumsum(1) - td["done"].long() == 0
     assert ((td["declared"] & first).sum(1) == 1).all()
     right = td["success"] & first

@@ -98,9 +98,9 @@ def test_the_accuracy_decides_and_confidence_prevents_false_arrivals() -> None:
     keys = (*DeclareArrival.default_in_keys, *STD_KEYS)
     rates = []
     for confidence in (0.0, 0.7):
-        declare = DeclareArrival(25.0, max_steps=50, confidence=confidence, in_keys=keys)
+        declare = DeclareArrival(25.0, max_steps=30, confidence=confidence, in_keys=keys)
         steps = Compose(SensorErrors(STD, bias=BIAS, seed=1), TrackGradient((*IN_KEYS, *STD_KEYS)), declare)
-        env = TransformedEnv(declared(100), steps)
+        env = TransformedEnv(declared(100, max_steps=30), steps)
         rates.append(summarize(episode_measures(evaluation_rollout(env, Secant(sensor_std=STD)))))
     bold, careful = rates
     assert bold["success_rate"] + bold["false_arrival_rate"] == 100
