@@ -155,16 +155,16 @@ def test_the_bound_is_that_of_readings_at_the_destination() -> None:
 
 
 def test_reliability_counts_readings_by_their_probability(monkeypatch) -> None:
-    """With an interval over regions, of which one alone says nothing."""
-    monkeypatch.setattr(flights, "LEVELS", [])
+    """The interval is clustered by region: deviations within the only region cancel."""
+    monkeypatch.setattr(flights, "LEVELS", [(0.5, 0.1, 20.0)])
     options = {"conditions": ["ship"], "tasks": 60, "max_steps": 25}
-    [many], [one] = (rows(declarations.reliability(["secant"], regions=n, **options))[2:] for n in (128, 1))
-    assert many[1] == "ship"
-    (least, _), (most, half) = (map(float, many[k].split(" ± ")) for k in (2, -1))
-    assert least < 20
-    assert 80 < most <= 100
+    many, one = (rows(declarations.reliability(["secant"], regions=n, **options))[2:] for n in (128, 1))
+    assert [row[1] for row in many] == ["0.5, 0.1, 20", "ship"]
+    assert all(float(row[2].split(" ± ")[0]) < 20 for row in many)
+    share, half = map(float, many[1][-1].split(" ± "))
+    assert 80 < share <= 100
     assert half > 0
-    assert one[-1].endswith("± 0")
+    assert one[1][-1].endswith("± 0")
 
 
 def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone(monkeypatch) -> None:
