@@ -11,8 +11,9 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 from support.recipes import RECIPES
+from tensordict import TensorDict
 
-from magrl.envs import Scenario, Tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.field import IGRF
 from magrl.field.model import elements_gradient_at
 from magrl.tracking import decision
@@ -155,16 +156,29 @@ def test_the_bound_is_that_of_readings_at_the_destination() -> None:
 
 
 def test_reliability_counts_readings_by_their_probability(monkeypatch) -> None:
-    """The interval is clustered by region: deviations within the only region cancel."""
-    monkeypatch.setattr(flights, "LEVELS", [(0.5, 0.1, 20.0)])
-    options = {"conditions": ["ship"], "tasks": 60, "max_steps": 25}
-    many, one = (rows(declarations.reliability(["secant"], regions=n, **options))[2:] for n in (128, 1))
-    assert [row[1] for row in many] == ["0.5, 0.1, 20", "ship"]
-    assert all(float(row[2].split(" ± ")[0]) < 20 for row in many)
-    share, half = map(float, many[1][-1].split(" ± "))
-    assert 80 < share <= 100
-    assert half > 0
-    assert one[1][-1].endswith("± 0")
+    """By hand: vehicles of one region are 24 km off, the others 26 km; second readings are after the end."""
+    options = {"conditions": ["ship"], "tasks": 200, "regions": 2}
+    found: list[float] = []
+
+    def flight(_: object, base: GeomagneticNavEnv, __: object) -> TensorDict:
+        near = base.scenario.tasks.region == 0
+        count, share = len(near), near.double().mean().item()
+        found[:] = 100 * share, 196 * 2**0.5 * share * (1 - share)  # both regions deviate by as much, in sum
+        target = torch.zeros(count, 2, 2, dtype=torch.float64)
+        target[..., 0] = torch.where(near, 24, 26).unsqueeze(-1) / 110.574  # km in a degree of latitude
+        probability = torch.tensor([[0.55], [0.15]]).expand(count, 2, 1)
+        content = {"arrival_probability": probability, "position": 0 * target, "target_position": target}
+        return TensorDict(content | {"next": {"done": torch.ones(count, 2, 1, dtype=torch.bool)}}, (count, 2))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(declarations, "rollout", flight)
+        cells = rows(declarations.reliability(["secant"], **options))[-1][2:]
+    share, half = found
+    assert cells == [*["—"] * 5, f"{share:.0f} ± {half:.0f}", *["—"] * 4]
+    table = rows(declarations.reliability(["secant"], conditions=["ship"], tasks=30, max_steps=12))[2:]
+    assert [row[1] for row in table][-1] == "ship"
+    assert len(table) == len(flights.LEVELS) + 1
+    assert all(float(row[2].split(" ± ")[0]) < 20 for row in table)
 
 
 def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone(monkeypatch) -> None:
