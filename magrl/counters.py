@@ -118,16 +118,6 @@ def advanced(state: Tensor, draws: int | Tensor) -> Tensor:
     return state + (draws * _GOLDEN if isinstance(draws, Tensor) else _signed(draws * _GOLDEN))
 
 
-def split(state: Tensor) -> Tensor:
-    """Return the states of new streams, one from the next number of each stream: ``(...)`` int64.
-
-    Example:
-        >>> bool(split(torch.tensor([5])) == torch.tensor([5]))
-        False
-    """
-    return _mix(advanced(state, 1))
-
-
 def _signed(value: int) -> int:
     """Return a 64-bit pattern as a signed integer (two's complement)."""
     value &= 0xFFFFFFFFFFFFFFFF

@@ -22,6 +22,7 @@ from torchrl.envs import EnvBase
 
 from magrl import guidance
 from magrl.checks import check_choice, check_number, check_type
+from magrl.counters import counter_stream
 from magrl.envs import specs
 from magrl.envs.arrival import Arrival
 from magrl.envs.regions import Regions, one_region
@@ -30,6 +31,7 @@ from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, move, polar, wrap_angle
+from magrl.transforms.errors.base import EPISODE_STREAM
 from magrl.transforms.errors.motion import DISPLACEMENT
 from magrl.transforms.views import ObservationView
 
@@ -43,6 +45,7 @@ PRIVILEGED_KEYS = (
     "objective_weights",
     "success",
     "region",
+    EPISODE_STREAM,
 )
 """Keys that a policy may not read if it navigates by the field alone."""
 
@@ -78,8 +81,9 @@ class GeomagneticNavEnv(EnvBase):
     Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
     move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
     ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
-    ``objective_weights`` ``(N, 3)``, and the index of the region, ``region`` ``(N, 1)``. Action ``(N, 2)``: distance
-    [km], turn [rad]. Rewards ``(N, 1)``: ``reward``, and its terms ``reward_destination`` and ``reward_proximity``.
+    ``objective_weights`` ``(N, 3)``, the index of the region, ``region`` ``(N, 1)``, and ``episode_stream`` ``(N, 1)``,
+    int64, of seed, vehicle and episode, for random numbers of transforms. Action ``(N, 2)``: distance [km], turn [rad].
+    Rewards ``(N, 1)``: ``reward``, and its terms ``reward_destination`` and ``reward_proximity``.
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=4, seed=0, max_steps=80)
@@ -242,6 +246,7 @@ class GeomagneticNavEnv(EnvBase):
                 "objective_weights": weights.float(),
                 "success": flags["done"].clone(),
                 "region": region.unsqueeze(-1),
+                EPISODE_STREAM: counter_stream(self.seed, torch.stack((vehicle, episode), -1)).unsqueeze(-1),
                 **flags,
                 **({specs.DECLARED: flags["done"].clone()} if self.arrival.declared else {}),
                 **({DISPLACEMENT: zeros} if self.drift_km else {}),

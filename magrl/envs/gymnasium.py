@@ -26,7 +26,6 @@ from torchrl.envs import CatTensors, TransformedEnv
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.envs.measures import path_measures
 from magrl.envs.navigation import anywhere_env, navigation_env
-from magrl.transforms.errors.base import EpisodeErrors
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v0"
@@ -122,9 +121,6 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
             raise ValueError(f"reset() of {ENV_ID} takes no options, got {options}")
         if seed is not None:
             self.torchrl_env.set_seed(seed)
-            for part in self.torchrl_env.modules():
-                if isinstance(part, EpisodeErrors):
-                    part.restart()
         self._state = self.torchrl_env.reset()
         self._length_km = torch.zeros_like(self._length_km)
         return self._observe(self._state), {}

@@ -10,13 +10,21 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
+from magrl.transforms.errors.base import EPISODE_STREAM
 from magrl.transforms.errors.motion import DISPLACEMENT
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Terms whose sum is ``reward``."""
 DECLARED = "declared"
 """Flag that the vehicle has declared its arrival, where it must."""
-CONSTANT_KEYS = ("target_field", "target_position", "start_position", "objective_weights", "region")
+CONSTANT_KEYS = (
+    "target_field",
+    "target_position",
+    "start_position",
+    "objective_weights",
+    "region",
+    EPISODE_STREAM,
+)
 """Keys that keep their values throughout an episode."""
 STATE_KEYS = (*CONSTANT_KEYS, "heading", "step_count", "position", "objective", DISPLACEMENT)
 """Keys that a step reads: the state of an episode."""
@@ -115,6 +123,7 @@ def observation_spec(
         objective_weights=Unbounded((3,)),
         success=FLAG.clone(),
         region=Bounded(0, num_regions - 1, (1,), dtype=torch.int64),
+        episode_stream=Unbounded((1,), dtype=torch.int64),
         **more,
     )
 

@@ -22,7 +22,6 @@ from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.scenarios import with_declaration, with_errors
 from magrl.navigators import Navigator
 from magrl.transforms import conditions_named
-from magrl.transforms.errors.base import EpisodeErrors
 
 
 def evaluate(
@@ -106,12 +105,9 @@ def _with_tasks(tasks: Scenario | Tasks | str) -> Scenario:
 def _next_episodes(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
     """Return the measures of the next episode of each vehicle, ``(num_envs,)``, and count exactly this episode."""
     base = getattr(env, "base_env", env)
-    errors = [part for part in env.modules() if isinstance(part, EpisodeErrors)]
-    before = base.episode, [part.streams for part in errors]
+    before = base.episode
     measures = episode_measures(_rollout(env, policy), env)
-    base.episode = before[0]
-    for part, streams in zip(errors, before[1], strict=True):
-        part.streams = streams
+    base.episode = before
     env.reset()
     return TensorDict(measures, [env.num_envs])
 
@@ -181,9 +177,6 @@ def restart(env: EnvBase) -> None:
     base = getattr(env, "base_env", env)
     check_type(GeomagneticNavEnv, env=base)
     base.set_seed(base.seed)
-    for part in env.modules():
-        if isinstance(part, EpisodeErrors):
-            part.restart()
 
 
 def with_true_field(rollout: TensorDictBase) -> TensorDictBase:

@@ -107,6 +107,7 @@ ENTRIES = {
     "objective_weights": (3, torch.float32),
     "success": (1, torch.bool),
     "region": (1, torch.int64),
+    "episode_stream": (1, torch.int64),
 }
 FLAGS = dict.fromkeys(("done", "terminated", "truncated"), (1, torch.bool))
 REWARDS = dict.fromkeys(("reward", "reward_destination", "reward_proximity"), (1, torch.float32))

@@ -53,7 +53,7 @@ def scrambled(state: TensorDict) -> TensorDict:
     state = state.clone()
     for key in {*PRIVILEGED_KEYS} - {"region"}:
         value = state[key]
-        state[key] = ~value if value.dtype == torch.bool else torch.full_like(value, math.nan)
+        state[key] = torch.full_like(value, math.nan) if value.is_floating_point() else ~value
     return state
 
 

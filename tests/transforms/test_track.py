@@ -214,16 +214,13 @@ def test_bad_options_are_refused(options: dict, message: str) -> None:
 
 
 def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
-    """Median error of the estimated direction after one leg of 30 km in the direction of the first estimate, on Earth.
-
-    docs/theory.md quotes these numbers.
-    """
+    """Median error of the estimated direction after one leg of 30 km along the first estimate, on Earth."""
     scenario = earth_scenario(16, seed=5, max_latitude=70)
     keys = (*IN_KEYS, "sensor_std")
     medians = []
     for std in ((0.0, 0.0, 0.0), (0.05, 0.05, 5.0)):
         for relation in (None, curl_relation):
-            base = GeomagneticNavEnv(scenario, num_envs=1000, seed=0, start_heading="random", max_turn_deg=180.0)
+            base = GeomagneticNavEnv(scenario, num_envs=4000, seed=0, start_heading="random", max_turn_deg=180.0)
             track = TrackGradient(keys, relation=relation, frame="vehicle")
             env = TransformedEnv(base, Compose(SensorNoise(std, seed=1), track, TrueWay()))
             state = env.reset()
@@ -232,7 +229,7 @@ def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
             after = env.step(state.set("action", action))["next"]
             angles = [torch.atan2(after[key][:, 1], after[key][:, 0]) for key in ("way", "true_way")]
             medians.append(wrap_angle(angles[0] - angles[1]).abs().rad2deg().median().item())
-    assert medians == pytest.approx([24.8, 12.4, 29.0, 21.9], abs=1.0)  # of chance, 90
+    assert medians == pytest.approx([25.0, 13.1, 28.7, 22.0], abs=1.0)  # of chance, 90
 
 
 def test_the_scaled_noise_is_that_of_the_pure_function() -> None:

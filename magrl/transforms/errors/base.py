@@ -1,15 +1,15 @@
 """Base of the errors: random numbers of each vehicle and episode, what is true, and what a vehicle knows of accuracy.
 
-The random numbers of an error are a pure function of (seed, vehicle, episode, step). Each episode has a stream of
-them, whose state is in the TensorDict, so that a step depends on its input alone. The transform itself only holds the
-streams from which the next episodes split off.
+The random numbers of an error are a pure function of its seed, of the seed of the environment, and of vehicle, episode
+and step. Each episode has a stream of them, whose state is in the TensorDict, so that a step depends on its input alone
+and a transform holds no state.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from magrl.checks import check_number, check_numbers
-from magrl.counters import advanced, counter_stream, split
+from magrl.counters import advanced, counter_stream
 from magrl.geodesy import wrap_longitude
 from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 
@@ -28,6 +28,9 @@ TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 What a vehicle knows of its accuracy is the same everywhere, or follows from what it reads. Stated for the true field,
 or for a reading to which an error is still added, it would give that field or that reading away.
 """
+
+EPISODE_STREAM = "episode_stream"
+"""Key of a number of an episode from which errors derive their random numbers: ``(..., 1)`` int64, privileged."""
 
 
 class Episode(NamedTuple):
@@ -47,9 +50,11 @@ class EpisodeErrors(StatefulTransform):
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
-        seed: seed of the errors. TorchRL's ``env.set_seed`` does not reach transforms; see :meth:`restart`.
-        **keys: of values beside those: ``error_key``, of the errors of an episode ``(..., size)``, and ``stream_key``,
-            of the state of the random numbers ``(..., 1)``, int64. Both are privileged: a policy must not read them.
+        seed: seed of the errors, beside that of the environment.
+        **keys: of values beside those: ``episode_key``, of :data:`EPISODE_STREAM`, which the navigation environment
+            writes (without it, the numbers come from torch's default generator); ``error_key``, of the errors of an
+            episode ``(..., size)``; and ``stream_key``, of the state of the random numbers ``(..., 1)``, int64. They
+            are privileged: a policy must not read them.
 
     Raises:
         TypeError: for the name of a key that the class does not have.
@@ -66,6 +71,7 @@ class EpisodeErrors(StatefulTransform):
     """Second counter: it separates the numbers of a class from others of the same seed."""
     true_keys: ClassVar[tuple[str, ...]] = ()
     """Default keys of true values, which are privileged."""
+    episode_key: NestedKey = EPISODE_STREAM
     error_key: NestedKey = "error"
     stream_key: NestedKey = "stream"
     size: int
@@ -76,7 +82,6 @@ class EpisodeErrors(StatefulTransform):
     """Random numbers that an episode takes before its first reading."""
     step_draws = 0
     """Random numbers of each reading."""
-    streams: Tensor | None
 
     def __init__(
         self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, seed: int = 0, **keys: NestedKey | None
@@ -88,28 +93,6 @@ class EpisodeErrors(StatefulTransform):
             if not name.endswith("_key") or not hasattr(type(self), name):
                 raise TypeError(f"{type(self).__name__} has no option {name!r}")
             setattr(self, name, key)
-        self.register_buffer("streams", None)
-
-    # Episodes
-
-    def restart(self) -> None:
-        """Begin with the first episode of each vehicle again, so that the episodes repeat their errors."""
-        self.streams = None
-
-    def _next_episode(self, batch: torch.Size, device: torch.device, mask: Tensor | None) -> Tensor:
-        """Return the streams of new episodes; the rows of vehicles that are not reset are placeholders."""
-        if self.streams is None or self.streams.shape != batch:
-            vehicle = torch.arange(batch.numel(), device=device).reshape(batch)
-            self.streams = counter_stream(self.seed, torch.stack((vehicle, torch.full_like(vehicle, self.channel)), -1))
-        self.streams = self.streams.to(device)  # a checkpoint may come from another one
-        stream = split(self.streams)
-        # Advanced out of place: a checkpoint may hold the old tensor.
-        self.streams = advanced(self.streams, 1 if mask is None else mask.reshape(batch).long())
-        return stream
-
-    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        self.restart()  # the batch may have another size
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     # Data
 
@@ -126,10 +109,17 @@ class EpisodeErrors(StatefulTransform):
         """Write what the errors change in the values at ``in_keys``; return the errors for the next step."""
         raise NotImplementedError
 
-    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:
-        stream = self._next_episode(tensordict.batch_size, values[0].device, mask)
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        stream = self._episode_stream(tensordict, values[0].device)
         errors = self._constants(stream).to(self.error_dtype or values[0].dtype)
         self._write(tensordict, values, Episode(errors, advanced(stream, self.draws), first=True))
+
+    def _episode_stream(self, tensordict: TensorDictBase, device: torch.device) -> Tensor:
+        """Return the stream of the episode in each row, ``(...)``."""
+        episode = tensordict.get(self.episode_key, None)
+        if episode is None:
+            episode = torch.randint(-(2**63), 2**63 - 1, (*tensordict.batch_size, 1), device=device)
+        return counter_stream(self.seed, torch.nn.functional.pad(episode, (0, 1), value=self.channel))
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         errors, stream, *_ = state

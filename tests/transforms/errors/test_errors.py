@@ -3,44 +3,73 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
 from support.errors import STD, actions, all_errors, assert_same, every_error, flown, nav, under
 from tensordict import TensorDict
+from torchrl.envs import EnvBase, SerialEnv
 
-from magrl.counters import advanced, counter_stream, split
+from magrl.counters import advanced, counter_stream
+from magrl.envs.navigation import anywhere_env
+from magrl.envs.random_regions import planet_scenario
 from magrl.transforms import TRUE_KEYS, NorthReferenceError, SensorErrors, SensorNoise
 from magrl.transforms.errors.base import check_sizes, gauss_markov
 
 ERRORS = ("motion_error", "weather_clock", "sensor_error", "north_error")
 
 
-def test_errors_are_those_of_the_seed_and_of_each_vehicle() -> None:
-    """Whatever the batch; another seed, vehicle or episode has others; a restart repeats them."""
+def test_errors_are_those_of_the_seeds_and_of_each_vehicle() -> None:
+    """Whatever the batch; another seed of the errors or of the environment, vehicle or episode has others."""
     steps, env = actions(4, 3), all_errors(3)
     three = flown(env, steps)
     for one, other in zip(three, flown(all_errors(3), steps), strict=True):
         assert_same(one, other)
     two, again, other = flown(all_errors(2), steps[:, :2]), env.reset(), all_errors(3, seed=1).reset()
+    env.set_seed(1)
+    reseeded = env.reset()
     for key in ERRORS:
         torch.testing.assert_close(two[-1][key], three[-1][key][:2], rtol=1e-4, atol=1e-4)
-        for different in (again[key], other[key], three[0][key].flip(0)):
-            assert not torch.equal(different, three[0][key])
+        for different in (again[key], other[key], reseeded[key], three[0][key].roll(1, 0)):
+            assert not (different == three[0][key]).all(-1).any(), key
     env.set_seed(0)
-    for error in env.transform:
-        error.restart()
     assert_same(env.reset(), three[0])
 
 
 def test_numbers_are_those_of_the_counters() -> None:
     env = under(SensorNoise(STD, seed=7), num_envs=3)
-    rows = torch.stack((torch.arange(3), torch.ones(3, dtype=torch.int64)), -1)
-    of_vehicle = counter_stream(7, rows)
     for episode in range(2):
+        counters = torch.stack((torch.arange(3), torch.full((3,), episode)), -1)
+        of_episode = torch.stack((counter_stream(0, counters), torch.ones(3, dtype=torch.int64)), -1)
         for reading, state in enumerate(flown(env, actions(2, 3))):
-            expected = advanced(split(advanced(of_vehicle, episode)), 3 * reading)
+            expected = advanced(counter_stream(7, of_episode), 3 * reading)
             assert torch.equal(state["sensor_stream"], expected.unsqueeze(-1))
+
+
+def test_workers_have_noise_of_their_own() -> None:
+    """Whoever makes and seeds the environments: all levels of noise differ, and a seed repeats them."""
+    scenario = planet_scenario(2, seed=0, distance_range_km=(300, 500), start_heading="random")
+    options = {"max_steps": 5, "observation": ["sensor_std"], "scenario": scenario}
+
+    def levels(make: Callable[[int], EnvBase], seed: int) -> set[float]:
+        env = make(seed)
+        return {level for _ in range(3) for level in env.reset()["sensor_std"][..., 0].flatten().tolist() if level}
+
+    def serial(seed: int) -> EnvBase:
+        env = SerialEnv(4, partial(anywhere_env, **options))
+        env.set_seed(seed)
+        return env
+
+    def one_by_one(seed: int) -> EnvBase:
+        return SerialEnv(4, [partial(anywhere_env, seed=seed * 4 + k, **options) for k in range(4)])
+
+    for make in (serial, one_by_one, lambda seed: anywhere_env(4, seed=seed, **options)):
+        first = levels(make, 0)
+        assert len(first) >= 8  # 15 % of the 12 levels are 0
+        assert first == levels(make, 0)
+        assert not first & levels(make, 1)
 
 
 def test_partial_reset_leaves_the_other_vehicles_alone() -> None:
@@ -54,21 +83,6 @@ def test_partial_reset_leaves_the_other_vehicles_alone() -> None:
     second = all_errors(4)
     second.reset()
     assert torch.equal(after["sensor_stream"][chosen], second.reset()["sensor_stream"][chosen])
-
-
-def test_a_state_dict_holds_the_streams_of_the_next_episodes() -> None:
-    """A checkpoint may come from another device."""
-    env, other = all_errors(3), all_errors(3)
-    for _ in range(3):
-        env.reset()
-    other.load_state_dict(env.state_dict())
-    other.base_env.episode = env.base_env.episode
-    assert_same(env.reset(), other.reset())
-    other.load_state_dict(all_errors(3).state_dict())
-    other.base_env.set_seed(0)
-    assert_same(other.reset(), all_errors(3).reset())
-    error, meta = env.transform[0], torch.device("meta")
-    assert error._next_episode(torch.Size([3]), meta, None).device == error.streams.device == meta
 
 
 def test_accuracy_adds_up_and_the_first_error_keeps_the_truth() -> None:
