@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from magrl.checks import CheckedModel, check_number, check_tensor
 from magrl.field.elements import elements_jacobian, field_vector
@@ -19,16 +20,19 @@ from magrl.logs.units import guess_unit
 from magrl.logs.vectors import rotation
 from magrl.onboard.start import known_elements
 
-SOFT_IRON_STD, HARD_IRON_STD = 0.05, 1.0
-"""Standard deviations of soft iron, each entry, and of hard iron, as a share of the field, before the swing; chosen."""
+GAIN_STD, SOFT_IRON_STD, HARD_IRON_STD = 0.3, 0.05, 1.0
+"""Standard deviations before the swing, as shares of the field: of the gain that the axes have in common, of each entry
+of soft iron, and of hard iron; chosen."""
 MOST_STD = (10.0, 4.0, 1000.0)
 """Standard deviations of D [deg], I [deg], B_H [nT] beyond which a calibration is refused; chosen."""
 LEAST_SAMPLES = 100
 LEAST_SPREAD = 0.05
+LEAST_CHANGE = 0.01
+"""Change of the known field along a direction, as a share of it, below which it may be noise of the attitude."""
 MOST_OUTLIERS = 0.1
 OUTLIER_SIGMAS = 5.0
 _BLOCKS = 100  # of consecutive samples, whose errors are not independent
-_ROUNDS, _SETTLED = 20, 1e-7  # of the fit: a swing converges in 4 to 8; a change of matrix and offset as a share
+_ROUNDS, _SETTLED, _MOVING = 20, 1e-7, 1e-3  # of the fit: a swing converges in 4 to 8; changes of mix and offset
 _SWING = (
     "swing the vehicle: slowly through all headings, with roll and pitch to both sides as far as it goes (a vehicle in "
     "the hand: every side up once)"
@@ -120,11 +124,11 @@ def calibrate(
 ) -> Calibration:
     """Fit a calibration to the samples of a swing at one place.
 
-    With the attitude of each sample, the corrected axes are fitted to the known vector. Without it, their length is
-    fitted to the known total intensity, which does not show a misalignment of the axes: it stays as ``alignment_deg``.
-    The fit is least squares without outliers. :data:`SOFT_IRON_STD`, :data:`HARD_IRON_STD` and ``alignment_deg`` are
-    the prior: what the swing does not show stays as uncertain as it was. The standard deviations allow for errors that
-    last a hundredth of the swing, hold for a field such as that of the swing, and include those of the known elements.
+    With the attitude of each sample, the known vector, through iron, is fitted to the samples. Without it, an ellipsoid
+    is, which does not show a misalignment of the axes: it stays as ``alignment_deg``. The fit is least squares without
+    outliers. :data:`GAIN_STD`, :data:`SOFT_IRON_STD`, :data:`HARD_IRON_STD` and ``alignment_deg`` are the prior: what
+    the swing does not show stays as uncertain as it was. The standard deviations allow for errors that last a hundredth
+    of the swing, hold for a field such as that of the swing, and include those of the known elements.
 
     Args:
         axes_nt: ``(N, 3)`` forward, right, down [nT].
@@ -156,22 +160,23 @@ def calibrate(
     axes, reference = axes_nt.double(), field_vector(torch.tensor(elements, dtype=torch.float64))
     scale, known = float(reference.norm()), torch.tensor(elements_std, dtype=torch.float64)
     _check_samples(axes, scale)
-    problem = _problem(axes, reference, attitude_deg)
-    matrix, offset, covariance, noise, kept = _fit(axes, *problem, scale, math.radians(alignment_deg))
-    outliers = 1 - float(kept.double().mean())
-    _check_fit(noise, outliers, scale)
-    corrected = ((axes - offset) @ matrix.mT)[kept] / scale
+    shares = axes / scale
+    level = _known(shares, reference / scale, attitude_deg)
+    mix, offset, covariance, noise, kept = _fit(shares, level, math.radians(alignment_deg), 1 / scale)
+    matrix, outliers = torch.linalg.inv(mix), 1 - float(kept.double().mean())
+    _check_fit(scale * noise, outliers, scale)
+    corrected = ((shares - offset) @ matrix.mT)[kept]
     seen = torch.stack((corrected.amin(0), corrected.amax(0)), -1)
     if attitude_deg is None:  # the known intensity is a scale: of B_H alone
         known = torch.stack((*torch.zeros(2), torch.hypot(known[2], torch.deg2rad(known[1]) * reference[2])))
-    std = torch.hypot(_left(matrix, covariance, reference, tilt_deg), known)
+    std = torch.hypot(_left(mix, covariance, reference, tilt_deg), known)
     _check_std(std, seen)
     return Calibration(
         matrix=_rows(matrix),
-        offset_nt=tuple(offset.tolist()),
+        offset_nt=tuple((scale * offset).tolist()),
         method="ellipsoid" if attitude_deg is None else "vector",
         std=tuple(std.tolist()),
-        noise_nt=noise,
+        noise_nt=scale * noise,
         samples=len(axes),
         outliers=outliers,
         seen=_rows(seen),
@@ -184,93 +189,106 @@ def _rows(matrix: Tensor) -> tuple:
     return tuple(map(tuple, matrix.tolist()))
 
 
-def _problem(axes: Tensor, reference: Tensor, attitude_deg: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return what the samples are compared with, vectors or a length, and the offset with which the fit starts."""
+def _known(shares: Tensor, reference: Tensor, attitude_deg: Tensor | None) -> Tensor | None:
+    """Return the known field along the vehicle's axes ``(N, 3)``, or None without attitude.
+
+    Along directions in which it changes by less than the attitude's noise, it is its mean: least squares would take
+    that noise for a change, which the samples do not follow.
+    """
     if attitude_deg is None:
-        total = reference.norm()
-        _check_directions(axes / total)
-        return total, _sphere_center(axes, float(total))
+        _check_directions(shares)
+        return None
     level = reference @ rotation(attitude_deg.double())
-    _check_axes(axes, level)
-    return level, (axes - level).median(0).values
+    _check_axes(shares, level)
+    change = level - level.mean(0)
+    variance, directions = torch.linalg.eigh(change.T @ change / len(level))
+    return level.mean(0) + change @ (directions * (variance > LEAST_CHANGE**2)) @ directions.T
 
 
 # The fit
 
 
-def _misfit(axes: Tensor, known: Tensor, matrix: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Return residuals ``(N, R)`` and their derivatives ``(N, R, 12)`` with respect to matrix and offset.
+def _design(field: Tensor) -> Tensor:
+    """Return the derivatives ``(..., 3, 12)`` of ``mix @ field + offset`` with respect to mix and offset."""
+    eye = torch.eye(3, dtype=field.dtype)
+    rows = torch.einsum("ij,...k->...ijk", eye, field).flatten(-2)
+    return torch.cat((rows, eye.expand(*field.shape[:-1], 3, 3)), -1)
 
-    Of the vectors, if those are known, ``(N, 3)``; of their length, if that is, ``()``.
+
+def _misfit(axes: Tensor, level: Tensor | None, mix: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return residuals ``(N, R)`` of the samples as they were measured, and their derivatives ``(N, R, 12)``.
+
+    Without known vectors, they are the distances from the ellipsoid ``mix @ field + offset`` of all fields of length 1,
+    to first order. Residuals after the inverse of ``mix`` would be smaller, the more it shrinks the samples.
     """
-    moved = axes - offset
-    corrected, slope = moved @ matrix.mT, _derivative(matrix, moved)
-    if known.ndim:
-        return corrected - known, slope
-    length = corrected.norm(dim=-1, keepdim=True)
-    return length - known, (corrected / length).unsqueeze(-2) @ slope
+    moved, inverse = axes - offset, torch.linalg.inv(mix)
+    field = normalize(moved @ inverse.mT, dim=-1) if level is None else level
+    error, design = moved - field @ mix.mT, _design(field)
+    if level is not None:
+        return error, design
+    normal = normalize(field @ inverse, dim=-1).unsqueeze(-2)
+    return (normal @ error.unsqueeze(-1)).squeeze(-1), normal @ design
 
 
-def _derivative(matrix: Tensor, moved: Tensor) -> Tensor:
-    """Return the derivatives ``(N, 3, 12)`` of ``matrix @ moved`` with respect to matrix and offset."""
-    rows = torch.einsum("ij,nk->nijk", torch.eye(3, dtype=moved.dtype), moved).flatten(-2)
-    return torch.cat((rows, -matrix.expand(len(moved), 3, 3)), -1)
-
-
-def _sphere_center(axes: Tensor, total: float) -> Tensor:
-    """Return the center c of the sphere nearest to samples, ``|m|^2 - F^2 = 2 m c - |c|^2``, with a prior."""
-    moved = axes / total
-    design = torch.cat((2 * moved, -torch.ones_like(moved[:, :1])), -1)
-    normal = design.T @ design + len(axes) * 1e-6 * torch.eye(4)
-    return total * torch.linalg.solve(normal, design.T @ (moved.square().sum(-1) - 1))[:3]
+def _start(axes: Tensor, level: Tensor | None) -> Tensor:
+    """Return mix and offset ``(12,)`` before the fit: the sphere ``|m|^2 = 2 m c + r^2 - |c|^2`` nearest to samples."""
+    eye = torch.eye(3, dtype=torch.float64).flatten()
+    if level is not None:
+        return torch.cat((eye, (axes - level).median(0).values))
+    design = torch.cat((2 * axes, torch.ones_like(axes[:, :1])), -1)
+    *center, rest = torch.linalg.lstsq(design, axes.square().sum(-1, keepdim=True)).solution.flatten()
+    offset = torch.stack(center)
+    return torch.cat((eye * (rest + offset.square().sum()).sqrt(), offset))
 
 
 def _fit(
-    axes: Tensor, known: Tensor, offset: Tensor, scale: float, alignment: float
+    axes: Tensor, level: Tensor | None, alignment: float, least: float
 ) -> tuple[Tensor, Tensor, Tensor, float, Tensor]:
-    """Return matrix, offset, their covariance ``(12, 12)``, the root mean square of residuals, and which were kept.
+    """Return mix, offset, their covariance ``(12, 12)``, the root mean square of residuals, and which were kept.
 
     Gauss-Newton without outliers. The covariance allows for errors that are not independent within blocks of samples.
+    All are shares of the field; ``least`` is a residual that is no outlier.
     """
-    unit = torch.cat((torch.ones(9), torch.full((3,), scale))).double()  # of the parameters
-    prior, matrix = _prior(alignment), torch.eye(3, dtype=torch.float64)
-    start = torch.cat((matrix.flatten(), offset / scale))
+    prior, values = _prior(alignment), _start(axes, level)
+    expected = torch.cat((torch.eye(3).flatten(), torch.zeros(3))).double()
     for _ in range(_ROUNDS):
-        error, slope = _misfit(axes, known, matrix, offset)
+        error, slope = _misfit(axes, level, values[:9].unflatten(0, (3, 3)), values[9:])
         size = error.norm(dim=-1)
-        kept = size <= max(OUTLIER_SIGMAS * 1.4826 * float(size.median()), 1.0)
-        variance = error[kept].square().mean().clamp_min(1e-6)
-        design = (slope * unit)[kept]
+        kept = size <= max(OUTLIER_SIGMAS * 1.4826 * float(size.median()), least)
+        variance = error[kept].square().mean().clamp_min((1e-3 * least) ** 2)
+        design = slope[kept]
         normal = torch.einsum("nij,nik->jk", design, design) + variance * prior
         scores = (design * error[kept].unsqueeze(-1)).sum(1)
-        now = torch.cat((matrix.flatten(), offset / scale))
-        change = torch.linalg.solve(normal, scores.sum(0) + variance * prior @ (now - start))
-        matrix, offset = matrix - change[:9].unflatten(0, (3, 3)), offset - scale * change[9:]
+        change = torch.linalg.solve(normal, scores.sum(0) - variance * prior @ (values - expected))
+        values = values + change
         if change.abs().max() < _SETTLED:
             break
+    if change.abs().max() > _MOVING:
+        raise ValueError(f"too few directions, with which the fit does not settle in {_ROUNDS} rounds: {_SWING}")
     blocks = torch.stack([block.sum(0) for block in scores.tensor_split(_BLOCKS)])
     inverse = torch.linalg.inv(normal)
     covariance = inverse @ (blocks.T @ blocks + variance.square() * prior) @ inverse
-    return matrix, offset, unit[:, None] * covariance * unit, float(variance.sqrt()), kept
+    return values[:9].unflatten(0, (3, 3)), values[9:], covariance, float(variance.sqrt()), kept
 
 
 def _prior(alignment: float) -> Tensor:
-    """Return the inverse of the covariance of matrix and offset before the swing: soft iron, and a small rotation."""
+    """Return the inverse of the covariance of mix and offset before the swing: gain, soft iron, a small rotation."""
     swap = torch.eye(9, dtype=torch.float64).unflatten(0, (3, 3)).transpose(0, 1).flatten(0, 1)
-    same, turned = (torch.eye(9) + swap) / 2, (torch.eye(9) - swap) / 2
+    gain = torch.outer(torch.eye(3).flatten(), torch.eye(3).flatten()) / 3
+    same, turned = (torch.eye(9) + swap) / 2 - gain, (torch.eye(9) - swap) / 2
     precision = torch.zeros(12, 12, dtype=torch.float64)
-    precision[:9, :9] = same / SOFT_IRON_STD**2 + turned / alignment**2
+    precision[:9, :9] = gain / 3 / GAIN_STD**2 + same / SOFT_IRON_STD**2 + turned / alignment**2
     precision[9:, 9:] = torch.eye(3) / HARD_IRON_STD**2
     return precision
 
 
-def _left(matrix: Tensor, covariance: Tensor, reference: Tensor, tilt_deg: float) -> Tensor:
+def _left(mix: Tensor, covariance: Tensor, reference: Tensor, tilt_deg: float) -> Tensor:
     """Return the standard deviations of D, I, B_H ``(3,)`` that a covariance leaves, over headings, roll and pitch."""
     tilts = (0.0, 0.0), (tilt_deg, 0.0), (-tilt_deg, 0.0), (0.0, tilt_deg), (0.0, -tilt_deg)
     attitude = torch.tensor([(*tilt, 30.0 * turn) for tilt in tilts for turn in range(12)], dtype=torch.float64)
-    turn = rotation(attitude)
-    moved = torch.linalg.solve(matrix, (turn.mT @ reference).mT).mT
-    spread = elements_jacobian(reference) @ turn @ _derivative(matrix, moved)
+    turn, scale = rotation(attitude), reference.norm()
+    moved = torch.linalg.solve(mix, _design(turn.mT @ reference / scale))
+    spread = scale * elements_jacobian(reference) @ turn @ moved
     return (spread @ covariance @ spread.mT).mean(0).diagonal().clamp_min(0).sqrt()
 
 
@@ -285,11 +303,16 @@ def _check_samples(axes: Tensor, total: float) -> None:
     if not axes.isfinite().all():
         row = int((~axes.isfinite().all(-1)).nonzero()[0])
         raise ValueError(f"sample {row + 1} is {axes[row].tolist()}: leave out samples that are not finite")
-    length = float(axes.norm(dim=-1).median())
-    if unit := guess_unit(length, total):
+    lengths = axes.norm(dim=-1)
+    length, change = float(lengths.median()), float(lengths.std())
+    unit = guess_unit(length, total)
+    if unit or not 0.25 < length / total < 4:
         raise ValueError(
-            f"the samples have a length of {length:g}, and {total:.0f} nT are known: they look like {unit}"
+            f"the samples have a length of {length:g}, and {total:.0f} nT are known: "
+            + (f"they look like {unit}" if unit else "scale raw counts to nanotesla")
         )
+    if change < 1e-6 * length:
+        raise ValueError(f"all samples have the length {length:g}: log the field as measured, not its direction alone")
 
 
 def _check_axes(axes: Tensor, level: Tensor) -> None:

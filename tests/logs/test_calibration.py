@@ -50,7 +50,7 @@ def test_what_a_swing_leaves_and_states() -> None:
     assert 0.8 < (torch.stack(squares) / std.square()).mean() < 1.25
 
 
-@pytest.mark.parametrize(("options", "times"), [({"headings": 90.0}, 1.3), ({"tilt": 0.0}, 50.0)])
+@pytest.mark.parametrize(("options", "times"), [({"headings": 90.0}, 1.3), ({"tilt": 0.0}, 4.0)])
 def test_a_poor_swing_states_more(options, times: float) -> None:
     """A quarter of the headings, and none of roll and pitch."""
     axes, attitude, _, _ = swing()
@@ -81,6 +81,24 @@ def test_the_length_alone() -> None:
     assert crust == pytest.approx(math.hypot(133, 49200 * math.radians(0.2)), rel=0.01)
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_half_of_the_directions_without_attitude(side: int) -> None:
+    """A gain of .83, and 1.6 % of noise: errors of the inclination, which may be on the other side, are as stated."""
+    elements, iron = (-2.0, 66.0, 19800.0), torch.tensor([4700.0, 100.0, 1800.0])
+    level = axes_of_elements(torch.tensor(elements).double(), LEVEL)
+    squares = []
+    for seed in range(10):
+        normal = torch.randn(6000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+        directions = normal / normal.norm(dim=-1, keepdim=True)
+        half = directions[side * directions[:, 2] > 0.2][:600]
+        swung = calibrate(0.83 * 48680 * half + iron + 800 * normal[-600:], elements, alignment_deg=0.01)
+        inclination = elements_of_axes(swung.apply(0.83 * level + iron), LEVEL, north="true").elements[:, 1]
+        squares.append((inclination - 66).square().mean() / swung.std[1] ** 2)
+        assert swung.offset_nt[2] == pytest.approx(1800, abs=4000)
+        assert swung.std[1] < 1.5
+    assert 0.2 < torch.stack(squares).mean() < 2
+
+
 def test_spikes_are_left_out() -> None:
     axes, attitude, level, _ = swing()
     axes[::50] += 20000
@@ -99,6 +117,8 @@ AXES = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
         (lambda m: m.index_fill(0, torch.tensor([7]), math.nan), {}, "sample 8 is .*leave out samples"),
         (lambda m: m / 1e5, {}, "a length of 0.49.*they look like G"),
         (lambda m: m / 1e3, {}, "they look like uT"),
+        (lambda m: m / 264, {}, "a length of 188.*, and 5[0-9]* nT are known: scale raw counts to nanotesla"),
+        (lambda m: 50000 * m / m.norm(dim=-1, keepdim=True), {}, "the length 50000: log the field as measured"),
         (lambda m: m[:, [1, 0, 2]], {}, "fit right, forward, down, and forward.*: a left-handed frame"),
         (lambda m: m * torch.tensor([1.0, -1.0, -1.0]), {}, "fit forward, minus right, minus down, and [^:]*, or the"),
         (lambda m: m @ AXES, {}, "fit forward, right, minus down.*: a left-handed frame; change the sign of one axis"),
