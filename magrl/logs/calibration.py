@@ -7,9 +7,10 @@ import math
 from collections.abc import Sequence
 from itertools import permutations, product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Strict
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -39,7 +40,9 @@ _SWING = (
 )
 _AXES = ("forward", "right", "down")
 _SIGNS = list(product((1.0, -1.0), repeat=3))
-Row = tuple[float, float, float]
+_LISTS = Strict(False)  # of JSON
+Share = Annotated[tuple[float, float], _LISTS]
+Row = Annotated[tuple[float, float, float], _LISTS]
 
 
 class Calibration(CheckedModel):
@@ -69,15 +72,15 @@ class Calibration(CheckedModel):
         tensor([15000., 0., 45000.])
     """
 
-    matrix: tuple[Row, Row, Row]
+    matrix: Annotated[tuple[Row, Row, Row], _LISTS]
     offset_nt: Row
     method: Literal["vector", "ellipsoid"]
     std: Row
     noise_nt: float
     samples: int
     outliers: float
-    seen: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    here: tuple[float, ...]
+    seen: Annotated[tuple[Share, Share, Share], _LISTS]
+    here: Annotated[tuple[float, ...], _LISTS]
     date: str | None = None
 
     def apply(self, axes_nt: Tensor) -> Tensor:
@@ -97,19 +100,9 @@ class Calibration(CheckedModel):
             DamagedFileError: naming the file and what is wrong with it.
         """
         try:
-            return cls(**json.loads(Path(path).read_text(), object_hook=_tuples))
+            return cls(**json.loads(Path(path).read_text()))
         except (ValueError, TypeError, OSError) as error:
             raise DamagedFileError(f"{path} is not a calibration: {error}") from error
-
-
-def _tuples(content: dict[str, Any]) -> dict[str, Any]:
-    """Return lists of JSON, and lists in them, as tuples."""
-    rows = {
-        name: [tuple(x) if isinstance(x, list) else x for x in value]
-        for name, value in content.items()
-        if isinstance(value, list)
-    }
-    return content | {name: tuple(row) for name, row in rows.items()}
 
 
 def calibrate(
