@@ -16,10 +16,10 @@ from magrl.checks import check_tensor
 
 NAMES = ("D", "I", "B_H")
 """Elements that a vehicle measures, in the order of every ``field`` tensor."""
-
-
 UNITS = ("deg", "deg", "nT")
 """Units of :data:`NAMES`."""
+FIELD_NT = {"nanotesla": 1.0, "milligauss": 100.0, "microtesla": 1e3, "gauss": 1e5, "millitesla": 1e6, "tesla": 1e9}
+"""Units of a magnetic field [nT]."""
 
 
 class Elements(NamedTuple):

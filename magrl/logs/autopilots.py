@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from magrl.field.elements import FIELD_NT
 from magrl.logs.samples import ATTITUDE, AXES, Array, Recording
-from magrl.logs.units import FIELD_NT, UNITS, column_of
+from magrl.logs.units import UNITS, column_of
 from magrl.logs.vectors import FRAMES, attitude_of, from_enu
 
 MODEL_NORTH = (
@@ -72,7 +73,7 @@ def read_ulg(path: Path) -> Recording:
         notes.append(f"{name}: {NOT_CALIBRATED}")
     field, attitude, position = (topics.get(topic, {}) for topic in (name, "vehicle_attitude", "vehicle_gps_position"))
     streams = {
-        axis: (_seconds(field), FIELD_NT["G"] * field[key])
+        axis: (_seconds(field), FIELD_NT["gauss"] * field[key])
         for axis, key in zip(AXES, _MAGNETOMETERS[name], strict=True)
     }
     if attitude:
@@ -110,7 +111,7 @@ def _px4_position(topic: Mapping[str, Array], fixed: NDArray[np.bool_]) -> dict[
 # ArduPilot
 
 _MESSAGES = {
-    "MAG": (dict(zip(AXES, ("MagX", "MagY", "MagZ"), strict=True)), FIELD_NT["mG"]),
+    "MAG": (dict(zip(AXES, ("MagX", "MagY", "MagZ"), strict=True)), FIELD_NT["milligauss"]),
     "ATT": ({"roll": "Roll", "pitch": "Pitch", "heading": "Yaw"}, 1.0),
     "GPS": ({"latitude": "Lat", "longitude": "Lng"}, 1.0),
 }
@@ -160,7 +161,7 @@ def read_bag(path: Path) -> Recording:
 def _ros_field(message: Any) -> dict[str, float]:
     field = message.magnetic_field
     values = zip(AXES, FRAMES["FLU"], (field.x, field.y, field.z), strict=True)
-    return {name: sign * FIELD_NT["T"] * value for name, sign, value in values}
+    return {name: sign * FIELD_NT["tesla"] * value for name, sign, value in values}
 
 
 def _ros_position(message: Any) -> dict[str, float]:

@@ -164,22 +164,16 @@ def calibrate(
         known = torch.stack((*torch.zeros(2), torch.hypot(known[2], torch.deg2rad(known[1]) * reference[2])))
     std = torch.hypot(_left(mix, covariance, reference, tilt_deg), known)
     _check_std(std, seen)
+    rows = {"matrix": matrix, "offset_nt": scale * offset, "std": std, "seen": seen}
     return Calibration(
-        matrix=_rows(matrix),
-        offset_nt=tuple((scale * offset).tolist()),
+        **{name: row.tolist() for name, row in rows.items()},
         method="ellipsoid" if attitude_deg is None else "vector",
-        std=tuple(std.tolist()),
         noise_nt=scale * noise,
         samples=len(axes),
         outliers=outliers,
-        seen=_rows(seen),
         here=tuple(map(float, here)),
         date=date,
     )
-
-
-def _rows(matrix: Tensor) -> tuple:
-    return tuple(map(tuple, matrix.tolist()))
 
 
 def _known(shares: Tensor, reference: Tensor, attitude_deg: Tensor | None) -> Tensor | None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-FIELD_NT: Mapping[str, float] = {"nT": 1.0, "mG": 100.0, "uT": 1e3, "G": 1e5, "mT": 1e6, "T": 1e9}
-"""Units of a magnetic field [nT]: nanotesla, milligauss, microtesla, gauss, millitesla, tesla."""
+from magrl.field.elements import FIELD_NT
+
 EARTH_NT = 48000.0
 """Total intensity of the Earth's field, within 45 %."""
+SYMBOLS = {"nt": "nanotesla", "mg": "milligauss", "ut": "microtesla", "µt": "microtesla", "g": "gauss"}
+SYMBOLS |= {"mt": "millitesla", "t": "tesla"}
 UNITS: Mapping[str, Mapping[str, float]] = {
-    "field": {name.lower(): size for name, size in FIELD_NT.items()} | {"gauss": 1e5, "tesla": 1e9, "µt": 1e3},
+    "field": FIELD_NT | {symbol: FIELD_NT[unit] for symbol, unit in SYMBOLS.items()},
     "angle": {"deg": 1.0, "rad": 57.29577951308232},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "utc": 1.0},
     "speed": {"m_s": 1.0, "mps": 1.0, "km_h": 1 / 3.6, "kmh": 1 / 3.6, "kn": 1852 / 3600, "kt": 1852 / 3600},
@@ -70,7 +72,7 @@ def guess_unit(length: float, total_nt: float) -> str | None:
 
     Example:
         >>> guess_unit(0.5, 50000.0), guess_unit(45000.0, 50000.0)
-        ('G', None)
+        ('gauss', None)
     """
     fitting = [unit for unit, size in FIELD_NT.items() if 0.55 < length * size / total_nt < 1.45]
-    return fitting[0] if fitting and fitting[0] != "nT" else None
+    return fitting[0] if fitting and fitting[0] != "nanotesla" else None

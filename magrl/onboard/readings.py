@@ -16,6 +16,7 @@ from numbers import Real
 from typing import Any
 
 from magrl.checks import check_number, check_numbers
+from magrl.field.elements import FIELD_NT
 
 TOTAL_NT = (20000.0, 76000.0)
 """Least and greatest total intensity: 10 % beyond those of IGRF [nT]."""
@@ -33,7 +34,6 @@ DISTURBANCE_NT = 2000.0
 """Change of the field vector between two readings by the crust and a severe magnetic storm; chosen [nT]."""
 _SLACK_DEG = 1.0  # of an inclination
 _SIGMAS = 8.0  # of the noise of a difference
-_UNITS = {"microtesla": 1e3, "gauss": 1e5, "millitesla": 1e6, "tesla": 1e9}
 
 
 def check_earth_reading(
@@ -73,7 +73,7 @@ where it is 5513 to 23485 nT there: it looks like microtesla, and nanotesla are 
     low, high = _horizontal_limits(abs(inclination))
     if low <= horizontal_intensity <= high:
         return
-    units = [unit for unit, factor in _UNITS.items() if low <= factor * horizontal_intensity <= high]
+    units = [unit for unit, factor in FIELD_NT.items() if low <= factor * horizontal_intensity <= high]
     in_radians = abs(inclination) <= math.pi / 2 and abs(declination) <= math.pi
     least, most = _horizontal_limits(math.degrees(abs(inclination))) if in_radians else (math.inf, 0.0)
     guess = f": it looks like {units[0]}, and nanotesla are expected" if units else ""

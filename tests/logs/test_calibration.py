@@ -115,8 +115,8 @@ AXES = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
     [
         (lambda m: m[:50], {}, r"at least 100 samples, got \(50, 3\)"),
         (lambda m: m.index_fill(0, torch.tensor([7]), math.nan), {}, "sample 8 is .*leave out samples"),
-        (lambda m: m / 1e5, {}, "a length of 0.49.*they look like G"),
-        (lambda m: m / 1e3, {}, "they look like uT"),
+        (lambda m: m / 1e5, {}, "a length of 0.49.*they look like gauss"),
+        (lambda m: m / 1e3, {}, "they look like microtesla"),
         (lambda m: m / 264, {}, "a length of 188.*, and 5[0-9]* nT are known: scale raw counts to nanotesla"),
         (lambda m: 50000 * m / m.norm(dim=-1, keepdim=True), {}, "the length 50000: log the field as measured"),
         (lambda m: m[:, [1, 0, 2]], {}, "fit right, forward, down, and forward.*: a left-handed frame"),

@@ -85,8 +85,8 @@ def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
             "1 gap, the longest of 3601 s, which is",
         ),
         (["2026-06-30T12:00:00,1,1,1,0"], "the times have no time zone: they are taken as UTC"),
-        (["0,0.15,0,0.48,0"], "the total intensity is 0.50.*, which looks like G: name the columns mag_x_G"),
-        (["0,15,0,48,0"], "the total intensity is 50.2.*, which looks like uT"),
+        (["0,0.15,0,0.48,0"], "the total intensity is 0.50.*, which looks like gauss: name the columns mag_x_gauss"),
+        (["0,15,0,48,0"], "the total intensity is 50.2.*, which looks like microtesla"),
         ([*ROWS, "3,0,0,0,40"], "1 sample of three zeros left out"),
     ],
 )
