@@ -38,6 +38,7 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
     command.add_argument("--frame", choices=FRAMES, default="FRD", help="axes of a CSV file; default FRD")
+    command.add_argument("--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a healthy one that was used")
     command.add_argument("--north", choices=NORTHS, help="north of the heading, where the log does not tell")
     command.add_argument("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
     command.add_argument("--every-s", type=float, help="duration of a move [s], in place of a length")
@@ -54,7 +55,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Read the command line and the log, and print what was found."""
     options = parser().parse_args(args)
     try:
-        log = read_log(*options.log, frame=options.frame)
+        log = read_log(*options.log, frame=options.frame, sensor=options.sensor)
         print("\n".join(summary(log)))
         date = options.date or log.date
         lines = swing(log, options, date) if options.calibrate else way(log, options, date)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import datetime
+import io
+import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from magrl.checks import check_choice
 from magrl.field.elements import FIELD_NT
 from magrl.logs.samples import ATTITUDE, AXES, Array, Recording
 from magrl.logs.units import UNITS, column_of
@@ -24,6 +26,8 @@ MODEL_NORTH = (
     "not used (state the north as true if the estimator had another heading, such as that of two GNSS antennas)"
 )
 NOT_CALIBRATED = "the magnetometer is as it was measured, without the calibration of the autopilot"
+_Rows = dict[tuple[str, ...], dict[str, list[tuple[float, ...]]]]
+_QUATERNION, _PLACE = ("w", "x", "y", "z"), ("latitude", "longitude")
 
 
 def _package(module: str, package: str) -> Any:
@@ -34,62 +38,105 @@ def _package(module: str, package: str) -> Any:
         raise ImportError(f"this format needs the package {package}: pip install 'magrl[logs]'") from error
 
 
-def _streams(rows: Mapping[str, list[tuple[float, float]]]) -> dict[str, tuple[Array, Array]]:
-    """Return times and values of each column, from pairs of both."""
-    arrays = {name: np.array(pairs, float) for name, pairs in rows.items()}
-    return {name: (pairs[:, 0], pairs[:, 1]) for name, pairs in arrays.items()}
+def _recording(
+    kind: str,
+    tables: Mapping[tuple[str, ...], Mapping[str, Array]],
+    sensor: str | None,
+    used: Collection[str] = (),
+    convert: Callable[[torch.Tensor], torch.Tensor] = lambda attitude: attitude,
+) -> Recording:
+    """Return the columns of one sensor of each kind, the first one, and of the magnetometer that is chosen.
+
+    Args:
+        kind: name of the format.
+        tables: rows of a time and values by the names of the columns, and by that of the sensor.
+        sensor: name of a magnetometer.
+        used: names of those that the estimator used.
+        convert: conversion of an attitude to FRD and NED.
+    """
+    names: list[str] = []
+    notes: list[str] = []
+    streams: dict[str, tuple[Array, Array]] = {}
+    for columns, sensors in tables.items():
+        name = next(iter(sensors))
+        if columns == AXES:
+            name, notes = _magnetometer(sensors, sensor, used)
+        names.append(name)
+        time, values = sensors[name][:, 0], sensors[name][:, 1:]
+        if columns == _QUATERNION:
+            columns, values = ATTITUDE, convert(attitude_of(torch.from_numpy(values.copy()))).numpy()
+        streams |= {column: (time, each) for column, each in zip(columns, values.T, strict=True)}
+    return Recording(streams, f"{kind}: {', '.join(names)}", None, notes)
 
 
-def _attitudes(
-    time: Array, quaternion: Array, convert: Callable[[torch.Tensor], torch.Tensor] | None = None
-) -> dict[str, tuple[Array, Array]]:
-    """Return roll, pitch, heading [deg] of quaternions w, x, y, z ``(N, 4)``, converted to FRD and NED."""
-    angles = attitude_of(torch.from_numpy(np.ascontiguousarray(quaternion, float)))
-    columns = (convert(angles) if convert else angles).unbind(-1)
-    return {name: (time, column.numpy()) for name, column in zip(ATTITUDE, columns, strict=True)}
+def _magnetometer(fields: Mapping[str, Array], sensor: str | None, used: Collection[str]) -> tuple[str, list[str]]:
+    """Return the name of a magnetometer, that stated or a healthy one, if possible a used one, and notes."""
+    if sensor is not None:
+        check_choice(fields, sensor=sensor)
+    dead = [name for name, rows in fields.items() if not (np.isfinite(rows).all() and np.ptp(rows[:, 1:], 0).any())]
+    name = sensor or min(fields, key=lambda name: (name in dead, name not in used))
+    others = ", ".join(other for other in fields if other != name)
+    notes = [f"the magnetometer is {name}; state sensor for another one: {others}"] if others else []
+    return name, notes + [f"{name}: {NOT_CALIBRATED}"] * name.startswith("sensor_mag")
 
 
 # PX4
 
-_MAGNETOMETERS = {
-    "vehicle_magnetometer": [f"magnetometer_ga[{index}]" for index in range(3)],
-    "sensor_combined": [f"magnetometer_ga[{index}]" for index in range(3)],
-    "sensor_mag": list(AXES),
-}
+_GAUSS = [f"magnetometer_ga[{index}]" for index in range(3)]
+_MAGNETOMETERS = {"vehicle_magnetometer": _GAUSS, "sensor_combined": _GAUSS, "sensor_mag": list(AXES)}
 """Topics with a magnetometer [gauss], the calibrated one first."""
 
 
-def read_ulg(path: Path) -> Recording:
+def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     """Read a log of PX4 (ULog) with pyulog: see :func:`~magrl.logs.read_log`. Times are UTC where GNSS gives it."""
     with path.open("rb") as file:
         log = _package("pyulog", "pyulog").ULog(file)
-    topics = {item.name: item.data for item in reversed(log.data_list)}  # the first instance of each
-    held = [name for name, columns in _MAGNETOMETERS.items() if columns[0] in topics.get(name, ())]
-    if not held:
-        raise ValueError(f"none of {', '.join(_MAGNETOMETERS)} is among its topics, {', '.join(sorted(topics))}")
-    name = held[0]
-    notes = ["the file is damaged or truncated"] if log.file_corruption or _ends_in_a_message(path) else []
-    if name == "sensor_mag":
-        notes.append(f"{name}: {NOT_CALIBRATED}")
-    field, attitude, position = (topics.get(topic, {}) for topic in (name, "vehicle_attitude", "vehicle_gps_position"))
-    streams = {
-        axis: (_seconds(field), FIELD_NT["gauss"] * field[key])
-        for axis, key in zip(AXES, _MAGNETOMETERS[name], strict=True)
-    }
-    if attitude:
-        streams |= _attitudes(_seconds(attitude), np.stack([attitude[f"q[{index}]"] for index in range(4)], -1))
+    instances = sorted(log.data_list, key=lambda item: item.multi_id)
+    topics = {item.name: item.data for item in reversed(instances)}  # the first instance of each
+    fields, used = _px4_fields(instances, topics)
+    tables: dict[tuple[str, ...], Mapping[str, Array]] = {AXES: fields}
+    if "vehicle_attitude" in topics:
+        tables[_QUATERNION] = _px4_table(topics, "vehicle_attitude", [f"q[{index}]" for index in range(4)])
+    position = topics.get("vehicle_gps_position", {})
     fixed = np.asarray(position.get("fix_type", ())) >= 3
     offset = 0.0
-    if fixed.any():
-        streams |= _px4_position(position, fixed)
-        offset = float(np.median(position["time_utc_usec"][fixed] / 1e6 - _seconds(position)[fixed]))
-    north = "true" if np.isfinite(position.get("heading", np.nan)).any() else "model"
-    notes += [] if north == "true" else [MODEL_NORTH]
-    streams = {column: (time + offset, values) for column, (time, values) in streams.items()}
-    return Recording(streams, f"PX4 ULog, {name}", north, notes)
+    if fixed.any():  # older logs have 1e-7 degrees as integers
+        columns, unit = (("lat", "lon"), 1e-7) if "lat" in position else (("latitude_deg", "longitude_deg"), 1.0)
+        (name, place), *_ = _px4_table(topics, "vehicle_gps_position", columns).items()
+        tables[_PLACE] = {name: place[fixed] * (1, unit, unit)}
+        offset = float(np.median((position["time_utc_usec"] - position["timestamp"].astype(float))[fixed])) / 1e6
+    flags = topics.get("estimator_status_flags", {})
+    gnss = np.mean(flags.get("cs_gnss_yaw", flags.get("cs_gps_yaw", 0))) > 0.5  # the heading of two antennas is used
+    found = _recording("PX4 ULog", tables, sensor, used)
+    notes = [] if gnss else [MODEL_NORTH]
+    notes += ["the file is damaged or truncated"] if log.file_corruption or _is_cut(path) else []
+    streams = {column: (time + offset, values) for column, (time, values) in found.streams.items()}
+    return Recording(streams, found.source, "true" if gnss else "model", [*notes, *found.notes])
 
 
-def _ends_in_a_message(path: Path) -> bool:
+def _px4_table(topics: Mapping[str, Any], name: str, columns: Sequence[str]) -> dict[str, Array]:
+    """Return rows of time [s] and columns of a topic, by its name."""
+    return {name: np.column_stack((topics[name]["timestamp"] / 1e6, *(topics[name][column] for column in columns)))}
+
+
+def _px4_fields(instances: Sequence[Any], topics: Mapping[str, Any]) -> tuple[dict[str, Array], list[str]]:
+    """Return the rows of all magnetometers, and the names of those that the estimator used."""
+    fields: dict[str, Array] = {}
+    used: list[str] = []
+    selected = topics.get("sensor_selection", {}).get("mag_device_id", [None])[-1]
+    for topic, columns in _MAGNETOMETERS.items():
+        for item in instances:
+            if item.name == topic and columns[0] in item.data:
+                name = f"{topic}:{item.multi_id}" if item.multi_id else topic
+                fields |= _px4_table({name: item.data}, name, columns)
+                fields[name][:, 1:] *= FIELD_NT["gauss"]
+                used += [name] if item.data.get("device_id", [0])[-1] == selected else []
+    if not fields:
+        raise ValueError(f"none of {', '.join(_MAGNETOMETERS)} is among its topics, {', '.join(sorted(topics))}")
+    return fields, used
+
+
+def _is_cut(path: Path) -> bool:
     """Return whether a ULog file ends before its last message does."""
     content, position = path.read_bytes(), 16
     while position + 3 <= len(content):
@@ -97,83 +144,93 @@ def _ends_in_a_message(path: Path) -> bool:
     return position != len(content)
 
 
-def _seconds(topic: Mapping[str, Array]) -> Array:
-    return np.asarray(topic["timestamp"]) / 1e6
-
-
-def _px4_position(topic: Mapping[str, Array], fixed: NDArray[np.bool_]) -> dict[str, tuple[Array, Array]]:
-    """Return latitude and longitude [deg] where GNSS has a fix; older logs have 1e-7 degrees as integers."""
-    names = {"latitude": ("latitude_deg", "lat"), "longitude": ("longitude_deg", "lon")}
-    degrees = {name: topic[new] if new in topic else topic[old] * 1e-7 for name, (new, old) in names.items()}
-    return {name: (_seconds(topic)[fixed], np.asarray(values)[fixed]) for name, values in degrees.items()}
-
-
 # ArduPilot
 
-_MESSAGES = {
-    "MAG": (dict(zip(AXES, ("MagX", "MagY", "MagZ"), strict=True)), FIELD_NT["milligauss"]),
-    "ATT": ({"roll": "Roll", "pitch": "Pitch", "heading": "Yaw"}, 1.0),
-    "GPS": ({"latitude": "Lat", "longitude": "Lng"}, 1.0),
+_MESSAGES: dict[str, tuple[tuple[str, ...], Sequence[str], float]] = {
+    "ATT": (ATTITUDE, ("Roll", "Pitch", "Yaw"), 1.0),
+    "ATTITUDE": (ATTITUDE, ("roll", "pitch", "yaw"), UNITS["angle"]["rad"]),
+    "GPS": (_PLACE, ("Lat", "Lng"), 1.0),
+    "GPS_RAW_INT": (_PLACE, ("lat", "lon"), 1e-7),
 }
-"""Messages of a log: fields of the columns, and their unit."""
+"""Messages of DataFlash and of telemetry: columns, their fields, and their unit."""
+_MAGS = {"MAG": ("MagX", "MagY", "MagZ"), "RAW_IMU": ("xmag", "ymag", "zmag")}
+_MAGS |= {"MAG2": _MAGS["MAG"], "MAG3": _MAGS["MAG"], "SCALED_IMU2": _MAGS["RAW_IMU"], "SCALED_IMU3": _MAGS["RAW_IMU"]}
+_MESSAGES |= {name: (AXES, fields, FIELD_NT["milligauss"]) for name, fields in _MAGS.items()}
+_USE = {"MAG": "", "MAG:1": "2", "MAG2": "2", "MAG:2": "3", "MAG3": "3"}
+"""Magnetometers, and the number of their parameter COMPASS_USE."""
 
 
-def read_bin(path: Path) -> Recording:
-    """Read a DataFlash log of ArduPilot with pymavlink: the first magnetometer with its offsets, attitude and GNSS."""
-    package = _package("pymavlink.DFReader", "pymavlink")
-    rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    with closing(package.DFReader_binary(str(path))) as log:
-        while message := log.recv_match(type=list(_MESSAGES)):
-            if getattr(message, "I", 0) or getattr(message, "Status", 3) < 3:  # another sensor, or no fix
-                continue
-            fields, unit = _MESSAGES[message.get_type()]
-            for name, field in fields.items():
-                rows[name].append((message._timestamp, unit * getattr(message, field)))
-    return Recording(_streams(rows), "ArduPilot DataFlash, MAG", "model", [MODEL_NORTH])
+def read_ardupilot(path: Path, sensor: str | None = None) -> Recording:
+    """Read a log of ArduPilot with pymavlink, DataFlash or telemetry: a magnetometer with its offsets, attitude, GNSS.
+
+    The magnetometer is the first that COMPASS_USE lets the vehicle use and whose messages are healthy.
+    """
+    with path.open("rb") as file:
+        flash = file.read(2) == b"\xa3\x95"
+    module, name = ("DFReader", "DFReader_binary") if flash else ("mavutil", "mavlogfile")
+    reader = getattr(_package(f"pymavlink.{module}", "pymavlink"), name)
+    rows: _Rows = defaultdict(lambda: defaultdict(list))
+    with closing(reader(str(path))) as log:
+        while message := log.recv_match(type=[*_MESSAGES, "PARM"]):
+            name, number = message.get_type(), getattr(message, "I", 0)
+            fixed = min(getattr(message, "Status", 3), getattr(message, "fix_type", 3)) >= 3
+            if name in _MESSAGES and fixed and getattr(message, "Health", 1):
+                columns, fields, unit = _MESSAGES[name]
+                values = (unit * getattr(message, field) for field in fields)
+                rows[columns][f"{name}:{number}" if number else name].append((message._timestamp, *values))
+    used = [name for name, number in _USE.items() if log.params.get(f"COMPASS_USE{number}", 1)]
+    found = _recording(f"ArduPilot {'DataFlash' if flash else 'telemetry'}", _tables(rows), sensor, used)
+    return found._replace(north="model", notes=[MODEL_NORTH, *found.notes])
+
+
+def _tables(rows: _Rows) -> dict[tuple[str, ...], Mapping[str, Array]]:
+    """Return rows of each sensor as an array, in the order of their times, and sensors in that of their names."""
+    return {columns: {name: np.array(sorted(some[name])) for name in sorted(some)} for columns, some in rows.items()}
 
 
 # ROS
 
 
-def read_bag(path: Path) -> Recording:
-    """Read a bag of ROS 1 (.bag) or 2 (its folder) with rosbags: the first topic of each type that is needed.
+def read_bag(path: Path, sensor: str | None = None) -> Recording:
+    """Read a bag of ROS 1 (.bag) or 2 (its folder, or a file in it) with rosbags: a topic of each type that is needed.
 
-    The axes and the attitude of ROS, forward, left, up and east, north, up (REP 103), become FRD and NED. The north of
-    the heading is that of the Imu, which the bag does not tell.
+    Times are those of the headers. The axes and the attitude of ROS, forward, left, up and east, north, up (REP 103),
+    become FRD and NED. The north of the heading is that of the Imu, which the bag does not tell.
     """
     package = _package("rosbags.highlevel", "rosbags")
     store = _package("rosbags.typesys", "rosbags")
-    rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    with package.AnyReader([path], default_typestore=store.get_typestore(store.Stores.LATEST)) as bag:
-        topics = {each.msgtype: each for each in reversed(bag.connections) if each.msgtype in _ROS_COLUMNS}
-        for connection, stamp, raw in bag.messages(connections=list(topics.values())):
+    rows: _Rows = defaultdict(lambda: defaultdict(list))
+    whole = path if path.is_dir() or path.suffix == ".bag" else path.parent
+    with package.AnyReader([whole], default_typestore=store.get_typestore(store.Stores.LATEST)) as bag:
+        for connection, recorded, raw in bag.messages([each for each in bag.connections if each.msgtype in _ROS]):
+            columns, values_of = _ROS[connection.msgtype]
             message = bag.deserialize(raw, connection.msgtype)
-            for name, value in _ROS_COLUMNS[connection.msgtype](message).items():
-                rows[name].append((stamp / 1e9, value))
-    streams = _streams(rows)
-    quaternion = [streams.pop(f"q{index}") for index in range(4) if f"q{index}" in streams]
-    if quaternion:
-        streams |= _attitudes(quaternion[0][0], np.stack([values for _, values in quaternion], -1), from_enu)
-    names = ", ".join(f"{each.topic} ({kind})" for kind, each in topics.items())
-    return Recording(streams, f"ROS bag, {names}")
+            stamp = message.header.stamp
+            if values := values_of(message):
+                time = stamp.sec + 1e-9 * stamp.nanosec or 1e-9 * recorded
+                rows[columns][connection.topic].append((time, *values))
+    return _recording("ROS bag", _tables(rows), sensor, convert=from_enu)
 
 
-def _ros_field(message: Any) -> dict[str, float]:
+def _ros_field(message: Any) -> Sequence[float]:
     field = message.magnetic_field
-    values = zip(AXES, FRAMES["FLU"], (field.x, field.y, field.z), strict=True)
-    return {name: sign * FIELD_NT["tesla"] * value for name, sign, value in values}
+    axes = zip(FRAMES["FLU"], (field.x, field.y, field.z), strict=True)
+    return [FIELD_NT["tesla"] * sign * value for sign, value in axes]
 
 
-def _ros_position(message: Any) -> dict[str, float]:
-    return {"latitude": message.latitude, "longitude": message.longitude} if message.status.status >= 0 else {}
+def _ros_attitude(message: Any) -> Sequence[float]:
+    """Return a quaternion; none if the covariance says that there is none, or it has no length."""
+    values = [getattr(message.orientation, name) for name in _QUATERNION]
+    return values if message.orientation_covariance[0] != -1 and sum(value**2 for value in values) > 0 else ()
 
 
-_ROS_COLUMNS: Mapping[str, Callable[[Any], dict[str, float]]] = {
-    "sensor_msgs/msg/MagneticField": _ros_field,
-    "sensor_msgs/msg/Imu": lambda m: {f"q{index}": getattr(m.orientation, name) for index, name in enumerate("wxyz")},
-    "sensor_msgs/msg/NavSatFix": _ros_position,
-    "nav_msgs/msg/Odometry": lambda m: {"speed": m.twist.twist.linear.x},
+_ROS: Mapping[str, tuple[tuple[str, ...], Callable[[Any], Sequence[float]]]] = {
+    "sensor_msgs/msg/MagneticField": (AXES, _ros_field),
+    "sensor_msgs/msg/Imu": (_QUATERNION, _ros_attitude),
+    "sensor_msgs/msg/NavSatFix": (_PLACE, lambda m: (m.latitude, m.longitude) if m.status.status >= 0 else ()),
+    "nav_msgs/msg/Odometry": (("speed",), lambda m: (m.twist.twist.linear.x,)),
 }
+"""Columns of each type, and what gives their values, none where a message tells nothing."""
 
 
 # NMEA 0183
@@ -192,39 +249,46 @@ _SENTENCES: Mapping[str, Mapping[str, tuple[str, float]]] = {
 }
 """Columns of each sentence: name of the field, and its unit."""
 _CHOICES = {"heading": ("heading_true", "heading_magnetic"), "speed": ("speed_water", "speed_ground")}
+_INVALID = {"status": "V", "mi": "V", "posMode": "N", "quality": 0}
+"""Fields of a sentence whose values are not valid."""
 
 
 def read_nmea(path: Path) -> Recording:
     """Read sentences of NMEA 0183 with pynmeagps: heading, speed, position, and transducers (XDR) by their names.
 
-    Sentences have the time of the last RMC or ZDA. A heading from true north and a speed through the water go first.
-    Names of transducers are those of columns, such as ``MAG_X_UT``, or ``PTCH`` and ``ROLL``.
+    Sentences have the time of their TAG block, or of the last RMC or ZDA. A heading from true north and a speed through
+    the water go first. Names of transducers are those of columns, such as ``MAG_X_UT``, or ``PTCH`` and ``ROLL``.
     """
     rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    now = None
-    with path.open("rb") as file:
-        for _, message in _package("pynmeagps", "pynmeagps").NMEAReader(file, quitonerror=0):
-            now = _nmea_time(message) or now
-            if now:
-                for name, value in _nmea_values(message):
+    reader, now = _package("pynmeagps", "pynmeagps").NMEAReader, None
+    for line in path.read_bytes().splitlines(keepends=True):
+        tag = re.match(rb"\\[^\\]*\bc:(\d+)", line)
+        for _, message in reader(io.BytesIO(line), quitonerror=0):
+            if any(getattr(message, field, None) == value for field, value in _INVALID.items()):
+                continue
+            now = int(tag[1]) / (1000 if len(tag[1]) > 11 else 1) if tag else _nmea_time(message) or now
+            for name, value in _nmea_values(message):
+                if now:
                     rows[name].append((now, value))
     if not rows:
-        raise ValueError("no sentence with a time (RMC or ZDA) is followed by one of heading, speed, position or XDR")
+        raise ValueError(
+            "no sentence with a time (TAG, RMC, ZDA) is followed by one of heading, speed, position or XDR"
+        )
     north = "true" if "heading_true" in rows else "magnetic"
     for name, choices in _CHOICES.items():
         held = [pairs for choice in choices if (pairs := rows.pop(choice, None))]
         rows |= {name: held[0]} if held else {}
-    return Recording(_streams(rows), "NMEA 0183", north)
+    return Recording({name: tuple(np.array(pairs, float).T) for name, pairs in rows.items()}, "NMEA 0183", north)
 
 
 def _nmea_time(message: Any) -> float | None:
     """Return the time of a sentence that has time and date [s since 1970]."""
-    date = getattr(message, "date", None)
-    if message.msgID == "ZDA":
-        date = datetime.date(message.year, message.month, message.day)
-    if message.msgID not in ("RMC", "ZDA") or not date or not message.time:
+    if message.msgID not in ("RMC", "ZDA"):
         return None
-    return datetime.datetime.combine(date, message.time, datetime.timezone.utc).timestamp()
+    with suppress(TypeError, ValueError):  # blank fields, or no date
+        date = message.date if message.msgID == "RMC" else datetime.date(message.year, message.month, message.day)
+        return datetime.datetime.combine(date, message.time, datetime.timezone.utc).timestamp()
+    return None
 
 
 def _nmea_values(message: Any) -> Iterator[tuple[str, float]]:
@@ -232,9 +296,14 @@ def _nmea_values(message: Any) -> Iterator[tuple[str, float]]:
     for name, (field, unit) in _SENTENCES.get(message.msgID, {}).items():
         value = getattr(message, field, "")
         if isinstance(value, (int, float)):
-            yield name, unit * value
+            yield name, unit * value + _deviation(message)
     for number in range(1, 10) if message.msgID == "XDR" else ():
         name, value = (getattr(message, f"{field}_{number:02}", "") for field in ("tdrid", "data"))
         found = column_of({"PTCH": "PITCH"}.get(name, name))
         if found and isinstance(value, (int, float)):
             yield found[0], found[1] * value
+
+
+def _deviation(message: Any) -> float:
+    """Return the deviation of a compass [deg, east] (HDG)."""
+    return (getattr(message, "deviation", 0) or 0) * (-1 if getattr(message, "deviationEW", "") == "W" else 1)

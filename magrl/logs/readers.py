@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+import io
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +12,25 @@ import pandas
 from pandas import Series
 
 from magrl.checks import check_choice, short
-from magrl.logs.autopilots import read_bag, read_bin, read_nmea, read_ulg
+from magrl.logs.autopilots import read_ardupilot, read_bag, read_nmea, read_ulg
 from magrl.logs.samples import AXES, Array, Log, Recording, samples_of, times_of
 from magrl.logs.units import EARTH_NT, column_of, guess_unit
 from magrl.logs.vectors import FRAMES
 
+_NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 
-def read_log(*paths: Path | str, frame: str = "FRD") -> Log:
+
+def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) -> Log:
     """Read the log of a vehicle, which may be in several files, such as one of the magnetometer and one of the heading.
 
     Args:
-        paths: files: ``.csv``; ``.ulg`` (PX4); ``.bin`` (ArduPilot); ``.bag`` (ROS 1), or a folder (ROS 2); ``.nmea``.
-            Columns of later ones replace those of earlier ones; all have one clock.
+        paths: files, recognized by their content: CSV, PX4 (ULog), ArduPilot (DataFlash, telemetry), ROS, NMEA 0183; or
+            a folder of ROS 2. Columns of later ones replace those of earlier ones; all have one clock.
         frame: axes of CSV files, one of :data:`~magrl.logs.vectors.FRAMES`; the attitude is that of FRD and NED.
+        sensor: magnetometer of those that a log of PX4, ArduPilot or ROS has; by default a healthy one that was used.
 
     Raises:
-        ValueError: naming the file and what is wrong with it, or a suffix that is not known.
+        ValueError: naming the file and what is wrong with it, or a content that is not known.
         ImportError: for a package that is not installed, naming the extra.
 
     Example:
@@ -37,22 +41,12 @@ def read_log(*paths: Path | str, frame: str = "FRD") -> Log:
         [[0.0, 15000.0, 0.0, 48000.0, 350.0]]
     """
     check_choice(FRAMES, frame=frame)
-    readers: Mapping[str, Callable[[Path], Recording]] = {
-        ".csv": partial(read_csv, frame=frame),
-        ".ulg": read_ulg,
-        ".bin": read_bin,
-        ".bag": read_bag,
-        "": read_bag,
-        ".nmea": read_nmea,
-    }
     found = []
     for path in map(Path, paths):
-        kind = "" if path.is_dir() else path.suffix.lower()
-        if kind not in readers or not path.exists():
-            known = ", ".join(filter(None, readers))
-            raise ValueError(f"a log is a file {known} or a folder of ROS 2 that exists, got {str(path)!r}")
+        reader = _reader(path)
+        options = {} if reader is read_nmea else {"frame": frame} if reader is read_csv else {"sensor": sensor}
         try:
-            found.append(readers[kind](path))
+            found.append(reader(path, **options))
         except ImportError:
             raise
         except Exception as error:  # whatever the packages raise for a foreign or damaged file
@@ -66,16 +60,36 @@ def read_log(*paths: Path | str, frame: str = "FRD") -> Log:
     return Log(samples, "; ".join(each.source for each in found), norths[-1] if norths else None, (*more, *notes))
 
 
+def _reader(path: Path) -> Callable[..., Recording]:
+    """Return the reader of a file or a folder."""
+    if path.is_dir():
+        return read_bag
+    if path.exists():
+        with path.open("rb") as file:
+            start = file.read(4096)
+        for pattern, reader in _FORMATS:
+            if re.match(pattern, start, re.DOTALL):
+                return reader
+    raise ValueError(
+        f"a log is a file of CSV, PX4, ArduPilot, ROS, NMEA 0183, or a folder of ROS 2 that exists, got {str(path)!r}"
+    )
+
+
 def read_csv(path: Path, frame: str = "FRD") -> Recording:
     """Read a CSV file with a header: see :data:`~magrl.logs.units.COLUMNS` for names and units.
 
-    Times are numbers or ISO 8601 texts. Blank cells do not count; other columns are ignored.
+    Three columns without a header are three axes, and their times row numbers. Times are numbers or
+    ISO 8601 texts. Blank cells do not count; other columns are ignored.
     """
-    raw = pandas.read_csv(path, skipinitialspace=True)
+    lines = path.read_text().rstrip().splitlines() or [""]
+    if re.fullmatch(rf"\s*{_NUMBER}(\s*[,;\s]\s*{_NUMBER}){{2}}\s*", lines[0]):
+        rows = (re.sub(r"[\s,;]+", ",", line.strip()) for line in lines)
+        lines = ["time,x,y,z", *(f"{number},{row}" for number, row in enumerate(rows))]
+    comma = max(",;\t", key=lines[0].count)
+    raw = pandas.read_csv(io.StringIO("\n".join(lines)), sep=comma, skipinitialspace=True)
     if not len(raw):
         raise ValueError("the table has no row")
-    lines = path.read_bytes().rstrip().splitlines()
-    cut = lines[-1].count(b",") < lines[0].count(b",")
+    cut = lines[-1].count(comma) < lines[0].count(comma)
     raw = raw[:-1] if cut else raw
     found: dict[str, tuple[str, float]] = {}
     for header in raw:
@@ -107,3 +121,13 @@ def _numbers(column: Series) -> Array:
         row = int(bad.idxmax())
         raise ValueError(f"row {row + 1}, {column.name}: {short(column[row])} is not a number")
     return numbers.to_numpy(float)
+
+
+_FORMATS: Sequence[tuple[bytes, Callable[..., Recording]]] = (
+    (rb"ULog", read_ulg),
+    (rb"\xa3\x95|\0.{7}[\xfd\xfe]", read_ardupilot),
+    (rb"#ROSBAG|SQLite format 3|\x89MCAP", read_bag),
+    (rb"([^\n]*\n)*?[^\n,]*[$!][A-Z]{2}[A-Z\d]{3},", read_nmea),
+    (rb"[^\0]*\Z", read_csv),
+)
+"""How the content of a file begins (a regular expression), and its reader."""

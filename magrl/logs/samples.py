@@ -172,11 +172,11 @@ def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
     }
     samples = pandas.DataFrame(table)
     whole = np.isfinite(samples[[name for name in (*AXES, *ATTITUDE) if name in samples]]).all(axis=1)
-    if not whole.any():
-        raise ValueError("no sample has a magnetometer and an attitude at the same time: check the times of both")
+    zero = (samples[list(AXES)] == 0).all(axis=1) & whole
+    if not (whole & ~zero).any():
+        raise ValueError("no sample has a field and an attitude at the same time: check both times, and the sensor")
     if left := int((~whole).sum()):
         notes.append(f"{_count(left, 'sample')} without attitude or axes left out")
-    zero = (samples[list(AXES)] == 0).all(axis=1) & whole
     if zero.any():
         notes.append(f"{_count(int(zero.sum()), 'sample')} of three zeros left out: the magnetometer did not answer")
     samples = samples[whole & ~zero].reset_index(drop=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from support.logs import ELEMENTS, ulog
 
 from magrl.logs import Calibration
 from magrl.logs.__main__ import main
@@ -48,11 +49,12 @@ def test_the_story_of_the_page(folder: Path, monkeypatch, capsys) -> None:
     assert table["miss_km"].iloc[-1] < 30
 
 
-def test_a_real_log_of_px4_agrees_with_igrf(capsys) -> None:
-    main([str(ROOT / "docs" / "examples" / "px4.ulg")])
+def test_a_log_of_px4_agrees_with_igrf(tmp_path: Path, capsys) -> None:
+    (tmp_path / "log.ulg").write_bytes(ulog({"vehicle_magnetometer:0": 1.0, "sensor_mag:0": 0.5}))
+    main([str(tmp_path / "log.ulg"), "--sensor", "vehicle_magnetometer"])
     said = capsys.readouterr().out
-    assert "first reading: D 3.00 deg, I 63.23 deg, B_H 21661 nT" in said
-    assert "mean of 1: D -0.06 deg, I -0.20 deg, B_H 105 nT" in said
+    assert "first reading: D {:.2f} deg, I {:.2f} deg, B_H {:.0f} nT".format(*ELEMENTS) in said
+    assert "state sensor for another one: sensor_mag" in said
     assert "warning" not in said
 
 
@@ -92,7 +94,7 @@ def test_a_short_log_is_compared(folder: Path, capsys) -> None:
     ("name", "options", "message"),
     [
         ("way.csv", ["--calibration", "none.json"], "none.json is not a calibration"),
-        ("swing.txt", [], "a log is a file .csv"),
+        ("swing.txt", [], "a log is a file of CSV"),
         (
             "swing.csv",
             ["--calibrate", "quay.json", "--here", "1"],

@@ -130,9 +130,10 @@ def test_two_files_of_one_vehicle(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["log.xlsx", "none.csv"])
-def test_files_that_are_not_logs(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"a log is a file \.csv, .* or a folder of ROS 2 that exists, got '{name}'"):
-        read_log(name)
+def test_files_that_are_not_logs(tmp_path: Path, name: str) -> None:
+    (tmp_path / "log.xlsx").write_bytes(b"PK\3\4\0")
+    with pytest.raises(ValueError, match=rf"a log is a file of CSV, .* that exists, got '.*{name}'"):
+        read_log(tmp_path / name)
 
 
 def test_times_that_are_not_there() -> None:
