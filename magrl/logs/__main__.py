@@ -120,6 +120,8 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     std = np.sqrt(np.square(table[list(STD_NAMES)]).mean())
     noise, bias = (" ".join(f"{each:.3g}" for each in values) for values in (std, known.std if known else np.zeros(3)))
     missing = "" if known else "; --bias is that of your sensors, which no calibration tells"
+    if std.isna().any():
+        noise, missing = "D I B_H", f"; --noise is that of your sensors, which so few samples do not tell{missing}"
     return [
         *found,
         f"{len(table)} readings, moves of {table['distance'][1:].mean():.3g} km: {out}",

@@ -46,7 +46,8 @@ def readings_of(
     Returns:
         Columns of ``recipes/replay_log.py``: ``time``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` of the move
         since the row before, ``latitude`` and ``longitude`` where known; and ``D_std``, ``I_std``, ``B_H_std``, the
-        standard deviations of the means by the scatter of tenths of their samples, ``samples``, and ``spikes``.
+        standard deviations of the means by the scatter of tenths of their samples, NaN where all moves have less than
+        three, ``samples``, and ``spikes``.
 
     Raises:
         ValueError: for a log without a heading or a motion, or an unknown north.
@@ -155,19 +156,21 @@ def _spikes(field: Array, part: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _covariance(field: Array, part: NDArray[np.int64]) -> Array:
-    """Return the covariance ``(3, 3)`` of the mean of a part, as a mean over the parts.
+    """Return the covariance ``(3, 3)`` of the mean of a part, as a mean over the parts; NaN if all are too short.
 
-    The means of tenths of a part scatter by errors that last less than a tenth; their linear trend is the field's.
+    The means of tenths of a part scatter by errors that last less than a tenth; their linear trend is the field's. In a
+    part of less than two samples a tenth, the samples scatter, which does not show errors that last longer.
     """
-    found = []
-    for rows in np.split(field, np.flatnonzero(np.diff(part)) + 1):
-        if len(rows) < 2 * _BLOCKS:
-            continue
-        blocks = np.stack([block.mean(0) for block in np.array_split(rows, _BLOCKS)])
-        line = np.linspace(-1, 1, _BLOCKS)
-        rest = blocks - blocks.mean(0) - np.outer(line, line @ blocks / (line @ line))
-        found.append(rest.T @ rest / (_BLOCKS - 2) / _BLOCKS)
-    return np.mean(found, 0) if found else np.zeros((3, 3))
+    parts = np.split(field, np.flatnonzero(np.diff(part)) + 1)
+    least = 2 * _BLOCKS if max(map(len, parts)) >= 2 * _BLOCKS else 3
+    covariances = []
+    for rows in parts:
+        if len(rows) >= least:
+            blocks = np.stack([block.mean(0) for block in np.array_split(rows, min(_BLOCKS, len(rows)))])
+            line = np.linspace(-1, 1, len(blocks))
+            rest = blocks - blocks.mean(0) - np.outer(line, line @ blocks / (line @ line))
+            covariances.append(rest.T @ rest / (len(blocks) - 2) / len(blocks))
+    return np.mean(covariances, 0) if covariances else np.full((3, 3), np.nan)
 
 
 def _readings(mean: DataFrame, covariance: Array, north: str) -> DataFrame:

@@ -83,11 +83,13 @@ def test_a_compass_calibrates_by_the_length_alone(folder: Path, capsys) -> None:
     assert "too few directions for a fit without attitude" in capsys.readouterr().err
 
 
-def test_a_short_log_is_compared(folder: Path, capsys) -> None:
+def test_a_short_log_is_compared_and_its_noise_is_to_be_stated(folder: Path, capsys) -> None:
     rows = (folder / "raw" / "way.csv").read_text().splitlines()[:200]
     (folder / "short.csv").write_text("\n".join(rows))
     main([str(folder / "short.csv")])
     assert "one reading: no file is written" in capsys.readouterr().out
+    main([str(folder / "short.csv"), "--every-s", "2"])
+    assert "--noise D I B_H --bias 0 0 0; --noise is that of your sensors" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

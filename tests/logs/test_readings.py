@@ -77,6 +77,15 @@ def test_the_standard_deviation_of_correlated_noise() -> None:
     assert np.mean(white) > 10
 
 
+@pytest.mark.parametrize("count", [3, 5, 12, 19, 20])
+def test_the_standard_deviation_of_few_samples(count: int) -> None:
+    """That of white noise, 30 / sqrt(n), and unknown below three samples."""
+    noise = np.random.default_rng(count).normal(0, 30, (200 * count, 3))
+    std = readings_of(sailed(200 * count, noise), every_s=float(count))["B_H_std"]
+    assert np.sqrt((std**2).mean()) == pytest.approx(30 / np.sqrt(count), rel=0.2)
+    assert readings_of(sailed(200, noise[:200]), every_s=2.0)["B_H_std"].isna().all()
+
+
 def test_a_magnetic_heading_and_a_calibration() -> None:
     one, options = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), {"noise_nt": 0.0, "samples": 9, "outliers": 0.0}
     options |= {"method": "vector", "std": (0.1, 0.1, 9.0), "seen": ((0.0, 1.0),) * 3, "here": (0.0, 0.0)}
