@@ -107,11 +107,11 @@ def read_ulg(path: Path, sensor: str | None = None) -> Recording:
         offset = float(np.median((position["time_utc_usec"] - position["timestamp"].astype(float))[fixed])) / 1e6
     flags = topics.get("estimator_status_flags", {})
     gnss = np.mean(flags.get("cs_gnss_yaw", flags.get("cs_gps_yaw", 0))) > 0.5  # the heading of two antennas is used
-    found = _recording("PX4 ULog", tables, sensor, used)
+    recording = _recording("PX4 ULog", tables, sensor, used)
     notes = [] if gnss else [MODEL_NORTH]
     notes += ["the file is damaged or truncated"] if log.file_corruption or _is_cut(path) else []
-    streams = {column: (time + offset, values) for column, (time, values) in found.streams.items()}
-    return Recording(streams, found.source, "true" if gnss else "model", [*notes, *found.notes])
+    streams = {column: (time + offset, values) for column, (time, values) in recording.streams.items()}
+    return Recording(streams, recording.source, "true" if gnss else "model", [*notes, *recording.notes])
 
 
 def _px4_table(topics: Mapping[str, Any], name: str, columns: Sequence[str]) -> dict[str, Array]:
@@ -153,11 +153,11 @@ _MESSAGES: dict[str, tuple[tuple[str, ...], Sequence[str], float]] = {
     "GPS_RAW_INT": (_PLACE, ("lat", "lon"), 1e-7),
 }
 """Messages of DataFlash and of telemetry: columns, their fields, and their unit."""
-_MAGS = {"MAG": ("MagX", "MagY", "MagZ"), "RAW_IMU": ("xmag", "ymag", "zmag")}
-_MAGS |= {"MAG2": _MAGS["MAG"], "MAG3": _MAGS["MAG"], "SCALED_IMU2": _MAGS["RAW_IMU"], "SCALED_IMU3": _MAGS["RAW_IMU"]}
+_RAW = dict.fromkeys(("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3"), ("xmag", "ymag", "zmag"))
+_MAGS = {"MAG": ("MagX", "MagY", "MagZ")} | _RAW
 _MESSAGES |= {name: (AXES, fields, FIELD_NT["milligauss"]) for name, fields in _MAGS.items()}
-_USE = {"MAG": "", "MAG:1": "2", "MAG2": "2", "MAG:2": "3", "MAG3": "3"}
-"""Magnetometers, and the number of their parameter COMPASS_USE."""
+_USE = {"MAG": "COMPASS_USE", "MAG:1": "COMPASS_USE2", "MAG:2": "COMPASS_USE3"}
+"""Magnetometers, and the parameter by which the vehicle uses them."""
 
 
 def read_ardupilot(path: Path, sensor: str | None = None) -> Recording:
@@ -178,9 +178,9 @@ def read_ardupilot(path: Path, sensor: str | None = None) -> Recording:
                 columns, fields, unit = _MESSAGES[name]
                 values = (unit * getattr(message, field) for field in fields)
                 rows[columns][f"{name}:{number}" if number else name].append((message._timestamp, *values))
-    used = [name for name, number in _USE.items() if log.params.get(f"COMPASS_USE{number}", 1)]
-    found = _recording(f"ArduPilot {'DataFlash' if flash else 'telemetry'}", _tables(rows), sensor, used)
-    return found._replace(north="model", notes=[MODEL_NORTH, *found.notes])
+    used = [name for name, parameter in _USE.items() if log.params.get(parameter, 1)]
+    recording = _recording(f"ArduPilot {'DataFlash' if flash else 'telemetry'}", _tables(rows), sensor, used)
+    return recording._replace(north="model", notes=[MODEL_NORTH, *recording.notes])
 
 
 def _tables(rows: _Rows) -> dict[tuple[str, ...], Mapping[str, Array]]:
@@ -213,8 +213,7 @@ def read_bag(path: Path, sensor: str | None = None) -> Recording:
 
 
 def _ros_field(message: Any) -> Sequence[float]:
-    field = message.magnetic_field
-    axes = zip(FRAMES["FLU"], (field.x, field.y, field.z), strict=True)
+    axes = zip(FRAMES["FLU"], (getattr(message.magnetic_field, name) for name in AXES), strict=True)
     return [FIELD_NT["tesla"] * sign * value for sign, value in axes]
 
 
