@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
-from magrl.checks import check_number, check_numbers, check_type
+from magrl.checks import check_numbers, check_type
 from magrl.field.elements import NAMES, UNITS
+from magrl.tracking.planning import MISSING_KM, SLOPES
 from magrl.transforms import ObservationView, TrackView
 
 LEAST_NT = 2000.0
 """Least B_H for an agent without a map: below, it fails more often (docs/earth.md, the whole globe) [nT]."""
 
-LEAST_STD_NT = 0.2
-"""Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
 STUCK_KM = (100.0, 400.0)
 """Path without a change of all readings, and of one of them, after which a sensor is stuck: at least this, and at least
 2 and 8 of the longest moves [km]. Coarse readings of one element can be equal that long; chosen."""
@@ -24,6 +22,7 @@ _LONGER = 1.1  # than the longest move
 
 View = ObservationView | TrackView | None
 Path = tuple[float, float, float]
+Reading = tuple[float | None, float | None, float | None]
 
 
 def view_of(policy: TensorDictModuleBase) -> View:
@@ -49,26 +48,23 @@ def move_limits(
         max_turn_deg: its largest turn to either side; by default that of the policy, or 90 degrees.
 
     Raises:
-        ValueError: for a vehicle that cannot do what the policy commands, or numbers out of their range.
+        ValueError: for a vehicle that cannot do what the policy commands.
 
     Example:
         >>> move_limits(None, max_move_km=20.0)
         (20.0, 90.0)
     """
     own = policy if policy is None else view_of(policy) or policy
-    moves, turns = getattr(own, "max_move_km", None), getattr(own, "max_turn_rad", None)
-    turns = None if turns is None else math.degrees(turns)
+    move, turn = getattr(own, "max_move_km", None), getattr(own, "max_turn_rad", None)
     limits = []
-    for name, vehicle, commanded, usual, most in (
-        ("max_move_km", max_move_km, moves, 50.0, 1000.0),
-        ("max_turn_deg", max_turn_deg, turns, 90.0, 180.0),
+    for name, value, commanded, usual in (
+        ("max_move_km", max_move_km, move, 50.0),
+        ("max_turn_deg", max_turn_deg, None if turn is None else math.degrees(turn), 90.0),
     ):
-        value = (usual if commanded is None else commanded) if vehicle is None else vehicle
-        given: dict[str, Any] = {name: value}
-        check_number(0, most, above=True, **given)
-        if commanded is not None and value < commanded * (1 - 1e-6):
+        least = usual if commanded is None else commanded
+        if commanded is not None and value is not None and value < commanded * (1 - 1e-6):
             raise ValueError(f"{name} must be at least {commanded:g}, which the policy commands, got {value!r}")
-        limits.append(float(value))
+        limits.append(float(least if value is None else value))
     return limits[0], limits[1]
 
 
@@ -101,21 +97,35 @@ def out_of_range(view: View, elements: Sequence[float]) -> str:
     return ""
 
 
-def unchanged_km(known: Sequence[float], before: Sequence[float], after: Sequence[float], move_km: float) -> Path:
-    """Return the path since each element last changed ``(3,)`` [km].
+def measured(std: Sequence[float]) -> tuple[bool, ...]:
+    """Return which elements a vehicle measures: those whose standard deviation is less than their change over 1000 km.
+
+    Args:
+        std: standard deviations of the reading's noise: D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> measured((1e4, 0.02, 2.0))
+        (False, True, True)
+    """
+    return tuple(value / slope < MISSING_KM for value, slope in zip(std, SLOPES, strict=True))
+
+
+def unchanged_km(known: Sequence[float], before: Sequence[float], after: Reading, move_km: float) -> Path:
+    """Return the path since each element last changed ``(3,)`` [km], without moves at whose end it was not read.
 
     Args:
         known: the same before the move.
         before: D, I, B_H before the move.
-        after: the same after it.
+        after: the same after it; None for an element that was not read.
         move_km: its length.
 
     Example:
-        >>> unchanged_km((30.0, 30.0, 30.0), (3.5, 73.0, 15000.0), (3.5, 73.1, 15020.0), 20.0)
-        (50.0, 0.0, 0.0)
+        >>> unchanged_km((30.0, 30.0, 30.0), (3.5, 73.0, 15000.0), (3.5, 73.1, None), 20.0)
+        (50.0, 0.0, 30.0)
     """
     first, second, third = (
-        km + move_km if one == other else 0.0 for km, one, other in zip(known, before, after, strict=True)
+        km if new is None else km + move_km if new == old else 0.0
+        for km, old, new in zip(known, before, after, strict=True)
     )
     return first, second, third
 
@@ -124,7 +134,7 @@ def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
     """Return which readings are those of a stuck sensor, as text; empty if none is.
 
     Args:
-        unchanged: from :func:`unchanged_km`.
+        unchanged: from :func:`unchanged_km`; 0 for an element that is not measured.
         max_move_km: longest move.
 
     Example:
@@ -138,30 +148,6 @@ def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
         return ""
     have, its = ("have", "their") if len(held) > 1 else ("has", "its")
     return f"{', '.join(held)} {have} not changed over {min(held.values()):.0f} km: {its} sensor is stuck"
-
-
-def check_std(**std: Sequence[float]) -> None:
-    """Raise unless standard deviations of D [deg], I [deg], B_H [nT] are possible for the sensors of a vehicle.
-
-    Args:
-        std: three numbers by the name that the message uses; 0 for perfect sensors.
-
-    Raises:
-        ValueError: for other than three numbers from 0 on, or a standard deviation that looks like microtesla.
-
-    Example:
-        >>> check_std(sensor_std=(0.02, 0.02, 0.005))
-        Traceback (most recent call last):
-        ValueError: sensor_std: 0.005 nT of B_H is less than the 0.2 nT of the best sensors in a vehicle: it looks \
-like microtesla, and nanotesla are expected; give 0 for a perfect sensor
-    """
-    check_numbers(3, 0, **std)
-    for name, values in std.items():
-        if 0 < values[2] < LEAST_STD_NT:
-            raise ValueError(
-                f"{name}: {values[2]:g} nT of B_H is less than the {LEAST_STD_NT:g} nT of the best sensors in a "
-                "vehicle: it looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor"
-            )
 
 
 def check_move(heading_deg: float, distance_km: float, steer_deg: float | None, max_move_km: float) -> None:
@@ -185,13 +171,10 @@ def check_move(heading_deg: float, distance_km: float, steer_deg: float | None, 
         Traceback (most recent call last):
         ValueError: heading 1.0472 looks like radians: the vehicle was to steer 60.0 deg; degrees are expected
     """
-    named: tuple[dict[str, Any], dict[str, Any]] = {"heading [deg]": heading_deg}, {"distance [km]": distance_km}
-    check_number(-360, 360, **named[0])
-    check_number(0, **named[1])
     if distance_km > _LONGER * max_move_km:
         raise ValueError(
             f"distance {distance_km:g} km is longer than the longest move of this vehicle, {max_move_km:g} km: it must "
-            "be in kilometers, and since the last step"
+            "be in kilometers, and since the last step; report a longer way in parts, None for the readings between"
         )
     if steer_deg is None or abs(heading_deg) > 2 * math.pi or _apart(heading_deg, steer_deg) < 10:
         return

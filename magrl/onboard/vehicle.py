@@ -19,12 +19,12 @@ from tensordict.nn import TensorDictModuleBase
 
 from magrl import tracking
 from magrl.agents import FieldPolicy, load_pretrained
-from magrl.checks import check_number, check_numbers, check_type
+from magrl.checks import check_type
 from magrl.envs.geomagnetic import PUBLIC_KEYS
-from magrl.files import DamagedFileError, load_tensors, save_tensors
-from magrl.navigators import Kalman, Navigator, RunAndTumble, Secant
+from magrl.navigators import Kalman, RunAndTumble, Secant
 from magrl.onboard.estimator import Estimator
-from magrl.onboard.limits import check_move, check_std, move_limits, out_of_range, stuck, unchanged_km, view_of
+from magrl.onboard.journal import Journal, Options, Start, Step
+from magrl.onboard.limits import check_move, measured, move_limits, out_of_range, stuck, unchanged_km, view_of
 from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_distance, check_earth_jump, check_earth_reading
 from magrl.onboard.start import Elements, calibrated, check_start, known_elements, nearby_elements
 from magrl.tracking import ArrivalDecision, Way
@@ -41,11 +41,7 @@ LOST_SURPRISE = 100.0
 simulation, it reached 5 with a right data sheet, and 31 under the conditions of an aircraft."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 4
-_FORMAT, _NOT_STARTED = 7, "the vehicle has no destination yet: call start(target) first"
-_OPTIONS = ("name", "sensor_std", "bias_std", "drift_std", "max_move_km", "max_turn_deg", "max_steps", "arrival_km")
-# Parts of the state that are numbers
-_PLAIN = "_step", "_steer", "_last", "_surprises", "_northward", "_unchanged", "_known", "_near", "_error", "_left_std"
-_STATES = ("state", "memory")  # attributes in which policies and navigators keep their state
+_NOT_STARTED = "the vehicle has no destination yet: call start(target) first"
 
 
 @dataclass(frozen=True)
@@ -137,41 +133,41 @@ class Onboard:
         confidence: float = 0.8,
     ) -> None:
         check_type((str, TensorDictModuleBase), navigator=navigator)
-        check_std(sensor_std=sensor_std, bias_std=bias_std, drift_std=drift_std)
-        check_number(1, whole=True, max_steps=max_steps)
-        check_number(0, above=True, arrival_km=arrival_km)
-        check_number(0, 1, confidence=confidence)
-        self.sensor_std, self.bias_std = tuple(map(float, sensor_std)), tuple(map(float, bias_std))
-        self.drift_std = tuple(map(float, drift_std))
-        self.max_steps, self.arrival_km, self.confidence = max_steps, float(arrival_km), confidence
-        known = load_pretrained("anywhere") if navigator == "anywhere" else navigator
-        policy = None if isinstance(known, str) else known
-        self._named = known if isinstance(known, str) else None
-        self._left_std = self.bias_std
-        self.max_move_km, self.max_turn_deg = move_limits(policy, max_move_km, max_turn_deg)
-        self.navigator: Any = self._aware(copy.deepcopy(policy or self._untrained(known))).cpu()
-        self.name = type(self.navigator).__name__
+        given: dict[str, Any] = {"sensor_std": sensor_std, "bias_std": bias_std, "drift_std": drift_std}
+        given |= {"max_move_km": max_move_km, "max_turn_deg": max_turn_deg, "max_steps": max_steps}
+        options = Options(**given, arrival_km=arrival_km, confidence=confidence)
+        source = load_pretrained("anywhere") if navigator == "anywhere" else navigator
+        policy = None if isinstance(source, str) else source
+        self.max_move_km, self.max_turn_deg = move_limits(policy, options.max_move_km, options.max_turn_deg)
+        self.options = options.replace(max_move_km=self.max_move_km, max_turn_deg=self.max_turn_deg)
+        self._left_std: Values = options.bias_std
+        self._source = source if policy is None else self._aware(copy.deepcopy(policy)).cpu()
+        self.navigator = self._new_navigator()
+        name, weights = type(self.navigator).__name__, self.navigator.state_dict().values()
+        content = b"".join(value.cpu().numpy().tobytes() for value in weights if isinstance(value, torch.Tensor))
+        self.options = self.options.replace(navigator=name, weights=hashlib.sha256(content).hexdigest())
         if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *STD_KEYS, "step_count", "done"}):
-            raise ValueError(f"{self.name} reads {', '.join(unknown)}, which a vehicle does not know")
+            raise ValueError(f"{name} reads {', '.join(unknown)}, which a vehicle does not know")
         self._view, self._estimator = view_of(self.navigator), Estimator(self.navigator)
 
-    def _untrained(self, name: str) -> Navigator:
-        """Return a new navigator of a name."""
-        bounds = self.max_move_km, math.radians(self.max_turn_deg)
-        if name == "secant":
-            return Secant(*bounds, sensor_std=self.sensor_std, bias_std=self._left_std)
-        if name == "kalman":
-            return Kalman(*bounds, self.sensor_std, self.max_steps, bias_std=self._left_std, search=False)
-        if name == "run_and_tumble":
+    def _new_navigator(self) -> Any:
+        """Return the navigator before its first step."""
+        if not isinstance(self._source, str):
+            return copy.deepcopy(self._source)
+        options, bounds = self.options, (self.max_move_km, math.radians(self.max_turn_deg))
+        if self._source == "secant":
+            return Secant(*bounds, sensor_std=options.sensor_std, bias_std=self._left_std)
+        if self._source == "kalman":
+            return Kalman(*bounds, options.sensor_std, options.max_steps, bias_std=self._left_std, search=False)
+        if self._source == "run_and_tumble":
             return RunAndTumble(*bounds)
-        raise ValueError(f"unknown navigator {name!r}: choose from {', '.join(NAMED)}, or give a policy")
+        raise ValueError(f"unknown navigator {self._source!r}: choose from {', '.join(NAMED)}, or give a policy")
 
     def _aware(self, navigator: TensorDictModuleBase) -> TensorDictModuleBase:
-        """Return a navigator that nobody tells that it has not arrived."""
-        view = view_of(navigator)
-        if not isinstance(navigator, FieldPolicy) or not isinstance(view, TrackView):
+        """Return the navigator with search disabled: a vehicle gets no arrival signal."""
+        if not isinstance(navigator, FieldPolicy) or not isinstance(view_of(navigator), TrackView):
             return navigator
-        return navigator.adapted(search=False, max_steps=self.max_steps)
+        return navigator.adapted(search=False, max_steps=self.options.max_steps)
 
     def start(
         self,
@@ -199,32 +195,38 @@ class Onboard:
         Raises:
             ValueError: for elements that are not possible on the Earth, or beyond the range of the policy.
         """
-        check_numbers(3, target=target)
-        goal = target[0], target[1], target[2]
-        check_earth_reading(*goal, what="the target")
-        if text := out_of_range(self._view, target):
+        given: dict[str, Any] = {"target": target, "here": here, "here_std": here_std, "near": near, "date": date}
+        start = Start(**given)
+        check_earth_reading(*start.target, what="the target")
+        if text := out_of_range(self._view, start.target):
             raise ValueError(f"the target: {text}")
-        most_km = LONGEST_WAY_KM if self._estimator.trained else self.max_steps * self.max_move_km
-        self._near = None if near is None else nearby_elements(near, date, goal, most_km)
-        self._known = None if here is None else known_elements(here, here_std, date)
+        nearby = None if start.near is None else nearby_elements(start.near, date, start.target, self._longest_way())
+        known = None if start.here is None else known_elements(start.here, start.here_std, date)
+        self._near, self._known, self._start, self.target = nearby, known, start, start.target
         self._error, self._left_std = self._calibrated()
-        self.target = tuple(map(float, target))
-        self._step = 0
-        if self._named:
-            self.navigator = self._untrained(self._named)
+        self.navigator = self._new_navigator()
         self._estimator = Estimator(self.navigator)
-        self._steer: float | None = None  # heading that the vehicle was to steer [deg]
+        self._steps: tuple[Step, ...] = ()
+        self._last_command: Command | None = None
+        self._raw: Elements | None = None  # the last reading, without calibration
         self._last, self._surprises = Values(), Values()  # the last reading with its course
         self._unchanged = EXACT  # path since each element last changed [km]
+        self._unread = [0.0] * 3  # path since it was last read [km]
         self._northward = Values()  # the first inclination, and how far magnetic north the vehicle has come [km]
-        for name in _STATES:
-            if hasattr(self.navigator, name):
-                setattr(self.navigator, name, [] if isinstance(getattr(self.navigator, name), list) else None)
 
     def step(
-        self, declination: float, inclination: float, horizontal_intensity: float, heading: float, distance: float = 0.0
+        self,
+        declination: float | None,
+        inclination: float | None,
+        horizontal_intensity: float | None,
+        heading: float,
+        distance: float = 0.0,
+        time: float | None = None,
     ) -> Command:
         """Return what to do after a move.
+
+        An element that could not be read is None: the vehicle goes on by dead reckoning. A way that is longer than a
+        move is reported in parts, each but the last without a reading.
 
         Args:
             declination: D at the end of the move [deg].
@@ -232,6 +234,8 @@ class Onboard:
             horizontal_intensity: B_H there [nT].
             heading: heading of the move [deg], -360 to 360; in the first step the heading at the start.
             distance: length of the move [km]; 0 in the first step.
+            time: time of the message, by any clock that does not run backward. The same message once more is then no
+                second move: it gets the same command.
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -239,69 +243,89 @@ class Onboard:
         """
         if self.target is None:
             raise RuntimeError(_NOT_STARTED)
-        check_earth_reading(declination, inclination, horizontal_intensity)
-        raw = declination, inclination, horizontal_intensity
+        given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
+        step = Step(**given, heading=heading, distance=distance, time=time)
+        if self._last_command is None or not step.repeats(self._steps[-1]):
+            self._last_command = self._move(step)
+            self._steps += (step,)
+        return self._last_command
+
+    def _move(self, step: Step) -> Command:
+        """Return what to do after a new move."""
+        raw = step.reading_after(self._raw)
+        check_earth_reading(*raw)
         error = self._error if self._last else self._calibrated(raw)[0]
         reading = math.remainder(raw[0] - error[0], 360), raw[1] - error[1], raw[2] - error[2]
-        self._check(reading, heading, distance)
-        self._error = error
-        course = math.remainder(math.radians(heading), 2 * math.pi)
+        self._check(step, reading)
+        course = math.remainder(math.radians(step.heading), 2 * math.pi)
         turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
+        std = step.accuracy(self.options.sensor_std)
         with torch.inference_mode():
-            seen = self._seen(reading, course, (distance, turn))
-            surprises = (*self._surprises, *((self._estimator.surprise(seen),) if self._last else ()))
+            seen = self._seen(reading, course, (step.distance, turn), std)
+            if self._last and step.reading != (None, None, None):
+                self._surprises = (*self._surprises, self._estimator.surprise(seen))[-_SURPRISES:]
             action = self._estimator.act(seen)
-            self._surprises = surprises[-_SURPRISES:]
-            self._unchanged = unchanged_km(self._unchanged, self._last[:3] or reading, reading, distance)
-            self._last = (*reading, course)
-            first, north = self._northward or (reading[1], 0.0)
-            self._northward = first, north + distance * math.cos(course - math.radians(reading[0]))
-            command = self._command(seen, action, course)
-            self._step += 1
-        self._steer = command.heading_deg
-        return command
+            self._error, self._last = error, (*reading, course)
+            self._remember(step, raw)
+            return self._command(seen, action, course)
+
+    def _remember(self, step: Step, raw: Elements) -> None:
+        """Keep what later steps are compared with."""
+        self._unchanged = unchanged_km(self._unchanged, self._raw or raw, step.reading, step.distance)
+        self._raw = raw
+        unread = zip(self._unread, step.reading, strict=True)
+        self._unread = [km + step.distance if value is None else 0.0 for km, value in unread]
+        declination, inclination, _, course = self._last
+        first, north = self._northward or (inclination, 0.0)
+        self._northward = first, north + step.distance * math.cos(course - math.radians(declination))
 
     def _calibrated(self, reading: Elements | None = None) -> tuple[Values, Values]:
         """Return the constant error of readings, as far as it is known, and the standard deviations that are left."""
+        options = self.options
         if reading and self._near:
-            std = [math.hypot(*each) for each in zip(self.sensor_std, self.bias_std, self._near[1], strict=True)]
+            std = [math.hypot(*each) for each in zip(options.sensor_std, options.bias_std, self._near[1], strict=True)]
             check_start(reading, self._near[0], std)
         if self._known is None:
-            return EXACT, self.bias_std
-        return calibrated(*self._known, (self.sensor_std, self.bias_std, self.drift_std), reading)
+            return EXACT, options.bias_std
+        return calibrated(*self._known, (options.sensor_std, options.bias_std, options.drift_std), reading)
 
-    def _check(self, reading: Elements, heading: float, distance: float) -> None:
+    def _check(self, step: Step, reading: Elements) -> None:
         """Raise unless a reading, a heading and a distance are possible, and possible together."""
-        if not self._last:
-            if distance != 0:
-                raise ValueError(f"the first step takes the reading at the start: distance must be 0, got {distance!r}")
-            check_move(heading, distance, None, self.max_move_km)
-            if text := out_of_range(self._view, reading):
-                raise ValueError(f"the reading at the start: {text}")
-            most_km = LONGEST_WAY_KM if self._estimator.trained else self.max_steps * self.max_move_km
-            check_earth_distance(reading, self.target, most_km)
+        steer_deg = self._last_command.heading_deg if self._last_command else None
+        check_move(step.heading, step.distance, steer_deg, self.max_move_km)
+        if self._last:
+            unread = (km for km, value in zip(self._unread, step.reading, strict=True) if value is not None)
+            distance = step.distance + max(unread, default=0.0)
+            check_earth_jump(self._last[:3], reading, distance, self.options.sensor_std)
             return
-        check_move(heading, distance, self._steer, self.max_move_km)
-        check_earth_jump(self._last[:3], reading, distance, self.sensor_std)
+        if step.distance != 0:
+            raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
+        if text := out_of_range(self._view, reading):
+            raise ValueError(f"the reading at the start: {text}")
+        check_earth_distance(reading, self.target, self._longest_way())
 
-    def _seen(self, reading: Sequence[float], course: float, move: tuple[float, float]) -> TensorDict:
+    def _longest_way(self) -> float:
+        """Return how far the target may be [km]."""
+        return LONGEST_WAY_KM if self._estimator.trained else self.options.max_steps * self.max_move_km
+
+    def _seen(self, reading: Elements, course: float, move: tuple[float, float], std: Sequence[float]) -> TensorDict:
         """Return what a policy reads, in a batch of one."""
         rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
-        rows |= dict(zip(STD_KEYS, (self.sensor_std, self._left_std, self.drift_std), strict=True))
+        rows |= dict(zip(STD_KEYS, (std, self._left_std, self.options.drift_std), strict=True))
         seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
-        seen |= {"step_count": torch.tensor([[self._step]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
+        seen |= {"step_count": torch.tensor([[len(self._steps)]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")
 
     def _command(self, seen: TensorDictBase, action: list[float], course: float) -> Command:
         """Return the command: to stop, to go to the estimated place where it is near, or what the navigator wants."""
-        left = torch.tensor([self.max_steps - 1 - self._step])
-        decision = self._estimator.decide(seen, left, self.arrival_km)
+        left = torch.tensor([self.options.max_steps - 1 - len(self._steps)])
+        decision = self._estimator.decide(seen, left, self.options.arrival_km)
         way = decision.posterior.way()
-        probability, radius = decision.probability.item(), decision.posterior.radius(self.confidence).item()
+        probability, radius = decision.probability.item(), decision.posterior.radius(self.options.confidence).item()
         stop, reason = self._stop(way, decision, radius, declared=action[2:] > [0.0])
         if stop:
             action = [0.0, 0.0]
-        elif way.displacement.norm() < self.arrival_km:
+        elif way.displacement.norm() < self.options.arrival_km:
             limits = decision.stop_km.unsqueeze(-1), self.max_move_km, math.radians(self.max_turn_deg)
             action = tracking.approach(way.displacement, seen["heading"], *limits)[0].tolist()
         steer = math.degrees(course + action[1]) % 360.0
@@ -312,7 +336,8 @@ class Onboard:
 
     def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float, declared: bool) -> tuple[str | None, str]:
         """Return why to stop, and that as a sentence."""
-        if text := stuck(self._unchanged, self.max_move_km):
+        options, useful = self.options, measured(self.options.sensor_std)
+        if text := stuck([km * use for km, use in zip(self._unchanged, useful, strict=True)], self.max_move_km):
             return "lost", text
         level = sum(self._surprises) / max(len(self._surprises), 1)
         if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
@@ -320,7 +345,7 @@ class Onboard:
         first, north_km = self._northward
         change = abs(self._last[1] - first) * 100 / max(abs(north_km), 1e-9) if abs(north_km) >= 100 else math.inf
         slope = min(change, tracking.steepest(self._estimator.track, 1))
-        if abs(self._last[1]) <= math.pi / 2 and slope < EQUATOR_SLOPE_DEG:
+        if useful[1] and abs(self._last[1]) <= math.pi / 2 and slope < EQUATOR_SLOPE_DEG:
             return "lost", f"inclination {self._last[1]:g} hardly changes: it looks like radians; degrees are expected"
         if text := out_of_range(self._view, self._last[:3]):
             return "out of range", text
@@ -330,18 +355,18 @@ class Onboard:
         wanted = ("arrived", "the policy declares its arrival") if declared else (None, "")
         if not decision.declare.item() or level > LOST_SURPRISE:
             return wanted
-        if decision.probability.item() >= self.confidence:
-            within = f"within {self.arrival_km:g} km with an estimated probability of {decision.probability.item():.2f}"
-            return "arrived", within
-        near = f"within {radius_km:.0f} km with an estimated probability of {self.confidence:.2f}"
-        if self._step >= self.max_steps - 1:
+        if decision.probability.item() >= options.confidence:
+            probability = f"an estimated probability of {decision.probability.item():.2f}"
+            return "arrived", f"within {options.arrival_km:g} km with {probability}"
+        near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"
+        if len(self._steps) >= options.max_steps - 1:
             return "nearest", f"out of steps: {near}"
-        if decision.attainable.item() < self.confidence:
+        if decision.attainable.item() < options.confidence:
             return "nearest", f"as near as these sensors allow: {near}"
         return wanted
 
     def save(self, path: Path | str) -> None:
-        """Write the state of the way to a file, for :meth:`restore`.
+        """Write all that the vehicle was told since :meth:`start` to a file, for :meth:`restore`.
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -349,38 +374,21 @@ class Onboard:
         """
         if self.target is None:
             raise RuntimeError(_NOT_STARTED)
-        kept = {name: getattr(self.navigator, name, None) for name in _STATES}
-        held = {name: value.to_dict() if isinstance(value, TensorDictBase) else value for name, value in kept.items()}
-        state = {name: getattr(self, name) for name in ("target", *_PLAIN)}
-        state["_estimates"] = None if self._estimator.state is None else self._estimator.state.to_dict()
-        save_tensors({"format": _FORMAT, "options": self._options(), "state": state, "navigator": held}, Path(path))
+        Journal(options=self.options, start=self._start, steps=self._steps).write(Path(path))
 
     def restore(self, path: Path | str) -> None:
-        """Resume from a file of :meth:`save`: the same readings give the same commands, bit for bit.
+        """Repeat the steps of a file of :meth:`save`: the same readings then give the same commands, bit for bit.
 
         Raises:
             ValueError: for a file that is damaged, of another format, or of a vehicle with other options.
+            OSError: if the file cannot be read.
         """
-        content = load_tensors(path)
-        parts = {"format", "options", "state", "navigator"}
-        if not isinstance(content, dict) or set(content) != parts or content["format"] != _FORMAT:
-            raise DamagedFileError(f"{path} is not the state of a vehicle of format {_FORMAT}")
-        options = self._options()
-        if other := [name for name in options if content["options"].get(name) != options[name]]:
-            raise ValueError(f"{path} is of a vehicle with another {other[0]}, {content['options'].get(other[0])!r}")
-        here, here_std = content["state"]["_known"] or (None, None)
-        self.start(content["state"]["target"], here, here_std=here_std)
-        for name in _PLAIN:
-            setattr(self, name, content["state"][name])
-        if content["state"]["_estimates"] is not None:
-            self._estimator.state = TensorDict(content["state"]["_estimates"], [1], device="cpu")
-        for name, value in content["navigator"].items():
-            held = TensorDict(value, [1], device="cpu") if isinstance(value, dict) else value
-            if held is not None:
-                setattr(self.navigator, name, held)
-
-    def _options(self) -> dict[str, Any]:
-        """Return what a state depends on."""
-        weights = [value for value in self.navigator.state_dict().values() if isinstance(value, torch.Tensor)]
-        digest = hashlib.sha256(b"".join(value.cpu().numpy().tobytes() for value in weights)).hexdigest()
-        return {name: getattr(self, name) for name in _OPTIONS} | {"weights": digest}
+        journal, own = Journal.read(Path(path)), dict(self.options)
+        for name, value in journal.options:
+            if value != own[name]:
+                raise ValueError(f"{path} is of a vehicle with another {name}, {value!r}")
+        resumed = copy.copy(self)
+        resumed.start(**dict(journal.start))
+        for step in journal.steps:
+            resumed.step(**dict(step))
+        self.__dict__ = resumed.__dict__

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import copy
+import hashlib
+import json
 import math
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from onnxruntime import InferenceSession
@@ -24,7 +29,7 @@ from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Secant
 from magrl.onboard import Onboard, VehicleStep, check_earth_jump, check_earth_reading, first_state, write_step
 from magrl.onboard.step import ONNX_INPUTS
-from magrl.transforms import Conditions, with_conditions, with_sensor_noise
+from magrl.transforms import Conditions, SensorErrors, with_conditions, with_sensor_noise
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
 NOISE = (0.02, 0.02, 2.0)
@@ -120,6 +125,12 @@ def test_commands_from_a_known_start_are_those_of_the_environment(name: str, tmp
     vehicle = Onboard(name, sensor_std=own.sensor_std, bias_std=own.bias_std, drift_std=own.drift_std, **options)
     vehicle.start(state["target_field"][0].tolist(), here, here_std=known)
     for step in range(6):
+        if step in (0, 3):
+            vehicle.save(tmp_path / "state")
+            vehicle = Onboard(
+                name, sensor_std=own.sensor_std, bias_std=own.bias_std, drift_std=own.drift_std, **options
+            )
+            vehicle.restore(tmp_path / "state")
         reading = (state["field"] + state["start_error"])[0].tolist()
         command = vehicle.step(*reading, *numbers(state)[3:])
         assert command.way_km == pytest.approx(state["arrival_way"][0].tolist(), rel=1e-3, abs=0.01)
@@ -127,12 +138,6 @@ def test_commands_from_a_known_start_are_those_of_the_environment(name: str, tmp
             state = env.step(policy(state))["next"]
         distance, turn = state["move"][0].tolist()
         assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
-        if step == 2:
-            vehicle.save(tmp_path / "state.pt")
-            vehicle = Onboard(
-                name, sensor_std=own.sensor_std, bias_std=own.bias_std, drift_std=own.drift_std, **options
-            )
-            vehicle.restore(tmp_path / "state.pt")
 
 
 @pytest.mark.parametrize(
@@ -235,40 +240,142 @@ def test_the_estimated_way_is_northward_and_eastward(navigator: str) -> None:
     assert math.dist(first.way_km, ways[6]) < 0.3 * distance.item()
 
 
+# Missed readings, useless elements, repeated messages
+
+
+@pytest.mark.parametrize("name", ["anywhere", "secant"])
+def test_missed_readings_are_the_outages_of_the_environment(name: str) -> None:
+    """The vehicle gets None, the policy in the environment the last reading with a large standard deviation."""
+    base = GeomagneticNavEnv(num_envs=1, seed=3, start_heading="random", arrival="declared")
+    env = with_declaration(TransformedEnv(base, SensorErrors(NOISE, outage_rate=0.5, seed=2)))
+    policy = make_navigator(name, base, sensor_std=NOISE)
+    vehicle, missed = Onboard(name, sensor_std=NOISE, max_steps=50, confidence=0.0), 0
+    restart(env)
+    state = env.reset()
+    vehicle.start(state["target_field"][0].tolist())
+    for _ in range(8):
+        missing = state["sensor_std"].max().item() > 100
+        missed += missing
+        command = vehicle.step(*([None] * 3 if missing else numbers(state)[:3]), *numbers(state)[3:])
+        assert command.way_km == pytest.approx(state["arrival_way"][0].tolist(), rel=1e-3, abs=0.01)
+        with torch.no_grad():
+            state = env.step(policy(state))["next"]
+        distance, turn = state["move"][0].tolist()
+        assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
+    assert 0 < missed < 8
+
+
+def test_a_way_that_is_longer_than_a_move_is_reported_in_parts() -> None:
+    """The path of all parts explains the change of I and B_H; that D is the same at both ends is no stuck sensor."""
+    after, vehicle = (3.5, 79.0, 9000.0), Onboard("secant", sensor_std=NOISE)
+    vehicle.start(TARGET)
+    with pytest.raises(ValueError, match=r"a reading of all three elements, got \(3.5, None, 15000.0\)"):
+        vehicle.step(3.5, None, 15000.0, 0.0)
+    before = vehicle.step(*HERE, 0.0)
+    with pytest.raises(ValueError, match="report a longer way in parts"):
+        vehicle.step(*after, 0.0, 700.0)
+    for _ in range(13):
+        command = vehicle.step(None, None, None, 0.0, 50.0)
+        assert command.stop is None
+    assert command.error_km > before.error_km
+    assert vehicle.step(*after, 0.0, 50.0).stop is None
+    with pytest.raises(ValueError, match="over 50 km"):
+        vehicle.step(*HERE, 0.0, 50.0)
+
+
+def test_the_same_message_twice_is_no_second_move() -> None:
+    """By its time; a message without a time is always new."""
+    vehicle, once = Onboard("secant", sensor_std=NOISE), Onboard("secant", sensor_std=NOISE)
+    messages = [(*HERE, 290.0, 0.0, 5.0), (3.49, 73.001, 14999.0, 290.0, 0.5, 6.5), (None, None, None, 290.0, 0.5, 9.0)]
+    for each in (vehicle, once):
+        each.start(TARGET)
+    for message in messages:
+        command = once.step(*message)
+        assert [vehicle.step(*message) for _ in range(3)] == [command] * 3
+    for late in (messages[1], (*HERE, 290.0, 0.5, 9.0)):
+        with pytest.raises(ValueError, match=r"time must be later than 9.0, that of the last step, got"):
+            vehicle.step(*late)
+    assert vehicle.step(*HERE, 290.0, 0.5) == once.step(*HERE, 290.0, 0.5)
+    assert vehicle.step(*HERE, 290.0, 0.5) != once.step(*HERE, 290.0, 0.0)
+
+
 # State
 
 
-@pytest.mark.parametrize("navigator", ["anywhere", "kalman"])
+@pytest.mark.parametrize("navigator", ["anywhere", "kalman", "run_and_tumble"])
 def test_a_restored_vehicle_goes_on_bit_for_bit(navigator: str, tmp_path: Path) -> None:
-    def vehicle() -> Onboard:
-        return Onboard(navigator, sensor_std=NOISE)
-
-    first, second = vehicle(), vehicle()
+    """From each step on, also after a missed reading and a repeated message, whatever kind of number was given."""
+    first, path = Onboard(navigator, sensor_std=np.float32(NOISE), max_steps=np.int64(50)), tmp_path / "state"
     target, known, _ = episode(Secant(), environment(), limit=6)
-    first.start(target)
-    first.save(tmp_path / "begun.pt")
-    second.restore(tmp_path / "begun.pt")
-    for number, step in enumerate(known):
-        assert first.step(*step) == second.step(*step)
-        if number == 2:
-            first.save(tmp_path / "state.pt")
-            second = vehicle()
-            second.restore(tmp_path / "state.pt")
+    first.start(torch.tensor(target))
+    kinds = (np.float64, np.float32, torch.tensor, np.array, float)
+    for number, step in enumerate((*known[:4], (None, None, None, *known[4][3:]), *known[5:])):
+        if number in (0, 1, 5):
+            first.save(path)
+            second = Onboard(navigator, sensor_std=np.float32(NOISE), max_steps=50)
+            second.restore(path)
+        values = [None if value is None else kinds[number % 5](value) for value in step]
+        command = first.step(*values, time=np.int32(number))
+        assert command == second.step(*(value and float(value) for value in values), time=number)
+        assert first.step(*values, time=number) == command
+    first.save(path)
+    second.save(tmp_path / "again")
+    assert path.read_bytes() == (tmp_path / "again").read_bytes()
 
 
 def test_a_state_of_another_vehicle_is_refused(tmp_path: Path) -> None:
-    path, vehicle = tmp_path / "state.pt", Onboard("secant", sensor_std=NOISE)
+    path, vehicle = tmp_path / "state", Onboard("secant", sensor_std=NOISE)
     with pytest.raises(RuntimeError, match=r"call start\(target\) first"):
         vehicle.save(path)
     vehicle.start(TARGET)
     vehicle.save(path)
     with pytest.raises(ValueError, match=r"another sensor_std, \(0\.02, 0\.02, 2\.0\)"):
         Onboard("secant").restore(path)
-    with pytest.raises(ValueError, match="another name, 'Secant'"):
+    with pytest.raises(ValueError, match="another navigator, 'Secant'"):
         Onboard("kalman", sensor_std=NOISE).restore(path)
+    region = Onboard(region_policy())
+    region.start((9.0, -25.0, 34500.0))
+    region.save(tmp_path / "region")
+    with pytest.raises(ValueError, match="another weights"):
+        Onboard(FieldPolicy(region_policy().config)).restore(tmp_path / "region")
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(ValueError, match="damaged"):
+    with pytest.raises(ValueError, match="it is damaged"):
         vehicle.restore(path)
+
+
+def changed(content: Any) -> Iterator[Any]:
+    """The content of a state with one part replaced by what no vehicle writes, or left out, or with another part."""
+    yield from ("x", math.nan, True, [[]], {})
+    if isinstance(content, dict):
+        yield content | {"forward": 5.0}
+        yield from ({key: value for key, value in content.items() if key != name} for name in content)
+    for key in content if isinstance(content, dict) else range(len(content)) if isinstance(content, list) else ():
+        for part in changed(content[key]):
+            copied = copy.copy(content)
+            copied[key] = part
+            yield copied
+
+
+def test_a_changed_state_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    """With a right checksum, whichever part is changed."""
+    path, vehicle, other = tmp_path / "state", *(Onboard(Secant(), sensor_std=NOISE) for _ in range(2))
+    for each in (vehicle, other):
+        each.start(TARGET, here=HERE, here_std=NOISE)
+        each.step(*HERE, 290.0, time=1.0)
+        each.step(3.49, 73.001, 14999.0, 290.0, 0.5)
+    vehicle.save(path)
+    state = json.loads(path.read_bytes().splitlines()[0])
+    jump = copy.deepcopy(state)
+    jump["steps"][1]["inclination"] = -73.0
+    states = [*changed(state), jump, "[" * 100_000, 1]
+    for content in states:
+        body = (content if isinstance(content, str) else json.dumps(content, separators=(",", ":"))).encode()
+        path.write_bytes(body + b"\n" + hashlib.sha256(body).hexdigest().encode())
+        with pytest.raises(ValueError, match=r"state|date|inclination changed"):
+            vehicle.restore(path)
+    assert len(states) > 200
+    after = (3.49, 73.002, 14998.0, 290.0, 0.5)
+    assert vehicle.step(*after) == other.step(*after)
 
 
 def test_a_refused_call_changes_nothing() -> None:
@@ -288,13 +395,16 @@ def test_a_refused_call_changes_nothing() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ((math.nan, 73.0, 15000.0, 0.0), r"declination \[deg\] must be a finite number from -180 up to 180, got nan"),
-        ((3.5, 73.0, 15000.0, math.nan), r"heading \[deg\] must be a finite number from -360 up to 360, got nan"),
+        ((math.nan, 73.0, 15000.0, 0.0), "declination must be a finite number, got nan"),
+        ((3.5, "73", 15000.0, 0.0), "inclination must be a valid number, got '73'"),
+        ((3.5, 73.0, np.bool_(True), 0.0), "horizontal_intensity must be a valid number, got True"),
+        ((3.5, 73.0, torch.tensor([15000.0]), 0.0), r"horizontal_intensity must be a valid number, got \[15000.0\]"),
+        ((3.5, 73.0, 15000.0, None), "heading must be a valid number, got None"),
+        ((3.5, 73.0, 15000.0, 361), "heading must be less than or equal to 360, got 361"),
         ((3.5, 73.0, 15000.0, 0.0, 1.0), "distance must be 0"),
         ((3.5, 73.0, 15.0, 0.0), "looks like microtesla, and nanotesla are expected"),
         ((3.5, 73.0, 0.15, 0.0), "looks like gauss"),
         ((350.5, 73.0, 15000.0, 0.0), r"declination \[deg\] must be from -180 up to 180, got 350.5: give -9.5"),
-        ((torch.tensor(3.5), 73.0, 15000.0, 0.0), r"got tensor\(3.5000\): give its number, value.item\(\)"),
         ((0.061, 1.274, 15000.0, 0.0), "the inclination looks like radians, and degrees are expected"),
         ((3.3, -7.7, 44600.0, 0.0), "44600 at an inclination of -7.7 deg is not possible on the Earth"),
         ((3.3, -7.7, 40000.0, 0.0), "at least 3676 km from the target, and the longest way is 2500 km: check"),
@@ -313,7 +423,7 @@ def test_first_readings_that_are_refused(values: tuple, message: str) -> None:
     ("values", "message"),
     [
         ((*HERE, 290.0, 30000.0), "distance 30000 km is longer than the longest move of this vehicle, 50 km"),
-        ((*HERE, 290.0, -1.0), r"distance \[km\] must be a finite number from 0 on, got -1"),
+        ((*HERE, 290.0, -1.0), "distance must be greater than or equal to 0, got -1"),
         ((*HERE, math.radians(290.0), 1.0), "looks like radians: the vehicle was to steer 290.0 deg"),
         ((3.5, 73.0, 21000.0, 290.0, 40.0), r"B_H changed from 15000 to 21000 nT over 40 km.*at most 4400 nT"),
         ((40.0, 73.0, 15000.0, 290.0, 20.0), "declination changed from 3.5 to 40 deg over 20 km"),
@@ -334,7 +444,7 @@ def test_step_before_start_and_bad_targets() -> None:
     for target, message in (
         ((-11.6, 75.4, 13.24), r"the target: .*microtesla"),
         ((-0.2, 1.316, 13240.0), r"the target: .*radians"),
-        ((-11.6, 75.4), r"target must be 3 finite numbers"),
+        ((-11.6, 75.4), r"target.2 is missing"),
         ((-11.6, 88.5, 1500.0), "the target: B_H 1500 nT is out of the range"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -402,9 +512,11 @@ def test_the_magnetic_equator_is_no_log_in_radians() -> None:
         ({"navigator": Geodesic()}, "Geodesic reads position, target_position, which a vehicle does not know"),
         ({"max_move_km": 20.0}, "max_move_km must be at least 50, which the policy commands, got 20.0"),
         ({"max_turn_deg": 45.0}, "max_turn_deg must be at least 90"),
-        ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std must be a finite number from 0 on, got -0.1"),
+        ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std.1 must be greater than or equal to 0, got -0.1"),
         ({"sensor_std": (0.02, 0.02, 0.002)}, r"sensor_std: 0.002 nT of B_H is less .*: it looks like microtesla"),
         ({"bias_std": (0.1, 0.1, 0.02)}, "bias_std: 0.02 nT .* give 0 for a perfect sensor"),
+        ({"sensor_std": (1e5, 0.1, 1.0)}, "sensor_std.0 must be less than or equal to 10000, got 100000"),
+        ({"max_move_km": True}, "max_move_km must be a valid number, got True"),
         ({"arrival_km": -1.0}, "arrival_km must be"),
         ({"confidence": 1.5}, "confidence must be"),
         ({"max_steps": 0}, "max_steps must be"),
@@ -445,6 +557,9 @@ def test_readings_that_scatter_more_than_the_data_sheet_says_are_no_track() -> N
         stops.append({vehicle.step(*r, 290.0, 1.0 if k else 0.0).stop for k, r in enumerate(readings)})
     assert stops == [{None, "lost"}, {None}, {None}]
     assert sum(vehicle._surprises) / len(vehicle._surprises) < 2
+    before = vehicle._surprises
+    vehicle.step(None, None, None, 290.0, 1.0)
+    assert vehicle._surprises == before
 
 
 def test_out_of_range_on_the_way() -> None:
@@ -469,19 +584,31 @@ def test_out_of_range_on_the_way() -> None:
         ((), None, ""),
     ],
 )
-def test_a_stuck_sensor(held: tuple[int, ...], moves: int | None, reason: str, tmp_path: Path) -> None:
-    """Moves of 30 km on a straight track where readings change; the path is part of the saved state."""
+def test_a_stuck_sensor(held: tuple[int, ...], moves: int | None, reason: str) -> None:
+    """Moves of 30 km on a straight track where readings change."""
     vehicle = Onboard("secant", max_move_km=50.0, sensor_std=(0.5, 0.5, 50.0))
     vehicle.start(TARGET)
     for step in range(15):
         reading = [value + 1e-3 * step * (index not in held) for index, value in enumerate(HERE)]
         command = vehicle.step(*reading, 290.0, 30.0 if step else 0.0)
         assert (command.reason if step == moves else command.stop) == (reason if step == moves else None)
-        vehicle.save(tmp_path / "state.pt")
-        vehicle.restore(tmp_path / "state.pt")
         if step == moves:
             assert command.stop == "lost"
             break
+
+
+@pytest.mark.parametrize("useless", [0, 1, 2])
+@pytest.mark.parametrize("std", [(5.0, 20.0, 5000.0), (1e4, 1e4, 1e4)])
+def test_an_element_that_is_stated_as_useless_never_ends_a_way(useless: int, std: Known) -> None:
+    """Its sensor always shows the same, even an inclination that looks like radians."""
+    here = [3.5, 1.3, 30000.0] if useless == 1 else list(HERE)
+    vehicle = Onboard("secant", sensor_std=[std[i] if i == useless else NOISE[i] for i in range(3)])
+    vehicle.start([-1.0, 4.0, 30500.0] if useless == 1 else TARGET)
+    for step in range(20):
+        reading = [value + (0.01, 0.02, 2.0)[i] * step * (i != useless) for i, value in enumerate(here)]
+        command = vehicle.step(*reading, 0.0, 30.0 if step else 0.0)
+        assert command.stop is None
+        assert math.isfinite(command.turn_deg + command.error_km)
 
 
 # Confidence
