@@ -361,7 +361,7 @@ class Onboard:
         near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"
         if len(self._steps) >= options.max_steps - 1:
             return "nearest", f"out of steps: {near}"
-        if decision.attainable.item() < options.confidence:
+        if 0 < decision.attainable.item() < options.confidence:  # 0 where nothing is known yet
             return "nearest", f"as near as these sensors allow: {near}"
         return wanted
 
