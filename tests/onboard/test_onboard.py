@@ -27,6 +27,7 @@ from magrl.evaluation.scenarios import with_declaration
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Secant
+from magrl.navigators.base import displacement_to
 from magrl.onboard import Onboard, VehicleStep, check_earth_jump, check_earth_reading, first_state, write_step
 from magrl.onboard.step import ONNX_INPUTS
 from magrl.transforms import Conditions, SensorErrors, with_conditions, with_sensor_noise
@@ -297,6 +298,18 @@ def test_the_same_message_twice_is_no_second_move() -> None:
             vehicle.step(*late)
     assert vehicle.step(*HERE, 290.0, 0.5) == once.step(*HERE, 290.0, 0.5)
     assert vehicle.step(*HERE, 290.0, 0.5) != once.step(*HERE, 290.0, 0.0)
+
+
+def test_the_altitude_of_the_target_moves_the_estimate() -> None:
+    """B_H at Reykjavik is 53 nT less at 10 km of altitude, as 14 km away at sea level: the numbers of the page."""
+    places = torch.tensor([[64.1, -21.9], [64.2, -21.9], [64.1, -21.7]]).double()
+    here, north, east = elements_at(IGRF("2026-06-30"), places)
+    change = elements_at(IGRF("2026-06-30", altitude_km=10.0), places[0]) - here
+    kilometers = torch.tensor([0.1, 0.2 * math.cos(math.radians(64.1))]) * 111.2
+    slopes = torch.stack((north - here, east - here), -1) / kilometers
+    noise = torch.tensor(NOISE)
+    assert change[2].item() == pytest.approx(-53, abs=1)
+    assert displacement_to(change / noise, slopes / noise[:, None]).norm().item() == pytest.approx(14, abs=0.5)
 
 
 # State
