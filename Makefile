@@ -5,7 +5,7 @@ RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
 export GOMP_SPINCOUNT ?= 3000
 
-.PHONY: train fly anywhere prior replay test test-slow check format docs bench mutate tables figures pictures help clean
+.PHONY: train fly anywhere prior replay test test-slow test-newest check format docs bench mutate tables figures pictures help clean
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RECIPE)/td3_gradient_guided.py $(ARGS)
@@ -27,6 +27,11 @@ test: $(VENV)/.installed-dev  ## run the fast tests, one process per core with o
 
 test-slow: $(VENV)/.installed-dev  ## run the slow tests (trainings); several minutes
 	$(RUN)/python -m pytest -m slow $(ARGS)
+
+test-newest:  ## run the fast tests with the newest release of TorchRL, in build/newest; they may fail
+	$(MAKE) VENV=build/newest build/newest/.installed-dev
+	build/newest/bin/pip install --quiet --disable-pip-version-check --upgrade torchrl tensordict
+	-$(MAKE) VENV=build/newest test
 
 check: $(VENV)/.installed-dev  ## check lint, format and types
 	$(RUN)/ruff check .

@@ -168,9 +168,9 @@ class TD3Loss(TorchRLTD3Loss):
 
 def _holding(network: nn.Module, params: Any) -> Any:
     """Return a copy of a network that holds some parameters, sharing their memory."""
-    held = copy.deepcopy(network)
-    params.to_module(held)
-    return held
+    copied = copy.deepcopy(network)
+    params.to_module(copied, preserve_module_state=True)  # optimizers take the parameters of the copies
+    return copied
 
 
 class SoftUpdate(TorchRLSoftUpdate):

@@ -78,6 +78,18 @@ def test_loss_is_that_of_torchrl() -> None:
         torch.testing.assert_close(mine, theirs, rtol=1e-6, atol=1e-8)
 
 
+def test_networks_hold_parameters_that_share_the_memory_of_the_loss() -> None:
+    loss = make_loss()
+    critics, targets = loss.qvalue_network_params, loss.target_qvalue_network_params
+    networks, actors = loss.networks, (loss.actor_network_params, loss.target_actor_network_params)
+    pairs = [(networks.actor, actors[0]), (networks.target_actor, actors[1]), (networks.frozen_critic, critics[0])]
+    pairs += zip([*networks.critics, *networks.target_critics], [*critics, *targets], strict=True)
+    for network, params in pairs:
+        assert len(list(network.parameters())) == 10  # two hidden layers with their normalization, and the last
+        addresses = {value.data_ptr() for value in (*network.parameters(), *network.buffers())}
+        assert addresses == {value.data_ptr() for value in params.data.values(True, True)}
+
+
 def test_actor_loss_has_no_gradient_of_the_critics() -> None:
     loss = make_loss()
     loss.actor_loss(transitions())[0].backward()
