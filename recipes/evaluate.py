@@ -52,7 +52,7 @@ from magrl.evaluation.runs import NO_NOISE, Noise, agreed, trained_runs, unfinis
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
-from magrl.training import UsageError, command
+from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
 from magrl.transforms import conditions_named
@@ -293,7 +293,7 @@ def write(config: Config, env: EnvBase, results: Results) -> None:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Read the command line, evaluate and print the table."""
-    config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
+    config = parse(Config, RECIPE, __doc__, args)
     evaluate(config)
     print((config.out / "table.md").read_text(), f"Results are in {config.out}", sep="\n")
 

@@ -41,7 +41,7 @@ from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
 from magrl.tracking import RANGE_KM
-from magrl.training import UsageError, command
+from magrl.training import UsageError, command, parse
 from magrl.transforms import TrackGradient, conditions_named
 from magrl.transforms.track import IN_KEYS, STD_KEYS
 
@@ -280,7 +280,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Read the command line, fly and print the summary."""
     words = sys.argv[1:] if args is None else args
     spaced = [f" {word}" if word[:1] == "-" and word[1:2].isdigit() else word for word in words]  # "-33.9 18.4"
-    config = tyro.cli(Config, args=spaced, prog=RECIPE, description=__doc__)
+    config = parse(Config, RECIPE, __doc__, spaced)
     config = replace(config, start=config.start.strip(), destination=config.destination.strip())
     print(summary(fly(config)))
     print(f"The picture is {config.out / 'flight.png'}")

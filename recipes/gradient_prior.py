@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-import tyro
 from torch import Tensor
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LinearLR
@@ -29,7 +28,7 @@ from magrl.field import elements_at
 from magrl.field.model import elements_gradient_at
 from magrl.files import check_writable
 from magrl.tracking import LearnedPrior
-from magrl.training import command
+from magrl.training import command, parse
 
 RECIPE = "gradient_prior.py"
 REGIONS = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
@@ -98,7 +97,7 @@ def fit(config: Config) -> LearnedPrior:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Read the command line and fit."""
-    config = tyro.cli(Config, prog=RECIPE, description=__doc__, args=args)
+    config = parse(Config, RECIPE, __doc__, args)
     if config.out is not None:
         check_writable(config.out)
     prior = fit(config)

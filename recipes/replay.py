@@ -31,7 +31,7 @@ from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import read_run
 from magrl.evaluation.scenarios import TaskSet, choose_tasks, first_tasks, with_declaration
 from magrl.files import check_writable
-from magrl.training import UsageError, command
+from magrl.training import UsageError, command, parse
 from magrl.transforms import with_sensor_noise
 
 RECIPE = "replay.py"
@@ -125,7 +125,7 @@ def replay(config: Config) -> Path:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Read the command line and write the page."""
-    print(f"Open {replay(tyro.cli(Config, args=args, prog=RECIPE, description=__doc__))} in a browser")
+    print(f"Open {replay(parse(Config, RECIPE, __doc__, args))} in a browser")
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
 from magrl.logs import checked_times, joined, mistakes
 from magrl.onboard import Onboard
-from magrl.training import UsageError, command
+from magrl.training import UsageError, command, parse
 
 RECIPE = "replay_log.py"
 ELEMENTS = [*NAMES]
@@ -275,7 +275,7 @@ def main(args: Sequence[str] | None = None) -> None:
     Raises:
         UsageError: for a log or a setting that is wrong.
     """
-    config = tyro.cli(Config, args=args, prog=RECIPE, description=__doc__)
+    config = parse(Config, RECIPE, __doc__, args)
     try:
         log = read_log(config)
         for name in ("log.csv", "log.md", "log.png"):

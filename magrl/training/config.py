@@ -322,7 +322,7 @@ class TD3Config(LearningConfig):
         return self
 
 
-Config = TypeVar("Config", bound=RunConfig)
+Config, Parsed = TypeVar("Config", bound=RunConfig), TypeVar("Parsed")
 
 
 def parse_config(
@@ -356,7 +356,37 @@ def parse_config(
             raise UsageError(f"--resume takes its settings from the run: leave out {' '.join(others)}")
         return resumed_config(known.resume, kind, recipe)
     default = presets[known.preset or next(iter(presets))]
-    return tyro.cli(kind, default=default, args=args, prog=recipe, description=description)
+    return parse(kind, recipe, description, args, default=default)
+
+
+def parse(
+    kind: Callable[..., Parsed], recipe: str, description: str | None, args: Sequence[str] | None = None, **options: Any
+) -> Parsed:
+    """Return the settings of a command line, in tyro's form or in that of W&B sweeps.
+
+    Args:
+        kind: class of the settings.
+        recipe: file name of the recipe.
+        description: text of ``--help``.
+        args: command line; that of this process by default.
+        options: options of ``tyro.cli``.
+
+    Example:
+        >>> parse(RunConfig, "mine.py", None, ["--noise=[0.05, 0.05, 5]"]).noise
+        (0.05, 0.05, 5.0)
+    """
+    words = [part for word in (sys.argv[1:] if args is None else args) for part in _tyro_words(word)]
+    return tyro.cli(kind, args=words, prog=recipe, description=description, **options)
+
+
+def _tyro_words(word: str) -> list[str]:
+    """Return ``--key=True``, ``--key=False`` and ``--key=[1, 2]``, as W&B sweeps write them, in tyro's form."""
+    option, _, value = word.partition("=")
+    if option.startswith("--") and value in ("True", "False"):
+        return [option if value == "True" else f"--no-{option[2:]}"]
+    if option.startswith("--") and value[:1] == "[" and value[-1:] == "]":
+        return [option, *(item.strip(" '\"") for item in value[1:-1].split(","))]
+    return [word]
 
 
 def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:

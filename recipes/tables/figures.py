@@ -36,7 +36,7 @@ from magrl.evaluation.runs import NO_NOISE
 from magrl.field import IGRF
 from magrl.field.records import WeatherRecord, weather_record
 from magrl.files import check_writable
-from magrl.training import UsageError, command
+from magrl.training import UsageError, command, parse
 from magrl.transforms import Conditions, VectorErrors
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -274,4 +274,4 @@ def draw(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    command(RECIPE, lambda: draw(tyro.cli(Config, prog=RECIPE, description=__doc__)))
+    command(RECIPE, lambda: draw(parse(Config, RECIPE, __doc__)))

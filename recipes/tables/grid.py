@@ -37,7 +37,7 @@ from magrl.evaluation.navigators import check_distinct
 from magrl.evaluation.runs import NO_NOISE
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
-from magrl.training import UsageError, command
+from magrl.training import UsageError, command, parse
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -262,4 +262,4 @@ def table(kind: str, **options: Any) -> str:
 
 
 if __name__ == "__main__":
-    command(RECIPE, lambda: make(tyro.cli(Config, prog=RECIPE, description=__doc__)))
+    command(RECIPE, lambda: make(parse(Config, RECIPE, __doc__)))

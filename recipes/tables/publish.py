@@ -13,7 +13,7 @@ from pathlib import Path
 
 import tyro
 
-from magrl.training import UsageError, command
+from magrl.training import UsageError, command, parse
 
 RECIPE = "publish.py"
 BLOCK = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -61,4 +61,4 @@ def publish(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    command(RECIPE, lambda: publish(tyro.cli(Config, prog=RECIPE, description=__doc__)))
+    command(RECIPE, lambda: publish(parse(Config, RECIPE, __doc__)))

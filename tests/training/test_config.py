@@ -1,5 +1,6 @@
 """Settings of runs, the command line, the settings of a run that is resumed, and how a command ends."""
 
+import importlib
 import json
 import sys
 from pathlib import Path
@@ -53,6 +54,23 @@ def test_scenario_and_settings_must_agree(tmp_path: Path) -> None:
 def test_linear_goes_from_start_to_end() -> None:
     config = recipe.Config(learning_rate=3e-3, final_learning_rate=1e-3)
     assert [config.linear("learning_rate", x) for x in (1.0, 0.5, 0.0)] == pytest.approx([3e-3, 2e-3, 1e-3])
+
+
+@pytest.mark.parametrize("name", ["td3_gradient_guided", "ppo", "ppo_anywhere", "ppo_recurrent"])
+def test_every_setting_can_be_given_as_wandb_sweeps_write_it(name: str) -> None:
+    """``--key=value`` with the value as Python prints it; so an own form of each switch and list is equal to it."""
+    module = importlib.import_module(name)
+    changed = {"seed": 3, "noise": (0.05, 0.05, 5.0), "num_cells": (8, 4), "wandb_mode": "disabled"}
+    defaults = module.Config()
+    switches = {key: not value for key, value in defaults.model_dump().items() if isinstance(value, bool)}
+    config = defaults.replace(**changed, **switches)
+    settings = {key: value for key, value in config.model_dump(mode="json").items() if key != "resume"}
+    words = [f"--{key}={value}" for key, value in settings.items()]
+    presets = getattr(module, "PRESETS", {"default": defaults})
+    assert parse_config(module.Config, presets, "mine.py", None, words) == config
+    assert "--noise=[0.05, 0.05, 5.0]" in words
+    own = parse_config(module.Config, presets, "mine.py", None, "--noise 0.05 0.05 5 --num-cells 8 4".split())
+    assert (own.noise, own.num_cells) == (config.noise, config.num_cells)
 
 
 # Runs that are resumed
