@@ -158,6 +158,7 @@ class RunLog:
         wandb_mode: ``offline`` (no network, no login), ``online``, or ``disabled`` (nothing of wandb is written).
         label: group and tag of the run in wandb.
         resumed: whether the run is resumed; its files stay unchanged until :meth:`load_state_dict`.
+        began: ``time.perf_counter()`` at the start of the run; now by default.
 
     Raises:
         ValueError: for an unknown logger or mode, or a logger that is not installed.
@@ -182,12 +183,13 @@ class RunLog:
         wandb_mode: str = "disabled",
         label: str = "",
         resumed: bool = False,
+        began: float | None = None,
     ) -> None:
         self.folder, self.columns, self.rows = folder, tuple(columns), list[dict[str, float]]()
         self._open_log = partial(
             open_log, logger, folder, config, wandb_mode, group=label, tags=(label,) if label else ()
         )
-        self._began = time.perf_counter()
+        self._began = time.perf_counter() if began is None else began
         if not resumed:
             self._open([])
 
@@ -204,7 +206,7 @@ class RunLog:
 
     @property
     def seconds(self) -> float:
-        """Training time [s]; the pause before a run was resumed does not count."""
+        """Time since the start [s], of a resumed run with the time that its checkpoint holds."""
         return time.perf_counter() - self._began
 
     def row(self, row: Mapping[str, float]) -> None:
@@ -234,7 +236,7 @@ class RunLog:
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore the rows; later rows in the file are dropped."""
-        self._began = time.perf_counter() - float(state_dict["seconds"])
+        self._began -= float(state_dict["seconds"])
         self._open(state_dict["rows"], str(state_dict["wandb_id"]))
 
     def close(self) -> None:

@@ -96,6 +96,7 @@ class Run:
     def __init__(
         self, config: RunConfig, *, recipe: str, name: str, losses: tuple[str, ...] = ("loss_critic", "loss_actor")
     ) -> None:
+        self._began = time.perf_counter()
         self.config, self.recipe, self.losses = config, recipe, losses
         self.scenario = config.load_scenario()
         self.name = f"{name}-{config.scenario.stem}" if config.scenario else name
@@ -204,7 +205,7 @@ class Run:
         columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", *self.losses)
         columns += tuple(f"eval_{key}" for key in EVALUATED)
         options = {"logger": self.config.logger, "wandb_mode": self.config.wandb_mode, "label": self.name}
-        return RunLog(self.folder, columns, self.settings, **options, resumed=resumed)
+        return RunLog(self.folder, columns, self.settings, **options, resumed=resumed, began=self._began)
 
     @property
     def remaining(self) -> float:

@@ -1,8 +1,10 @@
 """Runs around a training: folder, settings, noise, resume after any end, and workers."""
 
+import csv
 import json
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import td3_gradient_guided as recipe
@@ -12,7 +14,7 @@ from torchrl.collectors import Collector
 
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv
-from magrl.training import Run, RunConfig, UsageError, command
+from magrl.training import Run, RunConfig, UsageError, command, curves, run
 from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
 from magrl.training.collectors import worker_seed
 from magrl.training.config import resumed_config
@@ -136,6 +138,28 @@ def test_run_that_ended_before_its_first_checkpoint_starts_again(tmp_path: Path,
     assert not (folder / "checkpoints").exists()
     train(folder, scenario=AZORES, resume=folder)
     assert same_outcome(folder, whole)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_training_seconds_count_from_the_start_of_the_run(tmp_path: Path, signalled, monkeypatch) -> None:
+    """Collectors, whose processes may take long to start, and what went before a run was resumed; not the pause."""
+    clock = SimpleNamespace(perf_counter=lambda: clock.now, now=500.0)
+    for module in (curves, run):
+        monkeypatch.setattr(module, "time", clock)
+
+    def slow(*args: object, **options: object) -> None:
+        clock.now += 100.0
+        make(*args, **options)
+
+    make = Collector.__init__
+    monkeypatch.setattr(Collector, "__init__", slow)
+    with signalled(3, signal.SIGTERM), pytest.raises(SystemExit):
+        train(tmp_path)
+    clock.now += 10_000.0
+    train(tmp_path, resume=tmp_path)
+    assert json.loads((tmp_path / "eval.json").read_text())["training_seconds"] == 200.0
+    with (tmp_path / "train.csv").open() as file:
+        assert [row["seconds"] for row in csv.DictReader(file)] == ["100", "200", "200"]
 
 
 @pytest.mark.filterwarnings("ignore:.*trying the previous checkpoint")
