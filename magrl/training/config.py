@@ -57,6 +57,10 @@ class UsageError(ValueError):
     """
 
 
+CHANGEABLE = ("device", "logger", "wandb_mode", "checkpoint_every", "out", "resume")
+"""Settings that may be edited in ``config.json`` before a run is resumed: they are not part of the training."""
+
+
 class RunConfig(CheckedModel):
     """Settings of a run that do not depend on the algorithm.
 

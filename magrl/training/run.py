@@ -27,14 +27,14 @@ from typing_extensions import Self
 
 from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
-from magrl.checks import check_finite
+from magrl.checks import check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
 from magrl.evaluation.scenarios import task_names
 from magrl.files import write_json
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder, locked
-from magrl.training.config import RunConfig, UsageError
+from magrl.training.config import CHANGEABLE, RunConfig, UsageError
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
 from magrl.transforms import with_sensor_noise
 
@@ -161,6 +161,18 @@ class Run:
 
     # Parts
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the settings of the training, and the text of its scenario file."""
+        state = {name: value for name, value in self.settings.items() if name not in CHANGEABLE}
+        return state | {"scenario": self.config.scenario and (self.folder / state["scenario"]).read_text()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Raise a ValueError unless these are the settings of this training."""
+        for name, value in self.state_dict().items():
+            if value != state_dict.get(name):
+                both = f"{short(value)} in the run folder, {short(state_dict.get(name))} in the checkpoint"
+                raise ValueError(f"{name} is {both}: only {', '.join(CHANGEABLE)} may be edited")
+
     def start(
         self,
         *,
@@ -185,6 +197,7 @@ class Run:
         self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
         self._network = policy.actor if isinstance(policy, FieldPolicy) else policy
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
+        parts = {"settings": self, **parts}  # restored first
         parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}
         if isinstance(collector, Collector):  # other processes start new episodes
             parts["episodes"] = RunningEpisodes(collector, env)

@@ -17,7 +17,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.training import Run, RunConfig, UsageError, command, curves, run
 from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
 from magrl.training.collectors import worker_seed
-from magrl.training.config import resumed_config
+from magrl.training.config import CHANGEABLE, resumed_config
 from magrl.training.run import StopRequest, passes_paper
 
 ROOT = Path(__file__).parent.parent.parent
@@ -177,6 +177,27 @@ def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> N
         train(tmp_path, resume=tmp_path)
     assert len(curves.splitlines()) == 3
     assert (tmp_path / "train.csv").read_text() == curves
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, signalled) -> None:
+    """Another value of any setting is refused by its name and both values, but for those that are not of the training."""
+    with signalled(3, signal.SIGTERM), pytest.raises(SystemExit):
+        train(tmp_path, scenario=AZORES)
+    scenario = tmp_path / "scenario.toml"
+    written, text = json.loads((tmp_path / "config.json").read_text()), scenario.read_text()
+    other = {"recipe": "other.py", "name": "other", "noise": (0.1, 0.0, 0.0), "total_episodes": 7, "scenario": text}
+    other |= {name: value * 2 + 1 for name, value in written.items() if name not in other and name not in CHANGEABLE}
+    assert len(other) == len(written) - len(CHANGEABLE)
+    with in_run(resumed_config(tmp_path, RunConfig, "mine.py")) as resumed:
+        saved = resumed.state_dict()
+    for name, value in other.items():
+        before = saved | {name: value if name != "scenario" else text + "# edited"}
+        with pytest.raises(ValueError, match=f"^{name} is .* in the run folder, .* in the checkpoint: only device, "):
+            resumed.load_state_dict(before)
+    with pytest.raises(UsageError, match=r"settings .*: zeta is 0\.5 in the run folder, 0\.01 in the checkpoint"):
+        train(tmp_path, zeta=0.5, scenario=scenario, resume=tmp_path)
+    train(tmp_path, scenario=scenario, resume=tmp_path, logger="csv", checkpoint_every=5.0)
 
 
 # Several collecting processes
