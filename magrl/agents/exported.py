@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from magrl.agents.program import TensorProgram, export_module
 from magrl.checks import check_type
@@ -40,13 +41,26 @@ class TrainedPolicy(TensorDictModuleBase):
     state: TensorDictBase | None = None
     """State after its last call, and what that call began with; None before the first."""
 
-    def check_fits(self, env: GeomagneticNavEnv) -> None:
-        """Raise unless the field of an environment is within what the policy was trained in.
+    def for_env(self, env: EnvBase) -> TrainedPolicy:
+        """Return the policy for the limits of an environment.
 
         Raises:
-            ValueError: naming the element and both ranges; or for a policy that declares its arrival, where the episode
-                ends otherwise.
+            ValueError: as :meth:`check_fits`.
         """
+        self.check_fits(env)
+        return self
+
+    def check_fits(self, env: EnvBase) -> None:
+        """Raise unless an environment has the field of the policy, and allows what it does.
+
+        Args:
+            env: navigation environment, with transforms or without.
+
+        Raises:
+            ValueError: naming the element and both ranges, or both limits; or for a policy that declares its arrival,
+                where the episode ends otherwise.
+        """
+        env = getattr(env, "base_env", env)
         check_type(GeomagneticNavEnv, env=env)
         if self.declares and not env.arrival.declared:
             raise ValueError(

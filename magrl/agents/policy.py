@@ -6,6 +6,7 @@ transforms and is used like every other navigator.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,52 @@ class FieldPolicy(TrainedPolicy):
             actor.load_state_dict(self.actor.state_dict(), assign=True)
             return FieldPolicy(config, actor)
         return FieldPolicy(config, self.actor)
+
+    def for_env(self, env: EnvBase) -> FieldPolicy:
+        """Return the policy on the device of an environment, for its limits: those of a plan are adapted.
+
+        Example:
+            >>> from magrl import GeomagneticNavEnv, load_pretrained
+            >>> load_pretrained("anywhere").for_env(GeomagneticNavEnv(max_steps=80, seed=0)).view.max_steps
+            80
+        """
+        policy, base = self, getattr(env, "base_env", env)
+        if isinstance(self.view, TrackView):
+            limits = {name: min(getattr(self.view, name), getattr(base, name)) for name in LIMITS}
+            limits = {"zeta": base.zeta, "max_steps": base.max_steps} | (limits if self.config.num_cells else {})
+            searches = self.view.search and base.arrival.rule == "objective"
+            policy = self.adapted(**limits, search=searches).to(base.device)
+        policy.check_fits(base)
+        return policy
+
+    def check_fits(self, env: EnvBase) -> None:
+        """Raise unless an environment has the field of the policy, allows its moves and turns, and is as it plans.
+
+        Raises:
+            ValueError: naming the element and both ranges, or both limits.
+
+        Example:
+            >>> from magrl import GeomagneticNavEnv, load_pretrained
+            >>> load_pretrained("anywhere").check_fits(GeomagneticNavEnv(seed=0))
+            Traceback (most recent call last):
+            ValueError: the policy plans for max_steps 120, the environment has 50: fly policy.for_env(env)
+        """
+        super().check_fits(env)
+        view, base = self.view, getattr(env, "base_env", env)
+        for name in ("zeta", "max_steps") if isinstance(view, TrackView) else ():
+            planned, limit = getattr(view, name), getattr(base, name)
+            if planned != limit:
+                both = f"{name} {planned:g}, the environment has {limit:g}"
+                raise ValueError(f"the policy plans for {both}: fly policy.for_env(env)")
+        (move, turn), (longest, largest) = (
+            (round(part.max_move_km, 3), round(math.degrees(part.max_turn_rad), 3)) for part in (view, base)
+        )
+        if move > longest or turn > largest:
+            raise ValueError(
+                f"the policy was trained for moves up to {move:g} km and turns up to {turn:g}°, the environment allows "
+                f"{longest:g} km and {largest:g}°: evaluate with max_move_km={move:g} and max_turn_deg={turn:g}, or "
+                "train one for these limits"
+            )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
@@ -10,8 +9,7 @@ from typing import Any, NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 
-from magrl.agents import FieldPolicy, load_policy
-from magrl.agents.exported import TrainedPolicy
+from magrl.agents import load_policy
 from magrl.agents.pretrained import load_pretrained
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
@@ -136,53 +134,13 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
         file = " or the file of a policy" if name == OWN else ""
         raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
     path = Path(source) if name == OWN and not Path(source).is_dir() else Path(source) / "policy.pt"
-    policy = load_policy(path, env.device) if source else load_pretrained(name, env.device)
-    if isinstance(policy, FieldPolicy) and isinstance(policy.config.view, TrackView):
-        told = env.arrival.rule == "objective"
-        given = {"zeta": env.zeta, "max_steps": env.max_steps, "search": told, **options}
-        policy = policy.adapted(**given, **_limits(policy, env)).to(env.device)
-    elif options:
+    policy: Any = load_policy(path, env.device) if source else load_pretrained(name, env.device)
+    if options and not isinstance(policy.view, TrackView):
         raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
     try:
-        check_fits(policy, env)
+        return (policy.adapted(**options) if options else policy).for_env(env)
     except ValueError as error:
         raise ValueError(f"{text}: {error}") from error
-    return policy
-
-
-def _limits(policy: FieldPolicy, env: GeomagneticNavEnv) -> dict[str, float]:
-    """Return the limits of moves and turns that a policy and an environment share, if the policy can keep to others."""
-    names = ("max_move_km", "max_turn_rad") if policy.config.num_cells else ()
-    return {name: min(getattr(policy.view, name), getattr(env, name)) for name in names}
-
-
-def check_fits(policy: TrainedPolicy, env: GeomagneticNavEnv) -> None:
-    """Raise unless an environment has the field of a trained policy, and allows its moves and turns.
-
-    Args:
-        policy: trained policy.
-        env: environment that it is to fly in.
-
-    Raises:
-        ValueError: naming both ranges of an element, or both limits.
-
-    Example:
-        >>> check_fits(load_pretrained("anywhere"), GeomagneticNavEnv(max_move_km=10, seed=0))
-        Traceback (most recent call last):
-        ValueError: the policy was trained for moves up to 50 km and turns up to 90°, the environment allows 10 km and \
-90°: evaluate with max_move_km=50 and max_turn_deg=90, or train one for these limits
-    """
-    policy.check_fits(env)
-    if isinstance(policy, FieldPolicy):
-        (move, turn), (longest, largest) = (
-            (round(each.max_move_km, 3), round(math.degrees(each.max_turn_rad), 3)) for each in (policy.view, env)
-        )
-        if move > longest or turn > largest:
-            raise ValueError(
-                f"the policy was trained for moves up to {move:g} km and turns up to {turn:g}°, the environment allows "
-                f"{longest:g} km and {largest:g}°: evaluate with max_move_km={move:g} and max_turn_deg={turn:g}, or "
-                "train one for these limits"
-            )
 
 
 def _kind(name: str) -> TrainedAgent | type[Navigator]:

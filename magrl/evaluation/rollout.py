@@ -17,7 +17,7 @@ from magrl.agents.exported import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.metrics import episode_measures
-from magrl.evaluation.navigators import check_fits, make_navigator
+from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.scenarios import with_declaration, with_errors
 from magrl.navigators import Navigator
@@ -41,7 +41,8 @@ def evaluate(
 
     Args:
         policy: policy or navigator of the plain environment, or the text that names one, as
-            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.pt"``.
+            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.pt"``. A trained
+            policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
         tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
             region.
         num_envs: number of vehicles that fly at a time, each several tasks where there are more; by default one for
@@ -85,7 +86,7 @@ def evaluate(
     if isinstance(policy, str):
         policy = make_navigator(policy, base, seed=seed, **sheet)
     elif isinstance(policy, TrainedPolicy):
-        check_fits(policy, base)
+        policy = policy.for_env(base)
     if isinstance(policy, TrainedPolicy | Navigator):
         env = with_declaration(env, confidence, policy)
     restart(env)
@@ -129,6 +130,7 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
 
     Raises:
         TypeError: for another environment, or a policy that is not callable.
+        ValueError: for a trained policy that does not fit the environment (:meth:`magrl.FieldPolicy.check_fits`).
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0, max_steps=3)
@@ -143,6 +145,8 @@ def _rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
     """Return the next episode of each vehicle, without exploration or gradients."""
     if not callable(policy):
         raise TypeError(f"policy must be callable with a TensorDict, got {policy!r}")
+    if isinstance(policy, TrainedPolicy):
+        policy.check_fits(env)
     failed = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:

@@ -326,7 +326,8 @@ class TD3Config(LearningConfig):
         return self
 
 
-Config, Parsed = TypeVar("Config", bound=RunConfig), TypeVar("Parsed")
+Config = TypeVar("Config", bound=RunConfig)
+Parsed = TypeVar("Parsed")
 
 
 def parse_config(

@@ -9,10 +9,12 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from magrl.agents import FieldPolicy, PolicyConfig
+from magrl.agents import FieldPolicy, PolicyConfig, load_pretrained
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
-from magrl.evaluation import evaluate, evaluation_rollout, summarize
+from magrl.evaluation import episode_measures, evaluate, evaluation_rollout, summarize, with_declaration
+from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import Secant
+from magrl.transforms import with_sensor_noise
 
 
 def test_every_task_is_flown_once_however_many_vehicles_fly() -> None:
@@ -79,6 +81,23 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
     ):
         with pytest.raises(error, match=message):
             call()
+
+
+@pytest.mark.parametrize("options", [{"arrival": "declared"}, {"max_move_km": 20, "zeta": 0.02}])
+def test_a_pretrained_policy_flies_as_by_its_name(options: dict) -> None:
+    """Within the limits of the environment, which it gets from `evaluate`, or from a loop of one's own."""
+    scenario = first_tasks(choose_tasks(None, "paper-100"), 3)
+    policy, options = load_pretrained("anywhere"), {"max_steps": 12, **options}
+    flights = (evaluate(agent, scenario, noise=(0.05, 0.05, 5.0), **options) for agent in ("anywhere", policy))
+    named, given = flights
+    assert all(torch.equal(named[key], given[key]) for key in named.keys())  # noqa: SIM118
+    base = GeomagneticNavEnv(scenario, num_envs=3, seed=0, **options)
+    env = with_declaration(with_sensor_noise(base, (0.05, 0.05, 5.0), 0))
+    with pytest.raises(ValueError, match=r"the policy plans for .*: fly policy\.for_env\(env\)"):
+        evaluation_rollout(env, policy)
+    with torch.no_grad():
+        own = env.rollout(12, policy.for_env(env), break_when_any_done=False, break_when_all_done=True)
+    assert torch.equal(episode_measures(own, env)["length_km"], named["length_km"])
 
 
 def test_a_vehicle_without_a_finite_action_fails_alone() -> None:

@@ -181,7 +181,7 @@ def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> N
 
 @pytest.mark.usefixtures("without_figures")
 def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, signalled) -> None:
-    """Another value of any setting is refused by its name and both values, but for those that are not of the training."""
+    """Another value is refused by its name and both values, but for settings that are not of the training."""
     with signalled(3, signal.SIGTERM), pytest.raises(SystemExit):
         train(tmp_path, scenario=AZORES)
     scenario = tmp_path / "scenario.toml"

@@ -15,6 +15,9 @@ _FOLDER = Path(__file__).parent
 def load_pretrained(name: str, device: torch.device | str = "cpu") -> FieldPolicy:
     """Return a trained policy that comes with the library.
 
+    It plans for the 120 steps of its training until another number is given: :func:`magrl.evaluate` and
+    :class:`magrl.onboard.Onboard` give theirs, and in a loop of one's own :meth:`FieldPolicy.for_env` does.
+
     Args:
         name: ``"anywhere"``, which navigates without a map (``recipes/ppo_anywhere.py``).
         device: device on which the policy acts.
