@@ -34,7 +34,7 @@ def train(folder: Path, width: int = 1, **options: object) -> None:
     options = {"total_frames": 12, "eval_every": 2, "eval_tasks_small": 2, "eval_tasks": 2} | options
     with in_run(RunConfig(out=folder, wandb_mode="disabled", **options)) as run:
         torch.manual_seed(run.config.seed)
-        base = GeomagneticNavEnv(num_envs=2, seed=0, max_steps=2)
+        base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=2, seed=0, max_steps=2)
         validation, test = run.evaluation_envs(max_steps=2, zeta=2.9)
         policy = FieldPolicy(PolicyConfig(base.observation_view(), (8,)))
         collector = Collector(base, base.rand_action, frames_per_batch=2, total_frames=12, track_traj_ids=False)
