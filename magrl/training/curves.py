@@ -6,8 +6,7 @@ import csv
 import math
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,11 +16,12 @@ from torch import Tensor, nn
 
 from magrl.checks import check_number
 from magrl.files import write_json
-from magrl.training.loggers import open_log
+from magrl.training.loggers import CurveLog
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+OpenLog = Callable[..., CurveLog]
 COUNTS = ("frames", "episodes", "iterations", "updates")
 RETURN_TERMS = ("destination", "proximity", "alignment")
 """Terms of the reward whose sums over an episode are reported beside the return."""
@@ -153,20 +153,15 @@ class RunLog:
     Args:
         folder: run folder.
         columns: columns of ``train.csv``, in order.
-        config: settings of the run, shown by wandb.
-        logger: ``wandb``, ``tensorboard`` or ``csv``.
-        wandb_mode: ``offline`` (no network, no login), ``online``, or ``disabled`` (nothing of wandb is written).
-        label: group and tag of the run in wandb.
+        opens: opens the logger, of a run in wandb that is resumed by its ``run_id``:
+            :func:`magrl.training.loggers.open_log` with its other arguments.
         resumed: whether the run is resumed; its files stay unchanged until :meth:`load_state_dict`.
         began: ``time.perf_counter()`` at the start of the run; now by default.
-
-    Raises:
-        ValueError: for an unknown logger or mode, or a logger that is not installed.
 
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     log = RunLog(Path(folder), ["frames", "return"], {"seed": 0})
+        ...     log = RunLog(Path(folder), ["frames", "return"], lambda **_: CurveLog("none", None))
         ...     log.row({"frames": 512, "return": -3.5})
         ...     log.close()
         ...     (log.folder / "train.csv").read_text().split()
@@ -174,21 +169,10 @@ class RunLog:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        columns: Sequence[str],
-        config: Mapping[str, Any],
-        *,
-        logger: str = "wandb",
-        wandb_mode: str = "disabled",
-        label: str = "",
-        resumed: bool = False,
-        began: float | None = None,
+        self, folder: Path, columns: Sequence[str], opens: OpenLog, *, resumed: bool = False, began: float | None = None
     ) -> None:
         self.folder, self.columns, self.rows = folder, tuple(columns), list[dict[str, float]]()
-        self._open_log = partial(
-            open_log, logger, folder, config, wandb_mode, group=label, tags=(label,) if label else ()
-        )
+        self._open_log = opens
         self._began = time.perf_counter() if began is None else began
         if not resumed:
             self._open([])

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -36,6 +37,7 @@ from magrl.files import write_json
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder, locked
 from magrl.training.config import CHANGEABLE, RunConfig, UsageError
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
+from magrl.training.loggers import open_log
 from magrl.transforms import with_sensor_noise
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
@@ -217,8 +219,9 @@ class Run:
         terms = ("return", *(f"return_{term}" for term in RETURN_TERMS))
         columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", *self.losses)
         columns += tuple(f"eval_{key}" for key in EVALUATED)
-        options = {"logger": self.config.logger, "wandb_mode": self.config.wandb_mode, "label": self.name}
-        return RunLog(self.folder, columns, self.settings, **options, resumed=resumed, began=self._began)
+        opened = self.config.logger, self.folder, self.settings, self.config.wandb_mode
+        labeled = partial(open_log, *opened, group=self.name, tags=(self.name,))
+        return RunLog(self.folder, columns, labeled, resumed=resumed, began=self._began)
 
     @property
     def remaining(self) -> float:

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from magrl.training.curves import BestPolicy, RunLog, TrainingStatistics, selection_score
+from magrl.training.loggers import CurveLog
 
 
 def steps(done: list[bool], success: list[bool], **sums: list[float]) -> TensorDict:
@@ -71,7 +72,7 @@ def test_best_policy_is_the_best() -> None:
 
 def test_rows_are_on_disk_when_written(tmp_path: Path) -> None:
     row = {"frames": 512, "return": 1.5, "eval_spl": 88.4, "return_alignment": -0.5}
-    log = RunLog(tmp_path, list(row), {"seed": 0})
+    log = RunLog(tmp_path, list(row), lambda **_: CurveLog("none", None))
     log.row(row)
     with (tmp_path / "train.csv").open() as file:
         assert [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)] == [row]

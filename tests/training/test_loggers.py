@@ -10,6 +10,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -87,8 +88,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("A_SECRET_OF_MINE", "do-not-tell-anyone")
         patch.setenv("WANDB_MODE", "online")
-        settings = {"seed": 7, "num_cells": [8, 8]}
-        log = RunLog(folder, list(ROWS[0]), settings, wandb_mode="offline", label="a-label")
+        settings, labels = {"seed": 7, "num_cells": [8, 8]}, {"group": "a-label", "tags": ["a-label"]}
+        log = RunLog(folder, list(ROWS[0]), partial(open_log, "wandb", folder, settings, "offline", **labels))
         for row in ROWS:
             log.row(row)
         log.figure("trajectories", Figure())
@@ -156,20 +157,21 @@ def test_wandb_writes_to_the_run_folder_and_reports_nothing(tmp_path: Path, monk
     assert [os.environ.get(name) for name in names] == [None, "before", None]
 
 
-def resumed(folder: Path, **options: Any) -> RunLog:
+def resumed(folder: Path, logger: str = "wandb") -> RunLog:
     """Return a run that logged both rows, was killed, and is resumed from a checkpoint after the first."""
-    log = RunLog(folder, list(ROWS[0]), {}, **options)
+    opened = partial(open_log, logger, folder, {}, "offline")
+    log = RunLog(folder, list(ROWS[0]), opened)
     log.row(ROWS[0])
     state = log.state_dict()
     log.row(ROWS[1])
     log.close()
-    again = RunLog(folder, list(ROWS[0]), {}, resumed=True, **options)
+    again = RunLog(folder, list(ROWS[0]), opened, resumed=True)
     again.load_state_dict(state)
     return again
 
 
 def test_resumed_run_of_wandb_continues_its_curve(tmp_path: Path) -> None:
-    log = resumed(tmp_path, wandb_mode="offline")
+    log = resumed(tmp_path)
     log.row({**ROWS[1], "return": 9.0})
     log.close()
     parts = [Offline(path) for path in (tmp_path / "wandb").glob("offline-run-*")]
@@ -203,7 +205,7 @@ def test_missing_tensorboard_is_named(tmp_path: Path, monkeypatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "tensorboard" else found(name))
     with pytest.raises(ValueError, match=r"pip install 'magrl\[tensorboard\]'"):
-        RunLog(tmp_path, [], {}, logger="tensorboard")
+        open_log("tensorboard", tmp_path, {}, "disabled")
     assert not list(tmp_path.iterdir())
     check_logger("csv")
 
