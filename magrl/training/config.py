@@ -326,8 +326,7 @@ class TD3Config(LearningConfig):
         return self
 
 
-Config = TypeVar("Config", bound=RunConfig)
-Parsed = TypeVar("Parsed")
+Config = TypeVar("Config")
 
 
 def parse_config(
@@ -365,8 +364,8 @@ def parse_config(
 
 
 def parse(
-    kind: Callable[..., Parsed], recipe: str, description: str | None, args: Sequence[str] | None = None, **options: Any
-) -> Parsed:
+    kind: Callable[..., Config], recipe: str, description: str | None, args: Sequence[str] | None = None, **options: Any
+) -> Config:
     """Return the settings of a command line, in tyro's form or in that of W&B sweeps.
 
     Args:

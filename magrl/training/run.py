@@ -199,7 +199,7 @@ class Run:
         self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
         self._network = policy.actor if isinstance(policy, FieldPolicy) else policy
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
-        parts = {"settings": self, **parts}  # restored first
+        parts = {"configuration": self, **parts}  # restored first
         parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}
         if isinstance(collector, Collector):  # other processes start new episodes
             parts["episodes"] = RunningEpisodes(collector, env)

@@ -195,7 +195,7 @@ def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, si
         before = saved | {name: value if name != "scenario" else text + "# edited"}
         with pytest.raises(ValueError, match=f"^{name} is .* in the run folder, .* in the checkpoint: only device, "):
             resumed.load_state_dict(before)
-    with pytest.raises(UsageError, match=r"settings .*: zeta is 0\.5 in the run folder, 0\.01 in the checkpoint"):
+    with pytest.raises(UsageError, match=r"configuration does not fit .*: zeta is 0\.5 in the run folder, 0\.01 in"):
         train(tmp_path, zeta=0.5, scenario=scenario, resume=tmp_path)
     train(tmp_path, scenario=scenario, resume=tmp_path, logger="csv", checkpoint_every=5.0)
 
