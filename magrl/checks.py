@@ -7,7 +7,6 @@ for an accelerator. :func:`check_finite` and :func:`require` do read values.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterable
 from numbers import Integral, Real
 from typing import Any
@@ -254,5 +253,5 @@ def short(value: object, length: int = 80) -> str:
         >>> short("x" * 100, 10)
         "'xxxxxx..."
     """
-    text = re.sub(r"\s+", " ", repr(value))
+    text = " ".join(repr(value).split())
     return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 import os
-import sys
-import zipfile
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
+import tomli
 import torch
+from torch import Tensor
 
 from magrl.checks import check_type, short
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 MAX_FILE_BYTES = 10_000_000
 """Largest TOML or JSON file: a scenario with about fifty thousand tasks."""
@@ -42,30 +38,33 @@ class DamagedFileError(ValueError):
 
 
 def save_tensors(content: Any, path: Path) -> None:
-    """Write tensors with :func:`torch.save` atomically, with their SHA-256 as the comment of the archive.
+    """Write tensors and plain data as one safetensors file, atomically.
+
+    The metadata of the file holds the plain data as JSON, in which ``{"$tensor": name}`` stands for a tensor, and the
+    SHA-256 of the file with zeros in place of the digest.
 
     Args:
-        content: tensors, numbers, text and containers of them.
+        content: tensors, numbers, text, None, devices, and lists, tuples, dictionaries and state dictionaries of these.
         path: path of the file; an existing file is replaced.
 
     Raises:
+        TypeError: for anything else in the content.
         OSError: if it cannot be written; an existing file stays unchanged.
 
     Example:
         >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "numbers.pt"
+        >>> path = Path(tempfile.mkdtemp()) / "numbers.safetensors"
         >>> save_tensors({"speed": torch.ones(2)}, path)
         >>> load_tensors(path)
         {'speed': tensor([1., 1.])}
     """
-    archive = io.BytesIO()
-    torch.save(content, archive)
-    body = archive.getvalue()
+    tensors: dict[str, Tensor] = {}
+    text = json.dumps({"sha256": _NO_DIGEST, "content": _pack(content, tensors)})
+    body = safetensors.torch.save(tensors, {"magrl": text})
     aside = path.with_name(f"{path.name}.aside")
     try:
         with aside.open("wb") as file:
-            file.write(body[:-2])  # the last two bytes are the length of the comment
-            file.write(_DIGEST_LENGTH.to_bytes(2, "little") + hashlib.sha256(body).hexdigest().encode())
+            file.write(body.replace(_NO_DIGEST.encode(), hashlib.sha256(body).hexdigest().encode(), 1))
             file.flush()
             os.fsync(file.fileno())
         os.replace(aside, path)
@@ -76,7 +75,7 @@ def save_tensors(content: Any, path: Path) -> None:
 
 
 def load_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
-    """Read a file of :func:`save_tensors` from any source: it runs no code and takes no more memory than disk space.
+    """Read a file of :func:`save_tensors` from any source: it runs no code, and takes memory in proportion to its size.
 
     Args:
         path: path of the file.
@@ -90,11 +89,11 @@ def load_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
 
     Example:
         >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "numbers.pt"
+        >>> path = Path(tempfile.mkdtemp()) / "numbers.safetensors"
         >>> save_tensors([1, 2], path)
         >>> load_tensors(path)
         [1, 2]
-        >>> _ = path.write_bytes(path.read_bytes()[:-1])  # the last byte is missing
+        >>> _ = path.write_bytes(path.read_bytes().replace(b"2]", b"3]"))
         >>> try:
         ...     load_tensors(path)
         ... except DamagedFileError as error:
@@ -102,16 +101,61 @@ def load_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
         its SHA-256 does not match its content
     """
     try:
-        content = Path(path).read_bytes()
-        body = content[: -_DIGEST_LENGTH - 2] + bytes(2)
-        if hashlib.sha256(body).hexdigest().encode() != content[-_DIGEST_LENGTH:]:
+        body = Path(path).read_bytes()
+        if body[8:9] != b"{":
+            raise ValueError("it is no safetensors file, in which this version keeps tensors")
+        header = json.loads(body[8 : 8 + int.from_bytes(body[:8], "little")])
+        plain = json.loads(header["__metadata__"]["magrl"])
+        digest = plain["sha256"].encode()
+        if hashlib.sha256(body.replace(digest, _NO_DIGEST.encode(), 1)).hexdigest().encode() != digest:
             raise ValueError("its SHA-256 does not match its content")
-        with zipfile.ZipFile(io.BytesIO(body)) as archive:
-            if any(item.compress_type != zipfile.ZIP_STORED for item in archive.infolist()):
-                raise ValueError("it holds compressed entries")
-        return torch.load(io.BytesIO(body), map_location=device, weights_only=True)
-    except Exception as error:  # whatever zipfile and torch raise for a foreign archive
-        raise DamagedFileError(f"{path} is damaged: {error}") from error
+        tensors = {name: tensor.to(device) for name, tensor in safetensors.torch.load(body).items()}
+        return _unpack(plain["content"], tensors)
+    except Exception as error:  # whatever json, safetensors and foreign content raise
+        raise DamagedFileError(f"{path} is damaged: {str(error)[:200]}") from error
+
+
+_NO_DIGEST = "0" * 64
+
+
+def _pack(item: Any, tensors: dict[str, Tensor], name: str = "") -> Any:
+    """Return data for JSON, and collect the tensors by the path that leads to them."""
+    if isinstance(item, Tensor):
+        while name in tensors:  # a key may hold a slash
+            name += "'"
+        tensors[name] = item.detach().cpu().clone(memory_format=torch.contiguous_format)
+        return {"$tensor": name}
+    if isinstance(item, Mapping):
+        pairs = [(key, _pack(value, tensors, f"{name}/{key}")) for key, value in item.items()]
+        packed = dict(pairs) if all(isinstance(key, str) and key[:1] != "$" for key in item) else {"$dict": pairs}
+        metadata = getattr(item, "_metadata", None)  # of a state dictionary
+        return packed if metadata is None else {"$state": [packed, _pack(metadata, tensors, f"{name}/$metadata")]}
+    if isinstance(item, (list, tuple)):
+        parts = [_pack(part, tensors, f"{name}/{index}") for index, part in enumerate(item)]
+        return {"$tuple": parts} if isinstance(item, tuple) else parts
+    return {"$device": str(item)} if isinstance(item, torch.device) else item
+
+
+def _unpack(item: Any, tensors: dict[str, Tensor]) -> Any:
+    """Return what :func:`_pack` was given; each tensor stands in one place, so that its size bounds all work on it."""
+    if isinstance(item, list):
+        return [_unpack(part, tensors) for part in item]
+    match item:
+        case {"$tensor": name}:
+            return tensors.pop(name)
+        case {"$tuple": parts}:
+            return tuple(_unpack(parts, tensors))
+        case {"$device": name}:
+            return torch.device(name)
+        case {"$state": [entries, metadata]}:
+            state = OrderedDict(_unpack(entries, tensors))
+            state._metadata = _unpack(metadata, tensors)  # type: ignore[attr-defined]
+            return state
+        case {"$dict": pairs}:
+            return {key: _unpack(value, tensors) for key, value in pairs}
+        case dict():
+            return {key: _unpack(value, tensors) for key, value in item.items()}
+    return item
 
 
 def _sync_folder(folder: Path) -> None:
@@ -122,9 +166,6 @@ def _sync_folder(folder: Path) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
-
-
-_DIGEST_LENGTH = 64
 
 
 def json_ready(value: Any) -> Any:
@@ -193,7 +234,7 @@ def read_document(path: Path) -> Any:
         >>> read_document(path)
         {'speed_km_h': 15.0}
     """
-    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
+    parsers: dict[str, Callable[[str], Any]] = {".toml": tomli.loads, ".json": _json}
     if path.suffix.lower() not in parsers:
         raise ValueError(f"the file must end in .toml or .json, got {path.suffix!r}")
     with path.open("rb") as file:

@@ -6,7 +6,7 @@
     python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --noise 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --conditions ship                # errors of a real vehicle
     python recipes/evaluate.py secant kalman --arrival distance --arrival-radius-km 25 --max-steps 80 --altitude-km -3
-    python recipes/evaluate.py policy:SAC=sac.pt secant                         # a policy of another algorithm
+    python recipes/evaluate.py policy:SAC=sac.safetensors secant                # a policy of another algorithm
 
 Trained agents are given with their run folders. They are flown as they were trained: in their scenario, with their
 arrival threshold, start heading and sensor noise. Runs that differ in one of these need the option that chooses it. An

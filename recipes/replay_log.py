@@ -56,7 +56,7 @@ class Config:
     log: tyro.conf.Positional[Path]
     """Log of the vehicle: a CSV file with a header."""
     navigator: str = "anywhere"
-    """Navigator: anywhere (the pretrained agent), secant, kalman, run_and_tumble, or a policy file (.pt)."""
+    """Navigator: anywhere (the pretrained agent), secant, kalman, run_and_tumble, or a policy file (.safetensors)."""
     target: tuple[float, float, float] | None = None
     """Elements at the destination, D [deg], I [deg], B_H [nT]; by default those of the last row."""
     target_position: tuple[float, float] | None = None
@@ -133,7 +133,7 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
     Raises:
         UsageError: for a row that no vehicle can have recorded, with its number.
     """
-    navigator = load_policy(config.navigator) if config.navigator.endswith(".pt") else config.navigator
+    navigator = load_policy(config.navigator) if config.navigator.endswith(".safetensors") else config.navigator
     sheet = {"sensor_std": config.noise, "bias_std": config.bias}
     board = Onboard(navigator, max_steps=len(log) + 1, arrival_km=config.arrival_km, **sheet)
     board.start(log[ELEMENTS].iloc[-1].tolist() if config.target is None else config.target)

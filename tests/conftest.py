@@ -61,7 +61,7 @@ def outcome() -> Callable:
     def read(folder: Path) -> tuple[list[dict[str, str]], dict[str, Tensor]]:
         with (folder / "train.csv").open() as file:
             rows = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
-        policy = load_policy(folder / "policy.pt")
+        policy = load_policy(folder / "policy.safetensors")
         weights = getattr(policy, "actor", policy).state_dict()
         return rows, {key: value for key, value in weights.items() if isinstance(value, Tensor)}
 

@@ -56,7 +56,7 @@ class Network(TensorDictModuleBase):
         return tensordict.set("action", action.reshape(*tensordict.shape, -1))
 
     def content(self) -> dict[str, Any]:
-        """Return all that rebuilds the network as numbers, text and tensors on the CPU."""
+        """Return all that rebuilds the network as numbers, text and tensors."""
         return {"in_keys": self.in_keys, "program": self.program.content()}
 
 

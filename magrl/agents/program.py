@@ -87,8 +87,8 @@ class TensorProgram(nn.Module):
         return tuple(values[index] for index in self.outputs)
 
     def content(self) -> dict[str, Any]:
-        """Return the arguments of the class, with tensors on the CPU."""
-        tensors = [tensor.cpu().clone() for tensor in self.buffers()]
+        """Return the arguments of the class."""
+        tensors = list(self.buffers())
         return {"num_inputs": self.num_inputs, "steps": self.steps, "tensors": tensors, "outputs": self.outputs}
 
 

@@ -29,7 +29,7 @@ class TrainedAgent(NamedTuple):
 
 
 OWN = "policy"
-"""Name of a policy of any algorithm, which takes its file or a folder with ``policy.pt``, and after ``:`` a label."""
+"""Name of a policy of any algorithm, which takes its file or a folder with ``policy.safetensors``, and a label."""
 PRETRAINED = ("anywhere",)
 """Names of trained agents that come with the library; its training planets share only the spectrum of the field."""
 TRAINED = {
@@ -68,8 +68,8 @@ def parse_navigator(text: str) -> NavigatorText:
     """Return the parts of a text that names a navigator; empty where it has none.
 
     Example:
-        >>> parse_navigator("policy:SAC=sac.pt")
-        NavigatorText(name='policy', option='SAC', source='sac.pt')
+        >>> parse_navigator("policy:SAC=sac.safetensors")
+        NavigatorText(name='policy', option='SAC', source='sac.safetensors')
     """
     check_type(str, text=text)
     named, _, source = text.partition("=")
@@ -92,7 +92,7 @@ def make_navigator(
 
     Args:
         text: name; after ``=`` the run folder of a trained agent, or the file of a policy; after ``:`` the mode of a
-            metaheuristic, or the label of a policy, as in ``policy:SAC=sac.pt``.
+            metaheuristic, or the label of a policy, as in ``policy:SAC=sac.safetensors``.
         env: environment that it navigates in.
         sensor_std: standard deviations of the sensors' noise, D [deg], I [deg], B_H [nT], for navigators that weigh
             their readings. Agents read it from the TensorDict.
@@ -133,7 +133,7 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
     if not source and name not in PRETRAINED:
         file = " or the file of a policy" if name == OWN else ""
         raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
-    path = Path(source) if name == OWN and not Path(source).is_dir() else Path(source) / "policy.pt"
+    path = Path(source) if name == OWN and not Path(source).is_dir() else Path(source) / "policy.safetensors"
     policy: Any = load_policy(path, env.device) if source else load_pretrained(name, env.device)
     if options and not isinstance(policy.view, TrackView):
         raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")

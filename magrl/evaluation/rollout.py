@@ -41,8 +41,8 @@ def evaluate(
 
     Args:
         policy: policy or navigator of the plain environment, or the text that names one, as
-            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.pt"``. A trained
-            policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
+            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.safetensors"``. A
+            trained policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
         tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
             region.
         num_envs: number of vehicles that fly at a time, each several tasks where there are more; by default one for

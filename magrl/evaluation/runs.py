@@ -52,7 +52,7 @@ def read_run(folder: Path) -> TrainedRun:
     """
     path = folder / "config.json"
     if not path.is_file():
-        raise FileNotFoundError(f"there is no run at {folder}: it must hold config.json and policy.pt")
+        raise FileNotFoundError(f"there is no run at {folder}: it must hold config.json and policy.safetensors")
     try:
         settings = dict(json.loads(path.read_text()))
         kinds: dict[Any, str] = {True: "gg_td3", False: "td3"}

@@ -22,7 +22,7 @@ from magrl.files import DamagedFileError, load_tensors, save_tensors
 from magrl.training.config import UsageError
 
 CHECKPOINT_FORMAT = 1
-_PATTERN = "checkpoint-*.pt"
+_PATTERN = "checkpoint-*.safetensors"
 PRIVATE = ("_carrier", "_frames", "_iter")
 """Private attributes of TorchRL's ``Collector`` that :class:`RunningEpisodes` saves and restores."""
 
@@ -108,7 +108,7 @@ class Checkpoints:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     print(Checkpoints(folder, {"layer": layer}).save(100).name)
         ...     Checkpoints(folder, {"layer": other}).load()
-        checkpoint-000000000100.pt
+        checkpoint-000000000100.safetensors
         100
         >>> bool((layer.weight == other.weight).all())
         True
@@ -134,7 +134,7 @@ class Checkpoints:
             OSError: if it cannot be written; existing checkpoints stay unchanged.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / f"checkpoint-{frames:012d}.pt"
+        path = self.folder / f"checkpoint-{frames:012d}.safetensors"
         parts = {name: part.state_dict() for name, part in self.parts.items()}
         try:
             save_tensors({"format": CHECKPOINT_FORMAT, "frames": frames, "parts": parts}, path)

@@ -299,7 +299,7 @@ class Run:
 
         seconds = self.log.seconds
         self._network.load_state_dict(self.best.weights or self._network.state_dict())
-        save_policy(self.folder / "policy.pt", self.policy, self.validation)
+        save_policy(self.folder / "policy.safetensors", self.policy, self.validation)
         if self.log.rows:
             self.log.figure("training", figures.training_figure(self.log.rows))
         if not self.complete:
@@ -320,8 +320,8 @@ class Run:
 
     def _report_stop(self) -> None:
         print(
-            f"\nStopped after {self.statistics.frames} frames; the policy so far is {self.folder / 'policy.pt'}\n"
-            f"To resume: --resume {self.folder}",
+            f"\nStopped after {self.statistics.frames} frames; "
+            f"the policy so far is {self.folder / 'policy.safetensors'}\nTo resume: --resume {self.folder}",
             file=sys.stderr,
         )
         raise SystemExit(self.stop.exit_code)

@@ -1,7 +1,7 @@
 """Make the tables that recipes/tables/tables.toml declares: navigators by errors, tasks, dates and seeds.
 
     python recipes/tables/grid.py earth conditions --out docs/results        # writes earth.md and conditions.md
-    python recipes/tables/grid.py earth --navigators policy:MINE=mine.pt     # the same table of other navigators
+    python recipes/tables/grid.py earth --navigators policy:MINE=mine.safetensors  # the same table of other navigators
     python recipes/tables/grid.py earth --tasks 200                          # faster
 
 Without --out, tables are printed. Navigators are given the data sheets of their sensors. A cell holds the success rate
@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tomli
 import torch
 import tyro
 from tqdm import tqdm
@@ -38,11 +39,6 @@ from magrl.evaluation.runs import NO_NOISE
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
 from magrl.training import UsageError, command, parse
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 sys.path.insert(0, str(Path(__file__).parent))
 import declarations
@@ -219,7 +215,7 @@ KINDS: Mapping[str, Callable[..., str]] = {
 
 def declared_tables(file: Path = FILE) -> dict[str, dict[str, Any]]:
     """Return the kind and the options of each table in a file."""
-    return tomllib.loads(file.read_text())
+    return tomli.loads(file.read_text())
 
 
 def make(config: Config) -> None:

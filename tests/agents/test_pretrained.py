@@ -36,7 +36,7 @@ def test_anywhere_acts_alike_by_any_default_type_of_floating_point_numbers() -> 
 
 
 def test_every_policy_is_small_and_has_a_card() -> None:
-    (file,) = FOLDER.glob("*.pt")
+    (file,) = FOLDER.glob("*.safetensors")
     assert file.stat().st_size < 1_000_000
     card = file.with_suffix(".md").read_text()
     assert all(f"## {part}\n" in card for part in ("Training", "Data", "Figures", "Limits"))

@@ -19,7 +19,8 @@ def make_run(folder: Path, env: GeomagneticNavEnv, **settings: object) -> Path:
     """Return the folder of a run whose agent has learned nothing."""
     folder.mkdir()
     torch.manual_seed(0)
-    save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False)))
+    config = PolicyConfig(env.observation_view(), (8,), layer_norm=False)
+    save_policy(folder / "policy.safetensors", FieldPolicy(config))
     (folder / "config.json").write_text(json.dumps({"guided": True} | settings))
     return folder
 

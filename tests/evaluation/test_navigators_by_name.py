@@ -36,7 +36,8 @@ def env() -> GeomagneticNavEnv:
 def run(env: GeomagneticNavEnv, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a run whose agent has learned nothing."""
     folder = tmp_path_factory.mktemp("run")
-    save_policy(folder / "policy.pt", FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False)))
+    config = PolicyConfig(env.observation_view(), (8,), layer_norm=False)
+    save_policy(folder / "policy.safetensors", FieldPolicy(config))
     return folder
 
 
@@ -79,8 +80,8 @@ def test_a_policy_of_any_algorithm_is_a_file_or_a_folder(env: GeomagneticNavEnv,
     """Its network may be none of the library: this one moves by 25 km, straight on."""
     steps = [["mul.Tensor", [{"value": 0}, 0.0], {}], ["add.Tensor", [{"value": 2}, {"value": 1}], {}]]
     program = TensorProgram(1, steps, [torch.tensor([25.0, 0.0])], [3])
-    save_policy(tmp_path / "own.pt", ExportedPolicy(["move"], program))
-    action = make_navigator(f"policy:straight={tmp_path / 'own.pt'}", env)(env.reset())["action"]
+    save_policy(tmp_path / "own.safetensors", ExportedPolicy(["move"], program))
+    action = make_navigator(f"policy:straight={tmp_path / 'own.safetensors'}", env)(env.reset())["action"]
     assert action.tolist() == [[25, 0]] * 2
     assert isinstance(make_navigator(f"policy={run}", env), FieldPolicy)
     assert (label("policy:SAC"), label("policy"), needs("policy:SAC")) == ("SAC", "own policy", "training")
@@ -120,7 +121,7 @@ def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment(limi
 
 
 def test_navigators_that_are_given_twice(run: Path) -> None:
-    check_distinct(["secant", "ga", "ga:flown", f"td3={run}", "policy:A=a.pt", "policy:B=b.pt"])
+    check_distinct(["secant", "ga", "ga:flown", f"td3={run}", "policy:A=a.safetensors", "policy:B=b.safetensors"])
     for texts, mode, message in (
         (("secant", "ga", "secant"), "look-ahead", "^secant is given twice: the same episodes again are no spread"),
         ((f"gg_td3={run}", f"td3={run.parent / 'x' / '..' / run.name}"), "look-ahead", "^td3=.* is given twice"),

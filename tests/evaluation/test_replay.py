@@ -181,7 +181,7 @@ def test_the_recipe_flies_the_run_first(env: GeomagneticNavEnv, tmp_path: Path) 
     recipe, run = load("replay"), tmp_path / "agent"
     run.mkdir()
     torch.manual_seed(0)
-    save_policy(run / "policy.pt", FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False)))
+    save_policy(run / "policy.safetensors", FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False)))
     box = {"latitude": [-10.0, 0.0], "longitude": [160.0, 170.0]}
     scenario = {"region": box, "date": "2022-01-01", "generation": 13, "max_steps": 12}
     tasks = [{"start": [-2.0, 162.0], "target": [-8.0, 164.0]}, {"start": [-3.0, 163.0], "target": [-6.0, 165.0]}]

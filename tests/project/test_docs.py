@@ -42,7 +42,7 @@ BUDGET = {
     "num_envs=512)": "num_envs=8)",
     '"batch_size": 2048': '"batch_size": 256',
     "anywhere_env(1000": "anywhere_env(8",
-    '"sac.pt"), "test-1000"': '"sac.pt"), "figure-4-1"',
+    '"sac.safetensors"), "test-1000"': '"sac.safetensors"), "figure-4-1"',
     "= 100_000, 1024, 1000": "= 128, 4, 2",
     "earth_scenario(64, ": "earth_scenario(2, max_steps=5, ",
     "earth_scenario(128, ": "earth_scenario(2, max_steps=5, ",
@@ -82,7 +82,7 @@ def reader(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("reader")
     (folder / "runs" / "first").mkdir(parents=True)
     policy = FieldPolicy(PolicyConfig(GeomagneticNavEnv(seed=0).observation_view(), (8,)))
-    save_policy(folder / "runs" / "first" / "policy.pt", policy)
+    save_policy(folder / "runs" / "first" / "policy.safetensors", policy)
     return folder
 
 

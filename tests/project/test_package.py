@@ -104,7 +104,7 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     data |= {
         "field/weather.npz",
         "tracking/learned_prior.pt",
-        "agents/pretrained/anywhere.pt",
+        "agents/pretrained/anywhere.safetensors",
         "agents/pretrained/anywhere.md",
     }
     assert {path for path in held if path.parts[0] == "magrl"} == library | {Path("magrl") / name for name in data}

@@ -52,7 +52,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     assert same_outcome(run, whole)
     assert not (run / "checkpoints").exists()
 
-    files = {"config.json", "train.csv", "policy.pt", "eval.json", "training.png"}
+    files = {"config.json", "train.csv", "policy.safetensors", "eval.json", "training.png"}
     assert files <= {path.name for path in whole.iterdir()} <= files | {".lock", "trajectories.png"}
     written, config = (json.loads((whole / f"{name}.json").read_text()) for name in ("eval", "config"))
     assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 160)
@@ -62,7 +62,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     assert result["updates"] == int(rows[-1]["updates"]) > 0
     losses = getattr(module, "LOSSES", ("loss_critic", "loss_actor"))
     assert all(math.isfinite(float(rows[-1][key])) for key in losses)
-    policy = load_policy(run / "policy.pt")
+    policy = load_policy(run / "policy.safetensors")
     assert GeomagneticNavEnv(num_envs=3, seed=0).rollout(2, policy)["action"].isfinite().all()
     assert all(weight.isfinite().all() for weight in weights.values())
 
@@ -203,7 +203,7 @@ def test_many_kills(tmp_path: Path, same_outcome, seed: int, monkeypatch) -> Non
     process = context.Process(target=recipe.train, args=(config,))
     while survived < 6 and process.exitcode is None:
         process.start()
-        while process.is_alive() and not list(folder.glob("checkpoints/checkpoint-*.pt")):
+        while process.is_alive() and not list(folder.glob("checkpoints/checkpoint-*.safetensors")):
             time.sleep(0.01)
         process.join(moments.uniform(0, 5) if survived < 5 else None)
         process.kill()

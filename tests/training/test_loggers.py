@@ -93,7 +93,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for row in ROWS:
             log.row(row)
         log.figure("trajectories", Figure())
-        (folder / "policy.pt").write_bytes(b"weights")
+        (folder / "policy.safetensors").write_bytes(b"weights")
         log.result({"spl": 97.5, "steps": float("nan"), "num_tasks": 3}, navigator="a-navigator")
         log.close()
     return folder
@@ -125,7 +125,7 @@ def test_table_picture_policy_and_final_values(finished: Path) -> None:
     (model,) = (artifact for artifact in offline.records["artifact"] if artifact.type == "model")
     (entry,) = model.manifest.contents
     assert (model.name, json.loads(model.metadata)) == ("policy-a-run-1", row)
-    assert (entry.path, Path(entry.local_path), entry.size) == ("policy.pt", finished / "policy.pt", len(b"weights"))
+    assert (Path(entry.local_path), entry.size) == (finished / entry.path, len(b"weights"))
 
 
 def test_nothing_about_the_machine_is_logged(finished: Path) -> None:

@@ -169,9 +169,9 @@ def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> N
     with signalled(5, signal.SIGTERM), pytest.raises(SystemExit):
         train(tmp_path)
     curves = (tmp_path / "train.csv").read_text()
-    with pytest.raises(UsageError, match=r"cannot resume: .*checkpoint-\d+\.pt: part does not fit this training"):
+    with pytest.raises(UsageError, match=r"cannot resume: .*checkpoint-\d+\.\w+: part does not fit this training"):
         train(tmp_path, width=2, resume=tmp_path)
-    for file in tmp_path.glob("checkpoints/*.pt"):
+    for file in tmp_path.glob("checkpoints/*.safetensors"):
         file.write_bytes(b"")
     with pytest.raises(UsageError, match="cannot resume: there is no valid checkpoint in"):
         train(tmp_path, resume=tmp_path)

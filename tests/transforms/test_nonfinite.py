@@ -62,6 +62,6 @@ def test_training_stops_at_the_first_non_finite_value(
     monkeypatch.setattr(owner, name, poisoned(getattr(owner, name), *options))
     with pytest.raises(FloatingPointError, match=message):
         recipe.train(recipe.Config(**SMALL, out=tmp_path / "run"))
-    (file,) = sorted((tmp_path / "run" / "checkpoints").glob("*.pt"))[-1:]
+    (file,) = sorted((tmp_path / "run" / "checkpoints").glob("*.safetensors"))[-1:]
     weights = read_checkpoint(file)["parts"]["loss"]
     assert all(torch.isfinite(value).all() for value in weights.values() if isinstance(value, torch.Tensor))

@@ -29,6 +29,6 @@ def load_pretrained(name: str, device: torch.device | str = "cpu") -> FieldPolic
         >>> load_pretrained("anywhere").config.num_cells
         (128, 128, 128)
     """
-    names = sorted(path.stem for path in _FOLDER.glob("*.pt"))
+    names = sorted(path.stem for path in _FOLDER.glob("*.safetensors"))
     check_choice(names, pretrained_policy=name)
-    return load_policy(_FOLDER / f"{name}.pt", device)
+    return load_policy(_FOLDER / f"{name}.safetensors", device)
