@@ -138,6 +138,7 @@ class ExportedPolicy(TrainedPolicy):
             )
         self.in_keys, self.program, self.view = list(in_keys), program, view
         self.first_state, self.state_keys, self.declares = list(first_state), tuple(states), declares
+        program.check_size(*self._examples())
 
     def _examples(self) -> list[Tensor]:
         """Return an example of each input of the program, for one vehicle."""

@@ -60,6 +60,17 @@ class Network(TensorDictModuleBase):
         return {"in_keys": self.in_keys, "program": self.program.content()}
 
 
+def seen_by(view: ObservationView | TrackView) -> TensorDictBase:
+    """Return what a view writes for one vehicle, and what it reads.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> seen_by(GeomagneticNavEnv(seed=0).observation_view())["observation"].shape
+        torch.Size([1, 13])
+    """
+    return Compose(*view.observation_transforms())(TensorDict(EXAMPLES, [1]).clone())
+
+
 class _Values(nn.Module):
     """A network over plain tensors."""
 
@@ -93,7 +104,7 @@ def trace_network(actor: TensorDictModuleBase, view: ObservationView | TrackView
     if isinstance(actor, Network):
         return actor
     actor = copied(actor).to("cpu").eval()
-    seen = Compose(*view.observation_transforms())(TensorDict(EXAMPLES, [1]).clone())
+    seen = seen_by(view)
     keys = [unravel_key(key) for key in actor.in_keys]
     if unknown := [key for key in keys if key not in seen.keys(True, True)]:
         raise ValueError(

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.exported import ExportedPolicy, TrainedPolicy, rebuild
-from magrl.agents.network import Network, trace_network
+from magrl.agents.network import Network, seen_by, trace_network
 from magrl.agents.networks import Device, make_actor, make_correcting_actor
 from magrl.agents.pipeline import export_policy
 from magrl.agents.program import TensorProgram
@@ -287,7 +287,9 @@ def _rebuild(config: Any, weights: Any, name: str) -> FieldPolicy:
     view = VIEWS[config.pop("kind")](**config.pop("view"))
     rebuilt = PolicyConfig(view, **config)
     if rebuilt.num_cells is None:
-        return FieldPolicy(rebuilt, Network(weights["in_keys"], TensorProgram(**weights["program"])))
+        network = Network(weights["in_keys"], TensorProgram(**weights["program"]))
+        network.program.check_size(*map(seen_by(view).get, network.in_keys))
+        return FieldPolicy(rebuilt, network)
     # Before anything is allocated: a few bytes may ask for any number of cells
     shapes = {key: tuple(value.shape) for key, value in rebuilt.make_actor("meta").state_dict().items()}
     if {key: tuple(value.shape) for key, value in weights.items()} != shapes:

@@ -11,21 +11,21 @@ import operator
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr
+from functools import partial
 from typing import Any
 
 import torch
 from tensordict.nn import set_interaction_type
 from torch import Tensor, nn
+from torch._subclasses import FakeTensorMode
 from torch.distributions import Distribution
 
 from magrl.checks import check_finite, check_type, short
 
 Step = list[Any]
 """Name of an operation, positional arguments, named arguments."""
-PYTHON = {
-    f.__name__: f for f in (operator.getitem, operator.add, operator.sub, operator.mul, operator.floordiv, operator.mod)
-}
-"""Operations on lists of tensors and on sizes of batches."""
+SIZES = {f.__name__: f for f in (operator.add, operator.sub, operator.mul, operator.floordiv, operator.mod)}
+"""Operations on sizes of batches."""
 RECURRENT = ("lstm.input", "gru.input")
 _ACTIVATIONS = ("silu.default", "celu.default", "softplus.default", "mish.default", "log_sigmoid_forward.default")
 _FUNCTIONS = ("lerp.Tensor", "lerp.Scalar", "hypot.default", "exp2.default", "addcmul.default", "logaddexp.default")
@@ -38,6 +38,8 @@ TEXTS = ("none", "floor", "trunc", "tanh")
 """Texts that operations may take: modes of a division and of a GELU."""
 _LAYOUT = ("layout", "pin_memory", "non_blocking")  # says nothing about values
 _TYPES = {"dtype": torch.dtype, "memory_format": torch.memory_format}
+MOST_NUMBERS = 10**7
+"""Largest total of the numbers that a program computes for one vehicle, beside four times its weights."""
 _EXAMPLES = 7  # not one, which PyTorch traces as a special case, and no usual size of a vector
 
 
@@ -85,6 +87,26 @@ class TensorProgram(nn.Module):
         for call in self._calls:
             values.append(call(values))
         return tuple(values[index] for index in self.outputs)
+
+    def check_size(self, *inputs: Tensor) -> None:
+        """Compute the shapes of all values, without the values, and raise for more than :data:`MOST_NUMBERS`.
+
+        Args:
+            inputs: an example of each input, for one vehicle.
+
+        Raises:
+            ValueError: naming the operation.
+        """
+        shapes = FakeTensorMode()
+        values: list[Any] = [shapes.from_tensor(value) for value in (*inputs, *self.buffers())]
+        most, count = MOST_NUMBERS + 4 * sum(weight.numel() for weight in self.buffers()), 0
+        for step, call in zip(self.steps, self._calls, strict=True):
+            with shapes:
+                values.append(call(values))
+            made = values[-1] if isinstance(values[-1], (list, tuple)) else values[-1:]
+            count += sum(part.numel() for part in made if isinstance(part, Tensor))
+            if count > most:
+                raise ValueError(f"{step[0]} makes more numbers than {most}, the most for one vehicle")
 
     def content(self) -> dict[str, Any]:
         """Return the arguments of the class."""
@@ -221,8 +243,10 @@ def _operation(name: object) -> Callable[..., Any]:
     Raises:
         ValueError: with the name.
     """
-    if str(name) in PYTHON:
-        return PYTHON[str(name)]
+    if name == "getitem":
+        return operator.getitem
+    if str(name) in SIZES:
+        return partial(_size, SIZES[str(name)])
     if str(name) in WHOLE:
         return WHOLE[str(name)]
     family, _, overload = str(name).partition(".")
@@ -235,6 +259,15 @@ def _operation(name: object) -> Callable[..., Any]:
     if torch.Tag.core not in found.tags or found._schema.is_mutable:
         raise ValueError(f"{name!r} is not one of PyTorch's core operations on tensors")
     return found
+
+
+def _size(operation: Callable[[Any, Any], Any], *sizes: Any) -> Any:
+    """Return the result of an operation on sizes; on lists or large numbers it could take any time and memory."""
+    if any(
+        isinstance(size, (Tensor, list, tuple, str)) or (isinstance(size, int) and abs(size) > 2**62) for size in sizes
+    ):
+        raise ValueError(f"{operation.__name__} takes sizes of batches, got {short(sizes)}")
+    return operation(*sizes)
 
 
 def _argument(item: Any, known: int) -> Callable[[Sequence[Any]], Any]:

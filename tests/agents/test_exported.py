@@ -13,8 +13,9 @@ from torchrl.envs import CatTensors, Compose, ObservationNorm, RewardSum, Transf
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
-from magrl.agents import ExportedPolicy, load_policy, save_policy
-from magrl.agents.program import trace_program
+from magrl.agents import ExportedPolicy, FieldPolicy, PolicyConfig, load_policy, save_policy
+from magrl.agents.network import Network
+from magrl.agents.program import TensorProgram, trace_program
 from magrl.envs import GeomagneticNavEnv
 from magrl.files import load_tensors, save_tensors
 from magrl.transforms import (
@@ -203,6 +204,8 @@ def step(name: object, *args: object, **named: object) -> Callable:
         (lambda c: c.update(in_keys=["field"]), "a program for 1 keys and 0 tensors of state must take 1 inputs"),
         (lambda c: c.update(view={"field_low": 1}), "does not hold a valid policy"),
         (lambda c: c.update(more=1), "unexpected keyword argument 'more'"),
+        (step("_native_batch_norm_legit.default", *[{"value": 0}] * 5, True, 0.1, 1e-5), "is not one of"),
+        (step("full.default", [10**9], 1.0), "full.default makes more numbers than 1000"),
     ],
 )
 def test_damaged_and_foreign_content_is_refused(saved: Path, tmp_path: Path, change, message: str) -> None:
@@ -212,3 +215,32 @@ def test_damaged_and_foreign_content_is_refused(saved: Path, tmp_path: Path, cha
     with pytest.raises(ValueError, match=message) as error:
         load_policy(tmp_path / "own.pt")
     assert str(tmp_path / "own.pt") in str(error.value)
+
+
+X = {"value": 0}
+LARGE = [
+    [["arange.start_step", [0, 10**9], {}]],
+    [["constant_pad_nd.default", [X, [0, 10**9]], {}]],
+    [["expand.default", [X, [10**9, 2]], {}]],
+    [["repeat.default", [X, [10**9, 1]], {}]],
+    [["cat.default", [[{"value": index}] * 2], {}] for index in range(40)],
+]
+HUGE_SIZES = [
+    [["mul", [[X], 10**9], {}]],
+    [["sym_size.int", [X, 1], {}], *[["mul", [{"value": index}] * 2, {}] for index in range(1, 40)]],
+]
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [(steps, "makes more numbers than 10000000") for steps in LARGE] + [(steps, "takes sizes") for steps in HUGE_SIZES],
+)
+def test_a_program_that_takes_any_memory_is_refused(steps: list, message: str, tmp_path: Path) -> None:
+    """Before it runs, by the shapes of one vehicle; in an exported policy, and in a network behind a view."""
+    program = TensorProgram(1, steps, [], [0])
+    with pytest.raises(ValueError, match=message):
+        ExportedPolicy(["move"], program)
+    view = GeomagneticNavEnv(seed=0).observation_view()
+    save_policy(tmp_path / "own.safetensors", FieldPolicy(PolicyConfig(view), Network(["move"], program)))
+    with pytest.raises(ValueError, match=f"does not hold a valid policy: .*{message}"):
+        load_policy(tmp_path / "own.safetensors")
