@@ -44,11 +44,19 @@ def test_coordinates(text: str, expected: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["Bergen", "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361", "58°60'N 5°44'E"]
+    "text",
+    ["Bergen", "60.4", "60.4N", "5.3E 60.4N", "60.4N5.3E7", "nan 3", "-3N 4", "91 0", "0 361", "58°60'N 5°44'E"],
 )
 def test_coordinates_that_are_none(text: str) -> None:
     with pytest.raises(ValueError, match=r"must (be|have)"):
         parse_coordinates(text)
+
+
+def test_long_texts_are_no_coordinates() -> None:
+    """They took minutes: the time of the expression grew with powers of the length."""
+    for text in ("1" * 30_000 + "x", "1" + " " * 30_000 + "x", "1'" * 15_000):
+        with pytest.raises(ValueError, match=r"a place must be written such as .{30,150}$"):
+            parse_coordinates(text)
 
 
 def test_elements_that_no_field_has() -> None:
