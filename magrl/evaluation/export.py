@@ -98,7 +98,8 @@ def to_geojson(tracks: Sequence[Track]) -> str:
     for track in tracks:
         properties = {"name": track.name, **json_ready(track.properties)}
         features.append({"type": "Feature", "geometry": _geometry(track), "properties": properties})
-    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+    text = json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False)
+    return text.replace("<", "\\u003c") + "\n"  # no text can end a script element that holds the data
 
 
 def _geometry(track: Track) -> dict[str, Any]:

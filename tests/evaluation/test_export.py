@@ -60,7 +60,9 @@ def test_tracks_are_those_of_the_rollout() -> None:
 
 
 def test_geojson_is_that_of_rfc_7946() -> None:
-    collection = json.loads(to_geojson([STRAIGHT, ACROSS]))
+    text = to_geojson([STRAIGHT, ACROSS])
+    assert "<" not in text, "a text can end the script element of a page"
+    collection = json.loads(text)
     assert collection["type"] == "FeatureCollection"
     straight, across = collection["features"]
     assert straight["type"] == "Feature"
