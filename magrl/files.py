@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -127,9 +127,9 @@ def _pack(item: Any, tensors: dict[str, Tensor], name: str = "") -> Any:
         return {"$tensor": name}
     if isinstance(item, Mapping):
         pairs = [(key, _pack(value, tensors, f"{name}/{key}")) for key, value in item.items()]
-        packed = dict(pairs) if all(isinstance(key, str) and key[:1] != "$" for key in item) else {"$dict": pairs}
-        metadata = getattr(item, "_metadata", None)  # of a state dictionary
-        return packed if metadata is None else {"$state": [packed, _pack(metadata, tensors, f"{name}/$metadata")]}
+        metadata = _pack(getattr(item, "_metadata", None), tensors, f"{name}/$")  # of a state dictionary
+        plain = metadata is None and all(isinstance(key, str) and key[:1] != "$" for key in item)
+        return dict(pairs) if plain else {"$dict": pairs, "metadata": metadata}
     if isinstance(item, (list, tuple)):
         parts = [_pack(part, tensors, f"{name}/{index}") for index, part in enumerate(item)]
         return {"$tuple": parts} if isinstance(item, tuple) else parts
@@ -147,12 +147,10 @@ def _unpack(item: Any, tensors: dict[str, Tensor]) -> Any:
             return tuple(_unpack(parts, tensors))
         case {"$device": name}:
             return torch.device(name)
-        case {"$state": [entries, metadata]}:
-            state = OrderedDict(_unpack(entries, tensors))
+        case {"$dict": pairs, "metadata": metadata}:
+            state = OrderedDict((key, _unpack(value, tensors)) for key, value in pairs)
             state._metadata = _unpack(metadata, tensors)  # type: ignore[attr-defined]
             return state
-        case {"$dict": pairs}:
-            return {key: _unpack(value, tensors) for key, value in pairs}
         case dict():
             return {key: _unpack(value, tensors) for key, value in item.items()}
     return item
@@ -249,9 +247,8 @@ def read_document(path: Path) -> Any:
 
 def _json(text: str) -> Any:
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(dict(pairs)) < len(pairs):
-            names = [key for key, _ in pairs]
-            raise ValueError(f"the key {short(next(key for key in names if names.count(key) > 1))} is repeated")
-        return dict(pairs)
+        if len(content := dict(pairs)) < len(pairs):
+            raise ValueError(f"the key {short(Counter(key for key, _ in pairs).most_common(1)[0][0])} is repeated")
+        return content
 
     return json.loads(text, object_pairs_hook=unique)

@@ -192,7 +192,7 @@ class ExportedPolicy(TrainedPolicy):
         return {**content, "view": view, "program": self.program.content()}
 
 
-def rebuild(content: Any) -> ExportedPolicy:
+def rebuild(exported: Any) -> ExportedPolicy:
     """Return a policy from its :meth:`ExportedPolicy.content`.
 
     Raises:
@@ -203,5 +203,5 @@ def rebuild(content: Any) -> ExportedPolicy:
         >>> rebuild(ExportedPolicy(["move"], halves).content()).in_keys
         ['move']
     """
-    view = content["view"] and ObservationView(**content["view"])
-    return ExportedPolicy(**{**content, "view": view, "program": TensorProgram(**content["program"])})
+    view = exported["view"] and ObservationView(**exported["view"])
+    return ExportedPolicy(**{**exported, "view": view, "program": TensorProgram(**exported["program"])})

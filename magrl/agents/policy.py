@@ -267,34 +267,28 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no policy file at {path}")
     content = load_tensors(path)
-    content = content if isinstance(content, dict) else {}
-    version = content.get("format", POLICY_FORMAT)
+    version = content.pop("format", None) if isinstance(content, dict) else None
     if version != POLICY_FORMAT:
         raise ValueError(
             f"{path} is a policy of format {short(version)}; this version reads format {POLICY_FORMAT}: train it again"
         )
     try:
-        if set(content) == {"format", "exported"}:
-            return rebuild(content["exported"]).to(device).eval()
-        if set(content) != {"format", "config", "weights"}:
-            raise ValueError("it must hold format, config and weights, or format and exported")
-        return _rebuild(content["config"], content["weights"], str(path)).to(device).eval()
+        policy = rebuild(**content) if "exported" in content else _rebuild(**content)
+        return policy.to(device).eval()
     except Exception as error:  # whatever foreign content raises
-        raise ValueError(f"{path} does not hold a valid policy: {error}") from error
+        raise ValueError(f"{path} does not hold a valid policy: {' '.join(str(error).split())}") from error
 
 
-def _rebuild(config: Any, weights: Any, name: str) -> FieldPolicy:
+def _rebuild(config: Any, weights: Any) -> FieldPolicy:
     view = VIEWS[config.pop("kind")](**config.pop("view"))
     rebuilt = PolicyConfig(view, **config)
     if rebuilt.num_cells is None:
         network = Network(weights["in_keys"], TensorProgram(**weights["program"]))
         network.program.check_size(*map(seen_by(view).get, network.in_keys))
         return FieldPolicy(rebuilt, network)
-    # Before anything is allocated: a few bytes may ask for any number of cells
-    shapes = {key: tuple(value.shape) for key, value in rebuilt.make_actor("meta").state_dict().items()}
-    if {key: tuple(value.shape) for key, value in weights.items()} != shapes:
-        raise ValueError(f"its weights do not have the shapes of {rebuilt}")
-    check_finite(weights.items(), name)
+    # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
+    rebuilt.make_actor("meta").load_state_dict(weights, assign=True)
+    check_finite(weights.items(), "weights")
     policy = FieldPolicy(rebuilt)
     policy.actor.load_state_dict(weights)
     return policy

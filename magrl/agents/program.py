@@ -24,8 +24,19 @@ from magrl.checks import check_finite, check_type, short
 
 Step = list[Any]
 """Name of an operation, positional arguments, named arguments."""
-SIZES = {f.__name__: f for f in (operator.add, operator.sub, operator.mul, operator.floordiv, operator.mod)}
-"""Operations on sizes of batches."""
+
+
+def _size(operation: Callable[[Any, Any], Any], *sizes: Any) -> Any:
+    """Return the result of an operation on sizes; on lists or large numbers it could take any time and memory."""
+    large = any(isinstance(size, int) and abs(size) > 2**62 for size in sizes)
+    if large or any(isinstance(size, (Tensor, list, tuple, str)) for size in sizes):
+        raise ValueError(f"{operation.__name__} takes sizes of batches, got {short(sizes)}")
+    return operation(*sizes)
+
+
+_SIZES = (operator.add, operator.sub, operator.mul, operator.floordiv, operator.mod)
+PYTHON = {"getitem": operator.getitem} | {f.__name__: partial(_size, f) for f in _SIZES}
+"""Operations on lists of tensors and on sizes of batches."""
 RECURRENT = ("lstm.input", "gru.input")
 _ACTIVATIONS = ("silu.default", "celu.default", "softplus.default", "mish.default", "log_sigmoid_forward.default")
 _FUNCTIONS = ("lerp.Tensor", "lerp.Scalar", "hypot.default", "exp2.default", "addcmul.default", "logaddexp.default")
@@ -243,12 +254,8 @@ def _operation(name: object) -> Callable[..., Any]:
     Raises:
         ValueError: with the name.
     """
-    if name == "getitem":
-        return operator.getitem
-    if str(name) in SIZES:
-        return partial(_size, SIZES[str(name)])
-    if str(name) in WHOLE:
-        return WHOLE[str(name)]
+    if str(name) in PYTHON | WHOLE:
+        return (PYTHON | WHOLE)[str(name)]
     family, _, overload = str(name).partition(".")
     packet = getattr(torch.ops.aten, family, None)
     if not isinstance(packet, torch._ops.OpOverloadPacket) or overload not in packet.overloads():
@@ -259,15 +266,6 @@ def _operation(name: object) -> Callable[..., Any]:
     if torch.Tag.core not in found.tags or found._schema.is_mutable:
         raise ValueError(f"{name!r} is not one of PyTorch's core operations on tensors")
     return found
-
-
-def _size(operation: Callable[[Any, Any], Any], *sizes: Any) -> Any:
-    """Return the result of an operation on sizes; on lists or large numbers it could take any time and memory."""
-    if any(
-        isinstance(size, (Tensor, list, tuple, str)) or (isinstance(size, int) and abs(size) > 2**62) for size in sizes
-    ):
-        raise ValueError(f"{operation.__name__} takes sizes of batches, got {short(sizes)}")
-    return operation(*sizes)
 
 
 def _argument(item: Any, known: int) -> Callable[[Sequence[Any]], Any]:

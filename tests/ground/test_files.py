@@ -110,7 +110,11 @@ def test_what_this_library_did_not_write_is_named_and_takes_no_memory(tmp_path: 
 def test_what_a_forged_file_may_say_is_bounded_by_its_size(tmp_path: Path) -> None:
     """A tensor stands in one place, so that thousands of names do not multiply the work on a large one."""
     path, one, zeros = tmp_path / "forged.safetensors", {"$tensor": "a"}, "0" * 64
-    for tree, message in (([one, one], "'a'"), ({"$tuple": 5}, "not iterable"), ({"$dict": [[[], 1]]}, "unhashable")):
+    for tree, message in (
+        ([one, one], "'a'"),
+        ({"$tuple": 5}, "not iterable"),
+        ({"$dict": [[[], 1]], "metadata": 1}, "unhashable"),
+    ):
         body = save({"a": torch.ones(2)}, {"magrl": json.dumps({"sha256": zeros, "content": tree})})
         path.write_bytes(body.replace(zeros.encode(), hashlib.sha256(body).hexdigest().encode(), 1))
         with pytest.raises(DamagedFileError, match=f"^{path} is damaged: .*{message}"):
