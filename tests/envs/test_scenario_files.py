@@ -154,12 +154,18 @@ def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, 
     [
         ("a.yaml", b"", "the file must end in .toml or .json, got '.yaml'"),
         ("a.toml", b"[region", "the file is not valid TOML"),
+        ("a.toml", b".".join([b"a"] * 50_000) + b"=1", "key has more than the allowed 1000 parts"),
         ("a.json", b'{"region": 1, "region": 2}', "the key 'region' is repeated"),
         ("a.json", b"[" * 100_000, "JSON"),
+        (
+            "a.json",
+            json.dumps({str(key): 0 for key in range(10**5)})[:-1].encode() + b', "99999": 1}',
+            "'99999' is repeated",
+        ),
         ("a.json", b" " * (MAX_FILE_BYTES + 1), f"the file holds more than {MAX_FILE_BYTES} bytes"),
         ("a.json", b"[]", "a scenario file must hold a table, got []"),
     ],
-    ids=range(6),
+    ids=range(8),
 )
 def test_unreadable_files(tmp_path: Path, name: str, content: bytes, says: str) -> None:
     (tmp_path / name).write_bytes(content)
