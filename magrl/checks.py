@@ -1,4 +1,4 @@
-"""Argument checks. Each error names the argument, the value and what would be right.
+"""Argument checks, and the end of a command. Each error names the argument, the value and what would be right.
 
 Checks that run in every call read types, shapes and Python numbers, never values inside tensors, since that would wait
 for an accelerator. :func:`check_finite` and :func:`require` do read values.
@@ -7,7 +7,9 @@ for an accelerator. :func:`check_finite` and :func:`require` do read values.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+import os
+import sys
+from collections.abc import Callable, Collection, Iterable
 from numbers import Integral, Real
 from typing import Any
 
@@ -255,3 +257,42 @@ def short(value: object, length: int = 80) -> str:
     """
     text = " ".join(repr(value).split())
     return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
+class UsageError(ValueError):
+    """A command that cannot run as given; its message is shown without a traceback.
+
+    Example:
+        >>> raise UsageError("there is no run to resume in runs/a")
+        Traceback (most recent call last):
+        magrl.checks.UsageError: there is no run to resume in runs/a
+    """
+
+
+def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> None:
+    """Run a program from the command line.
+
+    A :class:`UsageError` and an :class:`OSError`, such as that of a full disk, are printed in one line, with exit
+    status 2. Where the reader of the output ends first, as in ``command --help | head``, the command ends without a
+    message, with status 141, as after ``SIGPIPE``.
+
+    Args:
+        name: name of the program in the message.
+        main: function that reads the command line.
+        errors: other errors that are printed in one line.
+
+    Example:
+        >>> command("mine.py", lambda: None)
+    """
+    usage: tuple[type[Exception], ...] = (UsageError, OSError, *errors)
+    try:
+        try:
+            main()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered is written at exit
+        raise SystemExit(141) from None
+    except usage as error:
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(2) from None

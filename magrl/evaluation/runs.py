@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from magrl.evaluation.navigators import OWN, TRAINED, parse_navigator
+from magrl.files import read_document
 
 Noise = tuple[float, float, float]
 NO_NOISE: Noise = (0.0, 0.0, 0.0)
@@ -54,7 +54,7 @@ def read_run(folder: Path) -> TrainedRun:
     if not path.is_file():
         raise FileNotFoundError(f"there is no run at {folder}: it must hold config.json and policy.safetensors")
     try:
-        settings = dict(json.loads(path.read_text()))
+        settings = dict(read_document(path))
         kinds: dict[Any, str] = {True: "gg_td3", False: "td3"}
         guided = kinds.get(settings.get("guided"))
         kind = "anywhere" if settings.get("recipe") == "ppo_anywhere.py" else guided

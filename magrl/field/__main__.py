@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,7 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magrl.checks import short
+from magrl.checks import command, short
 from magrl.field.elements import NAMES, elements_gradient, seven_elements
 from magrl.field.igrf import IGRF, parse_date
 
@@ -51,22 +50,26 @@ _DIGITS = {"deg": 6, "nT": 4, "km": 9}
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    command = argparse.ArgumentParser(
+    arguments = argparse.ArgumentParser(
         prog="python -m magrl.field", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    command.add_argument("points", type=Path, help="table of the points: .csv or .parquet")
-    command.add_argument("--out", type=Path, help="result: .csv or .parquet; by default beside the points, with _field")
+    arguments.add_argument("points", type=Path, help="table of the points: .csv or .parquet")
+    arguments.add_argument(
+        "--out", type=Path, help="result: .csv or .parquet; by default beside the points, with _field"
+    )
     for name, meaning in (("latitude", "geodetic latitude [deg]"), ("longitude", "longitude [deg]")):
-        command.add_argument(f"--{name}", help=f"column of the {meaning}, or a number; default {_usual(name)}")
-    height = command.add_mutually_exclusive_group()
+        arguments.add_argument(f"--{name}", help=f"column of the {meaning}, or a number; default {_usual(name)}")
+    height = arguments.add_mutually_exclusive_group()
     height.add_argument(
         "--altitude", help="column of the altitude above the ellipsoid, or a number; default altitude, alt"
     )
     height.add_argument("--depth", help="column of the depth below the ellipsoid, or a number; default depth")
-    command.add_argument("--unit", choices=UNITS_KM, help="unit of altitude or depth; default that of alt_m, or km")
-    command.add_argument("--date", help=f"column of the date, or a date; default {_usual('date')}")
-    command.add_argument("--generation", type=int, choices=(13, 14), default=14, help="generation of IGRF; default 14")
-    return command
+    arguments.add_argument("--unit", choices=UNITS_KM, help="unit of altitude or depth; default that of alt_m, or km")
+    arguments.add_argument("--date", help=f"column of the date, or a date; default {_usual('date')}")
+    arguments.add_argument(
+        "--generation", type=int, choices=(13, 14), default=14, help="generation of IGRF; default 14"
+    )
+    return arguments
 
 
 def _usual(name: str) -> str:
@@ -209,11 +212,10 @@ def read_points(path: Path) -> DataFrame:
     """Return a table from a file; columns of a CSV file stay text, so that they are written as they were.
 
     Raises:
-        ValueError: for a file that is no table, or another suffix.
+        ValueError: for a file that is no table.
     """
     import pandas
 
-    check_suffix(path)
     try:
         if path.suffix == ".parquet":
             return pandas.read_parquet(path)
@@ -257,21 +259,19 @@ def check_suffix(path: Path) -> None:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Read the command line, evaluate the field and write the table."""
-    options = parser().parse_args(args)
+    command("python -m magrl.field", lambda: _main(parser().parse_args(args)), ValueError)
+
+
+def _main(options: argparse.Namespace) -> None:
+    check_suffix(options.points)
     out = options.out or options.points.with_stem(f"{options.points.stem}_field")
-    try:
-        check_suffix(out)
-        if out.resolve() == options.points.resolve():
-            raise ValueError(f"--out {out} would replace the points: choose another name")
-        table = field_of_points(read_points(options.points), options)
-        write_points(out, table)
-    except (ValueError, OSError) as error:
-        print(f"python -m magrl.field: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    check_suffix(out)
+    if out.resolve() == options.points.resolve():
+        raise ValueError(f"--out {out} would replace the points: choose another name")
+    table = field_of_points(read_points(options.points), options)
+    write_points(out, table)
     print(f"The field at {len(table)} points is in {out}")
 
 
 if __name__ == "__main__":
-    if hasattr(signal, "SIGPIPE"):
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # end without a traceback when `head` closes the pipe
     main()

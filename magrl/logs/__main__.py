@@ -11,13 +11,13 @@ those of autopilots and ships (docs/onboard.md). The axes are forward, right, do
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas
 
+from magrl.checks import command
 from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.logs.calibration import Calibration, calibrate
@@ -33,36 +33,41 @@ _DIGITS |= {"altitude": 4, "D_std": 4, "I_std": 4, "B_H_std": 2}
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    command = argparse.ArgumentParser(
+    arguments = argparse.ArgumentParser(
         prog="python -m magrl.logs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    command.add_argument("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
-    command.add_argument("--frame", choices=FRAMES, default="FRD", help="axes of a CSV file; default FRD")
-    command.add_argument("--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a healthy one that was used")
-    command.add_argument("--north", choices=NORTHS, help="north of the heading, where the log does not tell")
-    command.add_argument("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
-    command.add_argument("--every-s", type=float, help="duration of a move [s], in place of a length")
-    command.add_argument("--calibration", type=Path, help="file of a calibration, which corrects the axes")
-    command.add_argument("--calibrate", type=Path, help="calibrate by this log, a swing, and write this file (.json)")
-    command.add_argument("--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H")
-    command.add_argument("--alignment-deg", type=float, default=0.5, help="misalignment of the axes [deg]; default 0.5")
-    command.add_argument("--date", help="date for IGRF, such as 2026-06-30; default that of the log")
-    command.add_argument("--out", type=Path, help="readings (.csv); default beside the first file, with _readings")
-    return command
+    arguments.add_argument("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
+    arguments.add_argument("--frame", choices=FRAMES, default="FRD", help="axes of a CSV file; default FRD")
+    arguments.add_argument(
+        "--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a healthy one that was used"
+    )
+    arguments.add_argument("--north", choices=NORTHS, help="north of the heading, where the log does not tell")
+    arguments.add_argument("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
+    arguments.add_argument("--every-s", type=float, help="duration of a move [s], in place of a length")
+    arguments.add_argument("--calibration", type=Path, help="file of a calibration, which corrects the axes")
+    arguments.add_argument("--calibrate", type=Path, help="calibrate by this log, a swing, and write this file (.json)")
+    arguments.add_argument(
+        "--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H"
+    )
+    arguments.add_argument(
+        "--alignment-deg", type=float, default=0.5, help="misalignment of the axes [deg]; default 0.5"
+    )
+    arguments.add_argument("--date", help="date for IGRF, such as 2026-06-30; default that of the log")
+    arguments.add_argument("--out", type=Path, help="readings (.csv); default beside the first file, with _readings")
+    return arguments
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Read the command line and the log, and print what was found."""
-    options = parser().parse_args(args)
-    try:
-        log = read_log(*options.log, frame=options.frame, sensor=options.sensor)
-        print("\n".join(summary(log)))
-        date = options.date or log.date
-        lines = swing(log, options, date) if options.calibrate else way(log, options, date)
-        print("\n".join(lines))
-    except (ValueError, OSError, ImportError) as error:
-        print(f"python -m magrl.logs: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    command("python -m magrl.logs", lambda: _main(parser().parse_args(args)), ValueError, ImportError)
+
+
+def _main(options: argparse.Namespace) -> None:
+    log = read_log(*options.log, frame=options.frame, sensor=options.sensor)
+    print("\n".join(summary(log)))
+    date = options.date or log.date
+    lines = swing(log, options, date) if options.calibrate else way(log, options, date)
+    print("\n".join(lines))
 
 
 def summary(log: Log) -> list[str]:

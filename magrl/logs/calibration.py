@@ -101,7 +101,7 @@ class Calibration(CheckedModel):
         """
         try:
             return cls(**json.loads(Path(path).read_text()))
-        except (ValueError, TypeError, OSError) as error:
+        except (ValueError, TypeError, OSError, RecursionError) as error:
             raise DamagedFileError(f"{path} is not a calibration: {error}") from error
 
 

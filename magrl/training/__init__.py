@@ -1,8 +1,8 @@
 """Infrastructure of a training: configuration, run folder, resume, signals, checkpoints, curves and loggers."""
 
+from magrl.checks import UsageError as UsageError
+from magrl.checks import command as command
 from magrl.training.config import RunConfig as RunConfig
-from magrl.training.config import UsageError as UsageError
-from magrl.training.config import command as command
 from magrl.training.config import parse as parse
 from magrl.training.config import parse_config as parse_config
 from magrl.training.run import Run as Run

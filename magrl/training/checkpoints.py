@@ -17,9 +17,9 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors import Collector
 
+from magrl.checks import UsageError, short
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.files import DamagedFileError, load_tensors, save_tensors
-from magrl.training.config import UsageError
 
 CHECKPOINT_FORMAT = 1
 _PATTERN = "checkpoint-*.safetensors"
@@ -67,7 +67,7 @@ def locked(folder: Path) -> AcquireReturnProxy:
         ...     with locked(Path(folder)):  # doctest: +ELLIPSIS
         ...         pass
         Traceback (most recent call last):
-        magrl.training.config.UsageError: another process is writing the run folder ...
+        magrl.checks.UsageError: another process is writing the run folder ...
     """
     try:
         return FileLock(folder / ".lock").acquire(timeout=0)
@@ -205,8 +205,8 @@ def read_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dic
     if not isinstance(content, dict) or set(content) != {"format", "frames", "parts"}:
         raise DamagedFileError(f"{path} is not a checkpoint: it must hold format, frames and parts")
     if content["format"] != CHECKPOINT_FORMAT:
-        found = content["format"]
-        raise ValueError(f"{path} is a checkpoint of format {found!r}; this version reads {CHECKPOINT_FORMAT}")
+        version = short(content["format"])
+        raise ValueError(f"{path} is a checkpoint of format {version}; this version reads {CHECKPOINT_FORMAT}")
     return content
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,9 +16,10 @@ from torchrl.envs import Transform
 from typing_extensions import Self
 
 from magrl import paper
-from magrl.checks import CheckedModel
+from magrl.checks import CheckedModel, UsageError, check_type
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.measures import check_zeta
+from magrl.files import read_document
 from magrl.training.loggers import Logger, WandbMode, check_logger
 from magrl.transforms import MotionError
 
@@ -45,16 +44,6 @@ def _check_rising(values: tuple[float, float]) -> tuple[float, float]:
 LONGEST_KM = 4400.0
 """Longest distance of a task on a random planet: the side of a region [km]."""
 Rising = Annotated[tuple[Positive, Positive], AfterValidator(_check_rising)]
-
-
-class UsageError(ValueError):
-    """A command that cannot run as given; its message is shown without a traceback.
-
-    Example:
-        >>> raise UsageError("there is no run to resume in runs/a")
-        Traceback (most recent call last):
-        magrl.training.config.UsageError: there is no run to resume in runs/a
-    """
 
 
 CHANGEABLE = ("device", "logger", "wandb_mode", "checkpoint_every", "out", "resume")
@@ -417,41 +406,15 @@ def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
     if result.is_file():
         raise UsageError(f"the run in {folder} is complete: its results are in {result}")
     try:
-        settings = json.loads(path.read_text())
+        settings = read_document(path)
         if not isinstance(settings, dict) or "recipe" not in settings:
             raise ValueError("it is not of this version of magrl: start the training again in a new folder")
         if (begun := settings.pop("recipe")) != recipe:
             raise ValueError(f"the run was started by {begun}: resume it with that recipe")
-        settings.pop("name", None)
+        check_type(str, name=settings.pop("name", ""))
         if settings.get("scenario"):
             settings["scenario"] = folder / Path(settings["scenario"]).name
         settings = {key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()}
         return kind(**settings | {"out": folder, "resume": folder})
     except (ValueError, TypeError) as error:
         raise UsageError(f"cannot resume from {path}: {error}") from error
-
-
-def command(recipe: str, main: Callable[[], Any]) -> None:
-    """Run a recipe from the command line.
-
-    A :class:`UsageError` is printed in one line, with exit status 2. Where the reader of the output ends first, as in
-    ``command --help | head``, the command ends without a traceback, with status 141, as after ``SIGPIPE``.
-
-    Args:
-        recipe: file name of the recipe.
-        main: function that reads the command line.
-
-    Example:
-        >>> command("mine.py", lambda: None)
-    """
-    try:
-        try:
-            main()
-        finally:
-            sys.stdout.flush()
-    except UsageError as error:
-        print(f"{recipe}: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered is written at exit
-        raise SystemExit(141) from None

@@ -28,14 +28,14 @@ from typing_extensions import Self
 
 from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
-from magrl.checks import check_finite, short
+from magrl.checks import UsageError, check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
 from magrl.evaluation.scenarios import task_names
 from magrl.files import write_json
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder, locked
-from magrl.training.config import CHANGEABLE, RunConfig, UsageError
+from magrl.training.config import CHANGEABLE, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
 from magrl.training.loggers import open_log
 from magrl.transforms import with_sensor_noise

@@ -13,6 +13,7 @@ import torch
 
 from magrl.field import IGRF, elements_at, elements_gradient_at
 from magrl.field.__main__ import main
+from magrl.logs.__main__ import main as log_main
 
 POINTS = """id,latitude,longitude,altitude,date
 007,-2.0,162.0,0.5,2022-01-01
@@ -116,6 +117,33 @@ def test_errors_name_the_row_and_the_value(points, monkeypatch, capsys, old, new
     assert message in error
     assert error.count("\n") == 1
     assert not points.with_name("points_field.csv").exists()
+
+
+@pytest.mark.parametrize("program", [main, log_main])
+def test_a_path_that_is_no_table_is_one_line(program, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("folder.csv").mkdir()
+    Path("empty.csv").touch()
+    Path("binary.csv").write_bytes(bytes(range(256)))
+    Path("full_field.csv").symlink_to("/dev/full")
+    Path("full.csv").write_text(POINTS)
+    for path in (
+        "",
+        ".",
+        "..",
+        "/",
+        "nowhere.csv",
+        "nowhere/points.csv",
+        "folder.csv",
+        "empty.csv",
+        "binary.csv",
+        "full.csv",
+    ):
+        with pytest.raises(SystemExit) as stop:
+            program([path])
+        lines = capsys.readouterr().err.splitlines()
+        assert (stop.value.code, len(lines)) == (2, 1), path
+        assert lines[0].startswith("python -m magrl."), path
 
 
 def test_missing_file_and_missing_engine_raise(points, monkeypatch, capsys) -> None:

@@ -83,6 +83,8 @@ MINE = '"recipe": "td3_gradient_guided.py"'
     [
         (None, "holds no config.json"),
         ("", "cannot resume"),
+        ("[" * 200_000, "config.json: the file is not valid JSON: maximum recursion depth"),
+        (f'{{{MINE}, "name": 5}}', "name must be a str, got 5"),
         ("[]", "not of this version of magrl: start the training again in a new folder"),
         ('{"recipe": "ppo.py"}', r"the run was started by ppo\.py: resume it with that recipe"),
         (f'{{{MINE}, "wings": 2}}', "unknown key 'wings'"),
@@ -124,12 +126,13 @@ def test_resumed_settings_are_those_of_the_run(tmp_path: Path) -> None:
 
 def test_bad_usage_is_one_line_and_bugs_keep_their_traceback(capsys) -> None:
     def fail(kind: type[Exception]) -> None:
-        raise kind("no such run")
+        raise kind("no such\nrun")
 
-    with pytest.raises(SystemExit) as stop:
-        command("mine.py", lambda: fail(UsageError))
-    assert (stop.value.code, capsys.readouterr().err) == (2, "mine.py: no such run\n")
-    with pytest.raises(ValueError, match="no such run"):
+    for kind, more in ((UsageError, ()), (OSError, ()), (ValueError, (KeyError, ValueError))):
+        with pytest.raises(SystemExit) as stop:
+            command("mine.py", lambda kind=kind: fail(kind), *more)
+        assert (stop.value.code, capsys.readouterr().err) == (2, "mine.py: no such run\n")
+    with pytest.raises(ValueError, match="no such"):
         command("mine.py", lambda: fail(ValueError))
 
 

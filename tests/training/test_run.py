@@ -1,7 +1,9 @@
 """Runs around a training: folder, settings, noise, resume after any end, and workers."""
 
 import csv
+import errno
 import json
+import shutil
 import signal
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +20,7 @@ from magrl.training import Run, RunConfig, UsageError, command, curves, run
 from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
 from magrl.training.collectors import worker_seed
 from magrl.training.config import CHANGEABLE, resumed_config
+from magrl.training.curves import TrainingStatistics
 from magrl.training.run import StopRequest, passes_paper
 
 ROOT = Path(__file__).parent.parent.parent
@@ -198,6 +201,28 @@ def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, si
     with pytest.raises(UsageError, match=r"configuration does not fit .*: zeta is 0\.5 in the run folder, 0\.01 in"):
         train(tmp_path, zeta=0.5, scenario=scenario, resume=tmp_path)
     train(tmp_path, scenario=scenario, resume=tmp_path, logger="csv", checkpoint_every=5.0)
+
+
+@pytest.mark.parametrize("fault", ["full disk", "folder removed"])
+def test_a_training_that_cannot_write_ends_in_one_line(tmp_path: Path, monkeypatch, capsys, fault: str) -> None:
+    folder, add = tmp_path / "run", TrainingStatistics.add
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def spoiled(self, batch) -> None:
+        add(self, batch)
+        if fault == "full disk":
+            monkeypatch.setattr("os.fsync", full)
+        else:
+            shutil.rmtree(folder)
+
+    monkeypatch.setattr(TrainingStatistics, "add", spoiled)
+    with pytest.raises(SystemExit) as stop:
+        command("mine.py", lambda: train(folder, checkpoint_every=0))
+    *_, line = capsys.readouterr().err.splitlines()
+    assert (stop.value.code, line[:9]) == (2, "mine.py: ")
+    assert ("No space left on device" if fault == "full disk" else "No such file or directory") in line
 
 
 # Several collecting processes
