@@ -96,7 +96,9 @@ def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
         raise ValueError("the table has no row")
     place = (*_place(table, options), _altitude_km(table, options))
     field = IGRF(_column(table, _name(table, "date", options.date), "date", _date), options.generation)
-    found = _columns(*field.value_and_gradient(*map(torch.from_numpy, place)))
+    value, gradient = field.value_and_gradient(*map(torch.from_numpy, place))
+    gradient[np.abs(place[0]) == 90, :, 1] = math.nan  # at a pole of the Earth no direction is east
+    found = _columns(value, gradient)
     if taken := sorted(found.keys() & set(table.columns)):
         raise ValueError(f"the table has columns {', '.join(taken)} already: rename them, or remove them")
     return table.assign(**found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -144,6 +145,17 @@ def test_a_path_that_is_no_table_is_one_line(program, tmp_path, monkeypatch, cap
         lines = capsys.readouterr().err.splitlines()
         assert (stop.value.code, len(lines)) == (2, 1), path
         assert lines[0].startswith("python -m magrl."), path
+
+
+def test_no_direction_is_east_at_a_pole(points) -> None:
+    """There D turns with the longitude, by 57 degrees per radian of it: its eastward gradient has no limit."""
+    points.write_text("lat,lon,alt,date\n90,10,0,2025-01-01\n-90,10,0,2025-01-01\n89.9,10,0,2025-01-01\n")
+    main([str(points)])
+    table = pandas.read_csv(points.with_name("points_field.csv"))
+    eastward = table[[name for name in table if "_east_" in name]]
+    assert eastward.isna().all(axis=1).tolist() == [True, True, False]
+    assert table.drop(columns=eastward.columns).notna().all(axis=None)
+    assert table["dD_east_deg_per_km"][2] == pytest.approx(180 / math.pi / 11.16, rel=0.01)
 
 
 def test_missing_file_and_missing_engine_raise(points, monkeypatch, capsys) -> None:
