@@ -27,10 +27,19 @@ from torchrl.objectives.value import GAE
 
 from magrl.agents import FieldPolicy, PolicyConfig, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
+from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, PPOConfig
-from magrl.transforms import AlignmentReward, DistanceCost, FieldGradient, GradientHeading, ObservationView, SensorNoise
+from magrl.transforms import (
+    AlignmentReward,
+    DistanceCost,
+    EpisodeSum,
+    FieldGradient,
+    GradientHeading,
+    ObservationView,
+    SensorNoise,
+)
 
 RECIPE = "ppo.py"
 LOSSES = ("loss_critic", "loss_actor", "loss_entropy", "entropy")
@@ -78,7 +87,8 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
     ]
     sensors = [SensorNoise(config.noise, seed=base.seed)] if any(config.noise) else []
     scaling = [*view.observation_transforms(), view.action_transform()]
-    rewards = [RewardSum(), DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
+    sums = [RewardSum(), EpisodeSum([*REWARD_TERMS, keys[1]])]
+    rewards = [*sums, DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
     return TransformedEnv(base, Compose(*guidance, *sensors, *scaling, *rewards))
 
 

@@ -31,10 +31,19 @@ from torchrl.modules import AdditiveGaussianModule
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
+from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import CollectorBackend, make_collector, worker_seed
 from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, TD3Config
-from magrl.transforms import AlignmentReward, DistanceCost, FieldGradient, GradientHeading, ObservationView, SensorNoise
+from magrl.transforms import (
+    AlignmentReward,
+    DistanceCost,
+    EpisodeSum,
+    FieldGradient,
+    GradientHeading,
+    ObservationView,
+    SensorNoise,
+)
 
 RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
@@ -112,7 +121,8 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
     ]
     sensors = [SensorNoise(config.noise, seed=base.seed)] if any(config.noise) else []
     scaling = [*view.observation_transforms(), view.action_transform()]
-    rewards = [RewardSum(), DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
+    sums = [RewardSum(), EpisodeSum([*REWARD_TERMS, *(keys[1:] if config.guided else ())])]
+    rewards = [*sums, DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
     return TransformedEnv(base, Compose(*(guidance if config.guided else []), *sensors, *scaling, *rewards))
 
 

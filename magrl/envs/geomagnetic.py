@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from magrl import guidance
@@ -46,6 +46,7 @@ PRIVILEGED_KEYS = (
     "success",
     "region",
     EPISODE_STREAM,
+    *specs.REWARD_TERMS,
 )
 """Keys that a policy may not read if it navigates by the field alone."""
 
@@ -81,9 +82,9 @@ class GeomagneticNavEnv(EnvBase):
     Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
     move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
     ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
-    ``objective_weights`` ``(N, 3)``, the index of the region, ``region`` ``(N, 1)``, and ``episode_stream`` ``(N, 1)``,
-    int64, of seed, vehicle and episode, for random numbers of transforms. Action ``(N, 2)``: distance [km], turn [rad].
-    Rewards ``(N, 1)``: ``reward``, and its terms ``reward_destination`` and ``reward_proximity``.
+    ``objective_weights`` ``(N, 3)``, the index of the region, ``region`` ``(N, 1)``, ``episode_stream`` ``(N, 1)``,
+    int64, of seed, vehicle and episode, for random numbers of transforms, and the terms of ``reward``,
+    ``reward_destination`` and ``reward_proximity`` ``(N, 1)``. Action ``(N, 2)``: distance [km], turn [rad].
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=4, seed=0, max_steps=80)
@@ -188,10 +189,8 @@ class GeomagneticNavEnv(EnvBase):
         options = self.max_move_km, self.max_turn_rad, len(self.region), self.arrival.declared, self.drift_km
         self.observation_spec = self._batched(specs.observation_spec(bounds, *options))
         self.state_spec = specs.state_spec(self.observation_spec)
-        self.action_spec = self._batched(Bounded(self.action_low.cpu().float(), self.action_high.cpu().float()))
-        self.full_reward_spec = self._batched(
-            Composite(dict.fromkeys(("reward", *specs.REWARD_TERMS), Unbounded((1,))))
-        )
+        self.action_spec = self._batched(specs.float_bounds(self.action_low, self.action_high))
+        self.reward_spec = self._batched(Unbounded((1,), dtype=torch.float32))
         self.full_done_spec = self._batched(Composite(dict.fromkeys(("done", "terminated", "truncated"), specs.FLAG)))
 
     def _batched(self, spec: TensorSpec) -> TensorSpec:
@@ -247,6 +246,7 @@ class GeomagneticNavEnv(EnvBase):
                 "success": flags["done"].clone(),
                 "region": region.unsqueeze(-1),
                 EPISODE_STREAM: counter_stream(self.seed, torch.stack((vehicle, episode), -1)).unsqueeze(-1),
+                **{term: zeros[:, :1].float() for term in specs.REWARD_TERMS},
                 **flags,
                 **({specs.DECLARED: flags["done"].clone()} if self.arrival.declared else {}),
                 **({DISPLACEMENT: zeros} if self.drift_km else {}),

@@ -14,7 +14,7 @@ from magrl.transforms.errors.base import EPISODE_STREAM
 from magrl.transforms.errors.motion import DISPLACEMENT
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
-"""Terms whose sum is ``reward``."""
+"""Privileged keys of the terms whose sum is ``reward``; 0 at a reset."""
 DECLARED = "declared"
 """Flag that the vehicle has declared its arrival, where it must."""
 CONSTANT_KEYS = (
@@ -105,7 +105,7 @@ def observation_spec(
         >>> observation_spec((torch.zeros(3), torch.ones(3)), 50.0, 1.5).expand(4)["field"].shape
         torch.Size([4, 3])
     """
-    field = Bounded(*(bound.cpu().float() for bound in field_bounds))
+    field, number = float_bounds(*field_bounds), Unbounded((1,), dtype=torch.float32)
     highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
     more = {DECLARED: FLAG} if declared else {}
     reach = 2 * max_move_km + drift_km  # from the end of a commanded move to that of a true one
@@ -113,19 +113,30 @@ def observation_spec(
     return Composite(
         field=field,
         target_field=field.clone(),
-        move=Bounded(highest_move * torch.tensor((0, -1)), highest_move),
-        heading=Bounded(-math.pi, math.pi, (1,)),
+        move=float_bounds(highest_move * torch.tensor((0, -1)), highest_move),
+        heading=Bounded(-math.pi, math.pi, (1,), dtype=torch.float32),
         step_count=Unbounded((1,), dtype=torch.int64),
         position=POSITION.clone(),
         target_position=POSITION.clone(),
         start_position=POSITION.clone(),
-        objective=Unbounded((1,)),
-        objective_weights=Unbounded((3,)),
+        objective=number,
+        objective_weights=number.expand(3),
         success=FLAG.clone(),
         region=Bounded(0, num_regions - 1, (1,), dtype=torch.int64),
         episode_stream=Unbounded((1,), dtype=torch.int64),
+        **{term: number.clone() for term in REWARD_TERMS},
         **more,
     )
+
+
+def float_bounds(low: Tensor, high: Tensor) -> Bounded:
+    """Return the spec of bounded float32 numbers, whatever torch's default type is.
+
+    Example:
+        >>> float_bounds(torch.zeros(2, dtype=torch.float64), torch.ones(2)).dtype
+        torch.float32
+    """
+    return Bounded(low.cpu().float(), high.cpu().float(), dtype=torch.float32)
 
 
 def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:

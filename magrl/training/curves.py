@@ -58,7 +58,7 @@ class TrainingStatistics:
 
         Args:
             batch: ``(B,)`` with ``next``: ``success``, ``done``, ``episode_reward`` and, as far as they are there,
-                ``episode_reward_destination`` and the other terms, from TorchRL's ``RewardSum``.
+                ``episode_reward_destination`` and the other terms, from ``RewardSum`` and ``EpisodeSum``.
         """
         after = batch["next"]
         ended = after["done"]

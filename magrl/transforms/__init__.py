@@ -30,6 +30,7 @@ from magrl.transforms.errors.vector import VectorErrors as VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H as SPEEDS_KM_H
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
 from magrl.transforms.rewards import DistanceCost as DistanceCost
+from magrl.transforms.rewards import EpisodeSum as EpisodeSum
 from magrl.transforms.rewards import HighestSPL as HighestSPL
 from magrl.transforms.rewards import ProgressReward as ProgressReward
 from magrl.transforms.rewards import RandomStepPrice as RandomStepPrice

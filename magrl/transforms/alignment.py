@@ -189,7 +189,7 @@ class AlignmentReward(StepReward):
         in_keys: the angle and the reference ``(..., 1)`` [rad]; and optionally a mask of the reference, where False
             makes the term 0.
         out_keys: one reward, to which the term is added (created if the environment has none of that name), and
-            optionally a second one for the term alone, such as ``["reward", "reward_alignment"]``.
+            optionally an observation of the term alone, such as ``["reward", "reward_alignment"]``.
         weight: zeta_3 [1/rad].
         offset: deviation at which the term changes sign [rad]. With the paper's pi/4 every aligned step is rewarded, so
             that slow progress is rewarded too; with 0 the term is never positive.

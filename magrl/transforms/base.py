@@ -226,8 +226,8 @@ class StatefulTransform(ObservationTransform):
 class StepReward(StatefulTransform):
     """Base class of rewards that depend on values before a step and after it; a reset has none.
 
-    A subclass writes ``out_keys`` in :meth:`_advance`. Their specs become unbounded; a reward that the environment
-    lacks has the shape ``(..., 1)``.
+    A subclass writes ``out_keys`` in :meth:`_advance`: the reward, whose spec becomes unbounded, and its terms, which
+    are observations of the same shape. A reward that the environment lacks has the shape ``(..., 1)``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -244,6 +244,8 @@ class StepReward(StatefulTransform):
     default_out_keys = ("reward",)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        for key in self.out_keys[1:]:
+            tensordict_reset.set(key, torch.zeros_like(tensordict_reset[self.in_keys[0]][..., :1]))
         return tensordict_reset
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -254,11 +256,16 @@ class StepReward(StatefulTransform):
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
         """Remove the bounds of the reward, or add it."""
-        like = self._leaf(observed_spec(self), self.in_keys[0])
-        for key in self.out_keys:
-            known = key in reward_spec.keys(True, True)
-            self._add(reward_spec, reward_spec[key] if known else like, key, 1)
+        key, like = self.out_keys[0], self._leaf(observed_spec(self), self.in_keys[0])
+        self._add(reward_spec, reward_spec[key] if key in reward_spec.keys(True, True) else like, key, 1)
         return reward_spec
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the terms of the reward."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        for key in self.out_keys[1:]:
+            self._add(observation_spec, self._leaf(observation_spec, self.in_keys[0]), key, 1)
+        return observation_spec
 
 
 def observed_spec(transform: Transform) -> Composite:

@@ -213,6 +213,40 @@ class ProgressReward(StepReward):
         tensordict.set(key, tensordict[key] + self.weight / 100 * (before - after))
 
 
+class EpisodeSum(StatefulTransform):
+    """Write the sums of observations over an episode, such as of the terms of the reward.
+
+    TorchRL's ``RewardSum`` takes rewards alone.
+
+    Args:
+        in_keys: numbers ``(..., 1)``, 0 at a reset. Each sum is named after its key, with the prefix ``episode_``.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from torchrl.envs import TransformedEnv
+        >>> env = TransformedEnv(GeomagneticNavEnv(seed=0), EpisodeSum(["reward_proximity"]))
+        >>> after = env.rollout(3)["next"]
+        >>> bool(torch.equal(after["episode_reward_proximity"], after["reward_proximity"].cumsum(1)))
+        True
+    """
+
+    def __init__(self, in_keys: Sequence[str]) -> None:
+        super().__init__(in_keys, [f"episode_{key}" for key in in_keys])
+        self.out_sizes = ((1,),) * len(in_keys)
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it: the sums."""
+        return self.out_keys
+
+    def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
+        self._advance(tensordict, values, values)
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        for key, value, before in zip(self.out_keys, values, state, strict=True):
+            tensordict.set(key, before + value)
+
+
 class DistanceCost(StepReward):
     """Subtract a cost of the distance of each move from a reward.
 

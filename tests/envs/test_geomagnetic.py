@@ -17,9 +17,11 @@ from ppigrf import igrf
 from ppigrf.ppigrf import shc_fn_igrf13
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import FrameSkipTransform, NoopResetEnv, TargetReturn, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from magrl.envs import PAPER_REGION, PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, Tasks
+from magrl.envs.navigation import navigation_env
 from magrl.envs.specs import REWARD_TERMS
 from magrl.field import IGRF, RegionalField
 from magrl.geodesy import move
@@ -94,6 +96,26 @@ def test_specs_match_the_data(options: dict[str, Any]) -> None:
     check_env_specs(make(**{"num_envs": 3} | options), break_when_any_done="both")
 
 
+@pytest.mark.parametrize("observation", ["flat", "track"])
+def test_specs_do_not_depend_on_the_default_type(observation: str) -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        env = navigation_env(2, observation=observation, seed=0)
+        check_env_specs(env)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert {env.base_env.observation_spec[key].dtype for key in PUBLIC_KEYS} == {torch.float32}
+
+
+@pytest.mark.parametrize(
+    "transform", [FrameSkipTransform(3), NoopResetEnv(noops=2), TargetReturn(250.0)], ids=lambda part: type(part).__name__
+)
+def test_transforms_of_torchrl_that_need_one_reward(transform: Transform) -> None:
+    env = TransformedEnv(make(), transform)
+    assert env.reward_key == "reward"
+    check_env_specs(env)
+
+
 ENTRIES = {
     "field": (3, torch.float32),
     "target_field": (3, torch.float32),
@@ -108,9 +130,10 @@ ENTRIES = {
     "success": (1, torch.bool),
     "region": (1, torch.int64),
     "episode_stream": (1, torch.int64),
+    **dict.fromkeys(REWARD_TERMS, (1, torch.float32)),
 }
 FLAGS = dict.fromkeys(("done", "terminated", "truncated"), (1, torch.bool))
-REWARDS = dict.fromkeys(("reward", "reward_destination", "reward_proximity"), (1, torch.float32))
+REWARDS = {"reward": (1, torch.float32)}
 
 
 def test_keys_shapes_and_dtypes() -> None:
@@ -241,7 +264,7 @@ class TestArrival:
 def test_ends_and_rewards_of_many_episodes() -> None:
     """An end is terminal or a cut; the reward is the sum of its terms, to the rounding of float32."""
     env = make(32, **LIVELY)
-    assert set(env.reward_keys) == set(env.full_reward_spec.keys()) == {"reward", *REWARD_TERMS} == set(REWARDS)
+    assert all((env.reset()[term] == 0).all() for term in REWARD_TERMS)
     after = fly_on(env, random_actions(30, 32))["next"]
     assert after["success"].any()
     assert after["truncated"].any()
