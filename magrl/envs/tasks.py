@@ -22,6 +22,8 @@ from magrl.field.bank import check_index
 from magrl.geodesy import MEAN_RADIUS_KM, check_positions, geodesic, move, wrap_angle, wrap_longitude
 
 TRIES_PER_ROUND = 8
+CHUNK = 16384
+"""Tasks drawn at a time, which keeps their tries in the cache."""
 MAX_ROUNDS = 1000
 """Rounds of rejection sampling after which a region counts as too small for its distances."""
 SHORTEST_KM = 0.001
@@ -130,15 +132,18 @@ def sample_tasks(
         True
     """
     check_distance_range(regions, distance_range_km, distance_law)
+    if len(vehicle) > CHUNK:
+        rows = zip(vehicle.split(CHUNK), episode.split(CHUNK), strict=True)
+        parts = [sample_tasks(regions, distance_range_km, seed, *some, distance_law) for some in rows]
+        return Tasks(*map(torch.cat, zip(*parts, strict=True)))
     counters = torch.stack((vehicle, episode), -1)
     region = (_draw(seed, counters, _REGION_STREAM) * len(regions)).long().squeeze(-1)
-    radii_km = torch.tensor(distance_range_km, dtype=torch.float64, device=vehicle.device).expand(len(vehicle), 2)
+    radii_km = torch.tensor(distance_range_km, dtype=torch.float64, device=region.device).expand(len(region), 2)
     if distance_law == "log":
         shortest, longest = distance_range_km
         radii_km = (shortest * (longest / shortest) ** _draw(seed, counters, _DISTANCE_STREAM)).expand_as(radii_km)
-    start = torch.empty(len(vehicle), 2, dtype=torch.float64, device=vehicle.device)
-    target = torch.empty_like(start)
-    waiting = torch.arange(len(vehicle), device=vehicle.device)
+    start, target = torch.empty_like(radii_km), torch.empty_like(radii_km)
+    waiting = torch.arange(len(region), device=region.device)
     for attempt in range(MAX_ROUNDS):
         uniform = _attempts(seed, counters[waiting], attempt)
         starts, ends = _candidates(regions, region[waiting], radii_km[waiting], uniform)

@@ -173,6 +173,19 @@ def test_a_task_is_a_function_of_seed_vehicle_and_episode(law):
     assert [len(column) for column in sample_tasks(regions, (200, 900), 3, vehicle[:0], episode[:0], law)] == [0] * 3
 
 
+def test_a_large_batch_is_drawn_in_chunks_of_the_same_tasks(monkeypatch):
+    """The time of a reset is linear in the number of vehicles: no array grows with it."""
+    vehicle = torch.arange(20)
+    whole = sample_tasks(Regions.of(PAPER_REGION), (300, 500), 0, vehicle, vehicle)
+    sizes, candidates = [], tasks_module._candidates
+    monkeypatch.setattr(tasks_module, "CHUNK", 8)
+    monkeypatch.setattr(tasks_module, "_candidates", lambda *args: sizes.append(len(args[1])) or candidates(*args))
+    parts = sample_tasks(Regions.of(PAPER_REGION), (300, 500), 0, vehicle, vehicle)
+    for one, other in zip(whole, parts, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-12)
+    assert max(sizes) == 8
+
+
 def test_log_uniform_distances():
     """Kolmogorov-Smirnov at 1 %; ends uniform over the ring would have three quarters of them beyond 600 km."""
     regions, vehicle = Regions.of([Region((40, 60), (170, 200)), Region((-55, -40), (-70, -50))]), torch.arange(4000)
