@@ -19,10 +19,10 @@ from magrl.envs.measures import distance_to_arrival, path_measures, spl
 from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
 from magrl.geodesy import geodesic, wrap_angle
 
-QUANTILES = {"median": 0.5, "p90": 0.9}
 WITHIN_KM = (10, 25)
-QUANTILES = {"median": 0.5, "p90": 0.9}
 """Distances of the additional success rates that do not depend on the field [km]."""
+QUANTILES = {"median": 0.5, "p90": 0.9}
+"""Quantiles of the final distance."""
 
 
 def first_episode_mask(done: Tensor) -> Tensor:
