@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from magrl.checks import check_numbers, check_type
+from magrl.checks import check_numbers, check_tensor, check_type
 from magrl.transforms.base import Keys, ObservationTransform, key_list
 
 
@@ -29,7 +29,7 @@ class MinMaxNorm(ObservationTransform):
         out_keys: names of the scaled entries; in place by default.
         in_keys_inv: entries of the environment that are filled from scaled ones, usually ``["action"]``.
         out_keys_inv: names of those scaled entries; the same by default.
-        bounds: (low, high) of each key of the environment, numbers or tensors that broadcast on the last dimensions;
+        bounds: (low, high) of each key of the environment, numbers or tensors of one shape, the last dimensions;
             other keys take theirs from the specs.
         interval: image of the bounds.
 
@@ -90,6 +90,9 @@ class MinMaxNorm(ObservationTransform):
 
     def _set_bounds(self, key: NestedKey, low: Tensor, high: Tensor) -> None:
         dtype = torch.promote_types(low.dtype, high.dtype)
+        if low.shape != high.shape and low.ndim and high.ndim:
+            shapes = f"{tuple(low.shape)} and {tuple(high.shape)}"
+            raise ValueError(f"the bounds of {key!r} must be numbers, or have one shape, got {shapes}")
         low, high = torch.broadcast_tensors(low.to(dtype), high.to(dtype))
         extreme = torch.finfo(dtype).max  # an open side in a spec
         finite = torch.isfinite(high - low) & (low > -extreme) & (high < extreme)
@@ -102,14 +105,21 @@ class MinMaxNorm(ObservationTransform):
         setattr(self, f"low_{index}", low.clone())
         setattr(self, f"high_{index}", high.clone())
 
-    def _bounds(self, key: NestedKey) -> tuple[Tensor, Tensor]:
+    def _bounds(self, key: NestedKey, shape: torch.Size) -> tuple[Tensor, Tensor]:
+        """Return the bounds of a key, whose value has a shape."""
         index = self._index(key)
         if getattr(self, f"low_{index}") is None:
             raise ValueError(
                 f"MinMaxNorm knows no bounds for {key!r}: give bounds={{{key!r}: (low, high)}}, or attach the "
                 "transform to an environment whose spec for it is bounded"
             )
-        return getattr(self, f"low_{index}"), getattr(self, f"high_{index}")
+        low, high = getattr(self, f"low_{index}"), getattr(self, f"high_{index}")
+        if any(size not in (1, actual) for size, actual in zip(low.shape[::-1], shape[::-1], strict=False)):
+            raise ValueError(
+                f"MinMaxNorm has bounds of the shape {tuple(low.shape)} for {key!r}, which has {tuple(shape)}"
+                + ": view.action_transform(declared=True) scales actions that declare" * (key == "action")
+            )
+        return low, high
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Read the bounds that are missing from the specs of the environment that the transform is attached to."""
@@ -130,13 +140,15 @@ class MinMaxNorm(ObservationTransform):
     def normalize(self, key: NestedKey, value: Tensor) -> Tensor:
         """Return a value of ``key`` scaled from its bounds to the interval: ``(...)`` to ``(...)``, floating point."""
         value = _as_float(value)
-        low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key))
+        low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key, value.shape))
         start, end = self.interval
         return start + (end - start) * ((value - low) / (high - low))
 
     def denormalize(self, key: NestedKey, value: Tensor) -> Tensor:
         """Return a value of ``key`` scaled from the interval back to its bounds: ``(...)`` to ``(...)``."""
-        low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key))
+        check_tensor(**{str(key): value})
+        value = _as_float(value)
+        low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key, value.shape))
         start, end = self.interval
         return torch.lerp(low.expand_as(value), high.expand_as(value), (value - start) / (end - start))
 
@@ -174,12 +186,7 @@ class MinMaxNorm(ObservationTransform):
         return input_spec
 
     def _scaled_spec(self, key: NestedKey, spec: TensorSpec) -> TensorSpec:
-        held = self._bounds(key)[0].shape  # an error before the first episode
-        if held and any(size not in (1, actual) for size, actual in zip(held[::-1], spec.shape[::-1], strict=False)):
-            raise ValueError(
-                f"MinMaxNorm has bounds of the shape {tuple(held)} for {key!r}, which has {tuple(spec.shape)}"
-                + ": view.action_transform(declared=True) scales actions that declare" * (key == "action")
-            )
+        self._bounds(key, spec.shape)  # an error before the first episode
         if not isinstance(spec, Bounded):
             dtype = spec.dtype if spec.dtype.is_floating_point else torch.get_default_dtype()
             return Unbounded(spec.shape, device=spec.device, dtype=dtype)

@@ -141,6 +141,9 @@ def test_bounds_that_are_not_known() -> None:
 def test_bounds_of_another_size_name_the_remedy() -> None:
     base = nav(4, arrival="declared")
     view = base.observation_view()
+    norm = MinMaxNorm(["x"], bounds={"x": (torch.zeros(2), torch.ones(2))})
+    with pytest.raises(ValueError, match=r"shape \(2,\) for 'x', which has \(4, 3\)$"):
+        norm(TensorDict(x=torch.zeros(4, 3)))
     with pytest.raises(ValueError, match=r"shape \(2,\) for 'action', which has \(4, 3\): view.*declared=True"):
         _ = TransformedEnv(base, view.action_transform()).specs
     assert TransformedEnv(nav(4, arrival="declared"), view.action_transform(declared=True)).action_spec.shape == (4, 3)
@@ -152,6 +155,7 @@ def test_bounds_of_another_size_name_the_remedy() -> None:
         ({"bounds": {"x": (2.0, 1.0)}}, "'x'.*2.0.*1.0"),
         ({"bounds": {"x": (0.0, math.inf)}}, "'x'.*0.0.*inf"),
         ({"bounds": {"x": 1.0}}, r"the bounds of 'x' must be \(low, high\), got 1.0"),
+        ({"bounds": {"x": (torch.zeros(2), torch.ones(3))}}, r"'x' must .*have one shape, got \(2,\) and \(3,\)"),
         ({"bounds": {"z": (0.0, 1.0)}}, r"'z'.*\['x'\]"),
         ({"interval": (0.5, 0.5)}, r"interval.*\(0.5, 0.5\)"),
         ({"out_keys": ["y", "z"]}, r"\['x'\].*\['y', 'z'\]"),
