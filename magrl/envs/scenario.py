@@ -222,44 +222,16 @@ class Scenario(CheckedModel):
             return self.field
         boxes, region = self.reachable(drift_km), self.region[0]
         try:
-            return self._expanded_igrf(boxes)
+            igrf = IGRF(self.date, self.generation, altitude_km=self.altitude_km)
+            field = RegionalField(igrf, boxes[0].latitude, boxes[0].longitude)
+            field_bounds(field, boxes)
         except ValueError as error:
             reason = f"region.latitude, region.longitude: {str(error).rpartition(': ')[0]}"  # without its advice
             if boxes.latitude.abs().max() == 90:
                 place = f"region.latitude {region.latitude}: with margin_deg {self.margin_deg:g}, vehicles reach"
-                reason = (
-                    f"{place} a pole in {boxes[0]}, where all longitudes meet and the declination takes every value"
-                )
-            raise ValueError(f"{reason}: {self._remedy(drift_km)}") from error
-
-    def _expanded_igrf(self, boxes: Regions) -> RegionalField:
-        """Return IGRF expanded over the only box, with a declination that does not jump."""
-        igrf = IGRF(self.date, self.generation, altitude_km=self.altitude_km)
-        field = RegionalField(igrf, boxes[0].latitude, boxes[0].longitude)
-        field_bounds(field, boxes)
+                reason = f"{place} a pole in {boxes[0]}, where the declination takes every value"
+            raise ValueError(f"{reason}: reduce margin_deg or the region, or move it toward the equator") from error
         return field
-
-    def _remedy(self, drift_km: float) -> str:
-        """Return the smallest changes that give a usable field; each of them was tried."""
-
-        def usable(region: Region, margin_deg: float) -> bool:
-            try:
-                self._expanded_igrf(Regions.of(region).expanded(margin_deg).reachable(self.max_move_km + drift_km))
-            except ValueError:
-                return False
-            return True
-
-        region = self.region[0]
-        south, north = region.latitude
-        margins = (step / 2 for step in range(min(math.ceil(2 * self.margin_deg), 20) - 1, -1, -1))
-        margin = next((margin for margin in margins if usable(region, margin)), None)
-        side = math.copysign(1, south + north)
-        shifts = range(1, min(30, int(abs(south + north) / 2)) + 1)
-        moved = ((shift, Region((south - side * shift, north - side * shift), region.longitude)) for shift in shifts)
-        shift = next((shift for shift, region in moved if usable(region, self.margin_deg)), None)
-        ways = [f"reduce margin_deg to {margin:g}"] if margin is not None else []
-        ways += [f"move the region {shift}° toward the equator"] if shift is not None else []
-        return ", or ".join(ways) or "choose a smaller region away from the poles"
 
     def floors(self, field: FieldModel | FieldBank) -> Tensor:
         """Return the floors of Eq. 2-6, D [deg], I [deg], B_H [nT], from ``field`` where none are given.
