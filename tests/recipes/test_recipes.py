@@ -24,6 +24,7 @@ from magrl import paper
 from magrl.agents import PolicyConfig, load_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.training import command, parse_config
+from magrl.training.curves import RETURN_TERMS
 from magrl.transforms import SensorNoise
 
 RECIPES = (recipe, ppo_anywhere, ppo_recurrent, ppo)
@@ -32,6 +33,14 @@ NOISE = (0.05, 0.05, 5.0)
 
 def names(module) -> str:
     return module.__name__
+
+
+@pytest.mark.parametrize("module", [recipe, ppo], ids=names)
+def test_the_return_is_the_sum_of_its_terms(module) -> None:
+    base = GeomagneticNavEnv(num_envs=2, seed=0)
+    after = module.make_env(base, base.observation_view(), module.Config()).rollout(4)["next"]
+    terms = sum(after[f"episode_reward_{term}"] for term in RETURN_TERMS)
+    torch.testing.assert_close(terms, after["episode_reward"], rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.usefixtures("without_figures")
