@@ -48,7 +48,9 @@ def check_finite(data: TensorDictBase | Iterable[tuple[str, Tensor]], what: str)
 
 
 def require(good: Tensor, values: Tensor, message: str) -> None:
-    """Raise unless every entry of a mask is True; compiled code cannot put the value into the message.
+    """Raise unless every entry of a mask is True.
+
+    Compiled code cannot put the value into the message, and an accelerator does not wait for the answer.
 
     Args:
         good: bool mask.
@@ -64,7 +66,7 @@ def require(good: Tensor, values: Tensor, message: str) -> None:
         Traceback (most recent call last):
         ValueError: speed -1.0 is negative
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or good.device.type != "cpu":
         torch._assert_async(good.all(), message)
     elif not good.all():
         raise ValueError(message.format(values[~good].flatten()[0].item()))

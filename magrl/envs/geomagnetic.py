@@ -8,9 +8,9 @@ and the number of the episode that each vehicle is in.
 from __future__ import annotations
 
 import copy
-import inspect
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,7 @@ class GeomagneticNavEnv(EnvBase):
 
     Raises:
         TypeError: for an unknown option, with the list of options.
-        ValueError: for an option out of its range, naming it and its value, or the device ``"meta"``.
+        ValueError: for an option out of its range, naming it and its value.
 
     Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
     move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
@@ -116,25 +116,21 @@ class GeomagneticNavEnv(EnvBase):
     ) -> None:
         scenario = Scenario() if scenario is None else scenario
         check_type(Scenario, scenario=scenario)
-        check_number(1, whole=True, num_envs=num_envs)
+        check_number(1, 10**8, whole=True, num_envs=num_envs)
         check_number(0, destination_weight=destination_weight, proximity_weight=proximity_weight, drift_km=drift_km)
         check_number(0, above=True, optional=True, objective_limit=objective_limit)
         check_choice((None, "rgb_array"), render_mode=render_mode)
         if unknown := sorted(changes.keys() - Scenario.model_fields.keys()):
-            own = inspect.signature(GeomagneticNavEnv.__init__).parameters.keys() - {"self", "changes"}
-            known = sorted(own | Scenario.model_fields.keys())
+            known = f"those of GeomagneticNavEnv and {sorted(Scenario.model_fields)}"
             # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
             raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {known}")
-        if torch.device(device or "cpu").type == "meta":
-            raise ValueError(f"device must be one that holds numbers, such as 'cpu' or 'cuda', got {device!r}")
+        check_choice(("cpu", "cuda", "xpu"), device=str(device or "cpu").partition(":")[0])  # those with float64
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.num_envs, self.drift_km, self.objective_limit = num_envs, float(drift_km), objective_limit
         self.destination_weight, self.proximity_weight = float(destination_weight), float(proximity_weight)
         self._place(scenario.replace(**changes))
-        self.render_mode, self._tracks = render_mode, None
-        if render_mode:
-            one_region(self.region)
-            self._tracks = TrackRecorder(self.max_steps + 1)
+        self.render_mode = render_mode
+        self._tracks = TrackRecorder(self.max_steps + 1 if render_mode else 0)
         self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
         self._make_specs(self.edge.reachable(self.max_move_km + self.drift_km))
@@ -205,20 +201,23 @@ class GeomagneticNavEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         """Start the next episode of every vehicle that is named by ``_reset``, or of all."""
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            chosen, start = self.vehicle, self._start_of(self.vehicle)
-        else:
-            mask = mask.reshape(self.num_envs)
-            chosen = mask.nonzero().squeeze(-1)
-            # The rows of the others are placeholders: the base class puts their running state back.
-            rows = self._start_of(chosen if len(chosen) else self.vehicle[:1])
-            start = rows[(mask.cumsum(0) - 1).clamp_min(0)]
+        mask = torch.ones_like(self.vehicle, dtype=torch.bool)
+        if tensordict is not None:
+            mask = tensordict.get("_reset", mask).reshape(self.num_envs)
+        chosen = mask.nonzero().squeeze(-1)
+        # The rows of the others are placeholders: the base class puts their running state back.
+        rows = self._start_of(chosen if len(chosen) else self.vehicle[:1])
+        start = rows[(mask.cumsum(0) - 1).clamp_min(0)]
         # Counted out of place: a rollout or a checkpoint may hold the old tensor.
         self.episode = self.episode.index_add(0, chosen, torch.ones_like(chosen))
-        if self._tracks is not None:
-            self._tracks.add(start, mask)
+        self._tracks.add(start, mask)
         return start
+
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        """Return the state of all vehicles: those that are not reset keep theirs."""
+        state = super()._reset_proc_data(tensordict, tensordict_reset)
+        specs.check_state(state["objective_weights"])
+        return state
 
     def _start_of(self, vehicle: Tensor) -> TensorDict:
         """Return the first observation of the next episode of some vehicles, ``(P,)``."""
@@ -268,6 +267,7 @@ class GeomagneticNavEnv(EnvBase):
         action = specs.checked_action(tensordict["action"], self.action_low, self.action_high)
         heading, position, field, lost = self._moved(tensordict, action)
         weights = tensordict["objective_weights"].double()
+        specs.check_state(weights)
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
         step = tensordict["step_count"] + 1
         ended, right = self.arrival(action, objective, position, tensordict["target_position"])
@@ -292,8 +292,7 @@ class GeomagneticNavEnv(EnvBase):
             batch_size=tensordict.batch_size,
             device=self.device,
         )
-        if self._tracks is not None:
-            self._tracks.add(after)
+        self._tracks.add(after)
         return after
 
     def _moved(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, ...]:
@@ -324,9 +323,9 @@ class GeomagneticNavEnv(EnvBase):
 
         Raises:
             RuntimeError: without ``render_mode="rgb_array"``, or before the first reset.
-            IndexError: for a vehicle that is not in the batch.
+            ValueError: for a vehicle that is not in the batch.
         """
-        return self._recorded.track(vehicle)
+        return self._tracks.track(vehicle)
 
     def render(self, vehicles: Sequence[int] | None = None, *, size_px: int = 700) -> np.ndarray:
         """Draw the running episodes over the field's contours.
@@ -339,15 +338,11 @@ class GeomagneticNavEnv(EnvBase):
             ``(size_px, size_px, 3)`` uint8 RGB.
 
         Raises:
-            RuntimeError, IndexError: as :meth:`track`.
+            RuntimeError, ValueError: as :meth:`track`, or for vehicles in several regions.
         """
         chosen = range(min(self.num_envs, 16)) if vehicles is None else vehicles
         paths = [self.track(vehicle).cpu() for vehicle in chosen]
-        targets = self._recorded.targets[list(chosen)].cpu()
-        return rgb_array(draw_tracks, size_px, self.field, self.region, paths, targets)
-
-    @property
-    def _recorded(self) -> TrackRecorder:
-        if self._tracks is None:
-            raise RuntimeError("no track is kept: create the environment with render_mode='rgb_array'")
-        return self._tracks
+        targets, region = (values[list(chosen)].cpu() for values in self._tracks.latest[2:])
+        boxes = Regions.of(self.region[index] for index in region.unique().tolist())
+        field = partial(copy.deepcopy(self.field).cpu(), index=region[0]) if len(self.region) > 1 else self.field
+        return rgb_array(draw_tracks, size_px, field, boxes, paths, targets)

@@ -241,7 +241,7 @@ def one_region(region: Region | Regions) -> Region:
     regions = Regions.of(region)
     if len(regions) > 1:
         raise ValueError(
-            f"this is made for one region, the scenario has {len(regions)}: take one of them, as region[0]"
+            f"this is made for one region, got {len(regions)}: take one of them, as region[0], or one vehicle"
         )
     return regions[0]
 

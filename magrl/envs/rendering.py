@@ -151,28 +151,27 @@ class TrackRecorder:
     """Positions of the running episodes of a batch, kept for rendering.
 
     Args:
-        length: states kept; the longest track that can be returned.
+        length: states kept; the longest track that can be returned. With 0, none is.
 
     Example:
         >>> from tensordict import TensorDict
         >>> recorder, step = TrackRecorder(length=3), torch.tensor([[0]])
         >>> for k in range(2):
         ...     place = torch.tensor([[-2.0 - k, 162.0]])
-        ...     recorder.add(TensorDict(position=place, target_position=place, step_count=step + k, batch_size=[1]))
+        ...     recorder.add(TensorDict(position=place, target_position=place, step_count=step + k, region=step))
         >>> recorder.track(0)
         tensor([[ -2., 162.],
                 [ -3., 162.]])
     """
 
     def __init__(self, length: int) -> None:
-        check_number(1, whole=True, length=length)
         self._states: deque[tuple[Tensor, ...]] = deque(maxlen=length)
 
     def add(self, state: TensorDictBase, started: Tensor | None = None) -> None:
         """Record a state of every vehicle; at a partial reset, only the rows ``started`` ``(N,)`` are new."""
         if torch.compiler.is_compiling():
             return
-        entry: tuple[Tensor, ...] = (state["position"], state["step_count"], state["target_position"])
+        entry: tuple[Tensor, ...] = tuple(state[key] for key in ("position", "step_count", "target_position", "region"))
         if started is not None and self._states:
             new, last = started.unsqueeze(-1), self._states.pop()
             entry = tuple(torch.where(new, a, b) for a, b in zip(entry, last, strict=True))
@@ -183,22 +182,15 @@ class TrackRecorder:
 
         Raises:
             RuntimeError: before the first state.
-            IndexError: for a vehicle that is not in the batch.
+            ValueError: for a vehicle that is not in the batch.
         """
-        steps, (count, *_) = self._latest[1], self._latest[1].shape
-        check_number(whole=True, vehicle=vehicle)
-        if not 0 <= vehicle < count:
-            raise IndexError(f"vehicle {vehicle} is not one of the {count} in the batch")
-        since = int(steps[vehicle])
+        check_number(0, len(self.latest[1]) - 1, whole=True, vehicle=vehicle)
+        since = int(self.latest[1][vehicle])
         return torch.stack([state[0][vehicle] for state in list(self._states)[-(since + 1) :]])
 
     @property
-    def targets(self) -> Tensor:
-        """Destinations of the running episodes, ``(N, 2)`` [deg]."""
-        return self._latest[2]
-
-    @property
-    def _latest(self) -> tuple[Tensor, ...]:
+    def latest(self) -> tuple[Tensor, ...]:
+        """Position ``(N, 2)``, step ``(N, 1)``, destination ``(N, 2)`` and region ``(N, 1)`` of running episodes."""
         if not self._states:
-            raise RuntimeError("there is no episode to show: call reset() first")
+            raise RuntimeError("no track is kept: create the environment with render_mode='rgb_array' and call reset()")
         return self._states[-1]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
+from magrl.checks import check_tensor, require
 from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
 from magrl.transforms.errors.base import EPISODE_STREAM
@@ -148,6 +149,7 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
         high: ``(2,)`` or ``(3,)`` highest.
 
     Raises:
+        TypeError: for complex numbers or bools.
         ValueError: for actions of another size; or naming the vehicles whose action is not finite or beyond the bounds
             by more than rounding.
 
@@ -155,6 +157,7 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
         >>> checked_action(torch.tensor([[50.000001, 0.0]]), torch.tensor([0.0, -1.5]), torch.tensor([50.0, 1.5]))
         tensor([[50.,  0.]], dtype=torch.float64)
     """
+    check_tensor(action=action)
     if action.shape[-1] != len(low):
         declared = len(low) > 2
         names = "distance, turn and declare" if declared else "distance and turn"
@@ -173,6 +176,19 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
             f"[-{float(high[1]):.4f}, {float(high[1]):.4f}]{', declare in [-1, 1]' * (len(high) > 2)}"
         )
     return action.clamp(low, high)
+
+
+def check_state(weights: Tensor) -> None:
+    """Raise unless every vehicle has a state: TorchRL fills what a reset of some vehicles does not know with 0.
+
+    Args:
+        weights: ``(N, 3)`` weights of the objective, which are above 0.
+
+    Example:
+        >>> check_state(torch.ones(2, 3))
+    """
+    message = "a vehicle has no state (objective_weights {}): to reset the others alone, set '_reset' in the "
+    require(weights > 0, weights, message + "TensorDict that reset(), step_mdp() or step_and_maybe_reset() returned")
 
 
 def state_spec(observation: Composite) -> Composite:

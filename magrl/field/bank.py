@@ -213,11 +213,7 @@ def check_index(index: Tensor, count: int, name: str = "index") -> None:
     check_tensor(**{name: index})
     if index.dtype != torch.int64:
         raise TypeError(f"{name} must be int64, got {index.dtype}")
-    good, message = (index >= 0) & (index < count), f"{name} {{}} is not in [0, {count})"
-    if index.device.type == "cpu":
-        require(good, index, message)
-    else:
-        torch._assert_async(good.all(), message)
+    require((index >= 0) & (index < count), index, f"{name} {{}} is not in [0, {count})")
 
 
 def checked_boxes(latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,9 +15,16 @@ import pytest
 import torch
 from ppigrf import igrf
 from ppigrf.ppigrf import shc_fn_igrf13
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import FrameSkipTransform, NoopResetEnv, TargetReturn, Transform, TransformedEnv
+from torchrl.envs import (
+    FrameSkipTransform,
+    NoopResetEnv,
+    SerialEnv,
+    TargetReturn,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from magrl.envs import PAPER_REGION, PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Region, Scenario, Tasks
@@ -108,7 +115,7 @@ def test_specs_do_not_depend_on_the_default_type(observation: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "transform", [FrameSkipTransform(3), NoopResetEnv(noops=2), TargetReturn(250.0)], ids=lambda part: type(part).__name__
+    "transform", [FrameSkipTransform(3), NoopResetEnv(noops=2), TargetReturn(250.0)], ids=["frames", "noops", "target"]
 )
 def test_transforms_of_torchrl_that_need_one_reward(transform: Transform) -> None:
     env = TransformedEnv(make(), transform)
@@ -346,6 +353,18 @@ def test_partial_reset_leaves_the_others_as_they_were(mask: list[int]) -> None:
     assert step["step_count"].flatten().tolist() == [1 if m else 4 for m in mask]
 
 
+def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
+    mask = torch.tensor([True, False, True])
+    for env in (make(3), navigation_env(3)):  # TorchRL hides the merge from an environment under transforms
+        with pytest.raises(ValueError, match=r"no state .*: to reset the others alone, set '_reset' in the TensorDict"):
+            env.rand_step(env.reset(TensorDict(_reset=mask, batch_size=[3])))
+        assert (env.reset(TensorDict(_reset=torch.ones_like(mask), batch_size=[3]))["step_count"] == 0).all()
+    batch = SerialEnv(2, lambda: make(3))
+    td = batch.step_mdp(batch.rand_step(batch.reset()))
+    after = batch.reset(td.set("_reset", torch.stack((mask, ~mask)).unsqueeze(-1)))
+    assert after["step_count"].flatten().tolist() == [0, 1, 0, 1, 0, 1]
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Seeds and tasks
 
@@ -425,6 +444,13 @@ def test_a_bad_action_is_named_with_its_vehicle(action: tuple[float, float]) -> 
         env.step(env.reset().set("action", actions))
 
 
+@pytest.mark.parametrize("kind", [torch.bool, torch.complex64])
+def test_an_action_that_is_not_real_is_refused(kind: torch.dtype) -> None:
+    for env in (make(), navigation_env()):
+        with pytest.raises(TypeError, match=f"action must hold real numbers, got {kind}"):
+            env.step(env.reset().set("action", torch.zeros(1, 2, dtype=kind)))
+
+
 def test_rounding_beyond_the_bounds_is_forgiven_and_cut() -> None:
     actions = torch.tensor([(50.0001, 0.0), (-0.0001, 0.0), (1.0, math.pi / 2 + 1e-6)])
     env = make(3)
@@ -438,10 +464,12 @@ def test_rounding_beyond_the_bounds_is_forgiven_and_cut() -> None:
     ("option", "value"),
     [
         ("num_envs", 0),
+        ("num_envs", 10**12),
         ("drift_km", -1.0),
         ("proximity_weight", float("inf")),
         ("render_mode", "human"),
         ("device", "meta"),
+        ("device", "foo"),
     ],
 )
 def test_a_bad_option_is_named_with_its_value(option: str, value: object) -> None:
@@ -465,7 +493,7 @@ def test_options_replace_those_of_the_scenario() -> None:
     assert (env.max_steps, env.zeta, env.max_move_km, env.start_heading) == (80, 0.5, 50.0, "north")
     assert (env.max_turn_rad, env.arrival.rule, env.arrival.radius_km) == (math.radians(60), "distance", 30.0)
     assert (env.scenario.max_steps, env.scenario.zeta, scenario.zeta) == (80, 0.5, 0.02)
-    with pytest.raises(TypeError, match=r"unexpected keyword argument 'speed'; the options are .*'max_steps'.*'seed'"):
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'speed'; the options are .*'max_steps'"):
         GeomagneticNavEnv(speed=3)
     with pytest.raises(TypeError, match="scenario must be a Scenario, got Region"):
         GeomagneticNavEnv(PAPER_REGION)
@@ -512,14 +540,13 @@ class TestTracks:
             make(2).render()
         env = make(2, render_mode="rgb_array")
         for call in (env.render, lambda: env.track(0)):
-            with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
+            with pytest.raises(RuntimeError, match=r"and call reset\(\)"):
                 call()
         env.reset()
         for vehicle in (2, -1):
-            with pytest.raises(IndexError, match=f"vehicle {vehicle} .* 2 in the batch"):
-                env.track(vehicle)
-            with pytest.raises(IndexError, match=f"vehicle {vehicle} "):
-                env.render([vehicle])
+            for call in (lambda: env.track(vehicle), lambda: env.render([vehicle])):  # noqa: B023
+                with pytest.raises(ValueError, match=f"vehicle must be a whole number from 0 up to 1, got {vehicle}"):
+                    call()
         with pytest.raises(ValueError, match="size_px must be a whole number from 1 on, got 0"):
             env.render(size_px=0)
 

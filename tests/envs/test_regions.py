@@ -155,7 +155,7 @@ def test_regions_are_a_batch_of_boxes():
     assert regions == Regions.of([PAPER_REGION, ARCTIC]) != Regions.of(PAPER_REGION)
     assert repr(regions) == "Regions(Region(latitude=(-10.0, 0.0), longitude=(160.0, 170.0)), and 1 more)"
     assert one_region(PAPER_REGION) == one_region(Regions.of(PAPER_REGION)) == PAPER_REGION
-    with pytest.raises(ValueError, match="has 2: take one of them"):
+    with pytest.raises(ValueError, match="got 2: take one of them"):
         one_region(regions)
     with pytest.raises(ValueError, match=r"with K >= 1, got \(0, 2\)"):
         Regions.of([])
