@@ -9,16 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import CatTensors, TransformedEnv
@@ -64,18 +66,31 @@ def _array(tensor: Tensor) -> NDArray[Any]:
     return np.array(tensor.detach().cpu().numpy())
 
 
+def _keep_spec(env: Any, spec: EnvSpec) -> None:
+    """Keep Gymnasium's ``spec`` of an environment, with its step limit."""
+    env.limited_spec = replace(spec, max_episode_steps=env.torchrl_env.base_env.max_steps)
+
+
+_SPEC: Any = property(lambda env: getattr(env, "limited_spec", None), _keep_spec, doc="Gymnasium's record of it.")
+
+
 class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """A batch of vehicles: ``gymnasium.make_vec("magrl/GeomagneticNavigation-v0", num_envs=N, **options)``.
 
-    All move in one batched step. A vehicle whose episode ends starts the next in the same step
-    (``AutoresetMode.SAME_STEP``): the observation returned is the first of the new episode, ``info["final_obs"]`` the
-    last of the old one and ``info["final_info"]`` its measures, each with its mask ``_final_obs``, ``_final_info``.
+    All move in one batched step. The autoreset mode is that of Gymnasium. With ``SAME_STEP``, a vehicle whose episode
+    ends starts the next in the same step: the observation returned is the first of the new episode,
+    ``info["final_obs"]`` the last of the old one and ``info["final_info"]`` its measures, each with its mask
+    ``_final_obs``, ``_final_info``. With ``NEXT_STEP``, the next step starts it, whatever the action; with
+    ``DISABLED``, ``reset(options={"reset_mask": ended})``. In both, ``info`` has the measures and their masks.
+
     ``reset(seed=s)`` is the first reset of the TorchRL environment of ``N`` vehicles and seed ``s``: each row has
     episodes of its own, those of row 0 are the single environment's.
 
     Args:
         num_envs: vehicles in the batch.
         render_mode: None, or ``"rgb_array"``: an image of each vehicle.
+        autoreset_mode: mode, or its value: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``.
+        max_episode_steps: Gymnasium's name of ``max_steps``.
         **options: of :func:`navigation_env`.
 
     Raises:
@@ -89,18 +104,26 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         ((4, 13), (4,))
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 as Gymnasium declares it
-        "render_modes": ["rgb_array"],
-        "render_fps": 4,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
-    autoreset_mode = AutoresetMode.SAME_STEP  # where TorchRL's GymWrapper reads it
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 as Gymnasium declares it
+    spec = _SPEC
     make_env: ClassVar[Callable[..., TransformedEnv]] = staticmethod(navigation_env)
     """Function that makes the environment."""
     default_observation: ClassVar[str] = "flat"
 
-    def __init__(self, num_envs: int = 1, *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
+        **options: Any,
+    ) -> None:
+        if max_episode_steps is not None:
+            options.setdefault("max_steps", max_episode_steps)
         self.num_envs, self.render_mode = num_envs, render_mode
+        self.autoreset_mode = AutoresetMode(autoreset_mode)  # where TorchRL's GymWrapper reads it
+        self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
         observation = options.get("observation", self.default_observation)
         self._flat = observation in ("flat", "track")
         self.torchrl_env = self.make_env(num_envs, render_mode=render_mode, **options)
@@ -109,21 +132,31 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         self.single_action_space = _box(self.torchrl_env.action_spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._state: TensorDictBase | None = None
         self._length_km = torch.zeros(num_envs, dtype=torch.float64, device=self.torchrl_env.device)
+        self._state: TensorDictBase = TensorDict(batch_size=num_envs, device=self.torchrl_env.device)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start the next episode of every vehicle, or with a seed the first."""
+        """Start the next episode of every vehicle, or with a seed the first.
+
+        Args:
+            seed: seed, from 0 on.
+            options: ``reset_mask``, ``(N,)`` bool: the vehicles that start, all at the first reset. Others are ignored.
+        """
         super().reset(seed=seed)
-        if options:
-            raise ValueError(f"reset() of {ENV_ID} takes no options, got {options}")
         if seed is not None:
             self.torchrl_env.set_seed(seed)
-        self._state = self.torchrl_env.reset()
-        self._length_km = torch.zeros_like(self._length_km)
+        everyone = torch.ones_like(self._length_km, dtype=torch.bool)
+        mask = (options or {}).get("reset_mask", everyone) if "done" in self._state else everyone
+        self._start(torch.as_tensor(mask).to(everyone))
         return self._observe(self._state), {}
+
+    def _start(self, mask: Tensor) -> None:
+        """Start the next episodes of some vehicles, ``(N,)`` bool."""
+        if mask.any():
+            self._state = self.torchrl_env.reset(self._state.set("_reset", mask.unsqueeze(-1)))
+            self._length_km = self._length_km.masked_fill(mask, 0.0)
 
     def step(self, actions: NDArray[np.float32]) -> VectorStep:
         """Move every vehicle.
@@ -132,31 +165,34 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
             actions: ``(N, 2)`` distance and turn, in [-1, 1] or in km and rad.
 
         Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-            ValueError: for actions of another shape, not finite, or out of their bounds.
+            gymnasium.error.ResetNeeded: before the first reset; without autoreset, before that of a vehicle that ended.
+            ValueError: for actions of another shape, not real numbers, not finite, or out of their bounds.
         """
-        observation, reward, terminated, truncated, measures = self._move(actions)
-        ended = terminated | truncated
-        info = _final(observation, measures, ended) if measures else {}
-        self._state = self.torchrl_env.maybe_reset(self._state)
-        return self._observe(self._state), reward, terminated, truncated, info
-
-    def _move(self, actions: Any) -> VectorStep:
-        """Move every vehicle, without the start of the next episodes.
-
-        Returns:
-            Observations, rewards, ``terminated``, ``truncated``, and the measures of the ``P`` episodes that ended.
-        """
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset() before step(): no episode is running")
+        disabled = self.autoreset_mode is AutoresetMode.DISABLED
+        if "done" not in self._state or (disabled and self._state["done"].any()):
+            raise gymnasium.error.ResetNeeded("call reset() before step(): a vehicle has no running episode")
+        idle = self._state["done"].squeeze(-1)  # with NEXT_STEP, those whose next episode starts now
         state = self.torchrl_env.step(self._state.set("action", self._action(actions)))
         self._state, after = self.torchrl_env.step_mdp(state), state["next"]
         self._length_km = self._length_km + after.get("true_move", after["move"])[:, 0].double()
-        done = after["done"].squeeze(-1)
-        measures = _measures(after[done], self._length_km[done]) if done.any() else {}
-        self._length_km = self._length_km.masked_fill(done, 0.0)
-        reward, terminated, truncated = (_array(after[k].squeeze(-1)) for k in ("reward", "terminated", "truncated"))
-        return self._observe(after), reward, terminated, truncated, measures
+        results = [after[key].squeeze(-1).masked_fill(idle, 0) for key in ("reward", "terminated", "truncated")]
+        ended = results[1] | results[2]
+        info = self._info(after, ended) if ended.any() else {}
+        self._start(ended if self.autoreset_mode is AutoresetMode.SAME_STEP else idle)
+        return self._observe(self._state), *map(_array, results), info  # type: ignore[return-value]
+
+    def _info(self, after: TensorDictBase, ended: Tensor) -> dict[str, Any]:
+        """Return Gymnasium's ``info`` of a step in which episodes ended: values, each with its mask."""
+        info, mask = dict[str, Any](), _array(ended)
+        for name, values in _measures(after[ended], self._length_km[ended]).items():
+            info[name], info[f"_{name}"] = np.zeros(self.num_envs, dtype=values.dtype), mask.copy()
+            info[name][mask] = values
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            return info
+        last, final_obs = self._observe(after), np.full(self.num_envs, None, dtype=object)
+        for vehicle in np.flatnonzero(mask):
+            final_obs[vehicle] = _row(last, int(vehicle))
+        return {"final_obs": final_obs, "_final_obs": mask, "final_info": info, "_final_info": mask.copy()}
 
     def _observe(self, state: TensorDictBase) -> Observation:
         """Return the observations of all vehicles, ``(N, ...)``."""
@@ -164,17 +200,11 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         return arrays["observation"] if self._flat else arrays
 
     def _action(self, actions: Any) -> Tensor:
-        array, space = np.array(actions, dtype=np.float32), self.action_space
-        assert isinstance(space, spaces.Box)
-        if array.shape != space.shape:
-            raise ValueError(f"actions must have shape {space.shape}, a vehicle per row, got shape {array.shape}")
-        slack = 1e-5 * (space.high - space.low)
-        inside = ((array >= space.low - slack) & (array <= space.high + slack)).all(-1)
-        if not inside.all():
-            vehicle = int(inside.argmin())
-            bounds = f"is not finite or out of bounds, {self.single_action_space}"
-            raise ValueError(f"action {array[vehicle].tolist()} of vehicle {vehicle} {bounds}")
-        return torch.from_numpy(array).to(self.torchrl_env.device)
+        array, wanted = np.asarray(actions), self.action_space.shape
+        if array.shape != wanted or array.dtype.kind not in "fiu":
+            shape = f"shape {wanted}, a vehicle per row"
+            raise ValueError(f"actions must be real numbers of {shape}, got {array.dtype} of shape {array.shape}")
+        return torch.from_numpy(array.astype(np.float32)).to(self.torchrl_env.device)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return an image of each vehicle's episode, ``(H, W, 3)``, or None without a ``render_mode``."""
@@ -208,11 +238,12 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 as Gymnasium declares it
+    spec = _SPEC
     vector_class: ClassVar[type[GeomagneticNavVectorEnv]] = GeomagneticNavVectorEnv
     """Batch of which this is the only vehicle."""
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
-        self._envs = self.vector_class(1, render_mode=render_mode, **options)
+        self._envs = self.vector_class(1, render_mode=render_mode, autoreset_mode="Disabled", **options)
         self.torchrl_env, self.render_mode = self._envs.torchrl_env, render_mode
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
@@ -220,7 +251,7 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the class describes the meaning of a seed."""
+        """Start an episode; the class describes the meaning of a seed. There are no options."""
         super().reset(seed=seed)
         observation, info = self._envs.reset(seed=seed, options=options)
         return _row(observation, 0), info
@@ -233,13 +264,12 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         Raises:
             gymnasium.error.ResetNeeded: if no episode is running.
-            ValueError: for an action of another shape, not finite, or out of its bounds.
+            ValueError: for an action of another shape, not real numbers, not finite, or out of its bounds.
         """
-        observation, *results, measures = self._envs._move(np.asarray(action)[None])
+        observation, *results, info = self._envs.step(np.asarray(action)[None])
         reward, terminated, truncated = (value.item() for value in results)
-        if terminated or truncated:
-            self._envs._state = None
-        return _row(observation, 0), reward, terminated, truncated, {name: x.item() for name, x in measures.items()}
+        measures = {name: values.item() for name, values in info.items() if not name.startswith("_")}
+        return _row(observation, 0), reward, terminated, truncated, measures
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the running episode over the field's contours, or None without a ``render_mode``."""
@@ -302,15 +332,3 @@ def _row(observation: Observation, index: int) -> Observation:
     if isinstance(observation, dict):
         return {key: value[index] for key, value in observation.items()}
     return observation[index]
-
-
-def _final(observation: Observation, measures: dict[str, NDArray[Any]], ended: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return Gymnasium's ``info`` of a step in which episodes ended: values, each with its mask."""
-    final_obs = np.full(len(ended), None, dtype=object)
-    for index in np.flatnonzero(ended):
-        final_obs[index] = _row(observation, int(index))
-    final_info = {}
-    for name, values in measures.items():
-        final_info[name], final_info[f"_{name}"] = np.zeros(len(ended), dtype=values.dtype), ended.copy()
-        final_info[name][ended] = values
-    return {"final_obs": final_obs, "_final_obs": ended.copy(), "final_info": final_info, "_final_info": ended.copy()}

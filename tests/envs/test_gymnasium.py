@@ -16,13 +16,15 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import NormalizeObservation
 from tensordict import TensorDict
 from torchrl.envs import Compose, GymEnv, GymWrapper, TransformedEnv
 
-from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks, planet_scenario
+from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks, geomagnetic, planet_scenario
 from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
 from magrl.envs.navigation import anywhere_env
 from magrl.evaluation import episode_measures
+from magrl.field import elements_at
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorNoise, TrackGradient, TrackView
 
 ROOT = Path(__file__).parent.parent.parent
@@ -174,7 +176,70 @@ def test_a_scenario_of_many_regions(options: dict) -> None:
         make_vec(scenario=planets)
 
 
-# Seeds and tasks
+# Modes of autoreset
+
+MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
+
+
+def ended_after(envs: gymnasium.vector.VectorEnv, step: tuple) -> tuple:
+    """The results of a step, and the first observation of the vehicles that ended, where they do not start alone."""
+    ended = step[2] | step[3]
+    if envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED and ended.any():
+        with pytest.raises((gymnasium.error.ResetNeeded, AssertionError)):  # the latter by Gymnasium's
+            envs.step(envs.action_space.sample())
+        return *step, envs.reset(options={"reset_mask": ended})[0]
+    return *step, step[0]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
+    single = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
+    batch, reference = make_vec(1, autoreset_mode=mode.value, **SHORT), make_vec(1, **single, **SHORT)
+    assert batch.metadata["autoreset_mode"] is batch.autoreset_mode is mode
+    np.testing.assert_array_equal(batch.reset(seed=4)[0], reference.reset(seed=4)[0])
+    for actions in random_actions(1, 2, 30):
+        flown = [ended_after(envs, envs.step(actions)) for envs in (batch, reference)]
+        (*results, info, start), (*expected, last, first) = flown
+        for value, other in zip((*results, start), (*expected, first), strict=True):
+            np.testing.assert_array_equal(value, other.astype(value.dtype))
+        assert info.keys() == last.keys()
+        assert all(info[name][0] == last[name][0] for name in info)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_modes_fly_the_same_episodes(mode: AutoresetMode) -> None:
+    flights = []
+    for envs in (make_vec(autoreset_mode=mode, **SHORT), make_vec(**SHORT)):
+        steps: list[list[tuple]] = [[] for _ in range(NUM)]
+        state, idle = envs.reset(seed=11)[0], np.zeros(NUM, dtype=bool)
+        for _ in range(24):
+            *step, _, after = ended_after(envs, envs.step(np.sin(9 * state[:, :2])))
+            for row in np.flatnonzero(~idle):
+                steps[row].append((*state[row], *(value[row] for value in step[1:])))
+            if mode is AutoresetMode.NEXT_STEP and envs.metadata["autoreset_mode"] is mode:
+                assert not step[1][idle].any()
+                idle = step[2] | step[3]
+            state = after
+        flights.append(steps)
+    for some, others in zip(*flights, strict=True):
+        assert len(some) > 16
+        assert some == others[: len(some)]
+
+
+def test_wrappers_that_need_the_next_step() -> None:
+    envs = NormalizeObservation(make_vec(autoreset_mode="NextStep", **SHORT))
+    envs.reset(seed=0)
+    assert np.isfinite(envs.step(random_actions(NUM, 0, 1)[0])[0]).all()
+
+
+# Limits
+
+
+def test_the_spec_has_the_step_limit() -> None:
+    env, envs = make(max_steps=7), make_vec(max_episode_steps=7)
+    assert env.spec.max_episode_steps == envs.spec.max_episode_steps == 7
+    for again in (gymnasium.make(env.spec), gymnasium.make_vec(env.spec)):
+        assert again.unwrapped.torchrl_env.base_env.max_steps == again.spec.max_episode_steps == 7
 
 
 # Spaces
@@ -286,22 +351,19 @@ def test_bad_calls() -> None:
     env = GeomagneticNavGymEnv(scenario=PAPER, max_steps=1)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(2))
-    with pytest.raises(ValueError, match=r"takes no options, got \{'task': 3\}"):
-        env.reset(options={"task": 3})
-    env.reset(seed=0)
+    env.reset(seed=0, options={"task": 3})  # ignored, as in Gymnasium's environments
     for bad, message in (
-        ((0, 0, 0), r"must have shape \(1, 2\).*got shape \(1, 3\)"),
-        (
-            (1.5, 0.0),
-            r"action \[1.5, 0.0\] of vehicle 0 is not finite or out of bounds, Box\(-1.0, 1.0,",
-        ),
-        ((0.0, math.nan), "out of bounds, Box"),
+        ((0, 0, 0), r"real numbers of shape \(1, 2\).*got int64 of shape \(1, 3\)"),
+        ((1.5, 0.0), r"of vehicles \[0\] are not finite or out of bounds: \[\[62.5, 0.0\]\]"),
+        ((0.0, math.nan), "not finite or out of bounds"),
+        ((True, False), "actions must be real numbers of .* got bool of shape"),
+        ((0.1j, 0), "actions must be real numbers of .* got complex"),
     ):
         with pytest.raises(ValueError, match=message):
-            env.step(action(*bad))
+            env.step(np.array(bad))
     envs = make_vec(2, scale_actions=False)
     envs.reset(seed=0)
-    with pytest.raises(ValueError, match=r"of vehicle 1 .* out of bounds, Box\(\[ 0. +-1.570\d*\], \[50. +1.570\d*\]"):
+    with pytest.raises(ValueError, match=r"of vehicles \[1\] .* out of bounds: \[\[51.0, 0.0\]\]"):
         envs.step(np.array([[50.0, 0.0], [51.0, 0.0]]))
 
 
@@ -378,6 +440,27 @@ def test_batched_environment_under_stable_baselines3() -> None:
     assert ended > NUM
     with pytest.raises(ValueError, match="NEXT_STEP"):
         BatchedVecEnv(gymnasium.make_vec(ENV_ID, num_envs=1, vectorization_mode="sync", **SHORT))
+
+
+def test_stable_baselines3_makes_environments_without_a_map(monkeypatch) -> None:
+    """With the render mode that it chooses: each vehicle is drawn over its own region."""
+    env_util = pytest.importorskip("stable_baselines3.common.env_util")
+    planets = planet_scenario(3, seed=0)
+    vec_env = env_util.make_vec_env(ANYWHERE_ID, n_envs=2, seed=0, env_kwargs={"scenario": planets})
+    vec_env.reset()
+    drawn: list[tuple] = []
+    image = np.zeros((2, 2, 3), dtype=np.uint8)
+    monkeypatch.setattr(geomagnetic, "rgb_array", lambda *args: drawn.append(args[2:]) or image)
+    assert len(vec_env.get_images()) == 2
+    for (field, boxes, paths, _), env in zip(drawn, vec_env.envs, strict=True):
+        state = env.unwrapped._envs._state
+        assert list(boxes) == [env.unwrapped.torchrl_env.base_env.region[int(state["region"])]]
+        torch.testing.assert_close(elements_at(field, paths[0][:1]).float(), state["true_field"])
+    monkeypatch.undo()
+    env = GeomagneticNavEnv(planets, num_envs=9, seed=0, render_mode="rgb_array")
+    env.reset()
+    with pytest.raises(ValueError, match="made for one region, got 3"):
+        env.render()
 
 
 def test_without_stable_baselines3_the_extra_is_named(monkeypatch) -> None:
