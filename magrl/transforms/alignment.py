@@ -205,7 +205,7 @@ class AlignmentReward(StepReward):
     """
 
     default_in_keys = ("heading", "gradient_heading", "gradient_heading_valid")
-    in_counts, out_counts = (2, 3), (1, 2)
+    in_counts, out_counts, out_sizes = (2, 3), (1, 2), ((), (1,))
 
     def __init__(
         self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, weight: float = 3.0, offset: float = math.pi / 4

@@ -51,7 +51,7 @@ class ObservationTransform(Transform):
     in_sizes: Sequence[int | None] = ()
     """Last dimensions of the values at ``in_keys``; None for any."""
     out_sizes: Sequence[tuple[int, ...]] = ()
-    """Last dimensions of the values at ``out_keys``, unbounded ones."""
+    """Last dimensions of the values at ``out_keys``, unbounded ones; () for a reward."""
 
     def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, **inverse: Keys) -> None:
         ins, outs = self.default_in_keys, self.default_out_keys
@@ -123,8 +123,9 @@ class ObservationTransform(Transform):
         self._check_shapes(self._leaf(observation_spec, key).shape for key in self.in_keys)
         if self.out_sizes:
             like = self._leaf(observation_spec, self.in_keys[0])
-            for key, last in zip(self.out_keys, self.out_sizes, strict=True):
-                self._add(observation_spec, like, key, *last)
+            for key, last in zip(self.out_keys, self.out_sizes, strict=False):
+                if last:
+                    self._add(observation_spec, like, key, *last)
         return observation_spec
 
     def _check_shapes(self, shapes: Iterable[torch.Size]) -> None:
@@ -259,13 +260,6 @@ class StepReward(StatefulTransform):
         key, like = self.out_keys[0], self._leaf(observed_spec(self), self.in_keys[0])
         self._add(reward_spec, reward_spec[key] if key in reward_spec.keys(True, True) else like, key, 1)
         return reward_spec
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the terms of the reward."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        for key in self.out_keys[1:]:
-            self._add(observation_spec, self._leaf(observation_spec, self.in_keys[0]), key, 1)
-        return observation_spec
 
 
 def observed_spec(transform: Transform) -> Composite:
