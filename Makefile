@@ -54,63 +54,56 @@ mutate: $(VENV)/.installed-mutation  ## run mutation tests of the mathematics; t
 	$(RUN)/mutmut run $(ARGS)
 	$(RUN)/mutmut results
 
-# Tables and figures. Runs that exist are used again; `make -j2` trains two at a time. Each run has one thread, but for
-# td3_gradient_guided-fast-seed* and *-two-threads-*, which show how little the number of threads matters.
+# Tables and figures. Runs that exist are used again; `make -j2` trains and makes two at a time, with one thread each.
+ONE := OMP_NUM_THREADS=1 $(RECIPE)
 FIVE := 0 1 2 3 4
 GUIDED := $(addprefix td3_gradient_guided-fast-one-thread-seed,$(FIVE) 5 6 7 8 9 $(addprefix 1,$(FIVE) 5 6 7 8 9))
 PLAIN := $(addprefix td3-fast-seed,$(FIVE))
-WHOLE := td3_gradient_guided-paper-seed0 td3-paper-seed0 $(firstword $(GUIDED)) $(firstword $(PLAIN))
-RUNS_comparison := $(GUIDED) $(PLAIN)
-RUNS_comparison-paper-100 := $(GUIDED) $(PLAIN)
-RUNS_learning := $(GUIDED) $(PLAIN)
-RUNS_noise := $(GUIDED) $(addprefix td3_gradient_guided-fast-noise-0.05-0.05-5-seed,$(FIVE))
-RUNS_seeds := $(GUIDED) $(addprefix td3_gradient_guided-fast-seed,$(FIVE))
-RUNS_own-world := $(addprefix td3_gradient_guided-fast-azores-seed,$(FIVE))
-RUNS_algorithms := $(GUIDED) $(addprefix ppo-seed,$(FIVE))
-DECLARED := $(addprefix ppo_anywhere-declared-seed,0 1 2)
-RUNS_anywhere-seeds := $(addprefix ppo_anywhere-far-seed,$(FIVE)) ppo_anywhere-far-two-threads-seed0
-RUNS_declared-training := $(DECLARED)
-RUNS_declared-training-conditions := $(DECLARED)
-RUNS_sequences := $(foreach name,ppo_recurrent ppo_recurrent-short,$(addprefix $(name)-seed,0 1 2))
-RUNS_sequences-learning := $(RUNS_sequences)
-RUNS_paper-run := $(WHOLE)
-RUNS_paper-run-100 := $(WHOLE)
-RUNS_paper-run-1000 := $(WHOLE)
+NOISY := $(GUIDED) $(addprefix td3_gradient_guided-fast-noise-0.05-0.05-5-seed,$(FIVE))
+WHOLE := td3_gradient_guided-paper-seed0 td3-paper-seed0
+MEMORY := $(foreach name,ppo_recurrent ppo_recurrent-short,$(addprefix $(name)-seed,0 1 2))
+RUNS_table-comparison := $(GUIDED) $(PLAIN)
+RUNS_table-noise := $(NOISY)
+RUNS_table-paper-run := $(WHOLE)
+RUNS_table-sequences := $(MEMORY)
+RUNS_figure-learning-return := $(GUIDED) $(PLAIN)
+RUNS_figure-learning-success := $(GUIDED) $(PLAIN)
+RUNS_figure-learning-spl := $(GUIDED) $(PLAIN)
+RUNS_figure-noise := $(NOISY)
+RUNS_figure-paper-run := $(WHOLE)
+RUNS_figure-sequences := $(MEMORY)
 TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' recipes/tables/tables.toml)
-FIGURES ?= section-4 learning sequences noise conditions globe paper-run prices
-needed = $(VENV)/.installed $(sort $(foreach name,$(1),$(RUNS_$(name):%=runs/%/eval.json)))
+FIGURES ?= section-4 noise conditions globe prices reliability $(shell sed -n 's/^\[curves\.\([a-z-]*\)\]$$/\1/p' recipes/tables/figures.toml)
 
-tables: $(call needed,$(TABLES))  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
-	$(RECIPE)/tables/grid.py $(TABLES) --out docs/results
+tables: $(TABLES:%=table-%)  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
 	$(RECIPE)/tables/publish.py README.md $(wildcard docs/*.md)
 
-figures: $(call needed,$(FIGURES))  ## draw the figures, all or FIGURES="globe"; section-4 and noise after their tables
-	$(RECIPE)/tables/figures.py $(FIGURES)
+figures: $(FIGURES:%=figure-%)  ## draw the figures, all or FIGURES="globe"; section-4 after table comparison
 
-pictures: $(VENV)/.installed  ## draw and animate the flight of the README
-	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --out runs/flight
-	cp runs/flight/flight.png docs/figures/flight.png
+.SECONDARY:  # keep the runs
+.SECONDEXPANSION:
+table-%: $(VENV)/.installed $$(addsuffix /eval.json,$$(addprefix runs/,$$(RUNS_$$@)))
+	$(ONE)/tables/grid.py $* --out docs/results
+
+figure-%: $(VENV)/.installed $$(addsuffix /eval.json,$$(addprefix runs/,$$(RUNS_$$@)))
+	$(ONE)/tables/figures.py $*
+
+pictures: $(VENV)/.installed  ## animate the flight of the README
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --noise 0.05 0.05 5 --out runs/flight --animate docs/figures/flight.gif
 
-# Trainings: name of the run, number of threads, recipe and options.
+# Trainings: name of the run, recipe and options.
 define training
 runs/$(1)-seed%/eval.json: | $(VENV)/.installed
-	OMP_NUM_THREADS=$(2) $(RECIPE)/$(3) --seed $$* --out $$(@D)
+	$(ONE)/$(2) --seed $$* --out $$(@D)
 endef
-$(eval $(call training,td3_gradient_guided-fast,2,td3_gradient_guided.py))
-$(eval $(call training,td3_gradient_guided-fast-one-thread,1,td3_gradient_guided.py))
-$(eval $(call training,td3_gradient_guided-fast-noise-0.05-0.05-5,1,td3_gradient_guided.py --noise 0.05 0.05 5))
-$(eval $(call training,td3_gradient_guided-fast-azores,1,td3_gradient_guided.py --scenario docs/examples/azores.toml))
-$(eval $(call training,td3-fast,1,td3_gradient_guided.py --preset td3-fast))
-$(eval $(call training,td3_gradient_guided-paper,1,td3_gradient_guided.py --preset paper --precision bfloat16))
-$(eval $(call training,td3-paper,1,td3_gradient_guided.py --preset td3-paper --precision bfloat16))
-$(eval $(call training,ppo,1,ppo.py))
-$(eval $(call training,ppo_anywhere-far,1,ppo_anywhere.py))
-$(eval $(call training,ppo_anywhere-far-two-threads,2,ppo_anywhere.py))
-$(eval $(call training,ppo_anywhere-declared,1,ppo_anywhere.py --preset fast --arrival declared --max-steps 80 \
-	--price-range 0.03 1 --total-frames 2621440))
-$(eval $(call training,ppo_recurrent,1,ppo_recurrent.py))
-$(eval $(call training,ppo_recurrent-short,1,ppo_recurrent.py --total-frames 1998848))
+$(eval $(call training,td3_gradient_guided-fast,td3_gradient_guided.py))
+$(eval $(call training,td3_gradient_guided-fast-one-thread,td3_gradient_guided.py))
+$(eval $(call training,td3_gradient_guided-fast-noise-0.05-0.05-5,td3_gradient_guided.py --noise 0.05 0.05 5))
+$(eval $(call training,td3-fast,td3_gradient_guided.py --preset td3-fast))
+$(eval $(call training,td3_gradient_guided-paper,td3_gradient_guided.py --preset paper --precision bfloat16))
+$(eval $(call training,td3-paper,td3_gradient_guided.py --preset td3-paper --precision bfloat16))
+$(eval $(call training,ppo_recurrent,ppo_recurrent.py))
+$(eval $(call training,ppo_recurrent-short,ppo_recurrent.py --total-frames 1998848))
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## /  \1\t/p' $(MAKEFILE_LIST) | expand -t 14

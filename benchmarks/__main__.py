@@ -92,7 +92,7 @@ class Report:
         results = DOCS / "results"
         (results / "performance.md").write_text(f"{table(self.rows)}\n{self.summary()}")
         (results / "profile.md").write_text(shares_table(self.content["profile"]))
-        cost_figure(self.content["vehicles"]).savefig(DOCS / "figures" / "cost-by-vehicles.png", dpi=110)
+        cost_figure(self.content["vehicles"]).savefig(results / "cost-by-vehicles.png", dpi=110)
 
 
 def main(args: list[str] | None = None) -> None:

@@ -1,11 +1,11 @@
-"""Draw the figures of the documentation from flights, and from the results of the tables in tables.toml.
+"""Draw the figures of the documentation.
 
-    python recipes/tables/figures.py section-4 noise learning     # from the runs of tables comparison, noise, learning
+    python recipes/tables/figures.py section-4 learning-spl       # from runs of evaluations and trainings
     python recipes/tables/figures.py conditions globe --out runs  # from new flights; five minutes and one minute
 
-Figures: section-4 (field contours 4-1, trajectories 4-4, convergence 4-5, box plots 4-6), learning (return 4-2, success
-rate 4-3, SPL), noise, conditions (the cost of each error alone), globe (a map of the Earth), prices (SPL over
-steps, from table prices), paper-run (learning curves of whole trainings).
+From new flights: conditions (the cost of each error alone), globe (a map of the Earth), noise (SPL over the noise, in
+the paper's box), prices (SPL over steps), reliability (of stated probabilities). From runs: section-4 (field contours
+4-1, trajectories 4-4, convergence 4-5, box plots 4-6), and the learning curves of figures.toml.
 """
 
 from __future__ import annotations
@@ -15,263 +15,214 @@ import os
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
 import csv
-import json
 import sys
+import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import tyro
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 from tqdm import tqdm
 
 from magrl.envs import PAPER_REGION, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import figures as plots
-from magrl.evaluation import summarize
 from magrl.evaluation.navigators import label
 from magrl.evaluation.runs import NO_NOISE
-from magrl.field import IGRF
-from magrl.field.records import WeatherRecord, weather_record
 from magrl.files import check_writable
-from magrl.training import UsageError, command, parse
-from magrl.transforms import Conditions, VectorErrors
+from magrl.training import UsageError, command
+from magrl.transforms import Conditions, load_conditions
 
 sys.path.insert(0, str(Path(__file__).parent))
-from flights import DRIFT_KM, LEVELS, earth_env, flown
+from flights import Flights, matching, reliability
 from globe import earth_tasks, globe_map, measured
-from grid import RESULTS, declared_tables
-from trainings import level_name, matching, read_curves
+from grid import RUNS, declared
 
 RECIPE = "figures.py"
+FILE = Path(__file__).parent / "figures.toml"
 Figures = Mapping[str, Figure]
-"""Figures by file name."""
-LEARNING = {
-    "fig-4-2-reward": ("return", "return, mean of the last 200 episodes"),
-    "fig-4-3-success": ("success_rate", "success rate over the last 200 episodes [%]"),
-    "learning-spl": ("eval_spl", "SPL on the validation tasks [%]"),
-}
-"""Column and label of each figure of learning curves."""
-PAPER_RUN = {
-    "return": "return, mean of\nthe last 200 episodes",
-    "success_rate": "success rate over\nthe last 200 episodes [%]",
-    "eval_spl": "SPL on the\nvalidation tasks [%]",
-}
+"""Figures by file, from the folder of the documentation."""
 SHOWN = ("gg_td3", "td3", "ga", "pso", "afsa", "secant", "parallel")
 """Navigators in the figures of Section 4."""
-BOXES = ("heading_mae_deg", "heading_rmse_deg", "smoothness_deg", "navigation_error_km")
-STD, SPEED_KM_H = (0.05, 0.05, 5.0), 24.0
-"""Noise and speed of the vehicle in figure conditions."""
+PILOTS = ("anywhere", "kalman", "secant", "map_matching", "parallel")
+LOOKS = dict(
+    zip(PILOTS, zip(("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000"), "osv^x", strict=True), strict=True)
+)
+"""Color and marker of navigators in panels."""
 
 
-@dataclass(frozen=True)
-class Config:
-    """Figures to draw."""
-
-    figures: tyro.conf.Positional[tuple[str, ...]]
-    """Names of figures."""
-    tasks: int | None = None
-    """Number of tasks of the flights; 200 for conditions and 10 000 for globe by default."""
-    out: Path = Path("docs/figures")
-    """Folder of the figures; files of the same name are replaced."""
-
-
-# Section 4 of the paper
+# From runs
 
 
 def columns_by_navigator(path: Path) -> dict[str, dict[str, list[float]]]:
     """Return the columns of a file of recipes/evaluate.py for each navigator of :data:`SHOWN`, without failures."""
-    found: dict[str, dict[str, list[float]]] = {}
-    with path.open() as file:
-        for row in csv.DictReader(file):
-            name = row.pop("navigator")
-            if name in SHOWN and row.pop("success", "True") == "True":
-                for key, value in row.items():
-                    found.setdefault(name, {}).setdefault(key, []).append(float(value or "nan"))
-    return found
+    columns: dict[str, dict[str, list[float]]] = {}
+    for row in csv.DictReader(path.read_text().splitlines()):
+        name = row.pop("navigator")
+        if name in SHOWN and row.pop("success", "True") == "True":
+            for key, value in row.items():
+                columns.setdefault(name, {}).setdefault(key, []).append(float(value or "nan"))
+    return columns
 
 
-def section_4(_: int | None) -> Figures:
+def section_4() -> Figures:
     """Return the field over the region, the example task of each navigator, and box plots."""
     contours = Figure(figsize=(7, 7.4), layout="constrained")
     field, task = Scenario().build_field(), named_tasks("figure-4-1")
     draw_tracks(contours.subplots(), field, PAPER_REGION, [task.start], task.target)
-    folder = Path(declared_tables()["comparison"]["folder"])
-    paths, episodes = (columns_by_navigator(folder / f"{name}.csv") for name in ("paths", "episodes"))
+    paths, episodes = (columns_by_navigator(RUNS / "comparison" / f"{name}.csv") for name in ("paths", "episodes"))
     tracks = {name: (columns["latitude"], columns["longitude"]) for name, columns in paths.items()}
-    boxes = {name: {key: columns[key] for key in BOXES} for name, columns in episodes.items()}
     return {
-        "fig-4-1-contours": contours,
-        "fig-4-4-trajectories": plots.compared_trajectories(tracks, field, task),
-        "fig-4-5-convergence": plots.convergence(paths, field, task),
-        "fig-4-6-boxes": plots.box_plots(boxes),
+        "figures/fig-4-1-contours": contours,
+        "figures/fig-4-4-trajectories": plots.compared_trajectories(tracks, field, task),
+        "results/fig-4-5-convergence": plots.convergence(paths, field, task),
+        "results/fig-4-6-boxes": plots.box_plots(episodes),
     }
 
 
-def learning(_: int | None, *, table: str = "learning", shown: Mapping[str, tuple[str, str]] = LEARNING) -> Figures:
-    """Return the learning curves of the runs of a table: by figure, the column and label that are ``shown``."""
-    runs = declared_tables()[table]["runs"]
-    found = {name: [read_curves(run) for run in matching(pattern)] for name, pattern in runs.items()}
-    return {
-        figure: plots.learning_curves(
-            {name: [(list(c["frames"]), list(c[column])) for c in curves] for name, curves in found.items()}, title
+def curves(name: str) -> Figures:
+    """Return the learning curves of a figure in figures.toml."""
+    options, values = declared(FILE)["curves"][name], {}
+    for navigator, pattern in options["runs"].items():
+        texts = [(Path(run) / "train.csv").read_text().splitlines() for run in matching(pattern)]
+        columns = [
+            [[float(row[key] or "nan") for row in csv.DictReader(text)] for key in ("frames", options["column"])]
+            for text in texts
+        ]
+        values[navigator] = [(frames, column) for frames, column in columns]
+    return {options["file"]: plots.learning_curves(values, options["label"])}
+
+
+# From new flights
+
+
+def noise(tasks: int | None = None) -> Figures:
+    """Return SPL over the noise, from the flights of table noise."""
+    options = declared()["noise"] | ({"tasks": tasks} if tasks else {})
+    flights = Flights(**{key: value for key, value in options.items() if key not in ("kind", "navigators")})
+    levels = {
+        name: {pilot.partition("=")[0]: flights.summaries(pilot, errors) for pilot in options["navigators"]}
+        for name, errors in flights.errors.items()
+    }
+    return {"figures/noise": plots.noise_figure(levels)}
+
+
+def look(navigator: str) -> dict[str, Any]:
+    """Return color, marker and label of a navigator in panels."""
+    color, marker = LOOKS[navigator]
+    return {"color": color, "marker": marker, "label": label(navigator).partition(" (")[0], "ms": 4, "lw": 1.3}
+
+
+def one_error(lines: str, size: object = "") -> Conditions:
+    """Return a size of an error in figures.toml, beside noise of the sensors of a ship."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "error.toml"
+        path.write_text(
+            f"speed_km_h = 24.0\nsensors.sensor_std = [0.05, 0.05, 5.0]\n{lines.replace('SIZE', str(size))}"
         )
-        for figure, (column, title) in shown.items()
-    }
+        return load_conditions(path)
 
 
-def noise(_: int | None) -> Figures:
-    """Return SR and SPL over the noise, from the evaluations of table noise."""
-    levels = declared_tables()["noise"]["levels"]
-    found = {level_name(std): Path(f"runs/noise-{std[0]:g}/summary.json").read_text() for std in levels}
-    return {"noise": plots.noise_figure({name: json.loads(text) for name, text in found.items()}, "look-ahead")}
-
-
-def paper_run(_: int | None) -> Figures:
-    """Return the curves of the runs of table paper-run, over the moves of the vehicle."""
-    figure = Figure(figsize=(8, 8.4), layout="constrained")
-    panels = figure.subplots(len(PAPER_RUN), sharex=True)
-    runs = {name: read_curves(run) for name, run in declared_tables()["paper-run"]["runs"].items()}
-    for axes, (column, title) in zip(panels, PAPER_RUN.items(), strict=True):
-        for name, curves in runs.items():
-            axes.plot(curves["frames"], curves[column], label=name, lw=1.2)
-        axes.set_ylabel(title)
-        axes.grid(alpha=0.3)
-    panels[0].legend(fontsize=8)
-    panels[-1].set_xlabel("moves of the vehicle")
-    panels[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
-    return {"paper-run": figure}
-
-
-# The cost of each error
-
-
-def sensors(**errors: object) -> Conditions:
-    """Return conditions with errors of the sensors beside the noise."""
-    return Conditions("sensors", sensors={"sensor_std": STD, **errors})
-
-
-def motion(**errors: float) -> Conditions:
-    """Return conditions with errors of motion."""
-    return Conditions("motion", SPEED_KM_H, sensors={"sensor_std": STD}, motion=errors)
-
-
-def weather(factor: float) -> Conditions:
-    """Return conditions with a multiple of the weather of a month."""
-    month = weather_record("boulder-2016")
-    record = WeatherRecord(factor * month.variation, month.first, month.last, f"{factor:g} x {month.name}")
-    return Conditions("weather", SPEED_KM_H, sensors={"sensor_std": STD}, weather={"record": record})
-
-
-def north(size: float) -> Conditions:
-    """Return conditions with a constant error of the north reference."""
-    return Conditions("north", sensors={"sensor_std": STD}, north={"constant_deg": size, "fixed": True})
-
-
-PANELS: Mapping[str, tuple[Callable[[float], Conditions], tuple[float, ...]]] = {
-    "bias of D [°]": (lambda size: sensors(bias=(size, 0.0, 0.0)), (0.1, 0.3, 1.0, 3.0)),
-    "north reference, constant b [°]": (north, (0.1, 0.5, 1.0, 3.0)),
-    "bias of I [°]": (lambda size: sensors(bias=(0.0, size, 0.0)), (0.05, 0.1, 0.2, 0.5)),
-    "hard iron [nT]": (lambda size: sensors(vector=VectorErrors((size,) * 3)), (10.0, 30.0, 60.0, 100.0)),
-    "roll and pitch [°]": (lambda size: sensors(vector=VectorErrors(attitude_deg=(size,) * 2)), (0.02, 0.05, 0.1, 0.2)),
-    "drift of $B_H$ over 200 km [nT]": (
-        lambda size: sensors(drift=(0.0, 0.0, size), drift_length=200.0),
-        (10.0, 30.0, 60.0, 100.0),
-    ),
-    "weather, 1 = January 2016": (weather, (0.5, 1.0, 2.0, 4.0)),
-    "outages [share of readings]": (lambda size: sensors(outage_rate=size), (0.05, 0.1, 0.3, 0.5)),
-    "scale of the log [share]": (lambda size: motion(log_scale=size), (0.02, 0.05, 0.1, 0.15)),
-    "compass in motion [°]": (lambda size: motion(compass_deg=size), (2.0, 5.0, 10.0, 20.0)),
-    "current [share of the speed]": (lambda size: motion(current_km_h=size * SPEED_KM_H), (0.05, 0.1, 0.2, 0.4)),
-}
-"""Conditions of each error by its size, and sizes; of normal errors the standard deviation."""
-
-
-def conditions(tasks: int | None) -> Figures:
-    """Return a panel for each error, SPL over its size for each navigator of table conditions.
+def conditions(tasks: int = 200) -> Figures:
+    """Return a panel for each error, SPL over its size for each navigator.
 
     Everything else is as at the noise alone, which is the first point of each panel.
     """
-    base = earth_env(tasks or 200, reach_km=DRIFT_KM, drift_km=DRIFT_KM)
-    figure = Figure(figsize=(11, 7.5), layout="constrained")
-    panels = list(figure.subplots(3, 4, sharey=True).flat)
-    names = [navigator for navigator in declared_tables()["conditions"]["navigators"] if isinstance(navigator, str)]
-    for index, navigator in enumerate(tqdm(names, unit="navigator")):
-        alone = summarize(flown(navigator, base, sensors()))["spl"]
-        look = {"color": plots.NAVIGATOR_COLORS[navigator], "ls": ("-", "--")[index % 2]}
-        look["label"] = label(navigator).partition(" (")[0]
-        for axes, (make, sizes) in zip(panels, PANELS.values(), strict=False):
-            spl = [summarize(flown(navigator, base, make(size)))["spl"] for size in sizes]
-            axes.plot([alone, *spl], marker="o", ms=3, lw=1.3, **look)
-    for axes, (title, (_, sizes)) in zip(panels, PANELS.items(), strict=False):
-        axes.set_xticks(range(len(sizes) + 1), [f"{size:g}" for size in (0.0, *sizes)])
-        axes.set_xlabel(title, fontsize=9)
-        axes.set_ylim(0, 101)
-        axes.grid(alpha=0.3)
-    for axes in figure.axes[::4]:
-        axes.set_ylabel("SPL [%]")
-    figure.axes[-1].axis("off")
-    figure.axes[-1].legend(*figure.axes[0].get_legend_handles_labels(), loc="center")
-    return {"conditions": figure}
+    flights = Flights(["ship"], tasks=tasks)  # its environment lets errors move vehicles
+    figure, errors = Figure(figsize=(11, 7.5), layout="constrained"), declared(FILE)["errors"]
+    *panels, last = figure.subplots(3, 4, sharey=True).flat
+    for navigator in tqdm(LOOKS, unit="navigator"):
+        alone = flights.summaries(navigator, one_error(""))[0]["spl"]
+        for axes, (title, error) in zip(panels, errors.items(), strict=True):
+            sizes = [one_error(error["lines"], size) for size in error["sizes"]]
+            axes.plot([alone, *(flights.summaries(navigator, size)[0]["spl"] for size in sizes)], **look(navigator))
+            axes.set_xticks(range(len(sizes) + 1), ["0", *(f"{size}" for size in error["sizes"])])
+            axes.set_xlabel(title, fontsize=9)
+            axes.grid(alpha=0.3)
+    figure.supylabel("SPL [%]")
+    last.axis("off")
+    last.legend(*panels[0].get_legend_handles_labels(), loc="center")
+    return {"figures/conditions": figure}
 
 
-# The map of the Earth
-
-
-def globe(tasks: int | None) -> Figures:
+def globe(tasks: int = 10_000) -> Figures:
     """Return the map of the tasks of table globe, with perfect sensors."""
-    field, ends = IGRF("2025-01-01"), earth_tasks(tasks or 10_000)
-    return {"globe": globe_map(field, ends, measured(declared_tables()["globe"]["navigator"], field, ends, NO_NOISE))}
+    ends = earth_tasks(tasks)
+    return {"figures/globe": globe_map(ends, measured("anywhere", ends, NO_NOISE))}
 
 
-def prices(_: int | None) -> Figures:
-    """Return SPL over the steps from table prices, a panel for each level of noise, a point for each price."""
-    lines = (RESULTS / "prices.md").read_text().splitlines()
-    head, _, *rows = ([cell.strip() for cell in line.strip("| ").split("|")] for line in lines)
-    figure = Figure(figsize=(10, 2.8), layout="constrained")
-    for column, axes in enumerate(figure.subplots(1, len(LEVELS)), start=len(head) - len(LEVELS)):
+def prices(tasks: int = 1000) -> Figures:
+    """Return SPL over the steps, a panel for each level of noise, a point for each price of a step."""
+    flights, figure = Flights(tasks=tasks), Figure(figsize=(9, 3.2), layout="constrained")
+    panels = figure.subplots(1, len(flights.errors), sharex=True, sharey=True)
+    for (title, errors), axes in zip(tqdm(flights.errors.items(), unit="level"), panels, strict=True):
         for name in ("anywhere", "kalman"):
-            points = [row[column].split(" / ") for row in rows if row[0].startswith(label(name))]
-            steps, spl = zip(*sorted((float(steps), float(spl)) for _, spl, steps in points), strict=True)
-            axes.plot(steps, spl, "o-", ms=3, lw=1, label=label(name))
-        axes.set(title=head[column], xlabel="steps")
+            pilots = [{"name": name, "step_price": price} for price in (0.1, 0.5, 2.0, 8.0, 30.0)]
+            points = [flights.summaries(pilot, errors)[0] for pilot in pilots]
+            axes.plot([point["steps"] for point in points], [point["spl"] for point in points], **look(name))
+        axes.set(title=title, xlabel="steps")
         axes.grid(alpha=0.3)
-    figure.axes[0].set_ylabel("SPL [%]")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
-    return {"prices": figure}
+    panels[0].set_ylabel("SPL [%]")
+    panels[0].legend()
+    return {"figures/prices": figure}
 
 
-FIGURES: Mapping[str, Callable[[int | None], Figures]] = {
+def reliability_diagram(tasks: int = 2000) -> Figures:
+    """Return the share of readings at which `anywhere` is within 25 km, over the probability that it states.
+
+    One panel is for white noise, one for the errors of vehicles; bars are intervals of 95 %, clustered by region.
+    """
+    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, names in zip(panels, ((), ("aircraft", "ship", "underwater", "low-cost")), strict=True):
+        flights = Flights(names, tasks=tasks, regions=min(tasks, 512), max_steps=80, within_km=25.0)
+        axes.axline((0, 0), (100, 100), color="#808080", lw=1, ls="--")
+        for (name, errors), (color, marker) in zip(flights.errors.items(), LOOKS.values(), strict=False):
+            bins = reliability(flights.fly("anywhere", errors), flights.env.scenario.tasks.region, 25.0)
+            axes.errorbar(*zip(*bins, strict=True), color=color, marker=marker, ms=4, lw=1.2, capsize=2, label=name)
+        axes.set_xlabel("stated probability [%]")
+        axes.legend(fontsize=8)
+    panels[0].set_ylabel("share of readings within 25 km [%]")
+    return {"figures/reliability": figure}
+
+
+FIGURES: Mapping[str, Callable[..., Figures]] = {
     "section-4": section_4,
-    "learning": learning,
-    "sequences": partial(learning, table="sequences-learning", shown={"sequences": LEARNING["learning-spl"]}),
     "noise": noise,
     "conditions": conditions,
     "globe": globe,
-    "paper-run": paper_run,
     "prices": prices,
+    "reliability": reliability_diagram,
 }
 
 
-def draw(config: Config) -> None:
+def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = None, out: Path = Path("docs")) -> None:
     """Draw figures.
+
+    Args:
+        figures: Names of figures.
+        tasks: Number of tasks of new flights; by default 200 for conditions, 10 000 for globe, 2000 for reliability,
+            and 1000 otherwise.
+        out: Folder of the folders figures and results; files of the same name are replaced.
 
     Raises:
         UsageError: for an unknown figure, or a missing file.
     """
-    if unknown := [name for name in config.figures if name not in FIGURES] or not config.figures:
-        raise UsageError(f"unknown figure {unknown}: choose from {', '.join(FIGURES)}")
+    known = [*FIGURES, *declared(FILE)["curves"]]
+    if unknown := [name for name in figures if name not in known] or not figures:
+        raise UsageError(f"unknown figure {unknown}: choose from {', '.join(known)}")
+    options = {"tasks": tasks} if tasks else {}
     try:
-        for name in config.figures:
-            for file, figure in FIGURES[name](config.tasks).items():
-                check_writable(config.out / f"{file}.png")
-                figure.savefig(config.out / f"{file}.png", dpi=110)
-                print(config.out / f"{file}.png")
+        for name in figures:
+            made = FIGURES[name](**options) if name in FIGURES else curves(name)
+            for file, figure in made.items():
+                check_writable(out / f"{file}.png")
+                figure.savefig(out / f"{file}.png", dpi=110)
+                print(out / f"{file}.png")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
 
 
 if __name__ == "__main__":
-    command(RECIPE, lambda: draw(parse(Config, RECIPE, __doc__)))
+    command(RECIPE, lambda: tyro.cli(draw, prog=RECIPE, description=__doc__))

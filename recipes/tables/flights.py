@@ -1,174 +1,185 @@
-"""Flights of the tables: random regions of the Earth, and navigators with the data sheets of their sensors."""
+"""Flights of tables and figures: frozen tasks in random regions of the Earth, and navigators with their data sheets."""
 
 from __future__ import annotations
 
+import glob
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import ObservationNorm, TransformedEnv
 
 from magrl import paper
-from magrl.envs import GeomagneticNavEnv, earth_scenario, planet_scenario
-from magrl.evaluation import episode_measures, evaluation_rollout, with_declaration, with_errors
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, earth_scenario, named_tasks
+from magrl.evaluation import episode_measures, evaluation_rollout, summarize, with_declaration, with_errors
+from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import label, make_navigator, needs
 from magrl.evaluation.runs import NO_NOISE, Noise
-from magrl.field.model import elements_gradient_at
-from magrl.tracking import common_error
+from magrl.evaluation.tables import mean_of_runs
+from magrl.geodesy import geodesic
 from magrl.transforms import Conditions, conditions_named
 
-FAR_KM = 500.0
-"""Longest distance of the paper's tasks; beyond, regions are larger and cells begin with kilometers."""
+Errors, Measures = Noise | Conditions, Mapping[str, Tensor]
+Spec = str | Mapping[str, Any]
+"""Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
+LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
+"""Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
 DRIFT_KM = 40.0
 """How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
 SEED = 3 * paper.FIRST_RESERVED_SEED
 """Seed of regions and tasks, beyond those of trainings and of frozen sets."""
-LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.5, 0.1, 20.0))
-"""Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
-OPTIONS = {"map_date": "map of", "prior": "prior of a", "step_price": "step [% of SPL]"}
-Spec = str | Mapping[str, Any]
-"""Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
 
 
-def flown(
-    navigator: TensorDictModuleBase | Spec,
+@dataclass(frozen=True)
+class Flights:
+    """Tasks that navigators fly under several errors, and how they end."""
+
+    conditions: Sequence[str] = ()
+    """Errors of real vehicles; by default there is white noise of several levels."""
+    levels: Sequence[Noise] = LEVELS
+    tasks: int = 1000
+    regions: int = 128
+    distance_km: Sequence[float] = paper.DISTANCE_KM
+    max_steps: int = 50
+    within_km: float | None = None
+    """Radius in which vehicles declare their arrival [km]; by default they are told, by the paper's rule."""
+    confidence: float = 0.0
+    """Least probability at which vehicles declare their arrival."""
+    known_start: Sequence[float] | None = None
+    """Standard deviations of the elements at the start, where the vehicles know them."""
+    box: bool = False
+    """Whether the tasks are those of the paper's box, ``test-1000``, in place of random regions."""
+
+    @property
+    def far(self) -> bool:
+        """Whether tasks are longer than the paper's."""
+        return self.distance_km[1] > paper.DISTANCE_KM[1]
+
+    @cached_property
+    def errors(self) -> dict[str, Errors]:
+        """Errors by the headings of their columns."""
+        levels: dict[str, Errors] = {", ".join(f"{std:g}" for std in noise): noise for noise in self.levels}
+        return {name: conditions_named(name) for name in self.conditions} or levels
+
+    @cached_property
+    def env(self) -> GeomagneticNavEnv:
+        """Environment of the tasks without errors, with one vehicle for each task."""
+        size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if self.far else {"max_latitude": 70}
+        size |= {"distance_range_km": tuple(self.distance_km), "max_move_km": 50.0 + DRIFT_KM * bool(self.conditions)}
+        earth = Scenario() if self.box else earth_scenario(self.regions, SEED, **size, start_heading="random")
+        tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, SEED)
+        options: dict[str, Any] = {"drift_km": DRIFT_KM} if self.conditions else {}
+        options |= {"arrival": "declared", "arrival_radius_km": self.within_km} if self.within_km else {}
+        scenario = earth.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
+        return GeomagneticNavEnv(scenario, num_envs=self.tasks, max_steps=self.max_steps, seed=0, **options)
+
+    @property
+    def measures(self) -> list[str]:
+        """Measures in a cell of a table."""
+        last = [] if self.box else ["false_arrival_rate" if self.within_km else "steps"]
+        return [*["success_rate_within_25km"] * self.far, "success_rate", "spl", *last]
+
+    def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
+        """Return an episode of each task."""
+        return fly(self.env, navigator, errors, self.confidence, self.known_start)
+
+    def episodes(self, navigator: Spec, errors: Errors) -> list[Measures]:
+        """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""
+        return [episode_measures(self.fly(run, errors)) for run in runs_of(navigator)]
+
+    def summaries(self, navigator: Spec, errors: Errors) -> list[dict[str, float]]:
+        """Return the summary of each run of a navigator."""
+        return [summarize(episodes) for episodes in self.episodes(navigator, errors)]
+
+
+def fly(
     base: GeomagneticNavEnv,
-    errors: Noise | Conditions,
+    navigator: Spec,
+    errors: Errors,
     confidence: float = 0.0,
     known_start: Sequence[float] | None = None,
-    stated: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> TensorDictBase:
-    """Return the measures of an episode of each vehicle, under noise or under the conditions of a real vehicle.
-
-    Args:
-        navigator: navigator.
-        base: environment without errors.
-        errors: noise of the sensors, or conditions.
-        confidence: least probability at which navigators declare arrivals, where they must be declared.
-        known_start: standard deviations of the elements at the start, where the vehicle knows them.
-        stated: noise on the data sheet over the true noise of D, I and B_H.
-    """
-    return episode_measures(rollout(navigator, base, errors, confidence, known_start, stated))
-
-
-def rollout(
-    navigator: TensorDictModuleBase | Spec,
-    base: GeomagneticNavEnv,
-    errors: Noise | Conditions,
-    confidence: float = 0.0,
-    known_start: Sequence[float] | None = None,
-    stated: Sequence[float] = (1.0, 1.0, 1.0),
-) -> TensorDictBase:
-    """Return an episode of each vehicle, as :func:`flown` measures it."""
+    """Return an episode of each vehicle of an environment without errors, under some errors."""
     env, sheet = with_errors(base, errors, base.seed, known_start)
-    if any(factor != 1 for factor in stated):
-        env = TransformedEnv(env, ObservationNorm(0.0, torch.tensor(stated), in_keys=["sensor_std"]), auto_unwrap=True)
-        sheet["sensor_std"] = tuple(a * b for a, b in zip(sheet["sensor_std"], stated, strict=True))
-    if isinstance(navigator, str):
-        navigator = {"name": navigator}
-    if isinstance(navigator, Mapping):
-        options = {key: value for key, value in navigator.items() if key != "name"}
-        navigator = make_navigator(navigator["name"], base, **sheet, **options)
-    return evaluation_rollout(with_declaration(env, confidence, navigator), navigator)
+    options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
+    pilot = make_navigator(options.pop("name"), base, **sheet, **options)
+    return evaluation_rollout(with_declaration(env, confidence, pilot), pilot)
 
 
-def earth_env(
-    tasks: int,
-    distance_km: Sequence[float] = paper.DISTANCE_KM,
-    date: str = "2025-01-01",
-    regions: int = 128,
-    *,
-    num_envs: int | None = None,
-    reach_km: float = 0.0,
-    crust: bool = False,
-    planets: bool = False,
-    **options: Any,
-) -> GeomagneticNavEnv:
-    """Return an environment of frozen tasks in random regions, large enough for the longest distance.
+def clustered(values: Tensor, region: Tensor) -> tuple[float, float]:
+    """Return the mean of ``(N,)`` values, and the half-width of its 95 % interval, clustered by their regions ``(N,)``.
 
-    Args:
-        tasks: number of tasks.
-        distance_km: shortest and longest distance of a task [km].
-        date: date of the field.
-        regions: number of regions.
-        num_envs: number of vehicles; by default one for each task.
-        reach_km: how far errors may carry a vehicle beyond its longest move [km].
-        crust: whether the field is WMMHR, with the crust, in place of IGRF.
-        planets: whether the regions are those of random planets, on which options are chosen, in place of the Earth.
-        options: options of the environment.
+    Values of a region are not independent: the standard error is that of the sums over each region.
     """
-    far = distance_km[1] > FAR_KM
-    size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"half_size_deg": 10, "max_latitude": 70}
-    size |= {"distance_range_km": tuple(distance_km), "max_move_km": 50.0 + reach_km}
-    if planets:
-        scenario = planet_scenario(regions, SEED, **size)
-    else:
-        scenario = earth_scenario(regions, SEED, date, crust=crust, **size)
-    scenario = scenario.with_tasks(scenario.random_tasks(tasks, SEED))
-    return GeomagneticNavEnv(scenario, num_envs=num_envs or tasks, start_heading="random", seed=0, **options)
-
-
-def estimate_within(
-    radius_km: float,
-    base: GeomagneticNavEnv,
-    errors: Noise | Conditions,
-    known_start: Sequence[float] | None = None,
-    readings: int = 8,
-) -> float:
-    """Return the probability that an estimate of the destination is within a radius of it, mean over the tasks [%].
-
-    The estimate is that of weighted least squares from some readings at the destination, with the true gradients and
-    the data sheet at the start: the bound of vehicles that do not search.
-    """
-    env, sheet = with_errors(base, errors, base.seed, known_start)
-    jacobian = elements_gradient_at(base.field, base.scenario.tasks.target, base.scenario.tasks.region)
-    start = env.reset()
-    new, constant = (start.get(key, jacobian.new_tensor(std)).to(jacobian).square() for key, std in sheet.items())
-    alike = common_error(start["target_field"].to(jacobian)) * constant.sqrt()
-    own = torch.diag_embed((new / readings + constant - alike.square()).clamp_min(1e-12))
-    noise = own + alike.unsqueeze(-1) * alike.unsqueeze(-2)
-    covariance = torch.linalg.pinv(jacobian.mT @ torch.linalg.solve(noise, jacobian))
-    angle = torch.arange(360, dtype=jacobian.dtype).deg2rad()
-    spread = torch.linalg.eigvalsh(covariance).clamp_min(0) @ torch.stack((angle.cos(), angle.sin())).square()
-    return 100 * (1 - torch.exp(-(radius_km**2) / (2 * spread))).mean().item()
-
-
-def number(value: float) -> str:
-    """Return a measure as text; it has no value where nothing arrives."""
-    return "—" if math.isnan(value) else f"{value:.1f}"
+    sums = torch.bincount(region, values - values.mean())
+    return values.mean().item(), 1.96 * (sums.square().sum() * len(sums) / (len(sums) - 1)).sqrt().item() / len(values)
 
 
 def paired_difference(first: Tensor, second: Tensor, region: Tensor) -> str:
-    """Return the mean difference of two shares over the same tasks, in percent, with an interval of 95 %.
+    """Return the mean difference of two shares ``(N,)`` of the same tasks, in percent, with an interval of 95 %.
 
-    Tasks of a region are not independent: the standard error is that of the sums over each region. An interval that
-    excludes 0 is bold.
+    An interval that excludes 0 is bold.
+    """
+    mean, half = clustered(100 * (first - second).double().flatten(), region)
+    text = f"{mean:+.1f} ({mean - half:+.1f} to {mean + half:+.1f})"
+    return f"**{text}**" if abs(mean) > half else text
+
+
+def reliability(flight: TensorDictBase, region: Tensor, radius_km: float) -> list[tuple[float, float, float]]:
+    """Return, for ten bins of the stated probability of being in the radius, its mean, the share right, and its error.
+
+    In percent; the error is the half-width of an interval of 95 %. Bins of fewer than 100 readings are left out.
 
     Args:
-        first: share of each task ``(tasks,)``.
-        second: the same of the other navigator.
-        region: region of each task ``(tasks,)``.
+        flight: ``(N, T)`` from vehicles that declare.
+        region: region of each vehicle ``(N,)``.
+        radius_km: radius in which a declaration is right [km].
     """
-    difference = 100 * (first - second).double().flatten()
-    mean, count = difference.mean(), int(region.max()) + 1
-    sums = torch.zeros(count, dtype=torch.float64).index_add(0, region.cpu(), difference - mean)
-    error = (sums.square().sum() * count / (count - 1)).sqrt().item() / len(difference)
-    text = f"{mean.item():+.1f} ({mean.item() - 1.96 * error:+.1f} to {mean.item() + 1.96 * error:+.1f})"
-    return f"**{text}**" if abs(mean.item()) > 1.96 * error else text
+    flown = first_episode_mask(flight["next", "done"]).squeeze(-1)
+    stated, ends = flight["arrival_probability"][flown].squeeze(-1).double(), flight["target_position"][flown]
+    right = geodesic(*flight["position"][flown].unbind(-1), *ends.unbind(-1))[0] <= radius_km
+    region, bins = region.unsqueeze(-1).expand_as(flown)[flown], (10 * stated).long().clamp_max(9)
+    chosen = [bins == place for place in range(10) if (bins == place).sum() >= 100]
+    return [(100 * stated[one].mean().item(), *clustered(100 * right[one].double(), region[one])) for one in chosen]
 
 
-def columns_of(conditions: Sequence[str]) -> dict[str, Noise | Conditions]:
-    """Return some conditions by name, or the levels of noise."""
-    columns: dict[str, Noise | Conditions] = {found.name: found for found in map(conditions_named, conditions)}
-    return columns or {", ".join(f"{level:g}" for level in noise): noise for noise in LEVELS}
+def matching(pattern: str) -> list[str]:
+    """Return the paths that a pattern names, in natural order.
+
+    Raises:
+        FileNotFoundError: for a pattern without a match.
+    """
+    paths = sorted(glob.glob(pattern), key=lambda path: (len(path), path))
+    if not paths:
+        raise FileNotFoundError(f"there is no {pattern}: train it by make tables")
+    return paths
+
+
+def runs_of(navigator: Spec) -> list[Spec]:
+    """Return a navigator once for each run that its pattern names."""
+    name, _, pattern = navigator.partition("=") if isinstance(navigator, str) else ("", "", "")
+    return [f"{name}={run}" for run in matching(pattern)] if "*" in pattern else [navigator]
+
+
+def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
+    """Return measures of the episodes of one or several runs; of several, the SPL has an interval."""
+    found = [summarize(episodes) for episodes in runs]
+    if len(found) == 1:
+        return " / ".join("—" if math.isnan(found[0][name]) else f"{found[0][name]:.1f}" for name in measures)
+    return " / ".join(
+        mean_of_runs([run[name] for run in found], form=".1f", interval=name == "spl") for name in measures
+    )
 
 
 def names(navigator: Spec) -> list[str]:
     """Return the label of a navigator, with the options that are given, and what it needs."""
-    name, *options = navigator.items() if isinstance(navigator, Mapping) else [("name", navigator)]
-    known = name[1].partition("=")[0]
-    return [", ".join([label(known), *(f"{OPTIONS.get(key, key)} {value}" for key, value in options)]), needs(known)]
+    options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
+    name = options.pop("name").partition("=")[0]
+    return [
+        ", ".join([label(name), *(f"{key.replace('_', ' ')} {value}" for key, value in options.items())]),
+        needs(name),
+    ]

@@ -8,57 +8,32 @@ A document marks the place and the file of a table by `<!-- table: docs/results/
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-import tyro
+from magrl.training import UsageError, command
 
-from magrl.training import UsageError, command, parse
-
-RECIPE = "publish.py"
 BLOCK = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-@dataclass
-class Config:
-    """Documents to fill."""
-
-    documents: tyro.conf.Positional[tuple[Path, ...]]
-    """Markdown files with marked tables."""
-    root: Path = Path()
-    """Folder that the paths of tables start from."""
-
-
-def filled(text: str, root: Path) -> str:
-    """Return a document with the present content of its tables.
-
-    Raises:
-        UsageError: for a missing table.
-    """
-
-    def block(match: re.Match[str]) -> str:
-        path = root / match[2]
-        if not path.is_file():
-            raise UsageError(f"there is no table {path}: see `make paper`")
-        return match[1] + "\n" + path.read_text().strip() + "\n\n" + match[3]
-
-    return BLOCK.sub(block, text)
-
-
-def publish(config: Config) -> None:
-    """Fill all documents, or none where one cannot be read or lacks a table.
+def publish(documents: Sequence[Path], root: Path = Path()) -> None:
+    """Fill all documents, or none where one cannot be read or lacks a table; tables are in a folder ``root``.
 
     Raises:
         UsageError: for a missing document or table.
     """
-    missing = [str(document) for document in config.documents if not document.is_file()]
-    if missing:
-        raise UsageError(f"there is no document {', '.join(missing)}")
-    texts = {document: filled(document.read_text(), config.root) for document in config.documents}
+
+    def block(match: re.Match[str]) -> str:
+        return f"{match[1]}\n{(root / match[2]).read_text().strip()}\n\n{match[3]}"
+
+    try:
+        texts = {document: BLOCK.sub(block, document.read_text()) for document in documents}
+    except OSError as error:
+        raise UsageError(str(error)) from error
     for document, text in texts.items():
         document.write_text(text)
-        print(document)
 
 
 if __name__ == "__main__":
-    command(RECIPE, lambda: publish(parse(Config, RECIPE, __doc__)))
+    command("publish.py", lambda: publish([Path(name) for name in sys.argv[1:]]))
