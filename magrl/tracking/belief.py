@@ -25,7 +25,7 @@ from magrl.tracking.planning import MISSING_KM, SLOPES
 from magrl.tracking.priors import field_curvature
 from magrl.tracking.track import reading_std
 
-# Compared with others on random planets: docs/results/data-sheet-options.md.
+# Chosen on random planets.
 SHEET_READINGS = 4.0
 """Number of readings that count as much as the data sheet, where its noise is estimated."""
 SHARED = 0.5

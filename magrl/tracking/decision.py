@@ -25,7 +25,7 @@ from magrl.tracking.posterior import WayPosterior, _normal, way_posterior
 from magrl.tracking.priors import common_error, curl_relation, field_curvature
 from magrl.tracking.track import related
 
-# Compared with others on random planets: docs/results/decision-options.md.
+# Chosen on random planets.
 TRIP_KM = 800.0
 """Path before the decision [km]: another kilometer has to make a right declaration about 1/800 more likely."""
 STEP_KM = 0.5
