@@ -1,7 +1,5 @@
-"""Tables from the declarative file, and the figures: flights by hand, cells by hand, and files that are named."""
+"""Tables and figures from their declarative files: flights and cells by hand, and files that are named."""
 
-import functools
-import json
 import math
 import sys
 from pathlib import Path
@@ -13,36 +11,35 @@ from matplotlib.figure import Figure
 from support.recipes import RECIPES
 from tensordict import TensorDict
 
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
+from magrl.envs import Scenario, Tasks
 from magrl.field import IGRF
-from magrl.field.model import elements_gradient_at
-from magrl.tracking import decision
 from magrl.training import UsageError
-from magrl.transforms import CONDITIONS
 
 sys.path.insert(0, str(RECIPES / "tables"))
-import declarations
 import figures
 import flights
 import globe
 import grid
 import publish
-import trainings
 
 
 def rows(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
 
 
-# The file
+# The files
 
 
-def test_every_table_declares_options_of_its_kind() -> None:
-    known = grid.declared_tables()
-    assert {"earth", "conditions", "globe", "readme", "learning", "alone", "paper-run"} <= known.keys()
-    for name, options in known.items():
-        grid.inspect.signature(grid.KINDS[options.pop("kind")]).bind(**options)
-        assert not set(options.get("of", ())) - known.keys(), name
+def test_tables_and_errors_declare_options_that_exist() -> None:
+    for options in grid.declared().values():
+        if options.pop("kind") == "flights":
+            del options["navigators"]
+            options.pop("against", None)
+            columns = options.get("conditions") or options.get("levels", flights.LEVELS)
+            assert len(flights.Flights(**options).errors) == len(columns)
+    for error in grid.declared(figures.FILE)["errors"].values():
+        for size in error["sizes"]:
+            assert not figures.one_error(error["lines"], size).perfect
 
 
 @pytest.mark.parametrize(
@@ -50,18 +47,20 @@ def test_every_table_declares_options_of_its_kind() -> None:
     [
         (("mars",), {}, "declares no table mars: choose from"),
         (("earth",), {"navigators": ("dowsing",), "tasks": 2}, "earth: unknown navigator 'dowsing'"),
-        (("learning",), {"tasks": 3}, "learning: got an unexpected keyword argument 'tasks'"),
-        (("learning",), {}, "there is no runs/.*: train it by make tables"),
+        (("globe",), {"confidence": 0.9}, "globe: .* unexpected keyword argument 'confidence'"),
+        (("sequences",), {}, "there is no runs/.*: train it by make tables"),
     ],
 )
 def test_bad_usage(tables, changes: dict, message: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError, match=message):
-        grid.make(grid.Config(tables, **changes))
+        grid.make(tables, **changes)
     with pytest.raises(UsageError, match="unknown figure"):
-        figures.draw(figures.Config(("mars",)))
+        figures.draw(("mars",))
     with pytest.raises(UsageError, match="No such file"):
-        figures.draw(figures.Config(("noise",)))
+        figures.draw(("section-4",))
+    with pytest.raises(UsageError, match=r"there is no runs/.*seed"):
+        figures.draw(("learning-spl",))
 
 
 def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
@@ -69,10 +68,10 @@ def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
     (tmp_path / "a.md").write_text("| 1 |\n")
     page.write_text("x\n<!-- table: a.md -->\nold\n<!-- end -->\ny")
     other.write_text("<!-- table: b.md -->\n<!-- end -->")
-    with pytest.raises(UsageError, match=r"there is no table .*b\.md"):
-        publish.publish(publish.Config((page, other), tmp_path))
+    with pytest.raises(UsageError, match=r"No such file .*b\.md"):
+        publish.publish((page, other), tmp_path)
     assert "old" in page.read_text()
-    publish.publish(publish.Config((page,), tmp_path))
+    publish.publish((page,), tmp_path)
     assert page.read_text() == "x\n<!-- table: a.md -->\n\n| 1 |\n\n<!-- end -->\ny"
 
 
@@ -80,54 +79,56 @@ def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
 
 
 @pytest.fixture(autouse=True)
-def few_regions_and_levels(monkeypatch) -> None:
-    monkeypatch.setattr(flights, "LEVELS", flights.LEVELS[::4])
-    for module in (grid, declarations):
-        monkeypatch.setattr(module, "earth_env", functools.partial(flights.earth_env, regions=4))
+def few_regions(monkeypatch) -> None:
+    earth = flights.earth_scenario
+    monkeypatch.setattr(
+        flights, "earth_scenario", lambda count, *rest, **options: earth(min(count, 4), *rest, **options)
+    )
 
 
-def test_earth_has_a_row_for_each_date_and_navigator(tmp_path: Path) -> None:
-    dates = ["1900-01-01", "2025-01-01"]
-    found = rows(grid.earth(["geodesic", {"name": "map_matching", "map_date": "2015-01-01"}], tasks=2, dates=dates))
-    assert found[0] == ["date", "navigator", "needs", "runs", "0, 0, 0", "0.5, 0.1, 20"]
-    assert [row[0] for row in found[2:]] == [dates[0]] * 2 + [dates[1]] * 2
-    assert found[2][4].startswith("100.0 / 100.0 / ")
-    assert found[3][1] == "map matching (Kalman filter), map of 2015-01-01"
-    assert rows(grid.earth(["geodesic"], tasks=2, max_steps=1))[2][3] == "0.0 / 0.0 / —"
-    far = rows(grid.earth(["geodesic"], tasks=2, distance_km=(1200, 1300), max_steps=60))
-    assert far[2][3].count("/") == 3, "beyond 500 km, kilometers come first"
-    grid.make(grid.Config(("conditions",), navigators=("geodesic",), tasks=2, out=tmp_path / "new"))
+def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> None:
+    oracle, old = "geodesic", {"name": "map_matching", "map_date": "2015-01-01"}
+    table = rows(grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], tasks=8))
+    assert table[0] == ["navigator", "needs", "0, 0, 0", "0.5, 0.1, 20"]
+    assert table[2][2].startswith("100.0 / 100.0 / ")
+    assert table[3][0] == "map matching (Kalman filter), map date 2015-01-01"
+    assert table[4][0] == f"{table[2][0]} − {table[3][0]}, SPL"
+    assert table[4][2].strip("*").startswith("+")
+    assert rows(grid.flights([oracle], tasks=2, max_steps=1))[2][2] == "0.0 / 0.0 / —"
+    far = rows(grid.flights([oracle], tasks=2, distance_km=(1200, 1300), max_steps=60))
+    assert far[2][2].count("/") == 3, "beyond 500 km, kilometers come first"
+    grid.make(("conditions",), navigators=(oracle,), tasks=2, out=tmp_path / "new")
     head, _, row = rows((tmp_path / "new" / "conditions.md").read_text())
-    assert head == ["navigator", "needs", "laboratory", "aircraft", "ship", "underwater", "low-cost"]
+    assert head == ["navigator", "needs", "aircraft", "ship", "underwater", "low-cost"]
     assert row[2].startswith("100.0 / 100.0 / ")
 
 
-def test_boxes_follow_the_seed() -> None:
-    first, second = (scenario.region for scenario in grid.random_boxes(2, seed=1))
-    assert grid.place(Scenario(region=first, objective_floors=None)) == "51°S to 41°S, 99°W to 89°W"
-    assert grid.random_boxes(2, seed=1)[1].region == second
-
-
-def test_boxes_have_mean_and_lowest_rows() -> None:
-    found = rows(grid.boxes(["geodesic", {"name": "secant", "elements": ["D", "I"]}], boxes=2, tasks=4))
-    assert found[0] == ["box", "geodesic, SR / SPL", "secant, D and I, SR / SPL"]
-    assert [row[0] for row in found[4:]] == ["**mean**", "**lowest**", "10°S to 0°, 175°E to 185°E"]
-    values = np.array([[float(x) for x in row[2].split("/")] for row in found[2:6]])
-    assert values[2] == pytest.approx(values[:2].mean(0), abs=0.051)
-    assert values[3] == pytest.approx(values[:2].min(0))
-
-
-def test_vehicles_that_declare_have_a_row_for_each_confidence() -> None:
+def test_vehicles_that_declare_are_right_or_wrong() -> None:
     options = {"conditions": ["ship"], "tasks": 4, "within_km": 25, "max_steps": 20}
-    options |= {"arrivals": ["distance", 1.0, 0.0], "differences": [("secant", "secant")]}
-    told, sure, bold, bound, difference = rows(grid.earth(["secant"], **options))[2:]
-    assert difference[1:] == ["—", "declared", "+0.0 (+0.0 to +0.0)"]  # each column has a cell
-    assert [told[2], sure[2], bold[2]] == ["told", "declared at 1", "declared"]
-    assert sure[3].split(" / ")[:3] == ["0.0", "0.0", "0.0"]
-    right, _, false, _, _ = map(float, bold[3].split(" / "))
+    sure, bold = (rows(grid.flights(["secant"], confidence=least, **options))[2][2] for least in (1.0, 0.0))
+    assert sure == "0.0 / 0.0 / 0.0"
+    right, _, false = map(float, bold.split(" / "))
     assert right + false == 100
-    assert float(told[3].split(" / ")[2]) == 0
-    assert 50 < float(bound[3]) < 100
+
+
+def test_tasks_of_the_box_are_frozen_and_start_northward() -> None:
+    table = rows(grid.flights(["geodesic"], box=True, tasks=3, levels=[(0, 0, 0)]))
+    assert table[2][2] == "100.0 / 100.0"
+    env = flights.Flights(box=True, tasks=3).env
+    assert env.reset()["heading"].tolist() == [[0.0]] * 3
+    assert env.scenario.tasks.start.tolist() == flights.named_tasks("test-1000").start[:3].tolist()
+
+
+def test_several_runs_have_the_range_of_their_spl(tmp_path: Path) -> None:
+    for seed in (10, 2):
+        (tmp_path / f"a-seed{seed}").mkdir()
+    assert flights.runs_of(f"td3={tmp_path}/a-seed*") == [f"td3={tmp_path}/a-seed{seed}" for seed in (2, 10)]
+    ends = {"success": torch.tensor([True]), "steps": torch.tensor([10]), "path_efficiency": torch.ones(1)}
+    ends |= {"length_km": torch.ones(1), "navigation_error_km": torch.ones(1)}
+    ends |= dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.zeros(1))
+    runs = [ends | {"spl": torch.tensor([spl])} for spl in (0.9, 0.8)]
+    assert flights.cell(runs, ("success_rate", "spl", "steps")) == "100.0 / 85.0 [80.0–90.0] / 10.0"
+    assert flights.cell(runs[:1], ("spl", "steps")) == "90.0 / 10.0"
 
 
 def test_the_interval_of_a_difference_is_clustered_by_region() -> None:
@@ -136,61 +137,20 @@ def test_the_interval_of_a_difference_is_clustered_by_region() -> None:
     region = torch.tensor([0, 0, 1, 1, 2, 2, 3, 3])
     assert flights.paired_difference(first, 0 * first, region) == "**+4.0 (+1.5 to +6.5)**"
     assert flights.paired_difference(first, 0 * first + 0.02, region) == "+2.0 (-0.5 to +4.5)"
-    table = rows(grid.earth(["secant", "geodesic"], tasks=8, differences=[("secant", "geodesic")]))
-    assert table[-1][0] == "secant (quasi-Newton) − geodesic (both positions, an oracle), SPL"
-    assert table[-1][3].startswith(("**-", "-"))
 
 
-def test_the_bound_is_that_of_readings_at_the_destination() -> None:
-    base = flights.earth_env(40, regions=4, reach_km=flights.DRIFT_KM, drift_km=flights.DRIFT_KM)
-    exact, noisy, more = (flights.estimate_within(25.0, base, (std, std, 100 * std)) for std in (0.0, 0.3, 0.6))
-    assert exact == pytest.approx(100)
-    assert exact > noisy > more
-    jacobian = elements_gradient_at(base.field, base.scenario.tasks.target, base.scenario.tasks.region)
-    readings = 0.3 / 8**0.5 * torch.randn(4000, 40, 3, dtype=torch.float64) * torch.tensor([1.0, 1.0, 100.0])
-    scale = torch.tensor([1.0, 1.0, 0.01])
-    places = torch.linalg.lstsq((scale[:, None] * jacobian).expand(4000, 40, 3, 2), (scale * readings)[..., None])[0]
-    assert noisy == pytest.approx(100 * (places.squeeze(-1).norm(dim=-1) < 25).double().mean().item(), abs=1)
-    ship = CONDITIONS["ship"]
-    assert flights.estimate_within(25.0, base, ship, (0.0, 0.0, 0.0)) > flights.estimate_within(25.0, base, ship)
-
-
-def test_reliability_counts_readings_by_their_probability(monkeypatch) -> None:
+def test_reliability_counts_readings_by_their_probability() -> None:
     """By hand: vehicles of one region are 24 km off, the others 26 km; second readings are after the end."""
-    options = {"conditions": ["ship"], "tasks": 200, "regions": 2}
-    found: list[float] = []
-
-    def flight(_: object, base: GeomagneticNavEnv, __: object) -> TensorDict:
-        near = base.scenario.tasks.region == 0
-        count, share = len(near), near.double().mean().item()
-        found[:] = 100 * share, 196 * 2**0.5 * share * (1 - share)  # both regions deviate by as much, in sum
-        target = torch.zeros(count, 2, 2, dtype=torch.float64)
-        target[..., 0] = torch.where(near, 24, 26).unsqueeze(-1) / 110.574  # km in a degree of latitude
-        probability = torch.tensor([[0.55], [0.15]]).expand(count, 2, 1)
-        content = {"arrival_probability": probability, "position": 0 * target, "target_position": target}
-        return TensorDict(content | {"next": {"done": torch.ones(count, 2, 1, dtype=torch.bool)}}, (count, 2))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(declarations, "rollout", flight)
-        cells = rows(declarations.reliability(["secant"], **options))[-1][2:]
-    share, half = found
-    assert cells == [*["—"] * 5, f"{share:.0f} ± {half:.0f}", *["—"] * 4]
-    table = rows(declarations.reliability(["secant"], conditions=["ship"], tasks=30, max_steps=12))[2:]
-    assert [row[1] for row in table][-1] == "ship"
-    assert len(table) == len(flights.LEVELS) + 1
-    assert all(float(row[2].split(" ± ")[0]) < 20 for row in table)
-
-
-def test_the_rule_of_declared_arrivals_is_changed_for_its_row_alone(monkeypatch) -> None:
-    """Vehicles to which a kilometer costs much declare at once: fewer of them are right, after fewer steps."""
-    monkeypatch.setattr(flights, "LEVELS", [(0.05, 0.05, 5.0)])
-    rules = [{"TRIP_KM": 1}, {"TRIP_KM": decision.TRIP_KM}]
-    table = rows(declarations.decisions(["kalman"], rules=rules, conditions=[], tasks=10, max_steps=20))[2:]
-    assert [row[0] for row in table] == ["Kalman (dual control), TRIP_KM 1", "Kalman (dual control), TRIP_KM 800.0"]
-    hasty, usual = ([float(number) for number in row[1].split(" / ")] for row in table)
-    assert hasty[0] < usual[0]
-    assert hasty[2] < usual[2]
-    assert decision.TRIP_KM == 800
+    near = torch.arange(200) < 120
+    target = torch.zeros(200, 2, 2, dtype=torch.float64)
+    target[..., 0] = torch.where(near, 24, 26).unsqueeze(-1) / 110.574  # km in a degree of latitude
+    probability = torch.tensor([[0.55], [0.15]]).expand(200, 2, 1)
+    content = {"arrival_probability": probability, "position": 0 * target, "target_position": target}
+    flight = TensorDict(content | {"next": {"done": torch.ones(200, 2, 1, dtype=torch.bool)}}, (200, 2))
+    ((stated, share, half),) = flights.reliability(flight, near.long(), 25.0)
+    assert stated == pytest.approx(55)
+    assert share == pytest.approx(60)
+    assert half == pytest.approx(1.96 * 2 * 100 * 200 * 0.6 * 0.4 / 200)  # two equal sums, times (2 / (2 - 1)) ** 0.5
 
 
 # The globe
@@ -211,9 +171,9 @@ class Slopes:
 
 def test_weakest_change_is_in_floors_of_the_objective() -> None:
     here = torch.zeros(1, 2, dtype=torch.float64)
-    assert globe.weakest_change(Slopes((2, 0), (0, 3)), here).item() == pytest.approx(2)
-    assert globe.weakest_change(Slopes((3, 3), (1, -1)), here).item() == pytest.approx(math.sqrt(2))
-    assert globe.weakest_change(Slopes((2, 4), (1, 2)), here).item() == pytest.approx(0, abs=1e-9)
+    assert globe.weakest_change(here, Slopes((2, 0), (0, 3))).item() == pytest.approx(2)
+    assert globe.weakest_change(here, Slopes((3, 3), (1, -1))).item() == pytest.approx(math.sqrt(2))
+    assert globe.weakest_change(here, Slopes((2, 4), (1, 2))).item() == pytest.approx(0, abs=1e-9)
 
 
 def test_vehicles_cross_the_pole_and_are_not_lost() -> None:
@@ -229,26 +189,27 @@ def test_vehicles_cross_the_pole_and_are_not_lost() -> None:
 def test_table_has_every_task_once_in_each_group(monkeypatch) -> None:
     success = torch.tensor([True, False, True, True])
     measures = {"success": success, "spl": torch.tensor([1.0, 0.0, 0.9, 0.7]), "steps": torch.tensor([8, 50, 10, 12])}
-    known = {
-        "latitude": torch.tensor([0.0, 90.0, 30.0, 74.0]),
+    measures |= dict.fromkeys(("length_km", "navigation_error_km", "path_efficiency"), torch.ones(4))
+    measures |= dict.fromkeys(("smoothness_deg", "heading_mae_deg", "heading_rmse_deg"), torch.ones(4))
+    places = {
+        "latitude": torch.tensor([0.0, 89.0, 30.0, 74.0]),
         "intensity_nt": torch.tensor([30e3, 0.0, 8e3, 7e3]),
         "weakest": torch.tensor([2.0, 0.01, 0.5, 0.05]),
     }
-    found = rows(globe.table({"perfect sensors": measures}, known))[2:]
-    assert found[0] == ["all", "4", "75.0 / 65.0 / 10.0"]
-    assert found[1] == ["latitude of the start up to 30°", "1", "100.0 / 100.0 / 8.0"]
-    for group, size in (("latitude", 4), ("smallest", 3), ("weakest", 3)):
-        band = [row for row in found[1:] if row[0].startswith(group)]
-        assert (len(band), sum(int(row[1]) for row in band)) == (size, 4), band
-    assert found[-3] == ["weakest change on the way below 0.05", "1", "0.0 / 0.0 / —"]
+    table = rows(globe.table({"perfect sensors": measures}, places))[2:]
+    assert table[0] == ["all", "4", "75.0 / 65.0 / 10.0"]
+    assert table[1] == ["latitude of the start 0 to 30°", "1", "100.0 / 100.0 / 8.0"]
+    for group in ("latitude", "smallest", "weakest"):
+        assert sum(int(row[1]) for row in table if row[0].startswith(group)) == 4, group
+    assert table[-1] == ["weakest change on the way 0.5 and more", "2", "100.0 / 95.0 / 9.0"]
     monkeypatch.setattr(globe, "CHUNK", 3)  # flown in parts
-    assert "| all | 4 | 100.0 / 100.0 /" in globe.globe("geodesic", tasks=4)
+    assert "| all | 4 | 100.0 / 100.0 /" in globe.globe(["geodesic"], tasks=4)
 
 
 def test_map_shows_the_dip_poles_and_the_failures() -> None:
     tasks = Tasks(torch.tensor([[10.0, 20.0], [50.0, -60.0]]), torch.tensor([[10.0, 24.0], [50.0, -64.0]]))
     measures = {"success": torch.tensor([True, False]), "spl": torch.tensor([0.9, 0.0])}
-    axes = figures.globe_map(IGRF("2025-01-01"), tasks, measures).axes[0]
+    axes = globe.globe_map(tasks, measures).axes[0]
     lines = {line.get_label(): np.degrees(np.stack(line.get_data(), -1)) for line in axes.lines}
     (south_east, south), (north_east, north) = lines["dip pole"]  # NOAA, 2025: 63.85 S 135.08 E, 85.76 N 139.30 E
     assert (south, south_east) == pytest.approx((-63.85, 135.08), abs=1)
@@ -257,60 +218,45 @@ def test_map_shows_the_dip_poles_and_the_failures() -> None:
     assert axes.collections[-1].get_array() == pytest.approx(np.array([90.0]))
 
 
-def test_each_error_has_a_line_for_each_navigator(monkeypatch) -> None:
-    monkeypatch.setattr(figures, "flown", lambda navigator, *_: navigator)
-    monkeypatch.setattr(figures, "summarize", lambda navigator: {"spl": float(len(navigator))})
-    *panels, last = figures.conditions(2)["conditions"].axes
-    assert [[len(line.get_xdata()) for line in axes.lines] for axes in panels] == [[5] * 5] * len(figures.PANELS)
+# Figures
+
+
+def test_each_error_and_each_level_has_a_line_for_each_navigator(monkeypatch) -> None:
+    measured = {"spl": 90.0, "steps": 10.0}
+    monkeypatch.setattr(flights.Flights, "summaries", lambda *_: [measured])
+    *panels, last = figures.conditions(2)["figures/conditions"].axes
+    sizes = [len(error["sizes"]) + 1 for error in grid.declared(figures.FILE)["errors"].values()]
+    assert [[len(line.get_xdata()) for line in axes.lines] for axes in panels] == [[size] * 5 for size in sizes]
     assert [text.get_text() for text in last.get_legend().texts][:2] == ["anywhere", "Kalman"]
+    assert [len(axes.lines) for axes in figures.prices(2)["figures/prices"].axes] == [2, 2, 2]
+    assert len(figures.noise(2)["figures/noise"].axes[0].lines) == len(grid.declared()["noise"]["navigators"])
 
 
-# Trainings
+def test_the_reliability_diagram_has_a_panel_for_noise_and_one_for_vehicles(monkeypatch) -> None:
+    monkeypatch.setattr(flights.Flights, "fly", lambda *_: None)
+    monkeypatch.setattr(figures, "reliability", lambda *_: [(10.0, 12.0, 3.0), (90.0, 80.0, 2.0)])
+    noise, vehicles = figures.reliability_diagram(2)["figures/reliability"].axes
+    assert [len(axes.containers) for axes in (noise, vehicles)] == [3, 4]
+    assert vehicles.containers[0].lines[0].get_xydata().tolist() == [[10, 12], [90, 80]]
 
 
-@pytest.fixture
-def runs(tmp_path: Path) -> str:
-    """Return the pattern of two runs, the second of which learns twice as fast."""
-    for seed in range(2):
-        folder = tmp_path / f"a-seed{seed}"
-        folder.mkdir()
-        result = {"seed": seed, "success_rate": 99.0 + seed, "spl": 90.0 + seed, "steps": 9.5, "training_seconds": None}
-        (folder / "eval.json").write_text(json.dumps(result))
-        head = "frames,episodes,seconds,return,success_rate,eval_success_rate,eval_spl,eval_steps\n"
-        half = f"{100 if seed else 200},10,1,0,50,90,80,12\n"
-        (folder / "train.csv").write_text(f"{head}{half}400,20,2,5,99,98,95,10\n")
-    return str(tmp_path / "a-seed*")
+def test_learning_curves_are_columns_of_the_runs(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for run, spl in (("td3_gradient_guided-paper-seed0", 90), ("td3-paper-seed0", 80)):
+        (tmp_path / "runs" / run).mkdir(parents=True)
+        (tmp_path / "runs" / run / "train.csv").write_text(f"frames,eval_spl\n0,\n100,50\n200,{spl}\n")
+    (figure,) = figures.curves("paper-run").values()
+    means = [line.get_ydata()[-1] for line in figure.axes[0].lines if line.get_label().startswith(("TD3", "Gradient"))]
+    assert means == [90, 80]
+    figures.draw(("paper-run",), out=tmp_path)
+    assert (tmp_path / "figures" / "paper-run.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_results_of_runs(runs: str) -> None:
-    head, _, published, group, together = rows(trainings.results({"mine": runs}, together=True))
-    assert head[:5] == ["", "runs", "SR %", "SPL %", "SPL, smallest–largest %"]
-    assert published[:4] == ["paper", "1", "97.0", "88.41"]
-    assert group[:5] == ["mine", "2", "99.5 [99.0–100.0]", "90.50 [90.00–91.00]", "90.00–91.00"]
-    assert group[-2:] == ["—", "—"]
-    assert together[1:] == group[1:]
-
-
-def test_learning_of_runs(runs: str) -> None:
-    (row,) = rows(trainings.learning({"mine": runs}))[2:]
-    assert row[:4] == ["mine", "2", "150 [100–200]", "400 [400–400]"]
-    # areas: (200 * 45 + 200 * 94) / 400 = 69.5 and (100 * 45 + 300 * 94) / 400 = 81.75
-    assert row[4:] == ["75.6 [69.5–81.8]", "95.00 [95.00–95.00]"]
-
-
-def test_evaluations_and_the_rows_of_other_tables(tmp_path: Path, monkeypatch) -> None:
+def test_evaluations_are_tables_and_figures_of_section_4(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("evaluate.trajectories_figure", lambda *_, **__: Figure())
-    options = {"navigators": ["secant", "geodesic"], "tasks": 3}
-    text = trainings.evaluation(folder="runs/a", wandb_mode="disabled", **options)
-    assert [row[0] for row in rows(text)[2:4]] == ["secant (quasi-Newton)", "geodesic (both positions, an oracle)"]
-    assert trainings.short("runs/a").startswith("| navigator | needs | SR % |")
-    head, _, secant, geodesic = rows(
-        trainings.noise_levels(levels=[(0, 0, 0), (0.1, 0.1, 10)], folder="runs/n", **options)
-    )
-    assert head == ["navigator", "needs", "runs", "no noise", "0.1°, 0.1°, 10 nT"]
-    assert geodesic[3:] == ["100.0 / 100.0"] * 2
-    assert secant[3].startswith("100.0 / 9")
-    monkeypatch.setattr(grid, "RESULTS", tmp_path)
-    (tmp_path / "earth.md").write_text(text)
-    assert rows(grid.rows_of(["earth"], ["geodesic"]))[2] == rows(text)[3]
+    navigators = ["secant", "parallel"]
+    text = grid.evaluation(navigators, folder=Path("runs/comparison"), tasks=3, wandb_mode="disabled")
+    assert [row[0] for row in rows(text)[2:4]] == ["secant (quasi-Newton)", "parallel (true gradient, an oracle)"]
+    made = figures.section_4()
+    assert [label.get_text() for label in made["results/fig-4-6-boxes"].axes[0].get_xticklabels()] == navigators
