@@ -72,12 +72,11 @@ def known_values(values: Iterable[float | None]) -> list[float]:
     return [value for value in values if value is not None and math.isfinite(value)]
 
 
-def mean_of_runs(*strata: Iterable[float | None], form: str, interval: bool = True) -> str:
+def mean_of_runs(values: Iterable[float | None], *, form: str, interval: bool = True) -> str:
     """Return the interquartile mean over runs with its interval, or with the range of fewer than ten runs.
 
     Args:
-        strata: values of the runs of each stratum (:func:`magrl.evaluation.intervals.stratified_bootstrap`); NaN or
-            None where a run has none.
+        values: value of each run; NaN or None where a run has none.
         form: number format.
         interval: whether interval or range are shown.
 
@@ -87,16 +86,15 @@ def mean_of_runs(*strata: Iterable[float | None], form: str, interval: bool = Tr
         >>> mean_of_runs([99.0], form=".1f"), mean_of_runs([], form=".1f")
         ('99.0', '—')
     """
-    scores = [torch.tensor(values, dtype=torch.float64) for stratum in strata if (values := known_values(stratum))]
-    if not scores:
+    runs = torch.tensor(known_values(values), dtype=torch.float64)
+    if not len(runs):
         return "—"
-    runs = torch.cat(scores)
     text = format(interquartile_mean(runs).item(), form)
     if len(runs) == 1 or not interval:
         return text
     if len(runs) < MIN_RUNS:
         return f"{text} [{runs.min():{form}}–{runs.max():{form}}]"
-    low, high = stratified_bootstrap(scores)
+    low, high = stratified_bootstrap([runs])
     return f"{text} ({low:{form}}–{high:{form}})"
 
 
