@@ -137,7 +137,8 @@ def conditions(tasks: int = 200) -> Figures:
         for axes, (title, error) in zip(panels, errors.items(), strict=True):
             sizes = [one_error(error["lines"], size) for size in error["sizes"]]
             axes.plot([alone, *(flights.summaries(navigator, size)[0]["spl"] for size in sizes)], **look(navigator))
-            axes.set_xticks(range(len(sizes) + 1), ["0", *(f"{size}" for size in error["sizes"])])
+            axes.set_xticks(range(len(sizes) + 1), ["0", *(f"{size}".removesuffix(".0") for size in error["sizes"])])
+            axes.tick_params("x", labelsize=7)
             axes.set_xlabel(title, fontsize=9)
             axes.grid(alpha=0.3)
     figure.supylabel("SPL [%]")
