@@ -32,13 +32,9 @@ class Estimator:
 
     def __init__(self, navigator: Any) -> None:
         self.navigator = navigator
-        view = view_of(navigator)
-        self.trained = isinstance(view, TrackView)
-        track = TrackGradient((*IN_KEYS, *STD_KEYS))
-        self.observe = navigator.observe if self.trained else Compose(track)
+        self.trained = isinstance(view_of(navigator), TrackView)
+        self.observe = navigator.observe if self.trained else Compose(TrackGradient((*IN_KEYS, *STD_KEYS)))
         self.noise = NoiseScale()
-        state_keys = view.state_keys if isinstance(view, TrackView) else track.state_keys
-        self.state_keys = (*state_keys, *self.noise.out_keys)
         self.state: Any = None
 
     def act(self, seen: TensorDictBase) -> list[float]:
@@ -49,14 +45,13 @@ class Estimator:
         """
         now = seen.copy()
         if self.state is None:
-            observed = self.observe(self.noise(now))
+            self.state = self.observe(self.noise(now))
         else:
-            observed = self.observe(self.noise(self.state.set("next", now)))["next"]
-        self.state = observed.select(*self.state_keys)
+            self.state = self.observe(self.noise(self.state.set("next", now)))["next"]
         if self.trained:
-            action = self.navigator.act.denormalize("action", self.navigator.actor(observed)["action"])
+            action = self.navigator.act.denormalize("action", self.navigator.actor(self.state)["action"])
         else:
-            action = self.navigator(observed)["action"]
+            action = self.navigator(self.state)["action"]
         return action[0].tolist()
 
     def decide(self, seen: TensorDictBase, steps_left: Tensor, radius_km: float) -> ArrivalDecision:

@@ -8,9 +8,10 @@ from __future__ import annotations
 import hashlib
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
 from magrl.onboard.limits import Reading
@@ -19,11 +20,6 @@ from magrl.transforms.errors.sensors import OUTAGE_STD
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
-
-
-def _plain(value: Any) -> Any:
-    """Return scalars and arrays of NumPy and torch as plain numbers and lists."""
-    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _in_nanotesla(std: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -36,7 +32,8 @@ def _in_nanotesla(std: tuple[float, float, float]) -> tuple[float, float, float]
     return std
 
 
-_PLAIN, _LAX = BeforeValidator(_plain), Field(strict=False)  # a tuple may be given as a list
+_PLAIN = BeforeValidator(lambda value: value.tolist() if hasattr(value, "tolist") else value)  # NumPy and torch
+_LAX = Field(strict=False)  # a tuple may be given as a list
 Number = Annotated[float, _PLAIN]
 Numbers = Annotated[tuple[Number, ...], _PLAIN, _LAX]
 Triple = Annotated[tuple[Number, Number, Number], _PLAIN, _LAX]
@@ -45,7 +42,21 @@ Std = Annotated[tuple[_Std, _Std, _Std], _PLAIN, _LAX, AfterValidator(_in_nanote
 
 
 class Options(CheckedModel):
-    """Hold the options of :class:`~magrl.onboard.Onboard`, the class of its navigator, and the digest of its weights.
+    """Hold the options of :class:`~magrl.onboard.Onboard`.
+
+    Args:
+        sensor_std: standard deviations of the noise of D [deg], I [deg], B_H [nT], new in each reading. Those that are
+            not 0 are corrected by what the readings show (:class:`~magrl.transforms.NoiseScale`).
+        bias_std: standard deviations of constant and slow errors of the same.
+        drift_std: those of the slow errors alone, which vary along the way: what a known start does not show, and what
+            readings average in part.
+        max_move_km: longest move; 50 km, or for a trained policy that of its training.
+        max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.
+        max_steps: steps of a way, the last of which stops.
+        arrival_km: distance from the destination that counts as arrived.
+        confidence: least estimated probability of arrival at which the vehicle is told that it has arrived.
+        navigator: class of the navigator; the vehicle writes it.
+        weights: digest of its weights; the vehicle writes it.
 
     Example:
         >>> Options(sensor_std=(0.02, 0.02, 0.002))
@@ -54,8 +65,6 @@ class Options(CheckedModel):
 like microtesla, and nanotesla are expected; give 0 for a perfect sensor
     """
 
-    navigator: str = ""
-    weights: str = ""
     sensor_std: Std = EXACT
     bias_std: Std = EXACT
     drift_std: Std = EXACT
@@ -64,22 +73,8 @@ like microtesla, and nanotesla are expected; give 0 for a perfect sensor
     max_steps: Annotated[int, _PLAIN] = Field(120, ge=1)
     arrival_km: Number = Field(25.0, gt=0)
     confidence: Number = Field(0.8, ge=0, le=1)
-
-
-class Start(CheckedModel):
-    """Hold the arguments of :meth:`~magrl.onboard.Onboard.start`.
-
-    Example:
-        >>> import torch
-        >>> Start(target=torch.tensor([-11.5, 75.5, 13240.0])).target
-        (-11.5, 75.5, 13240.0)
-    """
-
-    target: Triple
-    here: Numbers | None = None
-    here_std: Numbers | None = None
-    near: Numbers | None = None
-    date: str | None = None
+    navigator: str = ""
+    weights: str = ""
 
 
 class Step(CheckedModel):
@@ -103,33 +98,6 @@ class Step(CheckedModel):
         """D [deg], I [deg], B_H [nT]; None for an element that is missing."""
         return self.declination, self.inclination, self.horizontal_intensity
 
-    def reading_after(self, before: Triple | None) -> Triple:
-        """Return the reading, with those of the reading before in place of missing elements.
-
-        Raises:
-            ValueError: for a first reading that is not complete.
-
-        Example:
-            >>> step = Step(declination=None, inclination=73, horizontal_intensity=15000, heading=0)
-            >>> step.reading_after((3.5, 72.0, 15010.0))
-            (3.5, 73.0, 15000.0)
-        """
-        filled = zip(self.reading, before or (None, None, None), strict=True)
-        d, i, b_h = (old if new is None else new for new, old in filled)
-        if d is None or i is None or b_h is None:
-            raise ValueError(f"the first step takes a reading of all three elements, got {self.reading}")
-        return d, i, b_h
-
-    def accuracy(self, sensor_std: Triple) -> list[float]:
-        """Return the standard deviations of the reading: that of an outage for a missing element.
-
-        Example:
-            >>> step = Step(declination=None, inclination=73, horizontal_intensity=15000, heading=0)
-            >>> step.accuracy((0.02, 0.02, 2.0))
-            [10000.0, 0.02, 2.0]
-        """
-        return [OUTAGE_STD if new is None else std for new, std in zip(self.reading, sensor_std, strict=True)]
-
     def repeats(self, before: Step) -> bool:
         """Return whether this is the message of the step before once more, by its time.
 
@@ -152,24 +120,34 @@ class Journal(CheckedModel):
     """Hold all that a vehicle was told since its start, which gives its state, whatever its navigator keeps.
 
     Example:
-        >>> Journal(format=8, options=Options(), start=Start(target=(3.5, 73.0, 15000.0)), steps=[]).steps
-        ()
+        >>> import torch
+        >>> Journal(options=Options(), target=torch.tensor([-11.5, 75.5, 13240.0])).target
+        (-11.5, 75.5, 13240.0)
     """
 
     format: Literal[8] = 8
     options: Annotated[Options, _LAX]
-    start: Annotated[Start, _LAX]
-    steps: Annotated[tuple[Annotated[Step, _LAX], ...], _LAX]
+    target: Triple
+    here: Numbers | None = None
+    here_std: Numbers | None = None
+    near: Annotated[tuple[Number, Number], _PLAIN, _LAX] | None = None
+    date: str | None = None
+    steps: Annotated[tuple[Annotated[Step, _LAX], ...], _LAX] = ()
+
+    def content(self) -> bytes:
+        """Return the content of its file: JSON and its SHA-256."""
+        body = self.model_dump_json().encode()
+        return body + b"\n" + hashlib.sha256(body).hexdigest().encode()
 
     def write(self, path: Path) -> None:
-        """Write JSON and its SHA-256 atomically.
+        """Write a file atomically.
 
         Raises:
-            OSError: if the file cannot be written; an existing one stays unchanged.
+            OSError: if it cannot be written; an existing one stays unchanged.
         """
-        body, aside = self.model_dump_json().encode(), path.with_name(f"{path.name}.aside")
+        aside = path.with_name(f"{path.name}.aside")
         with aside.open("wb") as file:
-            file.write(body + b"\n" + hashlib.sha256(body).hexdigest().encode())
+            file.write(self.content())
             file.flush()
             os.fsync(file.fileno())
         os.replace(aside, path)
@@ -179,19 +157,14 @@ class Journal(CheckedModel):
         """Read a file of :meth:`write`.
 
         Raises:
-            ValueError: for a damaged file, and for content that is not that of a journal, naming what is wrong.
+            ValueError: for anything else, naming what is wrong.
             OSError: if it cannot be read.
         """
-        body, _, digest = path.read_bytes().rpartition(b"\n")
+        content = path.read_bytes()
         try:
-            if hashlib.sha256(body).hexdigest().encode() != digest:
-                raise ValueError("it is damaged, or of an earlier format")
-            journal = cls.model_validate_json(body)
-            if journal.model_dump_json().encode() != body:
-                raise ValueError("parts of it are missing")
-            return journal
-        except ValueError as error:
-            text = (
-                error.errors()[0]["msg"].removeprefix("Value error, ") if isinstance(error, ValidationError) else error
-            )
-            raise ValueError(f"{path} is not the state of a vehicle: {text}") from error
+            journal = cls(**from_json(content.partition(b"\n")[0]))
+            if journal.content() != content:
+                raise ValueError("it is damaged")
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path} is not the state of a vehicle: {error}") from error
+        return journal

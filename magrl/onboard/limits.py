@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 from tensordict.nn import TensorDictModuleBase
 
-from magrl.checks import check_numbers, check_type
 from magrl.field.elements import NAMES, UNITS
 from magrl.tracking.planning import MISSING_KM, SLOPES
 from magrl.transforms import ObservationView, TrackView
@@ -55,16 +54,15 @@ def move_limits(
         (20.0, 90.0)
     """
     own = policy if policy is None else view_of(policy) or policy
-    move, turn = getattr(own, "max_move_km", None), getattr(own, "max_turn_rad", None)
+    move, turn = getattr(own, "max_move_km", 0.0), math.degrees(getattr(own, "max_turn_rad", 0.0))
     limits = []
     for name, value, commanded, usual in (
         ("max_move_km", max_move_km, move, 50.0),
-        ("max_turn_deg", max_turn_deg, None if turn is None else math.degrees(turn), 90.0),
+        ("max_turn_deg", max_turn_deg, turn, 90.0),
     ):
-        least = usual if commanded is None else commanded
-        if commanded is not None and value is not None and value < commanded * (1 - 1e-6):
+        if value is not None and value < commanded * (1 - 1e-6):
             raise ValueError(f"{name} must be at least {commanded:g}, which the policy commands, got {value!r}")
-        limits.append(float(least if value is None else value))
+        limits.append(float(commanded or usual) if value is None else value)
     return limits[0], limits[1]
 
 
@@ -83,8 +81,6 @@ def out_of_range(view: View, elements: Sequence[float]) -> str:
         >>> out_of_range(view_of(load_pretrained("anywhere")), (0.0, 88.0, 1500.0))
         'B_H 1500 nT is out of the range of the policy, 2000 to inf nT'
     """
-    check_type((ObservationView, TrackView, type(None)), view=view)
-    check_numbers(3, elements=elements)
     low: Sequence[float] = (-180.0, -90.0, 0.0)
     high: Sequence[float] = (180.0, 90.0, math.inf)
     if isinstance(view, TrackView):
@@ -139,15 +135,12 @@ def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
 
     Example:
         >>> stuck((450.0, 20.0, 0.0), max_move_km=50.0)
-        'D has not changed over 450 km: its sensor is stuck'
+        'no change of D over 400 km: a sensor is stuck'
     """
     every_km, one_km = (max(km, moves * max_move_km) for km, moves in zip(STUCK_KM, (2, 8), strict=True))
     least_km = every_km if min(unchanged) >= every_km else one_km
-    held = {name: km for name, km in zip(NAMES, unchanged, strict=True) if km >= least_km}
-    if not held:
-        return ""
-    have, its = ("have", "their") if len(held) > 1 else ("has", "its")
-    return f"{', '.join(held)} {have} not changed over {min(held.values()):.0f} km: {its} sensor is stuck"
+    names = [name for name, km in zip(NAMES, unchanged, strict=True) if km >= least_km]
+    return f"no change of {', '.join(names)} over {least_km:.0f} km: a sensor is stuck" if names else ""
 
 
 def check_move(heading_deg: float, distance_km: float, steer_deg: float | None, max_move_km: float) -> None:

@@ -109,7 +109,6 @@ def check_earth_distance(reading: Sequence[float], target: Sequence[float], most
         ValueError: the reading at the start is at least 3639 km from the target, and the longest way is 2500 km: \
 check the target, and the axes, the units and the calibration of the sensors
     """
-    check_numbers(3, reading=reading, target=target)
     here, there = ((b, b * math.tan(math.radians(i))) for _, i, b in (reading, target))  # B_H and B_Z
     least_km = (math.dist(here, there) - DISTURBANCE_NT) / MERIDIAN_SLOPE_NT_KM
     if least_km > most_km:

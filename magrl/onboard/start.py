@@ -95,7 +95,6 @@ def nearby_elements(
         >>> [round(5 * value, 1) for value in std]
         [9.2, 3.4, 2843.7]
     """
-    check_numbers(2, near=near)
     elements, _ = known_elements(near, date=date)
     check_earth_distance(elements, target, most_km)
     bearing = torch.arange(0, 360, 45, dtype=torch.float64).deg2rad()

@@ -23,13 +23,14 @@ from magrl.checks import check_type
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.navigators import Kalman, RunAndTumble, Secant
 from magrl.onboard.estimator import Estimator
-from magrl.onboard.journal import Journal, Options, Start, Step
+from magrl.onboard.journal import Journal, Options, Step
 from magrl.onboard.limits import check_move, measured, move_limits, out_of_range, stuck, unchanged_km, view_of
 from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_distance, check_earth_jump, check_earth_reading
 from magrl.onboard.start import Elements, calibrated, check_start, known_elements, nearby_elements
 from magrl.tracking import ArrivalDecision, Way
 from magrl.transforms import TrackView
 from magrl.transforms.errors.known_start import EXACT
+from magrl.transforms.errors.sensors import OUTAGE_STD
 from magrl.transforms.track import STD_KEYS
 
 NAMED = ("anywhere", "secant", "kalman", "run_and_tumble")
@@ -91,16 +92,7 @@ class Onboard:
     Args:
         navigator: ``"anywhere"`` for the pretrained agent, ``"secant"``, ``"kalman"`` or ``"run_and_tumble"``; or a
             policy from :func:`magrl.load_policy`, or a navigator, of which the vehicle gets a copy.
-        sensor_std: standard deviations of the noise of D [deg], I [deg], B_H [nT], new in each reading. Those that are
-            not 0 are corrected by what the readings show (:class:`~magrl.transforms.NoiseScale`).
-        bias_std: standard deviations of constant and slow errors of the same.
-        drift_std: those of the slow errors alone, which vary along the way: what a known start does not show, and what
-            readings average in part.
-        max_move_km: longest move; 50 km, or for a trained policy that of its training.
-        max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.
-        max_steps: steps of a way, the last of which stops.
-        arrival_km: distance from the destination that counts as arrived.
-        confidence: least estimated probability of arrival at which the vehicle is told that it has arrived.
+        options: those of :class:`~magrl.onboard.journal.Options`.
 
     Raises:
         ValueError: for an option out of its range, an unknown navigator, one that reads more than the vehicle knows,
@@ -119,33 +111,21 @@ class Onboard:
     target: Any = None
     """Elements at the destination; None before :meth:`start`."""
 
-    def __init__(
-        self,
-        navigator: str | TensorDictModuleBase = "anywhere",
-        *,
-        sensor_std: Sequence[float] = EXACT,
-        bias_std: Sequence[float] = EXACT,
-        drift_std: Sequence[float] = EXACT,
-        max_move_km: float | None = None,
-        max_turn_deg: float | None = None,
-        max_steps: int = 120,
-        arrival_km: float = 25.0,
-        confidence: float = 0.8,
-    ) -> None:
+    def __init__(self, navigator: str | TensorDictModuleBase = "anywhere", **options: Any) -> None:
         check_type((str, TensorDictModuleBase), navigator=navigator)
-        given: dict[str, Any] = {"sensor_std": sensor_std, "bias_std": bias_std, "drift_std": drift_std}
-        given |= {"max_move_km": max_move_km, "max_turn_deg": max_turn_deg, "max_steps": max_steps}
-        options = Options(**given, arrival_km=arrival_km, confidence=confidence)
+        given = Options(**options)
         source = load_pretrained("anywhere") if navigator == "anywhere" else navigator
         policy = None if isinstance(source, str) else source
-        self.max_move_km, self.max_turn_deg = move_limits(policy, options.max_move_km, options.max_turn_deg)
-        self.options = options.replace(max_move_km=self.max_move_km, max_turn_deg=self.max_turn_deg)
-        self._left_std: Values = options.bias_std
-        self._source = source if policy is None else self._aware(copy.deepcopy(policy)).cpu()
+        self.max_move_km, self.max_turn_deg = move_limits(policy, given.max_move_km, given.max_turn_deg)
+        self.options, self._left_std = given, Values(given.bias_std)
+        if isinstance(policy, FieldPolicy) and isinstance(view_of(policy), TrackView):  # nothing signals the arrival
+            policy = policy.adapted(search=False, max_steps=given.max_steps)
+        self._source = source if policy is None else copy.deepcopy(policy).cpu()
         self.navigator = self._new_navigator()
         name, weights = type(self.navigator).__name__, self.navigator.state_dict().values()
         content = b"".join(value.cpu().numpy().tobytes() for value in weights if isinstance(value, torch.Tensor))
-        self.options = self.options.replace(navigator=name, weights=hashlib.sha256(content).hexdigest())
+        resolved = {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "navigator": name}
+        self.options = given.replace(**resolved, weights=hashlib.sha256(content).hexdigest())
         if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *STD_KEYS, "step_count", "done"}):
             raise ValueError(f"{name} reads {', '.join(unknown)}, which a vehicle does not know")
         self._view, self._estimator = view_of(self.navigator), Estimator(self.navigator)
@@ -162,12 +142,6 @@ class Onboard:
         if self._source == "run_and_tumble":
             return RunAndTumble(*bounds)
         raise ValueError(f"unknown navigator {self._source!r}: choose from {', '.join(NAMED)}, or give a policy")
-
-    def _aware(self, navigator: TensorDictModuleBase) -> TensorDictModuleBase:
-        """Return the navigator with search disabled: a vehicle gets no arrival signal."""
-        if not isinstance(navigator, FieldPolicy) or not isinstance(view_of(navigator), TrackView):
-            return navigator
-        return navigator.adapted(search=False, max_steps=self.options.max_steps)
 
     def start(
         self,
@@ -196,22 +170,23 @@ class Onboard:
             ValueError: for elements that are not possible on the Earth, or beyond the range of the policy.
         """
         given: dict[str, Any] = {"target": target, "here": here, "here_std": here_std, "near": near, "date": date}
-        start = Start(**given)
-        check_earth_reading(*start.target, what="the target")
-        if text := out_of_range(self._view, start.target):
+        journal = Journal(options=self.options, **given)
+        check_earth_reading(*journal.target, what="the target")
+        if text := out_of_range(self._view, journal.target):
             raise ValueError(f"the target: {text}")
-        nearby = None if start.near is None else nearby_elements(start.near, date, start.target, self._longest_way())
-        known = None if start.here is None else known_elements(start.here, start.here_std, date)
-        self._near, self._known, self._start, self.target = nearby, known, start, start.target
+        here, near, goal = journal.here, journal.near, journal.target
+        nearby = None if near is None else nearby_elements(near, date, goal, self._longest_way())
+        known = None if here is None else known_elements(here, journal.here_std, date)
+        self._near, self._known, self._journal, self.target = nearby, known, journal, goal
         self._error, self._left_std = self._calibrated()
         self.navigator = self._new_navigator()
         self._estimator = Estimator(self.navigator)
         self._steps: tuple[Step, ...] = ()
         self._last_command: Command | None = None
-        self._raw: Elements | None = None  # the last reading, without calibration
+        self._raw: tuple[Any, ...] = (None, None, None)  # the last reading, without calibration
         self._last, self._surprises = Values(), Values()  # the last reading with its course
         self._unchanged = EXACT  # path since each element last changed [km]
-        self._unread = [0.0] * 3  # path since it was last read [km]
+        self._unread_km = 0.0  # path since the last complete reading
         self._northward = Values()  # the first inclination, and how far magnetic north the vehicle has come [km]
 
     def step(
@@ -252,14 +227,15 @@ class Onboard:
 
     def _move(self, step: Step) -> Command:
         """Return what to do after a new move."""
-        raw = step.reading_after(self._raw)
+        sheet = self.options.sensor_std
+        raw: Any = tuple(old if new is None else new for new, old in zip(step.reading, self._raw, strict=True))
         check_earth_reading(*raw)
         error = self._error if self._last else self._calibrated(raw)[0]
         reading = math.remainder(raw[0] - error[0], 360), raw[1] - error[1], raw[2] - error[2]
         self._check(step, reading)
         course = math.remainder(math.radians(step.heading), 2 * math.pi)
         turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
-        std = step.accuracy(self.options.sensor_std)
+        std = [OUTAGE_STD if new is None else own for new, own in zip(step.reading, sheet, strict=True)]
         with torch.inference_mode():
             seen = self._seen(reading, course, (step.distance, turn), std)
             if self._last and step.reading != (None, None, None):
@@ -269,12 +245,11 @@ class Onboard:
             self._remember(step, raw)
             return self._command(seen, action, course)
 
-    def _remember(self, step: Step, raw: Elements) -> None:
+    def _remember(self, step: Step, raw: Values) -> None:
         """Keep what later steps are compared with."""
-        self._unchanged = unchanged_km(self._unchanged, self._raw or raw, step.reading, step.distance)
+        self._unchanged = unchanged_km(self._unchanged, self._raw, step.reading, step.distance)
         self._raw = raw
-        unread = zip(self._unread, step.reading, strict=True)
-        self._unread = [km + step.distance if value is None else 0.0 for km, value in unread]
+        self._unread_km = self._unread_km + step.distance if None in step.reading else 0.0
         declination, inclination, _, course = self._last
         first, north = self._northward or (inclination, 0.0)
         self._northward = first, north + step.distance * math.cos(course - math.radians(declination))
@@ -294,9 +269,7 @@ class Onboard:
         steer_deg = self._last_command.heading_deg if self._last_command else None
         check_move(step.heading, step.distance, steer_deg, self.max_move_km)
         if self._last:
-            unread = (km for km, value in zip(self._unread, step.reading, strict=True) if value is not None)
-            distance = step.distance + max(unread, default=0.0)
-            check_earth_jump(self._last[:3], reading, distance, self.options.sensor_std)
+            check_earth_jump(self._last[:3], reading, step.distance + self._unread_km, self.options.sensor_std)
             return
         if step.distance != 0:
             raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
@@ -374,7 +347,7 @@ class Onboard:
         """
         if self.target is None:
             raise RuntimeError(_NOT_STARTED)
-        Journal(options=self.options, start=self._start, steps=self._steps).write(Path(path))
+        self._journal.replace(steps=self._steps).write(Path(path))
 
     def restore(self, path: Path | str) -> None:
         """Repeat the steps of a file of :meth:`save`: the same readings then give the same commands, bit for bit.
@@ -388,7 +361,7 @@ class Onboard:
             if value != own[name]:
                 raise ValueError(f"{path} is of a vehicle with another {name}, {value!r}")
         resumed = copy.copy(self)
-        resumed.start(**dict(journal.start))
+        resumed.start(journal.target, journal.here, here_std=journal.here_std, near=journal.near, date=journal.date)
         for step in journal.steps:
             resumed.step(**dict(step))
         self.__dict__ = resumed.__dict__
