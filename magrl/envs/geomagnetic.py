@@ -229,7 +229,7 @@ class GeomagneticNavEnv(EnvBase):
         weights = guidance.objective_weights(field, target_field, self.objective_floors[region]).float().double()
         zeros = field.new_zeros(len(vehicle), 2)
         heading = zeros[:, :1] if self.start_heading == "north" else random_headings(self.seed, vehicle, episode)
-        flags = {key: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        flags = ("success", "done", "terminated", "truncated", *([specs.DECLARED] if self.arrival.declared else []))
         return TensorDict(
             {
                 "field": field.float(),
@@ -242,12 +242,10 @@ class GeomagneticNavEnv(EnvBase):
                 "start_position": start,
                 "objective": guidance.objective(field, target_field, weights).float(),
                 "objective_weights": weights.float(),
-                "success": flags["done"].clone(),
                 "region": region.unsqueeze(-1),
                 EPISODE_STREAM: counter_stream(self.seed, torch.stack((vehicle, episode), -1)).unsqueeze(-1),
                 **{term: zeros[:, :1].float() for term in specs.REWARD_TERMS},
-                **flags,
-                **({specs.DECLARED: flags["done"].clone()} if self.arrival.declared else {}),
+                **{flag: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for flag in flags},
                 **({DISPLACEMENT: zeros} if self.drift_km else {}),
             },
             batch_size=vehicle.shape,

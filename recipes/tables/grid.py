@@ -1,7 +1,7 @@
 """Make the tables that recipes/tables/tables.toml declares: navigators by errors, tasks and runs.
 
     python recipes/tables/grid.py earth conditions --out docs/results        # writes earth.md and conditions.md
-    python recipes/tables/grid.py earth --navigators policy:MINE=mine.pt     # the same table of other navigators
+    python recipes/tables/grid.py earth --navigators policy:MINE=mine.safetensors  # the same table of other navigators
     python recipes/tables/grid.py earth --tasks 200                          # faster
 
 Without --out, tables are printed. Navigators are given the data sheets of their sensors. Tables of trained agents read
