@@ -32,7 +32,6 @@ from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
 from magrl.transforms.rewards import DistanceCost as DistanceCost
 from magrl.transforms.rewards import EpisodeSum as EpisodeSum
 from magrl.transforms.rewards import HighestSPL as HighestSPL
-from magrl.transforms.rewards import ProgressReward as ProgressReward
 from magrl.transforms.rewards import RandomStepPrice as RandomStepPrice
 from magrl.transforms.rewards import SPLReward as SPLReward
 from magrl.transforms.rewards import TrueWay as TrueWay

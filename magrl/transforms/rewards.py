@@ -173,46 +173,6 @@ class RandomStepPrice(EpisodeErrors):
         return episode.errors
 
 
-class ProgressReward(StepReward):
-    """Add a reward for the distance by which a move brings the vehicle nearer to its destination. Privileged.
-
-    Over an episode it sums to the difference of the distances at the start and at the end, so that detours and returns
-    earn nothing: a potential-based reward without discount.
-
-    Args:
-        weight: reward for a move that is nearer by 100 km.
-        in_keys: true way ``(..., 2)`` [km].
-        out_keys: one reward ``(..., 1)``, to which the term is added.
-
-    Raises:
-        ValueError: for a negative weight, or another number of keys.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> after = TensorDict(true_way=torch.tensor([30.0, 40.0]), reward=torch.tensor([0.5]))
-        >>> step = TensorDict(true_way=torch.tensor([0.0, 100.0]), next=after)
-        >>> ProgressReward(2.0)(step)["next", "reward"]
-        tensor([1.5000])
-    """
-
-    default_in_keys = ("true_way",)
-
-    def __init__(self, weight: float, in_keys: GivenKeys = None, out_keys: GivenKeys = None) -> None:
-        super().__init__(in_keys, out_keys)
-        check_number(0, weight=weight)
-        self.weight = float(weight)
-
-    @property
-    def state_keys(self) -> list[NestedKey]:
-        """Keys that a step reads from the TensorDict before it: the true way."""
-        return self.in_keys
-
-    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        before, after = (way[0].norm(dim=-1, keepdim=True) for way in (state, values))
-        key = self.out_keys[0]
-        tensordict.set(key, tensordict[key] + self.weight / 100 * (before - after))
-
-
 class EpisodeSum(StatefulTransform):
     """Write the sums of observations over an episode, such as of the terms of the reward.
 

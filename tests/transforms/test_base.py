@@ -27,7 +27,6 @@ from magrl.transforms import (
     GradientHeading,
     HighestSPL,
     MinMaxNorm,
-    ProgressReward,
     RandomSensorNoise,
     RandomStepPrice,
     ReadingObservation,
@@ -84,9 +83,7 @@ ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     "guided": (nav, guided),
     "rewarded": (
         nav,
-        lambda: Compose(
-            ReadingObservation(), RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward(), ProgressReward(2.0)
-        ),
+        lambda: Compose(ReadingObservation(), RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward()),
     ),
     "every error": (nav, every_error),
     "plane": (partial(PlaneEnv, (3,), torch.float64), of_a_plane),

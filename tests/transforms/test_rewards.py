@@ -13,7 +13,7 @@ from torchrl.envs import Compose, TransformedEnv
 from magrl.evaluation import episode_measures
 from magrl.geodesy import geodesic, move
 from magrl.navigators import Secant
-from magrl.transforms import DistanceCost, HighestSPL, ProgressReward, RandomStepPrice, SPLReward, TrueWay
+from magrl.transforms import DistanceCost, HighestSPL, RandomStepPrice, SPLReward, TrueWay
 
 pytestmark = pytest.mark.filterwarnings("ignore:Nested TransformedEnvs are automatically unwrapped")
 
@@ -113,18 +113,7 @@ def test_distance_cost_is_paid_for_each_kilometer() -> None:
     assert (move[..., 0] == 30).all()
 
 
-def test_progress_is_the_distance_that_is_left_less() -> None:
-    plain, env = nav(4), TransformedEnv(nav(4), Compose(TrueWay(), ProgressReward(2.0)))
-    rewards, nearer = plain.rollout(6, long_move)["next", "reward"], env.rollout(6, long_move)
-    start, end = (nearer[key][:, place].norm(dim=-1) for key, place in (("true_way", 0), (("next", "true_way"), -1)))
-    gained = (nearer["next", "reward"] - rewards).sum(1).squeeze(-1)
-    assert (start - end).abs().min() > 5
-    torch.testing.assert_close(gained, 0.02 * (start - end), rtol=1e-3, atol=1e-2)
-
-
-@pytest.mark.parametrize(
-    "reward", [lambda: ProgressReward(-1.0), lambda: DistanceCost(-1.0), lambda: SPLReward(scale=-1.0)]
-)
+@pytest.mark.parametrize("reward", [lambda: DistanceCost(-1.0), lambda: SPLReward(scale=-1.0)])
 def test_a_negative_weight_is_refused(reward) -> None:
-    with pytest.raises(ValueError, match=r"(weight|cost|scale) must be .*-1\.0"):
+    with pytest.raises(ValueError, match=r"(cost|scale) must be .*-1\.0"):
         reward()
