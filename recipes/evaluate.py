@@ -2,7 +2,7 @@
 
     python recipes/evaluate.py secant parallel                                  # without training
     python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso:flown --out runs/comparison
-    python recipes/evaluate.py secant --scenario my.toml --export tracks.kml    # own tasks, tracks for a map
+    python recipes/evaluate.py secant --scenario my.toml --export tracks.geojson    # own tasks, tracks for a map
     python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --noise 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --conditions ship                # errors of a real vehicle
     python recipes/evaluate.py secant kalman --arrival distance --arrival-radius-km 25 --max-steps 80 --altitude-km -3
@@ -87,7 +87,7 @@ class Config(ScenarioOptions):
     """TOML or JSON file of an own region, date and tasks (docs/data.md); by default that of the runs, or the
     paper's."""
     export: Path | None = None
-    """File for the tracks of all episodes: .geojson, .gpx or .kml."""
+    """GeoJSON file for the tracks of all episodes (.geojson)."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
     """How metaheuristics evaluate a candidate move."""
     noise: Noise | None = None

@@ -84,7 +84,7 @@ class Config:
     out: Path = Path("runs/fly")
     """Folder of flight.png and flight.json, which are replaced."""
     export: Path | None = None
-    """File for the track: .geojson, .gpx or .kml."""
+    """GeoJSON file for the track (.geojson)."""
     animate: Path | None = None
     """File for an animation of the flight: .gif."""
 

@@ -67,7 +67,7 @@ def test_a_vehicle_that_is_alone_declares_its_arrival(tmp_path: Path) -> None:
         ({"noise": (0.1, 0.0, 0.0), "conditions": "ship"}, "omit --noise"),
         ({"known_start": (0.0, 0.0, 0.0)}, "needs conditions"),
         ({"start_heading": math.inf}, "start_heading"),
-        ({"export": Path("track.txt")}, "must end in one of .geojson, .gpx, .kml"),
+        ({"export": Path("track.txt")}, "must end in .geojson, got 'track.txt'"),
         ({"animate": Path("flight.mp4")}, r"an animation must end in \.gif, got flight\.mp4"),
     ],
 )
