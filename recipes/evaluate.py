@@ -76,7 +76,7 @@ class Config(ScenarioOptions):
     """Settings of an evaluation."""
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
-    """Navigators: anywhere, kalman, secant, run_and_tumble, mean_jacobian, map_matching, parallel, geodesic, ga, pso,
+    """Navigators: anywhere, kalman, secant, mean_jacobian, map_matching, parallel, geodesic, ga, pso,
     afsa; with a run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN; a policy of any algorithm
     policy=FILE or policy:LABEL=FILE."""
     tasks: TaskSet | int | None = None

@@ -56,7 +56,7 @@ class Config:
     log: tyro.conf.Positional[Path]
     """Log of the vehicle: a CSV file with a header."""
     navigator: str = "anywhere"
-    """Navigator: anywhere (the pretrained agent), secant, kalman, run_and_tumble, or a policy file (.safetensors)."""
+    """Navigator: anywhere (the pretrained agent), secant, kalman, or a policy file (.safetensors)."""
     target: tuple[float, float, float] | None = None
     """Elements at the destination, D [deg], I [deg], B_H [nT]; by default those of the last row."""
     target_position: tuple[float, float] | None = None

@@ -10,7 +10,6 @@ from magrl.navigators.mean_jacobian import MeanJacobian as MeanJacobian
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
 from magrl.navigators.parallel import ParallelApproach as ParallelApproach
 from magrl.navigators.quasi_newton import QuasiNewton as QuasiNewton
-from magrl.navigators.run_and_tumble import RunAndTumble as RunAndTumble
 from magrl.navigators.secant import Secant as Secant
 
 _CLASSES: tuple[type[Navigator], ...] = (
@@ -22,7 +21,6 @@ _CLASSES: tuple[type[Navigator], ...] = (
     Kalman,
     MeanJacobian,
     Geodesic,
-    RunAndTumble,
     MapMatching,
 )
 NAVIGATORS = {navigator.name: navigator for navigator in _CLASSES}

@@ -21,7 +21,7 @@ from magrl import tracking
 from magrl.agents import FieldPolicy, load_pretrained
 from magrl.checks import check_type
 from magrl.envs.geomagnetic import PUBLIC_KEYS
-from magrl.navigators import Kalman, RunAndTumble, Secant
+from magrl.navigators import Kalman, Secant
 from magrl.onboard.estimator import Estimator
 from magrl.onboard.journal import Journal, Options, Step
 from magrl.onboard.limits import check_move, measured, move_limits, out_of_range, stuck, unchanged_km, view_of
@@ -33,7 +33,7 @@ from magrl.transforms.errors.known_start import EXACT
 from magrl.transforms.errors.sensors import OUTAGE_STD
 from magrl.transforms.track import STD_KEYS
 
-NAMED = ("anywhere", "secant", "kalman", "run_and_tumble")
+NAMED = ("anywhere", "secant", "kalman")
 """Navigators by name; any other is given as a module."""
 LONGEST_WAY_KM = 2500.0
 """Estimated way beyond which an agent without a map is out of range: there its observation of the way saturates."""
@@ -90,8 +90,8 @@ class Onboard:
     move. Each returns a :class:`Command`. A call that raises an error changes nothing: repeat it with right values.
 
     Args:
-        navigator: ``"anywhere"`` for the pretrained agent, ``"secant"``, ``"kalman"`` or ``"run_and_tumble"``; or a
-            policy from :func:`magrl.load_policy`, or a navigator, of which the vehicle gets a copy.
+        navigator: ``"anywhere"`` for the pretrained agent, ``"secant"`` or ``"kalman"``; or a policy from
+            :func:`magrl.load_policy`, or a navigator, of which the vehicle gets a copy.
         options: those of :class:`~magrl.onboard.journal.Options`.
 
     Raises:
@@ -139,8 +139,6 @@ class Onboard:
             return Secant(*bounds, sensor_std=options.sensor_std, bias_std=self._left_std)
         if self._source == "kalman":
             return Kalman(*bounds, options.sensor_std, options.max_steps, bias_std=self._left_std, search=False)
-        if self._source == "run_and_tumble":
-            return RunAndTumble(*bounds)
         raise ValueError(f"unknown navigator {self._source!r}: choose from {', '.join(NAMED)}, or give a policy")
 
     def start(

@@ -13,7 +13,7 @@ from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
 from magrl.geodesy import steer
-from magrl.navigators import NAVIGATORS, MeanJacobian, Navigator, ParallelApproach, RunAndTumble, Secant
+from magrl.navigators import NAVIGATORS, MeanJacobian, Navigator, ParallelApproach, Secant
 from magrl.navigators.base import displacement_to
 from magrl.navigators.secant import probe_length
 from magrl.transforms import Conditions, with_conditions
@@ -182,18 +182,6 @@ def test_mean_jacobian_needs_no_probes(env) -> None:
     assert flown(env, noisy(navigator, NOISE))["spl"] > 96
 
 
-def test_run_and_tumble_turns_where_the_objective_rises() -> None:
-    """F = 3, 1.08, 1.47, 0.75: it falls, rises, falls."""
-    navigator = RunAndTumble(40.0, 2.0)
-    target, turns = torch.tensor([[10.0, 10.0, 1000.0]]), []
-    for step, share in enumerate((0.0, 0.4, 0.3, 0.5)):
-        state = {"field": share * target, "target_field": target, "heading": torch.zeros(1, 1)}
-        action = navigator(TensorDict(state | {"step_count": torch.tensor([[step]])}, [1]))["action"]
-        assert action[0, 0] == 20
-        turns.append(action[0, 1].item())
-    assert turns == pytest.approx([0.0, 0.0, math.pi / 2, 0.0])
-
-
 def test_each_navigator_declares_what_it_is() -> None:
     """Names and labels are different; an oracle needs more than its readings."""
     assert len({kind.label for kind in NAVIGATORS.values()}) == len(NAVIGATORS)
@@ -310,11 +298,9 @@ def test_maps_and_pairs_are_checked(env) -> None:
     for kind in (ParallelApproach, lambda field: MeanJacobian(field, torch.zeros(2, 2))):
         with pytest.raises(ValueError, match="field must have value_and_gradient"):
             kind(len)
-    with pytest.raises(ValueError, match="objective_floors"):
-        RunAndTumble(objective_floors=(1.0, 0.0, 1.0))
 
 
-@pytest.mark.parametrize("name", ["secant", "mean_jacobian", "run_and_tumble", "map_matching"])
+@pytest.mark.parametrize("name", ["secant", "mean_jacobian", "map_matching"])
 def test_a_reading_that_is_nan_is_not_flown(env, name: str) -> None:
     """A NaN action, which the environment refuses, and not a move by a guess; other vehicles go on."""
     env.set_seed(0)

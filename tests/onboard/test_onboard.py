@@ -315,7 +315,7 @@ def test_the_altitude_of_the_target_moves_the_estimate() -> None:
 # State
 
 
-@pytest.mark.parametrize("navigator", ["anywhere", "kalman", "run_and_tumble"])
+@pytest.mark.parametrize("navigator", ["anywhere", "kalman"])
 def test_a_restored_vehicle_goes_on_bit_for_bit(navigator: str, tmp_path: Path) -> None:
     """From each step on, also after a missed reading and a repeated message, whatever kind of number was given."""
     first, path = Onboard(navigator, sensor_std=np.float32(NOISE), max_steps=np.int64(50)), tmp_path / "state"
