@@ -100,7 +100,13 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         held = {Path(name) for name in archive.namelist()}
     library = {path.relative_to(ROOT) for path in (ROOT / "magrl").rglob("*") if path.suffix == ".py"}
-    data = {"py.typed", "evaluation/templates/replay.html", "evaluation/coastlines.npz", "field/wmmhr2025.cof.gz"}
+    data = {
+        "py.typed",
+        "__init__.pyi",
+        "evaluation/templates/replay.html",
+        "evaluation/coastlines.npz",
+        "field/wmmhr2025.cof.gz",
+    }
     data |= {
         "field/weather.npz",
         "tracking/learned_prior.pt",
