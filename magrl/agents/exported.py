@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import copy
-import io
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -15,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from magrl.agents.program import TensorProgram, export_module
+from magrl.agents.program import TensorProgram
 from magrl.checks import check_type
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.transforms import ObservationView
@@ -138,12 +135,8 @@ class ExportedPolicy(TrainedPolicy):
             )
         self.in_keys, self.program, self.view = list(in_keys), program, view
         self.first_state, self.state_keys, self.declares = list(first_state), tuple(states), declares
-        program.check_size(*self._examples())
-
-    def _examples(self) -> list[Tensor]:
-        """Return an example of each input of the program, for one vehicle."""
-        examples = [EXAMPLES[key] for key in self.in_keys]
-        return [torch.ones(1, 1, dtype=torch.bool), *examples, *self.first_state] if self.first_state else examples
+        starts = [torch.ones(1, 1, dtype=torch.bool)] if states else []
+        program.check_size(*starts, *(EXAMPLES[key] for key in self.in_keys), *self.first_state)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]; or ``(..., 3)`` with the declaration."""
@@ -164,26 +157,6 @@ class ExportedPolicy(TrainedPolicy):
         state = TensorDict(dict(zip(self.state_keys, after, strict=True)), flat.shape, device=seen.device)
         self._keep_state(seen, before, starts, state.reshape(seen.shape))
         return tensordict.set("action", action.reshape(*seen.shape, -1))
-
-    def write_torch(self, path: Path | str) -> None:
-        """Write a file for :func:`torch.export.load`, which acts without magrl and TorchRL.
-
-        Its module takes the values of ``in_keys`` in their order, ``(N, ...)`` each, and returns a tuple of the action.
-        With a state, it takes and returns what ``program`` does; the first state is ``first_state``.
-        PyTorch reads such a file with pickle: load it only from a source that you trust.
-
-        Args:
-            path: path of the file, ``.pt2``.
-
-        Raises:
-            ValueError: for another suffix.
-            OSError: if it cannot be written.
-        """
-        if Path(path).suffix != ".pt2":
-            raise ValueError(f"a file for torch.export.load must end with .pt2, got {str(path)!r}")
-        file = io.BytesIO()
-        torch.export.save(export_module(copy.deepcopy(self.program).cpu(), self._examples()), file)
-        Path(path).write_bytes(file.getvalue())
 
     def content(self) -> dict[str, Any]:
         """Return all that rebuilds the policy as numbers, text and tensors."""

@@ -18,10 +18,8 @@ from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.exported import ExportedPolicy, TrainedPolicy, rebuild
-from magrl.agents.network import Network, seen_by, trace_network
 from magrl.agents.networks import Device, make_actor, make_correcting_actor
 from magrl.agents.pipeline import export_policy
-from magrl.agents.program import TensorProgram
 from magrl.checks import check_finite, check_type, short
 from magrl.files import load_tensors, save_tensors
 from magrl.transforms import ObservationView, TrackView
@@ -39,7 +37,7 @@ class PolicyConfig:
 
     Args:
         view: what the policy observes, and its scaling: values scaled to a region, or estimates of its own track.
-        num_cells: width of each hidden layer; None for a network of one's own.
+        num_cells: width of each hidden layer.
         layer_norm: whether hidden layers are normalized.
 
     Raises:
@@ -54,22 +52,15 @@ class PolicyConfig:
     """
 
     view: ObservationView | TrackView
-    num_cells: tuple[int, ...] | None = None
+    num_cells: tuple[int, ...]
     layer_norm: bool = True
 
     def __post_init__(self) -> None:
         check_type((ObservationView, TrackView), view=self.view)
-        if self.num_cells is not None:
-            self.make_actor("meta")  # checks the sizes
+        self.make_actor("meta")  # checks the sizes
 
     def make_actor(self, device: Device = None) -> TensorDictSequential:
-        """Return an actor of this shape, with new weights.
-
-        Raises:
-            ValueError: for a network of one's own.
-        """
-        if self.num_cells is None:
-            raise ValueError("num_cells must be given, or the actor: FieldPolicy(PolicyConfig(view), actor)")
+        """Return an actor of this shape, with new weights."""
         if isinstance(self.view, TrackView):
             return make_correcting_actor(self.view, self.num_cells, device=device)
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
@@ -86,12 +77,10 @@ class FieldPolicy(TrainedPolicy):
 
     Args:
         config: what the policy observes, and the shape of its network.
-        actor: trained actor of that shape; one with new weights by default. With a network of one's own: a module
-            without a state from what the view writes to ``action`` ``(N, 2)`` in [-1, 1].
+        actor: trained actor of that shape; one with new weights by default.
 
     Raises:
         TypeError: for a configuration of another type.
-        ValueError: for a configuration without ``num_cells`` and without an actor.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -129,7 +118,7 @@ class FieldPolicy(TrainedPolicy):
         config = replace(self.config, view=replace(self.config.view, **changes))
         limits = [(name, getattr(self.view, name), getattr(config.view, name)) for name in LIMITS]
         if changed := [f"{name} is {old:g}, not {new:g}" for name, old, new in limits if new != old]:
-            if not (isinstance(self.view, TrackView) and config.num_cells):
+            if not isinstance(self.view, TrackView):
                 raise ValueError(f"the actions of this policy are scaled to the limits of its training: {changed[0]}")
             actor = config.make_actor()
             actor.load_state_dict(self.actor.state_dict(), assign=True)
@@ -147,7 +136,7 @@ class FieldPolicy(TrainedPolicy):
         policy, base = self, getattr(env, "base_env", env)
         if isinstance(self.view, TrackView):
             limits = {name: min(getattr(self.view, name), getattr(base, name)) for name in LIMITS}
-            limits = {"zeta": base.zeta, "max_steps": base.max_steps} | (limits if self.config.num_cells else {})
+            limits |= {"zeta": base.zeta, "max_steps": base.max_steps}
             searches = self.view.search and base.arrival.rule == "objective"
             policy = self.adapted(**limits, search=searches).to(base.device)
         policy.check_fits(base)
@@ -239,10 +228,7 @@ def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | N
     if isinstance(policy, ExportedPolicy):
         save_tensors({"format": POLICY_FORMAT, "exported": policy.content()}, Path(path))
         return
-    if policy.config.num_cells is None:
-        weights = trace_network(policy.actor, policy.view).content()
-    else:
-        weights = {key: value for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
+    weights = {key: value for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
     kind = next(name for name, view in VIEWS.items() if isinstance(policy.config.view, view))
     config = asdict(policy.config) | {"kind": kind}
     save_tensors({"format": POLICY_FORMAT, "config": config, "weights": weights}, Path(path))
@@ -282,10 +268,6 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
 def _rebuild(config: Any, weights: Any) -> FieldPolicy:
     view = VIEWS[config.pop("kind")](**config.pop("view"))
     rebuilt = PolicyConfig(view, **config)
-    if rebuilt.num_cells is None:
-        network = Network(weights["in_keys"], TensorProgram(**weights["program"]))
-        network.program.check_size(*map(seen_by(view).get, network.in_keys))
-        return FieldPolicy(rebuilt, network)
     # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
     rebuilt.make_actor("meta").load_state_dict(weights, assign=True)
     check_finite(weights.items(), "weights")

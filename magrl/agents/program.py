@@ -146,26 +146,15 @@ def trace_program(module: nn.Module, inputs: Sequence[Tensor]) -> TensorProgram:
         table = torch.export.default_decompositions()
         for operation in WHOLE.values():
             table.pop(operation, None)
-        exported = export_module(module, inputs).run_decompositions(table)
+        exported = _export(module, inputs).run_decompositions(table)
     except Exception as error:  # whatever torch.export and the module raise
         reason = str(error).strip().partition("\n")[0] or type(error).__name__
         raise ValueError(f"PyTorch cannot export it: {reason}") from error
     return _program(exported)
 
 
-def export_module(module: nn.Module, inputs: Sequence[Tensor]) -> torch.export.ExportedProgram:
-    """Return a module exported by PyTorch for a batch of any size, without exploration.
-
-    Args:
-        module: module of ``forward(*inputs)`` that returns a tuple of tensors, on the CPU, in evaluation mode.
-        inputs: example of each input, ``(N, ...)``.
-
-    Example:
-        >>> program = TensorProgram(1, [["neg.default", [{"value": 0}], {}]], [], [1])
-        >>> export_module(program, [torch.zeros(3, 1)]).module()(torch.ones(2, 1))
-        (tensor([[-1.],
-                [-1.]]),)
-    """
+def _export(module: nn.Module, inputs: Sequence[Tensor]) -> torch.export.ExportedProgram:
+    """Return a module exported by PyTorch for a batch of any size, without exploration."""
     examples = tuple(value[:1].expand(_EXAMPLES, *value.shape[1:]).clone() for value in inputs)
     batch = torch.export.Dim("batch")
     validated = Distribution._validate_args  # which reads values, and a trace has none

@@ -1,7 +1,6 @@
 """Policies of any algorithm: exported with the transforms that they need, compared, saved, loaded and refused."""
 
 import copy
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,8 +12,7 @@ from torchrl.envs import CatTensors, Compose, ObservationNorm, RewardSum, Transf
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
-from magrl.agents import ExportedPolicy, FieldPolicy, PolicyConfig, load_policy, save_policy
-from magrl.agents.network import Network
+from magrl.agents import ExportedPolicy, load_policy, save_policy
 from magrl.agents.program import TensorProgram, trace_program
 from magrl.envs import GeomagneticNavEnv
 from magrl.files import load_tensors, save_tensors
@@ -108,23 +106,6 @@ def test_programs_compute_usual_functions_to_the_bit() -> None:
     program = trace_program(Functions(), (x[:3], y[:3]))
     for found, expected in zip(program(x, y), Functions()(x, y), strict=True):
         assert torch.equal(found, expected)
-
-
-def test_an_export_acts_with_torch_alone(saved: Path, tmp_path: Path, monkeypatch) -> None:
-    """The same bits, where neither this library nor TorchRL can be imported."""
-    policy, state = load_policy(saved), GeomagneticNavEnv(num_envs=7, seed=1).reset()
-    policy.write_torch(tmp_path / "own.pt2")
-    with monkeypatch.context() as patch:
-        for name in [name for name in sys.modules if name.startswith(("magrl", "torchrl", "tensordict"))]:
-            patch.setitem(sys.modules, name, None)
-        act = torch.export.load(tmp_path / "own.pt2").module()
-    for count in (7, 1):
-        (actions,) = act(*(state[key][:count] for key in policy.in_keys))
-        assert torch.equal(actions, policy(state[:count].clone())["action"])
-    with pytest.raises(ValueError, match=r"must end with \.pt2, got .*own\.pt'"):
-        policy.write_torch(tmp_path / "own.pt")
-    with pytest.raises(ValueError, match=r"own\.pt2 is damaged: it is no safetensors file"):
-        load_policy(tmp_path / "own.pt2")
 
 
 # Refusals at save time
@@ -236,11 +217,11 @@ HUGE_SIZES = [
     [(steps, "makes more numbers than 10000000") for steps in LARGE] + [(steps, "takes sizes") for steps in HUGE_SIZES],
 )
 def test_a_program_that_takes_any_memory_is_refused(steps: list, message: str, tmp_path: Path) -> None:
-    """Before it runs, by the shapes of one vehicle; in an exported policy, and in a network behind a view."""
+    """Before it runs, by the shapes of one vehicle; also of a file."""
     program = TensorProgram(1, steps, [], [0])
     with pytest.raises(ValueError, match=message):
         ExportedPolicy(["move"], program)
-    view = GeomagneticNavEnv(seed=0).observation_view()
-    save_policy(tmp_path / "own.safetensors", FieldPolicy(PolicyConfig(view), Network(["move"], program)))
+    content = {"in_keys": ["move"], "view": None, "first_state": [], "declares": False, "program": program.content()}
+    save_tensors({"format": 3, "exported": content}, tmp_path / "own.safetensors")
     with pytest.raises(ValueError, match=f"does not hold a valid policy: .*{message}"):
         load_policy(tmp_path / "own.safetensors")

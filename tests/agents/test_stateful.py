@@ -13,11 +13,11 @@ from torchrl.data import Unbounded
 from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform, TransformedEnv
 from torchrl.modules import MLP, GRUModule, LSTMModule
 
-from magrl.agents import ExportedPolicy, FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
+from magrl.agents import ExportedPolicy, export_policy, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluate
 from magrl.evaluation.rollout import evaluation_rollout
-from magrl.onboard import Onboard, VehicleStep, first_state
+from magrl.onboard import Onboard
 from magrl.transforms import SensorNoise, TrackView
 from magrl.transforms.base import StatefulTransform
 
@@ -43,8 +43,8 @@ class Add(nn.Module):
         return memory + 0.1 * heading + 0.01
 
 
-def head(size: int, key: str, outputs: int = 2) -> TensorDictModule:
-    return TensorDictModule(nn.Sequential(MLP(size, outputs, num_cells=[16]), nn.Tanh()), [key], ["action"])
+def head(size: int, key: str) -> TensorDictModule:
+    return TensorDictModule(nn.Sequential(MLP(size, 2, num_cells=[16]), nn.Tanh()), [key], ["action"])
 
 
 def lstm() -> list[TensorDictModuleBase]:
@@ -142,71 +142,6 @@ def test_a_state_needs_neither_tracker_nor_primer_in_the_environment() -> None:
     policy = export_policy(TensorDictSequential(*parts), TransformedEnv(env, bare, auto_unwrap=True))
     wanted = evaluation_rollout(training_env(parts), TensorDictSequential(*parts))
     assert torch.equal(evaluation_rollout(plain_env(), policy)["next", "position"], wanted["next", "position"])
-
-
-def test_a_program_with_a_state_acts_with_torch_alone(flight, tmp_path: Path) -> None:
-    policy, *_ = flight
-    policy.write_torch(tmp_path / "own.pt2")
-    act, state = torch.export.load(tmp_path / "own.pt2").module(), plain_env().reset()
-    values = [state[key] for key in policy.in_keys]
-    first = [tensor.expand(5, *tensor.shape[1:]) for tensor in policy.first_state]
-    action, *after = act(torch.ones(5, 1, dtype=torch.bool), *values, *first)
-    assert torch.equal(action, policy(state)["action"])
-    assert [part.shape for part in after] == [part.shape for part in first]
-
-
-def test_a_network_of_ones_own_between_view_and_action(tmp_path: Path) -> None:
-    """It takes the options of the view, flies alike after saving, and as a file for other programs."""
-    torch.manual_seed(0)
-    view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
-    policy = FieldPolicy(PolicyConfig(view), TensorDictSequential(*own_network()))
-    save_policy(tmp_path / "own.pt", policy)
-    loaded = load_policy(tmp_path / "own.pt")
-    save_policy(tmp_path / "again.pt", loaded)
-    assert (tmp_path / "again.pt").read_bytes() == (tmp_path / "own.pt").read_bytes()
-    wanted = evaluation_rollout(plain_env(start_heading="random"), policy.adapted(search=False))
-    got = evaluation_rollout(plain_env(start_heading="random"), loaded.adapted(search=False))
-    assert torch.equal(got["next", "position"], wanted["next", "position"])
-    assert wanted["action"].std(1).min() > 1e-3
-    target, reading = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0, 290.0)
-    commands = []
-    for navigator in (policy, loaded):
-        vehicle = Onboard(navigator, max_steps=view.max_steps)
-        vehicle.start(target)
-        commands.append(vehicle.step(*reading))
-    assert commands[0] == commands[1]
-    here, there, course = (torch.tensor(x) for x in (reading[:3], target, (0.0, math.radians(290))))
-    action = VehicleStep(loaded)(here, there, course, torch.zeros(3, 3), *first_state())[0]
-    assert action[0].item() == pytest.approx(commands[0].distance_km, abs=1e-3)
-
-
-def own_network() -> list[TensorDictModuleBase]:
-    """Return a network that reads the observation and an estimate, and writes more than the action."""
-    joined = TensorDictModule(lambda a, b: torch.cat((a, b / 300), -1), ["observation", "way"], ["joined"])
-    return [joined, head(21, "joined")]
-
-
-@pytest.mark.parametrize(
-    ("actor", "message"),
-    [
-        (
-            head(19, "position"),
-            r"reads \['position'\], which the view does not write: .*save_policy\(path, actor, env\)",
-        ),
-        (head(19, "observation", 3), r"action of a network must be \(N, 2\), got \(5, 3\)"),
-        (TensorDictModule(lambda x: x.cumsum(0)[..., :2], ["observation"], ["action"]), "of one vehicle only"),
-    ],
-)
-def test_networks_that_cannot_be_saved_are_refused(actor, message: str, tmp_path: Path) -> None:
-    view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
-    with pytest.raises(ValueError, match=message):
-        save_policy(tmp_path / "own.pt", FieldPolicy(PolicyConfig(view), actor))
-
-
-def test_a_network_of_ones_own_is_given() -> None:
-    view = GeomagneticNavEnv(seed=0).observation_view()
-    with pytest.raises(ValueError, match=r"or the actor: FieldPolicy\(PolicyConfig\(view\), actor\)"):
-        FieldPolicy(PolicyConfig(view))
 
 
 @pytest.mark.slow  # PyTorch traces the filter for half a minute
