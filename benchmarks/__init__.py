@@ -1,0 +1,3 @@
+"""Benchmarks: ``python -m benchmarks``."""
+
+import magrl as magrl  # before torch: see recipes/ruff.toml

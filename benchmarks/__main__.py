@@ -6,10 +6,6 @@ for the documents where --publish is given.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # read when torch is imported: see recipes/td3_gradient_guided.py
-
 import argparse
 import importlib
 import platform
@@ -19,11 +15,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
-import torch
-
 from benchmarks.timing import HEADER, Row
 from magrl.files import write_json
+
+import matplotlib.pyplot as plt
+import torch
 
 DOCS = Path(__file__).parent.parent / "docs"
 COMPARISONS = ("fields", "env", "onboard", "update", "training")

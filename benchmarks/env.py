@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import time
 
-from torchrl.collectors import Collector
-from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
-
 from benchmarks.timing import Row, alternate
 from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.transforms import (
@@ -17,6 +14,9 @@ from magrl.transforms import (
     VectorErrors,
     north_reference,
 )
+
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 
 VEHICLES = 1024
 REGIONS = 2048

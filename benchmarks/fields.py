@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import datetime
 
-import ppigrf
-import torch
-
 from benchmarks.timing import Row, alternate, one_thread
 from magrl import paper
 from magrl.field import IGRF, RegionalField
+
+import ppigrf
+import torch
 
 DATE = datetime.fromisoformat(paper.DATE)
 BOX = tuple((low - 5.5, high + 5.5) for low, high in (paper.LATITUDE, paper.LONGITUDE))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-import torch
-from tensordict import TensorDictBase
-
 from benchmarks.timing import HEADER, Row, alternate, one_thread
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
 from magrl.onboard import Onboard
+
+import torch
+from tensordict import TensorDictBase
 
 NAVIGATORS = ("anywhere", "secant", "kalman")
 

@@ -9,16 +9,16 @@ import tempfile
 import time
 from pathlib import Path
 
+from benchmarks.timing import Row
+from magrl.envs.gymnasium import ENV_ID
+from magrl.envs.sb3 import BatchedVecEnv
+
 import gymnasium
 import numpy as np
 import torch
 from gymnasium.wrappers.vector import TransformReward as TransformRewards
 from stable_baselines3 import TD3
 from stable_baselines3.common.noise import NormalActionNoise
-
-from benchmarks.timing import Row
-from magrl.envs.gymnasium import ENV_ID
-from magrl.envs.sb3 import BatchedVecEnv
 
 RECIPES = Path(__file__).parent.parent / "recipes"
 sys.path.insert(0, str(RECIPES))

@@ -6,6 +6,9 @@ import copy
 import sys
 from pathlib import Path
 
+from benchmarks.timing import Row, alternate
+from magrl.agents import SoftUpdate, TD3Loss, make_actor, make_critic, optimize, saturation_penalty
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -13,9 +16,6 @@ from torch.nn import functional
 from torchrl.data import Bounded
 from torchrl.objectives import SoftUpdate as TorchRLSoftUpdate
 from torchrl.objectives import TD3Loss as TorchRLTD3Loss
-
-from benchmarks.timing import Row, alternate
-from magrl.agents import SoftUpdate, TD3Loss, make_actor, make_critic, optimize, saturation_penalty
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
 from td3_gradient_guided import PAPER, Config

@@ -5,8 +5,12 @@ Gymnasium. The names in ``magrl.__all__``, those of ``__init__.pyi``, are loaded
 does not load torch.
 """
 
+import os as _os
+
 import gymnasium as _gymnasium
 import lazy_loader as _lazy_loader
+
+_os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
 
 __version__ = "0.2.0"
 

@@ -20,10 +20,6 @@ trajectories.png (the first tasks of each navigator).
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 import csv
 import itertools
 import math
@@ -32,14 +28,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
-
-import torch
-import tyro
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torchrl import torchrl_logger
-from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from magrl.checks import check_numbers
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
@@ -56,6 +44,14 @@ from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
 from magrl.transforms import conditions_named
+
+import torch
+import tyro
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl import torchrl_logger
+from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 RECIPE = "evaluate.py"
 SHOWN = 24

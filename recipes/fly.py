@@ -12,25 +12,12 @@ Writes flight.png and flight.json.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
-
-import torch
-import tyro
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
-from torchrl import torchrl_logger
-from torchrl.envs import TransformedEnv
-from tqdm import tqdm
 
 from magrl.checks import check_number, check_numbers
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
@@ -44,6 +31,15 @@ from magrl.tracking import RANGE_KM
 from magrl.training import UsageError, command, parse
 from magrl.transforms import TrackGradient, conditions_named
 from magrl.transforms.track import IN_KEYS, STD_KEYS
+
+import torch
+import tyro
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl import torchrl_logger
+from torchrl.envs import TransformedEnv
+from tqdm import tqdm
 
 RECIPE = "fly.py"
 RULES = {"told": "objective", "alone": "declared"}

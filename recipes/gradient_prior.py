@@ -8,19 +8,9 @@ The fields are those on which recipes/ppo_anywhere.py trains. The Earth is compa
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import torch
-from torch import Tensor
-from torch.optim import Adam
-from torch.optim.lr_scheduler import LinearLR
-from tqdm import tqdm
 
 from magrl import paper
 from magrl.envs import Scenario, earth_scenario, planet_scenario
@@ -29,6 +19,12 @@ from magrl.field.model import elements_gradient_at
 from magrl.files import check_writable
 from magrl.tracking import LearnedPrior
 from magrl.training import command, parse
+
+import torch
+from torch import Tensor
+from torch.optim import Adam
+from torch.optim.lr_scheduler import LinearLR
+from tqdm import tqdm
 
 RECIPE = "gradient_prior.py"
 REGIONS = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}

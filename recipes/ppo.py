@@ -8,22 +8,9 @@ See docs/training.md.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 import math
 from collections.abc import Sequence
 from typing import Literal
-
-import torch
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
-from torch import nn
-from torch.optim import Adam
-from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 from magrl.agents import FieldPolicy, PolicyConfig, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
@@ -40,6 +27,15 @@ from magrl.transforms import (
     ObservationView,
     SensorNoise,
 )
+
+import torch
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
+from torch import nn
+from torch.optim import Adam
+from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
 
 RECIPE = "ppo.py"
 LOSSES = ("loss_critic", "loss_actor", "loss_entropy", "entropy")

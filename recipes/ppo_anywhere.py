@@ -14,24 +14,10 @@ arrival has an SPL of 0.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
-
-import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
-from torch.optim import Adam
-from torchrl.envs import Compose, ObservationNorm, RewardSum, Transform, TransformedEnv
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, optimize
@@ -53,6 +39,16 @@ from magrl.transforms import (
     sensor_levels,
 )
 from magrl.transforms.track import STD_KEYS
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torch.optim import Adam
+from torchrl.envs import Compose, ObservationNorm, RewardSum, Transform, TransformedEnv
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
 
 RECIPE = "ppo_anywhere.py"
 LOSSES = ("loss_critic", "loss_actor")

@@ -13,22 +13,7 @@ is given a Kalman filter: the difference between the two is what the filter is w
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 from collections.abc import Sequence
-
-import torch
-from ppo_anywhere import Spread, errors, evaluation_env
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
-from torch.optim import Adam
-from torchrl.envs import Compose, EnvBase, InitTracker, ObservationNorm, RewardSum, TransformedEnv
-from torchrl.modules import GRUModule, IndependentNormal, ProbabilisticActor, ValueOperator, set_recurrent_mode
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 from magrl import paper
 from magrl.agents import optimize
@@ -39,6 +24,17 @@ from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, Discount, PlanetConfig, Positive, Widths
 from magrl.transforms import HighestSPL, MinMaxNorm, RandomStepPrice, ReadingObservation, SPLReward, TrueWay
+from ppo_anywhere import Spread, errors, evaluation_env
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torch.optim import Adam
+from torchrl.envs import Compose, EnvBase, InitTracker, ObservationNorm, RewardSum, TransformedEnv
+from torchrl.modules import GRUModule, IndependentNormal, ProbabilisticActor, ValueOperator, set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
 
 RECIPE = "ppo_recurrent.py"
 LOSSES = ("loss_way", "loss_critic", "loss_actor")

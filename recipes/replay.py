@@ -9,18 +9,9 @@ noise of the training. The page shows the true field. Takes seconds.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import tyro
-from tensordict.nn import TensorDictModuleBase
-from torchrl import torchrl_logger
-from torchrl.envs import EnvBase
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluation_rollout
@@ -33,6 +24,11 @@ from magrl.evaluation.scenarios import TaskSet, choose_tasks, first_tasks, with_
 from magrl.files import check_writable
 from magrl.training import UsageError, command, parse
 from magrl.transforms import with_sensor_noise
+
+import tyro
+from tensordict.nn import TensorDictModuleBase
+from torchrl import torchrl_logger
+from torchrl.envs import EnvBase
 
 RECIPE = "replay.py"
 DEFAULT_TASKS = 12

@@ -12,23 +12,10 @@ Writes log.csv, log.md and log.png.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
-import pandas as pd
-import torch
-import tyro
-from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
-from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
 from magrl.agents import load_policy
 from magrl.evaluation.tables import markdown_table
@@ -38,6 +25,15 @@ from magrl.geodesy import check_positions, geodesic
 from magrl.logs import checked_times, joined, mistakes
 from magrl.onboard import Onboard
 from magrl.training import UsageError, command, parse
+
+import numpy as np
+import pandas as pd
+import torch
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 
 RECIPE = "replay_log.py"
 ELEMENTS = [*NAMES]

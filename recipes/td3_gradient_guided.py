@@ -10,23 +10,10 @@ See docs/start.md.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Literal
-
-import torch
-from pydantic import model_validator
-from tensordict.nn import TensorDictSequential
-from torch.optim import Adam
-from torchrl.collectors import BaseCollector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
-from torchrl.modules import AdditiveGaussianModule
 
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
@@ -44,6 +31,15 @@ from magrl.transforms import (
     ObservationView,
     SensorNoise,
 )
+
+import torch
+from pydantic import model_validator
+from tensordict.nn import TensorDictSequential
+from torch.optim import Adam
+from torchrl.collectors import BaseCollector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
+from torchrl.modules import AdditiveGaussianModule
 
 RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))

@@ -9,8 +9,6 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # read when torch is imported
-
 import pytest
 from hypothesis import settings
 

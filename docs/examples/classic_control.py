@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from magrl.transforms import MinMaxNorm
+
 import torch
 import tyro
 from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs import GymEnv, TransformedEnv
-
-from magrl.transforms import MinMaxNorm
 
 
 @dataclass(frozen=True)

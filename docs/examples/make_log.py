@@ -9,10 +9,10 @@ import csv
 import sys
 from pathlib import Path
 
-import torch
-
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move
+
+import torch
 
 COURSES = [290.0] * 4 + [335.0] * 4 + [310.0] * 6 + [280.0] * 4 + [315.0] * 6
 """Headings of the moves [deg]."""

@@ -10,13 +10,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import numpy as np
-import pandas
-import torch
-
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import curvature_radii
 from magrl.logs import axes_of_elements
+
+import numpy as np
+import pandas
+import torch
 
 COURSES = [290.0] * 3 + [335.0] * 3 + [310.0] * 4 + [280.0] * 5
 """Headings of the hours of the way [deg]."""

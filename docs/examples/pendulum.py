@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from magrl.transforms import MinMaxNorm
+
 import torch
 import tyro
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, PendulumEnv, TransformedEnv
-
-from magrl.transforms import MinMaxNorm
 
 
 @dataclass(frozen=True)

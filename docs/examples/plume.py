@@ -9,18 +9,19 @@ frames.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from magrl.agents import SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
+from magrl.agents.networks import make_mlp
+from magrl.evaluation import figures
+from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
+from plume_env import PlumeEnv, concentration
+
 import torch
 import tyro
-from plume_env import PlumeEnv, concentration
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch.optim import Adam
@@ -28,11 +29,6 @@ from torchrl.collectors import Collector
 from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import CatTensors, Compose, RewardScaling, StepCounter, Transform, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule, TanhModule
-
-from magrl.agents import SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
-from magrl.agents.networks import make_mlp
-from magrl.evaluation import figures
-from magrl.transforms import AlignmentReward, AngleVector, FieldGradient, GradientHeading, MinMaxNorm, TargetDifference
 
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
 OBSERVATION_SIZE, NUM_CELLS = 8, (128, 128)

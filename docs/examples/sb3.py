@@ -8,12 +8,12 @@ Prints success rate, SPL (success weighted by path length) and steps on 100 test
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 from dataclasses import dataclass
 from typing import Any, Literal
+
+from magrl import Scenario, paper
+from magrl.envs.gymnasium import ENV_ID
+from magrl.envs.sb3 import BatchedVecEnv
 
 import gymnasium
 import numpy as np
@@ -23,10 +23,6 @@ from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor
-
-from magrl import Scenario, paper
-from magrl.envs.gymnasium import ENV_ID
-from magrl.envs.sb3 import BatchedVecEnv
 
 
 @dataclass(frozen=True)

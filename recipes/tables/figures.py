@@ -10,20 +10,12 @@ the paper's box), prices (SPL over steps), reliability (of stated probabilities)
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 import csv
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
-
-import tyro
-from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from magrl.envs import PAPER_REGION, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
@@ -33,6 +25,10 @@ from magrl.evaluation.runs import NO_NOISE
 from magrl.files import check_writable
 from magrl.training import UsageError, command
 from magrl.transforms import Conditions, load_conditions
+
+import tyro
+from matplotlib.figure import Figure
+from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
 from flights import Flights, matching, reliability

@@ -9,10 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import torch
-from tensordict import TensorDictBase
-from torch import Tensor
-
 from magrl import paper
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, earth_scenario, named_tasks
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize, with_declaration, with_errors
@@ -22,6 +18,10 @@ from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.tables import mean_of_runs
 from magrl.geodesy import geodesic
 from magrl.transforms import Conditions, conditions_named
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
 
 Errors, Measures = Noise | Conditions, Mapping[str, Tensor]
 Spec = str | Mapping[str, Any]

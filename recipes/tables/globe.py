@@ -10,15 +10,6 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-import torch
-from flights import SEED, Errors, Measures, Spec, cell, fly
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from torch import Tensor
-from torchrl.data import Unbounded
-from tqdm import tqdm
-
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks
 from magrl.envs.specs import state_spec
 from magrl.envs.tasks import task_set
@@ -29,6 +20,15 @@ from magrl.evaluation.tables import markdown_table
 from magrl.field import IGRF, elements_at, elements_gradient_at
 from magrl.geodesy import geodesic, move
 from magrl.guidance import OBJECTIVE_FLOORS
+
+import numpy as np
+import torch
+from flights import SEED, Errors, Measures, Spec, cell, fly
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+from torchrl.data import Unbounded
+from tqdm import tqdm
 
 EARTH, FIELD = Region((-90, 90), (-180, 180)), IGRF("2025-01-01")
 CHUNK = 1000  # tasks flown at a time

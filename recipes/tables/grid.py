@@ -10,10 +10,6 @@ the run folders that they name; `make tables` trains what is missing.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each other down; read when torch is imported
-
 import shutil
 import sys
 import tempfile
@@ -21,13 +17,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import tyro
-from tqdm import tqdm
-
 from magrl.evaluation.navigators import check_distinct
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable
 from magrl.training import UsageError, command
+
+import tyro
+from tqdm import tqdm
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -36,8 +32,9 @@ else:
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 sys.path.insert(0, str(Path(__file__).parent))
-import globe
 from evaluate import Config, evaluate
+
+import globe
 from flights import Flights, Spec, cell, names, paired_difference, runs_of
 
 RECIPE = "grid.py"
