@@ -3,7 +3,6 @@ PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
-export GOMP_SPINCOUNT ?= 3000
 
 .PHONY: train fly anywhere prior replay test test-slow test-newest check format docs bench mutate tables figures pictures help clean
 
