@@ -20,7 +20,7 @@ PACKAGES = (
     "training",
 )
 """Packages whose functions and classes are public."""
-MODULES = ("checks", "files", "geodesy", "guidance", "envs.gymnasium")
+MODULES = ("checks", "files", "geodesy", "guidance", "sensor_std", "envs.gymnasium")
 """Modules whose functions and classes are public."""
 
 
