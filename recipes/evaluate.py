@@ -197,7 +197,7 @@ def make_fleet(config: Config, scenarios: Sequence[Scenario]) -> tuple[list[EnvB
     ]
     errors = conditions if config.conditions else config.noise
     flown = [with_errors(base, errors, config.seed, config.known_start) for base in bases]
-    options = {"mode": config.mode, "seed": config.seed, "map_date": config.map_date, **flown[0][1]}
+    options = {"mode": config.mode, "seed": config.seed, "map_date": config.map_date, "sensor_std": flown[0][1]}
     navigators = [tuple(make_navigator(text, base, **options) for base in bases) for text in config.navigators]
     return [with_declaration(env, config.confidence) for env, _ in flown], navigators
 

@@ -27,10 +27,10 @@ from magrl.evaluation.navigators import make_navigator, needs
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
+from magrl.sensor_std import STD_KEYS
 from magrl.tracking import RANGE_KM
 from magrl.training import UsageError, command, parse
 from magrl.transforms import TrackGradient, conditions_named
-from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 import torch
 import tyro
@@ -183,12 +183,11 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
 def equip(base: GeomagneticNavEnv, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:
     """Return the environment with errors and estimates of the way, and the navigator."""
     errors = conditions_named(config.conditions) if config.conditions else config.noise
-    env, sheet = with_errors(base, errors, config.seed, config.known_start)
-    navigator = make_navigator(config.navigator, base, seed=config.seed, **sheet)
+    env, sensor_std = with_errors(base, errors, config.seed, config.known_start)
+    navigator = make_navigator(config.navigator, base, seed=config.seed, sensor_std=sensor_std)
     if base.arrival.declared:
         return with_declaration(env), navigator
-    known = STD_KEYS if config.conditions or any(config.noise) else ()
-    track = TrackGradient((*IN_KEYS, *known), range_km=1000.0)
+    track = TrackGradient(std_keys=STD_KEYS if config.conditions or any(config.noise) else (), range_km=1000.0)
     return TransformedEnv(env, track, auto_unwrap=True), navigator
 
 

@@ -24,6 +24,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, optimize
 from magrl.agents.networks import make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.evaluation import with_declaration
+from magrl.sensor_std import STD_KEYS
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, Discount, NonNegative, PlanetConfig, Positive, Rising
@@ -38,7 +39,6 @@ from magrl.transforms import (
     TrueWay,
     sensor_levels,
 )
-from magrl.transforms.track import STD_KEYS
 
 import torch
 from tensordict import TensorDictBase
@@ -115,16 +115,14 @@ def declaration(base: GeomagneticNavEnv) -> list[Transform]:
     if not base.arrival.declared:
         return []
     farthest = max(base.scenario.distance_range_km)
-    keys = (*DeclareArrival.default_in_keys, *STD_KEYS)
-    return [DeclareArrival(base.arrival.radius_km, max_steps=base.max_steps, range_km=farthest, in_keys=keys)]
+    return [DeclareArrival(base.arrival.radius_km, max_steps=base.max_steps, range_km=farthest, std_keys=STD_KEYS)]
 
 
 def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> TransformedEnv:
     """Add the sensors, the price, the agent's view, and for training only what is privileged: critic and reward."""
     price = RandomStepPrice(config.price_range, seed=base.seed)
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
-    way, move, *others = HighestSPL.default_in_keys
-    highest = HighestSPL([way, "true_move" if config.drift else move, *others])
+    highest = HighestSPL({"move": "true_move"} if config.drift else None)
     privileged = [TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
     observed = [*errors(config, base.seed), price, *view.observation_transforms(), *declaration(base)]
     return TransformedEnv(base, Compose(*observed, view.action_transform(), *privileged))

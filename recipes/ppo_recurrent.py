@@ -143,8 +143,7 @@ def make_env(base: GeomagneticNavEnv, memory: TensorDictSequential, config: Conf
     """Add the sensors, the agent's view, and for training only what is privileged: critic, estimate and reward."""
     price = RandomStepPrice((config.step_price, config.step_price), seed=base.seed)
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
-    way, move, *others = HighestSPL.default_in_keys
-    highest = HighestSPL([way, "true_move" if config.drift else move, *others])
+    highest = HighestSPL({"move": "true_move"} if config.drift else None)
     privileged = [price, TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
     return with_view(TransformedEnv(base, Compose(*errors(config, base.seed), *privileged)), memory, config)
 

@@ -24,6 +24,7 @@ from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
 from magrl.logs import checked_times, joined, mistakes
 from magrl.onboard import Onboard
+from magrl.sensor_std import SensorStd
 from magrl.training import UsageError, command, parse
 
 import numpy as np
@@ -58,7 +59,7 @@ class Config:
     target_position: tuple[float, float] | None = None
     """Its latitude and longitude [deg], for the comparison only; by default that of the last row, without --target."""
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Standard deviations of the noise on D [deg], I [deg], B_H [nT]: the data sheet of the sensors."""
+    """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of constant and slow errors of the same."""
     arrival_km: float = 25.0
@@ -130,8 +131,8 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
         UsageError: for a row that no vehicle can have recorded, with its number.
     """
     navigator = load_policy(config.navigator) if config.navigator.endswith(".safetensors") else config.navigator
-    sheet = {"sensor_std": config.noise, "bias_std": config.bias}
-    board = Onboard(navigator, max_steps=len(log) + 1, arrival_km=config.arrival_km, **sheet)
+    sensor_std = SensorStd(config.noise, config.bias)
+    board = Onboard(navigator, sensor_std=sensor_std, max_steps=len(log) + 1, arrival_km=config.arrival_km)
     board.start(log[ELEMENTS].iloc[-1].tolist() if config.target is None else config.target)
     found = []
     for _, row in log.iterrows():

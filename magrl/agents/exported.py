@@ -15,8 +15,8 @@ from torchrl.envs import EnvBase
 from magrl.agents.program import TensorProgram
 from magrl.checks import check_type
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv
+from magrl.sensor_std import STD_KEYS
 from magrl.transforms import ObservationView
-from magrl.transforms.track import STD_KEYS
 
 EXAMPLES = {key: torch.zeros(1, size) for key, size in zip(PUBLIC_KEYS, (3, 3, 2, 1), strict=True)}
 EXAMPLES |= {key: torch.zeros(1, 3) for key in STD_KEYS} | {"step_count": torch.zeros(1, 1, dtype=torch.int64)}

@@ -23,7 +23,7 @@ from magrl.checks import check_finite, check_type
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
 from magrl.field import FieldBank
 from magrl.transforms.base import StatefulTransform
-from magrl.transforms.errors.base import EpisodeErrors
+from magrl.transforms.errors.base import EpisodeNumbers
 
 Keys = set[NestedKey]
 CHECKED_STEPS = 6
@@ -145,7 +145,7 @@ def _own_state(actor: TensorDictModuleBase) -> list[NestedKey]:
 
 def _transforms(env: EnvBase) -> list[Transform]:
     """Return the transforms from the plain environment outward, without errors, which are of the world."""
-    skipped = (Compose, EpisodeErrors, InitTracker, TensorDictPrimer)
+    skipped = (Compose, EpisodeNumbers, InitTracker, TensorDictPrimer)
     return [part for part in env.modules() if isinstance(part, Transform) and not isinstance(part, skipped)]
 
 

@@ -22,8 +22,8 @@ from magrl.agents.networks import Device, make_actor, make_correcting_actor
 from magrl.agents.pipeline import export_policy
 from magrl.checks import check_finite, check_type, short
 from magrl.files import load_tensors, save_tensors
+from magrl.sensor_std import STD_KEYS
 from magrl.transforms import ObservationView, TrackView
-from magrl.transforms.track import STD_KEYS
 
 POLICY_FORMAT = 3
 VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}

@@ -31,8 +31,7 @@ from magrl.envs.scenario import Scenario
 from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, move, polar, wrap_angle
-from magrl.transforms.errors.base import EPISODE_STREAM
-from magrl.transforms.errors.motion import DISPLACEMENT
+from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
 from magrl.transforms.views import ObservationView
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")

@@ -11,8 +11,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from magrl.checks import check_tensor, require
 from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
-from magrl.transforms.errors.base import EPISODE_STREAM
-from magrl.transforms.errors.motion import DISPLACEMENT
+from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Privileged keys of the terms whose sum is ``reward``; 0 at a reset."""

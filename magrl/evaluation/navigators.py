@@ -15,7 +15,7 @@ from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field import Date
 from magrl.navigators import NAVIGATORS, Navigator
-from magrl.navigators.base import PERFECT, Std
+from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms import TrackView
 
 
@@ -81,8 +81,7 @@ def make_navigator(
     text: str,
     env: GeomagneticNavEnv,
     *,
-    sensor_std: Std = PERFECT,
-    bias_std: Std = PERFECT,
+    sensor_std: SensorStd | Sequence[float] = PERFECT,
     mode: str = "look-ahead",
     seed: int = 0,
     map_date: Date | None = None,
@@ -94,9 +93,8 @@ def make_navigator(
         text: name; after ``=`` the run folder of a trained agent, or the file of a policy; after ``:`` the mode of a
             metaheuristic, or the label of a policy, as in ``policy:SAC=sac.safetensors``.
         env: environment that it navigates in.
-        sensor_std: standard deviations of the sensors' noise, D [deg], I [deg], B_H [nT], for navigators that weigh
-            their readings. Agents read it from the TensorDict.
-        bias_std: standard deviations of constant and slow errors of the sensors.
+        sensor_std: accuracy of the sensors, for navigators that weigh their readings; three numbers are white noise of
+            D [deg], I [deg], B_H [nT]. Agents read it from the TensorDict.
         mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
         map_date: date of the map of ``map_matching``, from IGRF; None for the environment's own field.
@@ -124,7 +122,7 @@ def make_navigator(
         raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(known)}")
     said = {"mode": option or mode, "seed": seed, "map_date": map_date}
     options = {key: value for key, value in said.items() if key in kind.options} | options
-    return kind.for_env(env, sensor_std=sensor_std, bias_std=bias_std, **options).to(env.device)
+    return kind.for_env(env, sensor_std=sensor_std, **options).to(env.device)
 
 
 def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> TensorDictModuleBase:

@@ -82,9 +82,9 @@ def evaluate(
     flown = conditions_named(conditions or "laboratory")
     drift = {"drift_km": flown.drift_km(options.get("max_move_km", scenario.max_move_km))}
     base = GeomagneticNavEnv(scenario, num_envs=num_envs, seed=seed, device=device, **(drift | options))
-    env, sheet = with_errors(base, flown if conditions else noise, seed, known_start)
+    env, sensor_std = with_errors(base, flown if conditions else noise, seed, known_start)
     if isinstance(policy, str):
-        policy = make_navigator(policy, base, seed=seed, **sheet)
+        policy = make_navigator(policy, base, seed=seed, sensor_std=sensor_std)
     elif isinstance(policy, TrainedPolicy):
         policy = policy.for_env(base)
     if isinstance(policy, TrainedPolicy | Navigator):

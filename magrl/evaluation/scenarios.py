@@ -14,9 +14,8 @@ from magrl import paper
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
-from magrl.evaluation.runs import NO_NOISE
+from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.transforms import Conditions, DeclareArrival, NoiseScale, TrackGradient, with_conditions, with_sensor_noise
-from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
@@ -122,8 +121,8 @@ def task_names(scenario: Scenario, first: int = 0) -> tuple[str, ...]:
 
 def with_errors(
     env: EnvBase, errors: Sequence[float] | Conditions, seed: int = 0, known_start: Sequence[float] | None = None
-) -> tuple[EnvBase, dict[str, Any]]:
-    """Return an environment with errors, and the data sheet of its vehicles: their ``sensor_std`` and ``bias_std``.
+) -> tuple[EnvBase, SensorStd]:
+    """Return an environment with errors, and the accuracy of the sensors as its vehicles know it.
 
     Args:
         env: navigation environment; under conditions with their ``drift_km``.
@@ -136,15 +135,14 @@ def with_errors(
         ValueError: for a known start without conditions.
 
     Example:
-        >>> with_errors(GeomagneticNavEnv(num_envs=2, seed=0), (0.05, 0.05, 5.0))[1]
-        {'sensor_std': (0.05, 0.05, 5.0), 'bias_std': (0.0, 0.0, 0.0)}
+        >>> with_errors(GeomagneticNavEnv(num_envs=2, seed=0), (0.05, 0.05, 5.0))[1].noise
+        (0.05, 0.05, 5.0)
     """
     if isinstance(errors, Conditions):
-        sheet = {"sensor_std": errors.sensor_std, "bias_std": errors.left_std(known_start)}
-        return with_conditions(env, errors, seed, known_start), sheet
+        return with_conditions(env, errors, seed, known_start), errors.std_at(known_start)
     if known_start is not None:
         raise ValueError(f"known_start {known_start} needs conditions: white noise has no constant error to calibrate")
-    return with_sensor_noise(env, errors, seed), {"sensor_std": tuple(errors), "bias_std": NO_NOISE}
+    return with_sensor_noise(env, errors, seed), SensorStd.of(errors)
 
 
 def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = None) -> EnvBase:
@@ -166,14 +164,14 @@ def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = 
     base: GeomagneticNavEnv = getattr(env, "base_env", env)
     if not base.arrival.declared or getattr(navigator, "declares", False):
         return env
-    told = STD_KEYS if STD_KEYS[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
+    std_keys = STD_KEYS if STD_KEYS[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
     farthest = torch.tensor(base.scenario.distance_range_km).max().item()
     declare = DeclareArrival(
         base.arrival.radius_km,
         max_steps=base.max_steps,
         confidence=confidence,
         range_km=farthest,
-        in_keys=(*DeclareArrival.default_in_keys, *told),
+        std_keys=std_keys,
     )
-    scale = [NoiseScale()] if told else []
-    return TransformedEnv(env, Compose(*scale, TrackGradient((*IN_KEYS, *told)), declare), auto_unwrap=True)
+    scale = [NoiseScale()] if std_keys else []
+    return TransformedEnv(env, Compose(*scale, TrackGradient(std_keys=std_keys), declare), auto_unwrap=True)

@@ -20,11 +20,7 @@ from typing_extensions import Self
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import element_index
-from magrl.transforms.track import STD_KEYS
-
-Std = Sequence[float]
-"""Standard deviations of the sensors: D [deg], I [deg], B_H [nT]."""
-PERFECT: Std = (0.0, 0.0, 0.0)
+from magrl.sensor_std import PERFECT, STD_KEYS, SensorStd
 
 
 def displacement_to(error: Tensor, jacobian: Tensor) -> Tensor:
@@ -121,25 +117,24 @@ class Navigator(TensorDictModuleBase):
 
     @classmethod
     def for_env(
-        cls, env: GeomagneticNavEnv, *, sensor_std: Std = PERFECT, bias_std: Std = PERFECT, **options: Any
+        cls, env: GeomagneticNavEnv, *, sensor_std: SensorStd | Sequence[float] = PERFECT, **options: Any
     ) -> Self:
         """Return the navigator of an environment.
 
         Args:
             env: environment to navigate in.
-            sensor_std: standard deviations of the noise of the sensors: D [deg], I [deg], B_H [nT].
-            bias_std: standard deviations of their constant and slow errors.
+            sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
             options: further options of the class.
 
         Raises:
             ValueError: for an option out of its range, or an environment that the navigator cannot navigate in.
         """
         bounds = {"max_move_km": env.max_move_km, "max_turn_rad": env.max_turn_rad}
-        return cls(**bounds | cls.env_options(env, sensor_std, bias_std) | options)
+        return cls(**bounds | cls.env_options(env, SensorStd.of(sensor_std)) | options)
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:  # noqa: ARG004
-        """Return the options of the constructor that follow from an environment and the data sheet, beside bounds."""
+    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
+        """Return the options of the constructor, beside bounds, that follow from an environment and its sensors."""
         return {}
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:  # noqa: ARG002
@@ -149,23 +144,6 @@ class Navigator(TensorDictModuleBase):
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad], each ``(P,)``, of vehicles in a new state, and update their memory."""
         raise NotImplementedError
-
-    @staticmethod
-    def accuracy(seen: TensorDictBase, std: Tensor, key: str = "sensor_std") -> Tensor:
-        """Return the standard deviations of the present reading, D, I, B_H.
-
-        Args:
-            seen: public keys of ``P`` vehicles, and the standard deviations ``(P, 3)`` where readings come with them.
-            std: ``(3,)`` those of the data sheet.
-            key: ``sensor_std`` of errors that are new in each reading, ``bias_std`` of constant and slow ones, or
-                ``drift_std`` of slow ones alone.
-
-        Returns:
-            ``std``, or ``(P, 3)`` the larger of both: during an outage, or where readings show more noise, a reading is
-            worse than the data sheet.
-        """
-        own = seen.get(key, None)
-        return std if own is None else torch.maximum(std, own.to(std))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]."""

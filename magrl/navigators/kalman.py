@@ -13,8 +13,8 @@ from torch import Tensor
 from magrl import tracking
 from magrl.checks import check_number, check_numbers
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
+from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import CAUTION, LENGTHS, STEP_PRICE, FieldTrack, GradientPrior, LearnedPrior
 
 
@@ -25,13 +25,12 @@ class Kalman(QuasiNewton):
     :func:`magrl.tracking.planned_move`, which weighs the path, the detour that the remaining uncertainty of the way may
     cost, and the price of the remaining steps, which rises as fewer of them are left.
 
-    It searches by default. Constant errors of the readings (``bias_std``) widen the posterior of the way and the
-    search.
+    It searches by default. The bias of the readings widens the posterior of the way and the search.
 
     Args:
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
+        sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
         max_steps: step limit of the episode.
         caution: weight of the uncertainty of the way.
         step_price: price of a step while many are left [% of SPL]; a way of ``range_km`` is 100 %.
@@ -39,7 +38,7 @@ class Kalman(QuasiNewton):
         lengths: of the moves that are compared, as fractions of the longest.
         search: as of :class:`QuasiNewton`, here by default.
         prior: of the gradients: learned on random planets, or that of a dipole, so that nothing is trained.
-        **options: ``bias_std`` and ``zeta`` of :class:`QuasiNewton`.
+        **options: ``zeta`` of :class:`QuasiNewton`.
 
     Raises:
         ValueError: for an option out of its range, or a negative standard deviation.
@@ -59,7 +58,7 @@ class Kalman(QuasiNewton):
         self,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        sensor_std: Std = PERFECT,
+        sensor_std: SensorStd | Sequence[float] = PERFECT,
         max_steps: int = 50,
         caution: float = CAUTION,
         step_price: float = STEP_PRICE,
@@ -91,14 +90,15 @@ class Kalman(QuasiNewton):
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         known, shared = tracking.related(track, tracking.curl_relation, self.scales)
         field = tracking.estimated_field(known, self.scales)
-        options = self.range_km, self.scales, shared, self.lasting_std(seen), self.periods, self.drift(field)
+        bias = self.accuracy(seen).bias
+        options = self.range_km, self.scales, shared, bias, self.periods, self.drift(field)
         target = seen["target_field"].double()
         posterior = tracking.way_posterior(known, target, *options, tracking.common_error(field), fine=False)
         way = tracking.Way(*(part.double() for part in posterior.aim(tracking.way_to(known, target, *options))))
         aim, std = self.aim(known, way, seen, memory), self.reading_std(seen)
         step, limits = seen["step_count"].squeeze(-1), (self.max_steps, self.max_move_km)
         price = tracking.step_price(self.step_price, self.range_km, aim, step, std, *limits)
-        costs = self.caution, self.lengths, self.scales, self.lasting_std(seen), self.drift(field)
+        costs = self.caution, self.lengths, self.scales, bias, self.drift(field)
         best = tracking.planned_move(track, aim, posterior, std, price, self.max_move_km, self.range_km, *costs)
         distance = best.norm(dim=-1)
         direction = torch.where((distance > 0).unsqueeze(-1), best, aim)  # standing still, face the way
@@ -108,5 +108,5 @@ class Kalman(QuasiNewton):
     description = "Kalman (dual control)"
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
-        return QuasiNewton.env_options(env, sensor_std, bias_std) | {"max_steps": env.max_steps}
+    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
+        return QuasiNewton.env_options(env, sensor_std) | {"max_steps": env.max_steps}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -19,8 +20,9 @@ from magrl.field import Date, FieldBank, FieldModel, RegionalField, elements_at,
 from magrl.field.elements import element_difference, elements_gradient, measured_elements
 from magrl.field.model import device_of
 from magrl.geodesy import steer
-from magrl.navigators.base import PERFECT, Navigator, Std, displacement_to
+from magrl.navigators.base import Navigator, displacement_to
 from magrl.navigators.quasi_newton import QuasiNewton, first_places, visit_place
+from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import SLOPES, Way
 
 FLOOR = (1e-3, 1e-3, 0.1)
@@ -35,8 +37,8 @@ PRIOR_KM = 1000.0
 """Prior standard deviation of a position along each axis [km]."""
 FORGET_KM = 30.0
 """Distance along which the error of a map changes the position as much as it moves it in all [km]; from a scan."""
-LASTING_SHARE = 0.25
-"""Share of the variance of constant and slow errors that counts as new in each reading."""
+BIAS_SHARE = 0.25
+"""Share of the variance of the bias that counts as noise of each reading."""
 _DEGREE_KM = 111.2
 
 
@@ -59,8 +61,7 @@ class MapMatching(Navigator):
         region: where vehicle and destination may be, usually ``env.edge``; the map must hold all of it.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
-        bias_std: standard deviations of constant and slow errors of the readings.
+        sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
         map_error: standard deviations of the map.
         hypotheses: number of positions that are tracked.
         zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
@@ -94,9 +95,8 @@ class MapMatching(Navigator):
         region: Region | Regions,
         max_move_km: float = 50.0,
         max_turn_rad: float = math.pi / 2,
-        sensor_std: Std = PERFECT,
-        bias_std: Std = PERFECT,
-        map_error: Std = PERFECT,
+        sensor_std: SensorStd | Sequence[float] = PERFECT,
+        map_error: Sequence[float] = PERFECT.noise,
         hypotheses: int = 4,
         zeta: float = 0.01,
         search: bool = False,
@@ -105,7 +105,7 @@ class MapMatching(Navigator):
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_type((Region, Regions), region=region)
-        check_numbers(3, 0, sensor_std=sensor_std, bias_std=bias_std, map_error=map_error)
+        check_numbers(3, 0, map_error=map_error)
         check_number(1, GRID_POINTS**2, whole=True, hypotheses=hypotheses)
         check_number(0, above=True, zeta=zeta)
         check_type(bool, search=search)
@@ -114,11 +114,11 @@ class MapMatching(Navigator):
         self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if bank else [])]
         self.map = field
         self._place(copy.deepcopy(Regions.of(region)).to(device_of(field)))
-        squares = (torch.tensor(std, dtype=torch.float64).square() for std in (FLOOR, map_error, sensor_std, bias_std))
-        floor, error, new, constant = (x.to(self.grid.device) for x in squares)
+        std = torch.tensor((FLOOR, map_error, *SensorStd.of(sensor_std)), dtype=torch.float64)
+        floor, error, noise, bias, drift = std.to(self.grid.device).square()
         self.target_std = nn.Buffer((floor + error).sqrt())
-        self.bias_std = nn.Buffer((floor + constant).sqrt())
-        self.std = nn.Buffer((floor + error + new + LASTING_SHARE * constant).sqrt())
+        variances = SensorStd(floor + error + noise + BIAS_SHARE * bias, floor + bias, drift)
+        self.sensor_std = nn.Buffer(torch.stack(variances).sqrt())
         # Two elements give a position, so that the second smallest of the three counts.
         self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
 
@@ -134,8 +134,8 @@ class MapMatching(Navigator):
         return super().for_env(env, **options)
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
-        return {"field": env.field, "region": env.edge, **QuasiNewton.env_options(env, sensor_std, bias_std)}
+    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
+        return {"field": env.field, "region": env.edge, **QuasiNewton.env_options(env, sensor_std)}
 
     def _place(self, region: Regions) -> None:
         """Keep the region, and the elements on a grid of it."""
@@ -177,7 +177,7 @@ class MapMatching(Navigator):
         A constant error of the readings moves the vehicle on the map, and not the destination.
         """
         region, elements = self._region(seen), seen["field"].double()
-        std = self.accuracy(seen, self.bias_std, "bias_std")
+        std = SensorStd(*self.sensor_std).at(seen).bias
         residual, jacobian = self._residual(here.unsqueeze(1), elements, std, region)
         prior = torch.diag_embed(torch.full_like(here, PRIOR_KM**2)).unsqueeze(1)
         constant = update(prior, jacobian, residual)[1].squeeze(1)
@@ -191,7 +191,7 @@ class MapMatching(Navigator):
         region = self._region(seen)
         target, _, misfit = self._located(seen["target_field"].double(), self.target_std, region)
         memory["target"] = best(target, misfit)
-        found = self._located(seen["field"].double(), self.std, region)
+        found = self._located(seen["field"].double(), self.sensor_std[0], region)
         memory["known"] = torch.ones_like(memory["known"])
         return memory.update(dict(zip(("position", "covariance", "misfit"), found, strict=True)))
 
@@ -201,7 +201,7 @@ class MapMatching(Navigator):
         position = self._moved(memory["position"], seen["heading"].double(), length, region)
         growth = self.map_error_km**2 * length / FORGET_KM
         covariance = memory["covariance"] + torch.diag_embed(growth.unsqueeze(-1).expand_as(position))
-        std = self.accuracy(seen, self.std)
+        std = SensorStd(*self.sensor_std).at(seen).noise
         position, covariance, more = self._corrected(position, covariance, seen["field"].double(), std, region)
         return memory.update({"position": position, "covariance": covariance, "misfit": memory["misfit"] + more})
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from magrl.checks import check_tensor
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.model import FieldModel, elements_gradient_at
-from magrl.navigators.base import Std
 from magrl.navigators.quasi_newton import QuasiNewton
+from magrl.sensor_std import SensorStd
 from magrl.tracking import GradientPrior
 
 
@@ -27,7 +27,7 @@ class MeanJacobian(QuasiNewton):
         position: ``(..., 2)`` places to average over, latitude, longitude [deg], usually ``env.region.grid(21)``.
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
-        **options: ``sensor_std``, ``bias_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
+        **options: ``sensor_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
 
     Raises:
         ValueError: for a bound out of its range, fewer than two places, or a negative standard deviation.
@@ -66,8 +66,8 @@ class MeanJacobian(QuasiNewton):
     description = "mean Jacobian (quasi-Newton)"
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
+    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
         if len(env.region) > 1:
             raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
         own = {"field": env.field, "position": env.region.grid(21).to(env.device)}
-        return own | QuasiNewton.env_options(env, sensor_std, bias_std)
+        return own | QuasiNewton.env_options(env, sensor_std)

@@ -16,7 +16,8 @@ from magrl.field.elements import NAMES, element_difference
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
 from magrl.guidance import parallel_approach
-from magrl.navigators.base import Navigator, Std, displacement_to, element_indices
+from magrl.navigators.base import Navigator, displacement_to, element_indices
+from magrl.sensor_std import SensorStd
 from magrl.tracking import CURVATURE
 
 
@@ -61,7 +62,7 @@ class ParallelApproach(Navigator):
         self.field, self.elements = field, element_indices(NAMES if pair is None else pair, 2)
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:  # noqa: ARG004
+    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
         return {"field": env.field}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002

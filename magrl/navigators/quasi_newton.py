@@ -10,11 +10,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl import tracking
-from magrl.checks import check_number, check_numbers, check_type
+from magrl.checks import check_number, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
 from magrl.geodesy import steer
-from magrl.navigators.base import PERFECT, Navigator, Std, element_indices
+from magrl.navigators.base import Navigator, element_indices
+from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import FieldTrack, GradientPrior, Way
 
 RANGE_KM = 1000.0
@@ -35,8 +36,7 @@ class QuasiNewton(Navigator):
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
         elements: two or three of D, I, B_H.
-        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
-        bias_std: standard deviations of constant and slow errors of the readings.
+        sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
         zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
         search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
             it, the way is the estimated one.
@@ -63,30 +63,27 @@ class QuasiNewton(Navigator):
         max_move_km: float,
         max_turn_rad: float,
         elements: Sequence[str] = NAMES,
-        sensor_std: Std = PERFECT,
-        bias_std: Std = PERFECT,
+        sensor_std: SensorStd | Sequence[float] = PERFECT,
         zeta: float = 0.01,
         search: bool = False,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
-        check_numbers(3, 0, sensor_std=sensor_std, bias_std=bias_std)
         check_number(0, above=True, zeta=zeta)
         check_type(bool, search=search)
         self.zeta, self.search = float(zeta), search
         self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
         self.elements = element_indices(elements, 2)
-        self._register("sensor_std", sensor_std)
-        self._register("bias_std", bias_std)
+        self._register("sensor_std", SensorStd.of(sensor_std))
         self._register("scales", [tracking.ELEMENT_SCALES[i] for i in self.elements])
         self._register("periods", [tracking.ELEMENT_PERIODS[i] for i in self.elements])
         self._register("curvature", [tracking.CURVATURE[i] for i in self.elements])
 
     @staticmethod
-    def env_options(env: GeomagneticNavEnv, sensor_std: Std, bias_std: Std) -> dict[str, Any]:
+    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
         search = env.arrival.rule == "objective"  # else, an episode does not end where the objective is low
-        return {"sensor_std": sensor_std, "bias_std": bias_std, "zeta": env.zeta, "search": search}
+        return {"sensor_std": sensor_std, "zeta": env.zeta, "search": search}
 
-    def _register(self, name: str, values: Sequence[float]) -> None:
+    def _register(self, name: str, values: Sequence[Any]) -> None:
         self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
 
     def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:
@@ -97,14 +94,14 @@ class QuasiNewton(Navigator):
         """
         raise NotImplementedError(f"{type(self).__name__} must return a GradientPrior in prior(reading, target)")
 
+    def accuracy(self, seen: TensorDictBase) -> SensorStd:
+        """Return the accuracy of the present reading, see :meth:`magrl.sensor_std.SensorStd.at`."""
+        return SensorStd(*self.sensor_std).at(seen)
+
     def reading_std(self, seen: TensorDictBase) -> Tensor:
         """Return the standard deviations of the present reading in the filter: D, I, B_H."""
-        slow = self.accuracy(seen, torch.zeros_like(self.sensor_std), "drift_std")
-        return tracking.reading_std(self.accuracy(seen, self.sensor_std), slow)
-
-    def lasting_std(self, seen: TensorDictBase) -> Tensor:
-        """Return the standard deviations of the constant and slow errors of the present reading: D, I, B_H."""
-        return self.accuracy(seen, self.bias_std, "bias_std")
+        std = self.accuracy(seen)
+        return tracking.reading_std(std.noise, std.drift)
 
     def drift(self, reading: Tensor) -> Tensor:  # noqa: ARG002
         """Return the standard deviation of the change of the Jacobian, see :func:`magrl.tracking.predict`."""
@@ -139,7 +136,7 @@ class QuasiNewton(Navigator):
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad], each ``(N,)``, given the state of the filter."""
-        target, bias_std = (x[..., self.elements] for x in (seen["target_field"].double(), self.lasting_std(seen)))
+        target, bias_std = (x[..., self.elements] for x in (seen["target_field"].double(), self.accuracy(seen).bias))
         curvature = self.drift(tracking.estimated_field(track, self.scales))
         way = tracking.way_to(track, target, RANGE_KM, self.scales, None, bias_std, self.periods, curvature)
         aim = self.aim(track, way, seen, memory)

@@ -13,15 +13,15 @@ from torch import Tensor
 from magrl import tracking
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import NAMES
-from magrl.navigators.base import PERFECT, Std
 from magrl.navigators.quasi_newton import QuasiNewton
+from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import FieldTrack, GradientPrior
 
 SHORTEST_PROBE_KM = 0.5
 """Length of a probing leg with perfect sensors [km]: the rounding of float32 readings does not matter there."""
 
 
-def probe_length(sensor_std: Sequence[float]) -> float:
+def probe_length(noise: Sequence[float]) -> float:
     """Return the length of a probing leg [km]: longer legs lengthen the path, shorter ones suffer more from noise.
 
     The loss by both legs grows with their length p, the loss by the wrong direction with (noise / p)^2, the noise as in
@@ -29,14 +29,14 @@ def probe_length(sensor_std: Sequence[float]) -> float:
     simulations.
 
     Args:
-        sensor_std: standard deviations of D [deg], I [deg], B_H [nT].
+        noise: standard deviations of D [deg], I [deg], B_H [nT].
 
     Example:
         >>> [round(probe_length(std), 1) for std in ((0, 0, 0), (0.02, 0.02, 2), (0.05, 0.05, 5), (0.1, 0.1, 10))]
         [0.5, 6.1, 11.2, 17.7]
     """
-    check_numbers(3, 0, sensor_std=sensor_std)
-    length = float(tracking.sensor_length(torch.tensor(sensor_std, dtype=torch.float64)))
+    check_numbers(3, 0, noise=noise)
+    length = float(tracking.sensor_length(torch.tensor(noise, dtype=torch.float64)))
     return max(SHORTEST_PROBE_KM, 5.0 * length ** (2 / 3))
 
 
@@ -51,8 +51,8 @@ class Secant(QuasiNewton):
         max_turn_rad: largest turn [rad].
         probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest move.
         elements: all three by default, each weighted by how well it determines the way; or two of them.
-        sensor_std: standard deviations of new errors of a reading: D [deg], I [deg], B_H [nT].
-        **options: ``bias_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
+        sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
+        **options: ``zeta`` and ``search`` of :class:`QuasiNewton`.
 
     Raises:
         ValueError: for a bound or a leg out of its range, fewer than two elements, or a negative standard deviation.
@@ -71,11 +71,12 @@ class Secant(QuasiNewton):
         max_turn_rad: float = math.pi / 2,
         probe_km: float | None = None,
         elements: Sequence[str] = NAMES,
-        sensor_std: Std = PERFECT,
+        sensor_std: SensorStd | Sequence[float] = PERFECT,
         **options: Any,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad, elements, sensor_std, **options)
-        probe_km = min(probe_length(sensor_std), self.max_move_km) if probe_km is None else probe_km
+        noise = SensorStd.of(sensor_std).noise
+        probe_km = min(probe_length(noise), self.max_move_km) if probe_km is None else probe_km
         check_number(0, max_move_km, above=True, probe_km=probe_km)
         self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)
 

@@ -10,9 +10,10 @@ from torchrl.envs import Compose
 
 from magrl import tracking
 from magrl.onboard.limits import view_of
+from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import ArrivalDecision, FieldTrack
 from magrl.transforms import NoiseScale, TrackGradient, TrackView
-from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS
+from magrl.transforms.track import TRACK_KEYS
 
 
 class Estimator:
@@ -33,7 +34,7 @@ class Estimator:
     def __init__(self, navigator: Any) -> None:
         self.navigator = navigator
         self.trained = isinstance(view_of(navigator), TrackView)
-        self.observe = navigator.observe if self.trained else Compose(TrackGradient((*IN_KEYS, *STD_KEYS)))
+        self.observe = navigator.observe if self.trained else Compose(TrackGradient(std_keys=STD_KEYS))
         self.noise = NoiseScale()
         self.state: Any = None
 
@@ -56,15 +57,15 @@ class Estimator:
 
     def decide(self, seen: TensorDictBase, steps_left: Tensor, radius_km: float) -> ArrivalDecision:
         """Return the decision about the arrival, in a batch of one; see :func:`magrl.tracking.arrival_decision`."""
-        target, lasting, slow = (seen[key] for key in ("target_field", *STD_KEYS[1:]))
-        new = self.state[self.noise.out_keys[0]]
-        track = FieldTrack(*(self.state[key].to(target.dtype) for key in OUT_KEYS[:2]))
-        return tracking.arrival_decision(track, target, new, lasting, slow, steps_left, radius_km)
+        target = seen["target_field"]
+        std = SensorStd.read(seen)._replace(noise=self.state["sensor_std"])
+        track = FieldTrack(*(self.state[key].to(target.dtype) for key in TRACK_KEYS))
+        return tracking.arrival_decision(track, target, *std, steps_left, radius_km)
 
     @property
     def track(self) -> FieldTrack:
         """State of the filter after the last reading."""
-        return FieldTrack(*(self.state[key][0] for key in OUT_KEYS[:2]))
+        return FieldTrack(*(self.state[key][0] for key in TRACK_KEYS))
 
     def surprise(self, seen: TensorDictBase) -> float:
         """Return how badly a reading fits the track before it, see :func:`magrl.tracking.surprise`."""

@@ -8,48 +8,59 @@ from __future__ import annotations
 import hashlib
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import BeforeValidator, Field
 from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
 from magrl.onboard.limits import Reading
-from magrl.transforms.errors.known_start import EXACT
+from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
 
 
-def _in_nanotesla(std: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Raise for a standard deviation of B_H that looks like microtesla."""
-    if 0 < std[2] < LEAST_STD_NT:
-        raise ValueError(
-            f"{std[2]:g} nT of B_H is less than the {LEAST_STD_NT:g} nT of the best sensors in a vehicle: it looks "
-            "like microtesla, and nanotesla are expected; give 0 for a perfect sensor"
-        )
-    return std
+def _plain(value: Any) -> Any:
+    """Return scalars and arrays of NumPy and torch as plain numbers and lists."""
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
-_PLAIN = BeforeValidator(lambda value: value.tolist() if hasattr(value, "tolist") else value)  # NumPy and torch
-_LAX = Field(strict=False)  # a tuple may be given as a list
+_PLAIN, _LAX = BeforeValidator(_plain), Field(strict=False)  # a tuple may be given as a list
 Number = Annotated[float, _PLAIN]
 Numbers = Annotated[tuple[Number, ...], _PLAIN, _LAX]
 Triple = Annotated[tuple[Number, Number, Number], _PLAIN, _LAX]
-_Std = Annotated[float, _PLAIN, Field(ge=0, le=OUTAGE_STD)]
-Std = Annotated[tuple[_Std, _Std, _Std], _PLAIN, _LAX, AfterValidator(_in_nanotesla)]
+
+
+def _accuracy(value: Any) -> SensorStd:
+    """Return the record of an argument, in which three numbers are white noise, or of a file.
+
+    Raises:
+        ValueError: for a standard deviation that is out of its range, or one of B_H that looks like microtesla.
+    """
+    value = _plain(value)
+    whole = isinstance(value, SensorStd) or (isinstance(value, list) and isinstance(value[0], list))
+    sensor_std = SensorStd.of(SensorStd(*map(_plain, value)) if whole else value)
+    for name, std in sensor_std._asdict().items():
+        if max(std) > OUTAGE_STD:
+            raise ValueError(f"sensor_std.{name} must be at most {OUTAGE_STD:g}, that of an outage, got {max(std):g}")
+        if 0 < std[2] < LEAST_STD_NT:
+            raise ValueError(
+                f"sensor_std.{name}: {std[2]:g} nT of B_H is less than the {LEAST_STD_NT:g} nT of the best sensors in "
+                "a vehicle: it looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor"
+            )
+    return sensor_std
 
 
 class Options(CheckedModel):
     """Hold the options of :class:`~magrl.onboard.Onboard`.
 
     Args:
-        sensor_std: standard deviations of the noise of D [deg], I [deg], B_H [nT], new in each reading. Those that are
-            not 0 are corrected by what the readings show (:class:`~magrl.transforms.NoiseScale`).
-        bias_std: standard deviations of constant and slow errors of the same.
-        drift_std: those of the slow errors alone, which vary along the way: what a known start does not show, and what
-            readings average in part.
+        sensor_std: accuracy of the sensors, a :class:`~magrl.sensor_std.SensorStd`; three numbers are white noise of
+            D [deg], I [deg], B_H [nT]. A noise that is not 0 is corrected by what the readings show
+            (:class:`~magrl.transforms.NoiseScale`). The drift is what a known start does not show, and what readings
+            average in part.
         max_move_km: longest move; 50 km, or for a trained policy that of its training.
         max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.
         max_steps: steps of a way, the last of which stops.
@@ -61,13 +72,11 @@ class Options(CheckedModel):
     Example:
         >>> Options(sensor_std=(0.02, 0.02, 0.002))
         Traceback (most recent call last):
-        ValueError: sensor_std: 0.002 nT of B_H is less than the 0.2 nT of the best sensors in a vehicle: it looks \
-like microtesla, and nanotesla are expected; give 0 for a perfect sensor
+        ValueError: sensor_std.noise: 0.002 nT of B_H is less than the 0.2 nT of the best sensors in a vehicle: it \
+looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
     """
 
-    sensor_std: Std = EXACT
-    bias_std: Std = EXACT
-    drift_std: Std = EXACT
+    sensor_std: Annotated[SensorStd, BeforeValidator(_accuracy)] = PERFECT
     max_move_km: Number | None = Field(None, gt=0, le=1000)
     max_turn_deg: Number | None = Field(None, gt=0, le=180)
     max_steps: Annotated[int, _PLAIN] = Field(120, ge=1)
@@ -125,7 +134,7 @@ class Journal(CheckedModel):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[8] = 8
+    format: Literal[9] = 9
     options: Annotated[Options, _LAX]
     target: Triple
     here: Numbers | None = None

@@ -119,7 +119,7 @@ check the target, and the axes, the units and the calibration of the sensors
 
 
 def check_earth_jump(
-    before: Sequence[float], after: Sequence[float], distance_km: float, sensor_std: Sequence[float] = (0.0, 0.0, 0.0)
+    before: Sequence[float], after: Sequence[float], distance_km: float, noise: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> None:
     """Raise unless a move can explain the change between two readings, up to 88 degrees of latitude.
 
@@ -130,7 +130,7 @@ def check_earth_jump(
         before: D [deg], I [deg], B_H [nT] before the move.
         after: the same after it.
         distance_km: length of the move [km].
-        sensor_std: standard deviations of the noise of a reading, in the same units.
+        noise: standard deviations of the noise of a reading, in the same units.
 
     Raises:
         ValueError: naming the element, both values, and what a move of this length can explain.
@@ -142,16 +142,16 @@ def check_earth_jump(
         ValueError: inclination changed from 40 to -40 deg over 50 km, by 41955 nT of the field vector; a move of this \
 length explains at most 5000 nT: the reading is wrong, or the distance is
     """
-    check_numbers(3, before=before, after=after, sensor_std=sensor_std)
-    check_number(0, distance_km=distance_km, sensor_std=min(sensor_std))
+    check_numbers(3, before=before, after=after, noise=noise)
+    check_number(0, distance_km=distance_km, noise=min(noise))
     horizontal = min(before[2], after[2])
     total = min(TOTAL_NT[1], *(b / max(math.cos(math.radians(i)), 1e-6) for _, i, b in (before, after)))
     radius = 2 * horizontal, 2 * total, 1.0
-    noise = math.radians(sensor_std[0]) * horizontal, math.radians(sensor_std[1]) * total, sensor_std[2]
+    noise_nt = math.radians(noise[0]) * horizontal, math.radians(noise[1]) * total, noise[2]
     for index, (name, unit) in enumerate((("declination", "deg"), ("inclination", "deg"), ("B_H", "nT"))):
         change = abs(after[index] - before[index])
         change = change if index == 2 else abs(math.sin(math.radians(change / 2)))
-        most = DISTURBANCE_NT + SLOPE_NT_KM * distance_km + _SIGMAS * math.sqrt(2) * noise[index]
+        most = DISTURBANCE_NT + SLOPE_NT_KM * distance_km + _SIGMAS * math.sqrt(2) * noise_nt[index]
         if radius[index] * change > most:
             raise ValueError(
                 f"{name} changed from {before[index]:g} to {after[index]:g} {unit} over {distance_km:g} km, by "

@@ -13,6 +13,7 @@ from magrl.field import IGRF, elements_at
 from magrl.field.elements import element_difference
 from magrl.geodesy import move
 from magrl.onboard.readings import DISTURBANCE_NT, check_earth_distance, check_earth_reading
+from magrl.sensor_std import SensorStd
 from magrl.transforms import calibration
 
 MODEL_STD = (0.26, 0.20, 133.0)
@@ -107,53 +108,57 @@ def nearby_elements(
 
 
 def calibrated(
-    known: Elements, known_std: Elements, sensors: tuple[Values, Values, Values], reading: Elements | None = None
-) -> tuple[Values, Values]:
-    """Return the constant error of the readings, and the standard deviations of the slow and constant ones left.
+    known: Elements, known_std: Elements, sensor_std: SensorStd, reading: Elements | None = None
+) -> tuple[Values, SensorStd]:
+    """Return the constant error of the readings, and the accuracy of the sensors without it.
 
     Args:
         known: D [deg], I [deg], B_H [nT] at the start.
         known_std: their standard deviations.
-        sensors: standard deviations of new errors, of constant and slow ones, and of slow ones.
+        sensor_std: accuracy of the sensors.
         reading: first reading; without it the error is not known, and 0.
 
     Raises:
         ValueError: for a reading that does not fit the start; see :func:`check_start`.
 
     Example:
-        >>> sheet = (0.0, 0.0, 0.0), (0.5, 0.1, 20.0), (0.3, 0.0, 0.0)
-        >>> error, left = calibrated((3.5, 73.0, 15000.0), (0.0, 0.0, 0.0), sheet, (4.0, 73.0, 15000.0))
-        >>> round(error[0], 2), round(left[0], 2)
+        >>> sensors = SensorStd(bias=(0.5, 0.1, 20.0), drift=(0.3, 0.0, 0.0))
+        >>> error, left = calibrated((3.5, 73.0, 15000.0), (0.0, 0.0, 0.0), sensors, (4.0, 73.0, 15000.0))
+        >>> round(error[0], 2), round(left.bias[0], 2)
         (0.32, 0.38)
     """
     if reading is not None:
-        check_start(reading, known, [math.hypot(*std) for std in zip(sensors[0], sensors[1], known_std, strict=True)])
-    values = known if reading is None else reading, known, *sensors, known_std
-    found = calibration(*(torch.tensor(each, dtype=torch.float64) for each in values))
-    return tuple(found.error.tolist()), tuple(found.bias_std.tolist())
+        check_start(reading, known, sensor_std, known_std)
+    rows = known if reading is None else reading, known, known_std, *sensor_std
+    first, there, there_std, *std = torch.tensor(rows, dtype=torch.float64)
+    error, left = calibration(first, there, SensorStd(*std), there_std)
+    return tuple(error.tolist()), sensor_std._replace(bias=tuple(left.bias.tolist()))
 
 
-def check_start(reading: Elements, known: Elements, std: Sequence[float]) -> None:
+def check_start(reading: Elements, known: Elements, sensor_std: SensorStd, known_std: Sequence[float]) -> None:
     """Raise unless the first reading fits the elements at the start.
 
     Args:
         reading: D [deg], I [deg], B_H [nT].
         known: the elements there.
-        std: standard deviations of the difference: of all errors of the sensors, and of the elements.
+        sensor_std: accuracy of the sensors.
+        known_std: standard deviations of the elements.
 
     Raises:
         ValueError: with the element that does not fit, and the mistake that would explain it, if one is known.
 
     Example:
-        >>> check_start((3.4, 73.1, 14950.0), (3.5, 73.0, 15000.0), (0.5, 0.1, 50.0))
-        >>> check_start((3.4, -73.1, 14950.0), (3.5, 73.0, 15000.0), (0.5, 0.1, 50.0))
+        >>> sensors, exact = SensorStd(bias=(0.5, 0.1, 50.0)), (0.0, 0.0, 0.0)
+        >>> check_start((3.4, 73.1, 14950.0), (3.5, 73.0, 15000.0), sensors, exact)
+        >>> check_start((3.4, -73.1, 14950.0), (3.5, 73.0, 15000.0), sensors, exact)
         Traceback (most recent call last):
         ValueError: the first reading, D 3.4, I -73.1, B_H 14950, does not fit the start, D 3.5, I 73, B_H 15000 (I \
 deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis points up, and down is expected
     """
+    std = [math.hypot(*each) for each in zip(sensor_std.noise, sensor_std.bias, known_std, strict=True)]
     if found := misfit(reading, known, std):
         texts: list[Any] = [f"D {each[0]:g}, I {each[1]:g}, B_H {each[2]:g}" for each in (reading, known)]
-        cause = found[1] or "check sensors, calibration, compass and place, or state larger errors in bias_std"
+        cause = found[1] or "check sensors, calibration, compass and place, or state a larger bias"
         raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({found[0]}): {cause}")
 
 

@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from magrl.agents.policy import FieldPolicy
 from magrl.checks import check_tensor, check_type
+from magrl.sensor_std import STD_KEYS
 from magrl.transforms import TrackView
-from magrl.transforms.track import IN_KEYS, STD_KEYS
+from magrl.transforms.track import IN_KEYS
 
 _FLOAT32 = 1  # number of the type in ONNX
 ONNX_INPUTS = ("field", "target_field", "course", "accuracy", "step", "mean", "covariance", "first_field")
@@ -96,8 +97,8 @@ class VehicleStep(nn.Module):
             field: ``(3,)`` reading of D [deg], I [deg], B_H [nT] after the move.
             target_field: ``(3,)`` the same at the destination.
             course: ``(2,)`` distance [km] and heading [rad] of the move; in the first step 0 and the heading.
-            accuracy: ``(3, 3)`` standard deviations of noise, of constant and slow errors, and of slow ones alone, in
-                the units of the reading.
+            accuracy: ``(3, 3)`` standard deviations of noise, bias and drift, in the units of the reading
+                (:class:`~magrl.sensor_std.SensorStd`).
             step: ``()`` int64, and with the next three the :class:`StepState`.
             mean: ``(3, 3)`` mean of the filter, float64.
             covariance: ``(3, 3, 3)`` covariance of the filter, float64.
@@ -109,9 +110,9 @@ class VehicleStep(nn.Module):
         """
         check_tensor(3, 3, accuracy=accuracy)
         distance, heading = course.split(1)
-        keys = *IN_KEYS, *STD_KEYS
-        values = (field, target_field, torch.cat((distance, torch.zeros_like(distance))), heading, *accuracy.unbind())
-        rows = {key: value.unsqueeze(0) for key, value in zip(keys, values, strict=True)}
+        values = field, target_field, torch.cat((distance, torch.zeros_like(distance))), heading
+        read = dict(zip(IN_KEYS, values, strict=True)) | dict(zip(STD_KEYS, accuracy.unbind(), strict=True))
+        rows = {key: value.unsqueeze(0) for key, value in read.items()}
         seen = TensorDict({**rows, "step_count": step.reshape(1, 1)}, [1])
         state = {"track_mean": mean, "track_covariance": covariance, "first_field": first_field}
         before = TensorDict({key: value.unsqueeze(0) for key, value in state.items()}, [1])

@@ -27,11 +27,10 @@ from magrl.onboard.journal import Journal, Options, Step
 from magrl.onboard.limits import check_move, measured, move_limits, out_of_range, stuck, unchanged_km, view_of
 from magrl.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_distance, check_earth_jump, check_earth_reading
 from magrl.onboard.start import Elements, calibrated, check_start, known_elements, nearby_elements
+from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import ArrivalDecision, Way
 from magrl.transforms import TrackView
-from magrl.transforms.errors.known_start import EXACT
 from magrl.transforms.errors.sensors import OUTAGE_STD
-from magrl.transforms.track import STD_KEYS
 
 NAMED = ("anywhere", "secant", "kalman")
 """Navigators by name; any other is given as a module."""
@@ -39,7 +38,7 @@ LONGEST_WAY_KM = 2500.0
 """Estimated way beyond which an agent without a map is out of range: there its observation of the way saturates."""
 LOST_SURPRISE = 100.0
 """Mean of the last surprises (:func:`magrl.tracking.surprise`) beyond which the readings do not fit the track. In
-simulation, it reached 5 with a right data sheet, and 31 under the conditions of an aircraft."""
+simulation, it reached 5 with the right accuracy, and 31 under the conditions of an aircraft."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 4
 _NOT_STARTED = "the vehicle has no destination yet: call start(target) first"
@@ -117,7 +116,7 @@ class Onboard:
         source = load_pretrained("anywhere") if navigator == "anywhere" else navigator
         policy = None if isinstance(source, str) else source
         self.max_move_km, self.max_turn_deg = move_limits(policy, given.max_move_km, given.max_turn_deg)
-        self.options, self._left_std = given, Values(given.bias_std)
+        self.options, self._sensor_std = given, given.sensor_std
         if isinstance(policy, FieldPolicy) and isinstance(view_of(policy), TrackView):  # nothing signals the arrival
             policy = policy.adapted(search=False, max_steps=given.max_steps)
         self._source = source if policy is None else copy.deepcopy(policy).cpu()
@@ -136,9 +135,9 @@ class Onboard:
             return copy.deepcopy(self._source)
         options, bounds = self.options, (self.max_move_km, math.radians(self.max_turn_deg))
         if self._source == "secant":
-            return Secant(*bounds, sensor_std=options.sensor_std, bias_std=self._left_std)
+            return Secant(*bounds, sensor_std=self._sensor_std)
         if self._source == "kalman":
-            return Kalman(*bounds, options.sensor_std, options.max_steps, bias_std=self._left_std, search=False)
+            return Kalman(*bounds, self._sensor_std, options.max_steps, search=False)
         raise ValueError(f"unknown navigator {self._source!r}: choose from {', '.join(NAMED)}, or give a policy")
 
     def start(
@@ -176,14 +175,14 @@ class Onboard:
         nearby = None if near is None else nearby_elements(near, date, goal, self._longest_way())
         known = None if here is None else known_elements(here, journal.here_std, date)
         self._near, self._known, self._journal, self.target = nearby, known, journal, goal
-        self._error, self._left_std = self._calibrated()
+        self._error, self._sensor_std = self._calibrated()
         self.navigator = self._new_navigator()
         self._estimator = Estimator(self.navigator)
         self._steps: tuple[Step, ...] = ()
         self._last_command: Command | None = None
         self._raw: tuple[Any, ...] = (None, None, None)  # the last reading, without calibration
         self._last, self._surprises = Values(), Values()  # the last reading with its course
-        self._unchanged = EXACT  # path since each element last changed [km]
+        self._unchanged = (0.0, 0.0, 0.0)  # path since each element last changed [km]
         self._unread_km = 0.0  # path since the last complete reading
         self._northward = Values()  # the first inclination, and how far magnetic north the vehicle has come [km]
 
@@ -225,7 +224,6 @@ class Onboard:
 
     def _move(self, step: Step) -> Command:
         """Return what to do after a new move."""
-        sheet = self.options.sensor_std
         raw: Any = tuple(old if new is None else new for new, old in zip(step.reading, self._raw, strict=True))
         check_earth_reading(*raw)
         error = self._error if self._last else self._calibrated(raw)[0]
@@ -233,7 +231,8 @@ class Onboard:
         self._check(step, reading)
         course = math.remainder(math.radians(step.heading), 2 * math.pi)
         turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
-        std = [OUTAGE_STD if new is None else own for new, own in zip(step.reading, sheet, strict=True)]
+        noise = zip(step.reading, self._sensor_std.noise, strict=True)
+        std = self._sensor_std._replace(noise=[OUTAGE_STD if new is None else own for new, own in noise])
         with torch.inference_mode():
             seen = self._seen(reading, course, (step.distance, turn), std)
             if self._last and step.reading != (None, None, None):
@@ -252,22 +251,19 @@ class Onboard:
         first, north = self._northward or (inclination, 0.0)
         self._northward = first, north + step.distance * math.cos(course - math.radians(declination))
 
-    def _calibrated(self, reading: Elements | None = None) -> tuple[Values, Values]:
-        """Return the constant error of readings, as far as it is known, and the standard deviations that are left."""
-        options = self.options
+    def _calibrated(self, reading: Elements | None = None) -> tuple[Values, SensorStd]:
+        """Return the constant error of readings, as far as it is known, and the accuracy without it."""
+        stated = self.options.sensor_std
         if reading and self._near:
-            std = [math.hypot(*each) for each in zip(options.sensor_std, options.bias_std, self._near[1], strict=True)]
-            check_start(reading, self._near[0], std)
-        if self._known is None:
-            return EXACT, options.bias_std
-        return calibrated(*self._known, (options.sensor_std, options.bias_std, options.drift_std), reading)
+            check_start(reading, self._near[0], stated, self._near[1])
+        return ((0.0, 0.0, 0.0), stated) if self._known is None else calibrated(*self._known, stated, reading)
 
     def _check(self, step: Step, reading: Elements) -> None:
         """Raise unless a reading, a heading and a distance are possible, and possible together."""
         steer_deg = self._last_command.heading_deg if self._last_command else None
         check_move(step.heading, step.distance, steer_deg, self.max_move_km)
         if self._last:
-            check_earth_jump(self._last[:3], reading, step.distance + self._unread_km, self.options.sensor_std)
+            check_earth_jump(self._last[:3], reading, step.distance + self._unread_km, self._sensor_std.noise)
             return
         if step.distance != 0:
             raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
@@ -279,10 +275,10 @@ class Onboard:
         """Return how far the target may be [km]."""
         return LONGEST_WAY_KM if self._estimator.trained else self.options.max_steps * self.max_move_km
 
-    def _seen(self, reading: Elements, course: float, move: tuple[float, float], std: Sequence[float]) -> TensorDict:
+    def _seen(self, reading: Elements, course: float, move: tuple[float, float], std: SensorStd) -> TensorDict:
         """Return what a policy reads, in a batch of one."""
         rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
-        rows |= dict(zip(STD_KEYS, (std, self._left_std, self.options.drift_std), strict=True))
+        rows |= dict(zip(STD_KEYS, std, strict=True))
         seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
         seen |= {"step_count": torch.tensor([[len(self._steps)]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")
@@ -307,7 +303,7 @@ class Onboard:
 
     def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float, declared: bool) -> tuple[str | None, str]:
         """Return why to stop, and that as a sentence."""
-        options, useful = self.options, measured(self.options.sensor_std)
+        options, useful = self.options, measured(self._sensor_std.noise)
         if text := stuck([km * use for km, use in zip(self._unchanged, useful, strict=True)], self.max_move_km):
             return "lost", text
         level = sum(self._surprises) / max(len(self._surprises), 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar, TypeAlias, cast
+from typing import Any, ClassVar, TypeAlias, TypeVar, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -12,9 +12,14 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from magrl.checks import check_choice
+
+T = TypeVar("T")
 Keys = Sequence[NestedKey]
-GivenKeys: TypeAlias = NestedKey | Keys | None
-"""Keys as a user gives them; None for the default ones."""
+GivenKeys: TypeAlias = NestedKey | Keys | Mapping[str, NestedKey] | None
+"""Keys as a user gives them: in their order, or those in place of default keys by name; None for the default ones."""
+MOST_KEYS = 4
+"""Most keys that are given by their order alone."""
 
 
 class ObservationTransform(Transform):
@@ -24,8 +29,10 @@ class ObservationTransform(Transform):
     keys in class attributes.
 
     Args:
-        in_keys: keys that are read; :attr:`default_in_keys` by default.
-        out_keys: keys that are written; :attr:`default_out_keys` by default.
+        in_keys: keys that are read, by default :attr:`default_in_keys`; or a mapping of names of default keys to the
+            keys in their place, as more than four of them must be given.
+        out_keys: keys that are written, by default :attr:`default_out_keys`; or a mapping.
+        optional: further keys that are read, in the order of :attr:`optional_in_keys`.
         **inverse: ``in_keys_inv`` and ``out_keys_inv`` of an invertible transform.
 
     Raises:
@@ -44,8 +51,10 @@ class ObservationTransform(Transform):
 
     default_in_keys: ClassVar[Keys] = ()
     default_out_keys: ClassVar[Keys] = ()
+    optional_in_keys: ClassVar[Keys] = ()
+    """Names of keys that are read only where they are given."""
     in_counts: ClassVar[Sequence[int]] = ()
-    """Numbers of ``in_keys`` that are allowed; by default that of :attr:`default_in_keys`."""
+    """Numbers of ``in_keys`` that are allowed; by default that of the default ones, with optional ones or without."""
     out_counts: ClassVar[Sequence[int]] = ()
     """Numbers of ``out_keys`` that are allowed; by default that of :attr:`default_out_keys`."""
     in_sizes: Sequence[int | None] = ()
@@ -53,11 +62,19 @@ class ObservationTransform(Transform):
     out_sizes: Sequence[tuple[int, ...]] = ()
     """Last dimensions of the values at ``out_keys``, unbounded ones; () for a reward."""
 
-    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, **inverse: Keys) -> None:
+    def __init__(
+        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, optional: Keys = (), **inverse: Any
+    ) -> None:
         ins, outs = self.default_in_keys, self.default_out_keys
-        super().__init__(in_keys=_chosen(in_keys, ins), out_keys=_chosen(out_keys, outs), **inverse)
+        keys = [*_chosen(in_keys, ins), *several_keys(optional)]
+        super().__init__(in_keys=keys, out_keys=_chosen(out_keys, outs), **inverse)
         if ins:
-            expect_keys(self, self.in_counts or len(ins), self.out_counts or len(outs))
+            counts = self.in_counts or (len(ins), len(ins) + len(self.optional_in_keys))
+            expect_keys(self, counts, self.out_counts or len(outs))
+
+    def _named(self, values: Sequence[T]) -> dict[NestedKey, T]:
+        """Return what belongs to ``in_keys`` by the names of the default keys, and of the optional ones."""
+        return dict(zip((*self.default_in_keys, *self.optional_in_keys), values, strict=False))
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
         """Return the values at ``out_keys``, given those at ``in_keys``."""
@@ -334,10 +351,20 @@ def several_keys(keys: Keys) -> list[NestedKey]:
 
 
 def _chosen(keys: GivenKeys, default: Keys) -> list[NestedKey]:
-    """Return the keys that a user gives, or the default ones; a tuple is one nested key where one key is usual."""
-    if keys is None:
-        return list(default)
-    return several_keys(cast(Keys, keys)) if len(default) > 1 else key_list(keys)
+    """Return the keys that a user gives, or the default ones; a tuple is one nested key where one key is usual.
+
+    Raises:
+        ValueError: for a name that is none of the default keys, or too many keys without names.
+    """
+    if isinstance(keys, Mapping):
+        for name in keys:
+            check_choice(default, key=name)
+    if keys is None or isinstance(keys, Mapping):
+        return [unravel_key((keys or {}).get(key, key)) for key in default]
+    chosen = several_keys(cast(Keys, keys)) if len(default) > 1 else key_list(keys)
+    if default and len(chosen) > MOST_KEYS:
+        raise ValueError(f"more than {MOST_KEYS} keys need names: give a mapping of {tuple(default)}, got {keys!r}")
+    return chosen
 
 
 def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int | Sequence[int]) -> None:
@@ -355,7 +382,7 @@ def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int 
             ...
         ValueError: CatTensors takes 3 in_keys and 1 out_keys, got ['field', 'move'] and ['observation']
     """
-    counts = [(count,) if isinstance(count, int) else count for count in (num_in, num_out)]
+    counts = [(count,) if isinstance(count, int) else sorted(set(count)) for count in (num_in, num_out)]
     if len(transform.in_keys) not in counts[0] or len(transform.out_keys) not in counts[1]:
         ins, outs = (" or ".join(map(str, count)) for count in counts)
         raise ValueError(

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 
 from magrl import tracking
 from magrl.checks import check_number
+from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import FieldTrack
-from magrl.transforms.base import GivenKeys, ObservationTransform, observed_spec, with_state
-from magrl.transforms.track import OUT_KEYS
+from magrl.transforms.base import Keys, ObservationTransform, observed_spec, with_state
+from magrl.transforms.track import TRACK_KEYS
 
 
 class DeclareArrival(ObservationTransform):
-    """Declare the arrival of vehicles by their own estimate; so any navigator can be flown without being told.
+    """Declare the arrival by the vehicle's own estimate, so that any navigator can fly without an arrival signal.
 
     For an environment whose action has a third number that declares the arrival. To the policy, the action has the
     first two. Where the vehicle is probably within the radius, and further readings are not worth their cost
@@ -34,12 +35,11 @@ class DeclareArrival(ObservationTransform):
         confidence: least probability at which the vehicle declares; below, the episode ends without a declaration.
         range_km: prior standard deviation of the way along each axis [km].
         in_keys: values at the target ``(..., 3)``, mean ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the
-            filter, heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, and optionally the standard deviations
-            ``(..., 3)`` of new errors of a reading, of constant and slow ones, and of slow ones alone.
+            filter, heading ``(..., 1)`` [rad], and number of the step ``(..., 1)``.
         out_keys: probability ``(..., 1)`` that the target is within the radius, the probability ``(..., 1)`` at which
             going on is worth as much, the mean way ``(..., 2)`` northward and eastward [km], and the distance
             ``(..., 1)`` from its end at which to stop [km].
-        action_key: action, ``(..., 2)`` to the policy and ``(..., 3)`` to the environment.
+        std_keys: where readings come with standard deviations ``(..., 3)``, those of noise, bias and drift.
 
     Raises:
         ValueError: for an option out of its range, another number of keys, or an environment whose action has no third
@@ -58,9 +58,9 @@ class DeclareArrival(ObservationTransform):
         (tensor(20), tensor(20))
     """
 
-    default_in_keys = ("target_field", *OUT_KEYS[:2], "heading", "step_count")
+    default_in_keys = ("target_field", *TRACK_KEYS, "heading", "step_count")
     default_out_keys = ("arrival_probability", "arrival_worth", "arrival_way", "arrival_stop")
-    in_counts = (5, 8)
+    optional_in_keys = STD_KEYS
     in_sizes = (3, 3, 3, 1, 1, 3, 3, 3)
     out_sizes = ((1,), (1,), (2,), (1,))
     invertible = True
@@ -72,11 +72,10 @@ class DeclareArrival(ObservationTransform):
         max_steps: int,
         confidence: float = 0.0,
         range_km: float = tracking.RANGE_KM,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
-        action_key: NestedKey = "action",
+        std_keys: Keys = (),
+        **keys: Any,
     ) -> None:
-        super().__init__(in_keys, out_keys, in_keys_inv=[action_key], out_keys_inv=[action_key])
+        super().__init__(optional=std_keys, **keys, in_keys_inv=["action"], out_keys_inv=["action"])
         check_number(0, above=True, radius_km=radius_km, range_km=range_km)
         check_number(0, 1, confidence=confidence)
         check_number(1, whole=True, max_steps=max_steps)
@@ -84,17 +83,17 @@ class DeclareArrival(ObservationTransform):
         self.max_steps, self.confidence = int(max_steps), float(confidence)
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
-        target, mean, covariance, _, step, *std = values
-        new, lasting, slow = std or [torch.zeros_like(target)] * 3
-        left = self.max_steps - 1 - step.squeeze(-1)
-        track = FieldTrack(mean.to(target.dtype), covariance.to(target.dtype))  # float32 suffices for probabilities
-        options = left, self.radius_km, self.range_km
-        decision = tracking.arrival_decision(track, target, new, lasting, slow, *options)
+        seen = self._named(values)
+        target, none = seen["target_field"], torch.zeros_like(seen["target_field"])
+        std = SensorStd(*(seen.get(key, none) for key in STD_KEYS))
+        left = self.max_steps - 1 - seen["step_count"].squeeze(-1)
+        track = FieldTrack(*(seen[key].to(target.dtype) for key in TRACK_KEYS))  # float32 suffices for probabilities
+        decision = tracking.arrival_decision(track, target, *std, left, self.radius_km, self.range_km)
         probability, worth, stop = (x.unsqueeze(-1) for x in (decision.probability, decision.worth, decision.stop_km))
         return probability, worth, decision.posterior.way().displacement, stop
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        values = self._read(tensordict, [*self.out_keys, self.in_keys[3], *self.in_keys_inv])
+        values = self._read(tensordict, [*self.out_keys, self._named(self.in_keys)["heading"], *self.in_keys_inv])
         if values is None:
             return tensordict
         probability, worth, way, stop, heading, action = values

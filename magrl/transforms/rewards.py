@@ -15,7 +15,7 @@ from magrl.checks import check_number, check_numbers
 from magrl.counters import stream_uniform
 from magrl.geodesy import geodesic
 from magrl.transforms.base import GivenKeys, ObservationTransform, StatefulTransform, StepReward
-from magrl.transforms.errors.base import Episode, EpisodeErrors
+from magrl.transforms.errors.base import Episode, EpisodeNumbers
 
 
 class TrueWay(ObservationTransform):
@@ -88,12 +88,13 @@ class HighestSPL(StatefulTransform):
         tensordict.set(self.out_keys[0], torch.ones_like(values[0][..., :1]))
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        (after, move, start, target, success, done), (before, highest) = values, state
-        task_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(move.dtype)
-        path_km = task_km / highest - before.norm(dim=-1, keepdim=True) + move[..., :1]
-        whole_km = torch.where(success, path_km, path_km + after.norm(dim=-1, keepdim=True))
+        after, (before, highest) = self._named(values), state
+        ends = (*after["start_position"].unbind(-1), *after["target_position"].unbind(-1))
+        task_km, success = geodesic(*ends)[0].unsqueeze(-1).to(after["move"].dtype), after["success"]
+        path_km = task_km / highest - before.norm(dim=-1, keepdim=True) + after["move"][..., :1]
+        whole_km = torch.where(success, path_km, path_km + after["true_way"].norm(dim=-1, keepdim=True))
         reached = task_km / torch.maximum(whole_km, task_km)
-        tensordict.set(self.out_keys[0], torch.where(done & ~success, torch.zeros_like(reached), reached))
+        tensordict.set(self.out_keys[0], torch.where(after["done"] & ~success, torch.zeros_like(reached), reached))
 
 
 class SPLReward(StepReward):
@@ -133,12 +134,12 @@ class SPLReward(StepReward):
         tensordict.set(self.out_keys[0], self.scale * (values[0] - state[0] - values[1] / 100))
 
 
-class RandomStepPrice(EpisodeErrors):
+class RandomStepPrice(EpisodeNumbers):
     """Draw the price of a step for each episode, log-uniform, so that one policy learns the whole range.
 
     Args:
         price_range: lowest and highest price [% of SPL].
-        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeErrors`.
+        **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeNumbers`.
 
     Raises:
         ValueError: for other than two rising numbers above 0.
@@ -154,7 +155,7 @@ class RandomStepPrice(EpisodeErrors):
 
     default_in_keys = ("heading",)
     default_out_keys = ("step_price",)
-    error_key, stream_key = "step_price", "step_price_stream"
+    numbers_key, stream_key = "step_price", "step_price_stream"
     size = draws = 1
 
     def __init__(self, price_range: Sequence[float], **options: Any) -> None:
@@ -170,7 +171,7 @@ class RandomStepPrice(EpisodeErrors):
         return low * (high / low) ** stream_uniform(stream, 1)
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:  # noqa: ARG002
-        return episode.errors
+        return episode.numbers
 
 
 class EpisodeSum(StatefulTransform):

@@ -13,19 +13,14 @@ from torchrl.data import Composite
 
 from magrl import tracking
 from magrl.checks import check_choice, check_number, check_numbers
+from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import STEP_PRICE, FieldTrack, GradientPrior, GradientRelation, LearnedPrior, Way
-from magrl.transforms.base import (
-    GivenKeys,
-    StatefulTransform,
-    several_keys,
-)
+from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 
-STD_KEYS = ("sensor_std", "bias_std", "drift_std")
-"""Standard deviations of a reading's new errors, of constant and slow ones, and of slow ones alone: D [deg], I [deg],
-B_H [nT]."""
 FRAMES = ("world", "vehicle")
 IN_KEYS = ("field", "target_field", "move", "heading")
-OUT_KEYS = ("track_mean", "track_covariance", "estimated_field", "estimated_gradient", "way", "way_covariance")
+TRACK_KEYS = ("track_mean", "track_covariance")
+OUT_KEYS = (*TRACK_KEYS, "estimated_field", "estimated_gradient", "way", "way_covariance")
 
 
 class TrackGradient(StatefulTransform):
@@ -37,15 +32,16 @@ class TrackGradient(StatefulTransform):
 
     Args:
         in_keys: readings ``(..., E)``, values at the target ``(..., E)``, the last move ``(..., K)`` (its first number
-            is the distance [km]), the heading after the move ``(..., 1)`` [rad], and optionally standard deviations
-            ``(..., E)``: that of the readings' noise, alone or with those of constant and slow errors, which widen the
-            covariance of the way, and of slow errors alone, of which a part counts as noise.
+            is the distance [km]), and the heading after the move ``(..., 1)`` [rad].
         out_keys: the state, in the scaled units of :class:`~magrl.tracking.FieldTrack`: mean ``(..., E, 3)`` and
             covariance ``(..., E, 3, 3)``, always northward and eastward; then the estimates: the field ``(..., E)``,
             its gradient ``(..., E, 2)`` [element unit / km], the way to aim at ``(..., 2)`` [km] and the covariance of
             that to the target ``(..., 2, 2)`` [km^2] (:meth:`magrl.tracking.WayPosterior.aim`).
-        sensor_std: standard deviation of the readings' noise, E numbers, where it is not among the ``in_keys``; by
-            default 0. The filter has a floor, :data:`~magrl.tracking.VARIANCE_FLOOR`.
+        std_keys: where readings come with standard deviations ``(..., E)``, the key of that of the noise, alone or with
+            those of the bias, which widens the covariance of the way, and of the drift, of which a part counts as
+            noise.
+        sensor_std: accuracy of the sensors without ``std_keys``, a :class:`~magrl.sensor_std.SensorStd` or E numbers
+            for white noise; perfect by default. The filter has a floor, :data:`~magrl.tracking.VARIANCE_FLOOR`.
         prior: function from a first reading and the values at the target, ``(..., E)`` each, to a
             :class:`~magrl.tracking.GradientPrior`; by default :class:`~magrl.tracking.LearnedPrior`. For other elements
             than D, I, B_H, give one, and also ``relation``, ``common``, ``scales``, ``curvature`` and ``angles``.
@@ -75,6 +71,7 @@ class TrackGradient(StatefulTransform):
 
     default_in_keys = IN_KEYS
     default_out_keys = OUT_KEYS
+    optional_in_keys = STD_KEYS
     in_counts = (4, 5, 7)
     scales: Tensor
     sensor_std: Tensor
@@ -86,7 +83,8 @@ class TrackGradient(StatefulTransform):
         in_keys: GivenKeys = None,
         out_keys: GivenKeys = None,
         *,
-        sensor_std: Sequence[float] | None = None,
+        std_keys: Keys = (),
+        sensor_std: SensorStd | Sequence[float] | None = None,
         prior: Callable[[Tensor, Tensor], GradientPrior] | None = None,
         relation: Callable[[Tensor], GradientRelation] | None = tracking.curl_relation,
         common: Callable[[Tensor], Tensor] | None = tracking.common_error,
@@ -96,9 +94,9 @@ class TrackGradient(StatefulTransform):
         range_km: float = 300.0,
         frame: str = "world",
     ) -> None:
-        super().__init__(in_keys, out_keys)
-        if sensor_std is not None and len(self.in_keys) > 4:
-            raise ValueError(f"give sensor_std or its key {self.in_keys[4]!r}, not both: got sensor_std {sensor_std}")
+        super().__init__(in_keys, out_keys, std_keys)
+        if sensor_std is not None and std_keys:
+            raise ValueError(f"give sensor_std or std_keys, not both: got {sensor_std} and {std_keys}")
         check_number(0, above=True, range_km=range_km)
         check_choice(FRAMES, frame=frame)
         prior = LearnedPrior.pretrained() if prior is None else prior
@@ -113,17 +111,15 @@ class TrackGradient(StatefulTransform):
         self.out_sizes = (count, 3), (count, 3, 3), (count,), (count, 2), (2,), (2, 2)
         if not set(angles) <= set(range(count)):
             raise ValueError(f"angles must be indices of the {count} elements, got {angles!r}")
-        self._register(count, scales=scales, sensor_std=(0.0,) * count if sensor_std is None else sensor_std)
-        self._register(count, periods=[360.0 * (index in angles) for index in range(count)])
+        stated = SensorStd.of((0.0,) * count if sensor_std is None else sensor_std, count)
+        self.biased, numbers = any(stated.bias), {"scales": scales, "sensor_std": stated}
+        numbers["periods"] = [360.0 * (index in angles) for index in range(count)]
         if not callable(curvature):
-            self._register(count, constant_curvature=curvature)
-
-    def _register(self, count: int, **numbers: Sequence[float]) -> None:
-        """Check and keep the numbers of each element; float64, as a 0.3 of float32 is another in float64."""
-        for name, values in numbers.items():
-            check_numbers(count, **{name: values})
-            smallest: dict[str, Any] = {name: min(values, default=0.0)}
-            check_number(0, above=name == "scales", **smallest)
+            check_numbers(count, 0, curvature=curvature)
+            numbers["constant_curvature"] = curvature
+        check_numbers(count, scales=scales)
+        check_number(0, above=True, scales=min(scales))
+        for name, values in numbers.items():  # float64, as a 0.3 of float32 is another in float64
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
 
     @property
@@ -160,11 +156,12 @@ class TrackGradient(StatefulTransform):
         return observation_spec
 
     def _std(self, values: list[Tensor]) -> tuple[Tensor, Tensor | None]:
-        """Return the standard deviations of a reading and of constant errors, of the TensorDict or as given."""
-        std = values[4:]
-        if len(std) > 1:
-            return tracking.reading_std(std[0], std[2]), std[1]
-        return std[0] if std else self.sensor_std, None
+        """Return the standard deviations of a reading and of its bias, of the TensorDict or as stated."""
+        _, _, _, _, *given = values
+        if len(given) == 1:
+            return given[0], None
+        std = SensorStd(*(given or self.sensor_std))
+        return tracking.reading_std(std.noise, std.drift), std.bias if given or self.biased else None
 
     def estimates(
         self, track: FieldTrack, target: Tensor, heading: Tensor, bias_std: Tensor | None = None
@@ -192,20 +189,19 @@ class TrackGradient(StatefulTransform):
 
 
 class NoiseScale(StatefulTransform):
-    """Scale the standard deviations of the noise of D, I, B_H on the data sheet by what the readings show.
+    """Scale the stated standard deviations of the noise of D, I, B_H by what the readings show.
 
-    Where the data sheet is too small, estimates are too sure, and arrivals are declared too soon; where it is too
-    large, readings are wasted. See :func:`magrl.tracking.noise_estimate`. It stands before :class:`TrackGradient`, so
-    that this and all that follow read the scaled value; a navigator takes the larger of this and its own data sheet.
-    An element without noise keeps 0. Its state is in the TensorDict.
+    Where less noise is stated than there is, estimates are too sure, and arrivals are declared too soon; where more is
+    stated, readings are wasted. See :func:`magrl.tracking.noise_estimate`. It stands before :class:`TrackGradient`, so
+    that this and all that follow read the scaled value; a navigator takes the larger of this and what it was given. An
+    element without noise keeps 0. Its state is in the TensorDict.
 
     Args:
         in_keys: reading ``(..., 3)``, the last move ``(..., K)`` (distance [km] first), heading ``(..., 1)`` [rad], and
-            the standard deviations ``(..., 3)`` of the noise on the data sheet and of slow errors.
-        out_keys: the standard deviation of the noise ``(..., 3)``, by default in place of that of the data sheet; and
-            the state: logarithms of the ratios of the variances ``(..., 3)``, and the effective numbers of readings
+            the standard deviations ``(..., 3)`` of noise and drift.
+        out_keys: the standard deviation of the noise ``(..., 3)``, by default in place of the stated one; and the
+            state: logarithms of the ratios of the variances ``(..., 3)``, and the effective numbers of readings
             ``(..., 3)``.
-        track_keys: mean and covariance of the filter of :class:`TrackGradient`, which are read before a step.
 
     Raises:
         ValueError: for another number of keys, shapes that do not match, or a place behind :class:`TrackGradient`.
@@ -215,47 +211,40 @@ class NoiseScale(StatefulTransform):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.transforms import SensorNoise
         >>> from torchrl.envs import Compose, TransformedEnv
-        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), NoiseScale(), TrackGradient((*IN_KEYS, *STD_KEYS)))
+        >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), NoiseScale(), TrackGradient(std_keys=STD_KEYS))
         >>> TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), steps).rollout(3)["noise_log_ratio"].shape
         torch.Size([2, 3, 3])
     """
 
-    default_in_keys = (IN_KEYS[0], *IN_KEYS[2:], STD_KEYS[0], STD_KEYS[2])
-    default_out_keys = (STD_KEYS[0], "noise_log_ratio", "noise_readings")
+    default_in_keys = ("field", "move", "heading", "sensor_std", "drift_std")
+    default_out_keys = ("sensor_std", "noise_log_ratio", "noise_readings")
     in_sizes = (3, None, 1, 3, 3)
     out_sizes = ((3,),) * 3
 
-    def __init__(
-        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, track_keys: Sequence[NestedKey] = OUT_KEYS[:2]
-    ) -> None:
-        super().__init__(in_keys, out_keys)
-        self.track_keys = several_keys(track_keys)
-        if len(self.track_keys) != 2:
-            raise ValueError(f"track_keys must be those of the mean and the covariance, got {track_keys!r}")
-
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Raise if the track is written before, by which the filter would not read the scaled value."""
-        if known := [key for key in self.track_keys if key in observation_spec.keys(True, True)]:
+        if known := [key for key in TRACK_KEYS if key in observation_spec.keys(True, True)]:
             raise ValueError(f"NoiseScale stands before the transform that writes {known}: change their order")
         return super().transform_observation_spec(observation_spec)
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
-        none = torch.zeros_like(values[3])
-        self._write(tensordict, values[3], tracking.NoiseEstimate(none, none))
+        noise = self._named(values)["sensor_std"]
+        self._write(tensordict, noise, tracking.NoiseEstimate(0 * noise, 0 * noise))
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        reading, move, heading, *std = (x.double() for x in values)
+        seen = self._named([x.double() for x in values])
         *before, mean, covariance = (x.double() for x in state)
-        track, displacement = FieldTrack(mean, covariance), tracking.displacement_of(move, heading)
-        estimate = tracking.noise_estimate(tracking.NoiseEstimate(*before), track, displacement, reading, *std)
-        self._write(tensordict, values[3], estimate)
+        track, displacement = FieldTrack(mean, covariance), tracking.displacement_of(seen["move"], seen["heading"])
+        errors = seen["field"], seen["sensor_std"], seen["drift_std"]
+        estimate = tracking.noise_estimate(tracking.NoiseEstimate(*before), track, displacement, *errors)
+        self._write(tensordict, self._named(values)["sensor_std"], estimate)
 
     def _write(self, tensordict: TensorDictBase, std: Tensor, estimate: tracking.NoiseEstimate) -> None:
         for key, value in zip(self.out_keys, (std * estimate.factor, *estimate), strict=True):
             tensordict.set(key, value.to(std.dtype))
 
     def _state(self, tensordict: TensorDictBase) -> list[Tensor] | None:
-        state, track = super()._state(tensordict), self._read(tensordict, self.track_keys, state=True)
+        state, track = super()._state(tensordict), self._read(tensordict, TRACK_KEYS, state=True)
         return None if state is None or track is None else [*state, *track]
 
 
@@ -290,31 +279,33 @@ class SearchAim(StatefulTransform):
         torch.Size([2, 3, 24, 2])
     """
 
-    default_in_keys = (*IN_KEYS, "track_mean", "track_covariance", "way", "way_covariance")
+    default_in_keys = (*IN_KEYS, *TRACK_KEYS, "way", "way_covariance")
     default_out_keys = ("aim", "visited", "arrival_weights")
     out_sizes = (2,), (tracking.VISITED, 2), (3,)
 
-    def __init__(
-        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, zeta: float, frame: str = "world"
-    ) -> None:
-        super().__init__(in_keys, out_keys)
+    def __init__(self, *, zeta: float, frame: str = "world", **keys: Any) -> None:
+        super().__init__(**keys)
         check_number(0, above=True, zeta=zeta)
         check_choice(FRAMES, frame=frame)
         self.zeta, self.frame = float(zeta), frame
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
-        weights = tracking.arrival_weights(values[0], values[1], self.zeta)
-        self._write(tensordict, values, tracking.unvisited_yet(values[0]), weights)
+        reading, target, *_ = values
+        weights = tracking.arrival_weights(reading, target, self.zeta)
+        self._write(tensordict, values, tracking.unvisited_yet(reading), weights)
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        (visited, weights), displacement = state, tracking.displacement_of(values[2], values[3])
+        (visited, weights), (_, _, move, heading, *_) = state, values
+        displacement = tracking.displacement_of(move, heading)
         self._write(tensordict, values, tracking.visit(visited, displacement), weights)
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], visited: Tensor, weights: Tensor) -> None:
-        heading, mean, covariance, *way = (x.double() for x in values[3:])
+        seen = self._named([x.double() for x in values])
+        track, way = FieldTrack(*(seen[key] for key in TRACK_KEYS)), Way(seen["way"], seen["way_covariance"])
+        heading = seen["heading"]
         north_east = torch.eye(2, dtype=heading.dtype, device=heading.device)
         axes = _turned(north_east, heading).mT if self.frame == "vehicle" else None
-        aim = tracking.aim(FieldTrack(mean, covariance), Way(*way), visited.double(), weights.double(), axes=axes)
+        aim = tracking.aim(track, way, visited.double(), weights.double(), axes=axes)
         for key, value in zip(self.out_keys, (aim.to(visited.dtype), visited, weights), strict=True):
             tensordict.set(key, value)
 
@@ -327,14 +318,14 @@ class PlannedMove(StatefulTransform):
     Args:
         in_keys: values at the target ``(..., 3)``, heading ``(..., 1)`` [rad], number of the step ``(..., 1)``, mean
             ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the filter, way to aim at ``(..., 2)`` [km], and the
-            standard deviations ``(..., 3)`` of new errors of a reading, of constant and slow ones, and of slow ones
-            alone.
+            standard deviations ``(..., 3)`` of noise, bias and drift.
         out_keys: displacement ``(..., 2)`` [km].
         max_move_km: longest move [km].
         max_steps: step limit.
         range_km: prior standard deviation of the way along each axis [km].
         frame: axes of the way and the displacement, as in :class:`TrackGradient`.
-        step_price: price of a step where it is not among the ``in_keys`` [% of SPL]; a way of ``range_km`` is 100 %.
+        step_price: price of a step [% of SPL], a way of ``range_km`` is 100 %; None where vehicles have their own, at
+            ``step_price`` ``(..., 1)``.
 
     Raises:
         ValueError: for an option out of its range, or another number of keys.
@@ -349,48 +340,49 @@ class PlannedMove(StatefulTransform):
         torch.Size([2, 3, 2])
     """
 
-    default_in_keys = ("target_field", "heading", "step_count", "track_mean", "track_covariance", "way", *STD_KEYS)
+    default_in_keys = ("target_field", "heading", "step_count", *TRACK_KEYS, "way", *STD_KEYS)
     default_out_keys = ("planned_move",)
-    in_counts = (9, 10)
+    optional_in_keys = ("step_price",)
     in_sizes = (3, 1, 1, 3, 3, 2, 3, 3, 3, 1)
     out_sizes = ((2,),)
 
     def __init__(
         self,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
         *,
         max_move_km: float,
         max_steps: int,
         range_km: float = 300.0,
         frame: str = "world",
-        step_price: float = STEP_PRICE,
+        step_price: float | None = STEP_PRICE,
+        **keys: Any,
     ) -> None:
-        super().__init__(in_keys, out_keys)
+        super().__init__(optional=["step_price"] if step_price is None else (), **keys)
         check_number(0, above=True, max_move_km=max_move_km, range_km=range_km)
         check_number(1, whole=True, max_steps=max_steps)
         check_choice(FRAMES, frame=frame)
-        check_number(0, above=True, step_price=step_price)
+        check_number(0, above=True, optional=True, step_price=step_price)
         self.max_move_km, self.max_steps = float(max_move_km), int(max_steps)
-        self.range_km, self.frame, self.step_price = float(range_km), frame, float(step_price)
+        self.range_km, self.frame, self.step_price = float(range_km), frame, step_price
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         self._advance(tensordict, values, [])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:  # noqa: ARG002
-        target, heading, step, mean, covariance, aim, sensor_std, bias_std, drift_std = (x.double() for x in values[:9])
-        given = values[9].double().squeeze(-1) if values[9:] else self.step_price
-        turn = heading if self.frame == "vehicle" else 0 * heading
-        aim, std = _turned(aim.unsqueeze(-2), -turn).squeeze(-2), tracking.reading_std(sensor_std, drift_std)
-        track = FieldTrack(mean, covariance)
+        seen = self._named([x.double() for x in values])
+        price = seen["step_price"].squeeze(-1) if self.step_price is None else self.step_price
+        turn = seen["heading"] if self.frame == "vehicle" else 0 * seen["heading"]
+        aim, errors = _turned(seen["way"].unsqueeze(-2), -turn).squeeze(-2), SensorStd.read(seen)
+        std, track = tracking.reading_std(errors.noise, errors.drift), FieldTrack(*(seen[key] for key in TRACK_KEYS))
         known, shared = tracking.related(track, tracking.curl_relation)
         field = tracking.estimated_field(known)
         curvature, common = tracking.field_curvature(field), tracking.common_error(field)
-        options = self.range_km, tracking.ELEMENT_SCALES, shared, bias_std, tracking.ELEMENT_PERIODS, curvature, common
-        posterior = tracking.way_posterior(known, target, *options, fine=False)
-        step, limits = step.squeeze(-1), (self.max_move_km, self.range_km)
-        price = tracking.step_price(given, self.range_km, aim, step, std, self.max_steps, self.max_move_km)
-        move = tracking.planned_move(track, aim, posterior, std, price, *limits, bias_std=bias_std, curvature=curvature)
+        units, periods = tracking.ELEMENT_SCALES, tracking.ELEMENT_PERIODS
+        options = self.range_km, units, shared, errors.bias, periods, curvature, common
+        posterior = tracking.way_posterior(known, seen["target_field"], *options, fine=False)
+        step, limits = seen["step_count"].squeeze(-1), (self.max_move_km, self.range_km)
+        price = tracking.step_price(price, self.range_km, aim, step, std, self.max_steps, self.max_move_km)
+        costs: dict[str, Any] = {"bias_std": errors.bias, "curvature": curvature}
+        move = tracking.planned_move(track, aim, posterior, std, price, *limits, **costs)
         tensordict.set(self.out_keys[0], _turned(move.unsqueeze(-2), turn).squeeze(-2).to(values[1].dtype))
 
 

@@ -17,14 +17,15 @@ from magrl import tracking
 from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES, element_difference
+from magrl.sensor_std import STD_KEYS
 from magrl.tracking import STEP_PRICE
-from magrl.transforms.base import GivenKeys, Keys, ObservationTransform, StatefulTransform
+from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS, PlannedMove, SearchAim, TrackGradient
+from magrl.transforms.track import IN_KEYS, TRACK_KEYS, PlannedMove, SearchAim, TrackGradient
 
 OBSERVATION_SIZE = 19
 """Numbers of :func:`track_observation`."""
-OBSERVED_KEYS = ("field", "target_field", *OUT_KEYS[2:4], "aim", OUT_KEYS[5], STD_KEYS[0], "step_count", "planned_move")
+_ESTIMATES = ("field", "target_field", "estimated_field", "estimated_gradient", "aim", "way_covariance")
 _STD_UNITS = (1.0, 1.0, 100.0)
 _LEAST_STD = 0.002
 _LEAST_PRICE = 0.01
@@ -313,18 +314,17 @@ class TrackObservation(StatefulTransform):
     """Write the observation of an agent that navigates by its own track, see :func:`track_observation`.
 
     It stands after :class:`~magrl.transforms.TrackGradient`, :class:`~magrl.transforms.SearchAim` and
-    :class:`~magrl.transforms.PlannedMove` in the vehicle's frame; without the second, its fifth key is that of the
-    estimated way. The weights of the objective follow from the first reading, which is kept as state in the TensorDict.
+    :class:`~magrl.transforms.PlannedMove` in the vehicle's frame; without the second, ``in_keys={"aim": "way"}``. The
+    weights of the objective follow from the first reading, which is kept as state in the TensorDict.
 
     Args:
         in_keys: reading and target ``(..., 3)``, estimated field ``(..., 3)``, its gradient ``(..., 3, 2)``, way to aim
             at ``(..., 2)``, covariance of the estimated way ``(..., 2, 2)``, standard deviation of the noise
-            ``(..., 3)``, number of the step ``(..., 1)``, planned displacement ``(..., 2)`` [km], and optionally the
-            price of a step ``(..., 1)`` [% of SPL].
+            ``(..., 3)``, number of the step ``(..., 1)``, and planned displacement ``(..., 2)`` [km].
         out_keys: observation ``(..., 19)`` and the first reading ``(..., 3)``.
         zeta: arrival threshold on the objective.
         max_steps: step limit.
-        step_price: price of a step where it is not among the ``in_keys``.
+        step_price: price of a step [% of SPL]; None where vehicles have their own, at ``step_price`` ``(..., 1)``.
 
     Raises:
         ValueError: for an option out of its range, or another number of keys.
@@ -333,7 +333,7 @@ class TrackObservation(StatefulTransform):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.transforms import SensorNoise
         >>> from torchrl.envs import Compose, TransformedEnv
-        >>> estimates = TrackGradient((*IN_KEYS, *STD_KEYS), frame="vehicle"), SearchAim(zeta=0.01, frame="vehicle")
+        >>> estimates = TrackGradient(std_keys=STD_KEYS, frame="vehicle"), SearchAim(zeta=0.01, frame="vehicle")
         >>> plan = PlannedMove(max_move_km=50.0, max_steps=50, frame="vehicle")
         >>> observation = TrackObservation(zeta=0.01, max_steps=50)
         >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), *estimates, plan, observation)
@@ -341,36 +341,31 @@ class TrackObservation(StatefulTransform):
         torch.Size([2, 3, 19])
     """
 
-    default_in_keys = OBSERVED_KEYS
+    default_in_keys = (*_ESTIMATES, "sensor_std", "step_count", "planned_move")
     default_out_keys = ("observation", "first_field")
-    in_counts = (9, 10)
+    optional_in_keys = ("step_price",)
     out_sizes = (OBSERVATION_SIZE,), (3,)
 
-    def __init__(
-        self,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
-        *,
-        zeta: float,
-        max_steps: int,
-        step_price: float = STEP_PRICE,
-    ) -> None:
-        super().__init__(in_keys, out_keys)
+    def __init__(self, *, zeta: float, max_steps: int, step_price: float | None = STEP_PRICE, **keys: Any) -> None:
+        super().__init__(optional=["step_price"] if step_price is None else (), **keys)
         check_number(0, above=True, zeta=zeta)
         check_number(1, whole=True, max_steps=max_steps)
-        check_number(0, above=True, step_price=step_price)
+        check_number(0, above=True, optional=True, step_price=step_price)
         self.zeta, self.max_steps, self.step_price = zeta, max_steps, step_price
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         self._advance(tensordict, values, values[:1])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        (first,), (_, target, estimate, gradient, way, covariance, sensor_std, step, planned, *given) = state, values
-        price = given[0] if given else torch.full_like(planned[..., :1], self.step_price)
-        remaining = element_difference(target, estimate)
+        (first,), seen = state, self._named(values)
+        target, planned = seen["target_field"], seen["planned_move"]
+        price = seen["step_price"] if self.step_price is None else torch.full_like(planned[..., :1], self.step_price)
+        estimates = seen["aim"], seen["way_covariance"], seen["estimated_gradient"]
+        remaining = element_difference(target, seen["estimated_field"])
         weights = tracking.arrival_weights(first, target, self.zeta)
-        time = (step.to(way.dtype) / self.max_steps).clamp(max=1)  # a policy may fly longer than it was trained for
-        observed = track_observation(way, covariance, gradient, remaining, weights, sensor_std, time, planned, price)
+        # A policy may fly longer than it was trained for.
+        time = (seen["step_count"].to(planned.dtype) / self.max_steps).clamp(max=1)
+        observed = track_observation(*estimates, remaining, weights, seen["sensor_std"], time, planned, price)
         tensordict.set(self.out_keys[0], observed).set(self.out_keys[1], first)
 
 
@@ -418,17 +413,14 @@ class TrackView(_View):
     @property
     def state_keys(self) -> tuple[str, ...]:
         """Keys of the state that a step reads from the one before."""
-        return *OUT_KEYS[:2], "first_field", *(("visited", "arrival_weights") if self.search else ())
+        return *TRACK_KEYS, "first_field", *(("visited", "arrival_weights") if self.search else ())
 
     def observation_transforms(self) -> list[Transform]:
         """Return the transforms from the public keys and standard deviations to ``observation`` ``(..., 19)``."""
-        track = TrackGradient((*IN_KEYS, *STD_KEYS), range_km=self.range_km, frame="vehicle")
+        track = TrackGradient(std_keys=STD_KEYS, range_km=self.range_km, frame="vehicle")
         search = [SearchAim(zeta=self.zeta, frame="vehicle")] if self.search else []
         aim = "aim" if self.search else "way"
-        price, priced = (STEP_PRICE, ["step_price"]) if self.step_price is None else (self.step_price, [])
-        planned = [*IN_KEYS[1::2], "step_count", *OUT_KEYS[:2], aim, *STD_KEYS, *priced]
-        observed = [*(aim if key == "aim" else key for key in OBSERVED_KEYS), *priced]
-        options: dict[str, Any] = {"max_steps": self.max_steps, "step_price": price}
+        options: dict[str, Any] = {"max_steps": self.max_steps, "step_price": self.step_price}
         limits: dict[str, Any] = {"max_move_km": self.max_move_km, "range_km": self.range_km, "frame": "vehicle"}
-        plan = PlannedMove(planned, **limits, **options)
-        return [track, *search, plan, TrackObservation(observed, zeta=self.zeta, **options)]
+        plan = PlannedMove(in_keys={"way": aim}, **limits, **options)
+        return [track, *search, plan, TrackObservation(in_keys={"aim": aim}, zeta=self.zeta, **options)]

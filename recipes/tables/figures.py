@@ -114,9 +114,7 @@ def one_error(lines: str, size: object = "") -> Conditions:
     """Return a size of an error in figures.toml, beside noise of the sensors of a ship."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "error.toml"
-        path.write_text(
-            f"speed_km_h = 24.0\nsensors.sensor_std = [0.05, 0.05, 5.0]\n{lines.replace('SIZE', str(size))}"
-        )
+        path.write_text(f"speed_km_h = 24.0\nsensors.noise = [0.05, 0.05, 5.0]\n{lines.replace('SIZE', str(size))}")
         return load_conditions(path)
 
 

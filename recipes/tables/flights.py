@@ -1,4 +1,4 @@
-"""Flights of tables and figures: frozen tasks in random regions of the Earth, and navigators with their data sheets."""
+"""Flights of tables and figures: frozen tasks in random regions of the Earth, and navigators told of their sensors."""
 
 from __future__ import annotations
 
@@ -104,9 +104,9 @@ def fly(
     known_start: Sequence[float] | None = None,
 ) -> TensorDictBase:
     """Return an episode of each vehicle of an environment without errors, under some errors."""
-    env, sheet = with_errors(base, errors, base.seed, known_start)
+    env, sensor_std = with_errors(base, errors, base.seed, known_start)
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
-    pilot = make_navigator(options.pop("name"), base, **sheet, **options)
+    pilot = make_navigator(options.pop("name"), base, sensor_std=sensor_std, **options)
     return evaluation_rollout(with_declaration(env, confidence, pilot), pilot)
 
 

@@ -4,7 +4,7 @@
     python recipes/tables/grid.py earth --navigators policy:MINE=mine.safetensors  # the same table of other navigators
     python recipes/tables/grid.py earth --tasks 200                          # faster
 
-Without --out, tables are printed. Navigators are given the data sheets of their sensors. Tables of trained agents read
+Without --out, tables are printed. Navigators are given the accuracy of their sensors. Tables of trained agents read
 the run folders that they name; `make tables` trains what is missing.
 """
 

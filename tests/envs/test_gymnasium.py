@@ -162,7 +162,7 @@ def test_one_vehicle_without_a_map_reads_its_sensors_alone() -> None:
     observation, _ = env.reset(seed=0)
     assert set(observation) == set(keys)
     assert env.observation_space.contains(observation)
-    np.testing.assert_allclose(observation["sensor_std"], NOISE.sensor_std)
+    np.testing.assert_allclose(observation["sensor_std"], NOISE.noise)
     assert gymnasium.make(ANYWHERE_ID, scenario=planets, transforms=[]).reset(seed=0)[0].shape == (19,)
 
 

@@ -23,6 +23,7 @@ from magrl.evaluation.navigators import (
 )
 from magrl.navigators import NAVIGATORS
 from magrl.navigators.secant import probe_length
+from magrl.sensor_std import SensorStd
 
 STD, BIAS = (0.3, 0.0, 3.0), (0.4, 0.1, 4.0)
 
@@ -68,10 +69,10 @@ def test_labels_and_needs_of_a_metaheuristic_depend_on_its_mode(env: Geomagnetic
 def test_navigators_are_made_for_their_environment_and_sensors(env: GeomagneticNavEnv) -> None:
     wrapped = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0, max_move_km=30.0), StepCounter())
     for name, kind in NAVIGATORS.items():
-        navigator = make_navigator(name, wrapped, sensor_std=STD, bias_std=BIAS)
+        navigator = make_navigator(name, wrapped, sensor_std=SensorStd(STD, BIAS))
         assert type(navigator) is kind
         assert navigator.max_move_km == 30
-    assert make_navigator("secant", env, sensor_std=STD, bias_std=BIAS).probe_km == probe_length(STD)
+    assert make_navigator("secant", env, sensor_std=SensorStd(STD, BIAS)).probe_km == probe_length(STD)
     first, second = (make_navigator("ga", env, seed=seed).generator.initial_seed() for seed in (3, 4))
     assert (first, second) == (3, 4)
 

@@ -36,7 +36,7 @@ def test_without_the_learned_prior_it_has_that_of_a_dipole() -> None:
 
 
 def test_bad_options_are_refused() -> None:
-    bad = {"bias_std": (0.1, -0.1, 1.0), "max_steps": 0, "zeta": math.nan, "range_km": 0.0, "caution": -1.0}
+    bad = {"sensor_std": (0.1, -0.1, 1.0), "max_steps": 0, "zeta": math.nan, "range_km": 0.0, "caution": -1.0}
     for name, value in (bad | {"step_price": 0.0, "prior": "igrf"}).items():
         with pytest.raises(ValueError, match=name):
             Kalman(**{name: value})

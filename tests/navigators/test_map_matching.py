@@ -58,7 +58,7 @@ def test_the_first_reading_is_inverted_as_by_scipy(box: GeomagneticNavEnv) -> No
     navigator(state)
     here = best(navigator.memory["position"], navigator.memory["misfit"])
     for row in range(5):
-        found = scipy_inversion(box, state["position"][row], state["field"][row].double(), navigator.std)
+        found = scipy_inversion(box, state["position"][row], state["field"][row].double(), navigator.sensor_std[0])
         assert away_km(here[row], found) < 0.02  # the prior of 1000 km pulls by meters
     assert away_km(navigator.memory["target"], state["target_position"]).max() < 0.05
 
@@ -103,7 +103,7 @@ def test_a_step_forgets_corrects_and_adds_to_the_misfit(box: GeomagneticNavEnv) 
     after, region = navigator.memory, torch.zeros(100, dtype=torch.int64)
     length, unit = state["move"][:, :1].double(), torch.eye(2, dtype=F64)
     position = navigator._moved(before["position"], state["heading"].double(), length, region)
-    _, jacobian = navigator._residual(position, state["field"].double(), navigator.std, region)
+    _, jacobian = navigator._residual(position, state["field"].double(), navigator.sensor_std[0], region)
     grown = before["covariance"] + navigator.map_error_km**2 * length[..., None, None] / 30 * unit
     expected = torch.linalg.inv(torch.linalg.inv(grown) + jacobian.mT @ jacobian)
     torch.testing.assert_close(after["covariance"], expected, rtol=1e-5, atol=1e-5)

@@ -63,7 +63,7 @@ def test_a_navigator_that_is_told_of_its_arrival_searches(name: str) -> None:
     biased, rates = Conditions("biased", sensors={"bias": (0.15, 0.05, 20.0)}), []
     for search in (False, True):
         base = GeomagneticNavEnv(num_envs=40, seed=0)
-        navigator = make_navigator(name, base, bias_std=biased.bias_std)
+        navigator = make_navigator(name, base, sensor_std=biased.std)
         assert navigator.search
         navigator.search = search
         rollout = evaluation_rollout(with_conditions(base, biased, seed=0), navigator)
@@ -280,13 +280,13 @@ def test_bad_options_are_refused_with_their_value() -> None:
             Secant(**options)
 
 
-def test_the_larger_bias_of_readings_and_data_sheet_counts() -> None:
+def test_the_larger_bias_of_readings_and_of_what_is_stated_counts() -> None:
     """A navigator that is told nothing flies by what comes with the readings."""
     bias = (0.5, 0.1, 20.0)
     env = GeomagneticNavEnv(num_envs=4, seed=0, start_heading="random")
-    own = Conditions("own", sensors={"sensor_std": (0.02, 0.02, 2.0), "bias": bias})
+    own = Conditions("own", sensors={"noise": (0.02, 0.02, 2.0), "bias": bias})
     flights = []
-    for told in (Secant(sensor_std=own.sensor_std), Secant(sensor_std=own.sensor_std, bias_std=bias)):
+    for told in (Secant(sensor_std=own.std.noise), Secant(sensor_std=own.std)):
         env.set_seed(0)
         flights.append(with_conditions(env, own).rollout(6, told, break_when_any_done=False)["next", "position"])
     assert torch.equal(*flights)

@@ -30,6 +30,7 @@ from magrl.navigators import Geodesic, Secant
 from magrl.navigators.base import displacement_to
 from magrl.onboard import Onboard, VehicleStep, check_earth_jump, check_earth_reading, first_state, write_step
 from magrl.onboard.step import ONNX_INPUTS
+from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms import Conditions, SensorErrors, with_conditions, with_sensor_noise
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
@@ -80,13 +81,13 @@ def region_policy() -> FieldPolicy:
     ],
 )
 def test_commands_are_those_of_the_environment(name: str, noise: Known, stated: float) -> None:
-    """Over a whole episode, with the declaration at its end; also with a wrong data sheet."""
-    env, sheet = environment(noise, arrival="declared"), tuple(stated * std for std in noise)
-    policy = make_navigator(name, getattr(env, "base_env", env), sensor_std=sheet)
+    """Over a whole episode, with the declaration at its end; also where other noise is stated."""
+    env, sensor_std = environment(noise, arrival="declared"), tuple(stated * std for std in noise)
+    policy = make_navigator(name, getattr(env, "base_env", env), sensor_std=sensor_std)
     if stated != 1:
         env = TransformedEnv(env, ObservationNorm(0.0, stated, in_keys=["sensor_std"]), auto_unwrap=True)
     env = with_declaration(env)
-    vehicle = Onboard(name, sensor_std=sheet, max_steps=50, confidence=0.0)
+    vehicle = Onboard(name, sensor_std=sensor_std, max_steps=50, confidence=0.0)
     restart(env)
     state, over, steps = env.reset(), False, 0
     vehicle.start(state["target_field"][0].tolist())
@@ -112,25 +113,23 @@ def test_commands_are_those_of_the_environment(name: str, noise: Known, stated: 
 def test_commands_from_a_known_start_are_those_of_the_environment(name: str, tmp_path: Path) -> None:
     """The constant errors of sensors that the first reading shows; also for a vehicle that is restored."""
     own = Conditions(
-        "own", sensors={"sensor_std": NOISE, "bias": (0.4, 0.1, 30.0), "drift": (0.2, 0.1, 20.0), "drift_length": 50}
+        "own", sensors={"noise": NOISE, "bias": (0.4, 0.1, 30.0), "drift": (0.2, 0.1, 20.0), "drift_length": 50}
     )
     known, options = (0.1, 0.1, 10.0), {"max_steps": 50, "confidence": 0.0}
     base = GeomagneticNavEnv(num_envs=1, seed=3, start_heading="random", arrival="declared")
-    policy = make_navigator(name, base, sensor_std=own.sensor_std, bias_std=own.left_std(known))
+    policy = make_navigator(name, base, sensor_std=own.std_at(known))
     env = with_conditions(base, own, seed=1)
     here = env.reset()["true_field"][0].tolist()
     bare, env = env, with_declaration(with_conditions(base, own, seed=1, known_start=known))
     restart(bare)
     restart(env)
     state = env.reset()
-    vehicle = Onboard(name, sensor_std=own.sensor_std, bias_std=own.bias_std, drift_std=own.drift_std, **options)
+    vehicle = Onboard(name, sensor_std=own.std, **options)
     vehicle.start(state["target_field"][0].tolist(), here, here_std=known)
     for step in range(6):
         if step in (0, 3):
             vehicle.save(tmp_path / "state")
-            vehicle = Onboard(
-                name, sensor_std=own.sensor_std, bias_std=own.bias_std, drift_std=own.drift_std, **options
-            )
+            vehicle = Onboard(name, sensor_std=own.std, **options)
             vehicle.restore(tmp_path / "state")
         reading = (state["field"] + state["start_error"])[0].tolist()
         command = vehicle.step(*reading, *numbers(state)[3:])
@@ -163,7 +162,7 @@ def test_a_first_reading_that_does_not_fit_the_start_is_refused(
 ) -> None:
     """Where a mistake explains it, that is named; the right reading is then taken."""
     here = (8.0, 65.0, intensity_nt)
-    vehicle = Onboard("kalman", sensor_std=NOISE, bias_std=(0.1, 0.1, 10.0))
+    vehicle = Onboard("kalman", sensor_std=SensorStd(NOISE, (0.1, 0.1, 10.0)))
     vehicle.start((5.0, 67.0, intensity_nt), here)
     with pytest.raises(ValueError, match=rf"^the first reading, .* does not fit the start, .*: .*{cause}"):
         vehicle.step(*(*reading, intensity_nt)[:3], heading=0.0)
@@ -189,7 +188,7 @@ def test_a_place_near_the_start_checks_the_first_reading_and_nothing_else(tmp_pa
 
 def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
     """With the accuracy of the model, to which a compass that is off by half a degree is corrected in part."""
-    vehicle = Onboard("secant", bias_std=(0.5, 0.0, 0.0))
+    vehicle = Onboard("secant", sensor_std=SensorStd(bias=(0.5, 0.0, 0.0)))
     vehicle.start(TARGET, (60.4, 5.3), date="2026-06-30")
     elements = elements_at(IGRF("2026-06-30"), torch.tensor([60.4, 5.3], dtype=torch.float64)).tolist()
     vehicle.step(elements[0] + 0.5, *elements[1:], heading=0.0)
@@ -342,7 +341,7 @@ def test_a_state_of_another_vehicle_is_refused(tmp_path: Path) -> None:
         vehicle.save(path)
     vehicle.start(TARGET)
     vehicle.save(path)
-    with pytest.raises(ValueError, match=r"another sensor_std, \(0\.02, 0\.02, 2\.0\)"):
+    with pytest.raises(ValueError, match=r"another sensor_std, SensorStd\(noise=\(0\.02, 0\.02, 2\.0\)"):
         Onboard("secant").restore(path)
     with pytest.raises(ValueError, match="another navigator, 'Secant'"):
         Onboard("kalman", sensor_std=NOISE).restore(path)
@@ -525,10 +524,13 @@ def test_the_magnetic_equator_is_no_log_in_radians() -> None:
         ({"navigator": Geodesic()}, "Geodesic reads position, target_position, which a vehicle does not know"),
         ({"max_move_km": 20.0}, "max_move_km must be at least 50, which the policy commands, got 20.0"),
         ({"max_turn_deg": 45.0}, "max_turn_deg must be at least 90"),
-        ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std.1 must be greater than or equal to 0, got -0.1"),
-        ({"sensor_std": (0.02, 0.02, 0.002)}, r"sensor_std: 0.002 nT of B_H is less .*: it looks like microtesla"),
-        ({"bias_std": (0.1, 0.1, 0.02)}, "bias_std: 0.02 nT .* give 0 for a perfect sensor"),
-        ({"sensor_std": (1e5, 0.1, 1.0)}, "sensor_std.0 must be less than or equal to 10000, got 100000"),
+        ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std.noise must be a finite number from 0 on, got -0.1"),
+        (
+            {"sensor_std": (0.02, 0.02, 0.002)},
+            r"sensor_std.noise: 0.002 nT .*: it looks like microtesla",
+        ),
+        ({"sensor_std": SensorStd(bias=(0.1, 0.1, 0.02))}, "sensor_std.bias: 0.02 nT .* give 0 for a perfect sensor"),
+        ({"sensor_std": (1e5, 0.1, 1.0)}, "sensor_std.noise must be at most 10000, that of an outage, got 100000"),
         ({"max_move_km": True}, "max_move_km must be a valid number, got True"),
         ({"arrival_km": -1.0}, "arrival_km must be"),
         ({"confidence": 1.5}, "confidence must be"),
@@ -554,8 +556,8 @@ def test_the_last_step_stops_and_says_how_near() -> None:
     assert (stops[-1].distance_km, stops[-1].turn_deg) == (0.0, 0.0)
 
 
-def test_readings_that_scatter_more_than_the_data_sheet_says_are_no_track() -> None:
-    """Noise of 0.5 degrees and 50 nT of sensors that are said to be perfect, and of sensors whose sheet says it.
+def test_readings_that_scatter_more_than_is_stated_are_no_track() -> None:
+    """Noise of 0.5 degrees and 50 nT of sensors that are stated as perfect, with this noise, and with a drift.
 
     A quarter of the variance of slow errors counts as new in each reading.
     """
@@ -563,8 +565,8 @@ def test_readings_that_scatter_more_than_the_data_sheet_says_are_no_track() -> N
     noise = torch.randn(30, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.5, 0.5, 50.0])
     stops = []
     slow = (1.0, 1.0, 100.0)
-    for sheet in ({}, {"sensor_std": (0.5, 0.5, 50.0)}, {"bias_std": slow, "drift_std": slow}):
-        vehicle = Onboard("secant", **sheet)
+    for sensor_std in (PERFECT, SensorStd((0.5, 0.5, 50.0)), SensorStd(bias=slow, drift=slow)):
+        vehicle = Onboard("secant", sensor_std=sensor_std)
         vehicle.start(TARGET)
         readings = (torch.tensor(HERE) + noise).tolist()
         stops.append({vehicle.step(*r, 290.0, 1.0 if k else 0.0).stop for k, r in enumerate(readings)})

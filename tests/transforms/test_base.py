@@ -63,7 +63,7 @@ def guided() -> Transform:
 
 def of_a_plane() -> Transform:
     """Transforms of entries with nested keys in a batch of 3."""
-    errors = {"bias": (1.0, 0.0), "drift": (1.0, 1.0), "drift_length": 3.0, "true_key": None}
+    errors = {"bias": (1.0, 0.0), "drift": (1.0, 1.0), "drift_length": 3.0}
     scents = [nested(name) for name in ("scent", "scent_there", "slope")]
     angles = [nested(name) for name in ("angle", "reference", "trusted")]
     return Compose(

@@ -18,8 +18,8 @@ from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import FieldModel
 from magrl.geodesy import move
 from magrl.navigators import Kalman, Secant
+from magrl.sensor_std import STD_KEYS
 from magrl.transforms import DeclareArrival, SensorErrors, TrackGradient
-from magrl.transforms.track import IN_KEYS, STD_KEYS
 
 STD, BIAS = (0.05, 0.05, 5.0), (0.1, 0.1, 10.0)
 
@@ -95,11 +95,10 @@ def test_every_navigator_can_be_flown(navigator) -> None:
 
 
 def test_the_accuracy_decides_and_confidence_prevents_false_arrivals() -> None:
-    keys = (*DeclareArrival.default_in_keys, *STD_KEYS)
     rates = []
     for confidence in (0.0, 0.7):
-        declare = DeclareArrival(25.0, max_steps=30, confidence=confidence, in_keys=keys)
-        steps = Compose(SensorErrors(STD, bias=BIAS, seed=1), TrackGradient((*IN_KEYS, *STD_KEYS)), declare)
+        declare = DeclareArrival(25.0, max_steps=30, confidence=confidence, std_keys=STD_KEYS)
+        steps = Compose(SensorErrors(STD, bias=BIAS, seed=1), TrackGradient(std_keys=STD_KEYS), declare)
         env = TransformedEnv(declared(100, max_steps=30), steps)
         rates.append(summarize(episode_measures(evaluation_rollout(env, Secant(sensor_std=STD)))))
     bold, careful = rates

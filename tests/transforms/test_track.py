@@ -19,6 +19,7 @@ from magrl import tracking
 from magrl.envs import GeomagneticNavEnv, earth_scenario
 from magrl.field import elements_gradient_at
 from magrl.geodesy import geodesic, wrap_angle
+from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import FieldTrack, GradientPrior, curl_relation
 from magrl.transforms import (
     NoiseScale,
@@ -28,7 +29,7 @@ from magrl.transforms import (
     TrackGradient,
     TrueWay,
 )
-from magrl.transforms.track import IN_KEYS, OUT_KEYS, STD_KEYS
+from magrl.transforms.track import IN_KEYS, OUT_KEYS
 
 sys.path.append(str(Path(__file__).parent.parent.parent / "docs" / "examples"))
 plume_env = importlib.import_module("plume_env")
@@ -86,14 +87,17 @@ def test_the_estimates_are_those_of_the_pure_functions() -> None:
 def test_standard_deviations_may_be_keys(row: int) -> None:
     """Each row has its own; a slow error makes readings less certain, and widens the way."""
     rows = torch.tensor(STD, dtype=torch.float64) * torch.tensor([[1.0], [4.0]], dtype=torch.float64)
-    sheet = {"sensor_std": rows, "bias_std": 20 * rows, "drift_std": 10 * rows}
-    first = first_reading(2).update(sheet)
+    std = {"sensor_std": rows, "bias_std": 20 * rows, "drift_std": 10 * rows}
+    first = first_reading(2).update(std)
     after = moved(first, 40.0, 0.3, torch.tensor((0.3, 0.5, 60.0), dtype=torch.float64))
-    after.update(sheet)
-    plain, biased = (stepped(TrackGradient((*IN_KEYS, *STD_KEYS[:count])), first, after)[row] for count in (1, 3))
+    after.update(std)
+    plain, biased = (stepped(TrackGradient(std_keys=STD_KEYS[:count]), first, after)[row] for count in (1, 3))
     alone = stepped(TrackGradient(sensor_std=rows[row].tolist()), first, after)[row]
+    stated = TrackGradient(sensor_std=SensorStd(*((factor * rows[row]).tolist() for factor in (1, 20, 10))))
+    stated = stepped(stated, first, after)[row]
     for key in OUT_KEYS:
         torch.testing.assert_close(plain[key], alone[key], msg=key)
+        torch.testing.assert_close(biased[key], stated[key], msg=key)
     noisier = stepped(TrackGradient(sensor_std=(26**0.5 * rows[row]).tolist()), first, after)[row]  # 1 + 10^2 / 4
     for key in (*STATE, "estimated_gradient"):
         torch.testing.assert_close(biased[key], noisier[key], msg=key)
@@ -202,8 +206,10 @@ def test_other_elements_are_not_wrapped() -> None:
     [
         ({"in_keys": ("move", "target_field", "move", "heading")}, r"reads 'move' as .*3\), got \(3, 2\)"),
         ({"in_keys": IN_KEYS[:3]}, "4 or 5 or 7 in_keys"),
-        ({"in_keys": (*IN_KEYS, "sensor_std"), "sensor_std": STD}, "give sensor_std or its key"),
-        ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std must be a finite number from 0 on, got -0.1"),
+        ({"std_keys": ["sensor_std"], "sensor_std": STD}, "give sensor_std or std_keys"),
+        ({"in_keys": (*IN_KEYS, "sensor_std")}, "more than 4 keys need names"),
+        ({"in_keys": {"reading": "field"}}, "key must be one of 'field', .*'reading'"),
+        ({"sensor_std": (0.1, -0.1, 1.0)}, "sensor_std.noise must be a finite number from 0 on, got -0.1"),
         ({"angles": (3,)}, r"angles must be indices of the 3 elements, got \(3,\)"),
         ({"relation": 1.0}, "relation one or None"),
     ],
@@ -216,12 +222,11 @@ def test_bad_options_are_refused(options: dict, message: str) -> None:
 def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
     """Median error of the estimated direction after one leg of 30 km along the first estimate, on Earth."""
     scenario = earth_scenario(16, seed=5, max_latitude=70)
-    keys = (*IN_KEYS, "sensor_std")
     medians = []
     for std in ((0.0, 0.0, 0.0), (0.05, 0.05, 5.0)):
         for relation in (None, curl_relation):
             base = GeomagneticNavEnv(scenario, num_envs=4000, seed=0, start_heading="random", max_turn_deg=180.0)
-            track = TrackGradient(keys, relation=relation, frame="vehicle")
+            track = TrackGradient(std_keys=["sensor_std"], relation=relation, frame="vehicle")
             env = TransformedEnv(base, Compose(SensorNoise(std, seed=1), track, TrueWay()))
             state = env.reset()
             ahead, right = state["way"].unbind(-1)
@@ -235,7 +240,7 @@ def test_the_relation_of_the_gradients_replaces_a_second_leg() -> None:
 def test_the_scaled_noise_is_that_of_the_pure_function() -> None:
     """Also where slow errors explain the deviation of a reading."""
     first = first_reading().update({key: torch.tensor(STD).double().expand(4, 3) for key in STD_KEYS})
-    track, after = TrackGradient((*IN_KEYS, *STD_KEYS)), moved(first, 40.0, 0.3, torch.tensor((0.5, 0.2, 50.0)))
+    track, after = TrackGradient(std_keys=STD_KEYS), moved(first, 40.0, 0.3, torch.tensor((0.5, 0.2, 50.0)))
     factors = []
     for slow in (0.0, 50.0):
         std = [first[key] * factor for key, factor in zip(STD_KEYS, (1, 1, slow), strict=True)]
@@ -257,7 +262,7 @@ def test_the_scaled_noise_is_that_of_the_pure_function() -> None:
 def searching(frame: str) -> TransformedEnv:
     base = GeomagneticNavEnv(num_envs=64, seed=3, start_heading="random")
     errors = SensorErrors((0.02, 0.02, 2.0), bias=(0.3, 0.0, 0.0), seed=1)
-    track = NoiseScale(), TrackGradient((*IN_KEYS, *STD_KEYS), frame=frame)
+    track = NoiseScale(), TrackGradient(std_keys=STD_KEYS, frame=frame)
     return TransformedEnv(base, Compose(errors, *track, SearchAim(zeta=0.01, frame=frame)))
 
 
@@ -269,12 +274,12 @@ def test_specs() -> None:
 
 
 def test_the_filter_weighs_readings_by_the_noise_that_they_show() -> None:
-    """A data sheet that states a twentieth of the noise, to vehicles that stay where they are."""
+    """A twentieth of the noise is stated to vehicles that stay where they are."""
     base, stay = GeomagneticNavEnv(num_envs=64, seed=3), torch.zeros(64, 2)
     variances = []
     for scaled in ([], [NoiseScale()]):
-        noise, sheet = SensorNoise((0.1, 0.1, 10.0), seed=1), ObservationNorm(0.0, 0.05, in_keys=["sensor_std"])
-        env = TransformedEnv(base, Compose(noise, sheet, *scaled, TrackGradient((*IN_KEYS, *STD_KEYS))))
+        noise, stated = SensorNoise((0.1, 0.1, 10.0), seed=1), ObservationNorm(0.0, 0.05, in_keys=["sensor_std"])
+        env = TransformedEnv(base, Compose(noise, stated, *scaled, TrackGradient(std_keys=STD_KEYS)))
         state = env.reset()
         for _ in range(12):
             state = env.step_mdp(env.step(state.set("action", stay)))

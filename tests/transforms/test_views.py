@@ -15,9 +15,9 @@ from torchrl.envs import Compose, TransformedEnv
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.guidance import OBJECTIVE_FLOORS
+from magrl.sensor_std import STD_KEYS
 from magrl.tracking import dipole_prior
 from magrl.transforms import ObservationView, SensorNoise, TrackGradient, TrackView
-from magrl.transforms.track import IN_KEYS, STD_KEYS
 from magrl.transforms.views import track_observation
 
 VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
@@ -86,7 +86,7 @@ def observed_track(turn: float) -> Tensor:
     north has a meaning, as the meridians converge.
     """
     free = {"prior": dipole_prior, "relation": None}
-    track = TrackGradient((*IN_KEYS, "sensor_std"), **free, range_km=VIEW.range_km, frame="vehicle")
+    track = TrackGradient(std_keys=["sensor_std"], **free, range_km=VIEW.range_km, frame="vehicle")
     observe = Compose(track, *VIEW.observation_transforms()[1:])
     state, seen, observations = None, first_reading(), []
     seen["heading"] += turn

@@ -1,6 +1,6 @@
 """Base of the errors: random numbers of each vehicle and episode, what is true, and what a vehicle knows of accuracy.
 
-The random numbers of an error are a pure function of its seed, of the seed of the environment, and of vehicle, episode
+Random numbers are a pure function of the transform's seed, of the seed of the environment, and of vehicle, episode
 and step. Each episode has a stream of them, whose state is in the TensorDict, so that a step depends on its input alone
 and a transform holds no state.
 """
@@ -20,6 +20,7 @@ from torchrl.data import Composite, TensorSpec
 from magrl.checks import check_number, check_numbers
 from magrl.counters import advanced, counter_stream
 from magrl.geodesy import wrap_longitude
+from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
@@ -30,115 +31,125 @@ or for a reading to which an error is still added, it would give that field or t
 """
 
 EPISODE_STREAM = "episode_stream"
-"""Key of a number of an episode from which errors derive their random numbers: ``(..., 1)`` int64, privileged."""
+"""Key of the environment's number of an episode, from which random numbers derive: ``(..., 1)`` int64, privileged."""
+DISPLACEMENT = "displacement"
+"""Key of what the environment adds to a commanded move, northward and eastward ``(..., 2)`` [km]."""
 
 
 class Episode(NamedTuple):
-    """State of an episode at a reading: its errors, the stream of random numbers, and whether it begins here."""
+    """State of an episode at a reading: its numbers, the stream of random numbers, and whether it begins here."""
 
-    errors: Tensor
+    numbers: Tensor
     stream: Tensor
     first: bool
 
 
-class EpisodeErrors(StatefulTransform):
-    """Base class of errors whose random numbers belong to a vehicle and an episode.
+class EpisodeNumbers(StatefulTransform):
+    """Base class of transforms with random numbers that belong to a vehicle and an episode.
 
-    A subclass draws the errors of new episodes in :meth:`_constants`, and writes what they change in :meth:`_disturb`.
-    On a TensorDict without an environment, an episode begins in each row.
+    A subclass draws the numbers of new episodes in :meth:`_constants`, and writes what they change in :meth:`_disturb`.
+    On a TensorDict without an environment, an episode begins in each row. Without :data:`EPISODE_STREAM`, which the
+    navigation environment writes, the numbers come from torch's default generator.
 
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
-        seed: seed of the errors, beside that of the environment.
-        **keys: of values beside those: ``episode_key``, of :data:`EPISODE_STREAM`, which the navigation environment
-            writes (without it, the numbers come from torch's default generator); ``error_key``, of the errors of an
-            episode ``(..., size)``; and ``stream_key``, of the state of the random numbers ``(..., 1)``, int64. They
-            are privileged: a policy must not read them.
+        seed: seed of the numbers, beside that of the environment.
 
     Raises:
-        TypeError: for the name of a key that the class does not have.
         ValueError: for a seed that is not a whole number.
         KeyError: for a step from a TensorDict without the state.
 
     Example:
-        >>> EpisodeErrors(["field"], ["field"], seed=0.5)
+        >>> EpisodeNumbers(["field"], ["field"], seed=0.5)
         Traceback (most recent call last):
         ValueError: seed must be a whole number, got 0.5
     """
 
     channel: ClassVar[int] = 0
     """Second counter: it separates the numbers of a class from others of the same seed."""
-    true_keys: ClassVar[tuple[str, ...]] = ()
-    """Default keys of true values, which are privileged."""
-    episode_key: NestedKey = EPISODE_STREAM
-    error_key: NestedKey = "error"
-    stream_key: NestedKey = "stream"
+    numbers_key: ClassVar[str]
+    """Key of the numbers of an episode ``(..., size)``."""
+    stream_key: ClassVar[str]
+    """Key of the state of the random numbers ``(..., 1)``, int64. Privileged."""
     size: int
-    """Numbers that hold the errors of an episode."""
-    error_dtype: ClassVar[torch.dtype | None] = None
+    """Numbers of an episode."""
+    numbers_dtype: ClassVar[torch.dtype | None] = None
     """Type of these numbers; by default that of the first value."""
     draws = 0
     """Random numbers that an episode takes before its first reading."""
     step_draws = 0
     """Random numbers of each reading."""
 
-    def __init__(
-        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, seed: int = 0, **keys: NestedKey | None
-    ) -> None:
+    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, seed: int = 0) -> None:
         super().__init__(in_keys, out_keys)
         check_number(whole=True, seed=seed)
         self.seed = int(seed)
-        for name, key in keys.items():
-            if not name.endswith("_key") or not hasattr(type(self), name):
-                raise TypeError(f"{type(self).__name__} has no option {name!r}")
-            setattr(self, name, key)
 
     # Data
 
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys that a step reads from the TensorDict before it."""
-        return [self.error_key, self.stream_key]
+        return [self.numbers_key, self.stream_key]
 
     def _constants(self, stream: Tensor) -> Tensor:
-        """Return the errors of new episodes ``(..., size)``."""
+        """Return the numbers of new episodes ``(..., size)``."""
         raise NotImplementedError
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
-        """Write what the errors change in the values at ``in_keys``; return the errors for the next step."""
+        """Write what the numbers change in the values at ``in_keys``; return those of the next step."""
         raise NotImplementedError
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         stream = self._episode_stream(tensordict, values[0].device)
-        errors = self._constants(stream).to(self.error_dtype or values[0].dtype)
-        self._write(tensordict, values, Episode(errors, advanced(stream, self.draws), first=True))
+        numbers = self._constants(stream).to(self.numbers_dtype or values[0].dtype)
+        self._write(tensordict, values, Episode(numbers, advanced(stream, self.draws), first=True))
 
     def _episode_stream(self, tensordict: TensorDictBase, device: torch.device) -> Tensor:
         """Return the stream of the episode in each row, ``(...)``."""
-        episode = tensordict.get(self.episode_key, None)
+        episode = tensordict.get(EPISODE_STREAM, None)
         if episode is None:
             episode = torch.randint(-(2**63), 2**63 - 1, (*tensordict.batch_size, 1), device=device)
         return counter_stream(self.seed, torch.nn.functional.pad(episode, (0, 1), value=self.channel))
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        errors, stream, *_ = state
-        self._write(tensordict, values, Episode(errors, advanced(stream.squeeze(-1), self.step_draws), first=False))
+        numbers, stream, *_ = state
+        self._write(tensordict, values, Episode(numbers, advanced(stream.squeeze(-1), self.step_draws), first=False))
 
     def _write(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> None:
-        tensordict.set(self.error_key, self._disturb(tensordict, values, episode))
+        tensordict.set(self.numbers_key, self._disturb(tensordict, values, episode))
         tensordict.set(self.stream_key, episode.stream.unsqueeze(-1))
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
+    # Specs
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Check the shapes that are read, and add what is written, the numbers and the state of the random ones."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        leaf = self._leaf(observation_spec, self.in_keys[0])
+        self._add(observation_spec, leaf, self.numbers_key, self.size, dtype=self.numbers_dtype)
+        self._add(observation_spec, leaf, self.stream_key, 1, dtype=torch.int64)
+        return observation_spec
+
+
+class EpisodeErrors(EpisodeNumbers):
+    """Base class of errors of a vehicle: their numbers, and what is true, are privileged.
+
+    Example:
+        >>> EpisodeErrors(["field"], ["field"]).farthest_km(50.0)
+        50.0
+    """
+
+    true_keys: ClassVar[tuple[str, ...]] = ()
+    """Keys of true values."""
+
+    def accuracy(self, field: Tensor) -> SensorStd:
+        """Return the standard deviations that the errors add to a reading, each ``(..., E)``.
 
         Args:
             field: ``(..., E)`` reading.
-
-        Returns:
-            All ``(..., E)``.
         """
-        return torch.zeros_like(field), torch.zeros_like(field), torch.zeros_like(field)
+        return SensorStd(torch.zeros_like(field), torch.zeros_like(field), torch.zeros_like(field))
 
     def farthest_km(self, max_move_km: float) -> float:
         """Return the longest path on the ground of a commanded move [km].
@@ -152,19 +163,9 @@ class EpisodeErrors(StatefulTransform):
         check_number(0, above=True, max_move_km=max_move_km)
         return max_move_km
 
-    # Specs
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Check the shapes that are read, and add what is written, the errors and the state of the random numbers."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        leaf = self._leaf(observation_spec, self.in_keys[0])
-        self._add(observation_spec, leaf, self.error_key, self.size, dtype=self.error_dtype)
-        self._add(observation_spec, leaf, self.stream_key, 1, dtype=torch.int64)
-        return observation_spec
-
 
 def true_keys(kind: type[EpisodeErrors] = EpisodeErrors) -> tuple[str, ...]:
-    """Return the default keys of all errors that a policy may not read: what is true, the errors, and their streams.
+    """Return the keys of all errors that a policy may not read: what is true, the errors, and their streams.
 
     Args:
         kind: base class of the errors; those of a module that is not imported are left out.
@@ -174,57 +175,51 @@ def true_keys(kind: type[EpisodeErrors] = EpisodeErrors) -> tuple[str, ...]:
         >>> true_keys(NorthReferenceError)
         ('true_field', 'true_heading', 'north_error', 'north_stream')
     """
-    own = [*kind.true_keys, str(kind.error_key), str(kind.stream_key)] if kind.channel else []
+    own = [*kind.true_keys, kind.numbers_key, kind.stream_key] if kind.channel else []
     return tuple(dict.fromkeys([*own, *(key for each in kind.__subclasses__() for key in true_keys(each))]))
 
 
 class ReadingErrors(EpisodeErrors):
     """Base class of errors of a reading, which keep its true value and state its accuracy.
 
-    The accuracy follows from :meth:`variances` at :data:`TYPICAL_FIELD`. Variances add up over the errors of a chain,
-    and the first error of a chain keeps the true value. A reading of three elements is D, I, B_H. Where an error
-    carries I beyond the vertical, the reading is that of a magnetometer: I is 180 degrees minus I, and D is reversed.
+    The accuracy is that of :meth:`accuracy` at :data:`TYPICAL_FIELD`. Variances add up over the errors of a chain, and
+    the first error of a chain keeps the true value. A reading of three elements is D, I, B_H. Where an error carries I
+    beyond the vertical, the reading is that of a magnetometer: I is 180 degrees minus I, and D is reversed.
+
+    It writes the true value at ``true_field``, privileged, and its accuracy at :data:`magrl.sensor_std.STD_KEYS`.
 
     Args:
         in_keys: of the transform.
         out_keys: of the transform.
         seed: seed of the errors.
-        **keys: of :class:`EpisodeErrors`; ``true_key``, of the true value, or None to leave it out, privileged; and
-            ``std_key``, ``bias_key`` and ``drift_key``, of the standard deviations of the errors that are new in each
-            reading, of those of constant and slow ones, and of those of slow ones alone, all ``(..., E)``.
 
     Example:
-        >>> ReadingErrors(["field"], ["measured"]).true_key
-        'true_field'
+        >>> ReadingErrors(["field"], ["measured"]).true_keys
+        ('true_field',)
     """
 
     default_out_keys: ClassVar[Keys] = ("field",)
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
     reading: ClassVar[int] = 0
     """Index of the reading among ``in_keys`` and ``out_keys``."""
-    true_key: NestedKey | None = "true_field"
-    std_key: NestedKey = "sensor_std"
-    bias_key: NestedKey = "bias_std"
-    drift_key: NestedKey = "drift_std"
     _accuracy: Tensor
 
     def _set_accuracy(self) -> None:
         """Compute the standard deviations that the vehicle knows, when all sizes are set."""
         count = self.in_sizes[self.reading]
         field = torch.tensor(TYPICAL_FIELD if count == 3 else (0.0,) * (count or 0), dtype=torch.float64)
-        new, constant, slow = self.variances(field)
-        accuracy = torch.stack((new, constant + slow, slow)).sqrt().to(torch.get_default_dtype())
+        accuracy = torch.stack(self.accuracy(field)).to(torch.get_default_dtype())
         self.register_buffer("_accuracy", accuracy, persistent=False)
 
     def _measure(
-        self, tensordict: TensorDictBase, value: Tensor, reading: Tensor, accuracy: Sequence[Tensor] | None = None
+        self, tensordict: TensorDictBase, value: Tensor, reading: Tensor, accuracy: SensorStd | None = None
     ) -> None:
-        """Write a reading, its true value and its accuracy: its three standard deviations, if not always the same."""
-        if self.true_key is not None and tensordict.get(self.true_key, None) is None:
-            tensordict.set(self.true_key, value)
+        """Write a reading, its true value and its accuracy, if that is not always the same."""
+        if tensordict.get(self.true_keys[0], None) is None:
+            tensordict.set(self.true_keys[0], value)
         tensordict.set(self.out_keys[self.reading], _folded(reading) if reading.shape[-1] == 3 else reading)
-        known = self._accuracy.to(reading.dtype).unbind() if accuracy is None else accuracy
-        for key, std in zip((self.std_key, self.bias_key, self.drift_key), known, strict=True):
+        accuracy = SensorStd(*self._accuracy.to(reading.dtype)) if accuracy is None else accuracy
+        for key, std in zip(STD_KEYS, accuracy, strict=True):
             before = tensordict.get(key, None)
             tensordict.set(key, std.expand_as(reading).clone() if before is None else torch.hypot(before, std))
 
@@ -232,9 +227,9 @@ class ReadingErrors(EpisodeErrors):
         """Add the true value, the accuracy, the errors and the state of the numbers; the reading is unbounded."""
         observation_spec = super().transform_observation_spec(observation_spec)
         leaf = observation_spec[self.in_keys[self.reading]]
-        if self.true_key is not None and self.true_key not in observation_spec.keys(True, True):
-            observation_spec[self.true_key] = leaf.clone()
-        for key in (self.out_keys[self.reading], self.std_key, self.bias_key, self.drift_key):
+        if self.true_keys[0] not in observation_spec.keys(True, True):
+            observation_spec[self.true_keys[0]] = leaf.clone()
+        for key in (self.out_keys[self.reading], *STD_KEYS):
             self._add(observation_spec, leaf, key, *leaf.shape[-1:])
         return observation_spec
 

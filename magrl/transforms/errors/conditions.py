@@ -14,6 +14,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from magrl.checks import check_choice, check_numbers, check_type
 from magrl.files import read_document
+from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.errors.known_start import KnownStart, calibration
 from magrl.transforms.errors.motion import MotionError
@@ -41,9 +42,9 @@ class Conditions:
         TypeError: for an option that the part does not have.
 
     Example:
-        >>> ship = Conditions("ship", 24.0, sensors={"sensor_std": (0.02, 0.02, 5.0)}, north={"constant_deg": 0.1})
-        >>> ship.sensor_std, ship.bias_std
-        ((0.02, 0.02, 5.0), (0.1, 0.0, 0.0))
+        >>> ship = Conditions("ship", 24.0, sensors={"noise": (0.02, 0.02, 5.0)}, north={"constant_deg": 0.1})
+        >>> ship.std
+        SensorStd(noise=(0.02, 0.02, 5.0), bias=(0.1, 0.0, 0.0), drift=(0.0, 0.0, 0.0))
     """
 
     name: str
@@ -101,44 +102,29 @@ class Conditions:
         return float(max(0, math.ceil(farthest_km - max_move_km)))
 
     @cached_property
-    def _variances(self) -> list[torch.Tensor]:
-        """Variances of new errors, of constant ones, and of slow ones, as a vehicle knows them."""
+    def std(self) -> SensorStd:
+        """Standard deviations of the errors of the readings, as a vehicle knows them, at :data:`TYPICAL_FIELD`."""
         field = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
-        return [sum(each) for each in zip(*(error.variances(field) for error in self.transforms()), strict=True)]
+        variances = sum(torch.stack(error.accuracy(field)).square() for error in self.transforms())
+        return _rounded(SensorStd(*torch.as_tensor(variances).sqrt()))
 
-    @property
-    def sensor_std(self) -> tuple[float, ...]:
-        """Standard deviations of the errors that are new at each reading, at :data:`TYPICAL_FIELD`."""
-        return _rounded(self._variances[0].sqrt())
-
-    @property
-    def bias_std(self) -> tuple[float, ...]:
-        """Standard deviations of the constant and the slow errors of the readings, at :data:`TYPICAL_FIELD`."""
-        return _rounded((self._variances[1] + self._variances[2]).sqrt())
-
-    @property
-    def drift_std(self) -> tuple[float, ...]:
-        """Standard deviations of the slow errors of the readings, which vary along the way."""
-        return _rounded(self._variances[2].sqrt())
-
-    def left_std(self, known_start: Sequence[float] | None) -> tuple[float, ...]:
-        """Return the standard deviations of the constant and slow errors that a vehicle navigates with.
+    def std_at(self, known_start: Sequence[float] | None) -> SensorStd:
+        """Return the standard deviations with which a vehicle navigates, given what it knows at its start.
 
         Args:
             known_start: standard deviations of D [deg], I [deg], B_H [nT] at the start, where the vehicle knows these
-                and calibrates its sensors; None where it does not, and :attr:`bias_std` is left.
+                and calibrates its sensors; None where it does not: :attr:`std`.
 
         Example:
             >>> ship = Conditions("ship", north={"constant_deg": 0.5, "random_deg": 0.1})
-            >>> ship.left_std(None), [round(std, 3) for std in ship.left_std((0.0, 0.0, 0.0))]
+            >>> ship.std_at(None).bias, [round(std, 3) for std in ship.std_at((0.0, 0.0, 0.0)).bias]
             ((0.5, 0.0, 0.0), [0.098, 0.0, 0.0])
         """
         if known_start is None:
-            return self.bias_std
+            return self.std
         check_numbers(3, 0, known_start=known_start)
-        reading = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
-        std = (reading.new_tensor(each) for each in (self.sensor_std, self.bias_std, self.drift_std, known_start))
-        return _rounded(calibration(reading, reading, *std).bias_std)
+        reading, known_std, *std = torch.tensor((TYPICAL_FIELD, known_start, *self.std), dtype=torch.float64)
+        return _rounded(calibration(reading, reading, SensorStd(*std), known_std)[1])
 
 
 _CALIBRATED = VectorErrors(hard_iron_nt=(5.0,) * 3, soft_iron=((1e-4,) * 3,) * 3, attitude_deg=(0.01, 0.01))
@@ -152,7 +138,7 @@ CONDITIONS: Mapping[str, Conditions] = {
         Conditions(
             "aircraft",
             SPEEDS_KM_H["aircraft"],
-            sensors={"sensor_std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            sensors={"noise": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
             north="fiber-optic",
             motion={"current_km_h": 2.1},
             weather={"record": "quiet"},
@@ -160,7 +146,7 @@ CONDITIONS: Mapping[str, Conditions] = {
         Conditions(
             "ship",
             SPEEDS_KM_H["ship"],
-            sensors={"sensor_std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            sensors={"noise": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
             north="fiber-optic",
             motion={"log_scale": 0.01, "current_km_h": 0.9},
             weather={"record": "quiet", "span_h": 240.0},
@@ -168,7 +154,7 @@ CONDITIONS: Mapping[str, Conditions] = {
         Conditions(
             "underwater",
             SPEEDS_KM_H["underwater"],
-            sensors={"sensor_std": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
+            sensors={"noise": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
             north="fiber-optic",
             motion={"log_scale": 0.002, "current_km_h": 0.36, "eddies_km_h": 0.36, "eddy_km": 100.0},
             weather=_MONTH,
@@ -177,7 +163,7 @@ CONDITIONS: Mapping[str, Conditions] = {
             "low-cost",
             SPEEDS_KM_H["ship"],
             sensors={
-                "sensor_std": (0.2, 0.1, 75.0),
+                "noise": (0.2, 0.1, 75.0),
                 "resolution": (0.0, 0.0, 13.0),
                 "drift": (0.0, 0.0, 10.0),
                 "drift_length": 200.0,
@@ -195,7 +181,7 @@ a document that is named with it was not read, and tells what kind of device it 
 
 Readings:
 
-- ``sensor_std``: chosen, the lowest level of noise of the published tables; it includes the vehicle's motion.
+- ``noise``: chosen, the lowest level of noise of the published tables; it includes the vehicle's motion.
   Low-cost: roll and pitch to 0.4 degrees root mean square (Moog Crossbow NAV440, data sheet rev. B), as a mean of 16
   readings (chosen), at :data:`TYPICAL_FIELD`.
 - Hard iron: 5 nT (chosen, as the offset error of a fluxgate such as Bartington Mag-03, for what calibration leaves);
@@ -218,9 +204,9 @@ Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, 20 
 """
 
 
-def _rounded(std: torch.Tensor) -> tuple[float, ...]:
-    """Return standard deviations as a vehicle knows them."""
-    return tuple(round(each, 6) for each in std.tolist())
+def _rounded(sensor_std: SensorStd) -> SensorStd:
+    """Return standard deviations as plain numbers."""
+    return SensorStd(*(tuple(round(number, 6) for number in std.tolist()) for std in sensor_std))
 
 
 def load_conditions(path: Path | str) -> Conditions:
@@ -237,7 +223,7 @@ def load_conditions(path: Path | str) -> Conditions:
         >>> path = Path(tempfile.mkdtemp()) / "boat.toml"
         >>> _ = path.write_text("north.constant_deg = 0.5" + chr(10) + "sensors.vector.hard_iron_nt = [20, 20, 20]")
         >>> boat = load_conditions(path)
-        >>> boat.name, boat.bias_std[2]
+        >>> boat.name, boat.std.bias[2]
         ('boat', 20.0)
     """
     path = Path(path)
@@ -298,7 +284,7 @@ def with_conditions(
     check_type(EnvBase, env=env)
     if conditions.perfect:
         return env
-    known = [] if known_start is None else [KnownStart(conditions.drift_std, known_start)]
+    known = [] if known_start is None else [KnownStart(conditions.std, known_start)]
     env = TransformedEnv(env, Compose(*conditions.transforms(seed), *known))
     _ = env.action_spec  # an error before the first episode
     return env

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -11,53 +11,38 @@ from torch import Tensor
 
 from magrl.checks import check_numbers, check_tensor
 from magrl.field.elements import element_difference
-from magrl.transforms.base import GivenKeys, StatefulTransform
-
-EXACT = (0.0, 0.0, 0.0)
-
-
-class Calibration(NamedTuple):
-    """Constant error ``(..., 3)`` of D [deg], I [deg], B_H [nT], to be subtracted from readings, and the standard
-    deviation ``(..., 3)`` of the constant and slow errors that are left.
-
-    Example:
-        >>> Calibration(torch.zeros(3), torch.ones(3)).bias_std
-        tensor([1., 1., 1.])
-    """
-
-    error: Tensor
-    bias_std: Tensor
+from magrl.sensor_std import PERFECT, SensorStd
+from magrl.transforms.base import StatefulTransform
 
 
-def calibration(
-    reading: Tensor, known: Tensor, sensor_std: Tensor, bias_std: Tensor, drift_std: Tensor, known_std: Tensor
-) -> Calibration:
-    """Return the constant errors of the sensors, given a reading where the elements are known.
+def calibration(reading: Tensor, known: Tensor, sensor_std: SensorStd, known_std: Tensor) -> tuple[Tensor, SensorStd]:
+    """Return the constant errors of the sensors, given a reading where the elements are known, and what is left.
 
-    With ``c^2 = bias_std^2 - drift_std^2`` and ``m^2 = sensor_std^2 + drift_std^2 + known_std^2``, the difference of
-    reading and known elements has the variance ``c^2 + m^2``. The error is ``c^2 / (c^2 + m^2)`` times the difference,
-    and ``c^2 m^2 / (c^2 + m^2) + drift_std^2`` is the variance that is left.
+    With ``c^2 = bias^2 - drift^2`` and ``m^2 = noise^2 + drift^2 + known_std^2``, the difference of reading and known
+    elements has the variance ``c^2 + m^2``. The error is ``c^2 / (c^2 + m^2)`` times the difference, and ``c^2 m^2 /
+    (c^2 + m^2) + drift^2`` is the variance that is left.
 
     Args:
         reading: ``(..., 3)`` D [deg], I [deg], B_H [nT], the first reading.
         known: ``(..., 3)`` the elements there, such as those of a field model.
-        sensor_std: ``(..., 3)`` standard deviations of the errors that are new in each reading.
-        bias_std: ``(..., 3)`` those of constant and slow errors.
-        drift_std: ``(..., 3)`` those of the slow errors alone, which vary along the way; at most ``bias_std``.
-        known_std: ``(..., 3)`` those of the known elements: of the model, and of the crust at the start.
+        sensor_std: accuracy of the sensors, each ``(..., 3)``.
+        known_std: ``(..., 3)`` standard deviations of the known elements: of the model, and of the crust at the start.
+
+    Returns:
+        Constant error ``(..., 3)``, to be subtracted from readings, and the accuracy after that.
 
     Example:
         >>> here, none = torch.tensor([8.0, -16.0, 35000.0]), torch.zeros(3)
         >>> bias, drift = torch.tensor([0.5, 0.0, 0.0]), torch.tensor([0.3, 0.0, 0.0])
-        >>> error, left = calibration(here + bias, here, none, bias, drift, none)
-        >>> error[0], left[0]
+        >>> error, left = calibration(here + bias, here, SensorStd(none, bias, drift), none)
+        >>> error[0], left.bias[0]
         (tensor(0.3200), tensor(0.3842))
     """
     check_tensor(3, reading=reading, known=known)
-    slow = drift_std.square()
-    constant, other = (bias_std.square() - slow).clamp_min(0), sensor_std.square() + slow + known_std.square()
+    noise, bias, slow = (std.square() for std in sensor_std)
+    constant, other = (bias - slow).clamp_min(0), noise + slow + known_std.square()
     gain = torch.where(constant > 0, constant / (constant + other), 0.0)
-    return Calibration(gain * element_difference(reading, known), (gain * other + slow).sqrt())
+    return gain * element_difference(reading, known), sensor_std._replace(bias=(gain * other + slow).sqrt())
 
 
 class KnownStart(StatefulTransform):
@@ -68,12 +53,11 @@ class KnownStart(StatefulTransform):
     only there.
 
     Args:
-        drift_std: standard deviations of slow errors, which vary along the way: of D [deg], I [deg], B_H [nT].
-        known_std: standard deviations of the elements that are known at the start.
-        in_keys: reading, elements without errors, and standard deviations of new errors, and of constant and slow ones,
+        sensor_std: accuracy of the sensors, of which the drift counts; noise and bias are those of the reading.
+        known_std: standard deviations of the elements that are known at the start: D [deg], I [deg], B_H [nT].
+        in_keys: reading, elements without errors, and standard deviations of noise and bias, all ``(..., 3)``.
+        out_keys: the reading without the error, the standard deviations of the bias that is left, and the error itself,
             all ``(..., 3)``.
-        out_keys: the reading without the error, the standard deviations of the constant and slow errors that are left,
-            and the error itself, all ``(..., 3)``.
 
     Raises:
         ValueError: for a standard deviation that is negative, or another number of keys.
@@ -97,18 +81,19 @@ class KnownStart(StatefulTransform):
 
     def __init__(
         self,
-        drift_std: Sequence[float] = EXACT,
-        known_std: Sequence[float] = EXACT,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
+        sensor_std: SensorStd | Sequence[float] = PERFECT,
+        known_std: Sequence[float] = PERFECT.noise,
+        **keys: Any,
     ) -> None:
-        super().__init__(in_keys, out_keys)
-        check_numbers(3, 0, drift_std=drift_std, known_std=known_std)
-        self.register_buffer("_std", torch.tensor([list(drift_std), list(known_std)]), persistent=False)
+        super().__init__(**keys)
+        check_numbers(3, 0, known_std=known_std)
+        self.register_buffer("_std", torch.tensor([SensorStd.of(sensor_std).drift, known_std]), persistent=False)
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
-        found = calibration(*values, *self._std.to(values[0].dtype))
-        self._write(tensordict, values[0], found.bias_std, found.error)
+        reading, known, noise, bias = values
+        drift, known_std = self._std.to(reading.dtype)
+        error, left = calibration(reading, known, SensorStd(noise, bias, drift), known_std)
+        self._write(tensordict, reading, left.bias, error)
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         self._write(tensordict, values[0], *state)

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
@@ -15,10 +14,8 @@ from magrl.checks import check_number
 from magrl.counters import NORMAL_LIMIT, counter_stream, normal_of, stream_normal, stream_uniform
 from magrl.geodesy import MEAN_RADIUS_KM, displaced, local_frame, polar, wrap_angle
 from magrl.transforms.base import observed_spec
-from magrl.transforms.errors.base import Episode, EpisodeErrors
+from magrl.transforms.errors.base import DISPLACEMENT, Episode, EpisodeErrors
 
-DISPLACEMENT = "displacement"
-"""Key of what an error of motion adds to a commanded move, northward and eastward [km] ``(..., 2)``."""
 EDDIES = 8
 """Number of waves of which a field of eddies is the sum."""
 
@@ -50,8 +47,7 @@ class MotionError(EpisodeErrors):
         in_keys: last move ``(..., 2)``, distance [km] and turn [rad]; heading ``(..., 1)`` [rad]; and position
             ``(..., 2)`` [deg].
         out_keys: true move ``(..., 2)`` and its direction ``(..., 1)`` [rad]. Privileged.
-        action_key: distance [km] and turn [rad] ``(..., 2)``; what follows is passed on.
-        **options: of :class:`~magrl.transforms.errors.base.EpisodeErrors`: other keys, and the seed. The errors of the
+        **options: ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeErrors`. The errors of the
             episode are scale, compass [deg], direction of the current and phases of the eddies [rad].
 
     Raises:
@@ -71,8 +67,7 @@ class MotionError(EpisodeErrors):
     channel = 4
     default_in_keys = ("move", "heading", "position")
     default_out_keys = true_keys = ("true_move", "true_course")
-    error_key, stream_key = "motion_error", "motion_stream"
-    action_key: NestedKey = "action"
+    numbers_key, stream_key = "motion_error", "motion_stream"
     in_sizes = (2, 1, 2)
     size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2
 
@@ -91,7 +86,7 @@ class MotionError(EpisodeErrors):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        self.in_keys_inv = self.out_keys_inv = [self.action_key, self.in_keys[1]]
+        self.in_keys_inv = self.out_keys_inv = ["action", self.in_keys[1]]
         check_number(-math.inf if fixed else 0, log_scale=log_scale, compass_deg=compass_deg)
         check_number(0, log_noise=log_noise, heading_noise_deg=heading_noise_deg)
         check_number(0, current_km_h=current_km_h, eddies_km_h=eddies_km_h)
@@ -165,7 +160,7 @@ class MotionError(EpisodeErrors):
             move = torch.stack((distance, move[..., 1].double()), -1).to(move.dtype)
             heading = torch.where(distance > 0, course, heading[..., 0]).unsqueeze(-1).to(heading.dtype)
         tensordict.set(self.out_keys[0], move).set(self.out_keys[1], heading)
-        return episode.errors
+        return episode.numbers
 
     # Specs
 
@@ -186,7 +181,7 @@ class MotionError(EpisodeErrors):
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
-        commanded = float(input_spec["full_action_spec"][self.action_key].space.high[..., 0].max())
+        commanded = float(input_spec["full_action_spec"][self.in_keys_inv[0]].space.high[..., 0].max())
         known = observed_spec(self).get(DISPLACEMENT, None)
         allowed = 0.0 if known is None else float(known.space.high.max()) - 2 * commanded
         drift = self.farthest_km(commanded) - commanded

@@ -13,25 +13,26 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.counters import normal_of, stream_uniform
+from magrl.sensor_std import SensorStd
 from magrl.transforms.base import Keys
 from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, gauss_markov
 
-LASTING_KM = 200.0
-"""Correlation length of lasting errors that are not constant [km]; chosen."""
+DRIFT_KM = 200.0
+"""Correlation length of the drift of random noise [km]; chosen."""
 
 
 class SensorNoise(ReadingErrors):
     """Add white noise to a reading, independent for each element, at reset and at each step.
 
-    The reading is ``value + sensor_std * z`` with a standard normal ``z``. Beside it, the transform writes the true
+    The reading is ``value + noise * z`` with a standard normal ``z``. Beside it, the transform writes the true
     value, the standard deviations, which a policy may read, and the state of the random numbers.
     In ``Compose``, a transform that reads the true value stands before this one, such as ``GradientHeading``.
 
     Args:
-        sensor_std: standard deviation of each element in its unit, E numbers. If all are 0, the reading is the value.
+        noise: standard deviation of each element in its unit, E numbers. If all are 0, the reading is the value.
         in_keys: one value ``(..., E)``.
         out_keys: its reading ``(..., E)``, in place by default.
-        **options: of :class:`~magrl.transforms.errors.base.ReadingErrors`: other keys, and the seed.
+        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`.
 
     Raises:
         ValueError: for standard deviations that are negative or not finite, a seed that is not a whole number, more
@@ -49,51 +50,50 @@ class SensorNoise(ReadingErrors):
 
     channel = 1
     default_in_keys: ClassVar[Keys] = ("field",)
-    error_key, stream_key = "sensor_error", "sensor_stream"
+    numbers_key, stream_key = "sensor_error", "sensor_stream"
 
-    def __init__(self, sensor_std: Sequence[float], **options: Any) -> None:
+    def __init__(self, noise: Sequence[float], **options: Any) -> None:
         super().__init__(**options)
-        check_sizes(sensor_std=sensor_std)
-        self.sensor_std = tuple(float(std) for std in sensor_std)
-        self.size = self.step_draws = len(self.sensor_std)
+        check_sizes(noise=noise)
+        self.noise = tuple(float(std) for std in noise)
+        self.size = self.step_draws = len(self.noise)
         self.in_sizes = (self.size,)
         self._set_accuracy()
 
     def _constants(self, stream: Tensor) -> Tensor:
         """Return the standard deviations of an episode ``(..., E)``."""
-        return torch.tensor(self.sensor_std, device=stream.device).expand(*stream.shape, -1)
+        return torch.tensor(self.noise, device=stream.device).expand(*stream.shape, -1)
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         uniform = stream_uniform(episode.stream, self.step_draws)
         normal = math.sqrt(2) * torch.erfinv(2 * uniform - 1 + 2.0**-53)  # the shift keeps it finite and centered
-        none = torch.zeros_like(episode.errors)
-        reading = values[0] + episode.errors * normal.to(values[0].dtype)
-        self._measure(tensordict, values[0], reading, (episode.errors, none, none))
-        return episode.errors
+        none = torch.zeros_like(episode.numbers)
+        reading = values[0] + episode.numbers * normal.to(values[0].dtype)
+        self._measure(tensordict, values[0], reading, SensorStd(episode.numbers, none, none))
+        return episode.numbers
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
+    def accuracy(self, field: Tensor) -> SensorStd:
+        """Return the standard deviations that the errors add to a reading, each ``(..., E)``.
 
         Example:
-            >>> SensorNoise((1.0, 2.0)).variances(torch.zeros(2))
-            (tensor([1., 4.]), tensor([0., 0.]), tensor([0., 0.]))
+            >>> SensorNoise((1.0, 2.0)).accuracy(torch.zeros(2)).noise
+            tensor([1., 2.])
         """
         check_tensor(self.in_sizes[0] or 0, field=field)
-        none = torch.zeros_like(field)
-        return field.new_tensor(self.sensor_std).square().expand_as(field), none, none
+        return super().accuracy(field)._replace(noise=field.new_tensor(self.noise).expand_as(field))
 
 
 class RandomSensorNoise(SensorNoise):
-    """Noise and lasting errors whose standard deviations are drawn for each vehicle and episode (domain randomization).
+    """Noise and bias whose standard deviations are drawn for each vehicle and episode (domain randomization).
 
-    A lasting error is the sum of a constant one and of a first-order Gauss-Markov process along the way
-    (:data:`LASTING_KM`), with shares of its variance that are drawn, too.
+    The bias is the sum of a constant error and of a drift, a first-order Gauss-Markov process along the way
+    (:data:`DRIFT_KM`), with shares of its variance that are drawn, too.
 
     Args:
         levels: function of uniform numbers ``(..., draws)`` in [0, 1) that returns standard deviations ``(..., 2 E)``:
-            those of the errors that are new in each reading, then those of lasting ones.
+            those of the noise, then those of the bias.
         draws: how many uniform numbers it takes.
-        **options: of :class:`SensorNoise`, except ``sensor_std``; ``in_keys`` are a reading and the last move.
+        **options: of :class:`SensorNoise`, except ``noise``; ``in_keys`` are a reading and the last move.
 
     Raises:
         TypeError: for ``levels`` that cannot be called.
@@ -124,21 +124,21 @@ class RandomSensorNoise(SensorNoise):
     def _constants(self, stream: Tensor) -> Tensor:
         uniform = stream_uniform(stream, self.draws)
         level, share, normal = uniform.split((self.level_draws, 1, self.step_draws), -1)
-        sensor_std, lasting = self.levels(level).split(self.count, -1)
-        constant_std, drift_std = lasting * share.sqrt(), lasting * (1 - share).sqrt()
+        noise_std, bias_std = self.levels(level).split(self.count, -1)
+        constant_std, drift_std = bias_std * share.sqrt(), bias_std * (1 - share).sqrt()
         first, second = normal_of(normal).split(self.count, -1)
-        return torch.cat((sensor_std, lasting, constant_std * first, drift_std, drift_std * second), -1)
+        return torch.cat((noise_std, bias_std, constant_std * first, drift_std, drift_std * second), -1)
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         value, move = values
         normal = normal_of(stream_uniform(episode.stream, self.step_draws)).to(value.dtype)
         noise, walk = normal.split(self.count, -1)
-        sensor_std, lasting, constant, drift_std, drift = episode.errors.split(self.count, -1)
+        noise_std, bias_std, constant, drift_std, drift = episode.numbers.split(self.count, -1)
         if not episode.first:
-            drift = gauss_markov(drift, drift_std, move[..., :1], LASTING_KM, walk)
-        reading = value + sensor_std * noise + constant + drift
-        self._measure(tensordict, value, reading, (sensor_std, lasting, drift_std))
-        return torch.cat((sensor_std, lasting, constant, drift_std, drift), -1)
+            drift = gauss_markov(drift, drift_std, move[..., :1], DRIFT_KM, walk)
+        reading = value + noise_std * noise + constant + drift
+        self._measure(tensordict, value, reading, SensorStd(noise_std, bias_std, drift_std))
+        return torch.cat((noise_std, bias_std, constant, drift_std, drift), -1)
 
 
 def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
@@ -148,7 +148,7 @@ def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
     half of them above 0.04 deg. Each element has a factor of its own, log-uniform from 0.4 to 2.5,
     and in 30 % of cases that of D is multiplied by a number from 1 to 7, as where the north reference is poor.
 
-    In half of the cases there are lasting errors as well, log-uniform over 1.6 decades up to 0.35 deg, 0.05 deg and
+    In half of the cases there is a bias as well, log-uniform over 1.6 decades up to 0.35 deg, 0.05 deg and
     45 nT, with the same factors of their own.
 
     Args:
@@ -157,7 +157,7 @@ def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
             the cases above 0.02 deg; the larger, the more noise.
 
     Returns:
-        ``(..., 6)``: those of new errors of a reading, and those of lasting ones.
+        ``(..., 6)``: those of the noise, and those of the bias.
 
     Raises:
         ValueError: for another number of uniform numbers, or an exponent that is not above 0.
@@ -168,12 +168,12 @@ def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
     """
     check_tensor(12, uniform=uniform)
     check_number(0, above=True, exponent=exponent)
-    none, common, poor, factor, exact, lasting = (uniform[..., k : k + 1] for k in (0, 1, 5, 6, 7, 8))
-    new = 10 ** (-2 * common**exponent) * _each(uniform[..., 2:5]) * uniform.new_tensor((0.2, 0.2, 20.0))
+    none, common, poor, factor, exact, biased = (uniform[..., k : k + 1] for k in (0, 1, 5, 6, 7, 8))
+    noise = 10 ** (-2 * common**exponent) * _each(uniform[..., 2:5]) * uniform.new_tensor((0.2, 0.2, 20.0))
     declination = torch.where(poor < 0.3, 1 + 6 * factor, 1.0)
-    new = new * torch.cat((declination, torch.ones_like(uniform[..., :2])), -1)
-    slow = 10 ** (-1.6 * lasting) * _each(uniform[..., 9:12]) * uniform.new_tensor((0.35, 0.05, 45.0))
-    return torch.cat((torch.where(none < 0.15, 0.0, new), torch.where(exact < 0.5, 0.0, slow)), -1)
+    noise = noise * torch.cat((declination, torch.ones_like(uniform[..., :2])), -1)
+    bias = 10 ** (-1.6 * biased) * _each(uniform[..., 9:12]) * uniform.new_tensor((0.35, 0.05, 45.0))
+    return torch.cat((torch.where(none < 0.15, 0.0, noise), torch.where(exact < 0.5, 0.0, bias)), -1)
 
 
 def _each(uniform: Tensor) -> Tensor:
@@ -181,12 +181,12 @@ def _each(uniform: Tensor) -> Tensor:
     return 10 ** (0.8 * uniform - 0.4)
 
 
-def with_sensor_noise(env: EnvBase, sensor_std: Sequence[float], seed: int = 0) -> EnvBase:
+def with_sensor_noise(env: EnvBase, noise: Sequence[float], seed: int = 0) -> EnvBase:
     """Return an environment whose readings have white noise, or the environment itself if there is none.
 
     Args:
         env: environment with the key ``field``.
-        sensor_std: standard deviation of each element, as :class:`SensorNoise` takes it.
+        noise: standard deviation of each element, as :class:`SensorNoise` takes it.
         seed: seed of the noise.
 
     Raises:
@@ -199,6 +199,6 @@ def with_sensor_noise(env: EnvBase, sensor_std: Sequence[float], seed: int = 0) 
         >>> with_sensor_noise(env, (0.0, 0.0, 0.0)) is env
         True
     """
-    noise = SensorNoise(sensor_std, seed=seed)
+    transform = SensorNoise(noise, seed=seed)
     check_type(EnvBase, env=env)
-    return TransformedEnv(env, noise) if any(noise.sensor_std) else env
+    return TransformedEnv(env, transform) if any(noise) else env

@@ -16,6 +16,7 @@ from torchrl.data import Composite
 from magrl.checks import check_choice, check_number
 from magrl.counters import stream_normal
 from magrl.geodesy import wrap_angle, wrap_longitude
+from magrl.sensor_std import SensorStd
 from magrl.transforms.base import Keys
 from magrl.transforms.errors.base import Episode, ReadingErrors, gauss_markov
 
@@ -66,8 +67,7 @@ class NorthReferenceError(ReadingErrors):
         in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, the last move, whose first number
             is the distance [km], and optionally the position ``(..., 2)``, latitude and longitude [deg]: b then grows
             with the secant of the latitude, as that of every gyrocompass does.
-        true_heading_key: key of the true heading ``(..., 1)``. Privileged.
-        **options: of :class:`~magrl.transforms.errors.base.ReadingErrors`: other keys, and the seed. The errors of the
+        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
             episode are constant part, drift and b itself [deg].
 
     Raises:
@@ -88,8 +88,7 @@ class NorthReferenceError(ReadingErrors):
     default_in_keys = ("heading", "field", "move")
     default_out_keys = ("heading", "field")
     in_counts = (3, 4)
-    error_key, stream_key = "north_error", "north_stream"
-    true_heading_key: NestedKey = "true_heading"
+    numbers_key, stream_key = "north_error", "north_stream"
     reading = 1
     in_sizes = (1, 3, None, 2)
     size, draws, step_draws = 3, 1, 2
@@ -106,7 +105,7 @@ class NorthReferenceError(ReadingErrors):
         **options: Any,
     ) -> None:
         super().__init__(in_keys, in_keys[:2], **options)
-        self.in_keys_inv, self.out_keys_inv = self.in_keys[:1], [self.true_heading_key]
+        self.in_keys_inv, self.out_keys_inv = self.in_keys[:1], [self.true_keys[1]]
         check_number(-math.inf if fixed else 0, constant_deg=constant_deg)
         check_number(0, drift_deg=drift_deg, random_deg=random_deg)
         if drift_deg:
@@ -120,7 +119,7 @@ class NorthReferenceError(ReadingErrors):
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys that a step reads from the TensorDict before it."""
-        return [*super().state_keys, self.true_heading_key]
+        return [*super().state_keys, self.true_keys[1]]
 
     def _constants(self, stream: Tensor) -> Tensor:
         normal = stream_normal(stream, 1).to(torch.get_default_dtype())
@@ -135,26 +134,24 @@ class NorthReferenceError(ReadingErrors):
         error = constant + drift + self.sizes[2] * white
         if position:
             error = error / torch.cos(torch.deg2rad(position[0][..., :1])).to(error.dtype)
-        tensordict.set(self.true_heading_key, heading)
+        tensordict.set(self.true_keys[1], heading)
         tensordict.set(self.out_keys[0], wrap_angle(heading - torch.deg2rad(error)))
         declination = wrap_longitude(field[..., :1] - error)
         growth = _secant(field[..., 1:2]) if position else torch.ones_like(declination)
         accuracy = growth * self._accuracy.to(field.dtype).reshape(3, *[1] * (field.ndim - 1), -1)
-        self._measure(tensordict, field, torch.cat((declination, field[..., 1:]), -1), accuracy.unbind())
+        self._measure(tensordict, field, torch.cat((declination, field[..., 1:]), -1), SensorStd(*accuracy))
         return torch.cat((constant, drift, error), -1)
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
+    def accuracy(self, field: Tensor) -> SensorStd:
+        """Return the standard deviations that the errors add to a reading, each ``(..., 3)``.
 
         Example:
-            >>> NorthReferenceError(2.0, random_deg=1.0).variances(torch.zeros(3))
-            (tensor([1., 0., 0.]), tensor([4., 0., 0.]), tensor([0., 0., 0.]))
+            >>> NorthReferenceError(2.0, random_deg=1.0).accuracy(torch.zeros(3)).bias
+            tensor([2., 0., 0.])
         """
-        constant, drift, random = (size**2 for size in self.sizes)
-        variances = super().variances(field)
-        for variance, size in zip(variances, (random, constant, drift), strict=True):
-            variance[..., 0] = size
-        return variances
+        constant, drift, random = self.sizes
+        of_declination = field.new_tensor((1.0, 0.0, 0.0)).expand_as(field)
+        return SensorStd(*(size * of_declination for size in (random, math.hypot(constant, drift), drift)))
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Give the true heading to the environment."""
@@ -164,7 +161,7 @@ class NorthReferenceError(ReadingErrors):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what is true, the error and the state of the numbers; the elements are unbounded."""
         observation_spec = super().transform_observation_spec(observation_spec)
-        observation_spec[self.true_heading_key] = observation_spec[self.in_keys[0]].clone()
+        observation_spec[self.true_keys[1]] = observation_spec[self.in_keys[0]].clone()
         return observation_spec
 
 

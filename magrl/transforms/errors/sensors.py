@@ -12,6 +12,7 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_tensor, check_type
 from magrl.counters import normal_of, stream_normal, stream_uniform
+from magrl.sensor_std import SensorStd
 from magrl.transforms.base import expect_keys
 from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, gauss_markov
 from magrl.transforms.errors.vector import VectorErrors
@@ -33,7 +34,7 @@ class SensorErrors(ReadingErrors):
     :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
     Args:
-        sensor_std: white noise.
+        noise: white noise.
         bias: constant error.
         scale: error of the scale, as a share of the value, where the elements are D, I, B_H.
         drift: slow drift.
@@ -46,11 +47,11 @@ class SensorErrors(ReadingErrors):
             without which the drift is by steps; and optionally the heading ``(..., 1)`` [rad], in whose axes ``vector``
             acts.
         out_keys: the reading ``(..., E)``, in place by default.
-        **options: of :class:`~magrl.transforms.errors.base.ReadingErrors`: other keys, and the seed. The errors of the
+        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
             episode are bias, scale error, drift, last reading, and those of ``vector``.
 
     Raises:
-        ValueError: for sizes that are negative or of another number than ``sensor_std``, a rate outside [0, 1), a drift
+        ValueError: for sizes that are negative or of another number than ``noise``, a rate outside [0, 1), a drift
             without its length, ``scale`` or ``vector`` with other than three elements, or ``vector`` without a heading.
 
     Example:
@@ -65,12 +66,12 @@ class SensorErrors(ReadingErrors):
     channel = 2
     default_in_keys = ("field", "move", "heading")
     in_counts = (1, 2, 3)
-    error_key, stream_key = "sensor_error", "sensor_stream"
+    numbers_key, stream_key = "sensor_error", "sensor_stream"
     _sizes: Tensor
 
     def __init__(
         self,
-        sensor_std: Sequence[float] = (0.0, 0.0, 0.0),
+        noise: Sequence[float] = (0.0, 0.0, 0.0),
         *,
         bias: Sequence[float] | None = None,
         scale: Sequence[float] | None = None,
@@ -83,9 +84,9 @@ class SensorErrors(ReadingErrors):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        check_sizes(sensor_std=sensor_std)
-        self.count = len(sensor_std)
-        sizes = [list(sensor_std)]
+        check_sizes(noise=noise)
+        self.count = len(noise)
+        sizes = [list(noise)]
         for name, values in {"bias": bias, "scale": scale, "drift": drift, "resolution": resolution}.items():
             values = (0.0,) * self.count if values is None else values
             check_sizes(self.count, fixed=fixed and name in ("bias", "scale"), **{name: values})
@@ -100,7 +101,7 @@ class SensorErrors(ReadingErrors):
             check_type(VectorErrors, vector=vector)
             expect_keys(self, 3, 1)
         if self.count != 3 and (vector is not None or any(scale or ())):
-            raise ValueError(f"scale and vector act on D, I and B_H, got {self.count} elements in sensor_std")
+            raise ValueError(f"scale and vector act on D, I and B_H, got {self.count} elements in noise")
         self.drift_length, self.outage_rate, self.vector = float(drift_length or 1), float(outage_rate), vector
         self.fixed, self.in_sizes = fixed, (self.count, None, 1)
         self.size = 4 * self.count + (vector.size if vector else 0)
@@ -118,31 +119,33 @@ class SensorErrors(ReadingErrors):
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         (value, *others), count, dtype = values, self.count, values[0].dtype
         errors, stream, first = episode
-        sensor_std, _, _, drift_std, resolution = self._sizes.to(dtype)
+        noise_std, _, _, drift_std, resolution = self._sizes.to(dtype)
         uniform = stream_uniform(stream, self.step_draws)
         noise, walk = normal_of(uniform[..., :-1]).to(dtype).split(count, -1)
         bias, scale, drift, last, vector = errors.tensor_split([count, 2 * count, 3 * count, 4 * count], -1)
         distance = math.inf if first else others[0][..., :1] if others else 1.0
         drift = gauss_markov(drift, drift_std, distance, self.drift_length, walk)
         reading = self.vector.disturb(value, others[1], vector) if self.vector else value
-        reading = reading + (reading * scale + bias + drift + noise * sensor_std)
+        reading = reading + (reading * scale + bias + drift + noise * noise_std)
         reading = torch.where(resolution > 0, torch.round(reading / resolution) * resolution, reading)
         missing = (uniform[..., -1:] < self.outage_rate) & (not first)
         reading = torch.where(missing, last, reading)
-        sensor_std, *lasting = self._accuracy.to(dtype)
-        self._measure(tensordict, value, reading, (torch.where(missing, OUTAGE_STD, sensor_std), *lasting))
+        accuracy = SensorStd(*self._accuracy.to(dtype))
+        accuracy = accuracy._replace(noise=torch.where(missing, OUTAGE_STD, accuracy.noise))
+        self._measure(tensordict, value, reading, accuracy)
         return torch.cat((bias, scale, drift, reading, vector), -1)
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
+    def accuracy(self, field: Tensor) -> SensorStd:
+        """Return the standard deviations that the errors add to a reading, each ``(..., E)``.
 
         Example:
-            >>> SensorErrors((1.0, 1.0), bias=(2.0, 0.0)).variances(torch.zeros(2))
-            (tensor([1., 1.]), tensor([4., 0.]), tensor([0., 0.]))
+            >>> SensorErrors((1.0, 1.0), bias=(2.0, 0.0)).accuracy(torch.zeros(2))
+            SensorStd(noise=tensor([1., 1.]), bias=tensor([2., 0.]), drift=tensor([0., 0.]))
         """
         check_tensor(self.count, field=field)
         noise, bias, scale, drift, resolution = self._sizes.to(field.dtype).square()
         slow = drift.expand_as(field)  # an error of the vector varies with the heading
         if self.vector is not None:
             slow = slow + self.vector.variance(field)
-        return (noise + resolution / 12).expand_as(field), bias + scale * field.square(), slow
+        noise, bias = (noise + resolution / 12).expand_as(field), bias + scale * field.square() + slow
+        return SensorStd(noise.sqrt(), bias.sqrt(), slow.sqrt())

@@ -15,6 +15,7 @@ from magrl.checks import check_number, check_type
 from magrl.counters import stream_uniform
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
 from magrl.field.records import WeatherRecord, weather_record
+from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import Episode, ReadingErrors
 
 SPEEDS_KM_H = {"aircraft": 341.0, "ship": 24.0, "underwater": 6.1}
@@ -52,7 +53,7 @@ class MagneticWeather(ReadingErrors):
         in_keys: D [deg], I [deg], B_H [nT] ``(..., 3)``, and the last move ``(..., K)``, whose first number is the
             distance [km].
         out_keys: the measured elements ``(..., 3)``, in place by default.
-        **options: of :class:`~magrl.transforms.errors.base.ReadingErrors`: other keys, and the seed. The errors of the
+        **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
             episode, float64, are the minute of the record in which it started, and the minutes since then.
 
     Raises:
@@ -71,9 +72,9 @@ class MagneticWeather(ReadingErrors):
 
     channel = 7
     default_in_keys = ("field", "move")
-    error_key, stream_key = "weather_clock", "weather_stream"
+    numbers_key, stream_key = "weather_clock", "weather_stream"
     in_sizes = (3, None)
-    size, error_dtype = 2, torch.float64
+    size, numbers_dtype = 2, torch.float64
     variation: Tensor
 
     def __init__(
@@ -124,7 +125,7 @@ class MagneticWeather(ReadingErrors):
         return pad(starts[(stream_uniform(stream, 1) * len(starts)).long()].double(), (0, 1))
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
-        (field, move), (start, minutes) = values, episode.errors.unbind(-1)
+        (field, move), (start, minutes) = values, episode.numbers.unbind(-1)
         if not episode.first:
             step_h = move[..., 0].double() / self.speed_km_h + self.reading_s / 3600
             minutes = (minutes + 60 * step_h).clamp(max=60 * self._longest_h())
@@ -132,17 +133,17 @@ class MagneticWeather(ReadingErrors):
         self._measure(tensordict, field, measured_elements(vector).to(field.dtype))
         return torch.stack((start, minutes), -1)
 
-    def variances(self, field: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the variances of a reading: of the errors that are new in it, of constant ones, and of slow ones.
+    def accuracy(self, field: Tensor) -> SensorStd:
+        """Return the standard deviations that the errors add to a reading, each ``(..., 3)``.
 
         Example:
             >>> weather = MagneticWeather("disturbed", speed_km_h=24.0)
-            >>> [round(x, 2) for x in weather.variances(torch.tensor([0.0, 60.0, 24000.0]))[2].sqrt().tolist()]
+            >>> [round(x, 2) for x in weather.accuracy(torch.tensor([0.0, 60.0, 24000.0])).drift.tolist()]
             [0.06, 0.05, 41.2]
         """
         change = elements_jacobian(field_vector(field))
-        none = torch.zeros_like(field)
-        return none, none, (change @ self._moments.to(field) * change).sum(-1)
+        slow = (change @ self._moments.to(field) * change).sum(-1).sqrt()
+        return SensorStd(torch.zeros_like(field), slow, slow)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the elements without weather and the state; the measured elements are unbounded.

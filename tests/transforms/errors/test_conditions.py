@@ -21,6 +21,7 @@ from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
 from magrl.field.records import weather_record
 from magrl.navigators import Kalman
+from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.transforms import (
     CONDITIONS,
     Conditions,
@@ -99,31 +100,30 @@ def test_what_is_told_follows_from_the_reading(conditions: Conditions) -> None:
     assert 20 <= read.sum() < (55 if conditions is EVERY_ERROR else 61)
     tangent = torch.tan(torch.deg2rad(rows["field"][read, 1])) / 2
     grows = conditions.north != "low-cost"
-    north = (each[0] for each in conditions.transforms()[-1].variances(torch.zeros(3)))
-    new, constant, drift = (grows * each * tangent.square() for each in north)
-    more = {"sensor_std": new, "bias_std": constant + drift, "drift_std": drift}
-    for key, growth in more.items():
-        expected = torch.tensor(getattr(conditions, key)).repeat(len(tangent), 1)
-        expected[:, 0] = (expected[:, 0].square() + growth).sqrt()
+    north = conditions.transforms()[-1].accuracy(torch.zeros(3))
+    for key, std, own in zip(STD_KEYS, conditions.std, north, strict=True):
+        expected = torch.tensor(std).repeat(len(tangent), 1)
+        expected[:, 0] = (expected[:, 0].square() + grows * own[0].square() * tangent.square()).sqrt()
         torch.testing.assert_close(rows[key][read], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_variances_of_all_errors_add_up() -> None:
     """By hand at I = 45 deg, B_H = 20000 nT, D = 0: weather, hard iron, bias, noise and north."""
     weather = {"record": "disturbed"}
-    sensors = {"sensor_std": (0.3, 0.0, 4.0), "bias": (0.0, 0.0, 5.0), "vector": VectorErrors((10.0,) * 3)}
+    sensors = {"noise": (0.3, 0.0, 4.0), "bias": (0.0, 0.0, 5.0), "vector": VectorErrors((10.0,) * 3)}
     conditions = Conditions("own", sensors=sensors, north={"constant_deg": 0.4, "random_deg": 0.4}, weather=weather)
     reading = torch.tensor([0.0, 45.0, 20000.0], dtype=torch.float64)
-    variances = zip(*(part.variances(reading) for part in conditions.transforms()), strict=True)
-    white, constant, slow = (sum(parts).sqrt() for parts in variances)
+    parts = torch.stack([torch.stack(part.accuracy(reading)) for part in conditions.transforms()])
+    std = SensorStd(*parts.square().sum(0).sqrt())
     moments = weather_record("disturbed").second_moments(500 / 24)
     (north2, east2, down2), both = moments.diagonal(), moments[0, 2]
     nanotesla = torch.stack((east2 + 100, (north2 + down2) / 2 - both + 100, north2 + 100)).sqrt()
     degrees = torch.tensor([20000.0, 20000 * 2**0.5, 1.0], dtype=torch.float64).reciprocal()
     degrees[:2] = torch.rad2deg(degrees[:2])
-    torch.testing.assert_close(white, torch.tensor([0.5, 0.0, 4.0], dtype=torch.float64))
-    torch.testing.assert_close(constant, torch.tensor([0.4, 0.0, 5.0], dtype=torch.float64))
-    torch.testing.assert_close(slow, nanotesla * degrees)
+    torch.testing.assert_close(std.noise, torch.tensor([0.5, 0.0, 4.0], dtype=torch.float64))
+    torch.testing.assert_close(std.drift, nanotesla * degrees)
+    constant = torch.tensor([0.4, 0.0, 5.0], dtype=torch.float64)
+    torch.testing.assert_close(std.bias, torch.hypot(constant, std.drift))
 
 
 def test_evaluations_repeat_and_seeds_differ() -> None:
@@ -136,18 +136,18 @@ def test_evaluations_repeat_and_seeds_differ() -> None:
 
 
 def test_navigators_are_told_what_they_can_tell_apart() -> None:
-    env, told = nav(2), {"sensor_std": (0.3, 0.0, 3.0), "bias_std": (0.4, 0.1, 4.0)}
+    env, told = nav(2), SensorStd((0.3, 0.0, 3.0), (0.4, 0.1, 4.0))
     for name in ("kalman", "secant"):
-        navigator = make_navigator(name, env, **told)
-        assert [navigator.sensor_std.tolist(), navigator.bias_std.tolist()] == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0]]
-        assert torch.equal(navigator.reading_std(TensorDict()), navigator.sensor_std)
+        navigator = make_navigator(name, env, sensor_std=told)
+        assert navigator.sensor_std.tolist() == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0], [0.0] * 3]
+        assert torch.equal(navigator.reading_std(TensorDict()), navigator.sensor_std[0])
         here = {"bias_std": torch.tensor([[0.9, 0.0, 4.0]]), "drift_std": torch.tensor([[0.8, 0.0, 0.0]])}
         here = TensorDict(here, batch_size=1)  # larger at this latitude
         assert navigator.reading_std(here)[0].tolist() == pytest.approx([0.5, 0.0, 3.0])
-        assert navigator.lasting_std(here)[0].tolist() == pytest.approx([0.9, 0.1, 4.0])
-    matching = make_navigator("map_matching", env, **told)
-    assert matching.std.tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5], rel=1e-3)
-    assert matching.bias_std.tolist() == pytest.approx([0.4, 0.1, 4.0], rel=1e-3)
+        assert navigator.accuracy(here).bias[0].tolist() == pytest.approx([0.9, 0.1, 4.0])
+    matching = make_navigator("map_matching", env, sensor_std=told)
+    assert matching.sensor_std[0].tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5], rel=1e-3)
+    assert matching.sensor_std[1].tolist() == pytest.approx([0.4, 0.1, 4.0], rel=1e-3)
 
 
 def test_the_agent_heeds_constant_errors() -> None:
@@ -167,7 +167,7 @@ def test_evaluate_under_conditions(tmp_path: Path) -> None:
     config = evaluate.Config(("kalman",), tasks=5, conditions="ship", out=out, wandb_mode="disabled")
     config, (env, _), navigators, _ = evaluate.prepare(config)
     assert {type(part) for part in env.transform} >= {MotionError, NorthReferenceError}
-    assert navigators[0][0].bias_std.tolist() == list(CONDITIONS["ship"].bias_std)
+    assert tuple(navigators[0][0].sensor_std[1].tolist()) == CONDITIONS["ship"].std.bias
     assert evaluate.settings(config, env)["conditions"] == "ship"
 
 
@@ -180,7 +180,7 @@ def test_own_errors_in_a_file() -> None:
         "survey boat",
         15.0,
         sensors={
-            "sensor_std": (0.02, 0.02, 5.0),
+            "noise": (0.02, 0.02, 5.0),
             "vector": VectorErrors(hard_iron_nt=(20.0, 20.0, 20.0), attitude_deg=(0.05, 0.05)),
         },
         north={"constant_deg": 0.2, "random_deg": 0.1},
@@ -191,7 +191,7 @@ def test_own_errors_in_a_file() -> None:
     for errors in (read, str(BOAT)):
         flown = [with_conditions(nav(2, 8.0), each, 3).rollout(4, Kalman()) for each in (errors, boat)]
         torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
-    assert (read.name, read.sensor_std, read.bias_std) == (boat.name, boat.sensor_std, boat.bias_std)
+    assert (read.name, read.std) == (boat.name, boat.std)
     for recipe, places in ((fly, ["60.4N 5.3E", "62.0N 6.7W"]), (evaluate, ["secant"])):
         assert tyro.cli(recipe.Config, args=[*places, "--errors", str(BOAT)]).conditions == str(BOAT)
 
@@ -200,8 +200,8 @@ def test_own_errors_in_a_file() -> None:
     ("text", "message"),
     [
         ("speed = 3", r"mine\.toml: .*unexpected keyword argument 'speed'"),
-        ("[motion]\ncurrent = 3", r"mine\.toml: MotionError has no option 'current'"),
-        ("[sensors]\nsensor_std = [0.1, 0.1, -1]", r"mine\.toml: sensor_std must .*got -1"),
+        ("[motion]\ncurrent = 3", r"mine\.toml: .*unexpected keyword argument 'current'"),
+        ("[sensors]\nnoise = [0.1, 0.1, -1]", r"mine\.toml: noise must .*got -1"),
         ("[sensors.vector]\nhard_iron_nt = 3", r"mine\.toml: hard_iron_nt must be 3 .*got 3"),
         ("north = 'best'", r"mine\.toml: .*must be one of 'fiber-optic'"),
         ("[north", r"mine\.toml: the file is not valid TOML"),
@@ -230,9 +230,7 @@ def test_fly_under_conditions(tmp_path: Path) -> None:
 def test_a_navigator_does_not_rely_on_the_reading_of_an_outage(name: str) -> None:
     """It goes the same way whatever the reading is, within a percent of what the reading is worth otherwise."""
     noise = (0.05, 0.05, 5.0)
-    env = with_conditions(
-        GeomagneticNavEnv(num_envs=20, seed=0), Conditions("noise", sensors={"sensor_std": noise}), seed=0
-    )
+    env = with_conditions(GeomagneticNavEnv(num_envs=20, seed=0), Conditions("noise", sensors={"noise": noise}), seed=0)
     navigator = make_navigator(name, env.base_env, sensor_std=noise)
     state = env.rollout(4, navigator, break_when_any_done=False)[:, -1]["next"]
 

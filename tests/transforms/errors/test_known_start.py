@@ -9,31 +9,32 @@ import torch
 from support.errors import nav
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 
+from magrl.sensor_std import SensorStd
 from magrl.transforms import CONDITIONS, Conditions, KnownStart, SensorErrors, calibration, with_conditions
 
-STD = (0.02, 0.02, 2.0), (0.5, 0.1, 20.0), (0.3, 0.05, 10.0), (0.1, 0.0, 0.0)  # new, constant and slow, slow, known
+STD = (0.02, 0.02, 2.0), (0.5, 0.1, 20.0), (0.3, 0.05, 10.0), (0.1, 0.0, 0.0)  # noise, bias, drift, known
 
 
 def test_calibration_is_the_best_linear_estimate_of_the_constant_error() -> None:
     """Of many errors that are drawn, it is unbiased, and what is left has the variance that it states."""
     draw = torch.Generator().manual_seed(0)
-    new, bias, drift, known = torch.tensor(STD, dtype=torch.float64)
+    noise, bias, drift, known = torch.tensor(STD, dtype=torch.float64)
     normal = torch.randn(5, 200_000, 3, generator=draw, dtype=torch.float64)
     constant, slow = (bias.square() - drift.square()).sqrt() * normal[0], drift * normal[1]
-    reading = constant + slow + new * normal[2] + torch.tensor([179.0, 60.0, 20000.0])
+    reading = constant + slow + noise * normal[2] + torch.tensor([179.0, 60.0, 20000.0])
     here = torch.tensor([-181.0, 60.0, 20000.0]) + known * normal[3]  # the same place, on the other side of 180
-    found = calibration(reading, here, new, bias, drift, known)
-    left = constant + drift * normal[4] - found.error  # later, the slow error is another
-    torch.testing.assert_close(left.square().mean(0).sqrt(), found.bias_std, rtol=0.01, atol=0)
-    assert ((left * found.error).mean(0) / (bias * bias)).abs().max() < 0.01  # nothing more to subtract
+    error, left = calibration(reading, here, SensorStd(noise, bias, drift), known)
+    rest = constant + drift * normal[4] - error  # later, the slow error is another
+    torch.testing.assert_close(rest.square().mean(0).sqrt(), left.bias, rtol=0.01, atol=0)
+    assert ((rest * error).mean(0) / (bias * bias)).abs().max() < 0.01  # nothing more to subtract
 
 
 @pytest.mark.parametrize(("bias", "expected"), [(0.0, 0.0), (0.5, 0.7)])
 def test_without_other_errors_the_whole_difference_is_constant(bias: float, expected: float) -> None:
-    none, bias_std = torch.zeros(3), torch.full((3,), bias)
-    found = calibration(torch.full((3,), 0.7), none, none, bias_std, none, none)
-    assert found.error.tolist() == pytest.approx([expected] * 3)
-    assert found.bias_std.tolist() == [0] * 3
+    none, std = torch.zeros(3), SensorStd(torch.zeros(3), torch.full((3,), bias), torch.zeros(3))
+    error, left = calibration(torch.full((3,), 0.7), none, std, none)
+    assert error.tolist() == pytest.approx([expected] * 3)
+    assert left.bias.tolist() == [0] * 3
 
 
 def test_the_error_of_the_start_is_subtracted_from_all_readings_of_an_episode() -> None:
@@ -53,27 +54,28 @@ def test_the_error_of_the_start_is_subtracted_from_all_readings_of_an_episode() 
 
 def test_conditions_state_what_is_left_where_the_start_is_known() -> None:
     """Of the constant error of the north reference little, of slow errors all, of the model's error some."""
-    own = Conditions("own", sensors={"sensor_std": (0.0, 0.0, 2.0)}, north={"constant_deg": 0.5})
-    assert own.left_std((0, 0, 0)) == (0, 0, 0)
-    assert own.left_std((0.5, 0, 0))[0] == pytest.approx(0.5 / 2**0.5, abs=1e-6)
+    own = Conditions("own", sensors={"noise": (0.0, 0.0, 2.0)}, north={"constant_deg": 0.5})
+    assert own.std_at((0, 0, 0)).bias == (0, 0, 0)
+    assert own.std_at((0.5, 0, 0)).bias[0] == pytest.approx(0.5 / 2**0.5, abs=1e-6)
     aircraft = CONDITIONS["aircraft"]
-    assert aircraft.bias_std[0] > 2 * aircraft.left_std((0, 0, 0))[0] > 2 * aircraft.drift_std[0] > 0
-    assert aircraft.left_std((0, 0, 0))[1:] == aircraft.drift_std[1:] == aircraft.bias_std[1:]
+    std, left = aircraft.std, aircraft.std_at((0, 0, 0))
+    assert std.bias[0] > 2 * left.bias[0] > 2 * std.drift[0] > 0
+    assert left.bias[1:] == std.drift[1:] == std.bias[1:]
+    assert left._replace(bias=std.bias) == std
     base = nav(4)
     env = with_conditions(base, aircraft, known_start=(0.0, 0.0, 0.0))
     state, none = env.reset(), torch.zeros(3)
     latitude = math.atan(
         math.tan(math.radians(state["field"][0, 1])) / 2
     )  # of a dipole: a gyrocompass errs by its secant
-    bias = math.hypot(0.1 / math.cos(latitude), aircraft.drift_std[0]), *aircraft.bias_std[1:]
-    sheet = (torch.tensor(std) for std in (aircraft.sensor_std, bias, aircraft.drift_std))
-    left = calibration(none, none, *sheet, none).bias_std
-    assert state["bias_std"][0].tolist() == pytest.approx(left.tolist(), abs=1e-6)
+    std = std._replace(bias=(math.hypot(0.1 / math.cos(latitude), std.drift[0]), *std.bias[1:]))
+    left = calibration(none, none, SensorStd(*map(torch.tensor, std)), none)[1]
+    assert state["bias_std"][0].tolist() == pytest.approx(left.bias.tolist(), abs=1e-6)
 
 
 def test_bad_standard_deviations_are_named() -> None:
-    for name in ("drift_std", "known_std"):
+    for name, bad in (("sensor_std.drift", SensorStd(drift=(0, -1, 0))), ("known_std", (0.0, -1.0, 0.0))):
         with pytest.raises(ValueError, match=rf"^{name} must be a finite number from 0 on, got -1"):
-            KnownStart(**{name: (0.0, -1.0, 0.0)})
+            KnownStart(**{name.partition(".")[0]: bad})
     with pytest.raises(ValueError, match=r"^known_start must be 3 finite numbers"):
-        CONDITIONS["ship"].left_std((1.0,))
+        CONDITIONS["ship"].std_at((1.0,))

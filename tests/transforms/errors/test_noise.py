@@ -20,7 +20,7 @@ from magrl.transforms import (
     sensor_levels,
     with_sensor_noise,
 )
-from magrl.transforms.errors.noise import LASTING_KM
+from magrl.transforms.errors.noise import DRIFT_KM
 
 F64 = torch.float64
 
@@ -79,10 +79,10 @@ def test_without_noise_the_reading_is_the_value_to_the_bit() -> None:
 
 
 def test_levels_by_hand() -> None:
-    #    none  common  own factors  D poor  by, then of lasting errors: none  common  own factors
+    #    none  common  own factors  D poor  by, then of the bias: none  common  own factors
     uniform = torch.tensor(
         [
-            [0.1499, 0.0, 0.5, 0.5, 0.5, 0.0, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5],  # perfect sensors, lasting errors
+            [0.1499, 0.0, 0.5, 0.5, 0.5, 0.0, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5],  # perfect sensors, bias
             [0.15, 0.5 ** (2 / 3), 0.5, 0.5, 0.5, 0.3, 0.5, 0.5, 0.625, 0.0, 1.0, 0.5],  # a tenth of the largest
             [0.99, 1.0, 0.0, 1.0, 0.5, 0.9, 0.5, 0.49, 0.0, 0.5, 0.5, 0.5],  # a hundredth, factors 0.398, 2.512, 1
             [0.99, 0.0, 0.5, 0.5, 0.5, 0.29, 0.5, 0.0, 0.0, 0.5, 0.5, 0.5],  # a poor north reference: 1 + 6 / 2
@@ -101,11 +101,11 @@ def test_levels_by_hand() -> None:
     torch.testing.assert_close(sensor_levels(uniform, 1.0), torch.tensor(expected, dtype=F64))
 
 
-def noisy(lasting: float) -> Callable[[Tensor], Tensor]:
-    """Levels of random noise in silence, or with one lasting error."""
+def noisy(bias: float) -> Callable[[Tensor], Tensor]:
+    """Levels of random noise in silence, or with one bias."""
 
     def levels(uniform: Tensor) -> Tensor:
-        return torch.cat((sensor_levels(uniform)[..., :3], torch.full_like(uniform[..., :3], lasting)), -1)
+        return torch.cat((sensor_levels(uniform)[..., :3], torch.full_like(uniform[..., :3], bias)), -1)
 
     return levels
 
@@ -125,7 +125,7 @@ def test_random_noise_has_the_level_of_its_episode() -> None:
     assert ((again != std[0]).any(-1) | (again == 0).all(-1)).double().mean() > 0.95
 
 
-def test_lasting_errors_are_partly_constant_and_as_large_as_told() -> None:
+def test_the_bias_is_partly_constant_and_as_large_as_told() -> None:
     """Their correlation along the way is that of a half that is constant and a half that drifts."""
     env = under(RandomSensorNoise(noisy(30.0), seed=3), num_envs=4000)
     keys = ("field", "true_field", "bias_std", "sensor_std", "move")
@@ -134,7 +134,7 @@ def test_lasting_errors_are_partly_constant_and_as_large_as_told() -> None:
     silent = (td["sensor_std"][0] == 0).all(-1)
     error, moved = (td["field"] - td["true_field"])[:, silent, 2] / 30, td["move"][:, silent, 0].cumsum(0)
     assert error.std() == pytest.approx(1.0, rel=0.06)
-    expected = 0.5 + 0.5 * torch.exp(-moved / LASTING_KM)  # shares are uniform
+    expected = 0.5 + 0.5 * torch.exp(-moved / DRIFT_KM)  # shares are uniform
     torch.testing.assert_close((error * error[0]).mean(-1), expected.mean(-1), rtol=0, atol=0.15)
 
 

@@ -73,7 +73,7 @@ def test_drift_by_steps_without_a_move() -> None:
         ({"bias": (0.1, 0.1)}, r"bias must be 3 finite numbers, got \(0.1, 0.1\)"),
         ({"drift": (0.1, 0.1, 1.0)}, "drift_length .*None"),
         ({"outage_rate": 1}, "outage_rate .*1"),
-        ({"sensor_std": (1.0, 1.0), "vector": VectorErrors()}, "got 2 elements"),
+        ({"noise": (1.0, 1.0), "vector": VectorErrors()}, "got 2 elements"),
         ({"vector": VectorErrors(), "in_keys": ["field"]}, r"3 in_keys .*\['field'\]"),
     ],
 )
