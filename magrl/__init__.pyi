@@ -13,6 +13,7 @@ from .envs import earth_scenario as earth_scenario
 from .envs import load_scenario as load_scenario
 from .envs import planet_scenario as planet_scenario
 from .envs import task_set as task_set
+from .evaluation import Flight as Flight
 from .evaluation import episode_measures as episode_measures
 from .evaluation import evaluate as evaluate
 from .evaluation import evaluation_rollout as evaluation_rollout

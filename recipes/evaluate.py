@@ -31,10 +31,10 @@ from typing import Annotated, Any, Literal
 
 from magrl.checks import check_numbers
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
-from magrl.evaluation import episode_measures, evaluation_rollout, export, summarize, with_declaration, with_errors
+from magrl.evaluation import Flight, episode_measures, export, summarize
 from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import check_distinct, check_map_date, label, make_navigator
+from magrl.evaluation.navigators import check_distinct, check_map_date, label
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import NO_NOISE, Noise, agreed, trained_runs, unfinished
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
@@ -43,14 +43,12 @@ from magrl.files import check_writable, write_json
 from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
-from magrl.transforms import conditions_named
 
 import torch
 import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
-from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 RECIPE = "evaluate.py"
@@ -157,11 +155,11 @@ def settle(config: Config) -> tuple[Config, list[str]]:
     return settled, [*thresholds, *unfinished(config.navigators), *headings, *noisy, *places]
 
 
-def prepare(config: Config) -> tuple[Config, list[EnvBase], list[Pair], list[str]]:
+def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]]:
     """Make environments and navigators, and the folder of the results.
 
     Returns:
-        Settings with those of the runs; environments of the tasks and of the example task; each navigator for both;
+        Settings with those of the runs; flights of the tasks and of the example task; each navigator for both;
         warnings.
 
     Raises:
@@ -178,28 +176,17 @@ def prepare(config: Config) -> tuple[Config, list[EnvBase], list[Pair], list[str
         config, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        envs, navigators = make_fleet(config, (scenario, example))
+        options = {"errors": config.conditions or config.noise, "known_start": config.known_start}
+        options |= {"confidence": config.confidence, "seed": config.seed}
+        flights = [Flight(scenario, **options), Flight(example, **options)]
+        options = {"mode": config.mode, "map_date": config.map_date}
+        navigators = [tuple(each.navigator(text, **options) for each in flights) for text in config.navigators]
         if config.export:
             check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
-    return config, envs, navigators, warnings
-
-
-def make_fleet(config: Config, scenarios: Sequence[Scenario]) -> tuple[list[EnvBase], list[Pair]]:
-    """Return the environment of each scenario with its errors, and each navigator for all of them."""
-    conditions = conditions_named(config.conditions or "laboratory")
-    drift_km = conditions.drift_km(scenarios[0].max_move_km)
-    bases = [
-        GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), drift_km=drift_km, seed=config.seed)
-        for scenario in scenarios
-    ]
-    errors = conditions if config.conditions else config.noise
-    flown = [with_errors(base, errors, config.seed, config.known_start) for base in bases]
-    options = {"mode": config.mode, "seed": config.seed, "map_date": config.map_date, "sensor_std": flown[0][1]}
-    navigators = [tuple(make_navigator(text, base, **options) for base in bases) for text in config.navigators]
-    return [with_declaration(env, config.confidence) for env, _ in flown], navigators
+    return config, flights, navigators, warnings
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
@@ -209,13 +196,13 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    config, (env, example_env), navigators, warnings = prepare(config)
-    names = task_names(env.scenario)
+    config, (flight, example_flight), navigators, warnings = prepare(config)
+    env, names = flight.base, task_names(flight.base.scenario)
     results = Results(warnings=warnings)
     for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
         name, _, run = text.partition("=")
         began = time.perf_counter()
-        rollout = evaluation_rollout(env, navigator)
+        rollout = flight.fly(navigator)
         measured = episode_measures(rollout, env)
         readings = getattr(navigator, "field_readings", torch.zeros(1)).double().mean().item()
         summary = summarize(measured) | {"field_readings": readings, "seconds": time.perf_counter() - began}
@@ -231,12 +218,12 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
             results.rollouts[label(name, config.mode)] = rollout[:SHOWN].clone()
-            results.paths += path_rows(name, evaluation_rollout(example_env, example))
+            results.paths += path_rows(name, example_flight.fly(example))
     write(config, env, results)
     return results.summaries
 
 
-def settings(config: Config, env: EnvBase) -> dict[str, Any]:
+def settings(config: Config, env: GeomagneticNavEnv) -> dict[str, Any]:
     """Return what was flown and how, without a path of this machine."""
     texts = (text.partition("=") for text in config.navigators)
     return {
@@ -254,7 +241,7 @@ def settings(config: Config, env: EnvBase) -> dict[str, Any]:
     }
 
 
-def write(config: Config, env: EnvBase, results: Results) -> None:
+def write(config: Config, env: GeomagneticNavEnv, results: Results) -> None:
     """Write the files of the results, and the runs as a table in wandb."""
     for name in ("episodes", "runs", "paths"):
         rows = getattr(results, name)

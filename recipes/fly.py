@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from magrl.checks import check_number, check_numbers
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
-from magrl.evaluation import episode_measures, export, places, with_declaration, with_errors
+from magrl.envs import Scenario, Tasks
+from magrl.evaluation import Flight, episode_measures, export, places, with_declaration
 from magrl.evaluation.maps import trajectories_figure, write_gif
-from magrl.evaluation.navigators import make_navigator, needs
+from magrl.evaluation.navigators import needs
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
@@ -163,32 +163,29 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
         tasks, ways = Tasks(start[None], target[None]), (0.0, RANGE_KM)
         scenario = Scenario(region=region, margin_deg=0, field=field, tasks=tasks, distance_range_km=ways)
         for name, arrival in RULES.items():
-            base = GeomagneticNavEnv(
+            flight = Flight(
                 scenario,
+                errors=config.conditions or config.noise,
+                known_start=config.known_start,
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
                 start_heading="random",
-                drift_km=drift_km,
                 seed=config.seed,
                 arrival=arrival,
             )
-            env, navigator = equip(base, config)
-            flights[name] = env, Watched(navigator, distance_km)
+            flights[name] = with_estimates(flight), Watched(flight.navigator(config.navigator), distance_km)
         check_files(config)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
     return flights
 
 
-def equip(base: GeomagneticNavEnv, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:
-    """Return the environment with errors and estimates of the way, and the navigator."""
-    errors = conditions_named(config.conditions) if config.conditions else config.noise
-    env, sensor_std = with_errors(base, errors, config.seed, config.known_start)
-    navigator = make_navigator(config.navigator, base, seed=config.seed, sensor_std=sensor_std)
-    if base.arrival.declared:
-        return with_declaration(env), navigator
-    track = TrackGradient(std_keys=STD_KEYS if config.conditions or any(config.noise) else (), range_km=1000.0)
-    return TransformedEnv(env, track, auto_unwrap=True), navigator
+def with_estimates(flight: Flight) -> TransformedEnv:
+    """Return the environment of a flight with estimates of the way, which those that declare have."""
+    if flight.base.arrival.declared:
+        return with_declaration(flight.env)
+    track = TrackGradient(std_keys=STD_KEYS if flight.env is not flight.base else (), range_km=1000.0)
+    return TransformedEnv(flight.env, track, auto_unwrap=True)
 
 
 def rollout(env: TransformedEnv, navigator: Watched, start_heading: float | Literal["random"]) -> TensorDictBase:

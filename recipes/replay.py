@@ -13,22 +13,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from magrl.envs import GeomagneticNavEnv
-from magrl.evaluation import evaluation_rollout
+from magrl.evaluation import Flight
 from magrl.evaluation.maps import write_gif
-from magrl.evaluation.navigators import label, make_navigator
+from magrl.evaluation.navigators import label
 from magrl.evaluation.replay import replay_data, write_replay
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import read_run
-from magrl.evaluation.scenarios import TaskSet, choose_tasks, first_tasks, with_declaration
+from magrl.evaluation.scenarios import TaskSet, choose_tasks, first_tasks
 from magrl.files import check_writable
 from magrl.training import UsageError, command, parse
-from magrl.transforms import with_sensor_noise
 
 import tyro
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
-from torchrl.envs import EnvBase
 
 RECIPE = "replay.py"
 DEFAULT_TASKS = 12
@@ -75,8 +72,8 @@ def labeled(texts: Sequence[str]) -> dict[str, str]:
     return named
 
 
-def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], str, Path]:
-    """Return the environment, navigators by label, and title and path of the page.
+def prepare(config: Config) -> tuple[Flight, dict[str, TensorDictModuleBase], str, Path]:
+    """Return the flight, navigators by label, and title and path of the page.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -89,10 +86,9 @@ def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], s
         assert scenario.tasks is not None
         available = len(scenario.tasks.start)
         count = min(DEFAULT_TASKS, available) if config.num_tasks is None else config.num_tasks
-        base = GeomagneticNavEnv(first_tasks(scenario, count), num_envs=count, seed=config.seed)
-        env = with_declaration(with_sensor_noise(base, run.noise, config.seed))
+        flight = Flight(first_tasks(scenario, count), errors=run.noise, seed=config.seed)
         texts = (f"{run.kind or f'policy:{config.run.name}'}={config.run}", *config.navigators)
-        made = {text: make_navigator(text, base, seed=config.seed, sensor_std=run.noise) for text in texts}
+        made = {text: flight.navigator(text) for text in texts}
         navigators = {name: made[text] for name, text in labeled(texts).items()}
         out = config.out or config.run / "replay.html"
         for file in filter(None, (out, config.gif)):
@@ -100,7 +96,7 @@ def prepare(config: Config) -> tuple[EnvBase, dict[str, TensorDictModuleBase], s
     except (ValueError, TypeError, OSError) as error:
         raise UsageError(str(error)) from error
     title = f"{config.run.name}, tasks of {path.name if path else config.tasks or 'test-1000'}"
-    return env, navigators, title, out
+    return flight, navigators, title, out
 
 
 def replay(config: Config) -> Path:
@@ -110,8 +106,9 @@ def replay(config: Config) -> Path:
         UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    env, navigators, title, out = prepare(config)
-    rollouts = {name: with_true_field(evaluation_rollout(env, flown)) for name, flown in navigators.items()}
+    flight, navigators, title, out = prepare(config)
+    env = flight.base
+    rollouts = {name: with_true_field(flight.fly(navigator)) for name, navigator in navigators.items()}
     data = replay_data(rollouts, env.field, env.region, zeta=env.zeta, title=title, names=env.scenario.names)
     write_replay(out, data)
     if config.gif:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -14,8 +13,8 @@ from magrl import paper
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
-from magrl.sensor_std import STD_KEYS, SensorStd
-from magrl.transforms import Conditions, DeclareArrival, NoiseScale, TrackGradient, with_conditions, with_sensor_noise
+from magrl.sensor_std import STD_KEYS
+from magrl.transforms import DeclareArrival, NoiseScale, TrackGradient
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
@@ -117,32 +116,6 @@ def task_names(scenario: Scenario, first: int = 0) -> tuple[str, ...]:
     """
     assert scenario.tasks is not None
     return scenario.names or tuple(f"task {number}" for number in range(first, first + len(scenario.tasks.start)))
-
-
-def with_errors(
-    env: EnvBase, errors: Sequence[float] | Conditions, seed: int = 0, known_start: Sequence[float] | None = None
-) -> tuple[EnvBase, SensorStd]:
-    """Return an environment with errors, and the accuracy of the sensors as its vehicles know it.
-
-    Args:
-        env: navigation environment; under conditions with their ``drift_km``.
-        errors: standard deviations of the noise on D [deg], I [deg], B_H [nT], or the conditions of a real vehicle.
-        seed: random seed of the errors.
-        known_start: standard deviations of the elements at the start, where the vehicles know these and calibrate their
-            sensors (:class:`~magrl.transforms.KnownStart`); None where they do not.
-
-    Raises:
-        ValueError: for a known start without conditions.
-
-    Example:
-        >>> with_errors(GeomagneticNavEnv(num_envs=2, seed=0), (0.05, 0.05, 5.0))[1].noise
-        (0.05, 0.05, 5.0)
-    """
-    if isinstance(errors, Conditions):
-        return with_conditions(env, errors, seed, known_start), errors.std_at(known_start)
-    if known_start is not None:
-        raise ValueError(f"known_start {known_start} needs conditions: white noise has no constant error to calibrate")
-    return with_sensor_noise(env, errors, seed), SensorStd.of(errors)
 
 
 def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = None) -> EnvBase:

@@ -30,15 +30,14 @@ from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import UsageError, check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.evaluation.flight import Flight
 from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
-from magrl.evaluation.scenarios import task_names
 from magrl.files import write_json
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder, locked
 from magrl.training.config import CHANGEABLE, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
 from magrl.training.loggers import open_log
-from magrl.transforms import with_sensor_noise
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
 """Measures of the validation tasks in ``train.csv``, there with the prefix ``eval_``."""
@@ -151,8 +150,7 @@ class Run:
         """
 
         def make(scenario: Scenario, seed: int) -> EnvBase:
-            base = GeomagneticNavEnv(scenario, num_envs=len(task_names(scenario)), seed=seed, **options)
-            return with_sensor_noise(base, self.config.noise, seed)
+            return Flight(scenario, errors=self.config.noise, seed=seed, **options).env
 
         if self.scenario.tasks is not None:
             self._own = make(self.scenario, paper.TEST_SEED)

@@ -174,7 +174,7 @@ def reliability_diagram(tasks: int = 2000) -> Figures:
         flights = Flights(names, tasks=tasks, regions=min(tasks, 512), max_steps=80, within_km=25.0)
         axes.axline((0, 0), (100, 100), color="#808080", lw=1, ls="--")
         for (name, errors), (color, marker) in zip(flights.errors.items(), LOOKS.values(), strict=False):
-            bins = reliability(flights.fly("anywhere", errors), flights.env.scenario.tasks.region, 25.0)
+            bins = reliability(flights.fly("anywhere", errors), flights.scenario.tasks.region, 25.0)
             axes.errorbar(*zip(*bins, strict=True), color=color, marker=marker, ms=4, lw=1.2, capsize=2, label=name)
         axes.set_xlabel("stated probability [%]")
         axes.legend(fontsize=8)

@@ -10,10 +10,10 @@ from functools import cached_property
 from typing import Any
 
 from magrl import paper
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, earth_scenario, named_tasks
-from magrl.evaluation import episode_measures, evaluation_rollout, summarize, with_declaration, with_errors
+from magrl.envs import Scenario, Tasks, earth_scenario, named_tasks
+from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import label, make_navigator, needs
+from magrl.evaluation.navigators import label, needs
 from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.tables import mean_of_runs
 from magrl.geodesy import geodesic
@@ -66,16 +66,15 @@ class Flights:
         return {name: conditions_named(name) for name in self.conditions} or levels
 
     @cached_property
-    def env(self) -> GeomagneticNavEnv:
-        """Environment of the tasks without errors, with one vehicle for each task."""
+    def scenario(self) -> Scenario:
+        """Scenario of the tasks, with room for all errors of motion."""
         size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if self.far else {"max_latitude": 70}
         size |= {"distance_range_km": tuple(self.distance_km), "max_move_km": 50.0 + DRIFT_KM * bool(self.conditions)}
         earth = Scenario() if self.box else earth_scenario(self.regions, SEED, **size, start_heading="random")
         tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, SEED)
-        options: dict[str, Any] = {"drift_km": DRIFT_KM} if self.conditions else {}
-        options |= {"arrival": "declared", "arrival_radius_km": self.within_km} if self.within_km else {}
-        scenario = earth.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
-        return GeomagneticNavEnv(scenario, num_envs=self.tasks, max_steps=self.max_steps, seed=0, **options)
+        rule: dict[str, Any] = {"arrival": "declared", "arrival_radius_km": self.within_km} if self.within_km else {}
+        scenario = earth.replace(max_steps=self.max_steps, **rule)
+        return scenario.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
 
     @property
     def measures(self) -> list[str]:
@@ -85,7 +84,8 @@ class Flights:
 
     def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
         """Return an episode of each task."""
-        return fly(self.env, navigator, errors, self.confidence, self.known_start)
+        flight = Flight(self.scenario, errors=errors, known_start=self.known_start, confidence=self.confidence)
+        return flown(flight, navigator)
 
     def episodes(self, navigator: Spec, errors: Errors) -> list[Measures]:
         """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""
@@ -96,18 +96,10 @@ class Flights:
         return [summarize(episodes) for episodes in self.episodes(navigator, errors)]
 
 
-def fly(
-    base: GeomagneticNavEnv,
-    navigator: Spec,
-    errors: Errors,
-    confidence: float = 0.0,
-    known_start: Sequence[float] | None = None,
-) -> TensorDictBase:
-    """Return an episode of each vehicle of an environment without errors, under some errors."""
-    env, sensor_std = with_errors(base, errors, base.seed, known_start)
+def flown(flight: Flight, navigator: Spec) -> TensorDictBase:
+    """Return an episode of each vehicle."""
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
-    pilot = make_navigator(options.pop("name"), base, sensor_std=sensor_std, **options)
-    return evaluation_rollout(with_declaration(env, confidence, pilot), pilot)
+    return flight.fly(flight.navigator(options.pop("name"), **options))
 
 
 def clustered(values: Tensor, region: Tensor) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks
 from magrl.envs.specs import state_spec
 from magrl.envs.tasks import task_set
-from magrl.evaluation import episode_measures
+from magrl.evaluation import Flight, episode_measures
 from magrl.evaluation.maps import coastlines
 from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.tables import markdown_table
@@ -23,7 +23,7 @@ from magrl.guidance import OBJECTIVE_FLOORS
 
 import numpy as np
 import torch
-from flights import SEED, Errors, Measures, Spec, cell, fly
+from flights import SEED, Errors, Measures, Spec, cell, flown
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -56,6 +56,12 @@ class GlobeEnv(GeomagneticNavEnv):
         self.state_spec = state_spec(self.observation_spec)
 
 
+class GlobeFlight(Flight):
+    """Vehicles all over the Earth."""
+
+    env_class = GlobeEnv
+
+
 def earth_tasks(count: int) -> Tasks:
     """Return random tasks all over the Earth."""
     return task_set(count, SEED, EARTH)
@@ -68,8 +74,8 @@ def measured(navigator: Spec, tasks: Tasks, errors: Errors) -> Measures:
         part = Tasks(*(ends[first : first + CHUNK] for ends in tasks))
         scenario = Scenario(region=EARTH, margin_deg=0, field=FIELD, tasks=part)
         # the seed gives each chunk headings and noise of its own
-        env = GlobeEnv(scenario, num_envs=len(part.start), start_heading="random", seed=first)
-        parts.append(episode_measures(fly(env, navigator, errors)))
+        flight = GlobeFlight(scenario, errors=errors, start_heading="random", seed=first)
+        parts.append(episode_measures(flown(flight, navigator)))
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
 

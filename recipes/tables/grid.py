@@ -52,7 +52,7 @@ def flights(navigators: Sequence[Spec], *, against: Sequence[Spec] = (), **optio
         episodes = [made.episodes(navigator, errors) for errors in made.errors.values()]
         spl[names(navigator)[0]] = [runs[0]["spl"] for runs in episodes]
         rows.append([*names(navigator), *(cell(runs, made.measures) for runs in episodes)])
-    first, region = names(navigators[0])[0], made.env.scenario.tasks.region
+    first, region = names(navigators[0])[0], made.scenario.tasks.region
     for other in [names(navigator)[0] for navigator in against if names(navigator)[0] in spl]:
         differences = (paired_difference(*pair, region) for pair in zip(spl[first], spl[other], strict=True))
         rows.append([f"{first} − {other}, SPL", "—", *differences])

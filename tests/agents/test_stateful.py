@@ -108,8 +108,8 @@ def test_a_policy_with_a_state_flies_alike_after_saving(flight) -> None:
 def test_a_policy_with_a_state_stands_in_tables(flight) -> None:
     """By the name of its file, several episodes in turn."""
     policy, *_, file = flight
-    episodes = evaluate(f"policy={file}", "paper-100", num_envs=40, noise=NOISE, max_steps=4)
-    alike = evaluate(policy, "paper-100", num_envs=100, noise=NOISE, max_steps=4)
+    episodes = evaluate(f"policy={file}", "paper-100", num_envs=40, errors=NOISE, max_steps=4)
+    alike = evaluate(policy, "paper-100", num_envs=100, errors=NOISE, max_steps=4)
     assert episodes.shape == (100,)
     torch.testing.assert_close(episodes["length_km"][:40], alike["length_km"][:40], atol=0.1, rtol=1e-4)
 

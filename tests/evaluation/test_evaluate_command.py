@@ -149,7 +149,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     ],
 )
 def test_bad_usage_is_refused_before_anything_is_flown(navigators, options, message, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(evaluate, "evaluation_rollout", lambda *_: pytest.fail("something was flown"))
+    monkeypatch.setattr(evaluate.Flight, "fly", lambda *_: pytest.fail("something was flown"))
     given = {"tasks": "figure-4-1", "out": tmp_path / "out", "wandb_mode": "disabled"} | options
     if "scenario" in options:
         given["tasks"] = None

@@ -34,13 +34,13 @@ def test_batches_have_errors_of_their_own_that_repeat() -> None:
     """The same task in three batches has other noise and another start heading; the same call has the same."""
     tasks = named_tasks("figure-4-1")
     thrice = Scenario().with_tasks(Tasks(tasks.start.repeat(3, 1), tasks.target.repeat(3, 1)))
-    for errors in ({"noise": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
-        one, again = (evaluate("secant", thrice, num_envs=1, **errors)["smoothness_deg"] for _ in range(2))
+    for options in ({"errors": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
+        one, again = (evaluate("secant", thrice, num_envs=1, **options)["smoothness_deg"] for _ in range(2))
         assert torch.equal(one, again)
         assert one.unique().numel() == 3
     perfect = evaluate("secant", thrice, num_envs=1)
     torch.testing.assert_close(perfect["length_km"], perfect["length_km"][:1].expand(3))
-    ship = evaluate("secant", thrice, conditions="ship", max_steps=5)
+    ship = evaluate("secant", thrice, errors="ship", max_steps=5)
     assert (ship["steps"] <= 5).all()
 
 
@@ -73,7 +73,7 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
     elsewhere = elsewhere.with_tasks(elsewhere.random_tasks(2, seed=0))
     for call, error, message in (
         (lambda: evaluate("secant", Scenario()), ValueError, "the scenario has no tasks to fly"),
-        (lambda: evaluate("secant", "figure-4-1", noise=(1, 1, 1), conditions="ship"), ValueError, "omit the noise"),
+        (lambda: evaluate("secant", "figure-4-1", errors="boat"), ValueError, "conditions must be one of 'laboratory'"),
         (lambda: evaluate("secant", "figure-4-1", known_start=(0, 0, 0)), ValueError, "needs conditions"),
         (lambda: evaluate(agent, elsewhere), ValueError, "trained"),
         (lambda: evaluate(agent, "figure-4-1", max_turn_deg=20), ValueError, "up to 90°, the environment .* and 20°"),
@@ -88,7 +88,7 @@ def test_a_pretrained_policy_flies_as_by_its_name(options: dict) -> None:
     """Within the limits of the environment, which it gets from `evaluate`, or from a loop of one's own."""
     scenario = first_tasks(choose_tasks(None, "paper-100"), 3)
     policy, options = load_pretrained("anywhere"), {"max_steps": 12, **options}
-    flights = (evaluate(agent, scenario, noise=(0.05, 0.05, 5.0), **options) for agent in ("anywhere", policy))
+    flights = (evaluate(agent, scenario, errors=(0.05, 0.05, 5.0), **options) for agent in ("anywhere", policy))
     named, given = flights
     assert all(torch.equal(named[key], given[key]) for key in named.keys())  # noqa: SIM118
     base = GeomagneticNavEnv(scenario, num_envs=3, seed=0, **options)

@@ -114,9 +114,9 @@ def test_vehicles_that_declare_are_right_or_wrong() -> None:
 def test_tasks_of_the_box_are_frozen_and_start_northward() -> None:
     table = rows(grid.flights(["geodesic"], box=True, tasks=3, levels=[(0, 0, 0)]))
     assert table[2][2] == "100.0 / 100.0"
-    env = flights.Flights(box=True, tasks=3).env
-    assert env.reset()["heading"].tolist() == [[0.0]] * 3
-    assert env.scenario.tasks.start.tolist() == flights.named_tasks("test-1000").start[:3].tolist()
+    scenario = flights.Flights(box=True, tasks=3).scenario
+    assert scenario.start_heading == "north"
+    assert scenario.tasks.start.tolist() == flights.named_tasks("test-1000").start[:3].tolist()
 
 
 def test_several_runs_have_the_range_of_their_spl(tmp_path: Path) -> None:

@@ -1,0 +1,179 @@
+"""Flights: the vehicles of a scenario with the errors of their sensors, and the policies that navigate them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, TypeAlias
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from magrl.agents.exported import TrainedPolicy
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
+from magrl.evaluation.metrics import episode_measures
+from magrl.evaluation.navigators import make_navigator
+from magrl.evaluation.rollout import evaluation_rollout, next_rollout, restart
+from magrl.evaluation.scenarios import with_declaration
+from magrl.navigators import Navigator
+from magrl.sensor_std import PERFECT, SensorStd
+from magrl.transforms import Conditions, conditions_named, with_conditions, with_sensor_noise
+
+Errors: TypeAlias = Conditions | Sequence[float] | str | Path
+
+
+class Flight:
+    """Vehicles in a scenario, the errors of their sensors, and what they know of these.
+
+    Args:
+        scenario: scenario.
+        errors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real vehicle:
+            :class:`~magrl.transforms.Conditions`, a name of :data:`magrl.transforms.CONDITIONS`, or a file of
+            conditions (:func:`magrl.transforms.load_conditions`).
+        known_start: where the vehicles know the elements at their start, the standard deviations of these: they then
+            calibrate their sensors (:class:`magrl.transforms.KnownStart`). With the errors of a real vehicle.
+        confidence: least probability at which navigators declare an arrival, where it must be declared.
+        num_envs: number of vehicles; by default one for each task of the scenario, and one without tasks.
+        seed: random seed of the errors, random start headings and metaheuristics.
+        device: device of the environment.
+        options: further options of :class:`~magrl.envs.GeomagneticNavEnv`, such as ``max_steps`` or ``zeta``.
+
+    Attributes:
+        base: environment without errors.
+        env: environment with errors.
+        sensor_std: accuracy of the sensors as the vehicles know it.
+
+    Raises:
+        ValueError: for unknown conditions, a known start with white noise, or an option out of its range.
+
+    Example:
+        >>> flight = Flight(Scenario(), errors=(0.05, 0.05, 5.0), num_envs=3)
+        >>> flight.fly("secant")["next", "success"].any(1).all()
+        tensor(True)
+    """
+
+    env_class: ClassVar[type[GeomagneticNavEnv]] = GeomagneticNavEnv
+    """Class of the environment without errors."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        errors: Errors = PERFECT.noise,
+        known_start: Sequence[float] | None = None,
+        confidence: float = 0.0,
+        num_envs: int | None = None,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        **options: Any,
+    ) -> None:
+        self.confidence, self.seed = confidence, seed
+        tasks = 1 if scenario.tasks is None else len(scenario.tasks.start)
+        options |= {"num_envs": tasks if num_envs is None else num_envs, "seed": seed, "device": device}
+        errors = conditions_named(str(errors)) if isinstance(errors, str | Path) else errors
+        if isinstance(errors, Conditions):
+            drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
+            self.base = self.env_class(scenario, **drift | options)
+            self.env = with_conditions(self.base, errors, seed, known_start)
+            self.sensor_std = errors.std_at(known_start)
+        else:
+            if known_start is not None:
+                raise ValueError(f"known_start {known_start} needs conditions: white noise has nothing to calibrate")
+            self.base = self.env_class(scenario, **options)
+            self.env = with_sensor_noise(self.base, errors, seed)
+            self.sensor_std = SensorStd.of(errors)
+
+    def navigator(self, policy: TensorDictModuleBase | str, **options: Any) -> TensorDictModuleBase:
+        """Return a policy that flies within the limits of the environment, with the accuracy of its sensors.
+
+        Args:
+            policy: policy or navigator of the plain environment, or the text that names one, as
+                :func:`magrl.evaluation.navigators.make_navigator` takes it.
+            options: of that function.
+
+        Raises:
+            ValueError: for an unknown name, or a policy of another field or of longer moves.
+        """
+        if isinstance(policy, str):
+            return make_navigator(policy, self.base, sensor_std=self.sensor_std, **{"seed": self.seed} | options)
+        return policy.for_env(self.base) if isinstance(policy, TrainedPolicy) else policy
+
+    def environment(self, navigator: TensorDictModuleBase) -> EnvBase:
+        """Return the environment in which a navigator of :meth:`navigator` flies.
+
+        Where an arrival must be declared, navigators and trained agents declare by their own estimate
+        (:func:`magrl.evaluation.scenarios.with_declaration`); another policy writes the third action itself.
+        """
+        own = isinstance(navigator, TrainedPolicy | Navigator)
+        return with_declaration(self.env, self.confidence, navigator) if own else self.env
+
+    def fly(self, policy: TensorDictModuleBase | str) -> TensorDict:
+        """Return a rollout of the first episode of each vehicle, as :func:`evaluation_rollout` does.
+
+        Args:
+            policy: as of :meth:`navigator`.
+
+        Raises:
+            TypeError: for a policy that is not callable.
+            ValueError: as :meth:`navigator`.
+        """
+        navigator = self.navigator(policy)
+        return evaluation_rollout(self.environment(navigator), navigator)
+
+
+def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, **options: Any) -> TensorDict:
+    """Fly each task exactly once, without exploration, and return the measures of the episodes.
+
+    Args:
+        policy: policy or navigator of the plain environment, or the text that names one, as
+            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.safetensors"``. A
+            trained policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
+        tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
+            region.
+        options: of :class:`Flight`, such as ``errors``. With fewer vehicles than tasks (``num_envs``), each flies
+            several. Errors and random start headings depend on their number, the tasks do not.
+
+    Returns:
+        ``(M,)``, one row for each task in its order, with the measures of
+        :func:`magrl.evaluation.episode_measures`. :func:`magrl.evaluation.summarize` takes it, and
+        ``pandas.DataFrame(episodes.to_dict(convert_tensors="numpy"))`` is its data frame.
+
+    Raises:
+        TypeError: for a policy that is not callable, or tasks of another type.
+        ValueError: for a scenario without tasks, a policy of another field or of longer moves, or another value out of
+            its range.
+
+    Example:
+        >>> episodes = evaluate("secant", "paper-100", num_envs=30)
+        >>> episodes.shape, episodes["success"].double().mean()
+        (torch.Size([100]), tensor(1., dtype=torch.float64))
+    """
+    scenario = _with_tasks(tasks)
+    flight = Flight(scenario, **options)
+    navigator = flight.navigator(policy)
+    env, count = flight.environment(navigator), len(scenario.tasks.start)  # type: ignore[union-attr]
+    restart(env)
+    episodes = [_next_episodes(env, navigator) for _ in range(math.ceil(count / env.num_envs))]
+    return torch.cat(episodes)[:count]  # a last batch that is not full has flown the first tasks again
+
+
+def _with_tasks(tasks: Scenario | Tasks | str) -> Scenario:
+    """Return a scenario with tasks; raise if it has none."""
+    tasks = named_tasks(tasks) if isinstance(tasks, str) else tasks
+    scenario = tasks if isinstance(tasks, Scenario) else Scenario().with_tasks(tasks)
+    if scenario.tasks is None:
+        raise ValueError("the scenario has no tasks to fly: scenario.with_tasks(scenario.random_tasks(300, seed=0))")
+    return scenario
+
+
+def _next_episodes(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
+    """Return the measures of the next episode of each vehicle, ``(num_envs,)``, and count exactly this episode."""
+    base = getattr(env, "base_env", env)
+    before = base.episode
+    measures = episode_measures(next_rollout(env, policy), env)
+    base.episode = before
+    env.reset()
+    return TensorDict(measures, [env.num_envs])
