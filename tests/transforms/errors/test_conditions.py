@@ -165,10 +165,10 @@ def test_the_agent_heeds_constant_errors() -> None:
 def test_evaluate_under_conditions(tmp_path: Path) -> None:
     out = tmp_path / "results"
     config = evaluate.Config(("kalman",), tasks=5, conditions="ship", out=out, wandb_mode="disabled")
-    config, (env, _), navigators, _ = evaluate.prepare(config)
-    assert {type(part) for part in env.transform} >= {MotionError, NorthReferenceError}
+    config, (flight, _), navigators, _ = evaluate.prepare(config)
+    assert {type(part) for part in flight.env.transform} >= {MotionError, NorthReferenceError}
     assert tuple(navigators[0][0].sensor_std[1].tolist()) == CONDITIONS["ship"].std.bias
-    assert evaluate.settings(config, env)["conditions"] == "ship"
+    assert evaluate.settings(config, flight.base)["conditions"] == "ship"
 
 
 BOAT = Path(__file__).parent.parent.parent.parent / "docs" / "examples" / "boat.toml"
