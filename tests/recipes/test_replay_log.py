@@ -57,18 +57,18 @@ def test_readings_of_short_moves_are_averaged(tmp_path: Path) -> None:
 
 
 def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(tmp_path: Path, capsys) -> None:
-    header, *rows = LOG.read_text().splitlines()
+    header, *rows = LOG.read_text().splitlines()[:8]
     path = tmp_path / "log.csv"
     path.write_text("\n".join([header, *(row for row in rows for _ in range(2))]))
     recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "a")])
     said = capsys.readouterr().out
-    assert "Warning: 25 rows with the time of the row before left out." in said
+    assert "Warning: 7 rows with the time of the row before left out." in said
     assert "IGRF" not in said
     assert "Error of the estimated way halfway" in said
-    wrong = pd.read_csv(LOG)
+    wrong = pd.read_csv(LOG)[:4]
     wrong.assign(I=-wrong["I"]).to_csv(path, index=False)
     recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "b")])
-    assert "25 of 25 readings do not fit IGRF" in capsys.readouterr().out
+    assert "4 of 4 readings do not fit IGRF" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
