@@ -304,8 +304,8 @@ def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude
             break
     converged = (change < 1e-11) & (lam.abs() <= math.pi)
     dtype = reduce(torch.promote_types, (x.dtype for x in inputs), torch.float32)
-    found = _arc_length(arc), wrap_angle(torch.atan2(arc.east, arc.north))
-    distance, bearing = (torch.where(converged, x, torch.nan).to(dtype) for x in found)
+    values = _arc_length(arc), wrap_angle(torch.atan2(arc.east, arc.north))
+    distance, bearing = (torch.where(converged, value, torch.nan).to(dtype) for value in values)
     return distance, bearing
 
 

@@ -18,7 +18,7 @@ class Arrival(NamedTuple):
             with a move whose third number is above 0, by which the vehicle declares that it has arrived. That is a
             success within ``radius_km`` of the destination, and a false arrival elsewhere.
         zeta: arrival threshold on the objective.
-        radius_km: largest distance from the destination of an arrival, or of a right declaration [km].
+        radius_km: largest distance from the destination of an arrival, or of a correct declaration [km].
 
     Example:
         >>> Arrival("declared", zeta=0.01, radius_km=25.0).declared
@@ -35,7 +35,7 @@ class Arrival(NamedTuple):
         return self.rule == "declared"
 
     def __call__(self, action: Tensor, objective: Tensor, place: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Return whether episodes end with an arrival, and whether an arrival is right there.
+        """Return whether episodes end with an arrival, and whether an arrival counts as a success there.
 
         Args:
             action: ``(N, 2)``, or ``(N, 3)`` by declaration.

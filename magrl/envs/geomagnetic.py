@@ -120,9 +120,9 @@ class GeomagneticNavEnv(EnvBase):
         check_number(0, above=True, optional=True, objective_limit=objective_limit)
         check_choice((None, "rgb_array"), render_mode=render_mode)
         if unknown := sorted(changes.keys() - Scenario.model_fields.keys()):
-            known = f"those of GeomagneticNavEnv and {sorted(Scenario.model_fields)}"
+            options = f"those of GeomagneticNavEnv and {sorted(Scenario.model_fields)}"
             # Python's wording: TorchRL's GymEnv looks for it to find out which arguments it can pass.
-            raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {known}")
+            raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}; the options are {options}")
         check_choice(("cpu", "cuda", "xpu"), device=str(device or "cpu").partition(":")[0])  # those with float64
         super().__init__(device=device or "cpu", batch_size=torch.Size([num_envs]))
         self.num_envs, self.drift_km, self.objective_limit = num_envs, float(drift_km), objective_limit

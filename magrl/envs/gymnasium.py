@@ -84,7 +84,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
     ``DISABLED``, ``reset(options={"reset_mask": ended})``. In both, ``info`` has the measures and their masks.
 
     ``reset(seed=s)`` is the first reset of the TorchRL environment of ``N`` vehicles and seed ``s``: each row has
-    episodes of its own, those of row 0 are the single environment's.
+    its own episodes; those of row 0 are the ones of the single environment.
 
     Args:
         num_envs: vehicles in the batch.

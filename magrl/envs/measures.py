@@ -31,8 +31,8 @@ def check_zeta(zeta: float) -> float:
     """
     check_number(0, above=True, zeta=zeta)
     if zeta >= MAX_OBJECTIVE:
-        known = f"the objective F is at most {MAX_OBJECTIVE} at the start, so every vehicle has arrived"
-        raise ValueError(f"zeta must be below {MAX_OBJECTIVE}, got {zeta!r}: {known}")
+        reason = f"the objective F is at most {MAX_OBJECTIVE} at the start, so every vehicle has arrived"
+        raise ValueError(f"zeta must be below {MAX_OBJECTIVE}, got {zeta!r}: {reason}")
     return zeta
 
 
@@ -124,13 +124,13 @@ def path_measures(success: Tensor, start: Tensor, end: Tensor, target: Tensor, l
 def distance_to_arrival(
     start: Tensor, target: Tensor, weights: Tensor, field: Any, zeta: float, boxes: Regions, region: Tensor
 ) -> Tensor:
-    """Return the distance from each start to the nearest place where a vehicle has arrived.
+    """Return the distance from each start to the nearest place that counts as an arrival.
 
     The places around a destination where F is below ``zeta`` are nearly an ellipse, which the gradients at the
     destination give. On lines from the destination, even in angle on that ellipse, the edge is found by bisection of
     the true F; the lines around the nearest edge are then refined three times. Every edge point is inside, so that the
     result is never too short. Searches on fine grids find places up to 5 m nearer for ``zeta`` up to 0.1, and up to
-    10 km nearer at 0.3, where the places reach over hundreds of kilometers and are no ellipse any more.
+    10 km nearer at 0.3, where the places extend over hundreds of kilometers and no longer form an ellipse.
 
     Args:
         start: ``(N, 2)`` latitude, longitude [deg].

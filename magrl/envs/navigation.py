@@ -55,10 +55,10 @@ def navigation_env(
             networks. ``"track"`` adds ``observation``, ``(N, 19)``, the estimates of the own track
             (:class:`~magrl.transforms.TrackView`), in any number of regions. ``"dict"`` leaves the public keys in
             physical units, and so does a list of keys, which the Gymnasium interface observes.
-        transforms: own transforms: errors of sensors, estimates, rewards. They are cloned, and act after the guidance.
+        transforms: added after the guidance: errors of sensors, estimates, rewards. They are cloned.
         reward: ``"guided"`` adds the alignment term to the paper's base reward, by the true field and heading; over
             several regions by the pair of elements that crosses best. ``"base"`` is that reward alone. ``"spl"`` is
-            :class:`~magrl.transforms.SPLReward`, at a price of a step of 0.5 %.
+            :class:`~magrl.transforms.SPLReward`, in which each step costs 0.5 % of SPL.
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
         alignment_weight: zeta_3 of Eq. 3-6 [1/rad], of the guided reward.
         alignment_offset: heading deviation at which the alignment term turns into a penalty [rad].
@@ -77,9 +77,9 @@ def navigation_env(
         check_choice(OBSERVATIONS, observation=observation)
     check_choice(REWARDS, reward=reward)
     check_type(bool, scale_actions=scale_actions)
-    check_type(Transform, **{f"transforms[{number}]": each for number, each in enumerate(transforms)})
+    check_type(Transform, **{f"transforms[{number}]": transform for number, transform in enumerate(transforms)})
     base = GeomagneticNavEnv(num_envs=num_envs, **options)
-    view, own = _view(base, observation), [each.clone() for each in _parts(transforms)]
+    view, added = _view(base, observation), [transform.clone() for transform in _parts(transforms)]
     steps: list[Transform] = []
     if reward == "guided":  # before errors of the sensors
         alignment = AlignmentReward(weight=alignment_weight, offset=alignment_offset)
@@ -87,13 +87,13 @@ def navigation_env(
         steps += [FieldGradient(base.field), heading, alignment]
     elif reward == "spl":
         steps += [TrueWay(), HighestSPL(), RandomStepPrice((STEP_PRICE, STEP_PRICE)), SPLReward()]
-    steps += own
-    if observation == "track" and not any(isinstance(each, ReadingErrors) for each in own):
+    steps += added
+    if observation == "track" and not any(isinstance(transform, ReadingErrors) for transform in added):
         steps.append(SensorNoise((0.0, 0.0, 0.0)))  # the view reads standard deviations
     if observation in ("flat", "track"):
         steps += view.observation_transforms()
     if scale_actions:
-        declared = base.arrival.declared and not any(isinstance(each, DeclareArrival) for each in own)
+        declared = base.arrival.declared and not any(isinstance(transform, DeclareArrival) for transform in added)
         steps.append(view.action_transform(declared=declared))
     return TransformedEnv(base, Compose(*steps))
 
@@ -106,7 +106,7 @@ def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **optio
         scenario: scenario of any number of regions; by default :data:`PLANET_REGIONS` of random planets, with
             destinations 300 to 500 km away.
         **options: of :func:`navigation_env`, with other defaults: ``observation="track"``, ``reward="spl"``,
-            ``start_heading="random"`` where the scenario does not say, and ``transforms=[RandomSensorNoise()]``.
+            ``start_heading="random"`` unless the scenario states one, and ``transforms=[RandomSensorNoise()]``.
 
     Raises:
         TypeError, ValueError: as :func:`navigation_env`.
@@ -140,5 +140,5 @@ def _view(base: GeomagneticNavEnv, observation: str | Sequence[str]) -> Observat
 
 def _parts(transforms: Iterable[Transform]) -> Iterator[Transform]:
     """Yield transforms, those of a ``Compose`` one by one."""
-    for each in transforms:
-        yield from _parts(each) if isinstance(each, Compose) else (each,)
+    for transform in transforms:
+        yield from _parts(transform) if isinstance(transform, Compose) else (transform,)

@@ -227,7 +227,7 @@ class Regions(Float64Module):
 
 
 def one_region(region: Region | Regions) -> Region:
-    """Return the only region of a scenario, for what is made for one, such as a map.
+    """Return the only region of a scenario, for uses that support one region, such as a map.
 
     Raises:
         TypeError: for anything else than regions.

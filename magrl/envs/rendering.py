@@ -151,7 +151,7 @@ class TrackRecorder:
     """Positions of the running episodes of a batch, kept for rendering.
 
     Args:
-        length: states kept; the longest track that can be returned. With 0, none is.
+        length: states kept; the longest track that can be returned. With 0, no track is returned.
 
     Example:
         >>> from tensordict import TensorDict

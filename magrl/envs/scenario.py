@@ -122,7 +122,7 @@ class Scenario(CheckedModel):
     """Least differences of D [deg], I [deg], B_H [nT] that Eq. 2-6 divides by, or None for the mean change of each over
     :data:`FLOOR_KM` in the region. Where the field is steep, floors that are too low make every detour very costly."""
     field: Annotated[Any, BeforeValidator(_field)] = None
-    """Own field model (:class:`magrl.field.FieldModel`) in place of IGRF; over many regions a
+    """Field model (:class:`magrl.field.FieldModel`) in place of IGRF; over many regions a
     :class:`magrl.field.FieldBank` with an expansion for each, of every place that a vehicle can reach."""
     tasks: Annotated[Tasks | None, BeforeValidator(_tasks)] = None
     """Frozen tasks to fly in place of random ones; by default in region 0."""
@@ -141,7 +141,7 @@ class Scenario(CheckedModel):
     ``"declared"``: the action has a third number, in [-1, 1], and above 0 the vehicle declares that it has arrived with
     this move, which ends the episode."""
     arrival_radius_km: Annotated[float, Field(gt=0)] = 25.0
-    """Distance from the destination of an arrival by distance, or of a right declaration [km]."""
+    """Distance from the destination of an arrival by distance, or of a correct declaration [km]."""
     start_heading: Literal["north", "random"] = "north"
     """Heading at the start of an episode; ``"random"`` is uniform."""
 
@@ -209,7 +209,7 @@ class Scenario(CheckedModel):
         return self.edge.reachable(self.max_move_km + drift_km)
 
     def build_field(self, drift_km: float = 0.0) -> FieldModel:
-        """Return the own field model or bank, or IGRF expanded over every place that a vehicle can reach.
+        """Return the field model or bank that is given, or IGRF expanded over every place that a vehicle can reach.
 
         Args:
             drift_km: as in :meth:`reachable`.

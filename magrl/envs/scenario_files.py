@@ -65,9 +65,9 @@ def load_scenario(path: Path | str, **changes: Any) -> Scenario:
 def _scenario(content: Any, changes: dict[str, Any]) -> Scenario:
     if not isinstance(content, dict):
         raise ValueError(f"a scenario file must hold a table, got {short(content)}")
-    known = [name for name in Scenario.model_fields if name not in ("field", "names")]
-    if unknown := [key for key in content if key not in known]:
-        raise ValueError(f"unknown key {short(unknown[0])}: choose from {', '.join(known)}")
+    keys = [name for name in Scenario.model_fields if name not in ("field", "names")]
+    if unknown := [key for key in content if key not in keys]:
+        raise ValueError(f"unknown key {short(unknown[0])}: choose from {', '.join(keys)}")
     if missing := [name for name in ("region", "date") if name not in content]:
         raise ValueError(f"{missing[0]} is missing: a scenario file must hold region and date")
     values: dict[str, Any] = {"generation": 14, "objective_floors": None} | content

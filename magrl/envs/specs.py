@@ -178,7 +178,7 @@ def checked_action(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def check_state(weights: Tensor) -> None:
-    """Raise unless every vehicle has a state: TorchRL fills what a reset of some vehicles does not know with 0.
+    """Raise unless every vehicle has a state: TorchRL fills the states that a partial reset lacks with 0.
 
     Args:
         weights: ``(N, 3)`` weights of the objective, which are above 0.
@@ -198,5 +198,5 @@ def state_spec(observation: Composite) -> Composite:
         >>> "field" in state_spec(observation_spec(bounds, 50.0, 1.5)).keys()
         False
     """
-    held = [key for key in STATE_KEYS if key in observation.keys()]  # noqa: SIM118 - a Composite is no mapping
-    return Composite({key: observation[key].clone() for key in held}, shape=observation.shape)
+    keys = [key for key in STATE_KEYS if key in observation.keys()]  # noqa: SIM118 - a Composite is no mapping
+    return Composite({key: observation[key].clone() for key in keys}, shape=observation.shape)

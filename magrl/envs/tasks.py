@@ -90,11 +90,11 @@ def check_distance_range(regions: Regions, distance_range_km: tuple[float, float
     if not 0 <= shortest < longest or (distance_law == "log" and shortest == 0):
         start = "above 0 with distance_law 'log'" if distance_law == "log" else "from 0 on"
         raise ValueError(f"distance_range_km {distance_range_km} must be two rising numbers {start}")
-    held, smallest = regions.longest_km.min(0)
-    if (shortest if distance_law == "area" else longest) >= held:
+    limit_km, smallest = regions.longest_km.min(0)
+    if (shortest if distance_law == "area" else longest) >= limit_km:
         raise ValueError(
             f"distance_range_km {distance_range_km}: no two points of {regions[int(smallest)]} are more than "
-            f"{held:.0f} km apart"
+            f"{limit_km:.0f} km apart"
         )
 
 
@@ -186,8 +186,8 @@ def _candidates(regions: Regions, region: Tensor, radii_km: Tensor, uniform: Ten
     """
     south, north = torch.sin(torch.deg2rad(regions.latitude[region])).unsqueeze(1).unbind(-1)
     west, east = regions.longitude[region].unsqueeze(1).unbind(-1)
-    held_km = 1.01 * regions.longest_km[region]  # beyond, no point of the ring lies in the box
-    near, far = torch.cos(radii_km.minimum(held_km.unsqueeze(-1)) / MEAN_RADIUS_KM).unsqueeze(1).unbind(-1)
+    limit_km = 1.01 * regions.longest_km[region]  # beyond, no point of the ring lies in the box
+    near, far = torch.cos(radii_km.minimum(limit_km.unsqueeze(-1)) / MEAN_RADIUS_KM).unsqueeze(1).unbind(-1)
     latitude = torch.rad2deg(torch.asin(south + (north - south) * uniform[..., 0]))
     longitude = wrap_longitude(west + (east - west) * uniform[..., 1])
     distance = MEAN_RADIUS_KM * torch.acos(near + (far - near) * uniform[..., 2])

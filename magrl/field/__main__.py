@@ -98,23 +98,23 @@ def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
     field = IGRF(_column(table, _name(table, "date", options.date), "date", _date), options.generation)
     value, gradient = field.value_and_gradient(*map(torch.from_numpy, place))
     gradient[np.abs(place[0]) == 90, :, 1] = math.nan  # at a pole of the Earth no direction is east
-    found = _columns(value, gradient)
-    if taken := sorted(found.keys() & set(table.columns)):
+    columns = _columns(value, gradient)
+    if taken := sorted(columns.keys() & set(table.columns)):
         raise ValueError(f"the table has columns {', '.join(taken)} already: rename them, or remove them")
-    return table.assign(**found)
+    return table.assign(**columns)
 
 
 def _columns(value: torch.Tensor, gradient: torch.Tensor) -> dict[str, NDArray[np.float64]]:
     """Return the columns of the result, from vectors ``(P, 3)`` and their gradients ``(P, 3, 2)``."""
     elements = seven_elements(value)
     names = {"D": "deg", "I": "deg", "B_H": "nT"}
-    found = {f"{name}_{unit}": getattr(elements, name) for name, unit in names.items()}
-    found |= {"X_nT": elements.B_x, "Y_nT": elements.B_y, "Z_nT": elements.B_z, "F_nT": elements.B_F}
+    columns = {f"{name}_{unit}": getattr(elements, name) for name, unit in names.items()}
+    columns |= {"X_nT": elements.B_x, "Y_nT": elements.B_y, "Z_nT": elements.B_z, "F_nT": elements.B_F}
     slopes = elements_gradient(value, gradient)
     for row, name in enumerate(NAMES):
         for column, way in enumerate(("north", "east")):
-            found[f"d{name}_{way}_{names[name]}_per_km"] = slopes[:, row, column]
-    return {name: values.numpy().round(_DIGITS[name.rpartition("_")[2]]) for name, values in found.items()}
+            columns[f"d{name}_{way}_{names[name]}_per_km"] = slopes[:, row, column]
+    return {name: values.numpy().round(_DIGITS[name.rpartition("_")[2]]) for name, values in columns.items()}
 
 
 def _name(table: DataFrame, name: str, given: str | None) -> str:
@@ -163,7 +163,7 @@ _SIGNS = {"altitude": 1.0, "depth": -1.0}
 
 
 def _column(table: DataFrame, text: str, name: str, read: Callable[[Any], Any]) -> NDArray[Any]:
-    """Return what is read of a column ``(P,)``, or of a text that names no column, for all rows."""
+    """Return the parsed values of a column ``(P,)``; a text that names no column is the value of all rows."""
     if text not in table.columns:
         try:
             return np.full(len(table), read(text))
@@ -172,13 +172,13 @@ def _column(table: DataFrame, text: str, name: str, read: Callable[[Any], Any]) 
                 f"{text!r} is no column of the table and no {name}: choose among {_listed(table)} with --{name}"
             ) from None
     values = table[text].tolist()
-    known: dict[Any, Any] = {}
+    parsed: dict[Any, Any] = {}
     try:
         for value in dict.fromkeys(values):
-            known[value] = read(value)
+            parsed[value] = read(value)
     except ValueError as error:
         raise ValueError(f"row {values.index(value) + 1}, {text}: {error}") from None
-    return np.array([known[value] for value in values])
+    return np.array([parsed[value] for value in values])
 
 
 def _numbers(table: DataFrame, text: str, name: str, low: float, high: float, unit: str) -> NDArray[np.float64]:

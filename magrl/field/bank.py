@@ -112,8 +112,8 @@ class FieldBank(Float64Module):
         polynomials = chebyshev(unit, degree + 1)
         errors = []
         for (k, box), table in zip(boxes, bank.coefficients.cpu().split(_BOXES), strict=True):
-            found = polynomials.T @ table.unflatten(2, (-1, 3)).permute(0, 3, 1, 2) @ polynomials
-            errors.append((found - _synthesis(weights[k], *inside_box(unit, box))).abs().amax((1, 2, 3)))
+            expanded = polynomials.T @ table.unflatten(2, (-1, 3)).permute(0, 3, 1, 2) @ polynomials
+            errors.append((expanded - _synthesis(weights[k], *inside_box(unit, box))).abs().amax((1, 2, 3)))
         bank.error_nt.copy_(torch.cat(errors))
         worst = int(bank.error_nt.nan_to_num(torch.inf).argmax())
         place = f"box {worst}, of planet {planet_index[worst]}"
@@ -179,8 +179,8 @@ class FieldBank(Float64Module):
         scaling = self.scaling.index_select(0, index).movedim(0, -1)
         polynomials = chebyshev(in_half_spans(position, scaling), self.degree + 1)
         slopes = (self.slopes @ polynomials.flatten(1)).reshape(polynomials.shape)
-        both = torch.cat((polynomials[:, 0], slopes[:, 0]), -1)
-        terms = self._sum_latitude(index.repeat(2), both).unflatten(-1, (2, -1))
+        latitude = torch.cat((polynomials[:, 0], slopes[:, 0]), -1)
+        terms = self._sum_latitude(index.repeat(2), latitude).unflatten(-1, (2, -1))
         east = (terms[:, :, 0] * slopes[:, 1:]).sum(0)
         value, north = (terms * polynomials[:, 1:].unsqueeze(1)).sum(0).unbind(1)
         meridian, prime_vertical = curvature_radii(position[0])
@@ -203,7 +203,7 @@ _BOXES = 64
 
 
 def check_index(index: Tensor, count: int, name: str = "index") -> None:
-    """Raise unless indices are int64 in [0, count); an accelerator does not wait for the answer.
+    """Raise unless indices are int64 in [0, count); on an accelerator, without synchronization.
 
     Example:
         >>> check_index(torch.tensor([0, 3]), 2)

@@ -99,7 +99,7 @@ def measured_elements(b_ned: Tensor) -> Tensor:
 
 
 def element_difference(elements: Tensor, others: Tensor) -> Tensor:
-    """Return D, I, B_H minus others, that of D by the shorter way around.
+    """Return D, I, B_H minus others, with the difference of D wrapped to half a turn.
 
     Args:
         elements: ``(..., E)`` with D [deg] first.

@@ -83,8 +83,8 @@ def parse_dates(dates: Sequence[Date] | NDArray[Any]) -> NDArray[np.datetime64]:
     if array.dtype.kind == "M" and not np.isnat(array).any():
         return array.astype("M8[us]")
     rows = list(array.flat) if array.dtype.kind == "M" else array.ravel().tolist()
-    known = {date: parse_date(date) for date in dict.fromkeys(rows)}
-    return np.array([known[date] for date in rows], dtype="M8[us]").reshape(array.shape)
+    parsed = {date: parse_date(date) for date in dict.fromkeys(rows)}
+    return np.array([parsed[date] for date in rows], dtype="M8[us]").reshape(array.shape)
 
 
 @cache
@@ -198,7 +198,7 @@ class IGRF(SphericalHarmonicField):
     def _evaluate(
         self, rows: int, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None
     ) -> Tensor:
-        """Return rows of the field as the parent class; of many dates, the sum over epochs of each times its share."""
+        """Return rows of the field as the parent class; for many dates, the sum over epochs weighted by share."""
         if self.share is None:
             return super()._evaluate(rows, latitude, longitude, altitude_km)
         points = self._points(latitude, longitude, altitude_km)
@@ -210,9 +210,9 @@ class IGRF(SphericalHarmonicField):
                 f"{tuple(self.share.shape[1:])}: give a date for each position"
             ) from None
         points = tuple(x.expand(shape).flatten() for x in points[: 2 if altitude_km is None else 3])
-        found = points[0].new_zeros(rows, points[0].numel())
+        total = points[0].new_zeros(rows, points[0].numel())
         for field, share in zip((self, *self.others), self.share, strict=True):
             share = share.expand(shape).flatten()
             used = share.nonzero().squeeze(-1)
-            found[:, used] += share[used] * SphericalHarmonicField._evaluate(field, rows, *(x[used] for x in points))
-        return found.reshape(rows, *shape)
+            total[:, used] += share[used] * SphericalHarmonicField._evaluate(field, rows, *(x[used] for x in points))
+        return total.reshape(rows, *shape)

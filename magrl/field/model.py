@@ -159,8 +159,8 @@ def device_of(field: object) -> torch.device:
         >>> device_of(IGRF("2022-01-01"))
         device(type='cpu')
     """
-    held = (*field.parameters(), *field.buffers()) if isinstance(field, nn.Module) else ()
-    return next((values.device for values in held), torch.device("cpu"))
+    tensors = (*field.parameters(), *field.buffers()) if isinstance(field, nn.Module) else ()
+    return next((values.device for values in tensors), torch.device("cpu"))
 
 
 def _place(field: Any, position: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:

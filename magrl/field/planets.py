@@ -1,7 +1,7 @@
-"""Random planets: magnetic fields with the spectrum and the polarity of the Earth's, and nothing else of it.
+"""Random planets: magnetic fields that share only the spectrum and the polarity of the Earth's.
 
 An agent that learns on one planet learns its map. One that learns on many planets can only learn what their fields have
-in common, which is also true of a place that it never saw.
+in common, which also holds at a place that it never visited.
 """
 
 from __future__ import annotations
@@ -105,10 +105,10 @@ def random_planets(
 def _earth_variance(degree: int) -> Tensor:
     """Return the mean square coefficient of each degree, ``(degree + 1,)`` [nT²]; zero below degree 2."""
     n = torch.arange(max(degree, KNOWN_DEGREE) + 1, dtype=torch.float64)
-    known = torch.log(power_spectrum(_earth())[2:])
+    log_power = torch.log(power_spectrum(_earth())[2:])
     line = torch.stack((torch.ones_like(n), n), -1)
-    fit = line @ torch.linalg.lstsq(line[2 : KNOWN_DEGREE + 1], known.unsqueeze(-1)).solution
-    power = torch.exp(torch.cat((known, fit[KNOWN_DEGREE + 1 :, 0])))
+    fit = line @ torch.linalg.lstsq(line[2 : KNOWN_DEGREE + 1], log_power.unsqueeze(-1)).solution
+    power = torch.exp(torch.cat((log_power, fit[KNOWN_DEGREE + 1 :, 0])))
     variance = torch.nn.functional.pad(power, (2, 0)) / ((n + 1) * (2 * n + 1))
     return variance[: degree + 1]
 

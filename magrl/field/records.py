@@ -81,25 +81,25 @@ class WeatherRecord:
             tensor([0, 1, 2, 3, 4, 5])
         """
         check_number(0, span_h=span_h)
-        held = torch.isfinite(self.variation).all(-1).cpu()
-        start = torch.arange(self.first, len(held) if self.last is None else self.last + 1)
-        missing = torch.cat((torch.zeros(1, dtype=torch.int64), (~held).long().cumsum(0)))  # before each minute
+        valid = torch.isfinite(self.variation).all(-1).cpu()
+        start = torch.arange(self.first, len(valid) if self.last is None else self.last + 1)
+        missing = torch.cat((torch.zeros(1, dtype=torch.int64), (~valid).long().cumsum(0)))  # before each minute
         end = torch.searchsorted(missing, missing[start], right=True) - 2  # the last minute before the next gap
         minutes = end - start
-        found = start[minutes >= math.ceil(60 * span_h)]
-        if not len(found):
+        starts = start[minutes >= math.ceil(60 * span_h)]
+        if not len(starts):
             longest_h = math.floor(max(0, int(minutes.max())) / 6) / 10
             raise ValueError(
                 f"an episode of up to {span_h:g} h does not fit into the magnetic weather {self.name!r}, where at most "
                 f"{longest_h:g} h follow a start without a gap: take a shorter span_h, a faster vehicle or another "
                 f"record ({', '.join(WEATHER)})"
             )
-        return found
+        return starts
 
     def second_moments(self, span_h: float = 0.0) -> Tensor:
         """Return the mean products of the variation northward, eastward and downward, ``(3, 3)`` [nT^2], without gaps.
 
-        Those of the minutes at which an episode may start, and of the time after them that it takes.
+        Over the minutes at which an episode may start, and the duration of an episode after them.
 
         Args:
             span_h: time that an episode takes [h].
@@ -111,8 +111,8 @@ class WeatherRecord:
         """
         check_number(0, span_h=span_h)
         last = None if self.last is None else self.last + 1 + math.ceil(60 * span_h)
-        held = self.variation[self.first : last].double()
-        return (held.unsqueeze(-1) * held.unsqueeze(-2)).nanmean(0)
+        variation = self.variation[self.first : last].double()
+        return (variation.unsqueeze(-1) * variation.unsqueeze(-2)).nanmean(0)
 
 
 WEATHER = {

@@ -53,8 +53,8 @@ class SphericalHarmonicField(Float64Module):
         self.degree, self.altitude_km = len(gauss) - 1, float(altitude_km)
         value, gradient = harmonics.field_table(gauss), harmonics.gradient_table(gauss)
         padding = (0, gradient.shape[1] - value.shape[1])
-        both = torch.cat((nn.functional.pad(value, padding), gradient[list(_INDEPENDENT)]))
-        for name, table, degree in (("value", value, self.degree + 1), ("gradient", both, self.degree + 2)):
+        all_rows = torch.cat((nn.functional.pad(value, padding), gradient[list(_INDEPENDENT)]))
+        for name, table, degree in (("value", value, self.degree + 1), ("gradient", all_rows, self.degree + 2)):
             # One row at a time: at degree 133 a row of temporary arrays takes 40 MB.
             weights = torch.cat([harmonics.separate(row, degree) for row in table.split(1)])
             self.register_buffer(f"{name}_weights", weights)
@@ -105,8 +105,8 @@ class SphericalHarmonicField(Float64Module):
         """Return the first 3 or all 9 rows of :meth:`_value_and_gradient`: ``(rows, ...)``."""
         points = self._points(latitude, longitude, altitude_km)
         function = partial(self._value if rows == 3 else self._value_and_gradient, altitude_km is None)
-        found = in_chunks(function, [x.reshape(-1) for x in points], rows, self.CHUNK)
-        return found.reshape(rows, *points[0].shape)
+        values = in_chunks(function, [x.reshape(-1) for x in points], rows, self.CHUNK)
+        return values.reshape(rows, *points[0].shape)
 
     def _points(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None) -> tuple[Tensor, ...]:
         """Return latitude, longitude and altitude in float64, broadcast and checked."""

@@ -41,11 +41,11 @@ def parser() -> argparse.ArgumentParser:
     arguments.add_argument(
         "--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a healthy one that was used"
     )
-    arguments.add_argument("--north", choices=NORTHS, help="north of the heading, where the log does not tell")
+    arguments.add_argument("--north", choices=NORTHS, help="north of the heading; default that of the log")
     arguments.add_argument("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
     arguments.add_argument("--every-s", type=float, help="duration of a move [s], in place of a length")
     arguments.add_argument("--calibration", type=Path, help="file of a calibration, which corrects the axes")
-    arguments.add_argument("--calibrate", type=Path, help="calibrate by this log, a swing, and write this file (.json)")
+    arguments.add_argument("--calibrate", type=Path, help="calibration to write (.json), of the swing in this log")
     arguments.add_argument(
         "--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H"
     )
@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Read the command line and the log, and print what was found."""
+    """Read the command line and the log, and print the results."""
     command("python -m magrl.logs", lambda: _main(parser().parse_args(args)), ValueError, ImportError)
 
 
@@ -78,7 +78,7 @@ def summary(log: Log) -> list[str]:
     total = np.sqrt(np.square(samples[list(AXES)]).sum(axis=1))
     return [
         f"{log.source}: {len(samples)} samples in {time[-1] - time[0]:.4g} s, {rate}, date {log.date or 'unknown'}",
-        f"columns: {', '.join(samples)}; north of the heading: {log.north or 'not told'}",
+        f"columns: {', '.join(samples)}; north of the heading: {log.north or 'not stated'}",
         f"total intensity as logged: {total.median():.0f} nT, from {total.min():.0f} to {total.max():.0f}",
         *(f"note: {note}" for note in log.notes),
     ]
@@ -91,17 +91,16 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
         if "latitude" not in log.samples:
             raise ValueError("the log has no position: state the place of the swing by --here, such as --here 60.4 5.3")
         here = log.tensor("latitude", "longitude").median(0).values.tolist()
-    north = options.north or log.north
-    attitude = log.tensor(*ATTITUDE) if north == "true" and "heading" in log.samples else None
-    known = {"date": date if len(here) == 2 else None, "alignment_deg": options.alignment_deg}
-    found = calibrate(log.tensor(*AXES), here, attitude_deg=attitude, **known)
+    attitude = log.tensor(*ATTITUDE) if (options.north or log.north) == "true" and "heading" in log.samples else None
+    settings = {"date": date if len(here) == 2 else None, "alignment_deg": options.alignment_deg}
+    calibration = calibrate(log.tensor(*AXES), here, attitude_deg=attitude, **settings)
     check_writable(options.calibrate)
-    found.save(options.calibrate)
-    offset = "{:.0f}, {:.0f}, {:.0f} nT".format(*found.offset_nt)
+    calibration.save(options.calibrate)
+    offset = "{:.0f}, {:.0f}, {:.0f} nT".format(*calibration.offset_nt)
     return [
-        f"calibration by {found.method}: hard iron {offset}, residuals {found.noise_nt:.0f} nT, "
-        f"{100 * found.outliers:.1f} % outliers",
-        f"it leaves standard deviations: {_elements(found.std)}",
+        f"calibration by {calibration.method}: hard iron {offset}, residuals {calibration.noise_nt:.0f} nT, "
+        f"{100 * calibration.outliers:.1f} % outliers",
+        f"remaining standard deviations: {_elements(calibration.std)}",
         f"calibration: {options.calibrate}",
     ]
 
@@ -109,26 +108,26 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
 def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     """Write the readings of a log, and return them beside IGRF, with the likely mistakes."""
     out = options.out or options.log[0].with_name(f"{options.log[0].stem}_readings.csv")
-    known = Calibration.load(options.calibration) if options.calibration else None
-    table = readings_of(log, every_km=options.every_km, every_s=options.every_s, north=options.north, calibration=known)
+    iron = Calibration.load(options.calibration) if options.calibration else None
+    table = readings_of(log, every_km=options.every_km, every_s=options.every_s, north=options.north, calibration=iron)
     first = table.iloc[0]
-    found = [f"first reading: {_elements(first[list(NAMES)])}; {int(table['spikes'].sum())} spikes left out"]
+    lines = [f"first reading: {_elements(first[list(NAMES)])}; {int(table['spikes'].sum())} spikes left out"]
     if "latitude" in table and date:
         mean = difference_from_igrf(table, date).mean(0)
-        found.append(f"minus IGRF of {date}, mean of {len(table)}: {_elements(mean)}")
-    found += [f"warning: {text}" for text in mistakes(table, date)]
+        lines.append(f"minus IGRF of {date}, mean of {len(table)}: {_elements(mean)}")
+    lines += [f"warning: {text}" for text in mistakes(table, date)]
     if len(table) < 2:
-        return [*found, "one reading: no file is written; choose shorter moves by --every-km or --every-s"]
+        return [*lines, "one reading: no file is written; choose shorter moves by --every-km or --every-s"]
     check_writable(out)
     stamp = pandas.to_datetime(table["time"], unit="s", utc=True).dt.strftime("%Y-%m-%dT%H:%M:%SZ")
     table.round(_DIGITS).assign(**({"time": stamp} if log.date else {})).to_csv(out, index=False)
     std = np.sqrt(np.square(table[list(STD_NAMES)]).mean())
-    noise, bias = (" ".join(f"{each:.3g}" for each in values) for values in (std, known.std if known else np.zeros(3)))
-    missing = "" if known else "; --bias is that of your sensors, which no calibration tells"
+    noise, bias = (" ".join(f"{value:.3g}" for value in values) for values in (std, iron.std if iron else np.zeros(3)))
+    missing = "" if iron else "; without a calibration, give --bias of your sensors"
     if std.isna().any():
-        noise, missing = "D I B_H", f"; --noise is that of your sensors, which so few samples do not tell{missing}"
+        noise, missing = "D I B_H", f"; too few samples for --noise: give that of your sensors{missing}"
     return [
-        *found,
+        *lines,
         f"{len(table)} readings, moves of {table['distance'][1:].mean():.3g} km: {out}",
         f"replay: python recipes/replay_log.py {out} --noise {noise} --bias {bias}{missing}",
     ]

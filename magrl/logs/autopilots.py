@@ -22,8 +22,8 @@ from magrl.logs.units import UNITS, column_of
 from magrl.logs.vectors import FRAMES, attitude_of, from_enu
 
 MODEL_NORTH = (
-    "the heading is of an estimator that adds the declination of a model to a compass: D is that of the model, and is "
-    "not used (state the north as true if the estimator had another heading, such as that of two GNSS antennas)"
+    "the heading is that of a compass plus the declination of a model, so D is that of the model and is not used "
+    "(state the north as true if the heading had another source, such as two GNSS antennas)"
 )
 NOT_CALIBRATED = "the magnetometer is as it was measured, without the calibration of the autopilot"
 _Rows = dict[tuple[str, ...], dict[str, list[tuple[float, ...]]]]
@@ -45,11 +45,11 @@ def _recording(
     used: Collection[str] = (),
     convert: Callable[[torch.Tensor], torch.Tensor] = lambda attitude: attitude,
 ) -> Recording:
-    """Return the columns of one sensor of each kind, the first one, and of the magnetometer that is chosen.
+    """Return the columns of the first sensor of each kind, and of the chosen magnetometer.
 
     Args:
         kind: name of the format.
-        tables: rows of a time and values by the names of the columns, and by that of the sensor.
+        tables: rows of a time and values, by the names of the columns and the name of the sensor.
         sensor: name of a magnetometer.
         used: names of those that the estimator used.
         convert: conversion of an attitude to FRD and NED.
@@ -65,12 +65,12 @@ def _recording(
         time, values = sensors[name][:, 0], sensors[name][:, 1:]
         if columns == _QUATERNION:
             columns, values = ATTITUDE, convert(attitude_of(torch.from_numpy(values.copy()))).numpy()
-        streams |= {column: (time, each) for column, each in zip(columns, values.T, strict=True)}
+        streams |= {column: (time, series) for column, series in zip(columns, values.T, strict=True)}
     return Recording(streams, f"{kind}: {', '.join(names)}", None, notes)
 
 
 def _magnetometer(fields: Mapping[str, Array], sensor: str | None, used: Collection[str]) -> tuple[str, list[str]]:
-    """Return the name of a magnetometer, that stated or a healthy one, if possible a used one, and notes."""
+    """Return the name of the stated magnetometer, or of a healthy one, preferably a used one, and notes."""
     if sensor is not None:
         check_choice(fields, sensor=sensor)
     dead = [name for name, rows in fields.items() if not (np.isfinite(rows).all() and np.ptp(rows[:, 1:], 0).any())]
@@ -195,14 +195,14 @@ def read_bag(path: Path, sensor: str | None = None) -> Recording:
     """Read a bag of ROS 1 (.bag) or 2 (its folder, or a file in it) with rosbags: a topic of each type that is needed.
 
     Times are those of the headers. The axes and the attitude of ROS, forward, left, up and east, north, up (REP 103),
-    become FRD and NED. The north of the heading is that of the Imu, which the bag does not tell.
+    become FRD and NED. The bag does not state the north of the heading, which is that of the Imu.
     """
     package = _package("rosbags.highlevel", "rosbags")
     store = _package("rosbags.typesys", "rosbags")
     rows: _Rows = defaultdict(lambda: defaultdict(list))
     whole = path if path.is_dir() or path.suffix == ".bag" else path.parent
     with package.AnyReader([whole], default_typestore=store.get_typestore(store.Stores.LATEST)) as bag:
-        for connection, recorded, raw in bag.messages([each for each in bag.connections if each.msgtype in _ROS]):
+        for connection, recorded, raw in bag.messages([topic for topic in bag.connections if topic.msgtype in _ROS]):
             columns, values_of = _ROS[connection.msgtype]
             message = bag.deserialize(raw, connection.msgtype)
             stamp = message.header.stamp
@@ -218,7 +218,7 @@ def _ros_field(message: Any) -> Sequence[float]:
 
 
 def _ros_attitude(message: Any) -> Sequence[float]:
-    """Return a quaternion; none if the covariance says that there is none, or it has no length."""
+    """Return a quaternion; empty if the covariance marks it as missing, or its length is zero."""
     values = [getattr(message.orientation, name) for name in _QUATERNION]
     return values if message.orientation_covariance[0] != -1 and sum(value**2 for value in values) > 0 else ()
 
@@ -229,7 +229,7 @@ _ROS: Mapping[str, tuple[tuple[str, ...], Callable[[Any], Sequence[float]]]] = {
     "sensor_msgs/msg/NavSatFix": (_PLACE, lambda m: (m.latitude, m.longitude) if m.status.status >= 0 else ()),
     "nav_msgs/msg/Odometry": (("speed",), lambda m: (m.twist.twist.linear.x,)),
 }
-"""Columns of each type, and what gives their values, none where a message tells nothing."""
+"""Columns of each type, and the function that returns their values, empty for a message without any."""
 
 
 # NMEA 0183
@@ -275,8 +275,8 @@ def read_nmea(path: Path) -> Recording:
         )
     north = "true" if "heading_true" in rows else "magnetic"
     for name, choices in _CHOICES.items():
-        held = [pairs for choice in choices if (pairs := rows.pop(choice, None))]
-        rows |= {name: held[0]} if held else {}
+        candidates = [pairs for choice in choices if (pairs := rows.pop(choice, None))]
+        rows |= {name: candidates[0]} if candidates else {}
     return Recording({name: tuple(np.array(pairs, float).T) for name, pairs in rows.items()}, "NMEA 0183", north)
 
 
@@ -298,9 +298,9 @@ def _nmea_values(message: Any) -> Iterator[tuple[str, float]]:
             yield name, unit * value + _deviation(message)
     for number in range(1, 10) if message.msgID == "XDR" else ():
         name, value = (getattr(message, f"{field}_{number:02}", "") for field in ("tdrid", "data"))
-        found = column_of({"PTCH": "PITCH"}.get(name, name))
-        if found and isinstance(value, (int, float)):
-            yield found[0], found[1] * value
+        column = column_of({"PTCH": "PITCH"}.get(name, name))
+        if column and isinstance(value, (int, float)):
+            yield column[0], column[1] * value
 
 
 def _deviation(message: Any) -> float:

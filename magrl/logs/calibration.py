@@ -1,4 +1,4 @@
-"""Calibration of a vector magnetometer in its vehicle: hard iron, soft iron and misalignment, and what they leave."""
+"""Calibration of a vector magnetometer in its vehicle: hard iron, soft iron, misalignment, and remaining errors."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ OUTLIER_SIGMAS = 5.0
 _BLOCKS = 100  # of consecutive samples, whose errors are not independent
 _ROUNDS, _SETTLED, _MOVING = 20, 1e-7, 1e-3  # of the fit: a swing converges in 4 to 8; changes of mix and offset
 _SWING = (
-    "swing the vehicle: slowly through all headings, with roll and pitch to both sides as far as it goes (a vehicle in "
-    "the hand: every side up once)"
+    "swing the vehicle: slowly through all headings, with as much roll and pitch to both sides as possible (turn a "
+    "vehicle in the hand once onto every side)"
 )
 _AXES = ("forward", "right", "down")
 _SIGNS = list(product((1.0, -1.0), repeat=3))
@@ -117,11 +117,11 @@ def calibrate(
 ) -> Calibration:
     """Fit a calibration to the samples of a swing at one place.
 
-    With the attitude of each sample, the known vector, through iron, is fitted to the samples. Without it, an ellipsoid
-    is, which does not show a misalignment of the axes: it stays as ``alignment_deg``. The fit is least squares without
-    outliers. :data:`GAIN_STD`, :data:`SOFT_IRON_STD`, :data:`HARD_IRON_STD` and ``alignment_deg`` are the prior: what
-    the swing does not show stays as uncertain as it was. The standard deviations allow for errors that last a hundredth
-    of the swing, hold for a field such as that of the swing, and include those of the known elements.
+    With the attitude of each sample, the samples are fitted by the known vector, distorted by iron. Without it, they
+    are fitted by an ellipsoid, which does not show a misalignment of the axes. The fit is least squares without
+    outliers. Its prior is :data:`GAIN_STD`, :data:`SOFT_IRON_STD`, :data:`HARD_IRON_STD` and ``alignment_deg``, which
+    remain where the swing shows nothing. The standard deviations allow for errors that last a hundredth of the swing,
+    hold for a field such as that of the swing, and include those of the known elements.
 
     Args:
         axes_nt: ``(N, 3)`` forward, right, down [nT].
@@ -135,7 +135,7 @@ def calibrate(
 
     Raises:
         ValueError: for samples that are too few, in another unit, along other axes, with too many outliers, or from too
-            few directions, each with what to do.
+            few directions, each with the remedy.
 
     Source:
         V. Renaudin, M. H. Afzal and G. Lachapelle, Complete triaxis magnetometer calibration in the magnetic domain,
@@ -151,18 +151,18 @@ def calibrate(
     elements, elements_std = known_elements(here, here_std, date)
     check_number(0, above=True, alignment_deg=alignment_deg, tilt_deg=tilt_deg)
     axes, reference = axes_nt.double(), field_vector(torch.tensor(elements, dtype=torch.float64))
-    scale, known = float(reference.norm()), torch.tensor(elements_std, dtype=torch.float64)
+    scale, std = float(reference.norm()), torch.tensor(elements_std, dtype=torch.float64)
     _check_samples(axes, scale)
     shares = axes / scale
-    level = _known(shares, reference / scale, attitude_deg)
-    mix, offset, covariance, noise, kept = _fit(shares, level, math.radians(alignment_deg), 1 / scale)
-    matrix, outliers = torch.linalg.inv(mix), 1 - float(kept.double().mean())
+    level = _expected_field(shares, reference / scale, attitude_deg)
+    mix, offset, covariance, noise, inliers = _fit(shares, level, math.radians(alignment_deg), 1 / scale)
+    matrix, outliers = torch.linalg.inv(mix), 1 - float(inliers.double().mean())
     _check_fit(scale * noise, outliers, scale)
-    corrected = ((shares - offset) @ matrix.mT)[kept]
+    corrected = ((shares - offset) @ matrix.mT)[inliers]
     seen = torch.stack((corrected.amin(0), corrected.amax(0)), -1)
     if attitude_deg is None:  # the known intensity is a scale: of B_H alone
-        known = torch.stack((*torch.zeros(2), torch.hypot(known[2], torch.deg2rad(known[1]) * reference[2])))
-    std = torch.hypot(_left(mix, covariance, reference, tilt_deg), known)
+        std = torch.stack((*torch.zeros(2), torch.hypot(std[2], torch.deg2rad(std[1]) * reference[2])))
+    std = torch.hypot(_remaining_std(mix, covariance, reference, tilt_deg), std)
     _check_std(std, seen)
     rows = {"matrix": matrix, "offset_nt": scale * offset, "std": std, "seen": seen}
     return Calibration(
@@ -176,11 +176,11 @@ def calibrate(
     )
 
 
-def _known(shares: Tensor, reference: Tensor, attitude_deg: Tensor | None) -> Tensor | None:
+def _expected_field(shares: Tensor, reference: Tensor, attitude_deg: Tensor | None) -> Tensor | None:
     """Return the known field along the vehicle's axes ``(N, 3)``, or None without attitude.
 
-    Along directions in which it changes by less than the attitude's noise, it is its mean: least squares would take
-    that noise for a change, which the samples do not follow.
+    Along directions in which it changes by less than the noise of the attitude, return its mean: least squares would
+    fit that noise as a change of the field.
     """
     if attitude_deg is None:
         _check_directions(shares)
@@ -206,7 +206,7 @@ def _misfit(axes: Tensor, level: Tensor | None, mix: Tensor, offset: Tensor) -> 
     """Return residuals ``(N, R)`` of the samples as they were measured, and their derivatives ``(N, R, 12)``.
 
     Without known vectors, they are the distances from the ellipsoid ``mix @ field + offset`` of all fields of length 1,
-    to first order. Residuals after the inverse of ``mix`` would be smaller, the more it shrinks the samples.
+    to first order. Residuals of corrected samples would favor a correction that shrinks the samples.
     """
     moved, inverse = axes - offset, torch.linalg.inv(mix)
     field = normalize(moved @ inverse.mT, dim=-1) if level is None else level
@@ -223,15 +223,15 @@ def _start(axes: Tensor, level: Tensor | None) -> Tensor:
     if level is not None:
         return torch.cat((eye, (axes - level).median(0).values))
     design = torch.cat((2 * axes, torch.ones_like(axes[:, :1])), -1)
-    *center, rest = torch.linalg.lstsq(design, axes.square().sum(-1, keepdim=True)).solution.flatten()
+    *center, constant = torch.linalg.lstsq(design, axes.square().sum(-1, keepdim=True)).solution.flatten()
     offset = torch.stack(center)
-    return torch.cat((eye * (rest + offset.square().sum()).sqrt(), offset))
+    return torch.cat((eye * (constant + offset.square().sum()).sqrt(), offset))
 
 
 def _fit(
     axes: Tensor, level: Tensor | None, alignment: float, least: float
 ) -> tuple[Tensor, Tensor, Tensor, float, Tensor]:
-    """Return mix, offset, their covariance ``(12, 12)``, the root mean square of residuals, and which were kept.
+    """Return mix, offset, their covariance ``(12, 12)``, the root mean square of residuals, and the inliers.
 
     Gauss-Newton without outliers. The covariance allows for errors that are not independent within blocks of samples.
     All are shares of the field; ``least`` is a residual that is no outlier.
@@ -241,21 +241,21 @@ def _fit(
     for _ in range(_ROUNDS):
         error, slope = _misfit(axes, level, values[:9].unflatten(0, (3, 3)), values[9:])
         size = error.norm(dim=-1)
-        kept = size <= max(OUTLIER_SIGMAS * 1.4826 * float(size.median()), least)
-        variance = error[kept].square().mean().clamp_min((1e-3 * least) ** 2)
-        design = slope[kept]
+        inliers = size <= max(OUTLIER_SIGMAS * 1.4826 * float(size.median()), least)
+        variance = error[inliers].square().mean().clamp_min((1e-3 * least) ** 2)
+        design = slope[inliers]
         normal = torch.einsum("nij,nik->jk", design, design) + variance * prior
-        scores = (design * error[kept].unsqueeze(-1)).sum(1)
+        scores = (design * error[inliers].unsqueeze(-1)).sum(1)
         change = torch.linalg.solve(normal, scores.sum(0) - variance * prior @ (values - expected))
         values = values + change
         if change.abs().max() < _SETTLED:
             break
     if change.abs().max() > _MOVING:
-        raise ValueError(f"too few directions, with which the fit does not settle in {_ROUNDS} rounds: {_SWING}")
+        raise ValueError(f"too few directions for the fit to converge in {_ROUNDS} rounds: {_SWING}")
     blocks = torch.stack([block.sum(0) for block in scores.tensor_split(_BLOCKS)])
     inverse = torch.linalg.inv(normal)
     covariance = inverse @ (blocks.T @ blocks + variance.square() * prior) @ inverse
-    return values[:9].unflatten(0, (3, 3)), values[9:], covariance, float(variance.sqrt()), kept
+    return values[:9].unflatten(0, (3, 3)), values[9:], covariance, float(variance.sqrt()), inliers
 
 
 def _prior(alignment: float) -> Tensor:
@@ -269,8 +269,8 @@ def _prior(alignment: float) -> Tensor:
     return precision
 
 
-def _left(mix: Tensor, covariance: Tensor, reference: Tensor, tilt_deg: float) -> Tensor:
-    """Return the standard deviations of D, I, B_H ``(3,)`` that a covariance leaves, over headings, roll and pitch."""
+def _remaining_std(mix: Tensor, covariance: Tensor, reference: Tensor, tilt_deg: float) -> Tensor:
+    """Return the remaining standard deviations of D, I, B_H ``(3,)``, averaged over headings, roll and pitch."""
     tilts = (0.0, 0.0), (tilt_deg, 0.0), (-tilt_deg, 0.0), (0.0, tilt_deg), (0.0, -tilt_deg)
     attitude = torch.tensor([(*tilt, 30.0 * turn) for tilt in tilts for turn in range(12)], dtype=torch.float64)
     turn, scale = rotation(attitude), reference.norm()
@@ -295,7 +295,7 @@ def _check_samples(axes: Tensor, total: float) -> None:
     unit = guess_unit(length, total)
     if unit or not 0.25 < length / total < 4:
         raise ValueError(
-            f"the samples have a length of {length:g}, and {total:.0f} nT are known: "
+            f"the samples have a length of {length:g}, where {total:.0f} nT are expected: "
             + (f"they look like {unit}" if unit else "scale raw counts to nanotesla")
         )
     if change < 1e-6 * length:
@@ -304,19 +304,19 @@ def _check_samples(axes: Tensor, total: float) -> None:
 
 def _check_axes(axes: Tensor, level: Tensor) -> None:
     """Raise if other axes, or other signs, explain the samples much better than those stated."""
-    alike = (axes - axes.mean(0)).T @ (level - level.mean(0))
-    both = (axes - axes.mean(0)).square().sum() + (level - level.mean(0)).square().sum()
+    products = (axes - axes.mean(0)).T @ (level - level.mean(0))
+    squares = (axes - axes.mean(0)).square().sum() + (level - level.mean(0)).square().sum()
     choices = [
         torch.eye(3).double()[list(order)] * torch.tensor(signs) for order in permutations(range(3)) for signs in _SIGNS
     ]
-    misfits = torch.stack([both - 2 * (alike * choice).sum() for choice in choices])
-    found = choices[int(misfits.argmin())]
-    if misfits.min() > 0.25 * (both - 2 * alike.trace()):
+    misfits = torch.stack([squares - 2 * (products * choice).sum() for choice in choices])
+    best = choices[int(misfits.argmin())]
+    if misfits.min() > 0.25 * (squares - 2 * products.trace()):
         return
-    names = [("minus " if row.sum() < 0 else "") + _AXES[int(row.abs().argmax())] for row in found]
+    names = [("minus " if row.sum() < 0 else "") + _AXES[int(row.abs().argmax())] for row in best]
     raise ValueError(
         f"the axes of the samples fit {', '.join(names)}, and {', '.join(_AXES)} are expected"
-        + (": a left-handed frame; change the sign of one axis" if torch.det(found) < 0 else "")
+        + (": a left-handed frame; change the sign of one axis" if torch.det(best) < 0 else "")
         + ", or the heading is not from true north"
     )
 

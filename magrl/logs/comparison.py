@@ -37,7 +37,7 @@ def difference_from_igrf(readings: DataFrame, date: str) -> Tensor:
         >>> difference_from_igrf(pandas.DataFrame(row), "2026-06-30").round(decimals=1)
         tensor([[-0.0000, 0.0000, 0.1000]], dtype=torch.float64)
     """
-    return element_difference(_columns(readings, *NAMES), _known(_places(readings), date))
+    return element_difference(_columns(readings, *NAMES), _igrf_elements(_places(readings), date))
 
 
 def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
@@ -59,19 +59,19 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     if "latitude" not in readings or "longitude" not in readings:
         return []
     place = _places(readings)
-    found = []
+    texts = []
     nowhere = (place[:, :2] == 0).all(-1)
     if nowhere.any():
-        found.append(f"{_rows(nowhere.nonzero())} at latitude 0, longitude 0: no position was known there")
-    held = readings[~nowhere.numpy()]
-    if not len(held):
-        return found
-    elements, place = _columns(held, *NAMES), place[~nowhere]
+        texts.append(f"{_rows(nowhere.nonzero())} at latitude 0, longitude 0: no position was known there")
+    rows = readings[~nowhere.numpy()]
+    if not len(rows):
+        return texts
+    elements, place = _columns(rows, *NAMES), place[~nowhere]
     if place[:, 0].abs().max() > 90:
         worst = float(place[:, 0].abs().max())
-        return [*found, f"latitude {worst:g} is outside -90 to 90: latitude and longitude are swapped"]
-    known = elements if date is None else _known(place, date)
-    return found + _field_mistakes(elements, known, place, date) + _move_mistakes(held, place[:, :2], known[:, 0])
+        return [*texts, f"latitude {worst:g} is outside -90 to 90: latitude and longitude are swapped"]
+    expected = elements if date is None else _igrf_elements(place, date)
+    return texts + _field_mistakes(elements, expected, place, date) + _move_mistakes(rows, place[:, :2], expected[:, 0])
 
 
 def _columns(readings: DataFrame, *names: str) -> Tensor:
@@ -90,20 +90,20 @@ def _rows(rows: Tensor) -> str:
     return f"row{'s' * (len(numbers) > 1)} {', '.join(numbers[:_SHOWN])}{more}"
 
 
-def _known(place: Tensor, date: str) -> Tensor:
+def _igrf_elements(place: Tensor, date: str) -> Tensor:
     return measured_elements(IGRF(date)(*place.unbind(-1)))
 
 
 # Readings
 
 
-def _field_mistakes(elements: Tensor, known: Tensor, place: Tensor, date: str | None) -> list[str]:
-    """Return which readings do not fit what is known at their positions, and why."""
-    misfits = _misfits(elements, known)
-    wrong = [row for row, each in enumerate(misfits) if each is not None]
+def _field_mistakes(elements: Tensor, expected: Tensor, place: Tensor, date: str | None) -> list[str]:
+    """Return which readings do not fit IGRF at their positions, and why."""
+    misfits = _misfits(elements, expected)
+    wrong = [row for row, deviation in enumerate(misfits) if deviation is not None]
     if date is None or not wrong:
         return []
-    texts = [each for each in misfits if each is not None]
+    texts = [deviation for deviation in misfits if deviation is not None]
     start = f"{len(wrong)} of {len(misfits)} readings do not fit IGRF, {_rows(torch.tensor(wrong))} ({texts[0][0]})"
     if len(wrong) <= MOST_SPIKES * len(misfits):
         return [f"{start}: spikes, or iron near the vehicle there"]
@@ -111,19 +111,19 @@ def _field_mistakes(elements: Tensor, known: Tensor, place: Tensor, date: str | 
     return [f"{start}: {cause if cause and 2 * count > len(wrong) else _other_cause(elements, place, date)}"]
 
 
-def _misfits(elements: Tensor, known: Tensor) -> list[tuple[str, str | None] | None]:
-    found = []
-    for reading, there in zip(elements.tolist(), known.tolist(), strict=True):
+def _misfits(elements: Tensor, expected: Tensor) -> list[tuple[str, str | None] | None]:
+    deviations = []
+    for reading, there in zip(elements.tolist(), expected.tolist(), strict=True):
         std = math.hypot(MODEL_STD[0], MODEL_D_NT / there[2]), *MODEL_STD[1:]
-        one = misfit(tuple(reading), tuple(there), std)
-        if one and one[1] is None:
+        deviation = misfit(tuple(reading), tuple(there), std)
+        if deviation and deviation[1] is None:
             try:
                 check_earth_reading(*reading)
             except ValueError as error:
                 likely = str(error).rpartition(": ")[2]
-                one = one[0], likely if "looks like" in likely else None
-        found.append(one)
-    return found
+                deviation = deviation[0], likely if "looks like" in likely else None
+        deviations.append(deviation)
+    return deviations
 
 
 def _other_cause(elements: Tensor, place: Tensor, date: str) -> str:
@@ -134,11 +134,11 @@ def _other_cause(elements: Tensor, place: Tensor, date: str) -> str:
         "longitudes are positive toward the west, and east is expected": (latitude, -longitude),
         "latitudes are positive toward the south, and north is expected": (-latitude, longitude),
     }
-    for cause, other in places.items():
-        there = torch.stack((*other, altitude), -1)
+    for cause, coordinates in places.items():
+        there = torch.stack((*coordinates, altitude), -1)
         if there[:, 0].abs().max() > 90:
             continue
-        if sum(each is None for each in _misfits(elements, _known(there, date))) > len(place) / 2:
+        if sum(deviation is None for deviation in _misfits(elements, _igrf_elements(there, date))) > len(place) / 2:
             return f"they fit if {cause}"
     return "no calibration, iron near the sensor, or a heading that is wrong"
 
@@ -153,18 +153,18 @@ def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> l
     going = (distance > 0) & (moved > 0)
     if not going.any():
         return []
-    found, ratio = [], float((distance[going] / moved[going]).median())
+    texts, ratio = [], float((distance[going] / moved[going]).median())
     if abs(ratio - 1) > MOST_DRIFT:
         unit = next((name for name, size in LENGTHS_KM.items() if abs(ratio / size - 1) < 0.1), None)
         likely = f"they look like {unit}" if unit else "check the log and its unit"
-        found.append(f"the positions are {ratio:.3g} times as far apart as the distances of the moves: {likely}")
+        texts.append(f"the positions are {ratio:.3g} times as far apart as the distances of the moves: {likely}")
     turn = (bearing - torch.deg2rad(heading))[going]
     drift, east = math.degrees(torch.atan2(turn.sin().mean(), turn.cos().mean()).item()), declination.median().item()
     text = f"the course between positions is {drift:.0f} deg to the right of the heading"
     if abs(abs(drift) - 180) < LEAST_TURN_DEG:
-        found.append(f"{text}: the heading is reciprocal, or the vehicle goes astern")
+        texts.append(f"{text}: the heading is reciprocal, or the vehicle goes astern")
     elif abs(east) > 3 and abs(drift - east) < 0.3 * abs(east):
-        found.append(f"{text}, as D is {east:.0f} deg: the heading is from magnetic north, and true north is expected")
+        texts.append(f"{text}, as D is {east:.0f} deg: the heading is from magnetic north, and true north is expected")
     elif abs(drift) > LEAST_TURN_DEG:
-        found.append(f"{text}: check the compass and its axes")
-    return found
+        texts.append(f"{text}: check the compass and its axes")
+    return texts

@@ -30,7 +30,7 @@ def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) 
         sensor: magnetometer of those that a log of PX4, ArduPilot or ROS has; by default a healthy one that was used.
 
     Raises:
-        ValueError: naming the file and what is wrong with it, or a content that is not known.
+        ValueError: naming the file and what is wrong with it, or its unknown format.
         ImportError: for a package that is not installed, naming the extra.
 
     Example:
@@ -41,23 +41,24 @@ def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) 
         [[0.0, 15000.0, 0.0, 48000.0, 350.0]]
     """
     check_choice(FRAMES, frame=frame)
-    found = []
+    recordings = []
     for path in map(Path, paths):
         reader = _reader(path)
         options = {} if reader is read_nmea else {"frame": frame} if reader is read_csv else {"sensor": sensor}
         try:
-            found.append(reader(path, **options))
+            recordings.append(reader(path, **options))
         except ImportError:
             raise
         except Exception as error:  # whatever the packages raise for a foreign or damaged file
             raise ValueError(f"cannot read {path}: {error}") from error
-    samples, notes = samples_of({name: stream for each in found for name, stream in each.streams.items()})
+    samples, notes = samples_of({name: pair for recording in recordings for name, pair in recording.streams.items()})
     length = float(np.sqrt(np.square(samples[list(AXES)]).sum(axis=1)).median())
     if unit := guess_unit(length, EARTH_NT):
         notes.append(f"the total intensity is {length:g}, which looks like {unit}: name the columns mag_x_{unit}, ...")
-    norths = [each.north for each in found if "heading" in each.streams]
-    more = [note for each in found for note in each.notes]
-    return Log(samples, "; ".join(each.source for each in found), norths[-1] if norths else None, (*more, *notes))
+    norths = [recording.north for recording in recordings if "heading" in recording.streams]
+    more = [note for recording in recordings for note in recording.notes]
+    source = "; ".join(recording.source for recording in recordings)
+    return Log(samples, source, norths[-1] if norths else None, (*more, *notes))
 
 
 def _reader(path: Path) -> Callable[..., Recording]:
@@ -91,25 +92,25 @@ def read_csv(path: Path, frame: str = "FRD") -> Recording:
         raise ValueError("the table has no row")
     cut = lines[-1].count(comma) < lines[0].count(comma)
     raw = raw[:-1] if cut else raw
-    found: dict[str, tuple[str, float]] = {}
+    headers: dict[str, tuple[str, float]] = {}
     for header in raw:
-        if named := column_of(header):
-            if named[0] in found:
-                raise ValueError(f"{found[named[0]][0]!r} and {header!r} are both the {named[0]}: keep one of them")
-            found[named[0]] = header, named[1]
-    if "time" not in found:
+        if column := column_of(header):
+            if column[0] in headers:
+                raise ValueError(f"{headers[column[0]][0]!r} and {header!r} are both the {column[0]}: keep one of them")
+            headers[column[0]] = header, column[1]
+    if "time" not in headers:
         raise ValueError(f"no column is the time, among {', '.join(raw)}: name it time, or time_ms")
-    time, notes = times_of(raw[found["time"][0]], found["time"][1])
-    values = {name: factor * _numbers(raw[header]) for name, (header, factor) in found.items() if name != "time"}
-    held = {name: np.isfinite(time) & np.isfinite(each) for name, each in values.items()}
+    time, notes = times_of(raw[headers["time"][0]], headers["time"][1])
+    values = {name: factor * _numbers(raw[header]) for name, (header, factor) in headers.items() if name != "time"}
+    valid = {name: np.isfinite(time) & np.isfinite(series) for name, series in values.items()}
     notes += ["the last row is not complete, and is left out: the log may be truncated"] if cut else []
-    axes = [held[name] for name in AXES if name in held]
+    axes = [valid[name] for name in AXES if name in valid]
     for name, sign in zip(AXES, FRAMES[frame], strict=True):
-        if name in held:
-            values[name], held[name] = sign * values[name], np.all(axes, axis=0)
-    heading = found.get("heading", ("", 1))[0].lower()
+        if name in valid:
+            values[name], valid[name] = sign * values[name], np.all(axes, axis=0)
+    heading = headers.get("heading", ("", 1))[0].lower()
     north = "true" if "true" in heading else "magnetic" if "mag" in heading else None
-    streams = {name: (time[held[name]], each[held[name]]) for name, each in values.items()}
+    streams = {name: (time[valid[name]], series[valid[name]]) for name, series in values.items()}
     return Recording(streams, f"CSV, {len(raw)} rows", north, notes)
 
 

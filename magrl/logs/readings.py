@@ -30,17 +30,17 @@ def readings_of(
     north: str | None = None,
     calibration: Calibration | None = None,
 ) -> DataFrame:
-    """Return one reading for each move: the mean of all samples of a part of the way, at the mean of their places.
+    """Return one reading for each move: the mean of the samples of that part of the track, at their mean position.
 
-    The parts are as long as the moves, so that every sample counts once. The mean is that of the vector, without
-    spikes. Places are by dead reckoning along the heading, from the distances or the speeds of the log; where it has
-    neither, from its positions.
+    The parts are as long as the moves, so that every sample counts once. The vector is averaged, without spikes.
+    Positions are by dead reckoning along the heading, from the distances or the speeds of the log, or from its
+    positions where it has neither.
 
     Args:
         log: samples with a heading.
         every_km: least length of a move.
         every_s: duration of a move [s], in place of a length.
-        north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`; needed where the log does not tell.
+        north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`; default that of the log.
         calibration: correction of the axes.
 
     Returns:
@@ -62,7 +62,7 @@ def readings_of(
     """
     north = north or log.north
     if north is None:
-        raise ValueError(f"the log does not tell which north the heading has: state north, one of {', '.join(NORTHS)}")
+        raise ValueError(f"the log does not state the north of the heading: give north, one of {', '.join(NORTHS)}")
     check_choice(NORTHS, north=north)
     check_number(0, above=True, every_km=every_km)
     check_number(0, above=True, optional=True, every_s=every_s)
@@ -74,21 +74,21 @@ def readings_of(
     for name in _MEANS:
         if name in log.samples:
             samples[name] = np.unwrap(log.samples[name], period=360)
-    kept = ~_spikes(field, part)
-    groups = samples[kept].groupby(part[kept])
-    table = _readings(groups.mean(), _covariance(field[kept], part[kept]), north)
-    return table.assign(samples=groups.size(), spikes=np.bincount(part[~kept], minlength=len(table)))
+    clean = ~_spikes(field, part)
+    groups = samples[clean].groupby(part[clean])
+    table = _readings(groups.mean(), _covariance(field[clean], part[clean]), north)
+    return table.assign(samples=groups.size(), spikes=np.bincount(part[~clean], minlength=len(table)))
 
 
 def joined(table: DataFrame, every_km: float) -> DataFrame:
-    """Return the means of the rows of each move, of a table that holds D, I, B_H already; see :func:`readings_of`.
+    """Return the means of the rows of each move in a table that already holds D, I, B_H; see :func:`readings_of`.
 
     Args:
         table: columns ``row``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` since the row before, and others.
         every_km: least length of a move; 0 for the rows as they are.
 
     Returns:
-        The same columns; those others are of the row in the middle of each move.
+        The same columns; the others are those of the middle row of each move.
 
     Raises:
         ValueError: for moves so long that one reading is left.
@@ -106,24 +106,24 @@ def joined(table: DataFrame, every_km: float) -> DataFrame:
     attitude = torch.stack((torch.zeros_like(heading), torch.zeros_like(heading), heading), -1)
     axes = axes_of_elements(torch.tensor(table[list(NAMES)].to_numpy(float).copy()), attitude).numpy()
     samples = table.assign(time=np.arange(len(table)), **dict(zip(AXES, axes.T, strict=True)))
-    found = readings_of(Log(samples, "readings", "true"), every_km=every_km)
-    if len(found) < 2:
+    readings = readings_of(Log(samples, "readings", "true"), every_km=every_km)
+    if len(readings) < 2:
         raise ValueError(f"every_km {every_km:g} leaves one reading of {len(table)}: choose shorter moves")
-    middle = table.iloc[found["time"].astype(int)].reset_index(drop=True)
-    return middle.assign(**{name: found[name] for name in found if name in table and name != "time"})
+    middle = table.iloc[readings["time"].astype(int)].reset_index(drop=True)
+    return middle.assign(**{name: readings[name] for name in readings if name in table and name != "time"})
 
 
 def _path(log: Log) -> Array:
     """Return places ``(N, 2)``, northward and eastward of the first one [km]."""
-    held = log.samples
-    if "distance" in held or "speed" in held:
-        step = np.diff(held["time"], prepend=held["time"].iloc[0])
-        length = held["distance"] if "distance" in held else held["speed"] * step / 1000
-        heading = np.radians(held["heading"])
-    elif "latitude" in held and "longitude" in held:
+    samples = log.samples
+    if "distance" in samples or "speed" in samples:
+        step = np.diff(samples["time"], prepend=samples["time"].iloc[0])
+        length = samples["distance"] if "distance" in samples else samples["speed"] * step / 1000
+        heading = np.radians(samples["heading"])
+    elif "latitude" in samples and "longitude" in samples:
         place = log.tensor("latitude", "longitude")
         distance, bearing = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))
-        length, heading = (np.concatenate(([0.0], each.numpy())) for each in (distance, bearing))
+        length, heading = (np.concatenate(([0.0], values.numpy())) for values in (distance, bearing))
     else:
         raise ValueError("the log has neither distances nor speeds nor positions: readings need the moves between them")
     return np.cumsum(np.stack((length * np.cos(heading), length * np.sin(heading)), -1), 0)
@@ -147,7 +147,7 @@ def _parts_s(time: Array, every_s: float) -> NDArray[np.int64]:
 def _spikes(field: Array, part: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which vectors ``(N, 3)`` deviate from the median of their part by more than its scatter explains.
 
-    None in a part of few samples, of which the scatter is not known.
+    A part of few samples has none: its scatter is unknown.
     """
     groups = pandas.DataFrame(field).groupby(part)
     deviation = np.abs(field - groups.transform("median").to_numpy())
@@ -158,8 +158,8 @@ def _spikes(field: Array, part: NDArray[np.int64]) -> NDArray[np.bool_]:
 def _covariance(field: Array, part: NDArray[np.int64]) -> Array:
     """Return the covariance ``(3, 3)`` of the mean of a part, as a mean over the parts; NaN if all are too short.
 
-    The means of tenths of a part scatter by errors that last less than a tenth; their linear trend is the field's. In a
-    part of less than two samples a tenth, the samples scatter, which does not show errors that last longer.
+    The means of tenths of a part scatter by errors that last less than a tenth; their linear trend is the field's. With
+    less than two samples in a tenth, the samples themselves are used, which do not show longer errors.
     """
     parts = np.split(field, np.flatnonzero(np.diff(part)) + 1)
     least = 2 * _BLOCKS if max(map(len, parts)) >= 2 * _BLOCKS else 3
@@ -168,8 +168,8 @@ def _covariance(field: Array, part: NDArray[np.int64]) -> Array:
         if len(rows) >= least:
             blocks = np.stack([block.mean(0) for block in np.array_split(rows, min(_BLOCKS, len(rows)))])
             line = np.linspace(-1, 1, len(blocks))
-            rest = blocks - blocks.mean(0) - np.outer(line, line @ blocks / (line @ line))
-            covariances.append(rest.T @ rest / (len(blocks) - 2) / len(blocks))
+            residual = blocks - blocks.mean(0) - np.outer(line, line @ blocks / (line @ line))
+            covariances.append(residual.T @ residual / (len(blocks) - 2) / len(blocks))
     return np.mean(covariances, 0) if covariances else np.full((3, 3), np.nan)
 
 

@@ -26,7 +26,7 @@ Streams = Mapping[str, tuple[Array, Array]]
 
 
 class Recording(NamedTuple):
-    """What one file holds: columns, format and sensors, the north of its heading where it tells, and notes."""
+    """Content of one file: columns, format and sensors, the north of its heading where it is stated, and notes."""
 
     streams: Streams
     source: str
@@ -43,7 +43,7 @@ class Log:
             and those that the log has of ``roll``, ``pitch``, ``heading`` [deg], ``speed`` [m/s], ``distance`` since
             the sample before [km], ``latitude``, ``longitude`` [deg], ``altitude`` [km].
         source: format and sensors.
-        north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`, where the log tells.
+        north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`, where the log states it.
         notes: what a reader of the log must know.
 
     Example:
@@ -69,12 +69,12 @@ class Log:
         Raises:
             ValueError: for another column that the log lacks.
         """
-        held = self.samples
-        if missing := [name for name in names if name not in held and name not in ATTITUDE[:2]]:
+        samples = self.samples
+        if missing := [name for name in names if name not in samples and name not in ATTITUDE[:2]]:
             raise ValueError(
-                f"the log has no {missing[0]}, only {', '.join(held)}: name its column so, or choose another log"
+                f"the log has no {missing[0]}, only {', '.join(samples)}: name its column so, or choose another log"
             )
-        columns = [held[name].to_numpy(float) if name in held else np.zeros(len(held)) for name in names]
+        columns = [samples[name].to_numpy(float) if name in samples else np.zeros(len(samples)) for name in names]
         return torch.from_numpy(np.stack(columns, -1))
 
 
@@ -149,7 +149,7 @@ def _count(number: int, name: str) -> str:
 def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
     """Return the samples at the times of the magnetometer, with notes; other columns are interpolated.
 
-    Samples without attitude before its first and after its last value are left out; a position or a speed holds there.
+    Samples before the first and after the last attitude are left out; the first and last position and speed hold there.
 
     Raises:
         ValueError: for a log without a magnetometer, or times that run backward.
@@ -185,16 +185,16 @@ def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
     return samples, notes
 
 
-def _at(time: Array, name: str, known: Array, values: Array) -> Array:
-    """Return the values of a column at other times; angles the shorter way around, a distance as a sum."""
-    if not len(known):
+def _at(time: Array, name: str, times: Array, values: Array) -> Array:
+    """Interpolate the values of a column at other times: angles along the shorter arc, distances as running sums."""
+    if not len(times):
         return np.full(len(time), np.nan)
-    if name == "distance":  # the sum, of which a row with the time of the row before is no part
-        return np.interp(time, known, np.cumsum(values * (np.diff(known, prepend=-np.inf) > 0)))
+    if name == "distance":  # the running sum, without rows that repeat a time
+        return np.interp(time, times, np.cumsum(values * (np.diff(times, prepend=-np.inf) > 0)))
     turning = name in _ANGLES
     ends = {} if name in ("latitude", "longitude", "altitude", "speed") else {"left": np.nan, "right": np.nan}
-    found = np.interp(time, known, np.unwrap(values, period=360) if turning else values, **ends)
-    return (found + 180) % 360 - 180 if name in ("roll", "longitude") else found % 360 if turning else found
+    column = np.interp(time, times, np.unwrap(values, period=360) if turning else values, **ends)
+    return (column + 180) % 360 - 180 if name in ("roll", "longitude") else column % 360 if turning else column
 
 
 def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:

@@ -55,11 +55,11 @@ def column_of(header: str) -> tuple[str, float] | None:
     name = re.sub(r"[^a-z0-9µ]+", "_", header.lower()).strip("_")
     for column, (kind, names, usual) in COLUMNS.items():
         units = "|".join(sorted(UNITS[kind], key=len, reverse=True))
-        if found := re.fullmatch(rf"(?P<name>{names})(_(?P<unit>{units}))?", name):
-            unit = found["unit"] or usual
+        if match := re.fullmatch(rf"(?P<name>{names})(_(?P<unit>{units}))?", name):
+            unit = match["unit"] or usual
             if not unit:
                 raise ValueError(f"column {header!r} has no unit: name it, such as speed_m_s, speed_km_h or speed_kn")
-            return column, UNITS[kind][unit] * (-1 if found["name"] == "depth" else 1)
+            return column, UNITS[kind][unit] * (-1 if match["name"] == "depth" else 1)
     return None
 
 
@@ -68,7 +68,7 @@ def guess_unit(length: float, total_nt: float) -> str | None:
 
     Args:
         length: length of the vector, in an unknown unit.
-        total_nt: total intensity that is known [nT].
+        total_nt: known total intensity [nT].
 
     Example:
         >>> guess_unit(0.5, 50000.0), guess_unit(45000.0, 50000.0)

@@ -102,8 +102,8 @@ def elements_of_axes(
     """Return D, I, B_H of three axes and an attitude, with standard deviations and correlations to first order.
 
     The heading decides what D is: only one from true north measures it. With a heading from magnetic north, D is that
-    of the compass, and with the declination of a model, that of the model. Both say nothing of the place: the standard
-    deviation is :data:`~magrl.transforms.errors.sensors.OUTAGE_STD`, so that a filter ignores D.
+    of the compass, and with the declination of a model, that of the model. Neither gives information on the place: the
+    standard deviation is :data:`~magrl.transforms.errors.sensors.OUTAGE_STD`, so that a filter ignores D.
 
     Args:
         axes_nt: ``(..., 3)`` the field along the axes of ``frame`` [nT].

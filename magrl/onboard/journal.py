@@ -1,4 +1,4 @@
-"""What a vehicle is told, as declared models: its options, its start and its steps, which together are its saved state.
+"""The inputs of a vehicle as declared models: options, start and steps, which together are its saved state.
 
 A number may be one of Python, NumPy or torch; it becomes a finite Python float.
 """
@@ -34,7 +34,7 @@ Triple = Annotated[tuple[Number, Number, Number], _PLAIN, _LAX]
 
 
 def _accuracy(value: Any) -> SensorStd:
-    """Return the record of an argument, in which three numbers are white noise, or of a file.
+    """Return the accuracy given by an argument (three numbers are white noise) or a file.
 
     Raises:
         ValueError: for a standard deviation that is out of its range, or one of B_H that looks like microtesla.
@@ -65,7 +65,7 @@ class Options(CheckedModel):
         max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.
         max_steps: steps of a way, the last of which stops.
         arrival_km: distance from the destination that counts as arrived.
-        confidence: least estimated probability of arrival at which the vehicle is told that it has arrived.
+        confidence: least estimated probability of arrival at which the command is to stop as arrived.
         navigator: class of the navigator; the vehicle writes it.
         weights: digest of its weights; the vehicle writes it.
 
@@ -108,7 +108,7 @@ class Step(CheckedModel):
         return self.declination, self.inclination, self.horizontal_intensity
 
     def repeats(self, before: Step) -> bool:
-        """Return whether this is the message of the step before once more, by its time.
+        """Return whether this repeats the message of the step before, by its time.
 
         Raises:
             ValueError: for an earlier time, or another message of the same time.
@@ -126,7 +126,7 @@ class Step(CheckedModel):
 
 
 class Journal(CheckedModel):
-    """Hold all that a vehicle was told since its start, which gives its state, whatever its navigator keeps.
+    """Hold all inputs of a vehicle since its start, which determine its state with any navigator.
 
     Example:
         >>> import torch

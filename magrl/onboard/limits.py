@@ -15,8 +15,8 @@ LEAST_NT = 2000.0
 """Least B_H for an agent without a map: below, it fails more often (docs/earth.md, the whole globe) [nT]."""
 
 STUCK_KM = (100.0, 400.0)
-"""Path without a change of all readings, and of one of them, after which a sensor is stuck: at least this, and at least
-2 and 8 of the longest moves [km]. Coarse readings of one element can be equal that long; chosen."""
+"""Path without a change of any element, and of one element, after which a sensor counts as stuck, but at least 2 and 8
+of the longest moves [km]. Coarse readings of one element can stay equal that long; chosen."""
 _LONGER = 1.1  # than the longest move
 
 View = ObservationView | TrackView | None
@@ -53,8 +53,8 @@ def move_limits(
         >>> move_limits(None, max_move_km=20.0)
         (20.0, 90.0)
     """
-    own = policy if policy is None else view_of(policy) or policy
-    move, turn = getattr(own, "max_move_km", 0.0), math.degrees(getattr(own, "max_turn_rad", 0.0))
+    source = policy if policy is None else view_of(policy) or policy
+    move, turn = getattr(source, "max_move_km", 0.0), math.degrees(getattr(source, "max_turn_rad", 0.0))
     limits = []
     for name, value, commanded, usual in (
         ("max_move_km", max_move_km, move, 50.0),
@@ -106,11 +106,11 @@ def measured(std: Sequence[float]) -> tuple[bool, ...]:
     return tuple(value / slope < MISSING_KM for value, slope in zip(std, SLOPES, strict=True))
 
 
-def unchanged_km(known: Sequence[float], before: Sequence[float], after: Reading, move_km: float) -> Path:
-    """Return the path since each element last changed ``(3,)`` [km], without moves at whose end it was not read.
+def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Reading, move_km: float) -> Path:
+    """Return the path since each element last changed ``(3,)`` [km], without moves that end without reading it.
 
     Args:
-        known: the same before the move.
+        unchanged: that path before the move.
         before: D, I, B_H before the move.
         after: the same after it; None for an element that was not read.
         move_km: its length.
@@ -121,7 +121,7 @@ def unchanged_km(known: Sequence[float], before: Sequence[float], after: Reading
     """
     first, second, third = (
         km if new is None else km + move_km if new == old else 0.0
-        for km, old, new in zip(known, before, after, strict=True)
+        for km, old, new in zip(unchanged, before, after, strict=True)
     )
     return first, second, third
 
@@ -146,13 +146,12 @@ def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
 def check_move(heading_deg: float, distance_km: float, steer_deg: float | None, max_move_km: float) -> None:
     """Raise unless a vehicle can have made a move.
 
-    A heading in radians is a small one in degrees. It is recognized where it is, in radians, what the vehicle was to
-    steer.
+    A heading in radians is a small one in degrees. It is recognized if, in radians, it equals the commanded heading.
 
     Args:
         heading_deg: heading of the move, -360 to 360.
         distance_km: its length.
-        steer_deg: heading that the vehicle was told to steer; None for none.
+        steer_deg: commanded heading; None without one.
         max_move_km: longest move; a vehicle may drift a tenth farther.
 
     Raises:

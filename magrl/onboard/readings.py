@@ -93,7 +93,7 @@ def _horizontal_limits(inclination: float) -> tuple[float, float]:
 
 
 def check_earth_distance(reading: Sequence[float], target: Sequence[float], most_km: float) -> None:
-    """Raise if no places on the Earth with such elements are as near to each other as the longest way.
+    """Raise if places with such elements are farther apart on the Earth than the longest way.
 
     Args:
         reading: D [deg], I [deg], B_H [nT] at the start.

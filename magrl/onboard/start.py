@@ -28,7 +28,7 @@ MOST_SIGMAS = 5.0
 SLACK_NT = 100.0
 """Deviation of the field vector that always fits; chosen [nT]."""
 NEAR_KM = 200.0
-"""Distance from the start to the place where the vehicle is believed to be; chosen [km]."""
+"""Largest distance from the start to its assumed place; chosen [km]."""
 
 Elements = tuple[float, float, float]
 Values = tuple[float, ...]
@@ -47,7 +47,7 @@ def known_elements(
 
     Raises:
         ValueError: for other than two or three numbers, elements that are not possible on the Earth, or a date that is
-            missing, or has no use.
+            missing or not needed.
 
     Example:
         >>> elements, std = known_elements((60.4, 5.3), date="2026-06-30")
@@ -58,8 +58,8 @@ def known_elements(
         raise ValueError(f"here must be D, I and B_H, or latitude and longitude, got {here!r}")
     check_numbers(len(here), here=here)
     if (date is None) == (len(here) == 2):
-        wanted = "a latitude and longitude need a date" if date is None else "elements need no date"
-        raise ValueError(f"here {tuple(here)}: {wanted}, got date {date!r}")
+        rule = "a latitude and longitude need a date" if date is None else "elements need no date"
+        raise ValueError(f"here {tuple(here)}: {rule}, got date {date!r}")
     if date is None:
         elements, usual = (float(here[0]), float(here[1]), float(here[2])), (0.0, 0.0, 0.0)
     else:
@@ -77,9 +77,9 @@ def known_elements(
 def nearby_elements(
     near: Sequence[float], date: str | None, target: Elements, most_km: float
 ) -> tuple[Elements, Values]:
-    """Return the elements where a vehicle is believed to be, and standard deviations of those where it is.
+    """Return the elements at the assumed place of a vehicle, and their standard deviations at its true place.
 
-    :data:`MOST_SIGMAS` of these are the largest difference at :data:`NEAR_KM`, and a crust of
+    :data:`MOST_SIGMAS` of these are the largest change over :data:`NEAR_KM` plus a crust of
     :data:`~magrl.onboard.readings.DISTURBANCE_NT`.
 
     Args:
@@ -104,19 +104,19 @@ def nearby_elements(
     change = element_difference(elements_at(IGRF(str(date)), ring), torch.tensor(elements).double()).abs().amax(0)
     horizontal, total = elements[2], elements[2] / math.cos(math.radians(elements[1]))
     crust = math.degrees(DISTURBANCE_NT / horizontal), math.degrees(DISTURBANCE_NT / total), DISTURBANCE_NT
-    return elements, tuple((each + rock) / MOST_SIGMAS for each, rock in zip(change.tolist(), crust, strict=True))
+    return elements, tuple((core + local) / MOST_SIGMAS for core, local in zip(change.tolist(), crust, strict=True))
 
 
 def calibrated(
-    known: Elements, known_std: Elements, sensor_std: SensorStd, reading: Elements | None = None
+    elements: Elements, elements_std: Elements, sensor_std: SensorStd, reading: Elements | None = None
 ) -> tuple[Values, SensorStd]:
     """Return the constant error of the readings, and the accuracy of the sensors without it.
 
     Args:
-        known: D [deg], I [deg], B_H [nT] at the start.
-        known_std: their standard deviations.
+        elements: D [deg], I [deg], B_H [nT] at the start.
+        elements_std: their standard deviations.
         sensor_std: accuracy of the sensors.
-        reading: first reading; without it the error is not known, and 0.
+        reading: first reading; without it the error is unknown, and 0 is returned.
 
     Raises:
         ValueError: for a reading that does not fit the start; see :func:`check_start`.
@@ -128,21 +128,21 @@ def calibrated(
         (0.32, 0.38)
     """
     if reading is not None:
-        check_start(reading, known, sensor_std, known_std)
-    rows = known if reading is None else reading, known, known_std, *sensor_std
+        check_start(reading, elements, sensor_std, elements_std)
+    rows = elements if reading is None else reading, elements, elements_std, *sensor_std
     first, there, there_std, *std = torch.tensor(rows, dtype=torch.float64)
     error, left = calibration(first, there, SensorStd(*std), there_std)
     return tuple(error.tolist()), sensor_std._replace(bias=tuple(left.bias.tolist()))
 
 
-def check_start(reading: Elements, known: Elements, sensor_std: SensorStd, known_std: Sequence[float]) -> None:
+def check_start(reading: Elements, elements: Elements, sensor_std: SensorStd, elements_std: Sequence[float]) -> None:
     """Raise unless the first reading fits the elements at the start.
 
     Args:
         reading: D [deg], I [deg], B_H [nT].
-        known: the elements there.
+        elements: D, I, B_H at the start.
         sensor_std: accuracy of the sensors.
-        known_std: standard deviations of the elements.
+        elements_std: standard deviations of the elements.
 
     Raises:
         ValueError: with the element that does not fit, and the mistake that would explain it, if one is known.
@@ -155,41 +155,41 @@ def check_start(reading: Elements, known: Elements, sensor_std: SensorStd, known
         ValueError: the first reading, D 3.4, I -73.1, B_H 14950, does not fit the start, D 3.5, I 73, B_H 15000 (I \
 deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis points up, and down is expected
     """
-    std = [math.hypot(*each) for each in zip(sensor_std.noise, sensor_std.bias, known_std, strict=True)]
-    if found := misfit(reading, known, std):
-        texts: list[Any] = [f"D {each[0]:g}, I {each[1]:g}, B_H {each[2]:g}" for each in (reading, known)]
-        cause = found[1] or "check sensors, calibration, compass and place, or state a larger bias"
-        raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({found[0]}): {cause}")
+    std = [math.hypot(*parts) for parts in zip(sensor_std.noise, sensor_std.bias, elements_std, strict=True)]
+    if deviation := misfit(reading, elements, std):
+        texts: list[Any] = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
+        cause = deviation[1] or "check sensors, calibration, compass and place, or state a larger bias"
+        raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({deviation[0]}): {cause}")
 
 
-def misfit(reading: Elements, known: Elements, std: Sequence[float]) -> tuple[str, str | None] | None:
-    """Return how a reading deviates from known elements, and the mistake that would explain it; None if it fits.
+def misfit(reading: Elements, expected: Elements, std: Sequence[float]) -> tuple[str, str | None] | None:
+    """Return how a reading deviates from expected elements, and the mistake that would explain it; None if it fits.
 
     Args:
         reading: D [deg], I [deg], B_H [nT].
-        known: the elements at its place.
+        expected: the elements at its place.
         std: standard deviations of the difference.
 
     Example:
         >>> misfit((3.4, -73.1, 14950.0), (3.5, 73.0, 15000.0), (0.5, 0.1, 50.0))[1]
         'it fits with -I: the vertical axis points up, and down is expected'
     """
-    total = math.hypot(known[2], known[2] * math.tan(math.radians(known[1])))
-    slack = math.degrees(SLACK_NT / max(known[2], SLACK_NT)), math.degrees(SLACK_NT / total), SLACK_NT
-    most = tuple(MOST_SIGMAS * s + each for s, each in zip(std, slack, strict=True))
+    total = math.hypot(expected[2], expected[2] * math.tan(math.radians(expected[1])))
+    slack = math.degrees(SLACK_NT / max(expected[2], SLACK_NT)), math.degrees(SLACK_NT / total), SLACK_NT
+    most = tuple(MOST_SIGMAS * s + margin for s, margin in zip(std, slack, strict=True))
 
     def misfit(elements: Sequence[float]) -> list[float]:
-        difference = [one - other for one, other in zip(elements, known, strict=True)]
+        difference = [value - reference for value, reference in zip(elements, expected, strict=True)]
         difference[0] = math.remainder(difference[0], 360)
-        return [abs(each) for each in difference]
+        return [abs(value) for value in difference]
 
     def fits(elements: Sequence[float]) -> bool:
-        return all(each <= limit for each, limit in zip(misfit(elements), most, strict=True))
+        return all(value <= limit for value, limit in zip(misfit(elements), most, strict=True))
 
     if fits(reading):
         return None
-    index, deviation = max(enumerate(misfit(reading)), key=lambda each: each[1] / most[each[0]])
-    causes = [text for text, elements in _mistakes(*reading, declination_there=known[0]) if fits(elements)]
+    index, deviation = max(enumerate(misfit(reading)), key=lambda item: item[1] / most[item[0]])
+    causes = [text for text, elements in _mistakes(*reading, declination_there=expected[0]) if fits(elements)]
     text = f"{('D', 'I', 'B_H')[index]} deviates by {deviation:.4g}, where {most[index]:.3g} is likely"
     return text, causes[0] if causes else None
 

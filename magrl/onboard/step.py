@@ -54,7 +54,7 @@ def first_state() -> StepState:
 class VehicleStep(nn.Module):
     """One step of an agent that reads its own track, from plain tensors to plain tensors, without a batch.
 
-    It does not search (:class:`~magrl.transforms.SearchAim`): the vehicle gets no signal that it has not arrived.
+    It does not search (:class:`~magrl.transforms.SearchAim`), because nobody confirms an arrival to the vehicle.
 
     Args:
         policy: trained policy with a :class:`~magrl.transforms.TrackView`.
@@ -118,8 +118,8 @@ class VehicleStep(nn.Module):
         before = TensorDict({key: value.unsqueeze(0) for key, value in state.items()}, [1])
         started, moved = self.observe(seen.copy()), self.observe(before.set("next", seen.copy()))["next"]
         observed = tuple(self.actor.in_keys)
-        kept = *observed, "way", "way_covariance", *state
-        now = {key: torch.where(step == 0, started[key], moved[key]) for key in kept}
+        keys = *observed, "way", "way_covariance", *state
+        now = {key: torch.where(step == 0, started[key], moved[key]) for key in keys}
         action = self.actor(TensorDict({key: now[key] for key in observed}, [1]))["action"]
         action = self.act.denormalize("action", action)
         return action[0], *(now[key][0] for key in ("way", "way_covariance")), step + 1, *(now[key][0] for key in state)

@@ -56,9 +56,9 @@ class Command:
         way_covariance_km2: its covariance, by rows.
         confidence: estimated probability that the destination is within ``arrival_km``.
         stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
-            the vehicle is then told to stay.
+            the distance is then 0.
         reason: why to stop, as text.
-        radius_km: radius that holds the destination with the ``confidence`` that the vehicle was given.
+        radius_km: radius that holds the destination with the ``confidence`` of the options.
 
     Example:
         >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
@@ -159,8 +159,8 @@ class Onboard:
             here: elements at the start; or its latitude and longitude [deg], with a ``date``.
             here_std: standard deviations of the elements at the start: by default 0 for elements, and for a position
                 those of a model of the core (:data:`magrl.onboard.start.MODEL_STD`).
-            near: latitude and longitude [deg] of the start, known to 200 km: by these, the first reading and the
-                distance of the target are checked; nothing navigates by them.
+            near: latitude and longitude [deg] of the start, known to 200 km; it serves only to check the
+                first reading and the distance of the target.
             date: date for a position, such as ``"2026-06-30"``.
 
         Raises:
@@ -173,8 +173,8 @@ class Onboard:
             raise ValueError(f"the target: {text}")
         here, near, goal = journal.here, journal.near, journal.target
         nearby = None if near is None else nearby_elements(near, date, goal, self._longest_way())
-        known = None if here is None else known_elements(here, journal.here_std, date)
-        self._near, self._known, self._journal, self.target = nearby, known, journal, goal
+        elements = None if here is None else known_elements(here, journal.here_std, date)
+        self._near, self._here, self._journal, self.target = nearby, elements, journal, goal
         self._error, self._sensor_std = self._calibrated()
         self.navigator = self._new_navigator()
         self._estimator = Estimator(self.navigator)
@@ -206,8 +206,8 @@ class Onboard:
             horizontal_intensity: B_H there [nT].
             heading: heading of the move [deg], -360 to 360; in the first step the heading at the start.
             distance: length of the move [km]; 0 in the first step.
-            time: time of the message, by any clock that does not run backward. The same message once more is then no
-                second move: it gets the same command.
+            time: time of the message, by any clock that does not run backward. A repeated message is then no second
+                move: it returns the same command.
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -232,7 +232,7 @@ class Onboard:
         course = math.remainder(math.radians(step.heading), 2 * math.pi)
         turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
         noise = zip(step.reading, self._sensor_std.noise, strict=True)
-        std = self._sensor_std._replace(noise=[OUTAGE_STD if new is None else own for new, own in noise])
+        std = self._sensor_std._replace(noise=[OUTAGE_STD if new is None else sigma for new, sigma in noise])
         with torch.inference_mode():
             seen = self._seen(reading, course, (step.distance, turn), std)
             if self._last and step.reading != (None, None, None):
@@ -256,7 +256,7 @@ class Onboard:
         stated = self.options.sensor_std
         if reading and self._near:
             check_start(reading, self._near[0], stated, self._near[1])
-        return ((0.0, 0.0, 0.0), stated) if self._known is None else calibrated(*self._known, stated, reading)
+        return ((0.0, 0.0, 0.0), stated) if self._here is None else calibrated(*self._here, stated, reading)
 
     def _check(self, step: Step, reading: Elements) -> None:
         """Raise unless a reading, a heading and a distance are possible, and possible together."""
@@ -284,7 +284,7 @@ class Onboard:
         return TensorDict(seen, [1], device="cpu")
 
     def _command(self, seen: TensorDictBase, action: list[float], course: float) -> Command:
-        """Return the command: to stop, to go to the estimated place where it is near, or what the navigator wants."""
+        """Return the command: to stop, to go to a near estimated destination, or the action of the navigator."""
         left = torch.tensor([self.options.max_steps - 1 - len(self._steps)])
         decision = self._estimator.decide(seen, left, self.options.arrival_km)
         way = decision.posterior.way()
@@ -302,7 +302,7 @@ class Onboard:
         return Command(action[0], math.degrees(action[1]), steer, *estimates)
 
     def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float, declared: bool) -> tuple[str | None, str]:
-        """Return why to stop, and that as a sentence."""
+        """Return the reason to stop, as a keyword and as a sentence."""
         options, useful = self.options, measured(self._sensor_std.noise)
         if text := stuck([km * use for km, use in zip(self._unchanged, useful, strict=True)], self.max_move_km):
             return "lost", text
@@ -333,7 +333,7 @@ class Onboard:
         return wanted
 
     def save(self, path: Path | str) -> None:
-        """Write all that the vehicle was told since :meth:`start` to a file, for :meth:`restore`.
+        """Write the arguments of :meth:`start` and of all steps since to a file, for :meth:`restore`.
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -350,9 +350,9 @@ class Onboard:
             ValueError: for a file that is damaged, of another format, or of a vehicle with other options.
             OSError: if the file cannot be read.
         """
-        journal, own = Journal.read(Path(path)), dict(self.options)
+        journal, options = Journal.read(Path(path)), dict(self.options)
         for name, value in journal.options:
-            if value != own[name]:
+            if value != options[name]:
                 raise ValueError(f"{path} is of a vehicle with another {name}, {value!r}")
         resumed = copy.copy(self)
         resumed.start(journal.target, journal.here, here_std=journal.here_std, near=journal.near, date=journal.date)

@@ -89,7 +89,7 @@ def test_a_short_log_is_compared_and_its_noise_is_to_be_stated(folder: Path, cap
     main([str(folder / "short.csv")])
     assert "one reading: no file is written" in capsys.readouterr().out
     main([str(folder / "short.csv"), "--every-s", "2"])
-    assert "--noise D I B_H --bias 0 0 0; --noise is that of your sensors" in capsys.readouterr().out
+    assert "--noise D I B_H --bias 0 0 0; too few samples for --noise" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def test_a_magnetic_heading_and_a_calibration() -> None:
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        (lambda log: Log(log.samples, "by hand"), {}, "does not tell which north the heading has: state north"),
+        (lambda log: Log(log.samples, "by hand"), {}, "does not state the north of the heading: give north"),
         (lambda log: Log(log.samples.drop(columns="heading"), "", "true"), {}, "the log has no heading, only time, x"),
         (
             lambda log: Log(log.samples.drop(columns="speed"), "", "true"),
