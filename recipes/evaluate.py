@@ -145,9 +145,9 @@ def settle(config: Config) -> tuple[Config, list[str]]:
     path, places = config.scenario, list[str]()
     if config.tasks != "figure-4-1":  # which lies in the paper's region
         path, places = agreed(runs, "scenario", config.scenario, None)
-    own = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
-    zeta, thresholds = agreed(every, "zeta", own.given("zeta"), 0.01)
-    heading, headings = agreed(runs, "start_heading", own.given("start_heading"), "north")
+    scenario = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
+    zeta, thresholds = agreed(every, "zeta", scenario.given("zeta"), 0.01)
+    heading, headings = agreed(runs, "start_heading", scenario.given("start_heading"), "north")
     noise, noisy = NO_NOISE, list[str]()
     if not config.conditions:
         noise, noisy = agreed(runs, "noise", config.noise, NO_NOISE)
@@ -180,7 +180,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         options |= {"confidence": config.confidence, "seed": config.seed}
         flights = [Flight(scenario, **options), Flight(example, **options)]
         options = {"mode": config.mode, "map_date": config.map_date}
-        navigators = [tuple(each.navigator(text, **options) for each in flights) for text in config.navigators]
+        navigators = [tuple(flight.navigator(text, **options) for flight in flights) for text in config.navigators]
         if config.export:
             check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")

@@ -221,8 +221,8 @@ def fly(config: Config) -> dict[str, Any]:
     flights = prepare(config)
     steps = {name: rollout(env, navigator, config.start_heading) for name, (env, navigator) in flights.items()}
     measures = {
-        name: {"outcome": outcome(each)} | {key: value[0].item() for key, value in episode_measures(each).items()}
-        for name, each in steps.items()
+        name: {"outcome": outcome(flight)} | {key: value[0].item() for key, value in episode_measures(flight).items()}
+        for name, flight in steps.items()
     }
     base, first, name = flights["told"][0].base_env, steps["told"][0, 0], config.navigator.partition("=")[0]
     result = {
@@ -235,9 +235,9 @@ def fly(config: Config) -> dict[str, Any]:
         "alone": measures["alone"],
     }
     write_json(config.out / "flight.json", result)
-    titles = {name: f"{name}: {each['outcome']}, {each['length_km']:.0f} km" for name, each in measures.items()}
+    titles = {name: f"{name}: {values['outcome']}, {values['length_km']:.0f} km" for name, values in measures.items()}
     titles["told"] = f"{config.start} to {config.destination}: {name}, {titles['told']}"
-    figure = trajectories_figure({titles[name]: each for name, each in steps.items()}, base.field, base.region)
+    figure = trajectories_figure({titles[name]: flight for name, flight in steps.items()}, base.field, base.region)
     figure.savefig(config.out / "flight.png", dpi=120)
     if config.export:
         export.write_tracks(config.export, export.tracks(steps["told"], [titles["told"]], navigator=name))

@@ -209,7 +209,7 @@ def train(config: Config) -> dict[str, float]:
         loss.set_keys(action="correction", sample_log_prob="correction_log_prob")
         weights = [list(module.parameters()) for module in (actor, critic)]
         rates = ("learning_rate", "critic_learning_rate")
-        optimizer = Adam([{"params": each, "lr": 0.0} for each in weights], fused=True)
+        optimizer = Adam([{"params": group, "lr": 0.0} for group in weights], fused=True)
 
         frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
         collector = make_collector(env, stochastic_actor, **frames)

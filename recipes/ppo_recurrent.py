@@ -185,7 +185,7 @@ def train(config: Config) -> dict[str, float]:
         actor = TensorDictSequential(memory, correction, TensorDictModule(limits, command_keys, ["action"]))
         value = make_mlp(size + 3, 1, config.critic_cells, layer_norm=True, device=base.device)
         critic = ValueOperator(value, in_keys=list(JUDGED))
-        validation, test = (with_view(evaluation_env(*each, config, **options), memory, config) for each in tasks)
+        validation, test = (with_view(evaluation_env(*group, config, **options), memory, config) for group in tasks)
 
         # Advantages and loss with a clipped probability ratio
         advantage = GAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=critic, deactivate_vmap=True)
@@ -200,7 +200,7 @@ def train(config: Config) -> dict[str, float]:
         loss.set_keys(action="correction", sample_log_prob="correction_log_prob")
         weights = [list(module.parameters()) for module in (memory, correction, critic)]
         rates = ("memory_learning_rate", "learning_rate", "critic_learning_rate")
-        optimizers = [Adam(each, lr=0.0, fused=True) for each in weights]
+        optimizers = [Adam(group, lr=0.0, fused=True) for group in weights]
 
         frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
         env = make_env(base, memory, config)
@@ -232,8 +232,8 @@ def train(config: Config) -> dict[str, float]:
                     total = losses["loss_objective"] + losses["loss_critic"]
                     optimize(total, *optimizers[1:], clip=weights[1], max_norm=config.clip_gradient)
                     stats.updates += 1
-            found = error, losses["loss_critic"], losses["loss_objective"]
-            stats.losses = dict(zip(LOSSES, found, strict=True))
+            values = error, losses["loss_critic"], losses["loss_objective"]
+            stats.losses = dict(zip(LOSSES, values, strict=True))
         return run.finish(test)
 
 

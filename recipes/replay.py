@@ -64,11 +64,11 @@ def labeled(texts: Sequence[str]) -> dict[str, str]:
     named: dict[str, str] = {}
     for text in texts:
         name, _, run = text.partition("=")
-        known = label(name)
-        known += f" ({Path(run).name})" if run and known in named else ""
-        if known in named:
+        title = label(name)
+        title += f" ({Path(run).name})" if run and title in named else ""
+        if title in named:
             raise ValueError(f"{text} is given twice: the page shows each navigator once")
-        named[known] = text
+        named[title] = text
     return named
 
 

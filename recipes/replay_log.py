@@ -134,7 +134,7 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
     sensor_std = SensorStd(config.noise, config.bias)
     board = Onboard(navigator, sensor_std=sensor_std, max_steps=len(log) + 1, arrival_km=config.arrival_km)
     board.start(log[ELEMENTS].iloc[-1].tolist() if config.target is None else config.target)
-    found = []
+    commands = []
     for _, row in log.iterrows():
         heading = row["heading"]
         if abs(heading) <= 2 * math.pi:
@@ -146,8 +146,8 @@ def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
         except ValueError as error:
             raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}") from error
         row = (order.distance_km, order.turn_deg, order.heading_deg, *order.way_km, order.error_km, order.confidence)
-        found.append((*row, order.stop or "", order.way_covariance_km2))
-    return pd.concat((log.reset_index(drop=True), pd.DataFrame(found, columns=COMMANDED)), axis=1)
+        commands.append((*row, order.stop or "", order.way_covariance_km2))
+    return pd.concat((log.reset_index(drop=True), pd.DataFrame(commands, columns=COMMANDED)), axis=1)
 
 
 def with_truth(config: Config, table: pd.DataFrame) -> pd.DataFrame:
@@ -251,19 +251,19 @@ def markdown(table: pd.DataFrame) -> str:
 
 def notes(table: pd.DataFrame) -> list[str]:
     """Return what a reader of the table must know."""
-    found = []
+    lines = []
     heading = table["heading"]
     if heading.abs().max() <= 2 * math.pi and heading.max() - heading.min() > 0.5:
         span = f"{heading.min():g} to {heading.max():g}"
-        found.append(f"Warning: all headings are {span} deg. If these are radians, convert them to degrees.")
+        lines.append(f"Warning: all headings are {span} deg. If these are radians, convert them to degrees.")
     stops = table[table["stop"] != ""]
     if len(stops):
-        found.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")
+        lines.append(f"First stop: {stops['stop'].iloc[0]}, at row {stops['row'].iloc[0]} of the log.")
     if "miss_km" in table:
         halfway, end = table[["miss_km", "error_km"]].iloc[[len(table) // 2, -1]].to_numpy(float)
         text = "Error of the estimated way {}: {:.1f} km; stated {:.1f} km.".format
-        found += [text("halfway", *halfway), text("at the end", *end)]
-    return found
+        lines += [text("halfway", *halfway), text("at the end", *end)]
+    return lines
 
 
 def main(args: Sequence[str] | None = None) -> None:

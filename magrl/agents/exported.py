@@ -68,12 +68,12 @@ class TrainedPolicy(TensorDictModuleBase):
 
     def _state_before(self, seen: TensorDictBase) -> tuple[TensorDictBase | None, Tensor]:
         """Return the state that a step begins with, and who starts anew ``(..., 1)``: both as in a call before it."""
-        held, starts = self.state, seen["step_count"] == 0
-        if held is None or held.shape != seen.shape or held.device != seen.device:
+        stored, starts = self.state, seen["step_count"] == 0
+        if stored is None or stored.shape != seen.shape or stored.device != seen.device:
             return None, torch.ones_like(starts)
-        again = held["step"] == seen["step_count"]
-        before = torch.where(again.squeeze(-1), held["before"], held.select(*self.state_keys))
-        return before, starts | (again & held["starts"])
+        again = stored["step"] == seen["step_count"]
+        before = torch.where(again.squeeze(-1), stored["before"], stored.select(*self.state_keys))
+        return before, starts | (again & stored["starts"])
 
     def _keep_state(
         self, seen: TensorDictBase, before: TensorDictBase | None, starts: Tensor, state: TensorDictBase

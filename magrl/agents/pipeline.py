@@ -126,10 +126,10 @@ def _exported(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
 def _with_first_state(env: EnvBase, actor: TensorDictModuleBase) -> EnvBase:
     """Return an environment whose reset writes the first state of a policy, and where an episode starts."""
     start = env.reset()
-    known, missing = set(start.keys(True, True)), [InitTracker()]
-    if "is_init" in known or "is_init" not in _keys(actor.in_keys):
+    written, missing = set(start.keys(True, True)), [InitTracker()]
+    if "is_init" in written or "is_init" not in _keys(actor.in_keys):
         missing.clear()
-    if lacking := sorted(set(_own_state(actor)) - known, key=str):
+    if lacking := sorted(set(_policy_state(actor)) - written, key=str):
         primer = get_primers_from_module(actor, warn=False)
         if primer is None:
             raise ValueError(f"its state {lacking} has no first value: add a TensorDictPrimer to the environment")
@@ -137,7 +137,7 @@ def _with_first_state(env: EnvBase, actor: TensorDictModuleBase) -> EnvBase:
     return TransformedEnv(env, Compose(*missing), auto_unwrap=True) if missing else env
 
 
-def _own_state(actor: TensorDictModuleBase) -> list[NestedKey]:
+def _policy_state(actor: TensorDictModuleBase) -> list[NestedKey]:
     """Return the keys that a policy reads and writes for the next step."""
     written = _keys(actor.out_keys)
     return [key for key in dict.fromkeys(map(unravel_key, actor.in_keys)) if unravel_key(("next", key)) in written]
@@ -182,20 +182,20 @@ class _Pipeline(nn.Module):
 
     def __init__(self, actor: TensorDictModuleBase, parts: Sequence[Transform], start: TensorDictBase) -> None:
         super().__init__()
-        self.own_state = _own_state(actor)
-        observed = _keys(actor.in_keys) - {*self.own_state, "is_init"}
+        self.policy_state = _policy_state(actor)
+        observed = _keys(actor.in_keys) - {*self.policy_state, "is_init"}
         before, needed = _leading_to(observed, reversed(parts), "out_keys", "in_keys")
-        known = set(start.keys(True, True))
-        for key in sorted(needed - (set(READ_KEYS) & known), key=str):
-            raise ValueError(f"it reads {key!r}, {_reason(key, known)}; it may read {', '.join(READ_KEYS)}")
-        kept = [unravel_key(key) for part in before if isinstance(part, StatefulTransform) for key in part.state_keys]
-        self.kept = list(dict.fromkeys(kept))
+        available = set(start.keys(True, True))
+        for key in sorted(needed - (set(READ_KEYS) & available), key=str):
+            raise ValueError(f"it reads {key!r}, {_reason(key, available)}; it may read {', '.join(READ_KEYS)}")
+        keys = [unravel_key(key) for part in before if isinstance(part, StatefulTransform) for key in part.state_keys]
+        self.transform_state = list(dict.fromkeys(keys))
         self.marks = "is_init" in _keys(actor.in_keys)
         needed = needed | ({"step_count"} if self.state_keys or self.marks else set())
         self.in_keys = [key for key in READ_KEYS if key in needed]
         fixed = (part.to_observation_norm() if hasattr(part, "to_observation_norm") else part for part in before)
         self.before, self.actor = nn.ModuleList(fixed), actor
-        self.first = [start[key][:1] for key in self.own_state]
+        self.first = [start[key][:1] for key in self.policy_state]
         self.after = nn.ModuleList(_leading_to({"action"}, parts, "in_keys_inv", "out_keys_inv")[0])
         for module in self.modules():  # a switch in a buffer, as that of ObservationNorm, is no constant to a trace
             for name, switch in list(module.named_buffers(recurse=False)):
@@ -206,7 +206,7 @@ class _Pipeline(nn.Module):
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys of the state of the policy and of the transforms."""
-        return [*self.own_state, *self.kept]
+        return [*self.policy_state, *self.transform_state]
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         starts = inputs[0] if self.state_keys else None
@@ -214,7 +214,7 @@ class _Pipeline(nn.Module):
         state = dict(zip(self.state_keys, values[len(self.in_keys) :], strict=True))
         seen = TensorDict(dict(zip(self.in_keys, values, strict=False)), batch_size=inputs[0].shape[:1])
         acted = self.actor(self._observed(seen, starts, state))
-        after = *(acted["next", key] for key in self.own_state), *(acted[key] for key in self.kept)
+        after = *(acted["next", key] for key in self.policy_state), *(acted[key] for key in self.transform_state)
         return _physical_action(acted, self.after), *after
 
     def _observed(self, seen: TensorDictBase, starts: Tensor | None, state: dict[NestedKey, Tensor]) -> TensorDictBase:
@@ -230,7 +230,7 @@ class _Pipeline(nn.Module):
         if starts is None and self.marks:
             starts = seen["step_count"] == 0
         if starts is not None:
-            for key, value in zip(self.own_state, self.first, strict=True):
+            for key, value in zip(self.policy_state, self.first, strict=True):
                 seen[key] = _where(starts, value, state[key])
             seen["is_init"] = starts
         return seen
@@ -266,11 +266,11 @@ def _physical_action(acted: TensorDictBase, transforms: Iterable[Any]) -> Tensor
     return acted["action"]
 
 
-def _reason(key: NestedKey, known: Keys) -> str:
+def _reason(key: NestedKey, available: Keys) -> str:
     """Return why a policy cannot read a key."""
     if key in PRIVILEGED_KEYS:
         return "which a vehicle that navigates by the field does not know"
-    return "which the plain environment does not have" if key in known else "which no transform writes"
+    return "which the plain environment does not have" if key in available else "which no transform writes"
 
 
 def _keys(keys: Any) -> Keys:

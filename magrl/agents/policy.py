@@ -159,8 +159,8 @@ class FieldPolicy(TrainedPolicy):
         for name in ("zeta", "max_steps") if isinstance(view, TrackView) else ():
             planned, limit = getattr(view, name), getattr(base, name)
             if planned != limit:
-                both = f"{name} {planned:g}, the environment has {limit:g}"
-                raise ValueError(f"the policy plans for {both}: fly policy.for_env(env)")
+                difference = f"{name} {planned:g}, the environment has {limit:g}"
+                raise ValueError(f"the policy plans for {difference}: fly policy.for_env(env)")
         (move, turn), (longest, largest) = (
             (round(part.max_move_km, 3), round(math.degrees(part.max_turn_rad), 3)) for part in (view, base)
         )

@@ -87,9 +87,9 @@ class TensorProgram(nn.Module):
         for index, tensor in enumerate(tensors):
             self.register_buffer(f"tensor_{index}", tensor.detach())
         self.num_inputs, self.steps, self.outputs = num_inputs, list(steps), list(outputs)
-        known = num_inputs + len(tensors)
-        self._calls = [_call(step, known + number) for number, step in enumerate(steps)]
-        if not outputs or not all(isinstance(i, int) and 0 <= i < known + len(steps) for i in outputs):
+        count = num_inputs + len(tensors)
+        self._calls = [_call(step, count + number) for number, step in enumerate(steps)]
+        if not outputs or not all(isinstance(i, int) and 0 <= i < count + len(steps) for i in outputs):
             raise ValueError(f"outputs must be numbers of values, got {outputs!r}")
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
@@ -194,8 +194,8 @@ def _program(exported: torch.export.ExportedProgram) -> TensorProgram:
             named = {key: _plain(item, value) for key, item in node.kwargs.items() if key not in _LAYOUT}
             steps.append([_name(node.target), _plain(node.args, value), named])
             value[node.name] = len(value)
-    held = exported.state_dict | exported.constants
-    tensors = [*(held[name] for name in sources.values()), *constant.values()]
+    stored = exported.state_dict | exported.constants
+    tensors = [*(stored[name] for name in sources.values()), *constant.values()]
     outputs = [value[name] for name in signature.user_outputs]
     return TensorProgram(len(signature.user_inputs), steps, tensors, outputs)
 
@@ -221,7 +221,7 @@ def _plain(item: Any, value: Mapping[str, int]) -> Any:
     return {"device": None} if isinstance(item, torch.device) else item
 
 
-def _call(step: Any, known: int) -> Callable[[Sequence[Any]], Any]:
+def _call(step: Any, count: int) -> Callable[[Sequence[Any]], Any]:
     """Return a function that computes a step from the values before it.
 
     Raises:
@@ -232,8 +232,8 @@ def _call(step: Any, known: int) -> Callable[[Sequence[Any]], Any]:
     name, args, named = step
     if name in RECURRENT and args[_TRAIN : _TRAIN + 1] != [False]:
         raise ValueError(f"{name} with dropout draws random numbers")
-    operation, arguments = _operation(name), _argument(args, known)
-    options = {str(key): _argument(item, known) for key, item in named.items()}
+    operation, arguments = _operation(name), _argument(args, count)
+    options = {str(key): _argument(item, count) for key, item in named.items()}
     return lambda values: operation(*arguments(values), **{key: item(values) for key, item in options.items()})
 
 
@@ -249,31 +249,31 @@ def _operation(name: object) -> Callable[..., Any]:
     packet = getattr(torch.ops.aten, family, None)
     if not isinstance(packet, torch._ops.OpOverloadPacket) or overload not in packet.overloads():
         raise ValueError(f"{short(name)} is no operation of PyTorch")
-    found: torch._ops.OpOverload = getattr(packet, overload)
-    if torch.Tag.nondeterministic_seeded in found.tags:
+    operation: torch._ops.OpOverload = getattr(packet, overload)
+    if torch.Tag.nondeterministic_seeded in operation.tags:
         raise ValueError(f"{name} draws random numbers")
-    if torch.Tag.core not in found.tags or found._schema.is_mutable:
+    if torch.Tag.core not in operation.tags or operation._schema.is_mutable:
         raise ValueError(f"{name!r} is not one of PyTorch's core operations on tensors")
-    return found
+    return operation
 
 
-def _argument(item: Any, known: int) -> Callable[[Sequence[Any]], Any]:
+def _argument(item: Any, count: int) -> Callable[[Sequence[Any]], Any]:
     """Return a function from the values before a step to its argument.
 
     Raises:
-        ValueError: for anything but plain data that refers to the ``known`` first values.
+        ValueError: for anything but plain data that refers to the ``count`` first values.
     """
     if isinstance(item, list):
-        parts = [_argument(part, known) for part in item]
+        parts = [_argument(part, count) for part in item]
         return lambda values: [part(values) for part in parts]
     if item is None or isinstance(item, (bool, int, float)) or (isinstance(item, str) and item in TEXTS):
         return lambda _: item
     kind, which = next(iter(item.items())) if isinstance(item, dict) and len(item) == 1 else (None, None)
     if kind == "device" and which is None:
         return lambda values: values[0].device
-    if kind == "value" and isinstance(which, int) and 0 <= which < known:
+    if kind == "value" and isinstance(which, int) and 0 <= which < count:
         return lambda values: values[which]
-    found = vars(torch).get(which) if isinstance(which, str) else None
-    if kind in _TYPES and isinstance(found, _TYPES[kind]):
-        return lambda _: found
+    constant = vars(torch).get(which) if isinstance(which, str) else None
+    if kind in _TYPES and isinstance(constant, _TYPES[kind]):
+        return lambda _: constant
     raise ValueError(f"an argument must be a number, a known value or a list of these, got {short(item)}")

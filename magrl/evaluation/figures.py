@@ -58,8 +58,8 @@ def training_figure(rows: Sequence[Mapping[str, float]]) -> Figure:
     for axes, (title, columns) in zip(figure.subplots(2, 2, sharex=True).flat, TRAINING_PANELS.items(), strict=True):
         for color, (column, label) in zip(LINES, columns.items(), strict=False):
             values = np.array([row.get(column, np.nan) for row in rows], dtype=float)
-            known = np.isfinite(values)
-            axes.plot(frames[known], values[known], color=color, lw=1.2, label=label)
+            finite = np.isfinite(values)
+            axes.plot(frames[finite], values[finite], color=color, lw=1.2, label=label)
         axes.set_title(title)
         axes.grid(alpha=0.3)
         if len(columns) > 1:
@@ -107,15 +107,15 @@ def learning_curves(
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     for index, (name, runs) in enumerate(curves.items()):
-        look, known = _look(name, index), [np.array(run)[:, np.isfinite(run[1])] for run in runs]
-        known = [run for run in known if run.shape[1]]
-        if not known:
+        look, measured = _look(name, index), [np.array(run)[:, np.isfinite(run[1])] for run in runs]
+        measured = [run for run in measured if run.shape[1]]
+        if not measured:
             continue
-        grid = np.linspace(max(run[0, 0] for run in known), min(run[0, -1] for run in known), points)
-        values = np.array([np.interp(grid, *run) for run in known])
+        grid = np.linspace(max(run[0, 0] for run in measured), min(run[0, -1] for run in measured), points)
+        values = np.array([np.interp(grid, *run) for run in measured])
         axes.plot(grid, values.T, color=look["color"], lw=0.5, alpha=0.5)
         axes.fill_between(grid, values.min(0), values.max(0), color=look["color"], alpha=0.15, lw=0)
-        text = f"{look['label']}, {len(known)} seed{'s' if len(known) > 1 else ''}"
+        text = f"{look['label']}, {len(measured)} seed{'s' if len(measured) > 1 else ''}"
         axes.plot(grid, values.mean(0), color=look["color"], lw=2, label=text)
     axes.set(xlabel="frames (vehicle-steps)", ylabel=label)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -107,8 +107,8 @@ class Flight:
         Where an arrival must be declared, navigators and trained agents declare by their own estimate
         (:func:`magrl.evaluation.scenarios.with_declaration`); another policy writes the third action itself.
         """
-        own = isinstance(navigator, TrainedPolicy | Navigator)
-        return with_declaration(self.env, self.confidence, navigator) if own else self.env
+        declares = isinstance(navigator, TrainedPolicy | Navigator)
+        return with_declaration(self.env, self.confidence, navigator) if declares else self.env
 
     def fly(self, policy: TensorDictModuleBase | str) -> TensorDict:
         """Return a rollout of the first episode of each vehicle, as :func:`evaluation_rollout` does.

@@ -118,10 +118,10 @@ def make_navigator(
     kind = NAVIGATORS.get(name)
     if kind is None or source or (option and "mode" not in kind.options):
         trained = [f"{agent}=RUN" for agent in TRAINED if agent != OWN]
-        known = [*PRETRAINED, *trained, "policy:NAME=FILE", *NAVIGATORS]
-        raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(known)}")
-    said = {"mode": option or mode, "seed": seed, "map_date": map_date}
-    options = {key: value for key, value in said.items() if key in kind.options} | options
+        names = [*PRETRAINED, *trained, "policy:NAME=FILE", *NAVIGATORS]
+        raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(names)}")
+    shared = {"mode": option or mode, "seed": seed, "map_date": map_date}
+    options = {key: value for key, value in shared.items() if key in kind.options} | options
     return kind.for_env(env, sensor_std=sensor_std, **options).to(env.device)
 
 

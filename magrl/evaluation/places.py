@@ -40,13 +40,13 @@ def parse_coordinates(text: str) -> Tensor:
         >>> parse_coordinates("33.9S 18.4E")
         tensor([-33.9000,  18.4000], dtype=torch.float64)
     """
-    found = _COORDINATES.fullmatch(" ".join(text.split())) if len(text) < 100 else None  # its time grows with length³
-    if not found:
+    match = _COORDINATES.fullmatch(" ".join(text.split())) if len(text) < 100 else None  # its time grows with length³
+    if not match:
         raise ValueError(
             f"a place must be written such as '60.4N 5.3E', '-33.9 18.4' or \"58°58'N 5°44'E\", got {short(text)}"
         )
     values = []
-    for number, minutes, seconds, letter in (found.group(1, 2, 3, 4), found.group(5, 6, 7, 8)):
+    for number, minutes, seconds, letter in (match.group(1, 2, 3, 4), match.group(5, 6, 7, 8)):
         if letter and number[0] in "+-":
             raise ValueError(f"a coordinate must have a sign or a letter, not both, got {number}{letter} in {text!r}")
         size = abs(float(number)) + _sixtieths(minutes, text) + _sixtieths(seconds, text) / 60
@@ -78,10 +78,10 @@ def parse_elements(text: str) -> Tensor | None:
         >>> parse_elements("D=-3.2 I=71.5 BH=15000").tolist(), parse_elements("60.4N 5.3E")
         ([-3.2, 71.5, 15000.0], None)
     """
-    found = _ELEMENTS.fullmatch(text)
-    if not found:
+    match = _ELEMENTS.fullmatch(text)
+    if not match:
         return None
-    declination, inclination, intensity = (float(number) for number in found.groups())
+    declination, inclination, intensity = (float(number) for number in match.groups())
     if abs(declination) > 180 or abs(inclination) > 90 or intensity <= 0:
         raise ValueError(f"D must be within 180 degrees, I within 90 degrees and BH above 0 nT, got {text!r}")
     return torch.tensor((declination, inclination, intensity), dtype=torch.float64)
@@ -122,9 +122,9 @@ def find_elements(field: FieldModel, elements: Tensor, near: Tensor) -> Tensor:
     distance, _ = geodesic(*near.double().expand_as(place).unbind(-1), *place.unbind(-1))
     if misfit.min() > 1:
         closest = elements_at(field, place[misfit.argmin()])
-        wanted, least, found = (elements_text(each) for each in (elements, scale, closest))
+        wanted, least, nearest = (elements_text(values) for values in (elements, scale, closest))
         raise ValueError(
-            f"no place has {wanted} within {least}: the most similar field found is {found}; take the elements of one "
+            f"no place has {wanted} within {least}: the most similar elements are {nearest}; take the elements of one "
             "place and date, or give the destination by its coordinates"
         )
     return place[torch.where(misfit <= 1, distance.nan_to_num(nan=1e5), torch.inf).argmin()]

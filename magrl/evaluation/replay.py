@@ -154,7 +154,7 @@ def _episodes(rollout: TensorDictBase, tracks: list[Tensor]) -> list[dict[str, A
     """Return the data of the episodes of a navigator."""
     measures = episode_measures(rollout)
     rows = [dict(zip(measures, row, strict=True)) for row in zip(*(m.tolist() for m in measures.values()), strict=True)]
-    return [_episode(*each) for each in zip(rollout.cpu(), tracks, rows, strict=True)]
+    return [_episode(*parts) for parts in zip(rollout.cpu(), tracks, rows, strict=True)]
 
 
 def _episode(row: TensorDictBase, track: Tensor, measures: dict[str, Any]) -> dict[str, Any]:

@@ -164,9 +164,9 @@ class Navigator(TensorDictModuleBase):
     def _recall(self, seen: TensorDictBase) -> TensorDictBase:
         """Return the memory of the batch, reset where an episode starts."""
         step = seen["step_count"].squeeze(-1)
-        own = {"action": seen["heading"].new_zeros(len(step), 2), "decided_at": torch.full_like(step, -1)}
-        own |= {"field_readings": torch.zeros_like(step), "over": torch.zeros_like(step, dtype=torch.bool)}
-        first = TensorDict(self.first_memory(seen) | own, batch_size=step.shape, device=step.device)
+        common = {"action": seen["heading"].new_zeros(len(step), 2), "decided_at": torch.full_like(step, -1)}
+        common |= {"field_readings": torch.zeros_like(step), "over": torch.zeros_like(step, dtype=torch.bool)}
+        first = TensorDict(self.first_memory(seen) | common, batch_size=step.shape, device=step.device)
         if self.memory is None or self.memory.shape != first.shape or self.memory.device != first.device:
             return first
         return torch.where(step == 0, first, self.memory)

@@ -88,14 +88,14 @@ class Kalman(QuasiNewton):
         return tracking.field_curvature(reading)
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        known, shared = tracking.related(track, tracking.curl_relation, self.scales)
-        field = tracking.estimated_field(known, self.scales)
+        related, shared = tracking.related(track, tracking.curl_relation, self.scales)
+        field = tracking.estimated_field(related, self.scales)
         bias = self.accuracy(seen).bias
         options = self.range_km, self.scales, shared, bias, self.periods, self.drift(field)
         target = seen["target_field"].double()
-        posterior = tracking.way_posterior(known, target, *options, tracking.common_error(field), fine=False)
-        way = tracking.Way(*(part.double() for part in posterior.aim(tracking.way_to(known, target, *options))))
-        aim, std = self.aim(known, way, seen, memory), self.reading_std(seen)
+        posterior = tracking.way_posterior(related, target, *options, tracking.common_error(field), fine=False)
+        way = tracking.Way(*(part.double() for part in posterior.aim(tracking.way_to(related, target, *options))))
+        aim, std = self.aim(related, way, seen, memory), self.reading_std(seen)
         step, limits = seen["step_count"].squeeze(-1), (self.max_steps, self.max_move_km)
         price = tracking.step_price(self.step_price, self.range_km, aim, step, std, *limits)
         costs = self.caution, self.lengths, self.scales, bias, self.drift(field)

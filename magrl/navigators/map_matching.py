@@ -154,13 +154,13 @@ class MapMatching(Navigator):
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         position = self.grid.new_zeros(len(seen["heading"]), self.hypotheses, 2)
         covariance, misfit = torch.diag_embed(position), position[..., 0].clone()
-        known = torch.zeros_like(position[:, 0, 0], dtype=torch.bool)
+        located = torch.zeros_like(position[:, 0, 0], dtype=torch.bool)
         hypotheses = {"position": position, "covariance": covariance, "misfit": misfit}
-        return {**hypotheses, "target": position[:, 0].clone(), "known": known} | first_places(seen, self.zeta)
+        return {**hypotheses, "target": position[:, 0].clone(), "known": located} | first_places(seen, self.zeta)
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        known = memory["known"].clone()
-        for rows, read in ((~known, self._begin), (known, self._track)):
+        located = memory["known"].clone()
+        for rows, read in ((~located, self._begin), (located, self._track)):
             if rows.any():
                 memory[rows] = read(seen[rows], memory[rows])
         visit_place(seen, memory)
@@ -191,9 +191,9 @@ class MapMatching(Navigator):
         region = self._region(seen)
         target, _, misfit = self._located(seen["target_field"].double(), self.target_std, region)
         memory["target"] = best(target, misfit)
-        found = self._located(seen["field"].double(), self.sensor_std[0], region)
+        hypotheses = self._located(seen["field"].double(), self.sensor_std[0], region)
         memory["known"] = torch.ones_like(memory["known"])
-        return memory.update(dict(zip(("position", "covariance", "misfit"), found, strict=True)))
+        return memory.update(dict(zip(("position", "covariance", "misfit"), hypotheses, strict=True)))
 
     def _track(self, seen: TensorDictBase, memory: TensorDictBase) -> TensorDictBase:
         """Dead-reckon the last move of each hypothesis, and correct it by the reading at its end."""
@@ -278,9 +278,9 @@ def update(covariance: Tensor, jacobian: Tensor, residual: Tensor) -> tuple[Tens
     innovation = gradient @ jacobian.mT + torch.eye(residual.shape[-1], dtype=residual.dtype, device=residual.device)
     solved, _ = torch.linalg.solve_ex(innovation, torch.cat((gradient, sides), -1))
     gain = solved[..., :2].mT
-    kept = torch.eye(2, dtype=gain.dtype, device=gain.device) - gain @ jacobian
+    complement = torch.eye(2, dtype=gain.dtype, device=gain.device) - gain @ jacobian
     misfit = (residual * solved[..., 2]).sum(-1)
-    return (gain @ sides).squeeze(-1), kept @ covariance @ kept.mT + gain @ gain.mT, misfit
+    return (gain @ sides).squeeze(-1), complement @ covariance @ complement.mT + gain @ gain.mT, misfit
 
 
 def best(position: Tensor, misfit: Tensor) -> Tensor:

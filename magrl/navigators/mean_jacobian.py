@@ -69,5 +69,5 @@ class MeanJacobian(QuasiNewton):
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
         if len(env.region) > 1:
             raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
-        own = {"field": env.field, "position": env.region.grid(21).to(env.device)}
-        return own | QuasiNewton.env_options(env, sensor_std)
+        options = {"field": env.field, "position": env.region.grid(21).to(env.device)}
+        return options | QuasiNewton.env_options(env, sensor_std)

@@ -139,8 +139,8 @@ class Checkpoints:
         try:
             save_tensors({"format": CHECKPOINT_FORMAT, "frames": frames, "parts": parts}, path)
         except Exception as error:
-            kept = f"the newest checkpoint is {self.files()[-1]}" if self.files() else "there is no older checkpoint"
-            raise OSError(f"the checkpoint {path} could not be written ({error}); {kept}") from error
+            newest = f"the newest checkpoint is {self.files()[-1]}" if self.files() else "there is no older checkpoint"
+            raise OSError(f"the checkpoint {path} could not be written ({error}); {newest}") from error
         for old in self.files()[:-2]:  # with two, one damaged file does not lose the training
             old.unlink()
         return path

@@ -101,17 +101,17 @@ class RunConfig(CheckedModel):
         try:
             torch.zeros(1, device=self.device).item()
         except (RuntimeError, AssertionError) as error:
-            said = f"device {self.device!r} cannot be used here ({str(error).splitlines()[0]})"
-            raise ValueError(f"{said}: choose another, such as cpu") from None
+            problem = f"device {self.device!r} cannot be used here ({str(error).splitlines()[0]})"
+            raise ValueError(f"{problem}: choose another, such as cpu") from None
         try:
             scenario = self.load_scenario()
         except OSError as error:
             raise ValueError(str(error)) from None
         for name in ("zeta", "start_heading", "max_steps"):
-            said, own = scenario.given(name), getattr(self, name, None)
-            if None not in (said, own) and said != own:
+            given, value = scenario.given(name), getattr(self, name, None)
+            if None not in (given, value) and given != value:
                 option = f"--{name.replace('_', '-')}"
-                raise ValueError(f"the scenario says {name} = {said!r}, the training {own!r}: add {option} {said}")
+                raise ValueError(f"the scenario says {name} = {given!r}, the training {value!r}: add {option} {given}")
         if scenario.arrival == "declared":
             trains = "only ppo_anywhere.py --arrival declared trains for that"
             raise ValueError(f'the scenario says arrival = "declared": {trains}')
@@ -342,13 +342,13 @@ def parse_config(
     first.add_argument("--resume", type=Path)
     first.add_argument("--preset", choices=list(presets))
     args = sys.argv[1:] if args is None else list(args)
-    known, others = first.parse_known_args(args)
-    if known.resume and not {"-h", "--help"} & set(args):
-        others += ["--preset", known.preset] if known.preset else []
+    chosen, others = first.parse_known_args(args)
+    if chosen.resume and not {"-h", "--help"} & set(args):
+        others += ["--preset", chosen.preset] if chosen.preset else []
         if others:
             raise UsageError(f"--resume takes its settings from the run: leave out {' '.join(others)}")
-        return resumed_config(known.resume, kind, recipe)
-    default = presets[known.preset or next(iter(presets))]
+        return resumed_config(chosen.resume, kind, recipe)
+    default = presets[chosen.preset or next(iter(presets))]
     return parse(kind, recipe, description, args, default=default)
 
 

@@ -264,14 +264,14 @@ def _wandb() -> Any:
 @contextlib.contextmanager
 def _wandb_in(folder: Path) -> Iterator[None]:
     """Keep the staged files of wandb in the run folder, and disable crash reports, which look up a host."""
-    own = dict.fromkeys(("WANDB_DATA_DIR", "WANDB_CACHE_DIR"), str(folder.absolute() / "wandb"))
-    own["WANDB_ERROR_REPORTING"] = "false"
-    before = {key: os.environ.get(key) for key in own}
-    os.environ.update(own)
+    settings = dict.fromkeys(("WANDB_DATA_DIR", "WANDB_CACHE_DIR"), str(folder.absolute() / "wandb"))
+    settings["WANDB_ERROR_REPORTING"] = "false"
+    before = {key: os.environ.get(key) for key in settings}
+    os.environ.update(settings)
     try:
         yield
     finally:
-        for key in own:
+        for key in settings:
             del os.environ[key]
         os.environ.update({key: value for key, value in before.items() if value is not None})
 

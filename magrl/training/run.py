@@ -108,7 +108,7 @@ class Run:
         self.statistics, self.best, self.stop = TrainingStatistics(), BestPolicy(), StopRequest()
         self.folder = config.out or Path("runs") / f"{self.name}-seed{config.seed}"
         self._exits = contextlib.ExitStack()
-        self._own: EnvBase | None = None  # of the tasks in the scenario file
+        self._scenario_env: EnvBase | None = None  # of the tasks in the scenario file
 
     # Folder
 
@@ -153,9 +153,9 @@ class Run:
             return Flight(scenario, errors=self.config.noise, seed=seed, **options).env
 
         if self.scenario.tasks is not None:
-            self._own = make(self.scenario, paper.TEST_SEED)
+            self._scenario_env = make(self.scenario, paper.TEST_SEED)
         sets = (self.config.eval_tasks_small, paper.VALIDATION_SEED), (self.config.eval_tasks, paper.TEST_SEED)
-        random = (make(self.scenario.with_tasks(self.scenario.random_tasks(*each)), each[1]) for each in sets)
+        random = (make(self.scenario.with_tasks(self.scenario.random_tasks(count, seed)), seed) for count, seed in sets)
         validation, test = random
         return validation, test
 
@@ -170,8 +170,8 @@ class Run:
         """Raise a ValueError unless these are the settings of this training."""
         for name, value in self.state_dict().items():
             if value != state_dict.get(name):
-                both = f"{short(value)} in the run folder, {short(state_dict.get(name))} in the checkpoint"
-                raise ValueError(f"{name} is {both}: only {', '.join(CHANGEABLE)} may be edited")
+                values = f"{short(value)} in the run folder, {short(state_dict.get(name))} in the checkpoint"
+                raise ValueError(f"{name} is {values}: only {', '.join(CHANGEABLE)} may be edited")
 
     def start(
         self,
@@ -308,7 +308,7 @@ class Run:
         reached = next((row["seconds"] for row in self.log.rows if passes_paper(row)), math.nan)
         result |= {"training_seconds": seconds, "seconds_to_97_sr_88_spl": reached}
         if len(test.region) == 1:
-            shown = rollout if self._own is None else evaluation_rollout(self._own, self.policy)
+            shown = rollout if self._scenario_env is None else evaluation_rollout(self._scenario_env, self.policy)
             figure = maps.trajectories_figure(shown, test.field, test.region, names=self.scenario.names)
             self.log.figure("trajectories", figure)
         self.log.result(result, navigator=self.name)

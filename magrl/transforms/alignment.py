@@ -167,11 +167,11 @@ class GradientHeading(ObservationTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the heading, in [-pi, pi], and its mask."""
         value, target, gradient = (self._leaf(observation_spec, key) for key in self.in_keys)
-        held = [0, 1, 2] if self.pair is None else self.pair
-        if value.shape != target.shape or gradient.shape != (*value.shape, 2) or max(held) >= value.shape[-1]:
+        indices = [0, 1, 2] if self.pair is None else self.pair
+        if value.shape != target.shape or gradient.shape != (*value.shape, 2) or max(indices) >= value.shape[-1]:
             raise ValueError(
                 f"GradientHeading needs values (..., E), targets (..., E) and gradients (..., E, 2) that hold elements "
-                f"{held}, got {tuple(value.shape)}, {tuple(target.shape)}, {tuple(gradient.shape)}"
+                f"{indices}, got {tuple(value.shape)}, {tuple(target.shape)}, {tuple(gradient.shape)}"
             )
         shape = (*value.shape[:-1], 1)
         observation_spec[self.out_keys[0]] = Bounded(-math.pi, math.pi, shape, device=value.device, dtype=value.dtype)

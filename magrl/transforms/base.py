@@ -98,21 +98,21 @@ class ObservationTransform(Transform):
         self, tensordict: TensorDictBase, keys: Keys | None = None, *, state: bool = False
     ) -> list[Tensor] | None:
         """Return the values at ``keys``, by default ``in_keys``; None if one is missing and this is tolerated."""
-        own, keys = keys is None, self.in_keys if keys is None else keys
+        checked, keys = keys is None, self.in_keys if keys is None else keys
         values = [tensordict.get(key, None) for key in keys]
         missing = [key for key, value in zip(keys, values, strict=True) if value is None]
         if not missing:
-            if own:
+            if checked:
                 self._check_shapes(value.shape for value in values)
             return values
         if self.missing_tolerance:
             return None
-        name, known = type(self).__name__, sorted_keys(tensordict)
+        name, available = type(self).__name__, sorted_keys(tensordict)
         if not state:
-            raise KeyError(f"{name} reads {missing}, which are not among {known}")
+            raise KeyError(f"{name} reads {missing}, which are not among {available}")
         raise KeyError(
             f"{name} reads its state {missing}, which a reset writes: step from what reset() or step_mdp() returned; "
-            f"got {known}"
+            f"got {available}"
         )
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:

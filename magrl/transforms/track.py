@@ -174,13 +174,13 @@ class TrackGradient(StatefulTransform):
             heading: ``(..., 1)`` [rad].
             bias_std: ``(..., E)`` standard deviation of a constant error of the readings.
         """
-        known, shared = (track, None) if self.relation is None else tracking.related(track, self.relation, self.scales)
-        field, gradient = (f(known, self.scales) for f in (tracking.estimated_field, tracking.estimated_gradient))
+        related, cross = (track, None) if self.relation is None else tracking.related(track, self.relation, self.scales)
+        field, gradient = (f(related, self.scales) for f in (tracking.estimated_field, tracking.estimated_gradient))
         field = field - self.periods.to(field.dtype) * torch.round(field / 360)
-        options = self.range_km, self.scales, shared, bias_std, self.periods, self._curvature(field)
+        options = self.range_km, self.scales, cross, bias_std, self.periods, self._curvature(field)
         common = None if self.common is None or bias_std is None else self.common(field)
-        posterior = tracking.way_posterior(known, target, *options, common, fine=False)
-        aim = posterior.aim(tracking.way_to(known, target, *options))
+        posterior = tracking.way_posterior(related, target, *options, common, fine=False)
+        aim = posterior.aim(tracking.way_to(related, target, *options))
         way, covariance = (part.to(target.dtype) for part in aim)
         if self.frame == "vehicle":
             gradient, covariance = _turned(gradient, heading), _turned(_turned(covariance, heading).mT, heading)
@@ -223,8 +223,8 @@ class NoiseScale(StatefulTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Raise if the track is written before, by which the filter would not read the scaled value."""
-        if known := [key for key in TRACK_KEYS if key in observation_spec.keys(True, True)]:
-            raise ValueError(f"NoiseScale stands before the transform that writes {known}: change their order")
+        if written := [key for key in TRACK_KEYS if key in observation_spec.keys(True, True)]:
+            raise ValueError(f"NoiseScale stands before the transform that writes {written}: change their order")
         return super().transform_observation_spec(observation_spec)
 
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
@@ -373,12 +373,12 @@ class PlannedMove(StatefulTransform):
         turn = seen["heading"] if self.frame == "vehicle" else 0 * seen["heading"]
         aim, errors = _turned(seen["way"].unsqueeze(-2), -turn).squeeze(-2), SensorStd.read(seen)
         std, track = tracking.reading_std(errors.noise, errors.drift), FieldTrack(*(seen[key] for key in TRACK_KEYS))
-        known, shared = tracking.related(track, tracking.curl_relation)
-        field = tracking.estimated_field(known)
+        related, shared = tracking.related(track, tracking.curl_relation)
+        field = tracking.estimated_field(related)
         curvature, common = tracking.field_curvature(field), tracking.common_error(field)
         units, periods = tracking.ELEMENT_SCALES, tracking.ELEMENT_PERIODS
         options = self.range_km, units, shared, errors.bias, periods, curvature, common
-        posterior = tracking.way_posterior(known, seen["target_field"], *options, fine=False)
+        posterior = tracking.way_posterior(related, seen["target_field"], *options, fine=False)
         step, limits = seen["step_count"].squeeze(-1), (self.max_move_km, self.range_km)
         price = tracking.step_price(price, self.range_km, aim, step, std, self.max_steps, self.max_move_km)
         costs: dict[str, Any] = {"bias_std": errors.bias, "curvature": curvature}

@@ -204,9 +204,9 @@ def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = Non
     Raises:
         UsageError: for an unknown figure, or a missing file.
     """
-    known = [*FIGURES, *declared(FILE)["curves"]]
-    if unknown := [name for name in figures if name not in known] or not figures:
-        raise UsageError(f"unknown figure {unknown}: choose from {', '.join(known)}")
+    available = [*FIGURES, *declared(FILE)["curves"]]
+    if unknown := [name for name in figures if name not in available] or not figures:
+        raise UsageError(f"unknown figure {unknown}: choose from {', '.join(available)}")
     options = {"tasks": tasks} if tasks else {}
     try:
         for name in figures:

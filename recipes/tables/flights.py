@@ -159,11 +159,11 @@ def runs_of(navigator: Spec) -> list[Spec]:
 
 def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
     """Return measures of the episodes of one or several runs; of several, the SPL has an interval."""
-    found = [summarize(episodes) for episodes in runs]
-    if len(found) == 1:
-        return " / ".join("—" if math.isnan(found[0][name]) else f"{found[0][name]:.1f}" for name in measures)
+    summaries = [summarize(episodes) for episodes in runs]
+    if len(summaries) == 1:
+        return " / ".join("—" if math.isnan(summaries[0][name]) else f"{summaries[0][name]:.1f}" for name in measures)
     return " / ".join(
-        mean_of_runs([run[name] for run in found], form=".1f", interval=name == "spl") for name in measures
+        mean_of_runs([run[name] for run in summaries], form=".1f", interval=name == "spl") for name in measures
     )
 
 

@@ -113,7 +113,7 @@ def table(results: Mapping[str, Measures], sorted_by: Measures) -> str:
         [
             name,
             int(chosen.sum()),
-            *(cell([{key: x[chosen] for key, x in found.items()}], MEASURES) for found in results.values()),
+            *(cell([{key: x[chosen] for key, x in values.items()}], MEASURES) for values in results.values()),
         ]
         for name, chosen in bands.items()
         if chosen.any()

@@ -96,15 +96,15 @@ def make(
     Raises:
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
     """
-    known, changes = declared(), {"navigators": navigators, "tasks": tasks, "confidence": confidence}
+    specs, changes = declared(), {"navigators": navigators, "tasks": tasks, "confidence": confidence}
     changes = {key: value for key, value in changes.items() if value is not None}
-    if unknown := [name for name in tables if name not in known]:
-        raise UsageError(f"{FILE} declares no table {', '.join(unknown)}: choose from {', '.join(known)}")
+    if unknown := [name for name in tables if name not in specs]:
+        raise UsageError(f"{FILE} declares no table {', '.join(unknown)}: choose from {', '.join(specs)}")
     check_distinct(navigators or ())
-    for name in tables or known:
+    for name in tables or specs:
         try:
             with tempfile.TemporaryDirectory() as folder:  # a table that is changed replaces no results
-                text = table(**known[name] | changes, folder=(Path(folder) if changes else RUNS) / name)
+                text = table(**specs[name] | changes, folder=(Path(folder) if changes else RUNS) / name)
         except (ValueError, OSError, TypeError) as error:
             raise UsageError(f"{name}: {error}") from error
         if out is None:

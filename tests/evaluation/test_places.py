@@ -78,7 +78,7 @@ def test_the_nearest_place_with_some_elements(field) -> None:
 
 
 def test_elements_of_no_place(field) -> None:
-    with pytest.raises(ValueError, match=r"no place has D=-3.20 I=71.50 BH=60000 within .* most similar field found"):
+    with pytest.raises(ValueError, match=r"no place has D=-3.20 I=71.50 BH=60000 within .* most similar elements are"):
         find_elements(field, place(-3.2, 71.5, 60000), place(60, 5))
 
 

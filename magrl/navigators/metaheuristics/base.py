@@ -144,9 +144,9 @@ class Metaheuristic(Navigator):
         """Return the navigator of an environment, with its :attr:`settings` where no options are given."""
         if len(env.region) > 1:
             raise ValueError(f"metaheuristics navigate in one region, and the scenario has {len(env.region)}")
-        own = {"field": env.field if mode == "look-ahead" else None, "mode": mode}
-        own["objective_floors"] = tuple(env.objective_floors[0].tolist())
-        return super().for_env(env, **{**own, **cls.settings.get(mode, {}), **options})
+        defaults = {"field": env.field if mode == "look-ahead" else None, "mode": mode}
+        defaults["objective_floors"] = tuple(env.objective_floors[0].tolist())
+        return super().for_env(env, **{**defaults, **cls.settings.get(mode, {}), **options})
 
     # Methods of a subclass
 

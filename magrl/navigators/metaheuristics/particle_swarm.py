@@ -67,7 +67,7 @@ class ParticleSwarm(Metaheuristic):
         lowest = torch.where(better, fitness, state["lowest"])
         best = torch.where(better.unsqueeze(-1), population, state["best"])
         leader = take(best, lowest.argmin(1, keepdim=True))
-        own, shared = self.uniform(population, 2, *population.shape)
-        pull = self.cognitive * own * (best - population) + self.social * shared * (leader - population)
+        personal, shared = self.uniform(population, 2, *population.shape)
+        pull = self.cognitive * personal * (best - population) + self.social * shared * (leader - population)
         velocity = (self.inertia * state["velocity"] + pull).clamp(-self.max_velocity, self.max_velocity)
         return {"population": in_disc(population + velocity), "velocity": velocity, "best": best, "lowest": lowest}

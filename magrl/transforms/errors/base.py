@@ -175,8 +175,8 @@ def true_keys(kind: type[EpisodeErrors] = EpisodeErrors) -> tuple[str, ...]:
         >>> true_keys(NorthReferenceError)
         ('true_field', 'true_heading', 'north_error', 'north_stream')
     """
-    own = [*kind.true_keys, kind.numbers_key, kind.stream_key] if kind.channel else []
-    return tuple(dict.fromkeys([*own, *(key for each in kind.__subclasses__() for key in true_keys(each))]))
+    keys = [*kind.true_keys, kind.numbers_key, kind.stream_key] if kind.channel else []
+    return tuple(dict.fromkeys([*keys, *(key for subclass in kind.__subclasses__() for key in true_keys(subclass))]))
 
 
 class ReadingErrors(EpisodeErrors):
@@ -258,8 +258,8 @@ def check_sizes(count: int | None = None, *, fixed: bool = False, **sizes: Seque
         ValueError: bias must be a finite number from 0 on, got -5.0
     """
     for name, values in sizes.items():
-        held = len(values) if count is None and isinstance(values, Sequence) else count
-        check_numbers(held or 1, -math.inf if fixed else 0, **{name: values})
+        length = len(values) if count is None and isinstance(values, Sequence) else count
+        check_numbers(length or 1, -math.inf if fixed else 0, **{name: values})
 
 
 def gauss_markov(value: Tensor, std: Tensor | float, distance: Tensor | float, length: float, normal: Tensor) -> Tensor:

@@ -284,7 +284,7 @@ def with_conditions(
     check_type(EnvBase, env=env)
     if conditions.perfect:
         return env
-    known = [] if known_start is None else [KnownStart(conditions.std, known_start)]
-    env = TransformedEnv(env, Compose(*conditions.transforms(seed), *known))
+    calibration = [] if known_start is None else [KnownStart(conditions.std, known_start)]
+    env = TransformedEnv(env, Compose(*conditions.transforms(seed), *calibration))
     _ = env.action_spec  # an error before the first episode
     return env

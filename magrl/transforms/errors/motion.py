@@ -182,10 +182,10 @@ class MotionError(EpisodeErrors):
         if self.parent is None:
             return input_spec
         commanded = float(input_spec["full_action_spec"][self.in_keys_inv[0]].space.high[..., 0].max())
-        known = observed_spec(self).get(DISPLACEMENT, None)
-        allowed = 0.0 if known is None else float(known.space.high.max()) - 2 * commanded
+        spec = observed_spec(self).get(DISPLACEMENT, None)
+        allowed = 0.0 if spec is None else float(spec.space.high.max()) - 2 * commanded
         drift = self.farthest_km(commanded) - commanded
-        if known is None or drift > allowed + 1e-6 * commanded:
+        if spec is None or drift > allowed + 1e-6 * commanded:
             raise ValueError(
                 f"MotionError carries a vehicle up to {drift:.6g} km farther than its command, the environment allows "
                 f"{allowed:.6g} km: create it with drift_km={math.ceil(100 * drift) / 100}"

@@ -169,14 +169,14 @@ def sensor_levels(uniform: Tensor, exponent: float = 1.5) -> Tensor:
     check_tensor(12, uniform=uniform)
     check_number(0, above=True, exponent=exponent)
     none, common, poor, factor, exact, biased = (uniform[..., k : k + 1] for k in (0, 1, 5, 6, 7, 8))
-    noise = 10 ** (-2 * common**exponent) * _each(uniform[..., 2:5]) * uniform.new_tensor((0.2, 0.2, 20.0))
+    noise = 10 ** (-2 * common**exponent) * _factors(uniform[..., 2:5]) * uniform.new_tensor((0.2, 0.2, 20.0))
     declination = torch.where(poor < 0.3, 1 + 6 * factor, 1.0)
     noise = noise * torch.cat((declination, torch.ones_like(uniform[..., :2])), -1)
-    bias = 10 ** (-1.6 * biased) * _each(uniform[..., 9:12]) * uniform.new_tensor((0.35, 0.05, 45.0))
+    bias = 10 ** (-1.6 * biased) * _factors(uniform[..., 9:12]) * uniform.new_tensor((0.35, 0.05, 45.0))
     return torch.cat((torch.where(none < 0.15, 0.0, noise), torch.where(exact < 0.5, 0.0, bias)), -1)
 
 
-def _each(uniform: Tensor) -> Tensor:
+def _factors(uniform: Tensor) -> Tensor:
     """Return the factors of the elements, log-uniform from 0.4 to 2.5."""
     return 10 ** (0.8 * uniform - 0.4)
 

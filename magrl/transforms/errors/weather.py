@@ -92,7 +92,7 @@ class MagneticWeather(ReadingErrors):
         check_number(0, above=True, speed_km_h=speed_km_h)
         check_number(0, reading_s=reading_s)
         self.speed_km_h, self.reading_s, self.span_h = float(speed_km_h), float(reading_s), span_h
-        self._found: dict[float, Tensor] = {}
+        self._starts_by_span: dict[float, Tensor] = {}
         self.register_buffer("variation", self.record.variation, persistent=False)
         moments = self.record.second_moments(WAY_KM / self.speed_km_h)
         self.register_buffer("_moments", moments, persistent=False)
@@ -115,9 +115,9 @@ class MagneticWeather(ReadingErrors):
     def _starts(self) -> Tensor:
         """Return the minutes at which an episode can start, ``(S,)`` int64."""
         span_h = self._longest_h()
-        if span_h not in self._found:
-            self._found = {span_h: self.record.starts(span_h)}
-        return self._found[span_h]
+        if span_h not in self._starts_by_span:
+            self._starts_by_span = {span_h: self.record.starts(span_h)}
+        return self._starts_by_span[span_h]
 
     def _constants(self, stream: Tensor) -> Tensor:
         """Return the minute of the record in which an episode starts, and 0 minutes since then, ``(..., 2)``."""
