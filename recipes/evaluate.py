@@ -8,9 +8,9 @@
     python recipes/evaluate.py secant kalman --arrival distance --arrival-radius-km 25 --max-steps 80 --altitude-km -3
     python recipes/evaluate.py policy:SAC=sac.safetensors secant                # a policy of another algorithm
 
-Trained agents are given with their run folders. They are flown as they were trained: in their scenario, with their
-arrival threshold, start heading and sensor noise. Runs that differ in one of these need the option that chooses it. An
-agent that was trained otherwise, or is not finished, is marked by a warning below the table.
+Trained agents are named by their run folders. By default, scenario, arrival threshold, start heading and sensor noise
+are those of the training. If the runs differ in one of these, give its option. A warning below the table names agents
+that were trained with other settings, or whose training is not finished.
 Metaheuristics evaluate candidate moves in one of two modes, `--mode` or a suffix such as `ga:flown`: `look-ahead` reads
 the field at the end of every candidate for free (an oracle), `flown` makes every candidate a move.
 
@@ -71,15 +71,15 @@ class Config(ScenarioOptions):
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
     """Navigators: anywhere, kalman, secant, mean_jacobian, map_matching, parallel, geodesic, ga, pso,
-    afsa; with a run gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN; a policy of any algorithm
-    policy=FILE or policy:LABEL=FILE."""
+    afsa; trained agents by run folder: gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN; policies of
+    any algorithm by file: policy=FILE or policy:LABEL=FILE."""
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
     tasks_seed: int | None = None
-    """Seed of random tasks, 0 by default; no training and no frozen set has the same tasks."""
+    """Seed of random tasks, disjoint from the tasks of trainings and of frozen sets; 0 by default."""
     scenario: Path | None = None
-    """TOML or JSON file of an own region, date and tasks (docs/data.md); by default that of the runs, or the
-    paper's."""
+    """Scenario file (.toml or .json) of region, date and tasks (docs/data.md); by default that of the runs, or
+    the paper's."""
     export: Path | None = None
     """GeoJSON file for the tracks of all episodes (.geojson)."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
@@ -87,21 +87,21 @@ class Config(ScenarioOptions):
     noise: Noise | None = None
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]; by default those of the runs, or 0."""
     conditions: Annotated[str | None, tyro.conf.arg(aliases=("--errors",))] = None
-    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater, low-cost, or a file of own
-    errors (.toml or .json, docs/conditions.md)."""
+    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater, low-cost, or a file of errors
+    (.toml or .json, docs/conditions.md); none by default."""
     known_start: Noise | None = None
-    """Where the vehicles know the field at their start and calibrate their sensors: standard deviations of what they
-    know of D [deg], I [deg], B_H [nT], such as 0 0 0; with --conditions."""
+    """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
+    calibrated; with --conditions; by default the start is unknown."""
     map_date: str | None = None
-    """Date of the map of map_matching, as 2015-01-01 (IGRF); by default its map is the field itself."""
+    """Date of the IGRF map of map_matching, such as 2015-01-01; by default its map is the true field."""
     kilometers: bool = False
-    """Whether the tables lead with distances, as they do where arrival is not by the objective."""
+    """Distances in the first columns of the tables; always on with another --arrival than objective."""
     confidence: float = 0.0
-    """Least probability at which a vehicle declares its arrival, with --arrival declared."""
+    """Minimum probability of a correct declaration, with --arrival declared; 0 by default."""
     seed: int = 0
     """Random seed of metaheuristics, sensor noise and random start headings."""
     out: Path = field(default_factory=free_folder)
-    """Folder of the results, new or empty; by default runs/evaluation, or with the first free number behind it."""
+    """Folder of the results, new or empty; by default the first free one of runs/evaluation, runs/evaluation-2, ..."""
     wandb_mode: WandbMode = "offline"
     """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
 

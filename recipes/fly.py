@@ -43,9 +43,9 @@ from tqdm import tqdm
 
 RECIPE = "fly.py"
 RULES = {"told": "objective", "alone": "declared"}
-"""Rules of arrival of the two flights: the vehicle is told when it has arrived, or declares it within 25 km."""
+"""Rules of arrival of the two flights: with an arrival signal, and declared by the vehicle within 25 km."""
 ARRIVAL_KM = 400.0
-"""Distance up to which the arrival threshold is 0.01; beyond, it falls so that arrival means as many kilometers."""
+"""Distance up to which the arrival threshold is 0.01; beyond, it decreases so that the arrival radius is constant."""
 
 
 @dataclass(frozen=True)
@@ -57,24 +57,24 @@ class Config:
     destination: tyro.conf.Positional[str]
     """Destination, such as a start, or by its magnetic elements: "D=-11.1 I=75.2 BH=13000" (deg, deg, nT)."""
     navigator: str = "anywhere"
-    """Navigator: anywhere (the pretrained agent), anywhere=RUN (an own training), kalman, secant, or another one of
+    """Navigator: anywhere (the pretrained agent), anywhere=RUN (a run folder), kalman, secant, or another one of
     recipes/evaluate.py."""
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
     conditions: Annotated[str | None, tyro.conf.arg(aliases=("--errors",))] = None
-    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater, low-cost, or a file of own
-    errors (.toml or .json, docs/conditions.md)."""
+    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater, low-cost, or a file of errors
+    (.toml or .json, docs/conditions.md); none by default."""
     known_start: tuple[float, float, float] | None = None
-    """Where the vehicle knows the field at its start and calibrates its sensors: standard deviations of what it knows
-    of D [deg], I [deg], B_H [nT], such as 0 0 0; with --conditions."""
+    """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
+    calibrated; with --conditions; by default the start is unknown."""
     date: str = "2025-01-01"
     """Date of the field, 1900 to 2030 (IGRF-14)."""
     zeta: float | None = None
-    """Arrival threshold on the objective (Eq. 2-7); by default 0.01, and less beyond 400 km: about 25 km around it."""
+    """Arrival threshold on the objective (Eq. 2-7); by default 0.01, and beyond 400 km less, for a radius of 25 km."""
     max_steps: int | None = None
-    """Moves after which the flight ends; by default three times the shortest path, and 20."""
+    """Maximum number of moves; by default 20 more than three times the shortest path at 50 km a move."""
     start_heading: float | Literal["random"] = "random"
-    """Heading at the start, degrees from true north."""
+    """Heading at the start, from true north [deg]; random by default."""
     seed: int = 0
     """Random seed of the start heading and of the noise."""
     out: Path = Path("runs/fly")
@@ -82,7 +82,7 @@ class Config:
     export: Path | None = None
     """GeoJSON file for the track (.geojson)."""
     animate: Path | None = None
-    """File for an animation of the flight: .gif."""
+    """GIF file for an animation of the flight (.gif)."""
 
 
 class Watched(TensorDictModuleBase):
@@ -95,7 +95,7 @@ class Watched(TensorDictModuleBase):
         self.bar = tqdm(total=distance_km, bar_format=form, mininterval=0.2)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Show the distance flown, and the estimate of the way that is left with its standard deviation."""
+        """Show the distance flown, and the estimated remaining way with its standard deviation."""
         way, covariance = tensordict["way"][0].double(), tensordict["way_covariance"][0].double()
         left = way.norm()
         direction = way / left.clamp_min(1e-6)
@@ -148,7 +148,7 @@ def check_files(config: Config) -> None:
 
 
 def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
-    """Return environment and navigator of a vehicle that is told when it has arrived, and of one that is alone.
+    """Return environment and navigator of a vehicle with an arrival signal (``told``) and without (``alone``).
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -181,7 +181,7 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
 
 
 def with_estimates(flight: Flight) -> TransformedEnv:
-    """Return the environment of a flight with estimates of the way, which those that declare have."""
+    """Return the environment of a flight; without a declaration, add estimates of the way."""
     if flight.base.arrival.declared:
         return with_declaration(flight.env)
     track = TrackGradient(std_keys=STD_KEYS if flight.env is not flight.base else (), range_km=1000.0)
@@ -212,7 +212,7 @@ def outcome(steps: TensorDictBase) -> str:
 
 
 def fly(config: Config) -> dict[str, Any]:
-    """Fly twice, told of the arrival and alone, write the files and return the content of ``flight.json``.
+    """Fly with and without an arrival signal, write the files and return the content of ``flight.json``.
 
     Raises:
         UsageError: for anything that is wrong with the settings, before anything is flown.

@@ -41,7 +41,7 @@ class Config:
     num_tasks: int = 200_000
     """Number of training tasks: starts and destinations."""
     distance_range_km: tuple[float, float] = (150.0, 1800.0)
-    """Shortest and longest distance of a task [km]; short ones are as frequent as long ones in logarithm."""
+    """Shortest and longest distance of a task [km], log-uniform."""
     test_regions: int = 256
     """Number of regions of other planets, and of the Earth, on which the fit is tested."""
     width: int = 64

@@ -6,7 +6,7 @@
     python recipes/ppo_anywhere.py --resume RUN     # resume an interrupted run exactly
 
 The agent corrects the move that dual control plans, so that it begins as the navigator `kalman`. The regions are
-patches of planets whose magnetic fields have the spectrum and the polarity of the Earth's and nothing else of it. The
+patches of planets whose magnetic fields share only the spectrum and the polarity of the Earth's. The
 errors of the sensors and the price of a step are drawn for each episode. The test tasks are on Earth, in regions that
 no training sees. With --arrival declared, vehicles declare their arrival by the rule of `DeclareArrival`, and a false
 arrival has an SPL of 0.
@@ -81,15 +81,15 @@ class Config(PlanetConfig):
     arrival: Literal["objective", "declared"] = "objective"
     """Rule of arrival: by the objective, or declared by the vehicle within ``arrival_km``."""
     arrival_km: Positive = 25.0
-    """Distance from the destination within which a declaration is right [km]."""
+    """Distance from the destination within which a declaration is correct [km]."""
     range_km: Positive = 300.0
     """Prior standard deviation of the way to the destination along each axis [km]."""
     price_range: Rising = (0.1, 30.0)
-    """Lowest and highest price of a step [% of SPL]; each episode has its own, which the agent observes."""
+    """Range of the step price [% of SPL], which is drawn for each episode and observed by the agent."""
     critic_batches: Count = 3
     """Collected batches before the first update of the actor."""
     advantage_floor: NonNegative = 0.2
-    """What is added to the expected loss by which advantages are divided, so that easy episodes count as well."""
+    """Constant added to the expected loss that divides advantages; it limits the weight of easy episodes."""
 
 
 FAR = Config()
@@ -119,7 +119,7 @@ def declaration(base: GeomagneticNavEnv) -> list[Transform]:
 
 
 def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> TransformedEnv:
-    """Add the sensors, the price, the agent's view, and for training only what is privileged: critic and reward."""
+    """Add sensors, step price, the agent's view, and the privileged inputs of critic and reward, for training only."""
     price = RandomStepPrice(config.price_range, seed=base.seed)
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
     highest = HighestSPL({"move": "true_move"} if config.drift else None)
@@ -165,7 +165,7 @@ def make_stochastic_actor(actor: TensorDictSequential, spread: Spread) -> Tensor
 
 
 def normalized(transitions: TensorDictBase, floor: float) -> TensorDictBase:
-    """Normalize advantages relative to the expected loss of an episode, which is larger by far with poor sensors."""
+    """Divide advantages by the expected loss of the episode, which is much larger with poor sensors, and normalize."""
     relative = transitions["advantage"] / (transitions["state_value"].abs() + floor)
     transitions["advantage"] = ((relative - relative.mean()) / relative.std()).clamp(-5, 5)
     return transitions

@@ -63,7 +63,7 @@ class Config(PlanetConfig):
     final_critic_learning_rate: Positive = 3e-5
 
     observe_heading: bool = True
-    """Whether the agent reads its heading; if not, episodes start northward, and the way is relative to it."""
+    """Observe the heading; otherwise episodes start northward, and the way is in the vehicle's frame."""
     step_price: Positive = 0.5
     """Price of a step [% of SPL]."""
 
@@ -73,7 +73,7 @@ class Config(PlanetConfig):
     sequences_per_update: Count = 128
     """Sequences per gradient step of the memory."""
     memory_batches: Count = 20
-    """Collected batches before the first update of the moves: until then, the vehicle moves along its estimate."""
+    """Collected batches before the first update of the moves; until then, the vehicle follows its estimate."""
     memory_learning_rate: Positive = 1e-3
     """Learning rate of the memory at the start."""
     final_memory_learning_rate: Positive = 3e-5
@@ -99,7 +99,7 @@ class Command(nn.Module):
 
 
 def make_memory(size: int, config: Config) -> TensorDictSequential:
-    """Return the network from readings to what is remembered of them and the estimate of the way, ``(..., 2)``.
+    """Return the network from readings to its memory and the estimated way ``(..., 2)``.
 
     The estimate is 1 long where the destination is farther than the longest move. It is shorter where the direction is
     not known well, so that the vehicle starts with short moves.
@@ -140,7 +140,7 @@ def with_view(env: EnvBase, memory: TensorDictSequential, config: Config) -> Tra
 
 
 def make_env(base: GeomagneticNavEnv, memory: TensorDictSequential, config: Config) -> TransformedEnv:
-    """Add the sensors, the agent's view, and for training only what is privileged: critic, estimate and reward."""
+    """Add sensors, the agent's view, and the privileged inputs of critic, estimate and reward, for training only."""
     price = RandomStepPrice((config.step_price, config.step_price), seed=base.seed)
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
     highest = HighestSPL({"move": "true_move"} if config.drift else None)

@@ -40,17 +40,17 @@ class Config:
     navigators: tuple[str, ...] = ("secant", "parallel")
     """Navigators beside the run's policy, as in recipes/evaluate.py."""
     num_tasks: int | None = None
-    """Number of tasks, the first of the set; 12 by default, or all where there are fewer."""
+    """Number of tasks, from the first of the set; 12 by default, or all if there are fewer."""
     tasks: TaskSet | None = None
     """Frozen task set; the scenario's own tasks by default, or test-1000 where it has none."""
     scenario: Path | None = None
-    """TOML or JSON file of an own region (docs/data.md); the scenario of the run by default."""
+    """Scenario file (.toml or .json, docs/data.md); the scenario of the run by default."""
     zeta: float | None = None
     """Arrival threshold on the objective; that of the training by default."""
     seed: int = 0
     """Random seed of metaheuristics, sensor noise and random start headings."""
     out: Path | None = None
-    """The page, replaced if it exists; replay.html in the run's folder by default."""
+    """File of the page, which is replaced; replay.html in the run folder by default."""
     gif: Path | None = None
     """Animated GIF of the run's policy on the same tasks; none by default."""
 

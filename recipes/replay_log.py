@@ -43,7 +43,7 @@ OPTIONS = {"D": "declination", "I": "inclination", "B_H": "horizontal"}
 COMMANDED = ["move_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
 """Columns of what the navigator would have commanded and estimated."""
 FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}"}
-"""Formats of columns of log.md, where not one decimal."""
+"""Formats of the columns of log.md that do not have one decimal."""
 
 
 @dataclass(frozen=True)
@@ -57,19 +57,19 @@ class Config:
     target: tuple[float, float, float] | None = None
     """Elements at the destination, D [deg], I [deg], B_H [nT]; by default those of the last row."""
     target_position: tuple[float, float] | None = None
-    """Its latitude and longitude [deg], for the comparison only; by default that of the last row, without --target."""
+    """Latitude, longitude of the destination [deg], for comparison only; without --target those of the last row."""
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Standard deviations of constant and slow errors of the same."""
+    """Standard deviations of constant and slow errors of D [deg], I [deg], B_H [nT]."""
     arrival_km: float = 25.0
-    """Distance from the destination that counts as arrived [km]."""
+    """Arrival radius around the destination [km]."""
     every_km: float = 0.0
-    """Least length of a move: the readings of shorter ones are averaged [km]."""
+    """Minimum length of a move [km]; readings of shorter moves are averaged."""
     date: str | None = None
-    """Date for a comparison with IGRF at the positions; by default that of the times, where these are dates."""
+    """Date of the IGRF that readings are compared with; by default from the column of the time, if it has dates."""
     time: str = "time"
-    """Column of the time, numbers or ISO 8601; it may be missing."""
+    """Column of the time, numbers or ISO 8601; optional."""
     declination: str = "D"
     """Column of the declination [deg]."""
     inclination: str = "I"
@@ -77,11 +77,11 @@ class Config:
     horizontal: str = "B_H"
     """Column of the horizontal intensity [nT]."""
     heading: str = "heading"
-    """Column of the heading of the move since the row before [deg]."""
+    """Column of the heading of the move from the previous row [deg]."""
     distance: str = "distance"
-    """Column of its length [km]."""
+    """Column of the length of the move from the previous row [km]."""
     latitude: str = "latitude"
-    """Column of the true latitude [deg]; it may be missing, with that of the longitude."""
+    """Column of the true latitude [deg]; optional, together with the longitude."""
     longitude: str = "longitude"
     """Column of the true longitude [deg]."""
     out: Path = Path("runs/replay_log")
@@ -187,7 +187,7 @@ def turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def figure(table: pd.DataFrame, title: str) -> Figure:
-    """Return a figure of the track with the estimates of the destination, and of the distance that is left."""
+    """Return a figure of the track, the estimates of the destination, and the remaining distance."""
     drawn = Figure(figsize=(12, 5.4), layout="constrained")
     plan, left = drawn.subplots(1, 2)
     dots = draw_track(plan, table)
@@ -250,7 +250,7 @@ def markdown(table: pd.DataFrame) -> str:
 
 
 def notes(table: pd.DataFrame) -> list[str]:
-    """Return what a reader of the table must know."""
+    """Return notes on the table: warnings, the first stop, and errors of the estimate."""
     lines = []
     heading = table["heading"]
     if heading.abs().max() <= 2 * math.pi and heading.max() - heading.min() > 0.5:

@@ -54,9 +54,9 @@ class Config(TD3Config, GuidanceConfig):
     guided: bool = True
     """Gradient guidance: the theoretical heading and its alignment reward."""
     collectors: Count = 1
-    """Number of collecting processes; with more than one, runs are not repeatable to the bit."""
+    """Number of collecting processes; with more than one, runs are not reproducible bit for bit."""
     collector_backend: CollectorBackend = "process"
-    """Where several collectors run: processes of this machine, or a Ray cluster."""
+    """Backend of several collectors: processes of this machine, or a Ray cluster."""
 
     # Environment
     start_heading: Literal["north", "random"] = "north"
@@ -66,7 +66,7 @@ class Config(TD3Config, GuidanceConfig):
     objective_limit: Positive | None = None
     """Upper bound on the objective in the proximity reward; 10 in preset paper."""
     time_limit_ends: bool = False
-    """Count the step limit as the end of the task, with no value after it; in preset paper."""
+    """Treat the step limit as a termination, without a bootstrapped value; on in preset paper."""
     observe_heading: bool = True
     """Observe cosine and sine of the heading."""
     observe_difference: bool = True

@@ -36,7 +36,7 @@ class TrainedPolicy(TensorDictModuleBase):
     state_keys: Sequence[str] = ()
     """Keys of the state that it keeps for each vehicle from step to step."""
     state: TensorDictBase | None = None
-    """State after its last call, and what that call began with; None before the first."""
+    """State after the last call, with the state before it; None before the first call."""
 
     def for_env(self, env: EnvBase) -> TrainedPolicy:
         """Return the policy for the limits of an environment.
@@ -48,7 +48,7 @@ class TrainedPolicy(TensorDictModuleBase):
         return self
 
     def check_fits(self, env: EnvBase) -> None:
-        """Raise unless an environment has the field of the policy, and allows what it does.
+        """Raise unless an environment has the field of the policy, and allows its moves and declarations.
 
         Args:
             env: navigation environment, with transforms or without.
@@ -67,7 +67,7 @@ class TrainedPolicy(TensorDictModuleBase):
             self.view.check_covers(env.field, env.region.grid(81).to(env.device))
 
     def _state_before(self, seen: TensorDictBase) -> tuple[TensorDictBase | None, Tensor]:
-        """Return the state that a step begins with, and who starts anew ``(..., 1)``: both as in a call before it."""
+        """Return the state before a step and a mask of new episodes ``(..., 1)``; repeated calls return the same."""
         stored, starts = self.state, seen["step_count"] == 0
         if stored is None or stored.shape != seen.shape or stored.device != seen.device:
             return None, torch.ones_like(starts)
@@ -78,7 +78,7 @@ class TrainedPolicy(TensorDictModuleBase):
     def _keep_state(
         self, seen: TensorDictBase, before: TensorDictBase | None, starts: Tensor, state: TensorDictBase
     ) -> None:
-        """Keep the state for the next step, and what this one began with."""
+        """Store the state for the next step, and the state before this one."""
         begun = {"step": seen["step_count"].clone(), "starts": starts, "before": state if before is None else before}
         self.state = state.clone(recurse=False).update(begun)
 
@@ -159,7 +159,7 @@ class ExportedPolicy(TrainedPolicy):
         return tensordict.set("action", action.reshape(*seen.shape, -1))
 
     def content(self) -> dict[str, Any]:
-        """Return all that rebuilds the policy as numbers, text and tensors."""
+        """Return the content of the policy file: numbers, text and tensors."""
         content = {name: getattr(self, name) for name in ("in_keys", "first_state", "declares")}
         view = None if self.view is None else asdict(self.view)
         return {**content, "view": view, "program": self.program.content()}

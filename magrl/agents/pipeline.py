@@ -37,9 +37,9 @@ TOLERANCE = 1e-4
 def export_policy(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
     """Return a policy of any algorithm as a navigator of the plain environment, and compare both in flight.
 
-    Of the transforms of the environment, those are taken along that the policy needs: they lead from public keys to
-    what it observes, and from its action to kilometers and radians. Errors of sensors and of motion stay behind.
-    Neither the policy nor the environment is changed. A state is taken along, whether of the policy (an
+    The export includes the transforms of the environment that the policy needs: from public keys to its observation,
+    and from its action to kilometers and radians. Errors of sensors and of motion stay behind.
+    Neither the policy nor the environment is changed. It includes the state, whether of the policy (an
     :class:`~torchrl.modules.LSTMModule`, or any ``key`` that it reads and writes as ``("next", key)``) or of a
     :class:`~magrl.transforms.base.StatefulTransform`, such as those of a :class:`~magrl.transforms.TrackView`.
 
@@ -70,7 +70,7 @@ def export_policy(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
 
 
 class _Values(TorchFunctionMode):
-    """Let tensors that were computed from others be copied, as values: other libraries keep such in their modules."""
+    """Copy non-leaf tensors by value, which ``deepcopy`` rejects and modules of other libraries may contain."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is Tensor.__deepcopy__ and not args[0].is_leaf:
@@ -124,7 +124,7 @@ def _exported(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
 
 
 def _with_first_state(env: EnvBase, actor: TensorDictModuleBase) -> EnvBase:
-    """Return an environment whose reset writes the first state of a policy, and where an episode starts."""
+    """Return an environment whose reset writes the first state of a policy, and ``is_init``."""
     start = env.reset()
     written, missing = set(start.keys(True, True)), [InitTracker()]
     if "is_init" in written or "is_init" not in _keys(actor.in_keys):
@@ -260,7 +260,7 @@ def _leading_to(needed: Keys, parts: Iterable[Transform], written: str, read: st
 
 
 def _physical_action(acted: TensorDictBase, transforms: Iterable[Any]) -> Tensor:
-    """Return the action of the environment that transforms make of the action of a policy."""
+    """Return the action of the environment, by the inverse transforms of the action of a policy."""
     for part in transforms:
         acted = part.inv(acted)
     return acted["action"]
@@ -294,7 +294,7 @@ def _compare(policy: ExportedPolicy, steps: TensorDictBase, after: Iterable[Any]
     differ = ~torch.isclose(got, wanted.to(got.dtype), TOLERANCE, TOLERANCE)
     if differ.any():
         raise ValueError(
-            f"its export acts otherwise than itself: from step {differ.any(-1).any(0).int().argmax()} on the actions "
+            f"its export acts differently: from step {differ.any(-1).any(0).int().argmax()} on the actions "
             f"differ by up to {(got - wanted).abs().flatten(0, 1).amax(0).tolist()} (km, rad). The policy and its "
             "transforms must depend on their in_keys and their state in the TensorDict, and on one vehicle only"
         )

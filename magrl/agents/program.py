@@ -276,4 +276,4 @@ def _argument(item: Any, count: int) -> Callable[[Sequence[Any]], Any]:
     constant = vars(torch).get(which) if isinstance(which, str) else None
     if kind in _TYPES and isinstance(constant, _TYPES[kind]):
         return lambda _: constant
-    raise ValueError(f"an argument must be a number, a known value or a list of these, got {short(item)}")
+    raise ValueError(f"an argument must be a number, an earlier value or a list of these, got {short(item)}")

@@ -230,7 +230,7 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
 def noise_figure(levels: Mapping[str, Summaries], mode: str = "look-ahead") -> Figure:
     """Return SPL over the noise level: a line for each navigator, and the range of its runs where it has several.
 
-    The axis leaves out navigators that are below 50 % at every level beside better ones; the legend says so.
+    Navigators below 50 % at every level are outside the axis if others are better; the legend marks them.
 
     Args:
         levels: by noise level, lowest first, the summaries of the runs of each navigator. A level that a navigator did

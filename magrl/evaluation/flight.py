@@ -26,16 +26,16 @@ Errors: TypeAlias = Conditions | Sequence[float] | str | Path
 
 
 class Flight:
-    """Vehicles in a scenario, the errors of their sensors, and what they know of these.
+    """Vehicles in a scenario, with the errors of their sensors and the accuracy that they know.
 
     Args:
         scenario: scenario.
         errors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real vehicle:
             :class:`~magrl.transforms.Conditions`, a name of :data:`magrl.transforms.CONDITIONS`, or a file of
             conditions (:func:`magrl.transforms.load_conditions`).
-        known_start: where the vehicles know the elements at their start, the standard deviations of these: they then
-            calibrate their sensors (:class:`magrl.transforms.KnownStart`). With the errors of a real vehicle.
-        confidence: least probability at which navigators declare an arrival, where it must be declared.
+        known_start: standard deviations of the elements at a known start, where the vehicles calibrate their sensors
+            (:class:`magrl.transforms.KnownStart`). With the errors of a real vehicle.
+        confidence: minimum probability at which navigators declare an arrival, with arrival ``"declared"``.
         num_envs: number of vehicles; by default one for each task of the scenario, and one without tasks.
         seed: random seed of the errors, random start headings and metaheuristics.
         device: device of the environment.
@@ -104,7 +104,7 @@ class Flight:
     def environment(self, navigator: TensorDictModuleBase) -> EnvBase:
         """Return the environment in which a navigator of :meth:`navigator` flies.
 
-        Where an arrival must be declared, navigators and trained agents declare by their own estimate
+        With arrival ``"declared"``, navigators and trained agents declare from their own estimate
         (:func:`magrl.evaluation.scenarios.with_declaration`); another policy writes the third action itself.
         """
         declares = isinstance(navigator, TrainedPolicy | Navigator)

@@ -20,7 +20,7 @@ from magrl.transforms import TrackView
 
 
 class TrainedAgent(NamedTuple):
-    """Labels of a kind of trained agent in figures and tables, and what it needs, as of a :class:`Navigator`."""
+    """Labels of a kind of trained agent in figures and tables, and its ``needs``, as in :class:`Navigator`."""
 
     label: str
     description: str
@@ -29,9 +29,9 @@ class TrainedAgent(NamedTuple):
 
 
 OWN = "policy"
-"""Name of a policy of any algorithm, which takes its file or a folder with ``policy.safetensors``, and a label."""
+"""Name of policies of any algorithm, given by a file or a folder with ``policy.safetensors``, and a label."""
 PRETRAINED = ("anywhere",)
-"""Names of trained agents that come with the library; its training planets share only the spectrum of the field."""
+"""Names of the trained agents in the library."""
 TRAINED = {
     "gg_td3": TrainedAgent("Gradient-Guided TD3", "Gradient-Guided TD3"),
     "gg_td3_noise": TrainedAgent("Gradient-Guided TD3, trained with noise", "Gradient-Guided TD3, trained with noise"),

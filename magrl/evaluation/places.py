@@ -17,8 +17,8 @@ from magrl.geodesy import geodesic, move, wrap_longitude
 from magrl.navigators.base import displacement_to
 
 ELEMENT_TOLERANCE = (0.25, 0.25, 100.0)
-"""Largest difference of D, I [deg] and B_H [nT] between the elements of a place and those that were asked for: their
-change over about 25 km."""
+"""Tolerance of D, I [deg] and B_H [nT] between the elements of a place and the given ones: their change over about
+25 km."""
 LEAST_INTENSITY_NT = 2000.0
 """Lowest horizontal intensity of a place: nearer to a magnetic pole, the declination is hardly defined."""
 _NUMBER = r"([+-]?\d+(?:\.\d*)?)"
@@ -102,7 +102,7 @@ def find_elements(field: FieldModel, elements: Tensor, near: Tensor) -> Tensor:
         ``(2,)`` latitude, longitude [deg], float64.
 
     Raises:
-        ValueError: if there is no such place, with the elements of the place that is most alike.
+        ValueError: if there is no such place, with the most similar elements.
 
     Example:
         >>> from magrl.field import IGRF

@@ -1,4 +1,4 @@
-"""How agents were trained, from the settings in their run folders, so that an evaluation flies them in the same way."""
+"""Settings of trained agents from their run folders, so that evaluations use the same."""
 
 from __future__ import annotations
 

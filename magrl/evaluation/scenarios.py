@@ -1,4 +1,4 @@
-"""What an evaluation flies: a scenario with frozen tasks, and the keys of it that a command line can change."""
+"""Scenarios of evaluations: frozen tasks, and the scenario keys that a command line can change."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class ScenarioOptions:
     """Rule of arrival: F below --zeta, the distance below --arrival-radius-km, or a declaration by the navigator's own
     estimate; objective by default."""
     arrival_radius_km: float | None = None
-    """Distance from the destination of an arrival by distance, or of a right declaration [km]; 25 by default."""
+    """Arrival radius around the destination, for --arrival distance and declared [km]; 25 by default."""
     max_steps: int | None = None
-    """Moves after which an episode ends; 50 by default."""
+    """Maximum number of moves in an episode; 50 by default."""
     max_move_km: float | None = None
     """Longest move [km]; 50 by default."""
     max_turn_deg: float | None = None
@@ -48,7 +48,7 @@ class ScenarioOptions:
     altitude_km: float | None = None
     """Altitude above the ellipsoid, negative for a depth [km]; 0 by default."""
     margin_deg: float | None = None
-    """How far beyond the region destinations may lie and vehicles may stray [deg]; 5 by default."""
+    """Margin around the region for destinations and vehicles [deg]; 5 by default."""
 
     def changes(self) -> dict[str, Any]:
         """Return the keys that are given."""
@@ -126,7 +126,7 @@ def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = 
 
     Args:
         env: navigation environment with all errors of the sensors.
-        confidence: least probability of a right declaration at which they declare.
+        confidence: minimum probability of a correct declaration at which they declare.
         navigator: navigator; one with its own declaration (``declares``) needs no other.
 
     Example:

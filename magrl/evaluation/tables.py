@@ -23,7 +23,7 @@ Summaries = Mapping[str, Sequence[Summary]]
 """By navigator, a summary of each of its runs."""
 
 MIN_RUNS = 10
-"""Fewest runs whose bootstrap interval holds the true mean about as often as it says."""
+"""Minimum number of runs for a bootstrap interval whose coverage is about nominal."""
 
 COLUMNS = {
     "SR %": ("success_rate", ".1f"),
@@ -55,8 +55,8 @@ KILOMETERS = {
     "final distance, median km": ("final_distance_km_median", ".1f"),
     "false arrivals %": ("false_arrival_rate", ".1f"),
 }
-"""The first columns of tables that lead with kilometers: on long ways, the objective hides how far off an end is. False
-arrivals are shown where vehicles declare their arrival."""
+"""Distance columns, first in some tables: over long distances, the objective hides the final distance. False arrivals
+are shown where vehicles declare their arrival."""
 
 INTERVALS = ("success_rate", "spl", "spl_to_arrival", "path_efficiency", "steps")
 """Measures that are shown with an interval."""

@@ -1,4 +1,4 @@
-"""Dual-control navigator: a filter estimates the gradient, and each move is also chosen for what it will teach."""
+"""Dual-control navigator: a filter estimates the gradient, and moves are chosen also for the information they give."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Kalman(QuasiNewton):
         caution: weight of the uncertainty of the way.
         step_price: price of a step while many are left [% of SPL]; a way of ``range_km`` is 100 %.
         range_km: prior standard deviation of the way along each axis [km].
-        lengths: of the moves that are compared, as fractions of the longest.
+        lengths: lengths of the candidate moves, as fractions of the longest move.
         search: as of :class:`QuasiNewton`, here by default.
-        prior: of the gradients: learned on random planets, or that of a dipole, so that nothing is trained.
+        prior: prior of the gradients: ``"learned"`` on random planets, or ``"dipole"``, without training.
         **options: ``zeta`` of :class:`QuasiNewton`.
 
     Raises:

@@ -26,7 +26,7 @@ from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import SLOPES, Way
 
 FLOOR = (1e-3, 1e-3, 0.1)
-"""Standard deviation of D, I [deg], B_H [nT] that every reading has at least: its rounding, and that of the map."""
+"""Minimum standard deviation of readings of D, I [deg], B_H [nT]: rounding of the reading and of the map."""
 SECULAR_VARIATION = (0.1, 0.1, 39.0)
 """Root mean square change per year of D, I [deg], B_H [nT] in regions of the Earth, 2015 to 2025 (IGRF-14)."""
 GRID_POINTS = 41
@@ -36,7 +36,7 @@ LONGEST_STEP_KM = 200.0
 PRIOR_KM = 1000.0
 """Prior standard deviation of a position along each axis [km]."""
 FORGET_KM = 30.0
-"""Distance along which the error of a map changes the position as much as it moves it in all [km]; from a scan."""
+"""Distance over which the position variance grows by that of the map's error [km]; from a scan."""
 BIAS_SHARE = 0.25
 """Share of the variance of the bias that counts as noise of each reading."""
 _DEGREE_KM = 111.2
@@ -54,7 +54,7 @@ class MapMatching(Navigator):
     An error of the map, for example its age, moves both positions nearly alike, so that much of it cancels. With
     ``map_error``, the filter also forgets: the older a reading, the less it tells of the error at the present place.
 
-    It is told the region, and over many regions in which of them it is (``region``).
+    It needs the region; with several regions, the key ``region`` names the vehicle's.
 
     Args:
         field: the map, a field model or a bank of them; ``env.field`` is a perfect one.

@@ -23,7 +23,7 @@ RANGE_KM = 1000.0
 
 
 class QuasiNewton(Navigator):
-    """Base class of quasi-Newton navigators: each move goes to where, by the estimated Jacobian, the error vanishes.
+    """Base class of quasi-Newton navigators: each move goes to where the estimated Jacobian predicts no error.
 
     The Jacobian is that of :mod:`magrl.tracking`. The filter weighs each reading by its noise and the length of the
     move, and each element by how well it determines the way. Without noise, the first update is Broyden's. With

@@ -1,4 +1,4 @@
-"""Quasi-Newton navigator that knows nothing in advance: two probing legs give a first Jacobian of the elements."""
+"""Quasi-Newton navigator without prior knowledge: two probing legs give a first Jacobian of the elements."""
 
 from __future__ import annotations
 

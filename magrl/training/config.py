@@ -71,13 +71,13 @@ class RunConfig(CheckedModel):
     device: str = "cpu"
     """Device of all tensors: cpu, cuda, cuda:0, ..."""
     logger: Logger = "wandb"
-    """Logger of the curves, beside train.csv (docs/training.md); tensorboard is an extra."""
+    """Logger of the curves, besides train.csv (docs/training.md); tensorboard needs the extra magrl[tensorboard]."""
     wandb_mode: WandbMode = "offline"
     """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
     checkpoint_every: NonNegative = 30.0
     """Time between checkpoints [s]."""
     scenario: Path | None = None
-    """TOML or JSON file of an own region, date and altitude (docs/data.md); the paper's by default."""
+    """Scenario file (.toml or .json) of region, date and altitude (docs/data.md); the paper's by default."""
     num_envs: Count = 512
     """Number of vehicles."""
     zeta: Threshold = 0.01
@@ -85,13 +85,13 @@ class RunConfig(CheckedModel):
     noise: Noise = (0.0, 0.0, 0.0)
     """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT], in training and evaluations."""
     total_frames: Count = 204_800
-    """Steps of all vehicles together."""
+    """Total number of steps over all vehicles."""
     total_episodes: Count | None = None
-    """Episodes after which training stops, if earlier."""
+    """Maximum number of training episodes."""
     eval_every: Count = 20
     """Collected batches between evaluations on the validation tasks."""
     eval_tasks_small: Count = 200
-    """Number of validation tasks, which select the policy that is kept."""
+    """Number of validation tasks, by which the best policy is selected."""
     eval_tasks: Count = 1000
     """Number of test tasks of the final evaluation."""
 
@@ -111,10 +111,10 @@ class RunConfig(CheckedModel):
             given, value = scenario.given(name), getattr(self, name, None)
             if None not in (given, value) and given != value:
                 option = f"--{name.replace('_', '-')}"
-                raise ValueError(f"the scenario says {name} = {given!r}, the training {value!r}: add {option} {given}")
+                raise ValueError(f"the scenario sets {name} = {given!r}, the training {value!r}: add {option} {given}")
         if scenario.arrival == "declared":
             trains = "only ppo_anywhere.py --arrival declared trains for that"
-            raise ValueError(f'the scenario says arrival = "declared": {trains}')
+            raise ValueError(f'the scenario sets arrival = "declared": {trains}')
         return self
 
     def load_scenario(self) -> Scenario:
@@ -122,7 +122,7 @@ class RunConfig(CheckedModel):
         return Scenario() if self.scenario is None else load_scenario(self.scenario)
 
     def linear(self, name: str, remaining: float) -> float:
-        """Return a setting on its line from ``name`` to ``final_name``, with a share of the training remaining."""
+        """Interpolate a setting linearly from ``name`` to ``final_name``, by the remaining share of the training."""
         start, end = getattr(self, name), getattr(self, f"final_{name}")
         return end + remaining * (start - end)
 
@@ -145,7 +145,7 @@ class LearningConfig(RunConfig):
     final_learning_rate: Positive = 4e-5
     """Learning rate of Adam at the end; linear in between."""
     saturation_weight: NonNegative = 0.05
-    """Weight of the penalty on the actor's outputs before the tanh; falls linearly to 0."""
+    """Initial weight of the penalty on the actor's outputs before the tanh; decreases linearly to 0."""
 
 
 class VehicleConfig(LearningConfig):
@@ -161,7 +161,7 @@ class VehicleConfig(LearningConfig):
     max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
     """Largest turn to either side before a move [deg]."""
     drift: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Speed of a current as a share of the vehicle's; its direction is random in each episode."""
+    """Speed of a current relative to the vehicle's speed; its direction is random in each episode."""
 
     @property
     def limits(self) -> dict[str, float]:
@@ -203,13 +203,13 @@ class PPOConfig(LearningConfig):
     steps_per_batch: Count = 16
     """Steps of each vehicle in a collected batch."""
     epochs: Count = 8
-    """Passes over a collected batch."""
+    """Epochs over each collected batch."""
     batch_size: Count = 1024
     """Transitions per gradient step."""
     gae_lambda: Share = 0.95
     """Factor lambda of the generalized advantage estimate."""
     clip_epsilon: Positive = 0.2
-    """Largest change of the probability ratio that is rewarded."""
+    """Clipping range of the probability ratio."""
     clip_gradient: Positive = 1.0
     """Largest norm of the gradients."""
 
@@ -241,7 +241,7 @@ class PlanetConfig(VehicleConfig, PPOConfig):
     max_steps: Count = 50
     """Moves after which an episode is truncated."""
     noise_exponent: Positive = 1.0
-    """Exponent of the random levels of noise; the larger, the more noise (magrl.transforms.sensor_levels)."""
+    """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
     critic_cells: Widths = (256, 256)
     """Width of each hidden layer of the critic."""
     exploration: Positive = 0.4
@@ -301,7 +301,7 @@ class TD3Config(LearningConfig):
     batch_size: Count = 1024
     """Transitions per gradient step."""
     init_random_frames: Annotated[int, Field(ge=0)] = 1024
-    """Steps with random actions before the policy acts."""
+    """Number of initial steps with random actions."""
 
     @model_validator(mode="after")
     def _fits_its_buffer(self) -> Self:

@@ -17,9 +17,9 @@ from magrl.checks import check_choice
 T = TypeVar("T")
 Keys = Sequence[NestedKey]
 GivenKeys: TypeAlias = NestedKey | Keys | Mapping[str, NestedKey] | None
-"""Keys as a user gives them: in their order, or those in place of default keys by name; None for the default ones."""
+"""Keys as a user gives them: in order, or replacements of default keys by name; None for the default keys."""
 MOST_KEYS = 4
-"""Most keys that are given by their order alone."""
+"""Maximum number of keys that are given by their order alone."""
 
 
 class ObservationTransform(Transform):
@@ -73,7 +73,7 @@ class ObservationTransform(Transform):
             expect_keys(self, counts, self.out_counts or len(outs))
 
     def _named(self, values: Sequence[T]) -> dict[NestedKey, T]:
-        """Return what belongs to ``in_keys`` by the names of the default keys, and of the optional ones."""
+        """Return values of ``in_keys`` by the names of the default and optional keys."""
         return dict(zip((*self.default_in_keys, *self.optional_in_keys), values, strict=False))
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:

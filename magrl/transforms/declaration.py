@@ -1,4 +1,4 @@
-"""Declaration of the arrival by the vehicle's own estimate."""
+"""Declaration of arrival from the vehicle's own estimate."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from magrl.transforms.track import TRACK_KEYS
 
 
 class DeclareArrival(ObservationTransform):
-    """Declare the arrival by the vehicle's own estimate, so that any navigator can fly without an arrival signal.
+    """Declare arrival from the vehicle's own estimate, so that any navigator can fly without an arrival signal.
 
     For an environment whose action has a third number that declares the arrival. To the policy, the action has the
     first two. Where the vehicle is probably within the radius, and further readings are not worth their cost
@@ -30,14 +30,14 @@ class DeclareArrival(ObservationTransform):
     In ``Compose``, it stands behind :class:`TrackGradient`. It reads nothing privileged.
 
     Args:
-        radius_km: distance from the target within which a declaration is right [km].
+        radius_km: distance from the target within which a declaration is correct [km].
         max_steps: step limit: the last step declares.
-        confidence: least probability at which the vehicle declares; below, the episode ends without a declaration.
+        confidence: minimum probability of arrival for a declaration; below it, episodes end without one.
         range_km: prior standard deviation of the way along each axis [km].
         in_keys: values at the target ``(..., 3)``, mean ``(..., 3, 3)`` and covariance ``(..., 3, 3, 3)`` of the
             filter, heading ``(..., 1)`` [rad], and number of the step ``(..., 1)``.
         out_keys: probability ``(..., 1)`` that the target is within the radius, the probability ``(..., 1)`` at which
-            going on is worth as much, the mean way ``(..., 2)`` northward and eastward [km], and the distance
+            continuing has the same value, the mean way ``(..., 2)`` northward and eastward [km], and the distance
             ``(..., 1)`` from its end at which to stop [km].
         std_keys: where readings come with standard deviations ``(..., 3)``, those of noise, bias and drift.
 

@@ -56,8 +56,8 @@ class TrueWay(ObservationTransform):
 class HighestSPL(StatefulTransform):
     """Write the highest SPL (success weighted by path length) that an episode can still reach. Privileged.
 
-    It is that of the straight way from where the vehicle is: the distance of the task over the path so far plus the
-    true way. After an arrival it is the SPL of the episode, after another end 0.
+    It is the SPL of the straight way from the present position: the distance of the task over the path so far plus the
+    true way. After an arrival it is the SPL of the episode, after any other end 0.
 
     Args:
         in_keys: true way ``(..., 2)`` [km], last move ``(..., K)`` with the distance [km] first, start position and

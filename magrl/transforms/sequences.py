@@ -1,4 +1,4 @@
-"""What a vehicle reads and does at each step: the observation of policies with a memory of their own."""
+"""Observation of readings and moves at each step, for policies with a memory."""
 
 from __future__ import annotations
 

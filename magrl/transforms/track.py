@@ -191,8 +191,8 @@ class TrackGradient(StatefulTransform):
 class NoiseScale(StatefulTransform):
     """Scale the stated standard deviations of the noise of D, I, B_H by what the readings show.
 
-    Where less noise is stated than there is, estimates are too sure, and arrivals are declared too soon; where more is
-    stated, readings are wasted. See :func:`magrl.tracking.noise_estimate`. It stands before :class:`TrackGradient`, so
+    If the stated noise is too low, estimates are overconfident and arrivals are declared too soon; if it is too high,
+    readings are wasted. See :func:`magrl.tracking.noise_estimate`. It stands before :class:`TrackGradient`, so
     that this and all that follow read the scaled value; a navigator takes the larger of this and what it was given. An
     element without noise keeps 0. Its state is in the TensorDict.
 
@@ -222,7 +222,7 @@ class NoiseScale(StatefulTransform):
     out_sizes = ((3,),) * 3
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Raise if the track is written before, by which the filter would not read the scaled value."""
+        """Raise if an earlier transform writes the track: its filter would not read the scaled value."""
         if written := [key for key in TRACK_KEYS if key in observation_spec.keys(True, True)]:
             raise ValueError(f"NoiseScale stands before the transform that writes {written}: change their order")
         return super().transform_observation_spec(observation_spec)
@@ -251,10 +251,10 @@ class NoiseScale(StatefulTransform):
 class SearchAim(StatefulTransform):
     """Write the way to the most probable destination that the vehicle has not visited.
 
-    The episode has not ended where the vehicle was, so the destination is not there: see
-    :func:`magrl.tracking.unvisited`. This matters where the readings have a constant error, since the estimate alone
-    then leads to a place beside the destination, and stays there. For environments that end the episode at arrival; a
-    vehicle that must declare its arrival does not know that it has not arrived.
+    The destination is not at a visited place, because the episode did not end there: see
+    :func:`magrl.tracking.unvisited`. This matters where the readings have a constant error: the estimate alone leads to
+    a place beside the destination and stays there. For environments that end the episode at arrival; a vehicle that
+    declares its arrival gets no such signal.
 
     It stands after :class:`TrackGradient`. Its state is in the TensorDict.
 

@@ -1,4 +1,4 @@
-"""What agents observe: scaled keys of a region, or estimates along the vehicle's own track, and the parts of both."""
+"""Observations of agents: scaled keys of a region, or estimates along the vehicle's own track."""
 
 from __future__ import annotations
 
@@ -248,8 +248,8 @@ def track_observation(
 ) -> Tensor:
     """Return the observation of an agent that navigates by the estimates of its own track.
 
-    All vectors are in the vehicle's frame, so that what is learned at one heading holds at every heading. Lengths are
-    seen through logarithms, because the right move depends on their ratios.
+    All vectors are in the vehicle's frame, so that a policy generalizes over headings. Lengths are logarithms, because
+    the best move depends on their ratios.
 
     Args:
         way: ``(..., 2)`` way to aim at, forward and to the right [km].
@@ -381,7 +381,7 @@ class TrackView(_View):
         range_km: prior standard deviation of the way along each axis [km].
         search: whether it observes the way to where the vehicle has not been (:class:`~magrl.transforms.SearchAim`), as
             suits environments that end the episode at arrival.
-        step_price: what a step may cost [% of SPL]; the higher, the fewer steps, and the longer the path. None where
+        step_price: price of a step [% of SPL]; a higher price gives fewer steps and a longer path. None where
             the agent observes it as ``step_price``, for training.
 
     Raises:

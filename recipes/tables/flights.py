@@ -1,4 +1,4 @@
-"""Flights of tables and figures: frozen tasks in random regions of the Earth, and navigators told of their sensors."""
+"""Flights of tables and figures: frozen tasks in random regions, navigators that know the accuracy of their sensors."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class Flights:
     distance_km: Sequence[float] = paper.DISTANCE_KM
     max_steps: int = 50
     within_km: float | None = None
-    """Radius in which vehicles declare their arrival [km]; by default they are told, by the paper's rule."""
+    """Radius in which vehicles declare their arrival [km]; by default they get a signal, by the paper's rule."""
     confidence: float = 0.0
-    """Least probability at which vehicles declare their arrival."""
+    """Minimum probability at which vehicles declare their arrival."""
     known_start: Sequence[float] | None = None
     """Standard deviations of the elements at the start, where the vehicles know them."""
     box: bool = False
@@ -122,14 +122,14 @@ def paired_difference(first: Tensor, second: Tensor, region: Tensor) -> str:
 
 
 def reliability(flight: TensorDictBase, region: Tensor, radius_km: float) -> list[tuple[float, float, float]]:
-    """Return, for ten bins of the stated probability of being in the radius, its mean, the share right, and its error.
+    """Return mean, share of correct readings and its error for ten bins of the stated probability of arrival.
 
     In percent; the error is the half-width of an interval of 95 %. Bins of fewer than 100 readings are left out.
 
     Args:
         flight: ``(N, T)`` from vehicles that declare.
         region: region of each vehicle ``(N,)``.
-        radius_km: radius in which a declaration is right [km].
+        radius_km: radius in which a declaration is correct [km].
     """
     flown = first_episode_mask(flight["next", "done"]).squeeze(-1)
     stated, ends = flight["arrival_probability"][flown].squeeze(-1).double(), flight["target_position"][flown]

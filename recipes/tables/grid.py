@@ -90,7 +90,7 @@ def make(
         tables: Names of tables in tables.toml; all by default.
         navigators: Navigators in place of those of the table, as in recipes/evaluate.py.
         tasks: Number of tasks in place of that of the table.
-        confidence: Least probability at which vehicles declare their arrival, in place of 0.
+        confidence: Minimum probability at which vehicles declare their arrival, in place of 0.
         out: Folder of the tables, which are replaced; by default they are printed.
 
     Raises:

@@ -176,7 +176,7 @@ def step(name: object, *args: object, **named: object) -> Callable:
         (step("rand.default", [2]), "rand.default draws random numbers"),
         (step("__class__.mro"), "is no operation of PyTorch"),
         (step(7), "7 is no operation of PyTorch"),
-        (step("neg.default", {"value": 9999}), "a known value or a list of these, got {'value': 9999}"),
+        (step("neg.default", {"value": 9999}), "an earlier value or a list of these, got {'value': 9999}"),
         (lambda c: c["program"]["steps"].append("neg"), "must be a name, arguments and named arguments, got 'neg'"),
         (lambda c: c["program"]["tensors"].__setitem__(0, torch.tensor(torch.nan)), "tensor 0 is not finite"),
         (lambda c: c["program"]["tensors"].__setitem__(0, 5), "tensor 0 must be a Tensor, got 5"),

@@ -23,7 +23,7 @@ def load_pretrained(name: str, device: torch.device | str = "cpu") -> FieldPolic
         device: device on which the policy acts.
 
     Raises:
-        ValueError: for an unknown name, with those that there are.
+        ValueError: for an unknown name, listing the known ones.
 
     Example:
         >>> load_pretrained("anywhere").config.num_cells

@@ -21,7 +21,7 @@ class ArtificialFishSwarm(Metaheuristic):
     Args:
         visual: range of sight of a fish, in longest moves.
         step: longest step of a fish, in longest moves.
-        crowding: share of the population about a place above which it is crowded.
+        crowding: share of the population near a place above which that place is crowded.
         tries: places that a preying fish evaluates before it steps at random.
         options: options of :class:`Metaheuristic`.
 

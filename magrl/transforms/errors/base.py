@@ -1,4 +1,4 @@
-"""Base of the errors: random numbers of each vehicle and episode, what is true, and what a vehicle knows of accuracy.
+"""Base of the errors: random numbers of each vehicle and episode, true values, and the accuracy that vehicles know.
 
 Random numbers are a pure function of the transform's seed, of the seed of the environment, and of vehicle, episode
 and step. Each episode has a stream of them, whose state is in the TensorDict, so that a step depends on its input alone
@@ -26,8 +26,8 @@ from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 """D [deg], I [deg], B_H [nT] at middle latitudes, for which data sheets state the errors that depend on the field.
 
-What a vehicle knows of its accuracy is the same everywhere, or follows from what it reads. Stated for the true field,
-or for a reading to which an error is still added, it would give that field or that reading away.
+The accuracy that a vehicle knows is constant, or follows from its readings. An accuracy at the true field, or at a
+reading to which another error is added, would reveal that field or that reading.
 """
 
 EPISODE_STREAM = "episode_stream"

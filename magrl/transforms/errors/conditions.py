@@ -176,8 +176,8 @@ CONDITIONS: Mapping[str, Conditions] = {
         ),
     )
 }
-"""Presets. Limits of standards are read as two standard deviations; "chosen" is what has no source;
-a document that is named with it was not read, and tells what kind of device it stands for.
+"""Presets. We take a standard's limit as two standard deviations. Values marked "chosen" have no source: we did not
+read the document that is named with them, which only indicates the kind of device.
 
 Readings:
 

@@ -1,4 +1,4 @@
-"""Noise of sensors: what is measured is written over what is true, which is kept under a key of its own."""
+"""Noise of sensors: readings replace the true values, which move to another key."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error of the north reference: what it does to the heading and to the declination, and units on the market."""
+"""Error of the north reference: its effect on heading and declination, and units on the market."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ NORTH_REFERENCES: Mapping[str, Mapping[str, float]] = {
     "marine": {"constant_deg": 0.375, "drift_deg": 0.125, "random_deg": 0.25},
     "low-cost": {"constant_deg": 0.5, "random_deg": 0.75},
 }
-"""Standard deviations, chosen in the size of units on the market. Limits of standards are read as two of them; the
-documents were not read.
+"""Standard deviations, chosen in the size of units on the market. We take a standard's limit as two of them; we did
+not read the documents.
 
 - ``fiber-optic``: 0.1° times the secant of the latitude, as of the fiber-optic gyrocompass Octans; all of it taken as
   constant, the worst case for D.

@@ -1,4 +1,4 @@
-"""Errors of a vector magnetometer in a vehicle: its magnetism and its attitude, and what they do to D, I and B_H."""
+"""Errors of a vector magnetometer: magnetism and attitude of the vehicle, and their effect on D, I and B_H."""
 
 from __future__ import annotations
 

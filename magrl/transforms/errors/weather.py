@@ -1,4 +1,4 @@
-"""Magnetic weather along an episode: the field that is measured varies in time, as an observatory recorded it."""
+"""Magnetic weather: the measured field varies in time as an observatory recorded it."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ class MagneticWeather(ReadingErrors):
     wherever they are. ``bias_std`` and ``drift_std`` grow by the root mean square of the variation over the time of
     :data:`WAY_KM`, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
-    ``field`` becomes what is measured, and ``true_field`` what it was: arrival, objective and reward belong to the
-    environment and know no weather. In ``Compose``, the weather stands before the errors of the sensors.
+    ``field`` becomes the measured field, and ``true_field`` the field without weather, from which the environment
+    computes arrival, objective and reward. In ``Compose``, the weather stands before the errors of the sensors.
 
     Args:
         record: name in :data:`magrl.field.WEATHER`, or a record of one's own.
         speed_km_h: speed of the vehicles [km/h], as in :data:`SPEEDS_KM_H`.
         reading_s: time that each step takes beside its move [s], so that standing still takes time.
-        span_h: longest time that an episode takes [h]: it starts where the record has no gap for so long, and the
-            weather of an episode that takes longer stays as it is then. By default the longest moves until the step
+        span_h: longest duration of an episode [h]: it starts where the record has no gap for that time; after it, the
+            weather stays constant. By default the longest moves until the step
             limit, where the environment has ``max_steps`` and ``max_move_km``.
         in_keys: D [deg], I [deg], B_H [nT] ``(..., 3)``, and the last move ``(..., K)``, whose first number is the
             distance [km].
