@@ -7,6 +7,7 @@ in common, which also holds at a place that it never visited.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +17,8 @@ from magrl.field.igrf import igrf_coefficients
 
 KNOWN_DEGREE = 13
 """Highest degree of IGRF."""
+STRENGTH, TILT_DEG, SPREAD = (0.7, 1.3), 40.0, (0.5, 2.0)
+"""Ranges of the strength of the dipole [Earth's], its tilt [deg] and the factor of a variance, by default."""
 
 
 def power_spectrum(gauss: Tensor) -> Tensor:
@@ -46,9 +49,9 @@ def random_planets(
     seed: int,
     *,
     degree: int = 13,
-    strength: tuple[float, float] = (0.7, 1.3),
-    tilt_deg: float = 40.0,
-    spread: tuple[float, float] = (0.5, 2.0),
+    strength: tuple[float, float] = STRENGTH,
+    tilt_deg: float = TILT_DEG,
+    spread: tuple[float, float] = SPREAD,
 ) -> Tensor:
     """Return Gauss coefficients of planets whose fields have the Earth's spectrum.
 
@@ -100,6 +103,45 @@ def random_planets(
     gauss[:, 1, 0] = (-dipole * torch.cos(tilt)).to(gauss.dtype)
     gauss[:, 1, 1] = torch.polar(dipole * torch.sin(tilt), uniform(0.0, 2 * math.pi, count))
     return gauss
+
+
+class GaussMoments(NamedTuple):
+    """Moments of the Gauss coefficients of :func:`random_planets` [nT, nT^2].
+
+    ``axial`` and ``axial_variance`` are those of the axial dipole. ``variance (N + 1,)`` are those of each other
+    coefficient by degree, whose means are 0; that of degree 1 is for the two equatorial coefficients.
+
+    Example:
+        >>> GaussMoments(-28000.0, 3e7, torch.zeros(3)).axial
+        -28000.0
+    """
+
+    axial: float
+    axial_variance: float
+    variance: Tensor
+
+
+def gauss_moments(degree: int = KNOWN_DEGREE) -> GaussMoments:
+    """Return the moments of the Gauss coefficients of :func:`random_planets` with its default options.
+
+    Args:
+        degree: highest degree N.
+
+    Example:
+        >>> moments = gauss_moments()
+        >>> round(moments.axial), round(moments.axial_variance**0.5), round(float(moments.variance[1].sqrt()))
+        (-27435, 5881, 8056)
+    """
+    check_number(1, whole=True, degree=degree)
+    tilt = math.radians(TILT_DEG)
+    dipole = math.sqrt(float(power_spectrum(_earth())[1]) / 2)
+    low, high = STRENGTH
+    mean, square = (sum(low**i * high ** (k - i) for i in range(k + 1)) / (k + 1) * dipole**k for k in (1, 2))
+    cos2 = (1 + math.sin(2 * tilt) / (2 * tilt)) / 2
+    axial = -mean * math.sin(tilt) / tilt
+    variance = _earth_variance(degree) * sum(SPREAD) / 2
+    variance[1] = square * (1 - cos2) / 2
+    return GaussMoments(axial, square * cos2 - axial**2, variance)
 
 
 def _earth_variance(degree: int) -> Tensor:

@@ -1,0 +1,372 @@
+"""What a vehicle knows of the field around it: one normal distribution, and how moves and readings change it.
+
+The state has the local coefficients of the field's potential to degree 3 (:mod:`~magrl.tracking.harmonics`, the first
+three are the field itself), the offset of the latitude from a reference that is dead-reckoned (true north turns along
+the way, by tan(latitude) / R for each kilometer eastward), and the errors of the readings of D, I, B_H: constant ones,
+slow ones, which vary along the way as a first-order Gauss-Markov process, and optionally hard iron in the vehicle's
+axes. Both steps are those of a Kalman filter:
+
+- A move along a great circle is linear in the coefficients, c' = Turn(gamma) exp(X) c, where X = n (d_x + T_N / M) + e
+  (d_y + T_E / N) has the generators of translations, with the degrees above 3 as their regression, and of the turns of
+  the vertical over the radii of curvature M and N. Gamma is by how much azimuths become larger along the great circle.
+- A reading measures the field: D, I, B_H are a vector in the local axes, and their errors are carried over to it by
+  the Jacobian at the reading. So nothing is linearized but errors.
+
+All functions batch over leading dimensions.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_tensor
+from magrl.field.elements import elements_jacobian, field_vector, measured_elements
+from magrl.geodesy import curvature_radii, move
+from magrl.tracking.harmonics import RADIUS, UNIT_KM, generators, size, turning
+from magrl.tracking.prior import DEGREE, closure, expected
+
+COEFFICIENTS = size(DEGREE)
+"""Number of coefficients of a belief; the latitude's offset [rad] has this index in the state."""
+CONSTANT = slice(COEFFICIENTS + 1, COEFFICIENTS + 4)
+"""Constant errors of D, I [deg], B_H [nT] in the state."""
+SLOW = slice(COEFFICIENTS + 4, COEFFICIENTS + 7)
+"""Slow errors of D, I [deg], B_H [nT] in the state."""
+IRON = slice(COEFFICIENTS + 7, COEFFICIENTS + 10)
+"""Hard iron forward, to the right and downward [nT] in the state, where it is estimated."""
+LASTING_KM = 200.0
+"""Correlation length of slow errors [km]; that of :mod:`magrl.transforms.errors`."""
+MODEL_NT = 2.0
+"""Least standard deviation of a reading in each axis [nT]: rounding of the ellipsoid and of series along a flight."""
+
+
+class Belief(NamedTuple):
+    """Mean ``(..., S)`` and covariance ``(..., S, S)`` of the state, and the reference latitude ``(...)`` [deg].
+
+    Example:
+        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0]))
+        >>> belief.mean.shape, round(float(belief.latitude))
+        (torch.Size([22]), 53)
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    latitude: Tensor
+
+    @property
+    def field(self) -> Tensor:
+        """Expected field ``(..., 3)`` north, east, down [nT]."""
+        return self.mean[..., :3]
+
+
+class Innovation(NamedTuple):
+    """A reading minus its prediction: residual ``(..., 3)`` of D, I [deg], B_H [nT], its derivatives ``(..., 3, S)``
+    with respect to the state, and its covariance ``(..., 3, 3)``. An element that is missing has a residual of 0, rows
+    of 0 and a variance of 1.
+
+    Example:
+        >>> Innovation(torch.zeros(3), torch.zeros(3, 22), torch.eye(3)).square()
+        tensor(0.)
+    """
+
+    residual: Tensor
+    rows: Tensor
+    covariance: Tensor
+
+    def square(self) -> Tensor:
+        """Return the normalized square ``(...)``: where the belief is right, chi-square of the elements present."""
+        return (self.residual.unsqueeze(-2) @ inverse3(self.covariance) @ self.residual.unsqueeze(-1)).squeeze((-2, -1))
+
+
+def start(
+    reading: Tensor,
+    sensor_std: Tensor,
+    bias_std: Tensor | None = None,
+    drift_std: Tensor | None = None,
+    heading: Tensor | None = None,
+    iron_std: Tensor | None = None,
+    crust_nt: float = 0.0,
+) -> Belief:
+    """Return the belief after a first reading.
+
+    Args:
+        reading: ``(..., 3)``: D [deg], I [deg], B_H [nT].
+        sensor_std: ``(..., 3)`` standard deviation of the errors that are new in each reading.
+        bias_std: ``(..., 3)`` that of constant and slow errors together; None for none.
+        drift_std: ``(..., 3)`` that of slow errors alone; None for none.
+        heading: ``(...)`` [rad], where there is iron.
+        iron_std: ``(..., 3)`` standard deviation of hard iron along the vehicle's axes [nT]; None for none.
+        crust_nt: standard deviation of the crust's field in each axis [nT].
+
+    Example:
+        >>> start(torch.tensor([3.0, 65.0, 18000.0]), torch.zeros(3)).covariance.shape
+        torch.Size([22, 22])
+    """
+    belief = before(reading, bias_std, drift_std, iron_std)
+    return read(belief, reading, sensor_std, heading, crust_nt)
+
+
+def before(
+    near: Tensor,
+    bias_std: Tensor | None = None,
+    drift_std: Tensor | None = None,
+    iron_std: Tensor | None = None,
+) -> Belief:
+    """Return the belief before any reading, where the elements are about ``near``; other arguments as :func:`start`.
+
+    Where the start's true elements are known: ``read(known(before(elements, ...), elements, std), reading, ...)``.
+
+    Example:
+        >>> before(torch.tensor([3.0, 65.0, 18000.0])).mean.shape
+        torch.Size([22])
+    """
+    check_tensor(3, near=near)
+    near = near.double()
+    mean, covariance = expected(field_vector(near))
+    none = torch.zeros_like(near)
+    slow = none if drift_std is None else drift_std.double().square()
+    constant = none if bias_std is None else (bias_std.double().square() - slow).clamp_min(0)
+    errors = [constant, slow] if iron_std is None else [constant, slow, iron_std.double().square()]
+    errors = torch.cat([x.expand_as(near) for x in errors], -1)
+    count = errors.shape[-1]
+    variances = torch.diag_embed(torch.nn.functional.pad(errors, (COEFFICIENTS + 1, 0)))
+    latitude = torch.rad2deg(mean[..., -1])
+    mean = torch.cat((mean[..., :-1], torch.zeros_like(latitude).unsqueeze(-1), torch.zeros_like(errors)), -1)
+    return Belief(mean, torch.nn.functional.pad(covariance, (0, count, 0, count)) + variances, latitude)
+
+
+def moved(belief: Belief, distance: Tensor, course: Tensor, drift_std: Tensor | None = None) -> Belief:
+    """Return the belief after a move, before the reading at its end.
+
+    Args:
+        belief: that before the move.
+        distance: ``(...)`` [km], to about 200; divide longer moves.
+        course: ``(...)`` at the start of the move [rad, clockwise from true north].
+        drift_std: ``(..., 3)`` standard deviation of slow errors of D, I [deg], B_H [nT]; None for none.
+
+    Example:
+        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0]))
+        >>> further = moved(belief, torch.tensor(50.0), torch.tensor(0.0))
+        >>> (further.field - belief.field).round()  # northward by 50 km
+        tensor([-434.,  -25.,  404.], dtype=torch.float64)
+    """
+    distance, course = distance.double(), course.double()
+    latitude, turn, slopes = _turn(belief.latitude, distance, course)
+    matrix = turning(turn, DEGREE) @ _exponential(_generator((belief.latitude + latitude) / 2, distance, course))
+    column = matrix @ belief.mean[..., :COEFFICIENTS, None]
+    column = slopes[0][..., None, None] * (generators(DEGREE).turn[2].to(column) @ column)
+    kept = torch.exp(-distance / LASTING_KM).unsqueeze(-1)
+    ones = torch.ones_like(belief.mean)
+    diagonal = torch.cat(
+        (
+            0 * ones[..., :COEFFICIENTS],
+            slopes[1].unsqueeze(-1),
+            ones[..., CONSTANT],
+            kept * ones[..., SLOW],
+            ones[..., IRON],
+        ),
+        -1,
+    )
+    top = torch.cat((matrix, column), -1)
+    rest = belief.mean.shape[-1] - COEFFICIENTS
+    step = torch.nn.functional.pad(top, (0, rest - 1, 0, rest)) + torch.diag_embed(diagonal)
+    noise = closure(DEGREE + 1).drift.to(step) * (distance / UNIT_KM).square()[..., None, None]
+    noise = torch.nn.functional.pad(noise, (0, rest, 0, rest))
+    if drift_std is not None:
+        fresh = (1 - kept.square()) * drift_std.double().square().expand_as(ones[..., SLOW])
+        noise = noise + torch.diag_embed(torch.nn.functional.pad(fresh, (SLOW.start, rest - 7)))
+    mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
+    return Belief(mean, step @ belief.covariance @ step.mT + noise, latitude)
+
+
+def innovation(
+    belief: Belief,
+    reading: Tensor,
+    sensor_std: Tensor,
+    heading: Tensor | None = None,
+    crust_nt: float = 0.0,
+    errors: bool = True,
+) -> Innovation:
+    """Return a reading minus what the belief predicts; arguments as those of :func:`read`.
+
+    Args:
+        belief: that before the reading.
+        reading: ``(..., 3)``.
+        sensor_std: ``(..., 3)``.
+        heading: ``(...)`` [rad].
+        crust_nt: standard deviation of the crust's field [nT].
+        errors: whether the reading has the errors of the state; the true elements of a known place have not.
+
+    Example:
+        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0]))
+        >>> innovation(belief, torch.tensor([3.5, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0])).residual.round(decimals=1)
+        tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
+    """
+    check_tensor(3, reading=reading, sensor_std=sensor_std)
+    reading, sensor_std = reading.double(), sensor_std.double()
+    present = (sensor_std < math.inf) & (reading == reading)
+    vector = field_vector(torch.where(present, reading, measured_elements(belief.field)))
+    jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(vector), 0.0)
+    parts = [jacobian, torch.zeros_like(jacobian[..., :1]).expand(*jacobian.shape[:-1], COEFFICIENTS - 2)]
+    if errors:
+        own = torch.diag_embed(present.double())
+        axes = [] if heading is None else [jacobian @ turning(heading.double(), 1)]  # forward, right, down
+        parts += [own, own, *axes]
+    rows = torch.cat(parts, -1)
+    rows = torch.nn.functional.pad(rows, (0, belief.mean.shape[-1] - rows.shape[-1]))
+    residual = (jacobian @ vector.unsqueeze(-1) - rows @ belief.mean.unsqueeze(-1)).squeeze(-1)
+    variance = torch.where(present, sensor_std, 1.0).square()
+    noise = torch.diag_embed(variance) + (MODEL_NT**2 + crust_nt**2) * jacobian @ jacobian.mT
+    return Innovation(residual, rows, rows @ belief.covariance @ rows.mT + noise)
+
+
+def updated(belief: Belief, new: Innovation) -> Belief:
+    """Return the belief given an innovation: mean x + K r and covariance P - K H P.
+
+    Example:
+        >>> belief = before(torch.tensor([3.0, 65.0, 18000.0]))
+        >>> updated(belief, innovation(belief, torch.tensor([4.0, 65.0, 18000.0]), torch.ones(3))).mean.shape
+        torch.Size([22])
+    """
+    cross = belief.covariance @ new.rows.mT
+    gain = cross @ inverse3(new.covariance)
+    mean = belief.mean + (gain @ new.residual.unsqueeze(-1)).squeeze(-1)
+    return Belief(mean, belief.covariance - gain @ cross.mT, belief.latitude)
+
+
+def read(
+    belief: Belief, reading: Tensor, sensor_std: Tensor, heading: Tensor | None = None, crust_nt: float = 0.0
+) -> Belief:
+    """Return the belief after a reading.
+
+    Args:
+        belief: that before the reading.
+        reading: ``(..., 3)``: D [deg], I [deg], B_H [nT]; NaN for an element that is missing.
+        sensor_std: ``(..., 3)`` standard deviation of the errors that are new in it; infinite for a missing element.
+        heading: ``(...)`` [rad, clockwise from true north] of the vehicle, where the state has iron.
+        crust_nt: standard deviation of the crust's field in each axis [nT], new in each reading.
+
+    Example:
+        >>> belief = before(torch.tensor([3.0, 65.0, 18000.0]))
+        >>> read(belief, torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0])).field.round()
+        tensor([17975.,   942., 38601.], dtype=torch.float64)
+    """
+    return updated(belief, innovation(belief, reading, sensor_std, heading, crust_nt))
+
+
+def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: float = 0.0) -> Belief:
+    """Return the belief given the true elements of the place, which have none of the errors of a reading.
+
+    Args:
+        belief: that before.
+        elements: ``(..., 3)``: D [deg], I [deg], B_H [nT], of a map or a pier.
+        std: ``(..., 3)`` their standard deviation.
+        crust_nt: standard deviation of the crust's field in each axis [nT], where the map has none.
+
+    Example:
+        >>> here = torch.tensor([3.0, 65.0, 18000.0])
+        >>> belief = known(before(here, bias_std=torch.ones(3)), here, torch.full((3,), 0.01))
+        >>> belief = read(belief, here + torch.tensor([0.8, 0.0, 0.0]), torch.full((3,), 0.01))
+        >>> belief.mean[CONSTANT].round(decimals=1)  # the compass is off by 0.8 degrees
+        tensor([0.8000, 0.0000, 0.0000], dtype=torch.float64)
+    """
+    return updated(belief, innovation(belief, elements, std, None, crust_nt, errors=False))
+
+
+class LocalElements(NamedTuple):
+    """D, I [deg], B_H [nT] at the vehicle ``(..., 3)``, their gradients ``(..., 3, 2)`` northward and eastward [per km],
+    and for each element the covariance ``(..., 3, 3, 3)`` of its value and gradient.
+
+    Example:
+        >>> elements(start(torch.tensor([3.0, 65.0, 18000.0]), torch.zeros(3))).gradient.shape
+        torch.Size([3, 2])
+    """
+
+    value: Tensor
+    gradient: Tensor
+    covariance: Tensor
+
+
+def elements(belief: Belief) -> LocalElements:
+    """Return the expected elements at the vehicle, their gradients, and how sure they are.
+
+    Example:
+        >>> here = elements(start(torch.tensor([0.0, 60.0, 20000.0]), torch.tensor([0.05, 0.05, 5.0])))
+        >>> (100 * here.gradient).round(decimals=1)  # change over 100 km
+        tensor([[  0.0000,   0.9000],
+                [  0.7000,   0.0000],
+                [-86.5000,   0.0000]], dtype=torch.float64)
+    """
+    mean, derivative = belief.mean[..., :COEFFICIENTS], closed_derivatives().to(belief.mean)
+    turn, latitude = generators(DEGREE).turn.to(mean), torch.deg2rad(belief.latitude)
+    meridian, vertical = (radius.unsqueeze(-1).unsqueeze(-1) for radius in curvature_radii(belief.latitude))
+    tan, cos = torch.tan(latitude)[..., None, None] / vertical, torch.cos(latitude)[..., None, None]
+    north = derivative[0, :3] / UNIT_KM + turn[0, :3] / meridian
+    east = derivative[1, :3] / UNIT_KM + turn[1, :3] / vertical + tan * turn[2, :3]
+    field = torch.eye(3, COEFFICIENTS).to(mean).expand_as(north)
+    rows = elements_jacobian(belief.field).unsqueeze(-3) @ torch.stack((field, north, east), -3)  # (..., 3, E, K)
+    column = elements_jacobian(belief.field) @ turn[2, :3, :3] @ belief.field.unsqueeze(-1) / (cos.square() * vertical)
+    column = torch.stack((0 * column, 0 * column, column), -3)
+    rows = torch.cat((rows, column), -1).transpose(-3, -2)  # (..., E, 3, K + 1): value, northward, eastward
+    state = COEFFICIENTS + 1
+    slopes = (rows[..., 1:, :] @ belief.mean[..., None, :state, None]).squeeze(-1)
+    covariance = rows @ belief.covariance[..., None, :state, :state] @ rows.mT
+    return LocalElements(measured_elements(belief.field), slopes, covariance)
+
+
+def closed_derivatives() -> Tensor:
+    """Return the derivatives ``(2, K, K)`` northward and eastward, with degree 4 as its regression."""
+    extend = closure(DEGREE + 1).extend
+    return generators(DEGREE + 1).derivative[:2, :COEFFICIENTS] @ extend
+
+
+def _generator(latitude: Tensor, distance: Tensor, course: Tensor) -> Tensor:
+    """Return the generator X of a move ``(..., K, K)``."""
+    meridian, vertical = curvature_radii(latitude)
+    turn, arcs = generators(DEGREE).turn[:2], ((distance * torch.cos(course)), (distance * torch.sin(course)))
+    steps = torch.cat((closed_derivatives(), turn)).to(arcs[0])
+    sizes = torch.stack((arcs[0] / UNIT_KM, arcs[1] / UNIT_KM, arcs[0] / meridian, arcs[1] / vertical), -1)
+    return torch.tensordot(sizes, steps, 1)
+
+
+def _exponential(matrix: Tensor) -> Tensor:
+    """Return the exponential of a generator, to the fourth order."""
+    one = torch.eye(matrix.shape[-1]).to(matrix)
+    square = matrix @ matrix
+    return one + matrix + square @ (one / 2 + matrix / 6 + square / 24)
+
+
+def _turn(latitude: Tensor, distance: Tensor, course: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+    """Return the latitude after a move [deg], by how much azimuths became larger [rad], and the derivatives of both
+    (of the turn first) with respect to the latitude before.
+
+    Axes that are carried along a great circle differ from north and east by the twist of the rotation between the two
+    local frames, whose meridians are at the angle of the longitudes.
+    """
+    after, longitude = move(latitude, torch.zeros_like(latitude), course, distance)
+    (sin, cos), (sin_after, cos_after) = ((torch.sin(x), torch.cos(x)) for x in map(torch.deg2rad, (latitude, after)))
+    angle, arc = torch.deg2rad(longitude), distance / (UNIT_KM * RADIUS)
+    twist = (sin + sin_after) * torch.sin(angle), torch.cos(angle) * (1 + sin * sin_after) + cos * cos_after
+    cos_after = cos_after.clamp_min(LEAST_COS)
+    slope = torch.sin(course) * torch.sin(arc) / cos_after.square()
+    rate = (cos * torch.cos(arc) - sin * torch.sin(arc) * torch.cos(course)) / cos_after
+    return after, torch.atan2(*twist), (slope, rate)
+
+
+LEAST_COS = 0.02
+"""Least cosine of a latitude in derivatives, 1 degree from a pole: there they do not hold, but stay finite."""
+
+
+def inverse3(matrix: Tensor) -> Tensor:
+    """Return the inverses of symmetric matrices ``(..., 3, 3)``, in closed form.
+
+    Example:
+        >>> inverse3(torch.diag(torch.tensor([1.0, 2.0, 4.0]))).diagonal()
+        tensor([1.0000, 0.5000, 0.2500])
+    """
+    x, y, z = matrix.unbind(-2)
+    adjugate = torch.stack([torch.linalg.cross(*rows) for rows in ((y, z), (z, x), (x, y))], -1)
+    return adjugate / (x.unsqueeze(-2) @ adjugate[..., :1]).squeeze(-1).unsqueeze(-1)

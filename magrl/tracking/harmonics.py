@@ -1,0 +1,170 @@
+"""Solid harmonics around a vehicle: the potential of a field near it, and how it changes when the vehicle moves.
+
+Outside its sources a magnetic field is the gradient of a harmonic function psi (B = -grad V, psi = -V). Around a place
+psi is a sum of solid harmonics in local Cartesian axes, x northward, y eastward and z downward:
+
+    rho = 2 Re R_n^m, 2 Im R_n^m (m > 0), R_n^0,    R_n^m = r^n P_nm(cos theta) e^{i m lambda} / (n + m)!
+
+with the Legendre functions P_nm of geomagnetism (no Condon-Shortley phase) and theta from the z axis. Its coefficients
+are ordered by degree n, and in each degree by falling order m. Those of degree 1 belong to x, y, z: they are the field
+itself, north, east, down. A constant is left out. Derivatives of a harmonic function and its rotations are harmonic, so
+both are matrices on the coefficients; with lengths in units of 1000 km, the coefficients are in nT per unit^(n - 1).
+
+In this normalization derivatives have the weights 1 and -1, and rotations are ladders:
+
+    (d_x - i d_y) R_n^m = R_{n-1}^{m-1},   (d_x + i d_y) R_n^m = -R_{n-1}^{m+1},   d_z R_n^m = R_{n-1}^m
+    (z (d_x - i d_y) - (x - i y) d_z) R_n^m = (n - m + 1) R_n^{m-1},   (x d_y - y d_x) R_n^m = i m R_n^m
+    (z (d_x + i d_y) - (x + i y) d_z) R_n^m = -(n + m + 1) R_n^{m+1},   R_n^{-m} = (-1)^m conj(R_n^m)
+
+Source: M. A. Epton and B. Dembart, Multipole translation theory for the three-dimensional Laplace and Helmholtz
+equations, SIAM Journal on Scientific Computing 16 (1995), with another sign of odd orders.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magrl.geodesy import REFERENCE_RADIUS_KM
+
+UNIT_KM = 1000.0
+"""Unit of length of the coefficients [km]."""
+RADIUS = REFERENCE_RADIUS_KM / UNIT_KM
+"""Radius of the sphere on which the vehicle moves [unit]; :mod:`~magrl.tracking` corrects for the ellipsoid."""
+
+
+def size(degree: int) -> int:
+    """Return the number of coefficients of the degrees 1 to ``degree``.
+
+    Example:
+        >>> size(3)
+        15
+    """
+    return degree * (degree + 2)
+
+
+def orders(degree: int) -> list[tuple[int, int]]:
+    """Return degree and order of each coefficient; the order is negative for the imaginary part.
+
+    Example:
+        >>> orders(1)
+        [(1, 1), (1, -1), (1, 0)]
+    """
+    return [(n, sign * m) for n in range(1, degree + 1) for m in range(n, -1, -1) for sign in (1, -1)[: 1 + (m > 0)]]
+
+
+class Generators(NamedTuple):
+    """Matrices ``(3, K, K)`` on the coefficients: the derivatives along x, y and z, and the turns of the axes.
+
+    The turns are those of a vehicle on a unit sphere that moves north (x d_z - z d_x) or east (y d_z - z d_y), and that
+    of axes whose azimuths become larger (y d_x - x d_y), all per radian.
+
+    Example:
+        >>> generators(2).derivative[2][:3, 7]  # what z^2 / 2 - (x^2 + y^2) / 4 adds to the field downward
+        tensor([0., 0., 1.], dtype=torch.float64)
+    """
+
+    derivative: Tensor
+    turn: Tensor
+
+
+@cache
+def generators(degree: int) -> Generators:
+    """Return the generators of translations and rotations for the degrees 1 to ``degree``.
+
+    Example:
+        >>> generators(3).turn.shape
+        torch.Size([3, 15, 15])
+    """
+    place = {order: k for k, order in enumerate(orders(degree))}  # here -m stands for R_n^{-m}
+
+    def ladder(step_n: int, step_m: int, weight: object) -> Tensor:
+        """Return the matrix that takes R_n^m to a weight times R_{n + step_n}^{m + step_m}."""
+        matrix = torch.zeros(len(place), len(place), dtype=torch.complex128)
+        for (n, m), k in place.items():
+            if (target := (n + step_n, m + step_m)) in place:
+                matrix[k, place[target]] = weight(n, m)
+        return matrix
+
+    minus, plus = ladder(-1, -1, lambda n, m: 1), ladder(-1, 1, lambda n, m: -1)  # d_x -+ i d_y
+    lower, raise_ = ladder(0, -1, lambda n, m: n - m + 1), ladder(0, 1, lambda n, m: -(n + m + 1))
+    derivative = (minus + plus) / 2, (minus - plus) * (1j / 2), ladder(-1, 0, lambda n, m: 1)
+    turn = -(raise_ + lower) / 2, (raise_ - lower) * (1j / 2), ladder(0, 0, lambda n, m: -1j * m)
+    parts = torch.zeros_like(minus)  # rows: the real harmonics as sums of R_n^m and R_n^{-m}
+    for (n, m), k in place.items():
+        positive, negative = place[n, abs(m)], place[n, -abs(m)]
+        parts[k, positive] += (1 if m >= 0 else -1j) * (1 if m else 0.5)
+        parts[k, negative] += (1 if m >= 0 else 1j) * (-1) ** m * (1 if m else 0.5)
+    inverse = torch.linalg.inv(parts)
+    real = [torch.stack([(parts @ matrix @ inverse).real.mT for matrix in kind]) for kind in (derivative, turn)]
+    return Generators(*(matrix.contiguous() for matrix in real))
+
+
+def turning(angle: Tensor, degree: int) -> Tensor:
+    """Return the matrices ``(..., K, K)`` that turn coefficients to axes in which azimuths are larger by an angle.
+
+    Args:
+        angle: ``(...)`` [rad].
+        degree: highest degree.
+
+    Example:
+        >>> turning(torch.tensor(math.pi / 2), 1).round() @ torch.tensor([1.0, 0.0, 5.0])  # what was north is east
+        tensor([0., 1., 5.])
+    """
+    m = torch.tensor([abs(m) for _, m in orders(degree)], dtype=angle.dtype, device=angle.device)
+    sign = generators(degree).turn[2].to(angle).sign()  # of the sine, between the two parts of an order
+    angles = angle.unsqueeze(-1) * m
+    return torch.diag_embed(torch.cos(angles)) + sign * torch.sin(angles).unsqueeze(-1)
+
+
+def powers(displacement: Tensor, degree: int) -> Tensor:
+    """Return the monomials ``(..., (J + 1) (J + 2) / 2)`` of degrees 0 to J of displacements.
+
+    Args:
+        displacement: ``(..., 2)`` northward and eastward.
+        degree: J.
+
+    Example:
+        >>> powers(torch.tensor([2.0, 3.0]), 2)
+        tensor([1., 2., 3., 4., 6., 9.])
+    """
+    north, east = displacement.unbind(-1)
+    rows = [[torch.ones_like(north)]]
+    for _ in range(degree):
+        rows.append([north * term for term in rows[-1]] + [east * rows[-1][-1]])
+    return torch.stack([term for row in rows for term in row], -1)
+
+
+def field_rows(degree: int, terms: int) -> Tensor:
+    """Return the field at a place on the sphere as polynomials of the displacement.
+
+    A vehicle that moves along a great circle by p = (n, e), and takes its axes with it without turning them about the
+    vertical, then has the coefficients exp(n X + e Y) c, with the generators X and Y of moves of a unit north and east;
+    the first three are the field there. The exponential is expanded in monomials of n and e.
+
+    Args:
+        degree: highest degree of the coefficients.
+        terms: highest degree J of the monomials. Those of the derivatives end with ``degree - 1``; those of the turns
+            fall by the factor (distance / radius) / J.
+
+    Returns:
+        ``(..., 3, K)`` for each of :func:`powers`.
+
+    Example:
+        >>> field_rows(1, 1)[1]  # a field that is downward here is partly northward a unit to the north
+        tensor([[ 0.0000,  0.0000, -0.1570],
+                [ 0.0000,  0.0000,  0.0000],
+                [ 0.1570,  0.0000,  0.0000]], dtype=torch.float64)
+    """
+    derivative, turn = generators(degree)
+    north, east = (derivative[i] + turn[i] / RADIUS for i in (0, 1))
+    words = [[torch.eye(size(degree), dtype=torch.float64)[:3]]]  # sums of all products of as many X and Y
+    for _ in range(terms):
+        before = words[-1]
+        both = [before[i] @ north + before[i - 1] @ east for i in range(1, len(before))]
+        words.append([before[0] @ north, *both, before[-1] @ east])
+    return torch.stack([word / math.factorial(j) for j, row in enumerate(words) for word in row])

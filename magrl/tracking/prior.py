@@ -1,0 +1,214 @@
+"""What is known of the field around a vehicle in advance: the local coefficients of random planets, in closed form.
+
+The Gauss coefficients of :func:`~magrl.field.planets.random_planets` are independent, and but for the axial dipole all of
+a degree have one variance. About local axes (its pole in the direction of z) a coefficient of degree n and order m has
+these local coefficients (:mod:`~magrl.tracking.harmonics`), of the same order and of every degree k from max(m, 1) on:
+
+    -(-1)^(n + m) sqrt((2 - delta_m0) / ((n - m)! (n + m)!)) (n + k)! R^(1 - k)    (half of it where m > 0)
+
+So the local coefficients are normal, too, and only their part by the axial dipole depends on the latitude.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magrl.field.planets import gauss_moments
+from magrl.tracking.harmonics import RADIUS, field_rows, generators, orders, size
+
+DEGREE = 3
+"""Highest degree of the coefficients that a belief holds; with 4, nothing is gained (random planets)."""
+CELLS = 36
+"""Number of cells of latitude, 5 degrees each: less than what a first reading tells of the latitude (about 10)."""
+_FOLLOWED = 10  # highest degree of the coefficients whose effect is known when they are left out
+
+
+def local_coefficient(n: int, order: int, k: int) -> float:
+    """Return the local coefficient of degree k of a Gauss coefficient of degree n = 1 nT about local axes.
+
+    Args:
+        n: degree of the Gauss coefficient.
+        order: order of both; negative for the coefficient of the sine.
+        k: degree of the local coefficient.
+
+    Example:
+        >>> local_coefficient(1, 1, 1), round(local_coefficient(1, 0, 1))  # at the equator and at the pole of a dipole
+        (-1.0, 2)
+    """
+    m = abs(order)
+    if k < m or n < m:
+        return 0.0
+    norm = math.sqrt((2 - (m == 0)) / (math.factorial(n - m) * math.factorial(n + m)))
+    return -((-1) ** (n + m)) * norm * math.factorial(n + k) * RADIUS ** (1 - k) * (0.5 if m else 1.0)
+
+
+def local_covariance(variance: Tensor, degree: int) -> Tensor:
+    """Return the covariance ``(K, K)`` of local coefficients, where all Gauss coefficients of a degree have a variance.
+
+    Args:
+        variance: ``(N + 1,)`` variances of the Gauss coefficients by degree [nT^2].
+        degree: highest degree of the local coefficients.
+
+    Example:
+        >>> local_covariance(torch.tensor([0.0, 1.0]), 1).diagonal()
+        tensor([1., 1., 4.], dtype=torch.float64)
+    """
+    places = orders(degree)
+    table = [[local_coefficient(n, m, k) for k, m in places] for n in range(1, len(variance))]
+    columns = torch.tensor(table, dtype=torch.float64)
+    order = torch.tensor([m for _, m in places])
+    return (columns.mT * variance[1:].double()) @ columns * (order == order.unsqueeze(-1))
+
+
+class Closure(NamedTuple):
+    """What higher degrees do, which a belief does not hold, given the degrees that it holds.
+
+    Attributes:
+        extend: ``(K', K)``, the coefficients of degrees 1 to N and the expected ones of higher degrees, from those of
+            1 to N.
+        drift: ``(K, K)`` [nT^2 per unit^2], covariance of the coefficients after a move by the coefficients of degree
+            N + 1 that differ from the expected ones.
+        left_out_nt: standard deviation of the field at a distance of a unit by all that differs from the expected
+            [nT]; it grows with the N-th power of the distance.
+
+    Example:
+        >>> closure(6).extend.shape
+        torch.Size([48, 15])
+    """
+
+    extend: Tensor
+    drift: Tensor
+    left_out_nt: float
+
+
+@cache
+def closure(degree: int) -> Closure:
+    """Return the regression of the coefficients of higher degrees on those of a belief, under the spectrum.
+
+    Its covariance has no preferred direction (the dipole's variance is shared over its three coefficients), so the
+    regression commutes with turns.
+
+    Args:
+        degree: highest degree that is regressed, above :data:`DEGREE`.
+
+    Example:
+        >>> round(closure(6).left_out_nt)
+        18
+    """
+    axial, axial_variance, variance = gauss_moments()
+    variance = variance.clone()
+    variance[1] = (axial**2 + axial_variance + 2 * variance[1]) / 3
+    covariance, low, all_ = local_covariance(variance, _FOLLOWED), size(DEGREE), size(degree)
+    known = covariance[:low, :low]
+    scale = known.diagonal().rsqrt()
+    inverse = torch.linalg.inv(known * scale * scale.unsqueeze(-1)) * scale * scale.unsqueeze(-1)
+    extend = torch.cat((torch.eye(low, dtype=torch.float64), covariance[low:all_, :low] @ inverse))
+    apart = torch.eye(len(covariance), dtype=torch.float64)
+    apart[:all_, :low] -= extend
+    left = apart @ covariance @ apart.mT
+    north = field_rows(_FOLLOWED, _FOLLOWED)
+    northward = sum(north[j * (j + 1) // 2] for j in range(_FOLLOWED + 1))  # powers of the distance alone, at a unit
+    left_out = float((northward @ left @ northward.mT).trace() / 3) ** 0.5
+    steps = generators(_FOLLOWED).derivative[:2, :low]
+    drift = (steps @ left @ steps.mT).mean(0)
+    return Closure(extend, drift, left_out)
+
+
+class LatitudeCells(NamedTuple):
+    """The prior in cells of latitude, given the field at the vehicle: constants for :func:`expected`.
+
+    Attributes:
+        latitude: ``(C,)`` middle of each cell [rad].
+        log_weight: ``(C,)`` logarithm of the share of the sphere, over the root of the determinant of the covariance.
+        mean: ``(C, K)`` of the coefficients.
+        field_covariance: ``(C, 3, 3)`` of the field.
+        precision: ``(C, 3, 3)`` inverse of that.
+        gain: ``(C, K + 1 - 3, 3)`` regression of the other coefficients and the latitude on the field.
+        covariance: ``(C, K + 1 - 3, K + 1 - 3)`` of those, given the field.
+
+    Example:
+        >>> latitude_cells().mean.shape
+        torch.Size([36, 15])
+    """
+
+    latitude: Tensor
+    log_weight: Tensor
+    mean: Tensor
+    field_covariance: Tensor
+    precision: Tensor
+    gain: Tensor
+    covariance: Tensor
+
+
+@cache
+def latitude_cells() -> LatitudeCells:
+    """Return the prior in each cell of latitude.
+
+    Example:
+        >>> latitude_cells().mean[-1, :3].round()  # 2.5 degrees from the north pole
+        tensor([ 1197.,    -0., 54818.], dtype=torch.float64)
+    """
+    axial, axial_variance, variance = gauss_moments()
+    edge = torch.linspace(-math.pi / 2, math.pi / 2, CELLS + 1, dtype=torch.float64)
+    latitude = (edge[1:] + edge[:-1]) / 2
+    dipole = [[local_coefficient(1, m, k) if m == axis else 0.0 for axis in (1, 0)] for k, m in orders(DEGREE)]
+    north_down = torch.stack((torch.cos(latitude), -torch.sin(latitude)), -1)
+    unit = north_down @ torch.tensor(dipole, dtype=torch.float64).mT  # coefficients of an axial dipole of 1 nT
+    joint = local_covariance(variance, DEGREE) + (axial_variance - variance[1]) * unit.unsqueeze(-1) * unit.unsqueeze(-2)
+    joint = torch.nn.functional.pad(joint, (0, 1, 0, 1))
+    joint[:, -1, -1] = (math.pi / CELLS) ** 2 / 12
+    field = joint[:, :3, :3]
+    precision = torch.linalg.inv(field)
+    gain = joint[:, 3:, :3] @ precision
+    rest = joint[:, 3:, 3:] - gain @ joint[:, :3, 3:]
+    log_weight = torch.log(torch.cos(latitude)) + torch.logdet(precision) / 2
+    return LatitudeCells(latitude, log_weight, axial * unit, field, precision, gain, rest)
+
+
+class Expected(NamedTuple):
+    """Moments of the coefficients and the latitude where the field is about a reading.
+
+    Attributes:
+        mean: ``(..., K + 1)`` of the coefficients [nT per unit^(n - 1)] and the latitude [rad].
+        covariance: ``(..., K + 1, K + 1)``; that of the field itself is wide.
+
+    Example:
+        >>> expected(torch.tensor([15000.0, 0.0, 45000.0])).mean.shape
+        torch.Size([16])
+    """
+
+    mean: Tensor
+    covariance: Tensor
+
+
+def expected(field: Tensor) -> Expected:
+    """Return the prior around a first reading, whose own information is still to be added.
+
+    The cells of latitude, weighted by the likelihood of the field, are joined to one normal distribution with their
+    moments given that field. The field itself keeps the covariance that it has before the reading.
+
+    Args:
+        field: ``(..., 3)`` north, east, down [nT].
+
+    Example:
+        >>> mean = expected(torch.tensor([15000.0, 0.0, 45000.0], dtype=torch.float64)).mean
+        >>> round(math.degrees(mean[-1]))  # latitude
+        54
+    """
+    cells = LatitudeCells(*(x.to(field) for x in latitude_cells()))
+    apart = field.unsqueeze(-2) - cells.mean[:, :3]  # (..., C, 3)
+    square = (apart.unsqueeze(-2) @ cells.precision @ apart.unsqueeze(-1)).squeeze((-2, -1))
+    weight = torch.softmax(cells.log_weight - square / 2, -1)
+    prior = torch.cat((cells.mean[:, 3:], cells.latitude.unsqueeze(-1)), -1)
+    means = prior + (cells.gain @ apart.unsqueeze(-1)).squeeze(-1)  # (..., C, K - 2), given the field
+    mean = (weight.unsqueeze(-2) @ means).squeeze(-2)
+    spread = (means - mean.unsqueeze(-2)) * weight.sqrt().unsqueeze(-1)
+    given, gain, wide = (torch.tensordot(weight, x, 1) for x in (cells.covariance, cells.gain, cells.field_covariance))
+    lever = torch.cat((torch.eye(3).to(field).expand(*gain.shape[:-2], 3, 3), gain), -2)
+    rest = torch.nn.functional.pad(given + spread.mT @ spread, (3, 0, 3, 0))
+    return Expected(torch.cat((field, mean), -1), lever @ wide @ lever.mT + rest)
