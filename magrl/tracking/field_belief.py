@@ -173,7 +173,7 @@ def moved(belief: Belief, distance: Tensor, course: Tensor, drift_std: Tensor | 
     top = torch.cat((matrix, column), -1)
     rest = belief.mean.shape[-1] - COEFFICIENTS
     step = torch.nn.functional.pad(top, (0, rest - 1, 0, rest)) + torch.diag_embed(diagonal)
-    noise = closure(DEGREE + 1).drift.to(step) * (distance / UNIT_KM).square()[..., None, None]
+    noise = closure().drift.to(step) * (distance / UNIT_KM).square()[..., None, None]
     noise = torch.nn.functional.pad(noise, (0, rest, 0, rest))
     if drift_std is not None:
         fresh = (1 - kept.square()) * drift_std.double().square().expand_as(ones[..., SLOW])
@@ -319,8 +319,8 @@ def elements(belief: Belief) -> LocalElements:
 
 def closed_derivatives() -> Tensor:
     """Return the derivatives ``(2, K, K)`` northward and eastward, with degree 4 as its regression."""
-    extend = closure(DEGREE + 1).extend
-    return generators(DEGREE + 1).derivative[:2, :COEFFICIENTS] @ extend
+    derivative = generators(DEGREE + 1).derivative[:2, :COEFFICIENTS]
+    return derivative @ closure().extend[: size(DEGREE + 1)]
 
 
 def _generator(latitude: Tensor, distance: Tensor, course: Tensor) -> Tensor:

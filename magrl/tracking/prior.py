@@ -25,7 +25,9 @@ DEGREE = 3
 """Highest degree of the coefficients that a belief holds; with 4, nothing is gained (random planets)."""
 CELLS = 36
 """Number of cells of latitude, 5 degrees each: less than what a first reading tells of the latitude (about 10)."""
-_FOLLOWED = 10  # highest degree of the coefficients whose effect is known when they are left out
+HIGHEST = 8
+"""Highest degree that is expected from those of a belief: with 6, the field left out at 1200 km is half as large again."""
+_FOLLOWED = 10  # highest degree of the coefficients whose effect is counted as left out
 
 
 def local_coefficient(n: int, order: int, k: int) -> float:
@@ -69,16 +71,15 @@ class Closure(NamedTuple):
     """What higher degrees do, which a belief does not hold, given the degrees that it holds.
 
     Attributes:
-        extend: ``(K', K)``, the coefficients of degrees 1 to N and the expected ones of higher degrees, from those of
-            1 to N.
+        extend: ``(K', K)``, the coefficients of degrees 1 to :data:`HIGHEST`, from those of 1 to N.
         drift: ``(K, K)`` [nT^2 per unit^2], covariance of the coefficients after a move by the coefficients of degree
             N + 1 that differ from the expected ones.
         left_out_nt: standard deviation of the field at a distance of a unit by all that differs from the expected
             [nT]; it grows with the N-th power of the distance.
 
     Example:
-        >>> closure(6).extend.shape
-        torch.Size([48, 15])
+        >>> closure().extend.shape
+        torch.Size([80, 15])
     """
 
     extend: Tensor
@@ -87,23 +88,20 @@ class Closure(NamedTuple):
 
 
 @cache
-def closure(degree: int) -> Closure:
+def closure() -> Closure:
     """Return the regression of the coefficients of higher degrees on those of a belief, under the spectrum.
 
     Its covariance has no preferred direction (the dipole's variance is shared over its three coefficients), so the
     regression commutes with turns.
 
-    Args:
-        degree: highest degree that is regressed, above :data:`DEGREE`.
-
     Example:
-        >>> round(closure(6).left_out_nt)
-        18
+        >>> round(closure().left_out_nt, 1)
+        17.5
     """
     axial, axial_variance, variance = gauss_moments()
     variance = variance.clone()
     variance[1] = (axial**2 + axial_variance + 2 * variance[1]) / 3
-    covariance, low, all_ = local_covariance(variance, _FOLLOWED), size(DEGREE), size(degree)
+    covariance, low, all_ = local_covariance(variance, _FOLLOWED), size(DEGREE), size(HIGHEST)
     known = covariance[:low, :low]
     scale = known.diagonal().rsqrt()
     inverse = torch.linalg.inv(known * scale * scale.unsqueeze(-1)) * scale * scale.unsqueeze(-1)

@@ -1,0 +1,421 @@
+"""Where the destination is, given its elements: the posterior of the way as weighted points.
+
+At a displacement d along a great circle, the field is linear in the coefficients of a belief, H(d) c
+(:func:`~magrl.tracking.harmonics.field_rows`, with the higher degrees as their regression). It is given in axes that
+are carried along the great circle; north there differs from theirs by the angle gamma(d) of the meridians, by which the
+vector of the destination's elements is turned back, and the vertical on the ellipsoid by a small angle more. The
+posterior's density is that of the vector under the normal distribution of the predicted field, times a normal prior of
+the displacement. It may have long tails and several maxima, so it is evaluated at points of two densities: around its
+mode, and around the vehicle at all distances.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_number, check_tensor
+from magrl.field.elements import field_vector
+from magrl.geodesy import curvature_radii
+from magrl.tracking.field_belief import COEFFICIENTS, LEAST_COS, MODEL_NT, Belief
+from magrl.tracking.harmonics import RADIUS, UNIT_KM, field_rows, powers, turning
+from magrl.tracking.prior import DEGREE, HIGHEST, closure
+
+_AT_ONCE = 13  # moves whose distances to all points are held at once
+_CANDIDATES = 32  # points among which that with most mass around it is chosen
+_NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out
+_SPREAD = 1.5  # standard deviations of the points around the mode, over those of the mode
+_LEAST_KM = 0.1  # standard deviation of the points around the mode
+_LEAST_WEIGHT = 1e-12  # below, products of weights would be denormal numbers, which are slow
+_TERMS = 5  # degree of the polynomials for the field there: 1.6 nT of error at 1000 km, 0.1 at 700
+_STEPS = 5  # of the search for the mode
+_DIFFERENCE_KM = 1.0  # of the derivatives of the predicted field there
+
+
+class Way(NamedTuple):
+    """Displacement ``(..., 2)`` northward and eastward [km] and its covariance ``(..., 2, 2)`` [km^2].
+
+    Example:
+        >>> Way(torch.zeros(2), torch.eye(2)).displacement
+        tensor([0., 0.])
+    """
+
+    displacement: Tensor
+    covariance: Tensor
+
+
+class WayPosterior(NamedTuple):
+    """Displacements ``(..., M, 2)`` northward and eastward [km] and their probabilities ``(..., M)``.
+
+    Example:
+        >>> posterior = WayPosterior(torch.tensor([[0.0, 10.0], [0.0, 30.0]]), torch.tensor([0.25, 0.75]))
+        >>> posterior.way().displacement, posterior.within(25.0)
+        (tensor([ 0., 25.]), tensor(0.2500))
+    """
+
+    points: Tensor
+    weights: Tensor
+
+    def way(self) -> Way:
+        """Return the mean and the covariance."""
+        mean = (self.points * self.weights.unsqueeze(-1)).sum(-2)
+        apart = self.points - mean.unsqueeze(-2)
+        return Way(mean, (apart * self.weights.unsqueeze(-1)).mT @ apart)
+
+    def aim(self, radius_km: float) -> Tensor:
+        """Return the displacement to aim at ``(..., 2)`` [km]: the mean, or, where that is within a radius of the
+        vehicle, the point that holds most probability within the radius.
+
+        Between two maxima the mean may be where the vehicle is, and no move makes progress.
+
+        Example:
+            >>> points = torch.tensor([[0.0, 40.0], [0.0, -40.0], [0.0, -42.0]])
+            >>> WayPosterior(points, torch.tensor([0.5, 0.25, 0.25])).aim(25.0)
+            tensor([ 0., 40.])
+        """
+        mean = (self.points * self.weights.unsqueeze(-1)).sum(-2)
+        likely = self.weights.topk(min(_CANDIDATES, self.weights.shape[-1]), -1).indices
+        centers = self.points.gather(-2, likely.unsqueeze(-1).expand(*likely.shape, 2))
+        apart = centers.unsqueeze(-2) - self.points.unsqueeze(-3)
+        mass = ((apart.square().sum(-1) <= radius_km**2) * self.weights.unsqueeze(-2)).sum(-1)
+        best = mass.argmax(-1, keepdim=True).unsqueeze(-1)
+        center = centers.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
+        return torch.where(mean.norm(dim=-1, keepdim=True) > radius_km, mean, center)
+
+    def mean_distance(self, moves: Tensor) -> Tensor:
+        """Return the mean distances ``(..., K)`` [km] of the place after moves ``(..., K, 2)`` [km], as float32.
+
+        Example:
+            >>> posterior = WayPosterior(torch.tensor([[30.0, 0.0], [0.0, 40.0]]), torch.tensor([0.5, 0.5]))
+            >>> posterior.mean_distance(torch.tensor([[0.0, 0.0], [30.0, 0.0]])).round()
+            tensor([35., 25.])
+        """
+        points, moves = self.points.float(), moves.float()
+        # |d - m|^2 as one matrix product, with 0.01 km^2 for its rounding
+        left = torch.cat((moves, moves.square().sum(-1, keepdim=True) + 0.01, torch.ones_like(moves[..., :1])), -1)
+        right = torch.cat((-2 * points, torch.ones_like(points[..., :1]), points.square().sum(-1, keepdim=True)), -1)
+        weights = self.weights.float().unsqueeze(-1)
+        parts = [((some @ right.mT).sqrt_() @ weights).squeeze(-1) for some in left.split(_AT_ONCE, -2)]
+        return torch.cat(parts, -1)
+
+    def within(self, radius_km: float) -> Tensor:
+        """Return the probability ``(...)`` that the place is within a radius [km] of the vehicle."""
+        check_number(0, above=True, radius_km=radius_km)
+        return (self.weights * (self.points.norm(dim=-1) <= radius_km)).sum(-1)
+
+    def radius(self, probability: float) -> Tensor:
+        """Return the least radius ``(...)`` [km] around the vehicle that holds the place with a probability.
+
+        Example:
+            >>> points = torch.tensor([[0.0, 30.0], [0.0, 10.0]])
+            >>> WayPosterior(points, torch.tensor([0.25, 0.75])).radius(0.7)
+            tensor(10.)
+        """
+        check_number(0, 1, probability=probability)
+        distance, order = self.points.norm(dim=-1).sort(-1)
+        held = self.weights.gather(-1, order).cumsum(-1)
+        first = (held < probability).sum(-1, keepdim=True).clamp_max(held.shape[-1] - 1)
+        return distance.gather(-1, first).squeeze(-1)
+
+
+class Destination(NamedTuple):
+    """A destination as seen from a belief, in units of 1000 km and nT.
+
+    Attributes:
+        belief: what is known of the field.
+        field: ``(..., 3)`` at the destination, in the axes there.
+        range: prior standard deviation of the displacement along each axis.
+        noise: variance of the field in each axis that the belief does not know.
+
+    Example:
+        >>> Destination._fields
+        ('belief', 'field', 'range', 'noise')
+    """
+
+    belief: Belief
+    field: Tensor
+    range: float
+    noise: float
+
+
+def destination(belief: Belief, elements: Tensor, range_km: float, crust_nt: float = 0.0) -> Destination:
+    """Return the destination where the field has given elements.
+
+    Args:
+        belief: what is known of the field.
+        elements: ``(..., 3)``: D [deg], I [deg], B_H [nT] at the destination.
+        range_km: prior standard deviation of the way along each axis [km].
+        crust_nt: standard deviation of the crust's field in each axis [nT].
+
+    Example:
+        >>> from magrl.tracking.field_belief import start
+        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.zeros(3))
+        >>> destination(belief, torch.tensor([3.0, 66.0, 17500.0]), 300.0).noise
+        4.0
+    """
+    check_tensor(3, elements=elements)
+    check_number(0, above=True, range_km=range_km)
+    return Destination(belief, field_vector(elements.double()), range_km / UNIT_KM, MODEL_NT**2 + crust_nt**2)
+
+
+def log_density(goal: Destination, points: Tensor) -> Tensor:
+    """Return the logarithm ``(..., M)`` of the posterior's density at displacements ``(..., M, 2)`` [km], but a
+    constant.
+
+    Example:
+        >>> from magrl.tracking.field_belief import start
+        >>> there = destination(start(torch.tensor([3.0, 65.0, 18000.0]), torch.zeros(3)), torch.zeros(3), 300.0)
+        >>> log_density(there, torch.zeros(5, 2)).shape
+        torch.Size([5])
+    """
+    points = points / UNIT_KM
+    return _log_density(goal, points, _moments(goal.belief, points))
+
+
+def mode(goal: Destination) -> Way:
+    """Return a maximum of the posterior by Gauss-Newton steps, and the inverse of its normal matrix.
+
+    The first step has the mean covariance over the prior of the way, the others that at the solution before.
+
+    Example:
+        >>> from magrl.tracking.field_belief import start
+        >>> here = torch.tensor([3.0, 65.0, 18000.0])
+        >>> mode(destination(start(here, torch.zeros(3)), here, 300.0)).displacement.round().abs()
+        tensor([0., 0.], dtype=torch.float64)
+    """
+    cross = torch.eye(2).to(goal.field)
+    around = (torch.cat((cross, -cross)) * (goal.range * math.sqrt(2))).expand(*goal.field.shape[:-1], 4, 2)
+    start = _covariance(goal, around, _moments(goal.belief, around))[1]
+    covariance = [entry.mean(-1, keepdim=True) for entry in start]
+    corners = torch.cat((torch.zeros_like(cross[:1]), cross)) * (_DIFFERENCE_KM / UNIT_KM)
+    place, ridge = torch.zeros_like(goal.field[..., :2]), goal.range**-2
+    for index in range(_STEPS):
+        points = place.unsqueeze(-2) + corners
+        moments = _moments(goal.belief, points)
+        residual, at = _covariance(goal, points, moments)
+        inverse, _ = _inverse([entry[..., :1] for entry in at] if index else covariance)
+        value, north, east = residual.split(1, -1)
+        north, east = ((value - x) * (UNIT_KM / _DIFFERENCE_KM) for x in (north, east))  # slopes of the prediction
+        pairs = (north, north), (north, east), (east, east), (north, value), (east, value)
+        nn, ne, ee, nr, er = (_quadratic(inverse, *pair).squeeze(-1) for pair in pairs)
+        nn, ee = nn + ridge, ee + ridge
+        nr, er = nr - ridge * place[..., 0], er - ridge * place[..., 1]
+        determinant = (nn * ee - ne * ne).unsqueeze(-1)
+        place = place + torch.stack((ee * nr - ne * er, nn * er - ne * nr), -1) / determinant
+    matrix = torch.stack((ee, -ne, -ne, nn), -1) / determinant
+    return Way(place * UNIT_KM, matrix.unflatten(-1, (2, 2)) * UNIT_KM**2)
+
+
+def posterior(goal: Destination, count: int = 256) -> WayPosterior:
+    """Return the posterior of the way to a destination, in single precision.
+
+    A quarter of the points are around the mode, the others around the vehicle; each has the density over that of all
+    points there as its weight.
+
+    Args:
+        goal: the destination.
+        count: number of points; 512 for probabilities, 256 for means.
+
+    Source:
+        A. B. Owen and Y. Zhou, Safe and effective importance sampling, Journal of the American Statistical Association
+        95 (2000): weights for points of several densities.
+
+    Example:
+        >>> from magrl.tracking.field_belief import start
+        >>> belief = start(torch.tensor([0.0, 60.0, 20000.0]), torch.tensor([0.05, 0.05, 5.0]))
+        >>> there = destination(belief, torch.tensor([0.0, 61.0, 19000.0]), 300.0)
+        >>> posterior(there).way().displacement.round(decimals=-1)
+        tensor([120.,   0.])
+    """
+    way = mode(goal)
+    heading = torch.atan2(way.displacement[..., 1], way.displacement[..., 0])
+    points, density = _points(way, heading, count)
+    near, around = (points.float() / UNIT_KM).split((count // 4, count - count // 4), -2)
+    parts = (near, _moments(goal.belief, near)), (around, _moments_around(goal.belief, heading, count))
+    logarithms = [_log_density(goal, *part) for part in parts]
+    weights = torch.softmax(torch.cat(logarithms, -1) - density.log(), -1)
+    return WayPosterior(points.float(), weights.where(weights > _LEAST_WEIGHT, 0.0))
+
+
+class _Moments(NamedTuple):
+    """Moments of the predicted field in axes that are carried to M points: the mean ``(..., 3, M)``, the covariance
+    with the latitude's offset ``(..., 3, M)`` and the six entries of the covariance without it ``(..., M)``; all but
+    these in axes that are turned so that azimuths are smaller by ``heading (...)`` [rad]."""
+
+    mean: Tensor
+    cross: Tensor
+    entries: Sequence[Tensor]
+    heading: Tensor
+
+
+_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
+
+
+def _moments(belief: Belief, points: Tensor) -> _Moments:
+    """Return the moments at displacements ``(..., M, 2)`` [unit], in their dtype."""
+    rows = _rows(_TERMS).to(points)  # (J, 3, K)
+    lever = (powers(points, _TERMS) @ rows.flatten(1)).unflatten(-1, (3, COEFFICIENTS))  # (..., M, 3, K)
+    state = _state(belief).to(points)
+    spread = (lever.flatten(-3, -2) @ state).unflatten(-2, (-1, 3))  # (..., M, 3, K + 2)
+    mean, cross = spread[..., -2:].permute(*range(points.ndim - 2), -1, -2, -3).unbind(-3)
+    product = spread[..., :-2] @ lever.mT
+    return _Moments(mean, cross, [product[..., i, j] for i, j in _ENTRIES], torch.zeros_like(points[..., 0, 0]))
+
+
+def _moments_around(belief: Belief, heading: Tensor, count: int) -> _Moments:
+    """Return the moments at the points around the vehicle, which are the same for all vehicles but for a turn."""
+    lever, products = _around(count)
+    turn = turning(-heading, DEGREE)
+    state = _state(belief)
+    covariance = (turn @ state[..., :-2] @ turn.mT)[..., *torch.triu_indices(COEFFICIENTS, COEFFICIENTS)]
+    entries = (covariance @ products.to(covariance)).unflatten(-1, (6, -1)).float().unbind(-2)
+    vectors = (turn @ state[..., -2:]).mT @ lever.to(covariance)
+    return _Moments(*vectors.unflatten(-1, (3, -1)).float().unbind(-3), entries, heading.float())
+
+
+def _state(belief: Belief) -> Tensor:
+    """Return the coefficients' covariance, their mean and their covariance with the latitude's offset, as columns."""
+    mean, block = belief.mean[..., :COEFFICIENTS, None], belief.covariance[..., :COEFFICIENTS, : COEFFICIENTS + 1]
+    return torch.cat((block[..., :-1], mean, block[..., -1:]), -1)
+
+
+@cache
+def _rows(terms: int) -> Tensor:
+    """Return the field at a displacement ``(J, 3, K)`` for each of its monomials."""
+    return field_rows(HIGHEST, terms) @ closure().extend
+
+
+@cache
+def _around(count: int) -> tuple[Tensor, Tensor]:
+    """Return the field at the points around the vehicle: its rows ``(K, 3 M)``, and for its covariance those of the
+    upper triangle of the coefficients' covariance ``(K (K + 1) / 2, 6 M)``."""
+    points = _unit_points(count)[1] / UNIT_KM
+    lever = torch.tensordot(powers(points, HIGHEST), _rows(HIGHEST), 1)  # (M, 3, K)
+    first, second = torch.triu_indices(COEFFICIENTS, COEFFICIENTS)
+    rows = []
+    for i, j in _ENTRIES:
+        product = lever[:, i, :, None] * lever[:, j, None, :]
+        whole = product + product.mT - torch.diag_embed(product.diagonal(dim1=-2, dim2=-1))
+        rows.append(whole[:, first, second])
+    return lever.permute(2, 1, 0).flatten(1), torch.cat(rows).mT.contiguous()
+
+
+def _log_density(goal: Destination, points: Tensor, moments: _Moments) -> Tensor:
+    """Return :func:`log_density` at displacements ``(..., M, 2)`` [unit], given the moments there."""
+    residual, covariance = _covariance(goal, points, moments)
+    inverse, volume = _inverse(covariance)
+    square = _quadratic(inverse, residual, residual) + points.square().sum(-1) / goal.range**2
+    return -(square + volume.log()) / 2
+
+
+def _covariance(goal: Destination, points: Tensor, moments: _Moments) -> tuple[Tensor, list[Tensor]]:
+    """Return the destination's field minus the predicted one ``(..., 3, M)`` in the axes of the moments, and the six
+    entries of its covariance ``(..., M)``.
+
+    To the moments it adds the latitude's offset, which turns the field by ``slope`` for each radian, the field that is
+    left out, and what the belief does not know.
+    """
+    target, slope = _carried(goal, points, moments.heading)
+    (x, y, _), (cx, cy, cz) = moments.mean.unbind(-2), moments.cross.unbind(-2)
+    offset, variance = (
+        part.to(points).unsqueeze(-1)
+        for part in (goal.belief.mean[..., COEFFICIENTS], goal.belief.covariance[..., COEFFICIENTS, COEFFICIENTS])
+    )
+    x, y = -slope * y, slope * x  # derivatives of the field with respect to the latitude
+    residual = target - moments.mean - torch.stack((x * offset, y * offset, torch.zeros_like(x)), -2)
+    apart = points.square().sum(-1) ** DEGREE * closure().left_out_nt ** 2 + goal.noise
+    xx, xy, xz, yy, yz, zz = moments.entries
+    xx, xz = xx + 2 * x * cx + x * x * variance + apart, xz + x * cz
+    yy, yz = yy + 2 * y * cy + y * y * variance + apart, yz + y * cz
+    return residual, [xx, xy + x * cy + y * cx + x * y * variance, xz, yy, yz, zz + apart]
+
+
+def _carried(goal: Destination, points: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the destination's field in the axes that are carried from the vehicle ``(..., 3, M)``, turned so that
+    azimuths are smaller by ``heading``, and the derivative of the angle of the meridians with respect to the latitude
+    ``(..., M)``.
+
+    With the angles (n, e) of the displacement, theta = |(n, e)|, S = sin(theta) / theta, K = (1 - cos(theta)) /
+    theta^2 and the latitudes phi here and phi' there, cos(phi') (cos(gamma), sin(gamma)) is
+    (cos(phi) (1 - n^2 K) - sin(phi) n S, e (sin(phi) S + cos(phi) n K)).
+    """
+    north, east = points.unbind(-1)
+    meridian, vertical = (radius.to(points).unsqueeze(-1) / UNIT_KM for radius in curvature_radii(goal.belief.latitude))
+    latitude, heading = torch.deg2rad(goal.belief.latitude).to(points).unsqueeze(-1), heading.unsqueeze(-1)
+    sin, cos = torch.sin(latitude), torch.cos(latitude)
+    n, e = north / meridian, east / vertical
+    square = n * n + e * e
+    s, k = 1 - square / 6 * (1 - square / 20), 0.5 - square / 24 * (1 - square / 30)
+    along, across = cos * (1 - n * n * k) - sin * n * s, e * (sin * s + cos * n * k)
+    length = torch.hypot(along, across).clamp_min(LEAST_COS)
+    slope = e * s / length.square()
+    along, across = along / length, across / length
+    x, y, z = (part.unsqueeze(-1) for part in goal.field.to(points).unbind(-1))
+    x, y = x * along + y * across, y * along - x * across
+    tilt_n, tilt_e = n - north / RADIUS, e - east / RADIUS  # of the vertical, more than on the sphere
+    x, y, z = x - tilt_n * z, y - tilt_e * z, z + tilt_n * x + tilt_e * y
+    sin, cos = torch.sin(heading), torch.cos(heading)
+    return torch.stack((x * cos + y * sin, y * cos - x * sin, z), -2), slope
+
+
+def _inverse(entries: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
+    """Return the six entries of the inverses of symmetric matrices, and their determinants."""
+    a, b, c, d, e, f = entries
+    minors = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * minors[0] + b * minors[1] + c * minors[2]
+    return [minor / determinant for minor in minors], determinant
+
+
+def _quadratic(entries: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
+    """Return the form of a symmetric matrix of columns ``(..., 3, M)``."""
+    a, b, c, d, e, f = entries
+    (x, y, z), (u, v, w) = left.unbind(-2), right.unbind(-2)
+    return x * (a * u + b * v + c * w) + y * (b * u + d * v + e * w) + z * (c * u + e * v + f * w)
+
+
+def _points(way: Way, heading: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return points ``(..., M, 2)`` around a way of a heading ``(...)`` [rad] and around the vehicle [km], and their
+    density ``(..., M)``, unnormalized.
+
+    They are laid out along and across the way, so that they turn with it.
+    """
+    normal, around = (points.to(way.displacement) for points in _unit_points(count))
+    distance, cos, sin = way.displacement.norm(dim=-1), torch.cos(heading), torch.sin(heading)
+    turn = torch.stack((torch.stack((cos, -sin), -1), torch.stack((sin, cos), -1)), -2)  # columns: along, across
+    covariance = turn.mT @ way.covariance @ turn * _SPREAD**2
+    first = covariance[..., 0, 0].clamp_min(_LEAST_KM**2).sqrt().unsqueeze(-1)  # Cholesky factor
+    below = covariance[..., 0, 1].unsqueeze(-1) / first
+    second = (covariance[..., 1, 1].unsqueeze(-1) - below * below).clamp_min(_LEAST_KM**2).sqrt()
+    x, y = normal.unbind(-1)
+    near = torch.stack((distance.unsqueeze(-1) + first * x, below * x + second * y), -1)
+    points = torch.cat((near, around.expand(*near.shape[:-2], *around.shape)), -2)
+    along, across = points.unbind(-1)
+    z0 = (along - distance.unsqueeze(-1)) / first
+    z1 = (across - below * z0) / second
+    bell = torch.exp(-(z0 * z0 + z1 * z1) / 2) * (len(normal) / (2 * math.pi)) / (first * second)
+    inverse_square = len(around) / (2 * math.pi * _MASS) / points.square().sum(-1).clamp_min(_NEAR_KM**2)
+    return points @ turn.mT, bell + inverse_square
+
+
+_MASS = 0.5 + math.log(_FAR_KM / _NEAR_KM)  # of the density within the nearest distance and beyond, over 2 pi
+
+
+@cache
+def _unit_points(count: int) -> tuple[Tensor, Tensor]:
+    """Return quasi-random points: a quarter of a standard normal, and the others around the vehicle [km].
+
+    The density of those is that of the inverse square of the distance, and constant within the nearest.
+    """
+    first = torch.quasirandom.SobolEngine(2, scramble=True, seed=0).draw(count // 4, dtype=torch.float64)
+    share, turn = (
+        torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count - count // 4, dtype=torch.float64).unbind(-1)
+    )
+    beyond, bearing = share * _MASS - 0.5, 2 * math.pi * turn
+    radius = _NEAR_KM * torch.where(beyond < 0, (2 * beyond + 1).clamp_min(0).sqrt(), torch.exp(beyond))
+    around = torch.stack((radius * torch.cos(bearing), radius * torch.sin(bearing)), -1)
+    return torch.special.ndtri(first.clamp(1e-6, 1 - 1e-6)), around
