@@ -22,8 +22,8 @@ from torch import Tensor
 from magrl.checks import check_number, check_tensor
 from magrl.field.elements import field_vector
 from magrl.geodesy import curvature_radii
-from magrl.tracking.field_belief import COEFFICIENTS, LEAST_COS, MODEL_NT, Belief
-from magrl.tracking.harmonics import RADIUS, UNIT_KM, field_rows, powers, turning
+from magrl.tracking.field_belief import COEFFICIENTS, MODEL_NT, Belief
+from magrl.tracking.harmonics import RADIUS, UNIT_KM, arc, field_rows, powers, turning
 from magrl.tracking.prior import DEGREE, HIGHEST, closure
 
 _AT_ONCE = 13  # moves whose distances to all points are held at once
@@ -230,22 +230,24 @@ def posterior(goal: Destination, count: int = 256) -> WayPosterior:
         >>> belief = start(torch.tensor([0.0, 60.0, 20000.0]), torch.tensor([0.05, 0.05, 5.0]))
         >>> there = destination(belief, torch.tensor([0.0, 61.0, 19000.0]), 300.0)
         >>> posterior(there).way().displacement.round(decimals=-1)
-        tensor([120.,   0.])
+        tensor([ 30., -10.])
     """
     way = mode(goal)
-    heading = torch.atan2(way.displacement[..., 1], way.displacement[..., 0])
-    points, density = _points(way, heading, count)
-    near, around = (points.float() / UNIT_KM).split((count // 4, count - count // 4), -2)
+    distance = way.displacement.norm(dim=-1, keepdim=True)
+    ahead = torch.tensor([1.0, 0.0]).to(distance)
+    heading = torch.where(distance > 0, way.displacement / distance, ahead)
+    points, density = _points(Way(*(part.float() for part in way)), heading.float(), count)
+    near, around = (points / UNIT_KM).split((count // 4, count - count // 4), -2)
     parts = (near, _moments(goal.belief, near)), (around, _moments_around(goal.belief, heading, count))
     logarithms = [_log_density(goal, *part) for part in parts]
     weights = torch.softmax(torch.cat(logarithms, -1) - density.log(), -1)
-    return WayPosterior(points.float(), weights.where(weights > _LEAST_WEIGHT, 0.0))
+    return WayPosterior(points, weights.where(weights > _LEAST_WEIGHT, 0.0))
 
 
 class _Moments(NamedTuple):
     """Moments of the predicted field in axes that are carried to M points: the mean ``(..., 3, M)``, the covariance
     with the latitude's offset ``(..., 3, M)`` and the six entries of the covariance without it ``(..., M)``; all but
-    these in axes that are turned so that azimuths are smaller by ``heading (...)`` [rad]."""
+    these in axes that are turned so that a ``heading (..., 2)``, a unit vector, is their first."""
 
     mean: Tensor
     cross: Tensor
@@ -264,15 +266,16 @@ def _moments(belief: Belief, points: Tensor) -> _Moments:
     spread = (lever.flatten(-3, -2) @ state).unflatten(-2, (-1, 3))  # (..., M, 3, K + 2)
     mean, cross = spread[..., -2:].permute(*range(points.ndim - 2), -1, -2, -3).unbind(-3)
     product = spread[..., :-2] @ lever.mT
-    return _Moments(mean, cross, [product[..., i, j] for i, j in _ENTRIES], torch.zeros_like(points[..., 0, 0]))
+    ahead = torch.eye(2).to(points)[0].expand_as(points[..., 0, :])
+    return _Moments(mean, cross, [product[..., i, j] for i, j in _ENTRIES], ahead)
 
 
 def _moments_around(belief: Belief, heading: Tensor, count: int) -> _Moments:
     """Return the moments at the points around the vehicle, which are the same for all vehicles but for a turn."""
-    lever, products = _around(count)
-    turn = turning(-heading, DEGREE)
+    lever, products, upper = _around(count)
+    turn = turning(heading[..., 0], -heading[..., 1], DEGREE)
     state = _state(belief)
-    covariance = (turn @ state[..., :-2] @ turn.mT)[..., *torch.triu_indices(COEFFICIENTS, COEFFICIENTS)]
+    covariance = (turn @ state[..., :-2] @ turn.mT).flatten(-2).index_select(-1, upper.to(heading.device))
     entries = (covariance @ products.to(covariance)).unflatten(-1, (6, -1)).float().unbind(-2)
     vectors = (turn @ state[..., -2:]).mT @ lever.to(covariance)
     return _Moments(*vectors.unflatten(-1, (3, -1)).float().unbind(-3), entries, heading.float())
@@ -291,9 +294,9 @@ def _rows(terms: int) -> Tensor:
 
 
 @cache
-def _around(count: int) -> tuple[Tensor, Tensor]:
+def _around(count: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return the field at the points around the vehicle: its rows ``(K, 3 M)``, and for its covariance those of the
-    upper triangle of the coefficients' covariance ``(K (K + 1) / 2, 6 M)``."""
+    upper triangle of the coefficients' covariance ``(K (K + 1) / 2, 6 M)``, and where these are in it, flattened."""
     points = _unit_points(count)[1] / UNIT_KM
     lever = torch.tensordot(powers(points, HIGHEST), _rows(HIGHEST), 1)  # (M, 3, K)
     first, second = torch.triu_indices(COEFFICIENTS, COEFFICIENTS)
@@ -302,7 +305,7 @@ def _around(count: int) -> tuple[Tensor, Tensor]:
         product = lever[:, i, :, None] * lever[:, j, None, :]
         whole = product + product.mT - torch.diag_embed(product.diagonal(dim1=-2, dim2=-1))
         rows.append(whole[:, first, second])
-    return lever.permute(2, 1, 0).flatten(1), torch.cat(rows).mT.contiguous()
+    return lever.permute(2, 1, 0).flatten(1), torch.cat(rows).mT.contiguous(), first * COEFFICIENTS + second
 
 
 def _log_density(goal: Destination, points: Tensor, moments: _Moments) -> Tensor:
@@ -310,7 +313,7 @@ def _log_density(goal: Destination, points: Tensor, moments: _Moments) -> Tensor
     residual, covariance = _covariance(goal, points, moments)
     inverse, volume = _inverse(covariance)
     square = _quadratic(inverse, residual, residual) + points.square().sum(-1) / goal.range**2
-    return -(square + volume.log()) / 2
+    return -(square + volume.clamp_min(goal.noise**3).log()) / 2  # the least volume, but for rounding
 
 
 def _covariance(goal: Destination, points: Tensor, moments: _Moments) -> tuple[Tensor, list[Tensor]]:
@@ -337,29 +340,19 @@ def _covariance(goal: Destination, points: Tensor, moments: _Moments) -> tuple[T
 
 def _carried(goal: Destination, points: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
     """Return the destination's field in the axes that are carried from the vehicle ``(..., 3, M)``, turned so that
-    azimuths are smaller by ``heading``, and the derivative of the angle of the meridians with respect to the latitude
+    the heading is their first, and the derivative of the angle of the meridians with respect to the latitude
     ``(..., M)``.
-
-    With the angles (n, e) of the displacement, theta = |(n, e)|, S = sin(theta) / theta, K = (1 - cos(theta)) /
-    theta^2 and the latitudes phi here and phi' there, cos(phi') (cos(gamma), sin(gamma)) is
-    (cos(phi) (1 - n^2 K) - sin(phi) n S, e (sin(phi) S + cos(phi) n K)).
     """
     north, east = points.unbind(-1)
     meridian, vertical = (radius.to(points).unsqueeze(-1) / UNIT_KM for radius in curvature_radii(goal.belief.latitude))
-    latitude, heading = torch.deg2rad(goal.belief.latitude).to(points).unsqueeze(-1), heading.unsqueeze(-1)
-    sin, cos = torch.sin(latitude), torch.cos(latitude)
+    latitude = torch.deg2rad(goal.belief.latitude).to(points).unsqueeze(-1)
     n, e = north / meridian, east / vertical
-    square = n * n + e * e
-    s, k = 1 - square / 6 * (1 - square / 20), 0.5 - square / 24 * (1 - square / 30)
-    along, across = cos * (1 - n * n * k) - sin * n * s, e * (sin * s + cos * n * k)
-    length = torch.hypot(along, across).clamp_min(LEAST_COS)
-    slope = e * s / length.square()
-    along, across = along / length, across / length
+    along, across, slope, *_ = arc(torch.sin(latitude), torch.cos(latitude), n, e)
     x, y, z = (part.unsqueeze(-1) for part in goal.field.to(points).unbind(-1))
     x, y = x * along + y * across, y * along - x * across
     tilt_n, tilt_e = n - north / RADIUS, e - east / RADIUS  # of the vertical, more than on the sphere
     x, y, z = x - tilt_n * z, y - tilt_e * z, z + tilt_n * x + tilt_e * y
-    sin, cos = torch.sin(heading), torch.cos(heading)
+    cos, sin = heading.unsqueeze(-2).unbind(-1)
     return torch.stack((x * cos + y * sin, y * cos - x * sin, z), -2), slope
 
 
@@ -379,13 +372,13 @@ def _quadratic(entries: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor
 
 
 def _points(way: Way, heading: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return points ``(..., M, 2)`` around a way of a heading ``(...)`` [rad] and around the vehicle [km], and their
+    """Return points ``(..., M, 2)`` around a way of a heading ``(..., 2)`` and around the vehicle [km], and their
     density ``(..., M)``, unnormalized.
 
     They are laid out along and across the way, so that they turn with it.
     """
     normal, around = (points.to(way.displacement) for points in _unit_points(count))
-    distance, cos, sin = way.displacement.norm(dim=-1), torch.cos(heading), torch.sin(heading)
+    distance, (cos, sin) = way.displacement.norm(dim=-1), heading.unbind(-1)
     turn = torch.stack((torch.stack((cos, -sin), -1), torch.stack((sin, cos), -1)), -2)  # columns: along, across
     covariance = turn.mT @ way.covariance @ turn * _SPREAD**2
     first = covariance[..., 0, 0].clamp_min(_LEAST_KM**2).sqrt().unsqueeze(-1)  # Cholesky factor
@@ -412,9 +405,8 @@ def _unit_points(count: int) -> tuple[Tensor, Tensor]:
     The density of those is that of the inverse square of the distance, and constant within the nearest.
     """
     first = torch.quasirandom.SobolEngine(2, scramble=True, seed=0).draw(count // 4, dtype=torch.float64)
-    share, turn = (
-        torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count - count // 4, dtype=torch.float64).unbind(-1)
-    )
+    second = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count - count // 4, dtype=torch.float64)
+    share, turn = second.unbind(-1)
     beyond, bearing = share * _MASS - 0.5, 2 * math.pi * turn
     radius = _NEAR_KM * torch.where(beyond < 0, (2 * beyond + 1).clamp_min(0).sqrt(), torch.exp(beyond))
     around = torch.stack((radius * torch.cos(bearing), radius * torch.sin(bearing)), -1)

@@ -22,11 +22,12 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from magrl.checks import check_tensor
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
-from magrl.geodesy import curvature_radii, move
-from magrl.tracking.harmonics import RADIUS, UNIT_KM, generators, size, turning
+from magrl.geodesy import curvature_radii
+from magrl.tracking.harmonics import UNIT_KM, arc, generators, size, turning
 from magrl.tracking.prior import DEGREE, closure, expected
 
 COEFFICIENTS = size(DEGREE)
@@ -49,7 +50,7 @@ class Belief(NamedTuple):
     Example:
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0]))
         >>> belief.mean.shape, round(float(belief.latitude))
-        (torch.Size([22]), 53)
+        (torch.Size([22]), 40)
     """
 
     mean: Tensor
@@ -110,10 +111,7 @@ def start(
 
 
 def before(
-    near: Tensor,
-    bias_std: Tensor | None = None,
-    drift_std: Tensor | None = None,
-    iron_std: Tensor | None = None,
+    near: Tensor, bias_std: Tensor | None = None, drift_std: Tensor | None = None, iron_std: Tensor | None = None
 ) -> Belief:
     """Return the belief before any reading, where the elements are about ``near``; other arguments as :func:`start`.
 
@@ -132,10 +130,10 @@ def before(
     errors = [constant, slow] if iron_std is None else [constant, slow, iron_std.double().square()]
     errors = torch.cat([x.expand_as(near) for x in errors], -1)
     count = errors.shape[-1]
-    variances = torch.diag_embed(torch.nn.functional.pad(errors, (COEFFICIENTS + 1, 0)))
+    variances = torch.diag_embed(pad(errors, (COEFFICIENTS + 1, 0)))
     latitude = torch.rad2deg(mean[..., -1])
-    mean = torch.cat((mean[..., :-1], torch.zeros_like(latitude).unsqueeze(-1), torch.zeros_like(errors)), -1)
-    return Belief(mean, torch.nn.functional.pad(covariance, (0, count, 0, count)) + variances, latitude)
+    mean = pad(mean[..., :-1], (0, count + 1))
+    return Belief(mean, pad(covariance, (0, count, 0, count)) + variances, latitude)
 
 
 def moved(belief: Belief, distance: Tensor, course: Tensor, drift_std: Tensor | None = None) -> Belief:
@@ -151,35 +149,32 @@ def moved(belief: Belief, distance: Tensor, course: Tensor, drift_std: Tensor | 
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0]))
         >>> further = moved(belief, torch.tensor(50.0), torch.tensor(0.0))
         >>> (further.field - belief.field).round()  # northward by 50 km
-        tensor([-434.,  -25.,  404.], dtype=torch.float64)
+        tensor([-157.,   -0.,  267.], dtype=torch.float64)
     """
     distance, course = distance.double(), course.double()
-    latitude, turn, slopes = _turn(belief.latitude, distance, course)
-    matrix = turning(turn, DEGREE) @ _exponential(_generator((belief.latitude + latitude) / 2, distance, course))
+    latitude = torch.deg2rad(belief.latitude)
+    sin, cos = torch.sin(latitude), torch.cos(latitude)
+    north, east = distance * torch.cos(course), distance * torch.sin(course)
+    middle = belief.latitude + torch.rad2deg(north / curvature_radii(belief.latitude)[0]) / 2
+    meridian, vertical = curvature_radii(middle)
+    angles = north / meridian, east / vertical
+    turn = arc(sin, cos, *angles)
+    matrix = turning(turn.cos_turn, turn.sin_turn, DEGREE) @ _carry(north / UNIT_KM, east / UNIT_KM, *angles)
     column = matrix @ belief.mean[..., :COEFFICIENTS, None]
-    column = slopes[0][..., None, None] * (generators(DEGREE).turn[2].to(column) @ column)
-    kept = torch.exp(-distance / LASTING_KM).unsqueeze(-1)
-    ones = torch.ones_like(belief.mean)
-    diagonal = torch.cat(
-        (
-            0 * ones[..., :COEFFICIENTS],
-            slopes[1].unsqueeze(-1),
-            ones[..., CONSTANT],
-            kept * ones[..., SLOW],
-            ones[..., IRON],
-        ),
-        -1,
-    )
-    top = torch.cat((matrix, column), -1)
+    column = turn.slope[..., None, None] * (generators(DEGREE).turn[2].to(column) @ column)
+    rise = turn.sin * cos - turn.cos * sin  # sine of the change of the latitude
+    after = belief.latitude + torch.rad2deg(rise * (1 + rise * rise / 6))
+    kept, ones = torch.exp(-distance / LASTING_KM).unsqueeze(-1), torch.ones_like(belief.mean)
+    parts = 0 * ones[..., :COEFFICIENTS], turn.rate.unsqueeze(-1), ones[..., CONSTANT], kept * ones[..., SLOW]
     rest = belief.mean.shape[-1] - COEFFICIENTS
-    step = torch.nn.functional.pad(top, (0, rest - 1, 0, rest)) + torch.diag_embed(diagonal)
-    noise = closure().drift.to(step) * (distance / UNIT_KM).square()[..., None, None]
-    noise = torch.nn.functional.pad(noise, (0, rest, 0, rest))
+    step = torch.diag_embed(torch.cat((*parts, ones[..., IRON]), -1))
+    step = step + pad(torch.cat((matrix, column), -1), (0, rest - 1, 0, rest))
+    noise = pad(closure().drift.to(step), (0, rest, 0, rest)) * (distance / UNIT_KM).square()[..., None, None]
     if drift_std is not None:
         fresh = (1 - kept.square()) * drift_std.double().square().expand_as(ones[..., SLOW])
-        noise = noise + torch.diag_embed(torch.nn.functional.pad(fresh, (SLOW.start, rest - 7)))
+        noise = noise + torch.diag_embed(pad(fresh, (SLOW.start, rest - 7)))
     mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
-    return Belief(mean, step @ belief.covariance @ step.mT + noise, latitude)
+    return Belief(mean, step @ belief.covariance @ step.mT + noise, after)
 
 
 def innovation(
@@ -202,21 +197,23 @@ def innovation(
 
     Example:
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0]))
-        >>> innovation(belief, torch.tensor([3.5, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0])).residual.round(decimals=1)
-        tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
+        >>> reading, std = torch.tensor([3.5, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0])
+        >>> innovation(belief, reading, std).residual.round(decimals=1)
+        tensor([0.5000, -0.0000, 0.7000], dtype=torch.float64)
     """
     check_tensor(3, reading=reading, sensor_std=sensor_std)
     reading, sensor_std = reading.double(), sensor_std.double()
     present = (sensor_std < math.inf) & (reading == reading)
-    vector = field_vector(torch.where(present, reading, measured_elements(belief.field)))
+    vector = field_vector(torch.where(present, reading, _elements(belief.field)))
     jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(vector), 0.0)
-    parts = [jacobian, torch.zeros_like(jacobian[..., :1]).expand(*jacobian.shape[:-1], COEFFICIENTS - 2)]
+    rows = pad(jacobian, (0, COEFFICIENTS - 2))
     if errors:
         own = torch.diag_embed(present.double())
-        axes = [] if heading is None else [jacobian @ turning(heading.double(), 1)]  # forward, right, down
-        parts += [own, own, *axes]
-    rows = torch.cat(parts, -1)
-    rows = torch.nn.functional.pad(rows, (0, belief.mean.shape[-1] - rows.shape[-1]))
+        rows = torch.cat((rows, own, own), -1)
+        if heading is not None:
+            cos, sin = torch.cos(heading.double()), torch.sin(heading.double())
+            rows = torch.cat((rows, jacobian @ turning(cos, sin, 1)), -1)  # forward, right, down
+    rows = pad(rows, (0, belief.mean.shape[-1] - rows.shape[-1]))
     residual = (jacobian @ vector.unsqueeze(-1) - rows @ belief.mean.unsqueeze(-1)).squeeze(-1)
     variance = torch.where(present, sensor_std, 1.0).square()
     noise = torch.diag_embed(variance) + (MODEL_NT**2 + crust_nt**2) * jacobian @ jacobian.mT
@@ -234,7 +231,8 @@ def updated(belief: Belief, new: Innovation) -> Belief:
     cross = belief.covariance @ new.rows.mT
     gain = cross @ inverse3(new.covariance)
     mean = belief.mean + (gain @ new.residual.unsqueeze(-1)).squeeze(-1)
-    return Belief(mean, belief.covariance - gain @ cross.mT, belief.latitude)
+    covariance = belief.covariance - gain @ cross.mT
+    return Belief(mean, (covariance + covariance.mT) / 2, belief.latitude)  # else, what is not symmetric grows
 
 
 def read(
@@ -271,14 +269,14 @@ def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: float = 0.0) 
         >>> belief = known(before(here, bias_std=torch.ones(3)), here, torch.full((3,), 0.01))
         >>> belief = read(belief, here + torch.tensor([0.8, 0.0, 0.0]), torch.full((3,), 0.01))
         >>> belief.mean[CONSTANT].round(decimals=1)  # the compass is off by 0.8 degrees
-        tensor([0.8000, 0.0000, 0.0000], dtype=torch.float64)
+        tensor([0.8000, -0.0000, 0.2000], dtype=torch.float64)
     """
     return updated(belief, innovation(belief, elements, std, None, crust_nt, errors=False))
 
 
 class LocalElements(NamedTuple):
-    """D, I [deg], B_H [nT] at the vehicle ``(..., 3)``, their gradients ``(..., 3, 2)`` northward and eastward [per km],
-    and for each element the covariance ``(..., 3, 3, 3)`` of its value and gradient.
+    """D, I [deg], B_H [nT] at the vehicle ``(..., 3)``, their gradients ``(..., 3, 2)`` northward and eastward
+    [per km], and for each element the covariance ``(..., 3, 3, 3)`` of its value and gradient.
 
     Example:
         >>> elements(start(torch.tensor([3.0, 65.0, 18000.0]), torch.zeros(3))).gradient.shape
@@ -296,9 +294,9 @@ def elements(belief: Belief) -> LocalElements:
     Example:
         >>> here = elements(start(torch.tensor([0.0, 60.0, 20000.0]), torch.tensor([0.05, 0.05, 5.0])))
         >>> (100 * here.gradient).round(decimals=1)  # change over 100 km
-        tensor([[  0.0000,   0.9000],
-                [  0.7000,   0.0000],
-                [-86.5000,   0.0000]], dtype=torch.float64)
+        tensor([[ 0.0000e+00, -2.0000e-01],
+                [ 8.0000e-01,  0.0000e+00],
+                [-2.8030e+02,  0.0000e+00]], dtype=torch.float64)
     """
     mean, derivative = belief.mean[..., :COEFFICIENTS], closed_derivatives().to(belief.mean)
     turn, latitude = generators(DEGREE).turn.to(mean), torch.deg2rad(belief.latitude)
@@ -314,7 +312,12 @@ def elements(belief: Belief) -> LocalElements:
     state = COEFFICIENTS + 1
     slopes = (rows[..., 1:, :] @ belief.mean[..., None, :state, None]).squeeze(-1)
     covariance = rows @ belief.covariance[..., None, :state, :state] @ rows.mT
-    return LocalElements(measured_elements(belief.field), slopes, covariance)
+    return LocalElements(_elements(belief.field), slopes, covariance)
+
+
+def _elements(field: Tensor) -> Tensor:
+    """Return D, I, B_H of a field; the angles by way of single precision, as ONNX Runtime has no other arc tangent."""
+    return measured_elements(field.float()).to(field)
 
 
 def closed_derivatives() -> Tensor:
@@ -323,41 +326,14 @@ def closed_derivatives() -> Tensor:
     return derivative @ closure().extend[: size(DEGREE + 1)]
 
 
-def _generator(latitude: Tensor, distance: Tensor, course: Tensor) -> Tensor:
-    """Return the generator X of a move ``(..., K, K)``."""
-    meridian, vertical = curvature_radii(latitude)
-    turn, arcs = generators(DEGREE).turn[:2], ((distance * torch.cos(course)), (distance * torch.sin(course)))
-    steps = torch.cat((closed_derivatives(), turn)).to(arcs[0])
-    sizes = torch.stack((arcs[0] / UNIT_KM, arcs[1] / UNIT_KM, arcs[0] / meridian, arcs[1] / vertical), -1)
-    return torch.tensordot(sizes, steps, 1)
-
-
-def _exponential(matrix: Tensor) -> Tensor:
-    """Return the exponential of a generator, to the fourth order."""
+def _carry(north: Tensor, east: Tensor, *angles: Tensor) -> Tensor:
+    """Return exp(X) ``(..., K, K)`` of a move [unit] that turns the vertical by angles northward and eastward [rad], to
+    the fourth order."""
+    steps = torch.cat((closed_derivatives(), generators(DEGREE).turn[:2])).to(north)
+    matrix = torch.tensordot(torch.stack((north, east, *angles), -1), steps, 1)
     one = torch.eye(matrix.shape[-1]).to(matrix)
     square = matrix @ matrix
     return one + matrix + square @ (one / 2 + matrix / 6 + square / 24)
-
-
-def _turn(latitude: Tensor, distance: Tensor, course: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-    """Return the latitude after a move [deg], by how much azimuths became larger [rad], and the derivatives of both
-    (of the turn first) with respect to the latitude before.
-
-    Axes that are carried along a great circle differ from north and east by the twist of the rotation between the two
-    local frames, whose meridians are at the angle of the longitudes.
-    """
-    after, longitude = move(latitude, torch.zeros_like(latitude), course, distance)
-    (sin, cos), (sin_after, cos_after) = ((torch.sin(x), torch.cos(x)) for x in map(torch.deg2rad, (latitude, after)))
-    angle, arc = torch.deg2rad(longitude), distance / (UNIT_KM * RADIUS)
-    twist = (sin + sin_after) * torch.sin(angle), torch.cos(angle) * (1 + sin * sin_after) + cos * cos_after
-    cos_after = cos_after.clamp_min(LEAST_COS)
-    slope = torch.sin(course) * torch.sin(arc) / cos_after.square()
-    rate = (cos * torch.cos(arc) - sin * torch.sin(arc) * torch.cos(course)) / cos_after
-    return after, torch.atan2(*twist), (slope, rate)
-
-
-LEAST_COS = 0.02
-"""Least cosine of a latitude in derivatives, 1 degree from a pole: there they do not hold, but stay finite."""
 
 
 def inverse3(matrix: Tensor) -> Tensor:

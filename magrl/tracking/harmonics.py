@@ -82,43 +82,49 @@ def generators(degree: int) -> Generators:
     """
     place = {order: k for k, order in enumerate(orders(degree))}  # here -m stands for R_n^{-m}
 
-    def ladder(step_n: int, step_m: int, weight: object) -> Tensor:
+    n, m = (torch.tensor(x, dtype=torch.complex128) for x in zip(*place, strict=True))
+
+    def ladder(step_n: int, step_m: int, weight: Tensor) -> Tensor:
         """Return the matrix that takes R_n^m to a weight times R_{n + step_n}^{m + step_m}."""
         matrix = torch.zeros(len(place), len(place), dtype=torch.complex128)
-        for (n, m), k in place.items():
-            if (target := (n + step_n, m + step_m)) in place:
-                matrix[k, place[target]] = weight(n, m)
+        for (degree, order), k in place.items():
+            if (target := (degree + step_n, order + step_m)) in place:
+                matrix[k, place[target]] = weight[k]
         return matrix
 
-    minus, plus = ladder(-1, -1, lambda n, m: 1), ladder(-1, 1, lambda n, m: -1)  # d_x -+ i d_y
-    lower, raise_ = ladder(0, -1, lambda n, m: n - m + 1), ladder(0, 1, lambda n, m: -(n + m + 1))
-    derivative = (minus + plus) / 2, (minus - plus) * (1j / 2), ladder(-1, 0, lambda n, m: 1)
-    turn = -(raise_ + lower) / 2, (raise_ - lower) * (1j / 2), ladder(0, 0, lambda n, m: -1j * m)
+    one = torch.ones_like(n)
+    minus, plus = ladder(-1, -1, one), ladder(-1, 1, -one)  # d_x - i d_y, d_x + i d_y
+    lower, rise = ladder(0, -1, n - m + 1), ladder(0, 1, -(n + m + 1))
+    derivative = (minus + plus) / 2, (minus - plus) * (1j / 2), ladder(-1, 0, one)
+    turn = -(rise + lower) / 2, (rise - lower) * (1j / 2), ladder(0, 0, -1j * m)
     parts = torch.zeros_like(minus)  # rows: the real harmonics as sums of R_n^m and R_n^{-m}
-    for (n, m), k in place.items():
-        positive, negative = place[n, abs(m)], place[n, -abs(m)]
-        parts[k, positive] += (1 if m >= 0 else -1j) * (1 if m else 0.5)
-        parts[k, negative] += (1 if m >= 0 else 1j) * (-1) ** m * (1 if m else 0.5)
+    for (degree, order), k in place.items():
+        unit = (1 if order >= 0 else -1j) * (1 if order else 0.5)
+        parts[k, place[degree, abs(order)]] += unit
+        parts[k, place[degree, -abs(order)]] += unit * (-1) ** order * (1 if order >= 0 else -1)
     inverse = torch.linalg.inv(parts)
     real = [torch.stack([(parts @ matrix @ inverse).real.mT for matrix in kind]) for kind in (derivative, turn)]
     return Generators(*(matrix.contiguous() for matrix in real))
 
 
-def turning(angle: Tensor, degree: int) -> Tensor:
+def turning(cos: Tensor, sin: Tensor, degree: int) -> Tensor:
     """Return the matrices ``(..., K, K)`` that turn coefficients to axes in which azimuths are larger by an angle.
 
     Args:
-        angle: ``(...)`` [rad].
+        cos: ``(...)`` cosine of the angle.
+        sin: ``(...)`` its sine.
         degree: highest degree.
 
     Example:
-        >>> turning(torch.tensor(math.pi / 2), 1).round() @ torch.tensor([1.0, 0.0, 5.0])  # what was north is east
+        >>> turning(torch.tensor(0.0), torch.tensor(1.0), 1) @ torch.tensor([1.0, 0.0, 5.0])  # what was north is east
         tensor([0., 1., 5.])
     """
-    m = torch.tensor([abs(m) for _, m in orders(degree)], dtype=angle.dtype, device=angle.device)
-    sign = generators(degree).turn[2].to(angle).sign()  # of the sine, between the two parts of an order
-    angles = angle.unsqueeze(-1) * m
-    return torch.diag_embed(torch.cos(angles)) + sign * torch.sin(angles).unsqueeze(-1)
+    waves = [(torch.ones_like(cos), torch.zeros_like(sin)), (cos, sin)]  # of m times the angle
+    for _ in range(degree - 1):
+        x, y = waves[-1]
+        waves.append((x * cos - y * sin, x * sin + y * cos))
+    cosines, sines = (torch.stack([waves[abs(m)][part] for _, m in orders(degree)], -1) for part in (0, 1))
+    return torch.diag_embed(cosines) + generators(degree).turn[2].to(cos).sign() * sines.unsqueeze(-1)
 
 
 def powers(displacement: Tensor, degree: int) -> Tensor:
@@ -139,6 +145,55 @@ def powers(displacement: Tensor, degree: int) -> Tensor:
     return torch.stack([term for row in rows for term in row], -1)
 
 
+class Arc(NamedTuple):
+    """A way along a great circle, each ``(...)``: cosine and sine of the angle gamma by which azimuths are larger at
+    its end than in axes that are carried along; the derivatives of gamma and of the latitude at its end with respect to
+    that at its start; and sine and cosine of the latitude at its end, the latter not below :data:`LEAST_COS`.
+
+    Example:
+        >>> Arc._fields
+        ('cos_turn', 'sin_turn', 'slope', 'rate', 'sin', 'cos')
+    """
+
+    cos_turn: Tensor
+    sin_turn: Tensor
+    slope: Tensor
+    rate: Tensor
+    sin: Tensor
+    cos: Tensor
+
+
+LEAST_COS = 0.02
+"""Least cosine of a latitude in derivatives, 1 degree from a pole: there they do not hold, but stay finite."""
+
+
+def arc(sin: Tensor, cos: Tensor, north: Tensor, east: Tensor) -> Arc:
+    """Return the turn of north along a great circle.
+
+    With theta = |(n, e)|, S = sin(theta) / theta, K = (1 - cos(theta)) / theta^2 and the latitudes phi and phi',
+    sin(phi') = sin(phi) (1 - theta^2 K) + cos(phi) n S and cos(phi') (cos(gamma), sin(gamma)) =
+    (cos(phi) (1 - n^2 K) - sin(phi) n S, e (sin(phi) S + cos(phi) n K)).
+
+    Args:
+        sin: ``(...)`` sine of the latitude at the start.
+        cos: ``(...)`` its cosine.
+        north: ``(...)`` angle n of the way northward [rad], below 1.
+        east: ``(...)`` angle e of the way eastward [rad].
+
+    Example:
+        >>> turn = arc(*(torch.tensor(x, dtype=torch.float64) for x in (0.8, 0.6, 0.0, 0.01)))
+        >>> round(float(turn.sin_turn), 5)  # tan(latitude) times 0.01
+        0.01333
+    """
+    square = north * north + east * east
+    s, k = 1 - square / 6 * (1 - square / 20 * (1 - square / 42)), 0.5 - square / 24 * (1 - square / 30)
+    along, across = cos * (1 - north * north * k) - sin * north * s, east * (sin * s + cos * north * k)
+    cos_end = torch.sqrt(along * along + across * across).clamp_min(LEAST_COS)
+    sin_end = sin * (1 - square * k) + cos * north * s
+    rate = (cos * (1 - square * k) - sin * north * s) / cos_end
+    return Arc(along / cos_end, across / cos_end, east * s / cos_end.square(), rate, sin_end, cos_end)
+
+
 def field_rows(degree: int, terms: int) -> Tensor:
     """Return the field at a place on the sphere as polynomials of the displacement.
 
@@ -156,9 +211,9 @@ def field_rows(degree: int, terms: int) -> Tensor:
 
     Example:
         >>> field_rows(1, 1)[1]  # a field that is downward here is partly northward a unit to the north
-        tensor([[ 0.0000,  0.0000, -0.1570],
+        tensor([[ 0.0000,  0.0000,  0.1570],
                 [ 0.0000,  0.0000,  0.0000],
-                [ 0.1570,  0.0000,  0.0000]], dtype=torch.float64)
+                [-0.1570,  0.0000,  0.0000]], dtype=torch.float64)
     """
     derivative, turn = generators(degree)
     north, east = (derivative[i] + turn[i] / RADIUS for i in (0, 1))

@@ -1,8 +1,8 @@
 """What is known of the field around a vehicle in advance: the local coefficients of random planets, in closed form.
 
-The Gauss coefficients of :func:`~magrl.field.planets.random_planets` are independent, and but for the axial dipole all of
-a degree have one variance. About local axes (its pole in the direction of z) a coefficient of degree n and order m has
-these local coefficients (:mod:`~magrl.tracking.harmonics`), of the same order and of every degree k from max(m, 1) on:
+The Gauss coefficients of :func:`~magrl.field.planets.random_planets` are independent, and but for the axial dipole all
+of a degree have one variance. About local axes (the pole is in the direction of z) a coefficient of degree n and order
+m has these local coefficients (:mod:`~magrl.tracking.harmonics`), of that order and of each degree k from max(m, 1) on:
 
     -(-1)^(n + m) sqrt((2 - delta_m0) / ((n - m)! (n + m)!)) (n + k)! R^(1 - k)    (half of it where m > 0)
 
@@ -26,7 +26,7 @@ DEGREE = 3
 CELLS = 36
 """Number of cells of latitude, 5 degrees each: less than what a first reading tells of the latitude (about 10)."""
 HIGHEST = 8
-"""Highest degree that is expected from those of a belief: with 6, the field left out at 1200 km is half as large again."""
+"""Highest degree that is expected from those of a belief: with 6, half as much more is left out at 1200 km."""
 _FOLLOWED = 10  # highest degree of the coefficients whose effect is counted as left out
 
 
@@ -149,7 +149,7 @@ def latitude_cells() -> LatitudeCells:
 
     Example:
         >>> latitude_cells().mean[-1, :3].round()  # 2.5 degrees from the north pole
-        tensor([ 1197.,    -0., 54818.], dtype=torch.float64)
+        tensor([ 1196.,    -0., 54797.], dtype=torch.float64)
     """
     axial, axial_variance, variance = gauss_moments()
     edge = torch.linspace(-math.pi / 2, math.pi / 2, CELLS + 1, dtype=torch.float64)
@@ -157,7 +157,8 @@ def latitude_cells() -> LatitudeCells:
     dipole = [[local_coefficient(1, m, k) if m == axis else 0.0 for axis in (1, 0)] for k, m in orders(DEGREE)]
     north_down = torch.stack((torch.cos(latitude), -torch.sin(latitude)), -1)
     unit = north_down @ torch.tensor(dipole, dtype=torch.float64).mT  # coefficients of an axial dipole of 1 nT
-    joint = local_covariance(variance, DEGREE) + (axial_variance - variance[1]) * unit.unsqueeze(-1) * unit.unsqueeze(-2)
+    axial_part = (axial_variance - variance[1]) * unit.unsqueeze(-1) * unit.unsqueeze(-2)
+    joint = local_covariance(variance, DEGREE) + axial_part
     joint = torch.nn.functional.pad(joint, (0, 1, 0, 1))
     joint[:, -1, -1] = (math.pi / CELLS) ** 2 / 12
     field = joint[:, :3, :3]
@@ -168,23 +169,7 @@ def latitude_cells() -> LatitudeCells:
     return LatitudeCells(latitude, log_weight, axial * unit, field, precision, gain, rest)
 
 
-class Expected(NamedTuple):
-    """Moments of the coefficients and the latitude where the field is about a reading.
-
-    Attributes:
-        mean: ``(..., K + 1)`` of the coefficients [nT per unit^(n - 1)] and the latitude [rad].
-        covariance: ``(..., K + 1, K + 1)``; that of the field itself is wide.
-
-    Example:
-        >>> expected(torch.tensor([15000.0, 0.0, 45000.0])).mean.shape
-        torch.Size([16])
-    """
-
-    mean: Tensor
-    covariance: Tensor
-
-
-def expected(field: Tensor) -> Expected:
+def expected(field: Tensor) -> tuple[Tensor, Tensor]:
     """Return the prior around a first reading, whose own information is still to be added.
 
     The cells of latitude, weighted by the likelihood of the field, are joined to one normal distribution with their
@@ -193,10 +178,13 @@ def expected(field: Tensor) -> Expected:
     Args:
         field: ``(..., 3)`` north, east, down [nT].
 
+    Returns:
+        Mean ``(..., K + 1)`` of the coefficients and the latitude [rad], and covariance ``(..., K + 1, K + 1)``.
+
     Example:
-        >>> mean = expected(torch.tensor([15000.0, 0.0, 45000.0], dtype=torch.float64)).mean
+        >>> mean, _ = expected(torch.tensor([15000.0, 0.0, 45000.0], dtype=torch.float64))
         >>> round(math.degrees(mean[-1]))  # latitude
-        54
+        47
     """
     cells = LatitudeCells(*(x.to(field) for x in latitude_cells()))
     apart = field.unsqueeze(-2) - cells.mean[:, :3]  # (..., C, 3)
@@ -209,4 +197,4 @@ def expected(field: Tensor) -> Expected:
     given, gain, wide = (torch.tensordot(weight, x, 1) for x in (cells.covariance, cells.gain, cells.field_covariance))
     lever = torch.cat((torch.eye(3).to(field).expand(*gain.shape[:-2], 3, 3), gain), -2)
     rest = torch.nn.functional.pad(given + spread.mT @ spread, (3, 0, 3, 0))
-    return Expected(torch.cat((field, mean), -1), lever @ wide @ lever.mT + rest)
+    return torch.cat((field, mean), -1), lever @ wide @ lever.mT + rest
