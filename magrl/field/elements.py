@@ -92,7 +92,7 @@ def measured_elements(b_ned: Tensor) -> Tensor:
     """
     check_tensor(3, b_ned=b_ned)
     north, east, down = b_ned.unbind(-1)
-    horizontal = torch.sqrt(north * north + east * east)  # ONNX has no hypot
+    horizontal = torch.hypot(north, east)
     # Adding zero removes the sign of a zero.
     angles = torch.rad2deg(torch.atan2(torch.stack((east + 0.0, down), -1), torch.stack((north + 0.0, horizontal), -1)))
     return torch.cat((angles, horizontal.unsqueeze(-1)), -1)

@@ -156,7 +156,7 @@ def destination(belief: Belief, elements: Tensor, range_km: float, crust_nt: flo
         >>> from magrl.tracking.field_belief import start
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.zeros(3))
         >>> destination(belief, torch.tensor([3.0, 66.0, 17500.0]), 300.0).noise
-        4.0
+        1.0
     """
     check_tensor(3, elements=elements)
     check_number(0, above=True, range_km=range_km)
@@ -278,7 +278,8 @@ def _moments_around(belief: Belief, heading: Tensor, count: int) -> _Moments:
     covariance = (turn @ state[..., :-2] @ turn.mT).flatten(-2).index_select(-1, upper.to(heading.device))
     entries = (covariance @ products.to(covariance)).unflatten(-1, (6, -1)).float().unbind(-2)
     vectors = (turn @ state[..., -2:]).mT @ lever.to(covariance)
-    return _Moments(*vectors.unflatten(-1, (3, -1)).float().unbind(-3), entries, heading.float())
+    mean, cross = vectors.unflatten(-1, (3, -1)).float().unbind(-3)
+    return _Moments(mean, cross, entries, heading.float())
 
 
 def _state(belief: Belief) -> Tensor:

@@ -40,8 +40,9 @@ IRON = slice(COEFFICIENTS + 7, COEFFICIENTS + 10)
 """Hard iron forward, to the right and downward [nT] in the state, where it is estimated."""
 LASTING_KM = 200.0
 """Correlation length of slow errors [km]; that of :mod:`magrl.transforms.errors`."""
-MODEL_NT = 2.0
-"""Least standard deviation of a reading in each axis [nT]: rounding of the ellipsoid and of series along a flight."""
+MODEL_NT = 1.0
+"""Standard deviation of the field by what the moves leave out, in each axis [nT]: .1 to .8 after six moves of 50 km on
+random planets."""
 
 
 class Belief(NamedTuple):
@@ -127,8 +128,8 @@ def before(
     none = torch.zeros_like(near)
     slow = none if drift_std is None else drift_std.double().square()
     constant = none if bias_std is None else (bias_std.double().square() - slow).clamp_min(0)
-    errors = [constant, slow] if iron_std is None else [constant, slow, iron_std.double().square()]
-    errors = torch.cat([x.expand_as(near) for x in errors], -1)
+    kinds = (constant, slow) if iron_std is None else (constant, slow, iron_std.double().square())
+    errors = torch.cat([kind.expand_as(near) for kind in kinds], -1)
     count = errors.shape[-1]
     variances = torch.diag_embed(pad(errors, (COEFFICIENTS + 1, 0)))
     latitude = torch.rad2deg(mean[..., -1])
@@ -269,7 +270,7 @@ def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: float = 0.0) 
         >>> belief = known(before(here, bias_std=torch.ones(3)), here, torch.full((3,), 0.01))
         >>> belief = read(belief, here + torch.tensor([0.8, 0.0, 0.0]), torch.full((3,), 0.01))
         >>> belief.mean[CONSTANT].round(decimals=1)  # the compass is off by 0.8 degrees
-        tensor([0.8000, -0.0000, 0.2000], dtype=torch.float64)
+        tensor([0.8000, -0.0000, 0.6000], dtype=torch.float64)
     """
     return updated(belief, innovation(belief, elements, std, None, crust_nt, errors=False))
 
@@ -301,9 +302,9 @@ def elements(belief: Belief) -> LocalElements:
     mean, derivative = belief.mean[..., :COEFFICIENTS], closed_derivatives().to(belief.mean)
     turn, latitude = generators(DEGREE).turn.to(mean), torch.deg2rad(belief.latitude)
     meridian, vertical = (radius.unsqueeze(-1).unsqueeze(-1) for radius in curvature_radii(belief.latitude))
-    tan, cos = torch.tan(latitude)[..., None, None] / vertical, torch.cos(latitude)[..., None, None]
+    sin, cos = (wave(latitude)[..., None, None] for wave in (torch.sin, torch.cos))
     north = derivative[0, :3] / UNIT_KM + turn[0, :3] / meridian
-    east = derivative[1, :3] / UNIT_KM + turn[1, :3] / vertical + tan * turn[2, :3]
+    east = derivative[1, :3] / UNIT_KM + turn[1, :3] / vertical + sin / (cos * vertical) * turn[2, :3]
     field = torch.eye(3, COEFFICIENTS).to(mean).expand_as(north)
     rows = elements_jacobian(belief.field).unsqueeze(-3) @ torch.stack((field, north, east), -3)  # (..., 3, E, K)
     column = elements_jacobian(belief.field) @ turn[2, :3, :3] @ belief.field.unsqueeze(-1) / (cos.square() * vertical)

@@ -110,7 +110,8 @@ def closure() -> Closure:
     apart[:all_, :low] -= extend
     left = apart @ covariance @ apart.mT
     north = field_rows(_FOLLOWED, _FOLLOWED)
-    northward = sum(north[j * (j + 1) // 2] for j in range(_FOLLOWED + 1))  # powers of the distance alone, at a unit
+    alone = [j * (j + 1) // 2 for j in range(_FOLLOWED + 1)]  # powers of the distance northward, at a unit
+    northward = north[alone].sum(0)
     left_out = float((northward @ left @ northward.mT).trace() / 3) ** 0.5
     steps = generators(_FOLLOWED).derivative[:2, :low]
     drift = (steps @ left @ steps.mT).mean(0)
