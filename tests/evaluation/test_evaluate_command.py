@@ -102,7 +102,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     path, out, tracks = tmp_path / "own.toml", tmp_path / "out", tmp_path / "maps" / "tracks.geojson"
     path.write_text(OWN)
     config = {"scenario": path, "out": out, "wandb_mode": "disabled", "export": tracks}
-    with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5$"):
+    with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5 to at least 7\.5$"):
         evaluate.evaluate(evaluate.Config(("secant",), **config))
     options = {"margin_deg": 8.0, "max_steps": 90, "max_turn_deg": 120.0, "start_heading": "random"}
     own = load_scenario(path, margin_deg=8.0)
