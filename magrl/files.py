@@ -61,10 +61,26 @@ def save_tensors(content: Any, path: Path) -> None:
     tensors: dict[str, Tensor] = {}
     text = json.dumps({"sha256": _NO_DIGEST, "content": _pack(content, tensors)})
     body = safetensors.torch.save(tensors, {"magrl": text})
+    write_atomically(path, body.replace(_NO_DIGEST.encode(), hashlib.sha256(body).hexdigest().encode(), 1))
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file that is complete or absent, whenever the process ends; after an error the old file is left.
+
+    Raises:
+        OSError: if it cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "file"
+        >>> write_atomically(path, b"content")
+        >>> path.read_bytes()
+        b'content'
+    """
     aside = path.with_name(f"{path.name}.aside")
     try:
         with aside.open("wb") as file:
-            file.write(body.replace(_NO_DIGEST.encode(), hashlib.sha256(body).hexdigest().encode(), 1))
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(aside, path)

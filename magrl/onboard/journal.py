@@ -6,7 +6,6 @@ A number may be one of Python, NumPy or torch; it becomes a finite Python float.
 from __future__ import annotations
 
 import hashlib
-import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,6 +13,7 @@ from pydantic import BeforeValidator, Field
 from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
+from magrl.files import write_atomically
 from magrl.onboard.limits import Reading
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms.errors.sensors import OUTAGE_STD
@@ -154,12 +154,7 @@ class Journal(CheckedModel):
         Raises:
             OSError: if it cannot be written; an existing one stays unchanged.
         """
-        aside = path.with_name(f"{path.name}.aside")
-        with aside.open("wb") as file:
-            file.write(self.content())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
+        write_atomically(path, self.content())
 
     @classmethod
     def read(cls, path: Path) -> Journal:
