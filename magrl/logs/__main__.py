@@ -123,7 +123,7 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     table.round(_DIGITS).assign(**({"time": stamp} if log.date else {})).to_csv(out, index=False)
     std = np.sqrt(np.square(table[list(STD_NAMES)]).mean())
     noise, bias = (" ".join(f"{value:.3g}" for value in values) for values in (std, iron.std if iron else np.zeros(3)))
-    missing = "" if iron else "; without a calibration, give --bias of your sensors"
+    missing = "" if iron else "; no calibration: give --bias of your sensors"
     if std.isna().any():
         noise, missing = "D I B_H", f"; too few samples for --noise: give that of your sensors{missing}"
     return [
