@@ -71,9 +71,8 @@ class FieldPolicy(TrainedPolicy):
 
     A policy that reads its own track (:class:`~magrl.transforms.TrackView`) keeps its own state for each vehicle from
     the start of an episode (``step_count`` 0) on. Another call in the same step begins with the same state as the
-    first, so that calling it twice on one state changes nothing. Such a policy reads the standard deviations of new
-    errors of the sensors, of constant and slow ones, and of slow ones alone (``sensor_std``, ``bias_std``,
-    ``drift_std``); without these keys they are 0.
+    first, so that calling it twice on one state changes nothing. Such a policy reads the accuracy of the readings
+    (:data:`magrl.sensor_std.STD_KEYS`); without these keys it is perfect.
 
     Args:
         config: what the policy observes, and the shape of its network.

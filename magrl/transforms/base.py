@@ -18,8 +18,6 @@ T = TypeVar("T")
 Keys = Sequence[NestedKey]
 GivenKeys: TypeAlias = NestedKey | Keys | Mapping[str, NestedKey] | None
 """Keys as a user gives them: in order, or replacements of default keys by name; None for the default keys."""
-MOST_KEYS = 4
-"""Maximum number of keys that are given by their order alone."""
 
 
 class ObservationTransform(Transform):
@@ -359,12 +357,12 @@ def _chosen(keys: GivenKeys, default: Keys) -> list[NestedKey]:
     if isinstance(keys, Mapping):
         for name in keys:
             check_choice(default, key=name)
-    if keys is None or isinstance(keys, Mapping):
-        return [unravel_key((keys or {}).get(key, key)) for key in default]
-    chosen = several_keys(cast(Keys, keys)) if len(default) > 1 else key_list(keys)
-    if default and len(chosen) > MOST_KEYS:
-        raise ValueError(f"more than {MOST_KEYS} keys need names: give a mapping of {tuple(default)}, got {keys!r}")
-    return chosen
+        return [unravel_key(keys.get(key, key)) for key in default]
+    if keys is None:
+        return list(default)
+    if len(default) and len(keys) > 4 and not isinstance(keys, str):
+        raise ValueError(f"more than 4 keys need names: give a mapping of {tuple(default)}, got {keys!r}")
+    return several_keys(cast(Keys, keys)) if len(default) > 1 else key_list(keys)
 
 
 def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int | Sequence[int]) -> None:

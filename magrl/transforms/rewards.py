@@ -89,8 +89,8 @@ class HighestSPL(StatefulTransform):
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         after, (before, highest) = self._named(values), state
-        ends = (*after["start_position"].unbind(-1), *after["target_position"].unbind(-1))
-        task_km, success = geodesic(*ends)[0].unsqueeze(-1).to(after["move"].dtype), after["success"]
+        start, target, success = (after[key] for key in ("start_position", "target_position", "success"))
+        task_km = geodesic(*start.unbind(-1), *target.unbind(-1))[0].unsqueeze(-1).to(after["move"].dtype)
         path_km = task_km / highest - before.norm(dim=-1, keepdim=True) + after["move"][..., :1]
         whole_km = torch.where(success, path_km, path_km + after["true_way"].norm(dim=-1, keepdim=True))
         reached = task_km / torch.maximum(whole_km, task_km)

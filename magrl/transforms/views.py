@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -235,32 +236,20 @@ class ObservationView(_View):
                 )
 
 
-def track_observation(
-    way: Tensor,
-    way_covariance: Tensor,
-    gradient: Tensor,
-    remaining: Tensor,
-    weights: Tensor,
-    sensor_std: Tensor,
-    time: Tensor,
-    planned: Tensor,
-    step_price: Tensor,
-) -> Tensor:
+def track_observation(seen: Mapping[Any, Tensor]) -> Tensor:
     """Return the observation of an agent that navigates by the estimates of its own track.
 
     All vectors are in the vehicle's frame, so that a policy generalizes over headings. Lengths are logarithms, because
     the best move depends on their ratios.
 
     Args:
-        way: ``(..., 2)`` way to aim at, forward and to the right [km].
-        way_covariance: ``(..., 2, 2)`` covariance of the estimated way to the target [km^2].
-        gradient: ``(..., E, 2)`` estimated gradient, forward and to the right [element unit / km].
-        remaining: ``(..., E)`` target elements minus estimated elements.
-        weights: ``(..., E)`` weights of the objective F (Eq. 2-6), divided by the arrival threshold.
-        sensor_std: ``(..., E)`` standard deviation of the readings' noise: D [deg], I [deg], B_H [nT].
-        time: ``(..., 1)`` share of the step limit that is over.
-        planned: ``(..., 2)`` planned displacement, forward and to the right [km].
-        step_price: ``(..., 1)`` price of a step [% of SPL].
+        seen: ``aim``, the way to aim at, forward and to the right ``(..., 2)`` [km]; ``way_covariance``, that of the
+            estimated way to the target ``(..., 2, 2)`` [km^2]; ``estimated_gradient``, forward and to the right
+            ``(..., E, 2)`` [element unit / km]; ``remaining``, target elements minus estimated ones ``(..., E)``;
+            ``weights`` of the objective F (Eq. 2-6), divided by the arrival threshold ``(..., E)``; ``sensor_std``,
+            standard deviation of the noise of D [deg], I [deg], B_H [nT] ``(..., E)``; ``time``, the share of the step
+            limit that is over ``(..., 1)``; ``planned_move``, the planned displacement, forward and to the right
+            ``(..., 2)`` [km]; and ``step_price``, the price of a step ``(..., 1)`` [% of SPL].
 
     Returns:
         ``(..., 19)``: direction (2) and length (2) of the way; logarithms of its standard deviations (2) and their
@@ -268,20 +257,20 @@ def track_observation(
         time; logarithms of the noise (3); direction (2) and logarithm of the length of the plan; that of the price.
 
     Example:
-        >>> eye = torch.eye(2)
-        >>> gradient = torch.tensor([[0.01, 0.0], [0.0, 0.01], [1.0, 1.0]])
-        >>> ones = torch.ones(3)
-        >>> way, rest = torch.tensor([30.0, 40.0]), (ones[:1], ones[:2], ones[:1])
-        >>> track_observation(way, eye, gradient, ones, ones, ones, *rest)[:2]
+        >>> seen = dict.fromkeys(("remaining", "weights", "sensor_std"), torch.ones(3))
+        >>> seen |= {"aim": torch.tensor([30.0, 40.0]), "planned_move": torch.ones(2), "way_covariance": torch.eye(2)}
+        >>> seen |= {"estimated_gradient": torch.ones(3, 2), "time": torch.ones(1), "step_price": torch.ones(1)}
+        >>> track_observation(seen)[:2]
         tensor([0.6000, 0.8000])
     """
-    check_tensor(2, way=way)
-    check_tensor(2, 2, way_covariance=way_covariance)
+    way, gradient, weights, planned = (seen[key] for key in ("aim", "estimated_gradient", "weights", "planned_move"))
+    check_tensor(2, aim=way)
+    check_tensor(2, 2, way_covariance=seen["way_covariance"])
     length = way.norm(dim=-1, keepdim=True)
     ellipse = (weights[..., None, None] * gradient.unsqueeze(-1) * gradient.unsqueeze(-2)).sum(-3)
-    objective = (weights * remaining.square()).sum(-1, keepdim=True)
-    units = torch.tensor(_STD_UNITS, dtype=sensor_std.dtype, device=sensor_std.device)
-    std, std_correlation = _axes(way_covariance, least=1e-6)
+    objective = (weights * seen["remaining"].square()).sum(-1, keepdim=True)
+    units = torch.tensor(_STD_UNITS, dtype=way.dtype, device=way.device)
+    std, std_correlation = _axes(seen["way_covariance"], least=1e-6)
     axes, axes_correlation = _axes(ellipse, least=1e-12)
     planned_km = planned.norm(dim=-1, keepdim=True)
     return torch.cat(
@@ -294,11 +283,11 @@ def track_observation(
             torch.log(axes * 20) / 2,
             axes_correlation,
             torch.log(objective + 1e-2) / 3 - 0.5,
-            time,
-            torch.log((sensor_std / units).clamp_min(_LEAST_STD)) / 2 + 2,
+            seen["time"],
+            torch.log((seen["sensor_std"] / units).clamp_min(_LEAST_STD)) / 2 + 2,
             planned / planned_km.clamp_min(1e-3),
             torch.log1p(planned_km / 20) - 1,
-            torch.log(step_price.clamp_min(_LEAST_PRICE) * 10) / 2,
+            torch.log(seen["step_price"].clamp_min(_LEAST_PRICE) * 10) / 2,
         ),
         -1,
     )
@@ -358,14 +347,14 @@ class TrackObservation(StatefulTransform):
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         (first,), seen = state, self._named(values)
-        target, planned = seen["target_field"], seen["planned_move"]
-        price = seen["step_price"] if self.step_price is None else torch.full_like(planned[..., :1], self.step_price)
-        estimates = seen["aim"], seen["way_covariance"], seen["estimated_gradient"]
-        remaining = element_difference(target, seen["estimated_field"])
-        weights = tracking.arrival_weights(first, target, self.zeta)
+        target, aim = seen["target_field"], seen["aim"]
+        if self.step_price is not None:
+            seen["step_price"] = torch.full_like(aim[..., :1], self.step_price)
+        seen["remaining"] = element_difference(target, seen["estimated_field"])
+        seen["weights"] = tracking.arrival_weights(first, target, self.zeta)
         # A policy may fly longer than it was trained for.
-        time = (seen["step_count"].to(planned.dtype) / self.max_steps).clamp(max=1)
-        observed = track_observation(*estimates, remaining, weights, seen["sensor_std"], time, planned, price)
+        seen["time"] = (seen["step_count"].to(aim.dtype) / self.max_steps).clamp(max=1)
+        observed = track_observation(seen)
         tensordict.set(self.out_keys[0], observed).set(self.out_keys[1], first)
 
 

@@ -39,17 +39,17 @@ def policy() -> FieldPolicy:
 
 def by_hand(**change: Tensor) -> Tensor:
     values = {
-        "way": float64([30.0, 40.0]),
+        "aim": float64([30.0, 40.0]),
         "way_covariance": float64([[400.0, 100.0], [100.0, 1600.0]]),
-        "gradient": float64([[0.01, 0.0], [0.0, 0.02], [1.0, 1.0]]),
+        "estimated_gradient": float64([[0.01, 0.0], [0.0, 0.02], [1.0, 1.0]]),
         "remaining": float64([0.1, -0.2, 3.0]),
         "weights": float64([100.0, 25.0, 0.01]),
         "sensor_std": float64([0.1, 0.0, 5.0]),
         "time": float64([0.3]),
-        "planned": float64([-12.0, 16.0]),
+        "planned_move": float64([-12.0, 16.0]),
         "step_price": float64([0.4]),
     }
-    return track_observation(**(values | change))
+    return track_observation(values | change)
 
 
 def test_the_numbers_by_hand() -> None:
@@ -72,10 +72,10 @@ def test_the_numbers_by_hand() -> None:
 
 def test_numbers_at_the_extremes() -> None:
     """No way, no uncertainty, no gradient; and a way beyond all measure, whose direction is still seen."""
-    flat = by_hand(way=torch.zeros(2), way_covariance=torch.zeros(2, 2), gradient=torch.zeros(3, 2))
+    flat = by_hand(aim=torch.zeros(2), way_covariance=torch.zeros(2, 2), estimated_gradient=torch.zeros(3, 2))
     assert flat.isfinite().all()
     assert flat[:2].tolist() == [0.0, 0.0]
-    far = by_hand(way=float64([0.0, -1e6]))
+    far = by_hand(aim=float64([0.0, -1e6]))
     assert (far[1], far[3]) == (-1.0, 2500 / 400 - 0.5)
 
 

@@ -79,7 +79,6 @@ class SensorNoise(ReadingErrors):
             >>> SensorNoise((1.0, 2.0)).accuracy(torch.zeros(2)).noise
             tensor([1., 2.])
         """
-        check_tensor(self.in_sizes[0] or 0, field=field)
         return super().accuracy(field)._replace(noise=field.new_tensor(self.noise).expand_as(field))
 
 

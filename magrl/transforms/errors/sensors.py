@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_tensor, check_type
+from magrl.checks import check_number, check_type
 from magrl.counters import normal_of, stream_normal, stream_uniform
 from magrl.sensor_std import SensorStd
 from magrl.transforms.base import expect_keys
@@ -130,9 +130,8 @@ class SensorErrors(ReadingErrors):
         reading = torch.where(resolution > 0, torch.round(reading / resolution) * resolution, reading)
         missing = (uniform[..., -1:] < self.outage_rate) & (not first)
         reading = torch.where(missing, last, reading)
-        accuracy = SensorStd(*self._accuracy.to(dtype))
-        accuracy = accuracy._replace(noise=torch.where(missing, OUTAGE_STD, accuracy.noise))
-        self._measure(tensordict, value, reading, accuracy)
+        stated, *slower = self._accuracy.to(dtype)
+        self._measure(tensordict, value, reading, SensorStd(torch.where(missing, OUTAGE_STD, stated), *slower))
         return torch.cat((bias, scale, drift, reading, vector), -1)
 
     def accuracy(self, field: Tensor) -> SensorStd:
@@ -142,7 +141,6 @@ class SensorErrors(ReadingErrors):
             >>> SensorErrors((1.0, 1.0), bias=(2.0, 0.0)).accuracy(torch.zeros(2))
             SensorStd(noise=tensor([1., 1.]), bias=tensor([2., 0.]), drift=tensor([0., 0.]))
         """
-        check_tensor(self.count, field=field)
         noise, bias, scale, drift, resolution = self._sizes.to(field.dtype).square()
         slow = drift.expand_as(field)  # an error of the vector varies with the heading
         if self.vector is not None:
