@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import datetime
 import math
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import torch
@@ -82,6 +85,14 @@ def _field(value: object) -> object:
     if value is not None and not callable(value):
         raise ValueError(f"field must be called as field(latitude, longitude), got {short(value)}")
     return value
+
+
+@lru_cache
+def _expanded_igrf(box: Region, date: datetime.datetime, generation: int, altitude_km: float) -> RegionalField:
+    """Return IGRF on a box where its elements are continuous; kept, as many environments have the same."""
+    field = RegionalField(IGRF(date, generation, altitude_km=altitude_km), box.latitude, box.longitude)
+    field_bounds(field, Regions.of(box))
+    return field
 
 
 class Scenario(CheckedModel):
@@ -222,16 +233,14 @@ class Scenario(CheckedModel):
             return self.field
         boxes, region = self.reachable(drift_km), self.region[0]
         try:
-            igrf = IGRF(self.date, self.generation, altitude_km=self.altitude_km)
-            field = RegionalField(igrf, boxes[0].latitude, boxes[0].longitude)
-            field_bounds(field, boxes)
+            field = _expanded_igrf(boxes[0], self.date, self.generation, self.altitude_km)
         except ValueError as error:
             reason = f"region.latitude, region.longitude: {str(error).rpartition(': ')[0]}"  # without its advice
             if boxes.latitude.abs().max() == 90:
                 place = f"region.latitude {region.latitude}: with margin_deg {self.margin_deg:g}, vehicles reach"
                 reason = f"{place} a pole in {boxes[0]}, where the declination takes every value"
             raise ValueError(f"{reason}: reduce margin_deg or the region, or move it toward the equator") from error
-        return field
+        return copy.deepcopy(field, {id(values): values for values in field.buffers()})  # a copy may be moved
 
     def floors(self, field: FieldModel | FieldBank) -> Tensor:
         """Return the floors of Eq. 2-6, D [deg], I [deg], B_H [nT], from ``field`` where none are given.
