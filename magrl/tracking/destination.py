@@ -49,11 +49,11 @@ class Way(NamedTuple):
     covariance: Tensor
 
 
-class WayPosterior(NamedTuple):
+class DestinationPosterior(NamedTuple):
     """Displacements ``(..., M, 2)`` northward and eastward [km] and their probabilities ``(..., M)``.
 
     Example:
-        >>> posterior = WayPosterior(torch.tensor([[0.0, 10.0], [0.0, 30.0]]), torch.tensor([0.25, 0.75]))
+        >>> posterior = DestinationPosterior(torch.tensor([[0.0, 10.0], [0.0, 30.0]]), torch.tensor([0.25, 0.75]))
         >>> posterior.way().displacement, posterior.within(25.0)
         (tensor([ 0., 25.]), tensor(0.2500))
     """
@@ -75,7 +75,7 @@ class WayPosterior(NamedTuple):
 
         Example:
             >>> points = torch.tensor([[0.0, 40.0], [0.0, -40.0], [0.0, -42.0]])
-            >>> WayPosterior(points, torch.tensor([0.5, 0.25, 0.25])).aim(25.0)
+            >>> DestinationPosterior(points, torch.tensor([0.5, 0.25, 0.25])).aim(25.0)
             tensor([ 0., 40.])
         """
         mean = (self.points * self.weights.unsqueeze(-1)).sum(-2)
@@ -91,7 +91,7 @@ class WayPosterior(NamedTuple):
         """Return the mean distances ``(..., K)`` [km] of the place after moves ``(..., K, 2)`` [km], as float32.
 
         Example:
-            >>> posterior = WayPosterior(torch.tensor([[30.0, 0.0], [0.0, 40.0]]), torch.tensor([0.5, 0.5]))
+            >>> posterior = DestinationPosterior(torch.tensor([[30.0, 0.0], [0.0, 40.0]]), torch.tensor([0.5, 0.5]))
             >>> posterior.mean_distance(torch.tensor([[0.0, 0.0], [30.0, 0.0]])).round()
             tensor([35., 25.])
         """
@@ -113,7 +113,7 @@ class WayPosterior(NamedTuple):
 
         Example:
             >>> points = torch.tensor([[0.0, 30.0], [0.0, 10.0]])
-            >>> WayPosterior(points, torch.tensor([0.25, 0.75])).radius(0.7)
+            >>> DestinationPosterior(points, torch.tensor([0.25, 0.75])).radius(0.7)
             tensor(10.)
         """
         check_number(0, 1, probability=probability)
@@ -211,7 +211,7 @@ def mode(goal: Destination) -> Way:
     return Way(place * UNIT_KM, matrix.unflatten(-1, (2, 2)) * UNIT_KM**2)
 
 
-def posterior(goal: Destination, count: int = 256) -> WayPosterior:
+def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
     """Return the posterior of the way to a destination, in single precision.
 
     A quarter of the points are around the mode, the others around the vehicle; each has the density over that of all
@@ -241,7 +241,7 @@ def posterior(goal: Destination, count: int = 256) -> WayPosterior:
     parts = (near, _moments(goal.belief, near)), (around, _moments_around(goal.belief, heading, count))
     logarithms = [_log_density(goal, *part) for part in parts]
     weights = torch.softmax(torch.cat(logarithms, -1) - density.log(), -1)
-    return WayPosterior(points, weights.where(weights > _LEAST_WEIGHT, 0.0))
+    return DestinationPosterior(points, weights.where(weights > _LEAST_WEIGHT, 0.0))
 
 
 class _Moments(NamedTuple):

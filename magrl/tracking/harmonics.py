@@ -170,7 +170,7 @@ LEAST_COS = 0.02
 def arc(sin: Tensor, cos: Tensor, north: Tensor, east: Tensor) -> Arc:
     """Return the turn of north along a great circle.
 
-    With theta = |(n, e)|, S = sin(theta) / theta, K = (1 - cos(theta)) / theta^2 and the latitudes phi and phi',
+    With theta^2 = n^2 + e^2, S = sin(theta) / theta, K = (1 - cos(theta)) / theta^2 and the latitudes phi and phi',
     sin(phi') = sin(phi) (1 - theta^2 K) + cos(phi) n S and cos(phi') (cos(gamma), sin(gamma)) =
     (cos(phi) (1 - n^2 K) - sin(phi) n S, e (sin(phi) S + cos(phi) n K)).
 

@@ -24,9 +24,9 @@ from magrl.tracking.harmonics import RADIUS, field_rows, generators, orders, siz
 DEGREE = 3
 """Highest degree of the coefficients that a belief holds; with 4, nothing is gained (random planets)."""
 CELLS = 36
-"""Number of cells of latitude, 5 degrees each: less than what a first reading tells of the latitude (about 10)."""
+"""Number of cells of latitude. Their 5 degrees are less than what a first reading leaves of it (about 10)."""
 HIGHEST = 8
-"""Highest degree that is expected from those of a belief: with 6, half as much more is left out at 1200 km."""
+"""Highest degree that is expected from those of a belief; with 6, half as much more is left out at 1200 km."""
 _FOLLOWED = 10  # highest degree of the coefficients whose effect is counted as left out
 
 
