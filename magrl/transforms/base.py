@@ -352,7 +352,7 @@ def _chosen(keys: GivenKeys, default: Keys) -> list[NestedKey]:
     """Return the keys that a user gives, or the default ones; a tuple is one nested key where one key is usual.
 
     Raises:
-        ValueError: for a name that is none of the default keys, or too many keys without names.
+        ValueError: for a name that is not among the default keys, or more than 4 keys without names.
     """
     if isinstance(keys, Mapping):
         for name in keys:
