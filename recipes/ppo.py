@@ -17,7 +17,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
-from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, PPOConfig
+from magrl.training.config import Count, NonNegative, Positive, RunConfig, Share
 from magrl.transforms import (
     AlignmentReward,
     DistanceCost,
@@ -29,6 +29,7 @@ from magrl.transforms import (
 )
 
 import torch
+from pydantic import model_validator
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.optim import Adam
@@ -39,15 +40,11 @@ from torchrl.objectives.value import GAE
 
 RECIPE = "ppo.py"
 LOSSES = ("loss_critic", "loss_actor", "loss_entropy", "entropy")
-TRANSITION = (
-    "observation",
-    "action",
-    "action_log_prob",
-    *(("next", k) for k in ("observation", "reward", "done", "terminated")),
-)
+NEXT = ("observation", "reward", "done", "terminated")
+TRANSITION = ("observation", "action", "action_log_prob", *(("next", k) for k in NEXT))
 
 
-class Config(PPOConfig, GuidanceConfig):
+class Config(RunConfig):
     """Settings of a training."""
 
     # Own defaults of shared settings
@@ -61,16 +58,40 @@ class Config(PPOConfig, GuidanceConfig):
     """Heading at the start of an episode."""
     distance_cost: NonNegative = 0.1
     """Cost of a move [1/km]."""
+    alignment_weight: float = 3.0
+    """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
+    alignment_offset: float = math.pi / 4
+    """Heading deviation at which the alignment reward changes sign [rad]."""
+    reward_scale: Positive = 0.05
+    """Factor on the rewards that the critics learn from; reported rewards are unscaled."""
 
     # Networks
     layer_norm: bool = True
     """Layer normalization in the actor."""
 
     # PPO
+    steps_per_batch: Count = 16
+    """Steps of each vehicle in a collected batch."""
+    epochs: Count = 8
+    """Epochs over each collected batch."""
+    batch_size: Count = 1024
+    """Transitions per gradient step."""
+    gae_lambda: Share = 0.95
+    """Factor lambda of the generalized advantage estimate."""
+    clip_epsilon: Positive = 0.2
+    """Clipping range of the probability ratio."""
+    clip_gradient: Positive = 1.0
+    """Largest norm of the gradients."""
     entropy_weight: NonNegative = 0.0
     """Weight of the entropy of the action."""
     scale: Positive = 0.5
     """Standard deviation of the action before the tanh at the start."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> Config:
+        if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
+            raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
+        return self
 
 
 def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> TransformedEnv:
@@ -136,20 +157,10 @@ def train(config: Config) -> dict[str, float]:
         weights = list(loss.parameters())
         optimizer = Adam(weights, lr=config.learning_rate, fused=True)
 
-        collector = make_collector(
-            env,
-            stochastic_actor,
-            frames_per_batch=config.num_envs * config.steps_per_batch,
-            total_frames=config.total_frames,
-        )
-        run.start(
-            policy=FieldPolicy(network, actor).to(env.device),
-            validation=validation,
-            env=base,
-            collector=collector,
-            loss=loss,
-            optimizer=optimizer,
-        )
+        frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
+        collector = make_collector(env, stochastic_actor, **frames)
+        policy = FieldPolicy(network, actor).to(env.device)
+        run.start(policy=policy, validation=validation, env=base, collector=collector, loss=loss, optimizer=optimizer)
         stats = run.statistics
         for batch in run.batches():
             optimizer.param_groups[0]["lr"] = config.linear("learning_rate", run.remaining)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
@@ -21,7 +21,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import CollectorBackend, make_collector, worker_seed
-from magrl.training.config import Count, GuidanceConfig, NonNegative, Positive, TD3Config
+from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RunConfig
 from magrl.transforms import (
     AlignmentReward,
     DistanceCost,
@@ -33,7 +33,7 @@ from magrl.transforms import (
 )
 
 import torch
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from tensordict.nn import TensorDictSequential
 from torch.optim import Adam
 from torchrl.collectors import BaseCollector
@@ -46,7 +46,7 @@ TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "r
 ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 
 
-class Config(TD3Config, GuidanceConfig):
+class Config(RunConfig):
     """Settings of a training; the defaults are those of the preset."""
 
     preset: Literal["fast", "paper", "td3-fast", "td3-paper"] = "fast"
@@ -72,16 +72,50 @@ class Config(TD3Config, GuidanceConfig):
     observe_difference: bool = True
     """Observe target elements minus measured elements."""
 
+    alignment_weight: float = 3.0
+    """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
+    alignment_offset: float = math.pi / 4
+    """Heading deviation at which the alignment reward changes sign [rad]."""
+    reward_scale: Positive = 0.05
+    """Factor on the rewards that the critics learn from; reported rewards are unscaled."""
+
     # Networks
     layer_norm: bool = True
     """Layer normalization in actor and critics."""
 
     # TD3
+    buffer_size: Count = 200_000
+    """Capacity of the replay buffer [transitions]."""
+    tau: PositiveShare = 0.01
+    """Polyak averaging factor of the target networks."""
+    policy_delay: Count = 2
+    """Critic updates per update of the actor and the target networks."""
+    exploration_noise: NonNegative = 0.2
+    """Standard deviation of the exploration noise at the start, for actions in [-1, 1]."""
+    final_exploration_noise: NonNegative = 0.1
+    """Standard deviation of the exploration noise at the end; linear in between."""
+    policy_noise: NonNegative = 0.1
+    """Standard deviation of the noise of target policy smoothing."""
+    noise_clip: NonNegative = 0.5
+    """Largest noise of target policy smoothing."""
+    updates_per_batch: Count = 8
+    """Gradient steps after each step of all vehicles."""
+    batch_size: Count = 1024
+    """Transitions per gradient step."""
+    init_random_frames: Annotated[int, Field(ge=0)] = 1024
+    """Number of initial steps with random actions."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Precision of the hidden layers in gradient steps; bfloat16 is faster where the processor has it."""
 
     @model_validator(mode="after")
     def _fits(self) -> Config:
+        start, end = self.exploration_noise, self.final_exploration_noise
+        if end > start:
+            raise ValueError(f"final_exploration_noise {end:g} must not exceed exploration_noise {start:g}")
+        if self.buffer_size < self.batch_size:
+            raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
+        if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
+            raise ValueError(f"batch_size {self.batch_size} must not exceed total_frames: no gradient step is possible")
         if self.num_envs % self.collectors:
             raise ValueError(f"num_envs {self.num_envs} cannot be divided evenly among {self.collectors} collectors")
         return self

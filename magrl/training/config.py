@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -51,7 +50,7 @@ CHANGEABLE = ("device", "logger", "wandb_mode", "checkpoint_every", "out", "resu
 
 
 class RunConfig(CheckedModel):
-    """Settings of a run that do not depend on the algorithm.
+    """Settings that all recipes share.
 
     Raises:
         ValueError: naming the setting, its value and what would be right.
@@ -94,6 +93,16 @@ class RunConfig(CheckedModel):
     """Number of validation tasks, by which the best policy is selected."""
     eval_tasks: Count = 1000
     """Number of test tasks of the final evaluation."""
+    num_cells: Widths = (128, 128, 128)
+    """Width of each hidden layer."""
+    gamma: Discount = 0.9
+    """Discount factor."""
+    learning_rate: Positive = 2e-3
+    """Learning rate of Adam at the start."""
+    final_learning_rate: Positive = 4e-5
+    """Learning rate of Adam at the end; linear in between."""
+    saturation_weight: NonNegative = 0.05
+    """Initial weight of the penalty on the actor's outputs before the tanh; decreases linearly to 0."""
 
     @model_validator(mode="after")
     def _available(self) -> Self:
@@ -127,34 +136,17 @@ class RunConfig(CheckedModel):
         return end + remaining * (start - end)
 
 
-class LearningConfig(RunConfig):
-    """Settings that all algorithms share.
+class PlanetConfig(RunConfig):
+    """Settings of PPO recipes that train on random planets and learn corrections of moves.
 
     Example:
-        >>> LearningConfig(gamma=1.0)
-        Traceback (most recent call last):
-        ValueError: gamma must be less than 1, got 1.0
-    """
-
-    num_cells: Widths = (128, 128, 128)
-    """Width of each hidden layer."""
-    gamma: Discount = 0.9
-    """Discount factor."""
-    learning_rate: Positive = 2e-3
-    """Learning rate of Adam at the start."""
-    final_learning_rate: Positive = 4e-5
-    """Learning rate of Adam at the end; linear in between."""
-    saturation_weight: NonNegative = 0.05
-    """Initial weight of the penalty on the actor's outputs before the tanh; decreases linearly to 0."""
-
-
-class VehicleConfig(LearningConfig):
-    """Settings of algorithms that can train for another vehicle.
-
-    Example:
-        >>> VehicleConfig(max_move_km=10.0, drift=0.1).limits
+        >>> PlanetConfig(max_move_km=10.0, drift=0.1).limits
         {'max_move_km': 10.0, 'max_turn_deg': 90.0, 'drift_km': 1.0}
     """
+
+    eval_every: Count = 10
+    learning_rate: Positive = 3e-4
+    final_learning_rate: Positive = 1e-5
 
     max_move_km: Positive = 50.0
     """Longest move [km]."""
@@ -162,45 +154,15 @@ class VehicleConfig(LearningConfig):
     """Largest turn to either side before a move [deg]."""
     drift: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Speed of a current relative to the vehicle's speed; its direction is random in each episode."""
-
-    @property
-    def limits(self) -> dict[str, float]:
-        """Options of the environment."""
-        drift_km = self.drift * self.max_move_km
-        return {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "drift_km": drift_km}
-
-    def motion(self, seed: int) -> list[Transform]:
-        """Return the errors of motion: the current, if there is one."""
-        return [MotionError(current_km_h=self.drift, speed_km_h=1.0, seed=seed)] if self.drift else []
-
-
-class GuidanceConfig(RunConfig):
-    """Settings of the guidance by the theoretical heading, and of the scale of rewards.
-
-    Example:
-        >>> GuidanceConfig(reward_scale=0.0)
-        Traceback (most recent call last):
-        ValueError: reward_scale must be greater than 0, got 0.0
-    """
-
-    alignment_weight: float = 3.0
-    """Weight zeta_3 of the alignment reward (Eq. 3-6) [1/rad]."""
-    alignment_offset: float = math.pi / 4
-    """Heading deviation at which the alignment reward changes sign [rad]."""
-    reward_scale: Positive = 0.05
-    """Factor on the rewards that the critics learn from; reported rewards are unscaled."""
-
-
-class PPOConfig(LearningConfig):
-    """Settings that all PPO recipes share.
-
-    Example:
-        >>> PPOConfig(batch_size=8192, num_envs=256)
-        Traceback (most recent call last):
-        ValueError: batch_size 8192 must not exceed num_envs * steps_per_batch, 4096
-    """
-
-    steps_per_batch: Count = 16
+    num_regions: Count = 1024
+    """Number of training regions, two on each random planet."""
+    distance_range_km: Rising = (300.0, 500.0)
+    """Shortest and longest distance of a task [km]."""
+    max_steps: Count = 50
+    """Moves after which an episode is truncated."""
+    noise_exponent: Positive = 1.0
+    """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
+    steps_per_batch: Count = 32
     """Steps of each vehicle in a collected batch."""
     epochs: Count = 8
     """Epochs over each collected batch."""
@@ -212,36 +174,6 @@ class PPOConfig(LearningConfig):
     """Clipping range of the probability ratio."""
     clip_gradient: Positive = 1.0
     """Largest norm of the gradients."""
-
-    @model_validator(mode="after")
-    def _collects_a_batch(self) -> Self:
-        if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
-            raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
-        return self
-
-
-class PlanetConfig(VehicleConfig, PPOConfig):
-    """Settings of PPO recipes that train on random planets and learn corrections of moves.
-
-    Example:
-        >>> PlanetConfig(distance_range_km=(150.0, 6000.0))
-        Traceback (most recent call last):
-        ValueError: distance_range_km must end at 4400 km or below, the side of a region, got (150.0, 6000.0)
-    """
-
-    eval_every: Count = 10
-    learning_rate: Positive = 3e-4
-    final_learning_rate: Positive = 1e-5
-    steps_per_batch: Count = 32
-
-    num_regions: Count = 1024
-    """Number of training regions, two on each random planet."""
-    distance_range_km: Rising = (300.0, 500.0)
-    """Shortest and longest distance of a task [km]."""
-    max_steps: Count = 50
-    """Moves after which an episode is truncated."""
-    noise_exponent: Positive = 1.0
-    """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
     critic_cells: Widths = (256, 256)
     """Width of each hidden layer of the critic."""
     exploration: Positive = 0.4
@@ -254,13 +186,21 @@ class PlanetConfig(VehicleConfig, PPOConfig):
     """Learning rate of the critic at the end; linear in between."""
 
     @model_validator(mode="after")
-    def _fits_planets(self) -> Self:
+    def _fits(self) -> Self:
+        if self.batch_size > (frames := self.num_envs * self.steps_per_batch):
+            raise ValueError(f"batch_size {self.batch_size} must not exceed num_envs * steps_per_batch, {frames}")
         if self.scenario is not None:
             raise ValueError(f"scenario must be left out, got {self.scenario}: this agent trains on random planets")
         if self.distance_range_km[1] > LONGEST_KM:
             message = f"must end at {LONGEST_KM:g} km or below, the side of a region"
             raise ValueError(f"distance_range_km {message}, got {self.distance_range_km}")
         return self
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Options of the environment."""
+        drift_km = self.drift * self.max_move_km
+        return {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "drift_km": drift_km}
 
     @property
     def regions(self) -> dict[str, Any]:
@@ -272,47 +212,9 @@ class PlanetConfig(VehicleConfig, PPOConfig):
         reach_km = self.max_move_km + self.limits["drift_km"]
         return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, **size}
 
-
-class TD3Config(LearningConfig):
-    """Settings of TD3 recipes.
-
-    Example:
-        >>> TD3Config(buffer_size=100)
-        Traceback (most recent call last):
-        ValueError: buffer_size 100 does not hold one batch of 1024
-    """
-
-    buffer_size: Count = 200_000
-    """Capacity of the replay buffer [transitions]."""
-    tau: PositiveShare = 0.01
-    """Polyak averaging factor of the target networks."""
-    policy_delay: Count = 2
-    """Critic updates per update of the actor and the target networks."""
-    exploration_noise: NonNegative = 0.2
-    """Standard deviation of the exploration noise at the start, for actions in [-1, 1]."""
-    final_exploration_noise: NonNegative = 0.1
-    """Standard deviation of the exploration noise at the end; linear in between."""
-    policy_noise: NonNegative = 0.1
-    """Standard deviation of the noise of target policy smoothing."""
-    noise_clip: NonNegative = 0.5
-    """Largest noise of target policy smoothing."""
-    updates_per_batch: Count = 8
-    """Gradient steps after each step of all vehicles."""
-    batch_size: Count = 1024
-    """Transitions per gradient step."""
-    init_random_frames: Annotated[int, Field(ge=0)] = 1024
-    """Number of initial steps with random actions."""
-
-    @model_validator(mode="after")
-    def _fits_its_buffer(self) -> Self:
-        start, end = self.exploration_noise, self.final_exploration_noise
-        if end > start:
-            raise ValueError(f"final_exploration_noise {end:g} must not exceed exploration_noise {start:g}")
-        if self.buffer_size < self.batch_size:
-            raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
-        if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
-            raise ValueError(f"batch_size {self.batch_size} must not exceed total_frames: no gradient step is possible")
-        return self
+    def motion(self, seed: int) -> list[Transform]:
+        """Return the errors of motion: the current, if there is one."""
+        return [MotionError(current_km_h=self.drift, speed_km_h=1.0, seed=seed)] if self.drift else []
 
 
 Config = TypeVar("Config")

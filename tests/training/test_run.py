@@ -189,7 +189,8 @@ def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, si
         train(tmp_path, scenario=AZORES)
     scenario = tmp_path / "scenario.toml"
     written, text = json.loads((tmp_path / "config.json").read_text()), scenario.read_text()
-    other = {"recipe": "other.py", "name": "other", "noise": (0.1, 0.0, 0.0), "total_episodes": 7, "scenario": text}
+    other = {"recipe": "other.py", "name": "other", "noise": (0.1, 0.0, 0.0), "num_cells": (8,), "total_episodes": 7}
+    other |= {"scenario": text}
     other |= {name: value * 2 + 1 for name, value in written.items() if name not in other and name not in CHANGEABLE}
     assert len(other) == len(written) - len(CHANGEABLE)
     with in_run(resumed_config(tmp_path, RunConfig, "mine.py")) as resumed:
