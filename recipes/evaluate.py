@@ -3,8 +3,8 @@
     python recipes/evaluate.py secant parallel                                  # without training
     python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso:flown --out runs/comparison
     python recipes/evaluate.py secant --scenario my.toml --export tracks.geojson    # own tasks, tracks for a map
-    python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --noise 0.05 0.05 5
-    python recipes/evaluate.py kalman parallel --conditions ship                # errors of a real vehicle
+    python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --errors 0.05 0.05 5
+    python recipes/evaluate.py kalman parallel --errors ship                    # errors of a real vehicle
     python recipes/evaluate.py secant kalman --arrival distance --arrival-radius-km 25 --max-steps 80 --altitude-km -3
     python recipes/evaluate.py policy:SAC=sac.safetensors secant                # a policy of another algorithm
 
@@ -27,9 +27,8 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from magrl.checks import check_numbers
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.evaluation import Flight, episode_measures, export, summarize
 from magrl.evaluation.maps import trajectories_figure
@@ -84,14 +83,13 @@ class Config(ScenarioOptions):
     """GeoJSON file for the tracks of all episodes (.geojson)."""
     mode: Literal["look-ahead", "flown"] = "look-ahead"
     """How metaheuristics evaluate a candidate move."""
-    noise: Noise | None = None
-    """Standard deviations of the noise on D [deg], I [deg], B_H [nT]; by default those of the runs, or 0."""
-    conditions: Annotated[str | None, tyro.conf.arg(aliases=("--errors",))] = None
-    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater, low-cost, or a file of errors
-    (.toml or .json, docs/conditions.md); none by default."""
+    errors: Noise | str | None = None
+    """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
+    vehicle, which are laboratory, aircraft, ship, underwater, low-cost, or a file (.toml or .json, docs/conditions.md);
+    by default the noise of the runs, or 0."""
     known_start: Noise | None = None
     """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
-    calibrated; with --conditions; by default the start is unknown."""
+    calibrated, with the errors of a real vehicle; by default the start is unknown."""
     map_date: str | None = None
     """Date of the IGRF map of map_matching, such as 2015-01-01; by default its map is the true field."""
     kilometers: bool = False
@@ -133,12 +131,9 @@ def settle(config: Config) -> tuple[Config, list[str]]:
     """Return the settings with those of the scenario, or of the runs, where none were chosen, and warnings.
 
     Raises:
-        ValueError: for runs that differ in a setting that was not chosen, or conditions with noise.
+        ValueError: for runs that differ in a setting that was not chosen.
         FileNotFoundError: for a run without its scenario file.
     """
-    check_numbers(3, 0, noise=config.noise or NO_NOISE)
-    if config.conditions and config.noise:
-        raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
     every = trained_runs(config.navigators)
     # Agents that train anywhere have seen every heading, many levels of noise, and no region in particular.
     runs = [run for run in every if run.kind != "anywhere"]
@@ -148,11 +143,9 @@ def settle(config: Config) -> tuple[Config, list[str]]:
     scenario = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
     zeta, thresholds = agreed(every, "zeta", scenario.given("zeta"), 0.01)
     heading, headings = agreed(runs, "start_heading", scenario.given("start_heading"), "north")
-    noise, noisy = NO_NOISE, list[str]()
-    if not config.conditions:
-        noise, noisy = agreed(runs, "noise", config.noise, NO_NOISE)
-    settled = replace(config, scenario=path, zeta=zeta, start_heading=heading, noise=noise)
-    return settled, [*thresholds, *unfinished(config.navigators), *headings, *noisy, *places]
+    errors, accuracies = agreed(runs, "errors", config.errors, NO_NOISE)
+    settled = replace(config, scenario=path, zeta=zeta, start_heading=heading, errors=errors)
+    return settled, [*thresholds, *unfinished(config.navigators), *headings, *accuracies, *places]
 
 
 def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]]:
@@ -176,8 +169,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         config, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        options = {"errors": config.conditions or config.noise, "known_start": config.known_start}
-        options |= {"confidence": config.confidence, "seed": config.seed}
+        options = {key: getattr(config, key) for key in ("errors", "known_start", "confidence", "seed")}
         flights = [Flight(scenario, **options), Flight(example, **options)]
         options = {"mode": config.mode, "map_date": config.map_date}
         navigators = [tuple(flight.navigator(text, **options) for flight in flights) for text in config.navigators]
@@ -234,8 +226,8 @@ def settings(config: Config, env: GeomagneticNavEnv) -> dict[str, Any]:
         "arrival": env.arrival.rule,
         "arrival_radius_km": env.arrival.radius_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        **{key: getattr(config, key) for key in ("tasks", "noise", "known_start", "map_date", "mode", "seed")},
-        "conditions": config.conditions and Path(config.conditions).name,
+        **{key: getattr(config, key) for key in ("tasks", "known_start", "map_date", "mode", "seed")},
+        "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
         **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
         **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
     }
@@ -251,13 +243,13 @@ def write(config: Config, env: GeomagneticNavEnv, results: Results) -> None:
             writer.writerows(rows)
     write_json(config.out / "summary.json", results.summaries)
     write_json(config.out / "settings.json", settings(config, env))
-    text = "{:g} deg, {:g} deg, {:g} nT".format
+    text, noisy = "{:g} deg, {:g} deg, {:g} nT".format, not isinstance(config.errors, str) and any(config.errors or ())
     lines = {
         "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
         "Date of the map of map matching": config.map_date,
-        "Conditions": config.conditions,
+        "Conditions": isinstance(config.errors, str) and config.errors,
         "Known start, standard deviations of D, I, B_H": config.known_start and text(*config.known_start),
-        "Standard deviations of the noise on D, I and B_H": any(config.noise or ()) and text(*config.noise),
+        "Standard deviations of the noise on D, I and B_H": noisy and text(*config.errors),
     }
     notes = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)
     notes += "".join(f"\nWarning: {text}.\n" for text in results.warnings)

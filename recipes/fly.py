@@ -2,8 +2,8 @@
 
     python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W"                     # Bergen to Reykjavik
     python recipes/fly.py "60.4N 5.3E" "D=-11.1 I=75.2 BH=13000"         # a destination by its magnetic elements
-    python recipes/fly.py "38.7, -9.1" "40.7, -74.0" --noise 0.05 0.05 5 --navigator secant --export track.geojson
-    python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W" --conditions underwater     # with the errors of a real vehicle
+    python recipes/fly.py "38.7, -9.1" "40.7, -74.0" --errors 0.05 0.05 5 --navigator secant --export track.geojson
+    python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors underwater         # with the errors of a real vehicle
 
 The agent measures declination D, inclination I and horizontal intensity B_H, and knows their values at the destination.
 It never observes a position: coordinates serve the simulation, the score and the picture only.
@@ -17,9 +17,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from magrl.checks import check_number, check_numbers
+from magrl.checks import check_number
 from magrl.envs import Scenario, Tasks
 from magrl.evaluation import Flight, episode_measures, export, places, with_declaration
 from magrl.evaluation.maps import trajectories_figure, write_gif
@@ -59,14 +59,13 @@ class Config:
     navigator: str = "anywhere"
     """Navigator: anywhere (the pretrained agent), anywhere=RUN (a run folder), kalman, secant, or another one of
     recipes/evaluate.py."""
-    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
-    conditions: Annotated[str | None, tyro.conf.arg(aliases=("--errors",))] = None
-    """Errors of a real vehicle instead of noise: laboratory, aircraft, ship, underwater, low-cost, or a file of errors
-    (.toml or .json, docs/conditions.md); none by default."""
+    errors: tuple[float, float, float] | str = (0.0, 0.0, 0.0)
+    """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
+    vehicle, which are laboratory, aircraft, ship, underwater, low-cost, or a file (.toml or .json,
+    docs/conditions.md)."""
     known_start: tuple[float, float, float] | None = None
     """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
-    calibrated; with --conditions; by default the start is unknown."""
+    calibrated, with the errors of a real vehicle; by default the start is unknown."""
     date: str = "2025-01-01"
     """Date of the field, 1900 to 2030 (IGRF-14)."""
     zeta: float | None = None
@@ -127,15 +126,6 @@ def ends(config: Config, field: IGRF) -> tuple[Tensor, Tensor, float]:
     return start, target, distance_km
 
 
-def check_settings(config: Config) -> None:
-    """Raise unless noise, conditions and heading can be flown."""
-    check_numbers(3, 0, noise=config.noise)
-    if config.conditions and any(config.noise):
-        raise ValueError(f"--conditions {config.conditions} hold the noise of the sensors: omit --noise")
-    if config.start_heading != "random":
-        check_number(-360, 360, start_heading=config.start_heading)
-
-
 def check_files(config: Config) -> None:
     """Raise unless all files can be written."""
     if config.export:
@@ -155,8 +145,9 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
     """
     flights = {}
     try:
-        check_settings(config)
-        drift_km = conditions_named(config.conditions or "laboratory").drift_km(50.0)
+        if config.start_heading != "random":
+            check_number(-360, 360, start_heading=config.start_heading)
+        drift_km = conditions_named(config.errors).drift_km(50.0) if isinstance(config.errors, str) else 0.0
         field = IGRF(config.date)
         start, target, distance_km = ends(config, field)
         region = places.region_around(start, target, field, 50.0 + drift_km)
@@ -165,7 +156,7 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,
-                errors=config.conditions or config.noise,
+                errors=config.errors,
                 known_start=config.known_start,
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
@@ -248,13 +239,14 @@ def fly(config: Config) -> dict[str, Any]:
 
 def summary(result: dict[str, Any]) -> str:
     """Return the result of a flight as text."""
-    noise = "{:g} deg, {:g} deg, {:g} nT".format(*result["noise"]) if any(result["noise"]) else "none"
-    noise = f"conditions {result['conditions']}" if result["conditions"] else noise
+    errors = result["errors"] if any(result["errors"]) else "none"
+    if not isinstance(errors, str):
+        errors = "{:g} deg, {:g} deg, {:g} nT".format(*errors)
     ends = ["{:.2f}, {:.2f}".format(*result[key]) for key in ("start_position", "target_position")]
     rows = {
         "outcome": result["outcome"],
         "navigator": f"{result['navigator']}, which needs {result['needs']} beside its readings",
-        "noise": noise,
+        "errors": errors,
         "start": ends[0],
         "destination": f"{ends[1]}, {places.elements_text(torch.tensor(result['target_field']))}",
         "steps": f"{result['steps']} of at most {result['max_steps']}",

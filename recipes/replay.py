@@ -86,7 +86,7 @@ def prepare(config: Config) -> tuple[Flight, dict[str, TensorDictModuleBase], st
         assert scenario.tasks is not None
         available = len(scenario.tasks.start)
         count = min(DEFAULT_TASKS, available) if config.num_tasks is None else config.num_tasks
-        flight = Flight(first_tasks(scenario, count), errors=run.noise, seed=config.seed)
+        flight = Flight(first_tasks(scenario, count), errors=run.errors, seed=config.seed)
         texts = (f"{run.kind or f'policy:{config.run.name}'}={config.run}", *config.navigators)
         made = {text: flight.navigator(text) for text in texts}
         navigators = {name: made[text] for name, text in labeled(texts).items()}

@@ -27,7 +27,7 @@ class TrainedRun:
     kind: str | None
     """Name of the agent among the navigators, or None for that of another recipe."""
     start_heading: str = "north"
-    noise: Noise = NO_NOISE
+    errors: Noise = NO_NOISE
     """Standard deviations of the sensors' noise on D [deg], I [deg], B_H [nT]."""
     scenario: Path | None = None
     """Scenario file in the folder, or None for the paper's."""
@@ -47,7 +47,7 @@ def read_run(folder: Path) -> TrainedRun:
         >>> folder = Path(tempfile.mkdtemp())
         >>> _ = (folder / "config.json").write_text('{"guided": false, "start_heading": "random"}')
         >>> run = read_run(folder)
-        >>> run.kind, run.start_heading, run.noise
+        >>> run.kind, run.start_heading, run.errors
         ('td3', 'random', (0.0, 0.0, 0.0))
     """
     path = folder / "config.json"

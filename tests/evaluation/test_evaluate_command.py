@@ -81,7 +81,7 @@ def test_settings_state_what_was_flown(results: Path) -> None:
     """A run is flown as it was trained."""
     settings = json.loads((results / "settings.json").read_text())
     assert settings["navigators"] == ["gg_td3=noisy", "secant", "pso", "afsa:flown"]
-    expected = {"zeta": 0.02, "noise": list(NOISE), "start_heading": "random", "scenario": None, "tasks_seed": 0}
+    expected = {"zeta": 0.02, "errors": list(NOISE), "start_heading": "random", "scenario": None, "tasks_seed": 0}
     assert settings.items() >= expected.items()
     assert list((results / "wandb").glob("offline-run-*/files/media/table/eval/navigators*.json"))
 
@@ -138,8 +138,8 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
         (("dowsing",), {}, "unknown navigator 'dowsing'"),
         (("secant",), {"map_date": "2020-01-01"}, "add that navigator, or omit the date"),
         (("secant",), {"zeta": 3.0}, "zeta must be below 3, got 3.0"),
-        (("secant",), {"noise": (0.05, -1.0, 5.0)}, "noise must be a finite number from 0 on, got -1.0"),
-        (("secant",), {"noise": NOISE, "conditions": "ship"}, "omit --noise"),
+        (("secant",), {"errors": (0.05, -1.0, 5.0)}, "noise must be a finite number from 0 on, got -1.0"),
+        (("secant",), {"errors": "boat"}, r"or a file that ends in \.toml or \.json, got 'boat'"),
         (("secant",), {"known_start": NOISE}, "needs conditions"),
         (("secant",), {"tasks": 0}, "num_tasks must be a whole number from 1 on, got 0"),
         (("secant",), {"tasks_seed": 7}, "--tasks-seed 7 needs a number of random tasks, such as --tasks 300"),

@@ -40,7 +40,7 @@ def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
 
 @pytest.mark.usefixtures("without_figure")
 def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distance(tmp_path: Path) -> None:
-    config = recipe.Config("60.4N 5.3E", "62.0N 6.8W", noise=(0.05, 0.05, 5.0), out=tmp_path)
+    config = recipe.Config("60.4N 5.3E", "62.0N 6.8W", errors=(0.05, 0.05, 5.0), out=tmp_path)
     first, second = recipe.fly(config), recipe.fly(config)
     assert first == second
     assert first["outcome"] == "arrived"
@@ -49,7 +49,7 @@ def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distanc
 
 @pytest.mark.usefixtures("without_figure")
 def test_a_vehicle_that_is_alone_declares_its_arrival(tmp_path: Path) -> None:
-    config = recipe.Config("60.4N 5.3E", "60.2N 1.1W", conditions="ship", navigator="kalman", out=tmp_path)
+    config = recipe.Config("60.4N 5.3E", "60.2N 1.1W", errors="ship", navigator="kalman", out=tmp_path)
     alone, calibrated = (recipe.fly(replace(config, known_start=known))["alone"] for known in (None, (0.0, 0.0, 0.0)))
     for result in (alone, calibrated):
         right = result["navigation_error_km"] <= 25
@@ -64,7 +64,7 @@ def test_a_vehicle_that_is_alone_declares_its_arrival(tmp_path: Path) -> None:
         ({"destination": "60.4N 5.3E"}, "are the same place"),
         ({"destination": "60.4S 174.7W"}, "is the antipode of the start"),
         ({"destination": "86N 140E"}, "the declination is hardly defined at '86N 140E', where BH is"),
-        ({"noise": (0.1, 0.0, 0.0), "conditions": "ship"}, "omit --noise"),
+        ({"errors": (0.1, -1.0, 0.0)}, "noise must be a finite number from 0 on, got -1.0"),
         ({"known_start": (0.0, 0.0, 0.0)}, "needs conditions"),
         ({"start_heading": math.inf}, "start_heading"),
         ({"export": Path("track.txt")}, "must end in .geojson, got 'track.txt'"),

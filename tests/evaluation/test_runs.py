@@ -31,7 +31,7 @@ def trained(tmp_path: Path) -> Callable[..., Path]:
 
 def test_settings_of_a_run(trained) -> None:
     run = read_run(trained("a", noise=NOISE, start_heading="random", zeta=0.05, scenario="elsewhere/scenario.toml"))
-    assert (run.kind, run.noise, run.start_heading, run.zeta) == ("gg_td3", NOISE, "random", 0.05)
+    assert (run.kind, run.errors, run.start_heading, run.zeta) == ("gg_td3", NOISE, "random", 0.05)
     assert run.scenario == run.folder / "scenario.toml"
     assert (read_run(trained("b", guided=False)).kind, read_run(trained("c", guided=None)).kind) == ("td3", None)
 
@@ -57,7 +57,7 @@ def test_runs_among_navigators(trained, tmp_path: Path) -> None:
     [
         ("zeta", 0.02, 0.01, "zeta, 0.01 (a), 0.02 (b): choose with --zeta"),
         ("start_heading", "random", "north", "start heading, north (a), random (b): choose with --start-heading"),
-        ("noise", NOISE, (0.0, 0.0, 0.0), "noise, 0 0 0 (a), 0.05 0.05 5 (b): choose with --noise"),
+        ("errors", NOISE, (0.0, 0.0, 0.0), "errors, 0 0 0 (a), 0.05 0.05 5 (b): choose with --errors"),
     ],
 )
 def test_runs_agree_or_need_a_choice(setting: str, value: object, default: object, text: str) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from magrl.checks import check_choice, check_numbers, check_type
+from magrl.checks import check_numbers, check_type
 from magrl.files import read_document
 from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
@@ -252,7 +252,9 @@ def conditions_named(name: str) -> Conditions:
     """
     if isinstance(name, str) and name.endswith((".toml", ".json")):
         return load_conditions(name)
-    check_choice(CONDITIONS, conditions=name)
+    if name not in CONDITIONS:
+        names = ", ".join(map(repr, CONDITIONS))
+        raise ValueError(f"conditions must be one of {names}, or a file that ends in .toml or .json, got {name!r}")
     return CONDITIONS[name]
 
 

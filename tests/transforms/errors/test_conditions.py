@@ -164,11 +164,11 @@ def test_the_agent_heeds_constant_errors() -> None:
 
 def test_evaluate_under_conditions(tmp_path: Path) -> None:
     out = tmp_path / "results"
-    config = evaluate.Config(("kalman",), tasks=5, conditions="ship", out=out, wandb_mode="disabled")
+    config = evaluate.Config(("kalman",), tasks=5, errors="ship", out=out, wandb_mode="disabled")
     config, (flight, _), navigators, _ = evaluate.prepare(config)
     assert {type(part) for part in flight.env.transform} >= {MotionError, NorthReferenceError}
     assert tuple(navigators[0][0].sensor_std[1].tolist()) == CONDITIONS["ship"].std.bias
-    assert evaluate.settings(config, flight.base)["conditions"] == "ship"
+    assert evaluate.settings(config, flight.base)["errors"] == "ship"
 
 
 BOAT = Path(__file__).parent.parent.parent.parent / "docs" / "examples" / "boat.toml"
@@ -193,7 +193,9 @@ def test_own_errors_in_a_file() -> None:
         torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
     assert (read.name, read.std) == (boat.name, boat.std)
     for recipe, places in ((fly, ["60.4N 5.3E", "62.0N 6.7W"]), (evaluate, ["secant"])):
-        assert tyro.cli(recipe.Config, args=[*places, "--errors", str(BOAT)]).conditions == str(BOAT)
+        assert tyro.cli(recipe.Config, args=[*places, "--errors", str(BOAT)]).errors == str(BOAT)
+        noise = tyro.cli(recipe.Config, args=[*places, "--errors", "0.05", "0.05", "5"]).errors
+        assert noise == (0.05, 0.05, 5.0)
 
 
 @pytest.mark.parametrize(
@@ -217,7 +219,7 @@ def test_files_of_errors_that_are_refused(tmp_path: Path, text: str | None, mess
 
 def test_fly_under_conditions(tmp_path: Path) -> None:
     """With a heading that was chosen, which is the true one; the measured one has the error of the north reference."""
-    options = {"conditions": "underwater", "start_heading": 90.0, "max_steps": 2}
+    options = {"errors": "underwater", "start_heading": 90.0, "max_steps": 2}
     config = fly.Config("60.4N 5.3E", "64.1N 21.9W", navigator="secant", out=tmp_path, **options)
     steps = fly.rollout(*fly.prepare(config)["told"], 90.0)
     north = torch.rad2deg(steps["true_heading"] - steps["heading"])[0, 0]
