@@ -24,7 +24,7 @@ from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
 
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
-"""D [deg], I [deg], B_H [nT] at middle latitudes, for which data sheets state the errors that depend on the field.
+"""D [deg], I [deg], B_H [nT] at middle latitudes, for which accuracy is stated where errors depend on the field.
 
 The accuracy that a vehicle knows is constant, or follows from its readings. An accuracy at the true field, or at a
 reading to which another error is added, would reveal that field or that reading.
