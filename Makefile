@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere prior replay test test-slow test-newest check format docs bench mutate tables figures pictures help clean
+.PHONY: train fly anywhere replay test test-slow test-newest check format docs bench mutate tables figures pictures help clean
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RECIPE)/td3_gradient_guided.py $(ARGS)
@@ -14,9 +14,6 @@ fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; s
 
 anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; half an hour on one core
 	OMP_NUM_THREADS=1 $(RECIPE)/ppo_anywhere.py $(ARGS)
-
-prior: $(VENV)/.installed  ## fit the prior of the gradients on random planets; 40 seconds on one core
-	OMP_NUM_THREADS=1 $(RECIPE)/gradient_prior.py --out magrl/tracking/learned_prior.pt $(ARGS)
 
 replay: runs/td3_gradient_guided-fast-seed0/eval.json  ## write a replay page, replay.html in the run folder
 	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 $(ARGS)

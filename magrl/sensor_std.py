@@ -11,7 +11,7 @@ from torch import Tensor
 
 from magrl.checks import check_numbers
 
-STD_KEYS = ("sensor_std", "bias_std", "drift_std")
+STD_KEYS = ("sensor_std", "bias_std", "drift_std", "iron_std")
 """Keys of the fields of :class:`SensorStd` in a TensorDict, each ``(..., 3)``."""
 _NONE = (0.0, 0.0, 0.0)
 
@@ -21,8 +21,9 @@ class SensorStd(NamedTuple):
 
     Args:
         noise: of errors that are new in each reading.
-        bias: of constant and slow errors.
-        drift: of slow errors alone, which vary along the way; at most ``bias``.
+        bias: of all others.
+        drift: of those that vary along the way or with the heading; at most ``bias``.
+        iron: of the part of them that is a constant field in the vehicle's axes: forward, right, down [nT].
 
     Example:
         >>> SensorStd((0.02, 0.02, 2.0)).bias
@@ -32,6 +33,7 @@ class SensorStd(NamedTuple):
     noise: Any = _NONE
     bias: Any = _NONE
     drift: Any = _NONE
+    iron: Any = _NONE
 
     @classmethod
     def of(cls, sensor_std: SensorStd | Sequence[float], count: int = 3) -> SensorStd:
@@ -48,7 +50,7 @@ class SensorStd(NamedTuple):
             >>> SensorStd.of((0.05, 0.05, 5)).noise
             (0.05, 0.05, 5.0)
         """
-        given = sensor_std if isinstance(sensor_std, SensorStd) else (sensor_std, (0.0,) * count, (0.0,) * count)
+        given = sensor_std if isinstance(sensor_std, SensorStd) else (sensor_std, *[(0.0,) * count] * 3)
         for name, values in zip(cls._fields, given, strict=True):
             check_numbers(count, 0, **{f"sensor_std.{name}": values})
         return cls(*(tuple(map(float, values)) for values in given))
@@ -67,7 +69,8 @@ class SensorStd(NamedTuple):
         """Return the standard deviations of a reading, given those that are stated.
 
         Noise and bias are the larger of the stated ones and of those that come with the reading: during an outage, or
-        where readings show more noise, it is worse than stated. The drift is that of the reading, if it comes with one.
+        where readings show more noise, it is worse than stated. Drift and iron are those of the reading, if it comes
+        with them.
 
         Args:
             tensordict: ``P`` readings, with some of :data:`STD_KEYS`, or none.
@@ -77,14 +80,14 @@ class SensorStd(NamedTuple):
 
         Example:
             >>> from tensordict import TensorDict
-            >>> SensorStd(*torch.ones(3, 3)).at(TensorDict(bias_std=torch.tensor([0.5, 2.0, 1.0]))).bias
+            >>> SensorStd(*torch.ones(4, 3)).at(TensorDict(bias_std=torch.tensor([0.5, 2.0, 1.0]))).bias
             tensor([1., 2., 1.])
         """
-        noise, bias, drift = (
+        noise, bias, *others = (
             stated if (own := tensordict.get(key, None)) is None else own.to(stated)
             for key, stated in zip(STD_KEYS, self, strict=True)
         )
-        return SensorStd(torch.maximum(self.noise, noise), torch.maximum(self.bias, bias), drift)
+        return SensorStd(torch.maximum(self.noise, noise), torch.maximum(self.bias, bias), *others)
 
 
 PERFECT = SensorStd()

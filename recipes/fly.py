@@ -28,9 +28,8 @@ from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking import RANGE_KM
 from magrl.training import UsageError, command, parse
-from magrl.transforms import TrackGradient, conditions_named
+from magrl.transforms import TrackField, conditions_named
 
 import torch
 import tyro
@@ -151,8 +150,8 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
         field = IGRF(config.date)
         start, target, distance_km = ends(config, field)
         region = places.region_around(start, target, field, 50.0 + drift_km)
-        tasks, ways = Tasks(start[None], target[None]), (0.0, RANGE_KM)
-        scenario = Scenario(region=region, margin_deg=0, field=field, tasks=tasks, distance_range_km=ways)
+        tasks = Tasks(start[None], target[None])
+        scenario = Scenario(region=region, margin_deg=0, field=field, tasks=tasks)
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,
@@ -175,7 +174,7 @@ def with_estimates(flight: Flight) -> TransformedEnv:
     """Return the environment of a flight; without a declaration, add estimates of the way."""
     if flight.base.arrival.declared:
         return with_declaration(flight.env)
-    track = TrackGradient(std_keys=STD_KEYS if flight.env is not flight.base else (), range_km=1000.0)
+    track = TrackField(std_keys=STD_KEYS if flight.env is not flight.base else (), range_km=1000.0)
     return TransformedEnv(flight.env, track, auto_unwrap=True)
 
 

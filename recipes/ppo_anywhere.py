@@ -25,6 +25,7 @@ from magrl.agents.networks import make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.evaluation import with_declaration
 from magrl.sensor_std import STD_KEYS
+from magrl.tracking import RANGE_KM
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, Discount, NonNegative, PlanetConfig, Positive, Rising
@@ -82,7 +83,7 @@ class Config(PlanetConfig):
     """Rule of arrival: by the objective, or declared by the vehicle within ``arrival_km``."""
     arrival_km: Positive = 25.0
     """Distance from the destination within which a declaration is correct [km]."""
-    range_km: Positive = 300.0
+    range_km: Positive = RANGE_KM
     """Prior standard deviation of the way to the destination along each axis [km]."""
     price_range: Rising = (0.1, 30.0)
     """Range of the step price [% of SPL], which is drawn for each episode and observed by the agent."""
@@ -110,12 +111,11 @@ def make_view(base: GeomagneticNavEnv, range_km: float) -> TrackView:
     return TrackView(**limits, range_km=range_km, step_price=None)
 
 
-def declaration(base: GeomagneticNavEnv) -> list[Transform]:
+def declaration(base: GeomagneticNavEnv, range_km: float) -> list[Transform]:
     """Return what declares the arrival by the estimates of the agent's view, where it must be declared."""
     if not base.arrival.declared:
         return []
-    farthest = max(base.scenario.distance_range_km)
-    return [DeclareArrival(base.arrival.radius_km, max_steps=base.max_steps, range_km=farthest, std_keys=STD_KEYS)]
+    return [DeclareArrival(base.arrival.radius_km, max_steps=base.max_steps, range_km=range_km, std_keys=STD_KEYS)]
 
 
 def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> TransformedEnv:
@@ -124,7 +124,7 @@ def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> Transf
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
     highest = HighestSPL({"move": "true_move"} if config.drift else None)
     privileged = [TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
-    observed = [*errors(config, base.seed), price, *view.observation_transforms(), *declaration(base)]
+    observed = [*errors(config, base.seed), price, *view.observation_transforms(), *declaration(base, view.range_km)]
     return TransformedEnv(base, Compose(*observed, view.action_transform(), *privileged))
 
 

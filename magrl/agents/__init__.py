@@ -6,6 +6,7 @@ from magrl.agents.networks import make_critic as make_critic
 from magrl.agents.pipeline import export_policy as export_policy
 from magrl.agents.policy import FieldPolicy as FieldPolicy
 from magrl.agents.policy import PolicyConfig as PolicyConfig
+from magrl.agents.policy import kalman as kalman
 from magrl.agents.policy import load_policy as load_policy
 from magrl.agents.policy import save_policy as save_policy
 from magrl.agents.pretrained import load_pretrained as load_pretrained

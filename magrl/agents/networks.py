@@ -121,7 +121,7 @@ class CorrectedMove(nn.Module):
         max_turn_rad: largest turn [rad].
 
     Example:
-        >>> CorrectedMove(50.0, 1.5)(torch.tensor([25.0, 0.0]), torch.zeros(2))
+        >>> CorrectedMove(50.0, 1.5)(torch.tensor([25.0, 0.0]), torch.zeros(1))
         tensor([0., 0.])
     """
 
@@ -129,22 +129,26 @@ class CorrectedMove(nn.Module):
         super().__init__()
         self.limits = float(max_move_km), float(max_turn_rad)
 
-    def forward(self, planned: Tensor, correction: Tensor) -> Tensor:
-        """Return the scaled action ``(..., 2)`` of a displacement forward and to the right [km] and its correction."""
-        forward, right = corrected(planned, correction).unbind(-1)
-        bearing, distance = torch.atan2(right, forward), torch.hypot(forward, right)
-        distance, turn = steer(torch.zeros_like(bearing), bearing, distance, *self.limits)
+    def forward(self, planned: Tensor, heading: Tensor, correction: Tensor | None = None) -> Tensor:
+        """Return the scaled action ``(..., 2)`` of a displacement northward and eastward [km] at a heading
+        ``(..., 1)`` [rad], and its correction."""
+        move = planned if correction is None else corrected(planned, correction)
+        north, east = move.unbind(-1)
+        bearing, distance = torch.atan2(east, north), torch.hypot(north, east)
+        distance, turn = steer(heading.squeeze(-1), bearing, distance, *self.limits)
         return torch.stack((2 * distance / self.limits[0] - 1, turn / self.limits[1]), -1)
 
 
-def make_correcting_actor(view: TrackView, num_cells: Sequence[int], *, device: Device = None) -> TensorDictSequential:
+def make_correcting_actor(
+    view: TrackView, num_cells: Sequence[int] | None, *, device: Device = None
+) -> TensorDictSequential:
     """Return an actor that corrects a plan: ``observation`` and ``planned_move`` to ``correction`` and ``action``.
 
     Its correction starts at zero, so that the untrained actor flies as planned.
 
     Args:
         view: what it observes.
-        num_cells: width of each hidden layer.
+        num_cells: width of each hidden layer; None for an actor without a network, which flies as planned.
         device: device of the parameters.
 
     Raises:
@@ -156,14 +160,15 @@ def make_correcting_actor(view: TrackView, num_cells: Sequence[int], *, device: 
         >>> make_correcting_actor(view, (32, 32)).out_keys
         ['correction', 'action']
     """
+    move, keys = CorrectedMove(view.max_move_km, view.max_turn_rad), ["planned_move", "heading"]
+    if num_cells is None:
+        return TensorDictSequential(TensorDictModule(move, keys, ["action"]))
     network = make_mlp(view.size, 2, num_cells, layer_norm=True, device=device)
     for parameter in network[-1].parameters():
         nn.init.zeros_(parameter)
     return TensorDictSequential(
         TensorDictModule(network, ["observation"], ["correction"]),
-        TensorDictModule(
-            CorrectedMove(view.max_move_km, view.max_turn_rad), ["planned_move", "correction"], ["action"]
-        ),
+        TensorDictModule(move, [*keys, "correction"], ["action"]),
     )
 
 

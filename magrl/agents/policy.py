@@ -24,6 +24,8 @@ from magrl.checks import check_finite, check_type, short
 from magrl.files import load_tensors, save_tensors
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms import ObservationView, TrackView
+from magrl.transforms.errors.known_start import START_KEYS
+from magrl.transforms.track import TRACK_KEYS
 
 POLICY_FORMAT = 3
 VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}
@@ -37,7 +39,7 @@ class PolicyConfig:
 
     Args:
         view: what the policy observes, and its scaling: values scaled to a region, or estimates of its own track.
-        num_cells: width of each hidden layer.
+        num_cells: width of each hidden layer; None for a plan without a network, of a :class:`TrackView`.
         layer_norm: whether hidden layers are normalized.
 
     Raises:
@@ -52,7 +54,7 @@ class PolicyConfig:
     """
 
     view: ObservationView | TrackView
-    num_cells: tuple[int, ...]
+    num_cells: tuple[int, ...] | None
     layer_norm: bool = True
 
     def __post_init__(self) -> None:
@@ -63,6 +65,10 @@ class PolicyConfig:
         """Return an actor of this shape, with new weights."""
         if isinstance(self.view, TrackView):
             return make_correcting_actor(self.view, self.num_cells, device=device)
+        if self.num_cells is None:
+            raise ValueError(
+                f"num_cells must be the widths of the hidden layers with {type(self.view).__name__}, got None"
+            )
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
 
 
@@ -72,7 +78,8 @@ class FieldPolicy(TrainedPolicy):
     A policy that reads its own track (:class:`~magrl.transforms.TrackView`) keeps its own state for each vehicle from
     the start of an episode (``step_count`` 0) on. Another call in the same step begins with the same state as the
     first, so that calling it twice on one state changes nothing. Such a policy reads the accuracy of the readings
-    (:data:`magrl.sensor_std.STD_KEYS`); without these keys it is perfect.
+    (:data:`magrl.sensor_std.STD_KEYS`); without these keys it is perfect. Where the environment has a
+    :class:`~magrl.transforms.TrackField`, it reads that belief and computes none of its own.
 
     Args:
         config: what the policy observes, and the shape of its network.
@@ -95,6 +102,8 @@ class FieldPolicy(TrainedPolicy):
         self.config, self.view = config, config.view
         self.in_keys = list(config.view.in_keys)
         self.observe = Compose(*config.view.observation_transforms())
+        if isinstance(config.view, TrackView):
+            self.observe_tracked = Compose(*config.view.observation_transforms(tracked=True))
         self.act = config.view.action_transform()
         self.actor = config.make_actor().float() if actor is None else actor  # environments write float32
         self.state_keys = config.view.state_keys
@@ -136,7 +145,8 @@ class FieldPolicy(TrainedPolicy):
         if isinstance(self.view, TrackView):
             limits = {name: min(getattr(self.view, name), getattr(base, name)) for name in LIMITS}
             limits |= {"zeta": base.zeta, "max_steps": base.max_steps}
-            searches = self.view.search and base.arrival.rule == "objective"
+            limits["radius_km"] = base.arrival.radius_km if base.arrival.rule == "distance" else None
+            searches = self.view.search and not base.arrival.declared
             policy = self.adapted(**limits, search=searches).to(base.device)
         policy.check_fits(base)
         return policy
@@ -177,19 +187,43 @@ class FieldPolicy(TrainedPolicy):
             action = self.actor(self.observe(seen))["action"]
             return tensordict.set("action", self.act.denormalize("action", action))
         before, starts = self._state_before(seen)
-        observed = self._track(seen.update(tensordict.select(*STD_KEYS, strict=False)), before, starts)
+        observed = self._track(
+            seen.update(tensordict.select(*STD_KEYS, *START_KEYS, *TRACK_KEYS, strict=False)), before, starts
+        )
         action = self.actor(observed)["action"]
         self._keep_state(seen, before, starts, observed.select(*self.state_keys).detach())
         return tensordict.set("action", self.act.denormalize("action", action))
 
     def _track(self, seen: TensorDictBase, state: TensorDictBase | None, starts: Tensor) -> TensorDictBase:
         """Return the observation after the last move."""
+        tracked = all(key in seen.keys() for key in TRACK_KEYS)  # noqa: SIM118 - a TensorDict is no mapping
+        observe = self.observe_tracked if tracked else self.observe
         for key in STD_KEYS:
             seen[key] = seen.get(key, torch.zeros_like(seen["field"]))
         if state is None or starts.all():
-            return self.observe(seen)
-        observed = self.observe(state.copy().set("next", seen.copy()))["next"]
-        return torch.where(starts.squeeze(-1), self.observe(seen), observed) if starts.any() else observed
+            return observe(seen)
+        observed = observe(state.copy().set("next", seen.copy()))["next"]
+        return torch.where(starts.squeeze(-1), observe(seen), observed) if starts.any() else observed
+
+
+def kalman(**options: Any) -> FieldPolicy:
+    """Return dual control by the belief of the field: the policy that flies as planned, without a network.
+
+    Args:
+        options: options of :class:`~magrl.transforms.TrackView` other than its defaults: moves up to 50 km, turns up to
+            90 degrees, 50 steps, and the arrival threshold 0.01.
+
+    Source:
+        A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> bool(env.rollout(50, kalman(), break_when_any_done=False)["next", "success"].any(1).all())
+        True
+    """
+    usual: dict[str, Any] = {"zeta": 0.01, "max_steps": 50, "max_move_km": 50.0, "max_turn_rad": math.pi / 2}
+    return FieldPolicy(PolicyConfig(TrackView(**usual | options), num_cells=None))
 
 
 def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | None = None) -> None:

@@ -111,7 +111,7 @@ def trajectories_figure(
     """Return maps of the first episodes of one or several navigators, beside each other.
 
     A map has the tracks, the shortest paths, contours of the field and coastlines; for an episode with the key ``way``
-    ``(..., 2)`` [km] northward and eastward (:class:`~magrl.transforms.TrackGradient`) also where its destination was
+    ``(..., 2)`` [km] northward and eastward (:class:`~magrl.transforms.TrackField`) also where its destination was
     estimated.
 
     Args:
@@ -268,7 +268,7 @@ def write_gif(
     Args:
         path: path of the image; an existing file is replaced.
         rollout: ``(M, T)`` from the environment; of one vehicle with the keys ``way`` ``(..., 2)`` [km] northward and
-            eastward and ``way_covariance`` ``(..., 2, 2)`` [km^2] (:class:`~magrl.transforms.TrackGradient`), the
+            eastward and ``way_covariance`` ``(..., 2, 2)`` [km^2] (:class:`~magrl.transforms.TrackField`), the
             ellipse of two standard deviations around the estimated destination is drawn.
         field: any model of :mod:`magrl.field`.
         region: region of the episodes.

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 
-from magrl.agents import load_policy
+from magrl.agents import kalman, load_policy
 from magrl.agents.pretrained import load_pretrained
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
@@ -30,22 +30,23 @@ class TrainedAgent(NamedTuple):
 
 OWN = "policy"
 """Name of policies of any algorithm, given by a file or a folder with ``policy.safetensors``, and a label."""
-PRETRAINED = ("anywhere",)
-"""Names of the trained agents in the library."""
+PRETRAINED = ("anywhere", "kalman")
+"""Names of the agents in the library; ``kalman`` has no network."""
 TRAINED = {
     "gg_td3": TrainedAgent("Gradient-Guided TD3", "Gradient-Guided TD3"),
     "gg_td3_noise": TrainedAgent("Gradient-Guided TD3, trained with noise", "Gradient-Guided TD3, trained with noise"),
     "td3": TrainedAgent("TD3", "TD3"),
     "anywhere": TrainedAgent("anywhere", "anywhere (PPO on random planets)", Navigator.needs),
     OWN: TrainedAgent("own policy", "own policy", "training"),
+    "kalman": TrainedAgent("Kalman", "Kalman (dual control)", Navigator.needs),
 }
 """Trained agents, which take a run folder; ``anywhere`` without one is the pretrained policy."""
 
 KINDS: dict[str, TrainedAgent | type[Navigator]] = {**TRAINED, **NAVIGATORS}
 NAVIGATOR_NAMES = {name: kind.label for name, kind in KINDS.items()}
 """Label of each navigator in figures."""
-_COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
-_COLORS += ["#882255", "#332288", "#44AA99", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
+_COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#44AA99", "#E69F00", "#56B4E9", "#000000"]
+_COLORS += ["#882255", "#332288", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
 NAVIGATOR_COLORS = dict(zip(KINDS, cycle(_COLORS), strict=False))
 """Color of each navigator in every figure, and in files for maps."""
 
@@ -117,7 +118,7 @@ def make_navigator(
         return _load(text, env, options)
     kind = NAVIGATORS.get(name)
     if kind is None or source or (option and "mode" not in kind.options):
-        trained = [f"{agent}=RUN" for agent in TRAINED if agent != OWN]
+        trained = [f"{agent}=RUN" for agent in TRAINED if agent not in (OWN, "kalman")]
         names = [*PRETRAINED, *trained, "policy:NAME=FILE", *NAVIGATORS]
         raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(names)}")
     shared = {"mode": option or mode, "seed": seed, "map_date": map_date}
@@ -132,7 +133,7 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
         file = " or the file of a policy" if name == OWN else ""
         raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
     path = Path(source) if name == OWN and not Path(source).is_dir() else Path(source) / "policy.safetensors"
-    policy: Any = load_policy(path, env.device) if source else load_pretrained(name, env.device)
+    policy: Any = load_policy(path, env.device) if source else kalman() if name == "kalman" else load_pretrained(name)
     if options and not isinstance(policy.view, TrackView):
         raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
     try:

@@ -8,11 +8,15 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from magrl.agents.exported import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
+from magrl.transforms.track import BELIEF_KEYS, POSTERIOR_KEYS
+
+LARGE_KEYS = [key for name in (*BELIEF_KEYS, *POSTERIOR_KEYS) for key in (name, ("next", name))]
+"""Keys that rollouts leave out."""
 
 
 def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
@@ -28,7 +32,8 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
 
     Returns:
         ``(num_envs, T)``, as :func:`magrl.evaluation.episode_measures` takes it, until the last episode is done.
-        What follows the end of an episode does not count.
+        What follows the end of an episode does not count. The belief and the posterior of
+        :class:`~magrl.transforms.TrackField`, some ten kilobytes for each step, are left out.
 
     Raises:
         TypeError: for another environment, or a policy that is not callable.
@@ -56,8 +61,14 @@ def next_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
         failed.logical_or_(~torch.isfinite(action).all(-1, keepdim=True))
         return tensordict.set("action", torch.where(failed, 0.0, action))
 
+    steps: list[TensorDictBase] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        rollout = env.rollout(env.max_steps, act, break_when_any_done=False, break_when_all_done=True)
+        state = env.reset()
+        while len(steps) < env.max_steps and not (steps and steps[-1]["next", "done"].all()):
+            step = env.step(act(state))
+            steps.append(step.exclude(*LARGE_KEYS))
+            state = step_mdp(step)
+    rollout = TensorDict.stack(steps, -1).refine_names(..., "time")
     if failed.any():
         lost = failed.squeeze(-1).nonzero().squeeze(-1)[:8].tolist()
         warnings.warn(f"the policy wrote actions that are not finite: vehicles {lost} stopped", stacklevel=3)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from magrl import paper
@@ -14,7 +13,7 @@ from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
 from magrl.sensor_std import STD_KEYS
-from magrl.transforms import DeclareArrival, NoiseScale, TrackGradient
+from magrl.transforms import DeclareArrival, TrackField, TrackView
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
@@ -121,8 +120,8 @@ def task_names(scenario: Scenario, first: int = 0) -> tuple[str, ...]:
 def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = None) -> EnvBase:
     """Return an environment in which navigators of two numbers declare their arrival, where it must be declared.
 
-    They declare by a filter of their own track (:class:`~magrl.transforms.DeclareArrival`). Where readings come with
-    standard deviations, that of the noise is scaled by what the readings show (:class:`~magrl.transforms.NoiseScale`).
+    They declare by the belief of their own track (:class:`~magrl.transforms.DeclareArrival`). Where readings come with
+    standard deviations, that of the noise is scaled by what the readings show (:class:`~magrl.transforms.TrackField`).
 
     Args:
         env: navigation environment with all errors of the sensors.
@@ -138,13 +137,11 @@ def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = 
     if not base.arrival.declared or getattr(navigator, "declares", False):
         return env
     std_keys = STD_KEYS if STD_KEYS[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
-    farthest = torch.tensor(base.scenario.distance_range_km).max().item()
-    declare = DeclareArrival(
-        base.arrival.radius_km,
-        max_steps=base.max_steps,
-        confidence=confidence,
-        range_km=farthest,
-        std_keys=std_keys,
+    view = getattr(navigator, "view", None)
+    world: dict[str, Any] = (
+        {"range_km": view.range_km, "crust_nt": view.crust_nt} if isinstance(view, TrackView) else {}
     )
-    scale = [NoiseScale()] if std_keys else []
-    return TransformedEnv(env, Compose(*scale, TrackGradient(std_keys=std_keys), declare), auto_unwrap=True)
+    track = TrackField(std_keys=std_keys, estimate_noise=bool(std_keys), **world)
+    options: dict[str, Any] = {"max_steps": base.max_steps, "confidence": confidence, "std_keys": std_keys}
+    declare = DeclareArrival(base.arrival.radius_km, **options, **world)
+    return TransformedEnv(env, Compose(track, declare), auto_unwrap=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from magrl.navigators.base import Navigator as Navigator
 from magrl.navigators.geodesic import Geodesic as Geodesic
-from magrl.navigators.kalman import Kalman as Kalman
 from magrl.navigators.map_matching import MapMatching as MapMatching
 from magrl.navigators.mean_jacobian import MeanJacobian as MeanJacobian
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
@@ -18,7 +17,6 @@ _CLASSES: tuple[type[Navigator], ...] = (
     ArtificialFishSwarm,
     Secant,
     ParallelApproach,
-    Kalman,
     MeanJacobian,
     Geodesic,
     MapMatching,

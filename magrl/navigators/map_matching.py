@@ -66,6 +66,7 @@ class MapMatching(Navigator):
         hypotheses: number of positions that are tracked.
         zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
         search: whether the episode ends at arrival, so that the destination is not where the vehicle has been.
+        radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.
 
     Raises:
         TypeError: for a region of another type.
@@ -100,8 +101,10 @@ class MapMatching(Navigator):
         hypotheses: int = 4,
         zeta: float = 0.01,
         search: bool = False,
+        radius_km: float | None = None,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
+        check_number(0, above=True, optional=True, radius_km=radius_km)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
         check_type((Region, Regions), region=region)
@@ -110,14 +113,14 @@ class MapMatching(Navigator):
         check_number(0, above=True, zeta=zeta)
         check_type(bool, search=search)
         self.hypotheses, bank = int(hypotheses), isinstance(field, FieldBank)
-        self.zeta, self.search = float(zeta), search
+        self.zeta, self.search, self.radius_km = float(zeta), search, radius_km
         self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if bank else [])]
         self.map = field
         self._place(copy.deepcopy(Regions.of(region)).to(device_of(field)))
         std = torch.tensor((FLOOR, map_error, *SensorStd.of(sensor_std)), dtype=torch.float64)
-        floor, error, noise, bias, drift = std.to(self.grid.device).square()
+        floor, error, noise, bias, drift, iron = std.to(self.grid.device).square()
         self.target_std = nn.Buffer((floor + error).sqrt())
-        variances = SensorStd(floor + error + noise + BIAS_SHARE * bias, floor + bias, drift)
+        variances = SensorStd(floor + error + noise + BIAS_SHARE * bias, floor + bias, drift, iron)
         self.sensor_std = nn.Buffer(torch.stack(variances).sqrt())
         # Two elements give a position, so that the second smallest of the three counts.
         self.map_error_km = sorted(std / slope for std, slope in zip(map_error, SLOPES, strict=True))[1]
@@ -183,7 +186,8 @@ class MapMatching(Navigator):
         constant = update(prior, jacobian, residual)[1].squeeze(1)
         covariance = best(memory["covariance"], memory["misfit"]) + constant
         gradient = jacobian.squeeze(1) * std.unsqueeze(-1)
-        ellipse = gradient.mT @ (memory["weights"].unsqueeze(-1) * gradient)
+        nothing = torch.zeros(2, 2).to(gradient)  # the map states no error of its gradient
+        ellipse = tracking.arrival_ellipse(gradient, nothing, memory["weights"], self.radius_km)
         return tracking.unvisited(Way(way, covariance), memory["visited"], ellipse)
 
     def _begin(self, seen: TensorDictBase, memory: TensorDictBase) -> TensorDictBase:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from magrl.checks import check_tensor
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.model import FieldModel, elements_gradient_at
+from magrl.navigators.filter import GradientPrior
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.sensor_std import SensorStd
-from magrl.tracking import GradientPrior
 
 
 class MeanJacobian(QuasiNewton):
@@ -60,7 +59,7 @@ class MeanJacobian(QuasiNewton):
         self.register_buffer("std", gradients.std(0))
 
     def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
-        return GradientPrior(self.mean.expand(*reading.shape, 2), self.std, torch.zeros_like(reading[:, 0]))
+        return GradientPrior(self.mean, self.std)
 
     name, label = "mean_jacobian", "mean Jacobian"
     description = "mean Jacobian (quasi-Newton)"

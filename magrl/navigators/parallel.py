@@ -17,15 +17,15 @@ from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
 from magrl.guidance import parallel_approach
 from magrl.navigators.base import Navigator, displacement_to, element_indices
+from magrl.navigators.filter import CURVATURE
 from magrl.sensor_std import SensorStd
-from magrl.tracking import CURVATURE
 
 
 class ParallelApproach(Navigator):
     """Newton steps with the true gradient at the vehicle's position: an oracle.
 
     By default, each step closes the errors of all three elements by least squares, weighted by the inverse of
-    :data:`magrl.tracking.CURVATURE`. With a pair, it is the paper's parallel approach (Eq. 3-15), which fails
+    :data:`magrl.navigators.filter.CURVATURE`. With a pair, it is the paper's parallel approach (Eq. 3-15), which fails
     where the gradients of the pair are nearly parallel.
 
     Args:

@@ -14,21 +14,26 @@ from magrl.checks import check_number, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
 from magrl.geodesy import steer
+from magrl.navigators import filter as filtering
 from magrl.navigators.base import Navigator, element_indices
+from magrl.navigators.filter import CURVATURE, PERIODS, FieldTrack, GradientPrior
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import FieldTrack, GradientPrior, Way
+from magrl.tracking import Way
+from magrl.transforms.track import displacement_of
 
 RANGE_KM = 1000.0
 """Prior standard deviation of the way to the destination along each axis [km]."""
+SLOW_SHARE = 0.25
+"""Share of the variance of slow errors that counts as new in each reading; chosen on random planets."""
 
 
 class QuasiNewton(Navigator):
     """Base class of quasi-Newton navigators: each move goes to where the estimated Jacobian predicts no error.
 
-    The Jacobian is that of :mod:`magrl.tracking`. The filter weighs each reading by its noise and the length of the
-    move, and each element by how well it determines the way. Without noise, the first update is Broyden's. With
-    ``search``, the way is that to the most probable destination, given that the episode has not ended at the places
-    where the vehicle has been (:func:`~magrl.tracking.aim`).
+    The filter (:mod:`magrl.navigators.filter`) weighs each reading by its noise and the length of the move, and each
+    element by how well it determines the way. Without noise, the first update is Broyden's. With ``search``, the way is
+    that to the most probable destination, given that the episode has not ended at the places where the vehicle has been
+    (:func:`~magrl.tracking.unvisited`).
 
     A subclass returns the prior of the Jacobian in :meth:`prior`.
 
@@ -40,6 +45,7 @@ class QuasiNewton(Navigator):
         zeta: arrival threshold on the objective, see :func:`~magrl.tracking.arrival_weights`.
         search: whether the episode ends at arrival, so that the destination is not where the vehicle has been; without
             it, the way is the estimated one.
+        radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.
 
     Raises:
         ValueError: for an option out of its range, fewer than two elements, or a negative standard deviation.
@@ -49,12 +55,13 @@ class QuasiNewton(Navigator):
         C. G. Broyden, A class of methods for solving nonlinear simultaneous equations, Math. Comp. 19 (1965).
 
     Example:
-        >>> class DipoleNavigator(QuasiNewton):
-        ...     def prior(self, reading, target):
-        ...         return tracking.dipole_prior(reading)
+        >>> class DipNavigator(QuasiNewton):
+        ...     def prior(self, reading, target):  # I grows southward by about 1.5 degrees per 100 km
+        ...         gradient = torch.tensor([[0.0, 0.0], [-0.015, 0.0], [0.0, 0.0]])
+        ...         return GradientPrior(gradient, torch.tensor([[0.004], [0.01], [4.0]]).expand(3, 2))
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> env.rollout(50, DipoleNavigator(50.0, 1.5))["next", "success"].any()
+        >>> env.rollout(50, DipNavigator(50.0, 1.5))["next", "success"].any()
         tensor(True)
     """
 
@@ -66,22 +73,22 @@ class QuasiNewton(Navigator):
         sensor_std: SensorStd | Sequence[float] = PERFECT,
         zeta: float = 0.01,
         search: bool = False,
+        radius_km: float | None = None,
     ) -> None:
         super().__init__(max_move_km, max_turn_rad)
         check_number(0, above=True, zeta=zeta)
         check_type(bool, search=search)
-        self.zeta, self.search = float(zeta), search
+        check_number(0, above=True, optional=True, radius_km=radius_km)
+        self.zeta, self.search, self.radius_km = float(zeta), search, radius_km
         self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
         self.elements = element_indices(elements, 2)
         self._register("sensor_std", SensorStd.of(sensor_std))
-        self._register("scales", [tracking.ELEMENT_SCALES[i] for i in self.elements])
-        self._register("periods", [tracking.ELEMENT_PERIODS[i] for i in self.elements])
-        self._register("curvature", [tracking.CURVATURE[i] for i in self.elements])
+        self._register("periods", [PERIODS[i] for i in self.elements])
+        self._register("curvature", [CURVATURE[i] for i in self.elements])
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
-        search = env.arrival.rule == "objective"  # else, an episode does not end where the objective is low
-        return {"sensor_std": sensor_std, "zeta": env.zeta, "search": search}
+        return {"sensor_std": sensor_std, "zeta": env.zeta, **search_options(env)}
 
     def _register(self, name: str, values: Sequence[Any]) -> None:
         self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
@@ -99,25 +106,18 @@ class QuasiNewton(Navigator):
         return SensorStd(*self.sensor_std).at(seen)
 
     def reading_std(self, seen: TensorDictBase) -> Tensor:
-        """Return the standard deviations of the present reading in the filter: D, I, B_H."""
-        std = self.accuracy(seen)
-        return tracking.reading_std(std.noise, std.drift)
+        """Return the standard deviations of the present reading in the filter, of the chosen elements.
 
-    def drift(self, reading: Tensor) -> Tensor:  # noqa: ARG002
-        """Return the standard deviation of the change of the Jacobian, see :func:`magrl.tracking.predict`."""
-        return self.curvature
+        Slow errors vary along the way, which the filter would take for a gradient: a share of them is noise to it.
+        """
+        std = self.accuracy(seen)
+        return torch.hypot(std.noise, SLOW_SHARE**0.5 * std.drift)[..., self.elements]
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         reading, target = (seen[key].double()[:, self.elements] for key in ("field", "target_field"))
-        std = self.reading_std(seen)[..., self.elements]
-        track = tracking.start(reading, self.prior(reading, target), std, self.scales)
+        track = filtering.start(reading, self.prior(reading, target), self.reading_std(seen))
         decisions = torch.zeros_like(seen["step_count"].squeeze(-1))
-        return {
-            "mean": track.mean,
-            "covariance": track.covariance,
-            "decisions": decisions,
-            **first_places(seen, self.zeta),
-        }
+        return {**track._asdict(), "decisions": decisions, **first_places(seen, self.zeta)}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         return self.move(self.read(seen, memory), seen, memory)
@@ -126,8 +126,7 @@ class QuasiNewton(Navigator):
         """Return the state of the filter after the present reading, and keep it in the memory."""
         before = FieldTrack(memory["mean"], memory["covariance"])
         reading, moved = seen["field"].double()[:, self.elements], displacement(seen)
-        std = self.reading_std(seen)[..., self.elements]
-        after = tracking.read(before, moved, reading, std, self.drift(reading), self.scales, self.periods)
+        after = filtering.read(before, moved, reading, self.reading_std(seen), self.curvature, self.periods)
         began = (memory["decisions"] == 0)[:, None, None]  # the first reading is in the track already
         mean = torch.where(began, before.mean, after.mean)
         covariance = torch.where(began.unsqueeze(-1), before.covariance, after.covariance)
@@ -136,9 +135,9 @@ class QuasiNewton(Navigator):
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad], each ``(N,)``, given the state of the filter."""
-        target, bias_std = (x[..., self.elements] for x in (seen["target_field"].double(), self.accuracy(seen).bias))
-        curvature = self.drift(tracking.estimated_field(track, self.scales))
-        way = tracking.way_to(track, target, RANGE_KM, self.scales, None, bias_std, self.periods, curvature)
+        target, bias_std = seen["target_field"].double(), self.accuracy(seen).bias.expand_as(seen["target_field"])
+        target, bias_std = target[..., self.elements], bias_std[..., self.elements]
+        way = filtering.way_to(track, target, RANGE_KM, bias_std, self.curvature, self.periods)
         aim = self.aim(track, way, seen, memory)
         return self.steer(seen, aim, aim.norm(dim=-1))
 
@@ -147,7 +146,9 @@ class QuasiNewton(Navigator):
         visit_place(seen, memory)
         if not self.search:
             return way.displacement
-        return tracking.aim(track, way, memory["visited"], memory["weights"][:, self.elements], self.scales)
+        gradient, covariance = track.mean[..., 1:], track.covariance[..., 1:, 1:]
+        ellipse = tracking.arrival_ellipse(gradient, covariance, memory["weights"][:, self.elements], self.radius_km)
+        return tracking.unvisited(way, memory["visited"], ellipse)
 
     def steer(self, seen: TensorDictBase, direction: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return distance [km] and turn [rad] of a move in a direction ``(N, 2)`` northward and eastward."""
@@ -164,7 +165,20 @@ def displacement(seen: TensorDictBase) -> Tensor:
         >>> displacement(TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]]}, 1))
         tensor([[30.,  0.]], dtype=torch.float64)
     """
-    return tracking.displacement_of(seen["move"].double(), seen["heading"].double())
+    return displacement_of(seen["move"].double(), seen["heading"].double())
+
+
+def search_options(env: GeomagneticNavEnv) -> dict[str, Any]:
+    """Return whether episodes end at arrival, so that places without an arrival are excluded, and within what distance.
+
+    Example:
+        >>> search_options(GeomagneticNavEnv(arrival="distance", seed=0))
+        {'search': True, 'radius_km': 25.0}
+    """
+    return {
+        "search": not env.arrival.declared,
+        "radius_km": env.arrival.radius_km if env.arrival.rule == "distance" else None,
+    }
 
 
 def first_places(seen: TensorDictBase, zeta: float) -> dict[str, Tensor]:

@@ -13,9 +13,9 @@ from torch import Tensor
 from magrl import tracking
 from magrl.checks import check_number, check_numbers
 from magrl.field.elements import NAMES
+from magrl.navigators.filter import FieldTrack, GradientPrior
 from magrl.navigators.quasi_newton import QuasiNewton
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import FieldTrack, GradientPrior
 
 SHORTEST_PROBE_KM = 0.5
 """Length of a probing leg with perfect sensors [km]: the rounding of float32 readings does not matter there."""
@@ -82,7 +82,7 @@ class Secant(QuasiNewton):
 
     def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
         std = reading.new_tensor([tracking.SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
-        return GradientPrior(reading.new_zeros(*reading.shape, 2), std, torch.zeros_like(reading[:, 0]))
+        return GradientPrior(torch.zeros_like(std), std)
 
     def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
         distance, turn = super().move(track, seen, memory)

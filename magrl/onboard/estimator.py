@@ -1,4 +1,4 @@
-"""The estimates of a vehicle: of the filter that its policy observes, or of one beside its navigator."""
+"""The estimates of a vehicle: of the belief that its policy observes, or of one beside its navigator."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from torchrl.envs import Compose
 from magrl import tracking
 from magrl.onboard.limits import view_of
 from magrl.sensor_std import STD_KEYS, SensorStd
-from magrl.tracking import ArrivalDecision, FieldTrack
-from magrl.transforms import NoiseScale, TrackGradient, TrackView
-from magrl.transforms.track import TRACK_KEYS
+from magrl.tracking import RANGE_KM, ArrivalDecision, Belief, DestinationPosterior
+from magrl.transforms import TrackField, TrackView
+from magrl.transforms.errors.known_start import START_KEYS
+from magrl.transforms.track import POSTERIOR_KEYS, belief_of
 
 
 class Estimator:
-    """The estimates of one vehicle, by the filter of :func:`~magrl.evaluation.scenarios.with_declaration`.
+    """The estimates of one vehicle, as of :func:`~magrl.evaluation.scenarios.with_declaration`.
 
-    A trained policy that reads its own track observes this filter. Beside any other navigator it runs on its own.
+    A policy with a :class:`~magrl.transforms.TrackView` observes them. Beside any other navigator they stand alone.
 
     Args:
         navigator: policy or navigator.
@@ -32,10 +33,13 @@ class Estimator:
     """
 
     def __init__(self, navigator: Any) -> None:
-        self.navigator = navigator
-        self.trained = isinstance(view_of(navigator), TrackView)
-        self.observe = navigator.observe if self.trained else Compose(TrackGradient(std_keys=STD_KEYS))
-        self.noise = NoiseScale()
+        self.navigator, view = navigator, view_of(navigator)
+        self.tracked = isinstance(view, TrackView)
+        self.trained = self.tracked and navigator.config.num_cells is not None
+        self.range_km = view.range_km if isinstance(view, TrackView) else RANGE_KM
+        track = TrackField(std_keys=STD_KEYS, estimate_noise=True, range_km=self.range_km)
+        observed = view.observation_transforms(tracked=True) if isinstance(view, TrackView) else []
+        self.observe = Compose(track, *observed)
         self.state: Any = None
 
     def act(self, seen: TensorDictBase) -> list[float]:
@@ -45,11 +49,8 @@ class Estimator:
             seen: public keys and standard deviations after a move, in a batch of one.
         """
         now = seen.copy()
-        if self.state is None:
-            self.state = self.observe(self.noise(now))
-        else:
-            self.state = self.observe(self.noise(self.state.set("next", now)))["next"]
-        if self.trained:
+        self.state = self.observe(now) if self.state is None else self.observe(self.state.set("next", now))["next"]
+        if self.tracked:
             action = self.navigator.act.denormalize("action", self.navigator.actor(self.state)["action"])
         else:
             action = self.navigator(self.state)["action"]
@@ -57,18 +58,31 @@ class Estimator:
 
     def decide(self, seen: TensorDictBase, steps_left: Tensor, radius_km: float) -> ArrivalDecision:
         """Return the decision about the arrival, in a batch of one; see :func:`magrl.tracking.arrival_decision`."""
-        target = seen["target_field"]
-        std = SensorStd.read(seen)._replace(noise=self.state["sensor_std"])
-        track = FieldTrack(*(self.state[key].to(target.dtype) for key in TRACK_KEYS))
-        return tracking.arrival_decision(track, target, *std, steps_left, radius_km)
+        goal = tracking.destination(self.belief, seen["target_field"], self.range_km)
+        return tracking.arrival_decision(goal, self.posterior, SensorStd.read(self.state), steps_left, radius_km)
 
     @property
-    def track(self) -> FieldTrack:
-        """State of the filter after the last reading."""
-        return FieldTrack(*(self.state[key][0] for key in TRACK_KEYS))
+    def belief(self) -> Belief:
+        """What is known of the field after the last reading, in a batch of one."""
+        return belief_of(self.state)
+
+    @property
+    def posterior(self) -> DestinationPosterior:
+        """Where the destination is, in a batch of one."""
+        return DestinationPosterior(*(self.state[key] for key in POSTERIOR_KEYS))
 
     def surprise(self, seen: TensorDictBase) -> float:
-        """Return how badly a reading fits the track before it, see :func:`magrl.tracking.surprise`."""
-        displacement = tracking.displacement_of(seen["move"], seen["heading"])[0]
-        std = tracking.reading_std(seen["sensor_std"], seen["drift_std"])[0]
-        return tracking.surprise(self.track, displacement, seen["field"][0], std)
+        """Return the normalized square of the innovation of a reading, over the number of elements: 1 on average where
+        the belief is right."""
+        course, errors = seen["heading"].squeeze(-1), SensorStd.read(seen)
+        reading = seen["field"] + seen.get(START_KEYS[0], 0.0)  # as it was read
+        belief = tracking.moved(self.belief, seen["move"][..., 0], course, errors)
+        return tracking.innovation(belief, reading, errors.noise, course).square().item() / 3
+
+    @property
+    def steepest_inclination(self) -> float:
+        """Return the greatest gradient that the inclination may have: the estimate and two standard deviations
+        [deg / 100 km]."""
+        local = tracking.elements(self.belief)
+        spread = local.covariance[0, 1, 1:, 1:].diagonal().sum().sqrt()
+        return 100 * (local.gradient[0, 1].norm() + 2 * spread).item()

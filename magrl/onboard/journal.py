@@ -59,7 +59,7 @@ class Options(CheckedModel):
     Args:
         sensor_std: accuracy of the sensors, a :class:`~magrl.sensor_std.SensorStd`; three numbers are white noise of
             D [deg], I [deg], B_H [nT]. A noise that is not 0 is corrected by what the readings show
-            (:class:`~magrl.transforms.NoiseScale`). The drift is what a known start does not show, and what readings
+            (:class:`~magrl.transforms.TrackField`). The drift is what a known start does not show, and what readings
             average in part.
         max_move_km: longest move; 50 km, or for a trained policy that of its training.
         max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.

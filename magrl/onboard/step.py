@@ -13,14 +13,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from magrl import tracking
 from magrl.agents.policy import FieldPolicy
 from magrl.checks import check_tensor, check_type
-from magrl.sensor_std import STD_KEYS
+from magrl.sensor_std import STD_KEYS, SensorStd
+from magrl.tracking import Belief
+from magrl.tracking.belief import STATES
 from magrl.transforms import TrackView
-from magrl.transforms.track import IN_KEYS
+from magrl.transforms.track import BELIEF_KEYS, TRACK_KEYS, tracked
 
 _FLOAT32 = 1  # number of the type in ONNX
-ONNX_INPUTS = ("field", "target_field", "course", "accuracy", "step", "mean", "covariance", "first_field")
+ONNX_INPUTS = ("field", "target_field", "course", "accuracy", "step", *BELIEF_KEYS, "first_field")
 """Names of the tensors that a step takes, in ONNX: see :meth:`VehicleStep.forward`."""
 ONNX_OUTPUTS = ("action", "way", "way_covariance", *(f"next_{name}" for name in ONNX_INPUTS[4:]))
 """Names of the tensors that it returns."""
@@ -31,12 +34,13 @@ class StepState(NamedTuple):
 
     Example:
         >>> StepState._fields
-        ('step', 'mean', 'covariance', 'first_field')
+        ('step', 'belief_mean', 'belief_covariance', 'belief_latitude', 'first_field')
     """
 
     step: Tensor
-    mean: Tensor
-    covariance: Tensor
+    belief_mean: Tensor
+    belief_covariance: Tensor
+    belief_latitude: Tensor
     first_field: Tensor
 
 
@@ -44,11 +48,13 @@ def first_state() -> StepState:
     """Return the state before the first step.
 
     Example:
-        >>> first_state().covariance.shape
-        torch.Size([3, 3, 3])
+        >>> first_state().belief_covariance.shape
+        torch.Size([25, 25])
     """
-    eye = torch.eye(3, dtype=torch.float64)
-    return StepState(torch.tensor(0), 0 * eye, eye.expand(3, 3, 3).clone(), torch.zeros(3))
+    eye = torch.eye(STATES, dtype=torch.float64)
+    field = torch.tensor([20000.0, 0.0, 40000.0], dtype=torch.float64)  # any, but a possible one
+    mean = torch.cat((field, torch.zeros_like(eye[0, 3:])))
+    return StepState(torch.tensor(0), mean, eye, torch.zeros_like(eye[0, :1]), torch.zeros(3))
 
 
 class VehicleStep(nn.Module):
@@ -65,7 +71,7 @@ class VehicleStep(nn.Module):
     Example:
         >>> from magrl.agents import load_pretrained
         >>> act = VehicleStep(load_pretrained("anywhere"))
-        >>> here, there, exact = torch.tensor([3.5, 73, 15000]), torch.tensor([-11.6, 75.4, 13240]), torch.zeros(3, 3)
+        >>> here, there, exact = torch.tensor([3.5, 73, 15000]), torch.tensor([-11.6, 75.4, 13240]), torch.zeros(4, 3)
         >>> action, way, covariance, *state = act(here, there, torch.zeros(2), exact, *first_state())
         >>> action.shape, state[0]
         (torch.Size([2]), tensor(1))
@@ -77,8 +83,9 @@ class VehicleStep(nn.Module):
         view = policy.config.view
         if not isinstance(view, TrackView):
             raise ValueError(f"the policy must read its own track (TrackView), got {view}")
-        alone = FieldPolicy(replace(policy.config, view=replace(view, search=False)), policy.actor)
-        self.observe, self.act, self.actor = alone.observe, alone.act, alone.actor
+        self.view = replace(view, search=False)
+        alone = FieldPolicy(replace(policy.config, view=self.view), policy.actor)
+        self.observe, self.act, self.actor = alone.observe_tracked, alone.act, alone.actor
 
     def forward(
         self,
@@ -87,8 +94,9 @@ class VehicleStep(nn.Module):
         course: Tensor,
         accuracy: Tensor,
         step: Tensor,
-        mean: Tensor,
-        covariance: Tensor,
+        belief_mean: Tensor,
+        belief_covariance: Tensor,
+        belief_latitude: Tensor,
         first_field: Tensor,
     ) -> tuple[Tensor, ...]:
         """Return what to do after a move, the estimates, and the next state.
@@ -97,32 +105,35 @@ class VehicleStep(nn.Module):
             field: ``(3,)`` reading of D [deg], I [deg], B_H [nT] after the move.
             target_field: ``(3,)`` the same at the destination.
             course: ``(2,)`` distance [km] and heading [rad] of the move; in the first step 0 and the heading.
-            accuracy: ``(3, 3)`` standard deviations of noise, bias and drift, in the units of the reading
+            accuracy: ``(4, 3)`` standard deviations of noise, bias, drift and iron
                 (:class:`~magrl.sensor_std.SensorStd`).
-            step: ``()`` int64, and with the next three the :class:`StepState`.
-            mean: ``(3, 3)`` mean of the filter, float64.
-            covariance: ``(3, 3, 3)`` covariance of the filter, float64.
+            step: ``()`` int64, and with the next four the :class:`StepState`.
+            belief_mean: ``(25,)`` mean of the belief, float64.
+            belief_covariance: ``(25, 25)`` its covariance, float64.
+            belief_latitude: ``(1,)`` its reference latitude, float64.
             first_field: ``(3,)`` first reading.
 
         Returns:
-            Distance [km] and turn [rad] ``(2,)``, the way to the destination forward and to the right ``(2,)`` [km],
+            Distance [km] and turn [rad] ``(2,)``, the way to the destination northward and eastward ``(2,)`` [km],
             its covariance ``(2, 2)`` [km^2], and the parts of the next state.
         """
-        check_tensor(3, 3, accuracy=accuracy)
-        distance, heading = course.split(1)
-        values = field, target_field, torch.cat((distance, torch.zeros_like(distance))), heading
-        read = dict(zip(IN_KEYS, values, strict=True)) | dict(zip(STD_KEYS, accuracy.unbind(), strict=True))
-        rows = {key: value.unsqueeze(0) for key, value in read.items()}
-        seen = TensorDict({**rows, "step_count": step.reshape(1, 1)}, [1])
-        state = {"track_mean": mean, "track_covariance": covariance, "first_field": first_field}
-        before = TensorDict({key: value.unsqueeze(0) for key, value in state.items()}, [1])
-        started, moved = self.observe(seen.copy()), self.observe(before.set("next", seen.copy()))["next"]
-        observed = tuple(self.actor.in_keys)
-        keys = *observed, "way", "way_covariance", *state
-        now = {key: torch.where(step == 0, started[key], moved[key]) for key in keys}
-        action = self.actor(TensorDict({key: now[key] for key in observed}, [1]))["action"]
-        action = self.act.denormalize("action", action)
-        return action[0], *(now[key][0] for key in ("way", "way_covariance")), step + 1, *(now[key][0] for key in state)
+        check_tensor(4, 3, accuracy=accuracy)
+        (distance, heading), errors = course, SensorStd(*accuracy)
+        crust_nt = self.view.crust_nt
+        begun = tracking.start(field, errors, heading, crust_nt)
+        before = Belief(belief_mean, belief_covariance, belief_latitude[0])
+        after = tracking.read(tracking.moved(before, distance, heading, errors), field, errors.noise, heading, crust_nt)
+        starts = step == 0
+        belief = Belief(*(torch.where(starts, new, old) for new, old in zip(begun, after, strict=True)))
+        now = dict(zip(TRACK_KEYS, tracked(belief, target_field, self.view.range_km, crust_nt), strict=True))
+        now |= dict(zip(STD_KEYS, errors, strict=True)) | {"field": field, "target_field": target_field}
+        now |= {"heading": heading.reshape(1), "step_count": step.reshape(1)}
+        first = {"first_field": torch.where(starts, field, first_field).unsqueeze(0)}
+        batch = TensorDict({key: value.unsqueeze(0) for key, value in now.items()}, [1])
+        observed = self.observe(TensorDict(first, [1]).set("next", batch))["next"]
+        action = self.act.denormalize("action", self.actor(observed)["action"])
+        state = (observed[key][0] for key in (*BELIEF_KEYS, "first_field"))
+        return action[0], observed["way"][0], observed["way_covariance"][0], step + 1, *state
 
 
 def write_step(path: Path | str, policy: FieldPolicy) -> None:
@@ -150,8 +161,9 @@ def write_step(path: Path | str, policy: FieldPolicy) -> None:
     if Path(path).suffix not in (".pt2", ".onnx"):
         raise ValueError(f"a file of a step must end with .pt2 or .onnx, got {str(path)!r}")
     module = VehicleStep(copy.deepcopy(policy).cpu()).eval()
-    examples = torch.zeros(3), torch.ones(3), torch.zeros(2), torch.zeros(3, 3)
+    examples = torch.ones(3), torch.ones(3), torch.zeros(2), torch.zeros(4, 3)
     with torch.no_grad():
+        module(*examples, *first_state())  # computes the constants of the model, which are no part of the step
         exported = torch.export.export(module, (*examples, *first_state()), strict=False)
     if Path(path).suffix == ".onnx":
         content = _onnx(exported)

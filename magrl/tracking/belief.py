@@ -1,4 +1,19 @@
-"""How well readings fit the track, what this says of their noise, and how steep the field may be."""
+"""What a vehicle knows of the field around it: one normal distribution, and how moves and readings change it.
+
+The state has the local coefficients of the field's potential to degree 3 (:mod:`~magrl.tracking.harmonics`, the first
+three are the field itself), the offset of the latitude from a reference that is dead-reckoned (true north turns along
+the way, by tan(latitude) / R for each kilometer eastward), and the errors of the readings of D, I, B_H: constant ones,
+slow ones, which vary along the way as a first-order Gauss-Markov process, and a field that turns with the vehicle,
+such as that of hard iron. Both steps are those of a Kalman filter:
+
+- A move along a great circle is linear in the coefficients, c' = Turn(gamma) exp(X) c, where X = n (d_x + T_N / M) + e
+  (d_y + T_E / N) has the generators of translations, with the degrees above 3 as their regression, and of the turns of
+  the vertical over the radii of curvature M and N. Gamma is by how much azimuths become larger along the great circle.
+- A reading measures the field: D, I, B_H are a vector in the local axes, and their errors are carried over to it by
+  the Jacobian at the reading. So nothing is linearized but errors.
+
+All functions batch over leading dimensions.
+"""
 
 from __future__ import annotations
 
@@ -7,165 +22,345 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from magrl.checks import check_tensor
-from magrl.tracking.filter import (
-    ELEMENT_PERIODS,
-    ELEMENT_SCALES,
-    VARIANCE_FLOOR,
-    FieldTrack,
-    PerElement,
-    _units,
-    _variance,
-    continued,
-    estimated_field,
-    predict,
-)
-from magrl.tracking.planning import MISSING_KM, SLOPES
-from magrl.tracking.priors import field_curvature
-from magrl.tracking.track import reading_std
+from magrl.field.elements import elements_jacobian, field_vector, measured_elements
+from magrl.geodesy import curvature_radii
+from magrl.sensor_std import PERFECT, SensorStd
+from magrl.tracking.harmonics import UNIT_KM, arc, generators, size, turning
+from magrl.tracking.prior import DEGREE, closure, expected
 
-# Chosen on random planets.
-SHEET_READINGS = 4.0
-"""Number of readings that count as much as the data sheet, where its noise is estimated."""
-SHARED = 0.5
-"""Weight of an element's readings in the estimates of the other elements."""
-DEAD_BAND = 0.4
-"""Deviation of the logarithm of the variance up to which the data sheet is kept; beyond, it is subtracted."""
-LARGEST_SCORE = 8.0
-"""Largest evidence of one element in a reading, that of three standard deviations: a spike counts no more."""
-LARGEST_RATIO = 64.0
-"""Largest ratio of the variances: with the dead band, the standard deviation is scaled by at most 6.5."""
+COEFFICIENTS = size(DEGREE)
+"""Number of coefficients of a belief; the latitude's offset [rad] has this index in the state."""
+CONSTANT = slice(COEFFICIENTS + 1, COEFFICIENTS + 4)
+"""Constant errors of D, I [deg], B_H [nT] in the state."""
+SLOW = slice(COEFFICIENTS + 4, COEFFICIENTS + 7)
+"""Slow errors of D, I [deg], B_H [nT] in the state."""
+IRON = slice(COEFFICIENTS + 7, COEFFICIENTS + 10)
+"""Errors that turn with the vehicle, such as hard iron: forward, to the right and downward [nT] in the state."""
+STATES = COEFFICIENTS + 10
+"""Number of states."""
+LASTING_KM = 30.0
+"""Correlation length of slow errors [km]: for a ship, an hour of magnetic weather; chosen on random planets, under the
+conditions of four vehicles."""
+MODEL_NT = 2.0
+"""Standard deviation of the field by what the model leaves out, in each axis [nT]: .1 to .8 after six moves of 50 km on
+random planets, and more after many."""
 
 
-class NoiseEstimate(NamedTuple):
-    """Logarithm ``(..., E)`` of the variance of the noise over that of the data sheet, and the effective number
-    ``(..., E)`` of readings from which it is known.
+class Belief(NamedTuple):
+    """Mean ``(..., S)`` and covariance ``(..., S, S)`` of the state, and the reference latitude ``(...)`` [deg].
 
     Example:
-        >>> NoiseEstimate(torch.tensor([0.3, 1.8]), torch.tensor([9.0, 9.0])).factor.round(decimals=2)
-        tensor([1.0000, 2.0100])
+        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
+        >>> belief.mean.shape, round(float(belief.latitude))
+        (torch.Size([25]), 40)
     """
 
-    log_ratio: Tensor
-    readings: Tensor
+    mean: Tensor
+    covariance: Tensor
+    latitude: Tensor
 
     @property
-    def factor(self) -> Tensor:
-        """Factor ``(..., E)`` of the standard deviation on the data sheet; 1 within :data:`DEAD_BAND`."""
-        beyond = (self.log_ratio.abs() - DEAD_BAND).clamp_min(0)
-        return (self.log_ratio.sign() * beyond / 2).exp()
+    def field(self) -> Tensor:
+        """Expected field ``(..., 3)`` north, east, down [nT]."""
+        return self.mean[..., :3]
 
 
-def noise_estimate(
-    before: NoiseEstimate,
-    track: FieldTrack,
-    displacement: Tensor,
+class Innovation(NamedTuple):
+    """A reading minus its prediction: residual ``(..., 3)`` of D, I [deg], B_H [nT], the derivatives ``(..., 3, S)`` of
+    the prediction with respect to the state, and the residual's covariance ``(..., 3, 3)``. An element that is missing
+    has a residual of 0, rows of 0 and a variance of 1.
+
+    Example:
+        >>> Innovation(torch.zeros(3), torch.zeros(3, 25), torch.eye(3)).square()
+        tensor(0.)
+    """
+
+    residual: Tensor
+    rows: Tensor
+    covariance: Tensor
+
+    def square(self) -> Tensor:
+        """Return the normalized square ``(...)``: where the belief is right, chi-square of the elements present."""
+        return (self.residual.unsqueeze(-2) @ inverse3(self.covariance) @ self.residual.unsqueeze(-1)).squeeze((-2, -1))
+
+
+def start(reading: Tensor, errors: SensorStd, heading: Tensor | None = None, crust_nt: float = 0.0) -> Belief:
+    """Return the belief after a first reading.
+
+    Args:
+        reading: ``(..., 3)``: D [deg], I [deg], B_H [nT].
+        errors: accuracy of the readings, tensors ``(..., 3)``.
+        heading: ``(...)`` [rad, clockwise from true north]; None without errors that turn with the vehicle.
+        crust_nt: standard deviation of the crust's field in each axis [nT].
+
+    Example:
+        >>> start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.zeros(3))).covariance.shape
+        torch.Size([25, 25])
+    """
+    return read(before(reading, errors), reading, torch.as_tensor(errors.noise), heading, crust_nt)
+
+
+def before(near: Tensor, errors: SensorStd) -> Belief:
+    """Return the belief before any reading, where the elements are about ``near``; other arguments as :func:`start`.
+
+    Where the start's true elements are known: ``read(known(before(elements, errors), elements, std), reading, ...)``.
+
+    Example:
+        >>> before(torch.tensor([3.0, 65.0, 18000.0]), PERFECT).mean.shape
+        torch.Size([25])
+    """
+    check_tensor(3, near=near)
+    near = near.double()
+    mean, covariance = expected(field_vector(near))
+    constant, slow, iron = (kind.expand(*near.shape, 3) for kind in lasting_covariances(mean[..., :3], errors))
+    count = STATES - COEFFICIENTS - 1
+    variances = sum(
+        pad(kind, (part.start, STATES - part.stop) * 2)
+        for kind, part in zip((constant, slow, iron), (CONSTANT, SLOW, IRON), strict=True)
+    )
+    latitude = torch.rad2deg(mean[..., -1])
+    return Belief(pad(mean[..., :-1], (0, count + 1)), pad(covariance, (0, count, 0, count)) + variances, latitude)
+
+
+def lasting_covariances(field: Tensor, errors: SensorStd) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the covariances ``(..., 3, 3)`` of constant and slow errors of D, I [deg], B_H [nT], and of iron along
+    the vehicle's axes [nT^2].
+
+    The stated drift contains the effect of the iron on the elements, as a mean over the headings. Slow errors of the
+    field vector, such as magnetic weather, have a part along magnetic north, which changes B_H by that and I by -sin(I)
+    of it over the total intensity, and a downward part, which changes I by cos(I) of it over the same. Where both have
+    the same size, the correlation of I and B_H is -sin(I).
+
+    Args:
+        field: ``(..., 3)`` north, east, down [nT].
+        errors: accuracy of the readings, tensors ``(..., 3)``.
+
+    Example:
+        >>> errors = SensorStd(bias=torch.tensor([0.5, 0.0, 0.0]), drift=torch.tensor([0.3, 0.0, 0.0]))
+        >>> lasting_covariances(torch.tensor([20000.0, 0.0, 30000.0]), errors)[0].diagonal()
+        tensor([0.1600, 0.0000, 0.0000], dtype=torch.float64)
+    """
+    bias, drift, iron = (torch.as_tensor(std).to(field.device, torch.float64).square() for std in errors[1:])
+    level = iron[..., :2].mean(-1)
+    axes = torch.stack((level, level, iron[..., 2]), -1)
+    spread = elements_jacobian(field.double()).square() @ axes.unsqueeze(-1)
+    slow = torch.diag_embed((drift - spread.squeeze(-1)).clamp_min(0))
+    sin = field[..., 2].double() / field.double().norm(dim=-1)
+    shared = -sin * (slow[..., 1, 1] * slow[..., 2, 2]).sqrt()
+    slow[..., 1, 2], slow[..., 2, 1] = shared, shared
+    return torch.diag_embed((bias - drift).clamp_min(0)), slow, torch.diag_embed(iron)
+
+
+def moved(belief: Belief, distance: Tensor, course: Tensor, errors: SensorStd = PERFECT) -> Belief:
+    """Return the belief after a move, before the reading at its end.
+
+    Args:
+        belief: that before the move.
+        distance: ``(...)`` [km], to about 200; divide longer moves.
+        course: ``(...)`` at the start of the move [rad, clockwise from true north].
+        errors: accuracy of the readings, tensors ``(..., 3)``.
+
+    Example:
+        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
+        >>> further = moved(belief, torch.tensor(50.0), torch.tensor(0.0))
+        >>> (further.field - belief.field).round()  # northward by 50 km
+        tensor([-157.,   -0.,  267.], dtype=torch.float64)
+    """
+    distance, course = distance.double(), course.double()
+    latitude = torch.deg2rad(belief.latitude)
+    sin, cos = torch.sin(latitude), torch.cos(latitude)
+    north, east = distance * torch.cos(course), distance * torch.sin(course)
+    middle = belief.latitude + torch.rad2deg(north / curvature_radii(belief.latitude)[0]) / 2
+    meridian, vertical = curvature_radii(middle)
+    angles = north / meridian, east / vertical
+    turn = arc(sin, cos, *angles)
+    matrix = turning(turn.cos_turn, turn.sin_turn, DEGREE) @ _carry(north / UNIT_KM, east / UNIT_KM, *angles)
+    column = matrix @ belief.mean[..., :COEFFICIENTS, None]
+    column = turn.slope[..., None, None] * (generators(DEGREE).turn[2].to(column) @ column)
+    rise = turn.sin * cos - turn.cos * sin  # sine of the change of the latitude
+    after = belief.latitude + torch.rad2deg(rise * (1 + rise * rise / 6))
+    kept, ones = torch.exp(-distance / LASTING_KM).unsqueeze(-1), torch.ones_like(belief.mean)
+    parts = 0 * ones[..., :COEFFICIENTS], turn.rate.unsqueeze(-1), ones[..., CONSTANT], kept * ones[..., SLOW]
+    rest = belief.mean.shape[-1] - COEFFICIENTS
+    step = torch.diag_embed(torch.cat((*parts, ones[..., IRON]), -1))
+    step = step + pad(torch.cat((matrix, column), -1), (0, rest - 1, 0, rest))
+    noise = pad(closure().drift.to(step), (0, rest, 0, rest)) * (distance / UNIT_KM).square()[..., None, None]
+    fresh = (1 - kept.square()).unsqueeze(-1) * lasting_covariances(belief.field, errors)[1]
+    noise = noise + pad(fresh, (SLOW.start, STATES - SLOW.stop) * 2)
+    mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
+    return Belief(mean, step @ belief.covariance @ step.mT + noise, after)
+
+
+def innovation(
+    belief: Belief,
     reading: Tensor,
     sensor_std: Tensor,
-    drift_std: Tensor,
-) -> NoiseEstimate:
-    """Return the estimate of the noise of D, I, B_H after another reading.
-
-    With the variance ``S = P + R + slow errors`` of the innovation ν, ``ν^2 / S - 1`` is 0 on average where R, with the
-    estimate so far, is right. The logarithm of R moves by it with the weight ``(R / S)^2``, over the sum of these
-    weights and of :data:`SHEET_READINGS`: an innovation that comes from an unknown gradient says little of the noise.
-    Elements share a part of the evidence (:data:`SHARED`), as a data sheet is often wrong for all of them. An element
-    without noise, or with so much that its reading is missing (:data:`~magrl.tracking.planning.MISSING_KM`), gives no
-    evidence.
+    heading: Tensor | None = None,
+    crust_nt: float = 0.0,
+    errors: bool = True,
+) -> Innovation:
+    """Return a reading minus what the belief predicts; arguments as those of :func:`read`.
 
     Args:
-        before: estimate before the reading; zeros at the start.
-        track: state of the filter before the move.
-        displacement: ``(..., 2)`` northward and eastward [km].
-        reading: ``(..., 3)`` at its end.
-        sensor_std: ``(..., 3)`` standard deviations of its noise on the data sheet.
-        drift_std: ``(..., 3)`` those of slow errors.
-
-    Raises:
-        ValueError: for shapes that do not match.
-
-    Source:
-        R. K. Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Transactions on Automatic
-        Control 15 (1970): noise from innovations, here recursively and for one track.
+        belief: that before the reading.
+        reading: ``(..., 3)``.
+        sensor_std: ``(..., 3)``.
+        heading: ``(...)`` [rad].
+        crust_nt: standard deviation of the crust's field [nT].
+        errors: whether the reading has the errors of the state; the true elements of a known place have not.
 
     Example:
-        >>> track = FieldTrack(torch.zeros(3, 3), torch.zeros(3, 3, 3))
-        >>> none, std = torch.zeros(3), torch.tensor([0.3, 1.5, 100.0])
-        >>> reading = torch.tensor([0.6, 1.5, 100.0])  # D deviates by two standard deviations
-        >>> noise_estimate(NoiseEstimate(none, none), track, torch.zeros(2), reading, std, none)
-        NoiseEstimate(log_ratio=tensor([0.5000, 0.2500, 0.2500]), readings=tensor([2., 2., 2.]))
+        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
+        >>> reading, std = torch.tensor([3.5, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0])
+        >>> innovation(belief, reading, std).residual.round(decimals=1)
+        tensor([0.5000, -0.0000, 0.7000], dtype=torch.float64)
     """
-    check_tensor(3, reading=reading, sensor_std=sensor_std, drift_std=drift_std)
-    innovation, variance, unit = _innovation(track, displacement, reading, ELEMENT_SCALES)
-    noise = (sensor_std / unit).square() * before.log_ratio.exp()
-    slow = reading_std(torch.zeros_like(drift_std), drift_std) / unit
-    total = variance + noise + slow.square()
-    known = (sensor_std > 0) & (sensor_std / sensor_std.new_tensor(SLOPES) < MISSING_KM)
-    weight = torch.where(known, noise / total, 0.0).square()
-    score = (weight * (innovation.square() / total - 1)).clamp_max(LARGEST_SCORE).where(known, 0.0)
-    score, weight = (SHARED * x.sum(-1, keepdim=True) + (1 - SHARED) * x for x in (score, weight))
-    readings = before.readings + weight
-    limit = math.log(LARGEST_RATIO)
-    log_ratio = before.log_ratio + score / (SHEET_READINGS + readings)
-    return NoiseEstimate(log_ratio.clamp(-limit, limit), readings)
+    check_tensor(3, reading=reading, sensor_std=sensor_std)
+    reading, sensor_std = reading.double(), sensor_std.double()
+    present = (sensor_std < math.inf) & (reading == reading)
+    vector = field_vector(torch.where(present, reading, _elements(belief.field)))
+    jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(vector), 0.0)
+    rows = pad(jacobian, (0, COEFFICIENTS - 2))
+    if errors:
+        own, course = (
+            torch.diag_embed(present.double()),
+            torch.zeros_like(reading[..., 0]) if heading is None else heading,
+        )
+        turn = turning(torch.cos(course.double()), torch.sin(course.double()), 1)  # forward, right, down
+        rows = torch.cat((rows, own, own, jacobian @ turn), -1)
+    rows = pad(rows, (0, belief.mean.shape[-1] - rows.shape[-1]))
+    residual = (jacobian @ vector.unsqueeze(-1) - rows @ belief.mean.unsqueeze(-1)).squeeze(-1)
+    variance = torch.where(present, sensor_std, 1.0).square()
+    noise = torch.diag_embed(variance) + (MODEL_NT**2 + crust_nt**2) * jacobian @ jacobian.mT
+    return Innovation(residual, rows, rows @ belief.covariance @ rows.mT + noise)
 
 
-def surprise(
-    track: FieldTrack,
-    displacement: Tensor,
-    reading: Tensor,
-    sensor_std: PerElement,
-    scales: PerElement = ELEMENT_SCALES,
-) -> float:
-    """Return the mean over D, I, B_H of the squared innovation of a reading over its variance S.
+def updated(belief: Belief, new: Innovation) -> Belief:
+    """Return the belief given an innovation: mean x + K r and covariance P - K H P.
 
-    It is 1 on average where the filter is right. The noise has the floor :data:`~magrl.tracking.VARIANCE_FLOOR`.
+    Example:
+        >>> belief = before(torch.tensor([3.0, 65.0, 18000.0]), PERFECT)
+        >>> updated(belief, innovation(belief, torch.tensor([4.0, 65.0, 18000.0]), torch.ones(3))).mean.shape
+        torch.Size([25])
+    """
+    cross = belief.covariance @ new.rows.mT
+    gain = cross @ inverse3(new.covariance)
+    mean = belief.mean + (gain @ new.residual.unsqueeze(-1)).squeeze(-1)
+    covariance = belief.covariance - gain @ cross.mT
+    return Belief(mean, (covariance + covariance.mT) / 2, belief.latitude)  # else, what is not symmetric grows
+
+
+def read(
+    belief: Belief, reading: Tensor, sensor_std: Tensor, heading: Tensor | None = None, crust_nt: float = 0.0
+) -> Belief:
+    """Return the belief after a reading.
 
     Args:
-        track: state of one vehicle before the move.
-        displacement: ``(2,)`` northward and eastward [km].
-        reading: ``(3,)`` at its end.
-        sensor_std: standard deviations of its noise, as in :func:`~magrl.tracking.update`.
-        scales: those of :func:`~magrl.tracking.start`.
+        belief: that before the reading.
+        reading: ``(..., 3)``: D [deg], I [deg], B_H [nT]; NaN for an element that is missing.
+        sensor_std: ``(..., 3)`` standard deviation of the errors that are new in it; infinite for a missing element.
+        heading: ``(...)`` [rad, clockwise from true north] of the vehicle, where the state has iron.
+        crust_nt: standard deviation of the crust's field in each axis [nT], new in each reading.
 
     Example:
-        >>> track = FieldTrack(torch.zeros(3, 3), 3.0 * torch.eye(3).expand(3, 3, 3))
-        >>> surprise(track, torch.zeros(2), torch.tensor([0.0, 6.0, 0.0]), (0.3, 1.5, 100.0))  # 4^2 over 3 + 1, and 0
-        1.3333333333333333
+        >>> belief = before(torch.tensor([3.0, 65.0, 18000.0]), PERFECT)
+        >>> read(belief, torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0])).field.round()
+        tensor([17975.,   942., 38601.], dtype=torch.float64)
     """
-    track = FieldTrack(*(tensor.double() for tensor in track))
-    innovation, variance, unit = _innovation(track, displacement, reading, scales)
-    usual = _units(track, ELEMENT_SCALES)
-    noise = _variance(sensor_std, usual).clamp_min(VARIANCE_FLOOR)
-    return (innovation.square() / (variance + noise * (usual / unit).square())).mean().item()
+    return updated(belief, innovation(belief, reading, sensor_std, heading, crust_nt))
 
 
-def steepest(track: FieldTrack, element: int, scales: PerElement = ELEMENT_SCALES) -> float:
-    """Return the greatest gradient that an element may have: the estimate and two standard deviations.
+def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: float = 0.0) -> Belief:
+    """Return the belief given the true elements of the place, which have none of the errors of a reading.
 
     Args:
-        track: state of one vehicle.
-        element: number of the element.
-        scales: those of :func:`~magrl.tracking.start`.
-
-    Returns:
-        Gradient [element unit / 100 km].
+        belief: that before.
+        elements: ``(..., 3)``: D [deg], I [deg], B_H [nT], of a map or a pier.
+        std: ``(..., 3)`` their standard deviation.
+        crust_nt: standard deviation of the crust's field in each axis [nT], where the map has none.
 
     Example:
-        >>> track = FieldTrack(torch.tensor([[0.0, 3.0, 4.0]]), torch.eye(3).unsqueeze(0))
-        >>> steepest(track, 0, scales=(1.0,))
-        7.0
+        >>> here = torch.tensor([3.0, 65.0, 18000.0])
+        >>> belief = known(before(here, SensorStd(bias=torch.ones(3))), here, torch.full((3,), 0.01))
+        >>> belief = read(belief, here + torch.tensor([0.8, 0.0, 0.0]), torch.full((3,), 0.01))
+        >>> belief.mean[CONSTANT].round(decimals=1)  # the compass is off by 0.8 degrees
+        tensor([0.8000, -0.0000, 0.2000], dtype=torch.float64)
     """
-    largest = torch.linalg.eigvalsh(track.covariance[element, 1:, 1:].double())[-1].clamp_min(0).sqrt()
-    return ((track.mean[element, 1:].norm() + 2 * largest) * _units(track, scales)[element]).item()
+    return updated(belief, innovation(belief, elements, std, None, crust_nt, errors=False))
 
 
-def _innovation(
-    track: FieldTrack, displacement: Tensor, reading: Tensor, scales: PerElement
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the innovation ``(..., E)`` of a reading, the variance of its prediction, and the units of both."""
-    predicted = predict(track, displacement, field_curvature(estimated_field(track, scales)), scales)
-    unit = _units(predicted, scales)
-    innovation = continued(reading, predicted, scales, ELEMENT_PERIODS) / unit - predicted.mean[..., 0]
-    return innovation, predicted.covariance[..., 0, 0], unit
+class LocalElements(NamedTuple):
+    """D, I [deg], B_H [nT] at the vehicle ``(..., 3)``, their gradients ``(..., 3, 2)`` northward and eastward
+    [per km], and for each element the covariance ``(..., 3, 3, 3)`` of its value and gradient.
+
+    Example:
+        >>> elements(start(torch.tensor([3.0, 65.0, 18000.0]), PERFECT)).gradient.shape
+        torch.Size([3, 2])
+    """
+
+    value: Tensor
+    gradient: Tensor
+    covariance: Tensor
+
+
+def elements(belief: Belief) -> LocalElements:
+    """Return the expected elements at the vehicle, their gradients, and how sure they are.
+
+    Example:
+        >>> here = elements(start(torch.tensor([0.0, 60.0, 20000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0]))))
+        >>> (100 * here.gradient).round(decimals=1)  # change over 100 km
+        tensor([[ 0.0000e+00, -2.0000e-01],
+                [ 8.0000e-01,  0.0000e+00],
+                [-2.8030e+02,  0.0000e+00]], dtype=torch.float64)
+    """
+    mean, derivative = belief.mean[..., :COEFFICIENTS], closed_derivatives().to(belief.mean)
+    turn, latitude = generators(DEGREE).turn.to(mean), torch.deg2rad(belief.latitude)
+    meridian, vertical = (radius.unsqueeze(-1).unsqueeze(-1) for radius in curvature_radii(belief.latitude))
+    sin, cos = (wave(latitude)[..., None, None] for wave in (torch.sin, torch.cos))
+    north = derivative[0, :3] / UNIT_KM + turn[0, :3] / meridian
+    east = derivative[1, :3] / UNIT_KM + turn[1, :3] / vertical + sin / (cos * vertical) * turn[2, :3]
+    field = torch.eye(3, COEFFICIENTS).to(mean).expand_as(north)
+    rows = elements_jacobian(belief.field).unsqueeze(-3) @ torch.stack((field, north, east), -3)  # (..., 3, E, K)
+    column = elements_jacobian(belief.field) @ turn[2, :3, :3] @ belief.field.unsqueeze(-1) / (cos.square() * vertical)
+    column = torch.stack((0 * column, 0 * column, column), -3)
+    rows = torch.cat((rows, column), -1).transpose(-3, -2)  # (..., E, 3, K + 1): value, northward, eastward
+    state = COEFFICIENTS + 1
+    slopes = (rows[..., 1:, :] @ belief.mean[..., None, :state, None]).squeeze(-1)
+    covariance = rows @ belief.covariance[..., None, :state, :state] @ rows.mT
+    return LocalElements(_elements(belief.field), slopes, covariance)
+
+
+def _elements(field: Tensor) -> Tensor:
+    """Return D, I, B_H of a field; the angles by way of single precision, as ONNX Runtime has no other arc tangent."""
+    return measured_elements(field.float()).to(field)
+
+
+def closed_derivatives() -> Tensor:
+    """Return the derivatives ``(2, K, K)`` northward and eastward, with degree 4 as its regression."""
+    derivative = generators(DEGREE + 1).derivative[:2, :COEFFICIENTS]
+    return derivative @ closure().extend[: size(DEGREE + 1)]
+
+
+def _carry(north: Tensor, east: Tensor, *angles: Tensor) -> Tensor:
+    """Return exp(X) ``(..., K, K)`` of a move [unit] that turns the vertical by angles northward and eastward [rad], to
+    the fourth order."""
+    steps = torch.cat((closed_derivatives(), generators(DEGREE).turn[:2])).to(north)
+    matrix = torch.tensordot(torch.stack((north, east, *angles), -1), steps, 1)
+    one = torch.eye(matrix.shape[-1]).to(matrix)
+    square = matrix @ matrix
+    return one + matrix + square @ (one / 2 + matrix / 6 + square / 24)
+
+
+def inverse3(matrix: Tensor) -> Tensor:
+    """Return the inverses of symmetric matrices ``(..., 3, 3)``, in closed form.
+
+    Example:
+        >>> inverse3(torch.diag(torch.tensor([1.0, 2.0, 4.0]))).diagonal()
+        tensor([1.0000, 0.5000, 0.2500])
+    """
+    x, y, z = matrix.unbind(-2)
+    adjugate = torch.stack([torch.linalg.cross(*rows) for rows in ((y, z), (z, x), (x, y))], -1)
+    return adjugate / (x.unsqueeze(-2) @ adjugate[..., :1]).squeeze(-1).unsqueeze(-1)

@@ -22,12 +22,14 @@ from torch import Tensor
 from magrl.checks import check_number, check_tensor
 from magrl.field.elements import field_vector
 from magrl.geodesy import curvature_radii
-from magrl.tracking.field_belief import COEFFICIENTS, MODEL_NT, Belief
-from magrl.tracking.harmonics import RADIUS, UNIT_KM, arc, field_rows, powers, turning
+from magrl.tracking.belief import COEFFICIENTS, MODEL_NT, Belief
+from magrl.tracking.harmonics import RADIUS, UNIT_KM, Arc, arc, field_rows, powers, turning
 from magrl.tracking.prior import DEGREE, HIGHEST, closure
 
+RANGE_KM = 400.0
+"""Default of the prior standard deviation of the way along each axis [km]."""
 _AT_ONCE = 13  # moves whose distances to all points are held at once
-_CANDIDATES = 32  # points among which that with most mass around it is chosen
+_CANDIDATES = 16  # points among which that with most mass around it is chosen
 _NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out
 _SPREAD = 1.5  # standard deviations of the points around the mode, over those of the mode
 _LEAST_KM = 0.1  # standard deviation of the points around the mode
@@ -81,8 +83,7 @@ class DestinationPosterior(NamedTuple):
         mean = (self.points * self.weights.unsqueeze(-1)).sum(-2)
         likely = self.weights.topk(min(_CANDIDATES, self.weights.shape[-1]), -1).indices
         centers = self.points.gather(-2, likely.unsqueeze(-1).expand(*likely.shape, 2))
-        apart = centers.unsqueeze(-2) - self.points.unsqueeze(-3)
-        mass = ((apart.square().sum(-1) <= radius_km**2) * self.weights.unsqueeze(-2)).sum(-1)
+        mass = ((self._squares(centers) <= radius_km**2).to(self.weights) @ self.weights.unsqueeze(-1)).squeeze(-1)
         best = mass.argmax(-1, keepdim=True).unsqueeze(-1)
         center = centers.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
         return torch.where(mean.norm(dim=-1, keepdim=True) > radius_km, mean, center)
@@ -95,13 +96,17 @@ class DestinationPosterior(NamedTuple):
             >>> posterior.mean_distance(torch.tensor([[0.0, 0.0], [30.0, 0.0]])).round()
             tensor([35., 25.])
         """
+        weights = self.weights.float().unsqueeze(-1)
+        parts = [(self._squares(some).sqrt_() @ weights).squeeze(-1) for some in moves.split(_AT_ONCE, -2)]
+        return torch.cat(parts, -1)
+
+    def _squares(self, moves: Tensor) -> Tensor:
+        """Return the squared distances ``(..., K, M)`` of the points after moves, as one matrix product [km^2]."""
         points, moves = self.points.float(), moves.float()
-        # |d - m|^2 as one matrix product, with 0.01 km^2 for its rounding
+        # 0.01 km^2 is for the rounding
         left = torch.cat((moves, moves.square().sum(-1, keepdim=True) + 0.01, torch.ones_like(moves[..., :1])), -1)
         right = torch.cat((-2 * points, torch.ones_like(points[..., :1]), points.square().sum(-1, keepdim=True)), -1)
-        weights = self.weights.float().unsqueeze(-1)
-        parts = [((some @ right.mT).sqrt_() @ weights).squeeze(-1) for some in left.split(_AT_ONCE, -2)]
-        return torch.cat(parts, -1)
+        return left @ right.mT
 
     def within(self, radius_km: float) -> Tensor:
         """Return the probability ``(...)`` that the place is within a radius [km] of the vehicle."""
@@ -153,10 +158,11 @@ def destination(belief: Belief, elements: Tensor, range_km: float, crust_nt: flo
         crust_nt: standard deviation of the crust's field in each axis [nT].
 
     Example:
-        >>> from magrl.tracking.field_belief import start
-        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), torch.zeros(3))
+        >>> from magrl.sensor_std import SensorStd
+        >>> from magrl.tracking.belief import start
+        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd())
         >>> destination(belief, torch.tensor([3.0, 66.0, 17500.0]), 300.0).noise
-        1.0
+        4.0
     """
     check_tensor(3, elements=elements)
     check_number(0, above=True, range_km=range_km)
@@ -168,8 +174,9 @@ def log_density(goal: Destination, points: Tensor) -> Tensor:
     constant.
 
     Example:
-        >>> from magrl.tracking.field_belief import start
-        >>> there = destination(start(torch.tensor([3.0, 65.0, 18000.0]), torch.zeros(3)), torch.zeros(3), 300.0)
+        >>> from magrl.sensor_std import SensorStd
+        >>> from magrl.tracking.belief import start
+        >>> there = destination(start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd()), torch.zeros(3), 300.0)
         >>> log_density(there, torch.zeros(5, 2)).shape
         torch.Size([5])
     """
@@ -178,14 +185,16 @@ def log_density(goal: Destination, points: Tensor) -> Tensor:
 
 
 def mode(goal: Destination) -> Way:
-    """Return a maximum of the posterior by Gauss-Newton steps, and the inverse of its normal matrix.
+    """Return about where the posterior is largest, by Gauss-Newton steps, and the inverse of their normal matrix.
 
-    The first step has the mean covariance over the prior of the way, the others that at the solution before.
+    The covariance of the field there counts as constant in each step. The first step has the mean covariance over the
+    prior of the way, the others that at the solution before.
 
     Example:
-        >>> from magrl.tracking.field_belief import start
+        >>> from magrl.sensor_std import SensorStd
+        >>> from magrl.tracking.belief import start
         >>> here = torch.tensor([3.0, 65.0, 18000.0])
-        >>> mode(destination(start(here, torch.zeros(3)), here, 300.0)).displacement.round().abs()
+        >>> mode(destination(start(here, SensorStd()), here, 300.0)).displacement.round().abs()
         tensor([0., 0.], dtype=torch.float64)
     """
     cross = torch.eye(2).to(goal.field)
@@ -219,15 +228,16 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
 
     Args:
         goal: the destination.
-        count: number of points; 512 for probabilities, 256 for means.
+        count: number of points.
 
     Source:
         A. B. Owen and Y. Zhou, Safe and effective importance sampling, Journal of the American Statistical Association
         95 (2000): weights for points of several densities.
 
     Example:
-        >>> from magrl.tracking.field_belief import start
-        >>> belief = start(torch.tensor([0.0, 60.0, 20000.0]), torch.tensor([0.05, 0.05, 5.0]))
+        >>> from magrl.sensor_std import SensorStd
+        >>> from magrl.tracking.belief import start
+        >>> belief = start(torch.tensor([0.0, 60.0, 20000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
         >>> there = destination(belief, torch.tensor([0.0, 61.0, 19000.0]), 300.0)
         >>> posterior(there).way().displacement.round(decimals=-1)
         tensor([ 30., -10.])
@@ -242,6 +252,30 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
     logarithms = [_log_density(goal, *part) for part in parts]
     weights = torch.softmax(torch.cat(logarithms, -1) - density.log(), -1)
     return DestinationPosterior(points, weights.where(weights > _LEAST_WEIGHT, 0.0))
+
+
+def inverse2(matrix: Tensor) -> Tensor:
+    """Return the inverses of symmetric matrices ``(..., 2, 2)``.
+
+    Example:
+        >>> inverse2(torch.diag(torch.tensor([2.0, 4.0]))).diagonal()
+        tensor([0.5000, 0.2500])
+    """
+    nn, ne, ee = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
+    return (torch.stack((ee, -ne, -ne, nn), -1) / (nn * ee - ne * ne).unsqueeze(-1)).unflatten(-1, (2, 2))
+
+
+def _levers(points: Tensor) -> Tensor:
+    """Return the field at displacements [unit] as rows ``(..., M, 3, K)`` on the coefficients."""
+    rows = _rows(_TERMS).to(points)  # (J, 3, K)
+    return (powers(points, _TERMS) @ rows.flatten(1)).unflatten(-1, (3, COEFFICIENTS))
+
+
+def _with_latitude(levers: Tensor, field: Tensor, slope: Tensor) -> Tensor:
+    """Return rows with the effect of the latitude's offset, which turns a field ``(..., M, 3)`` by ``slope`` for each
+    radian."""
+    x, y, _ = field.unbind(-1)
+    return torch.cat((levers, torch.stack((-slope * y, slope * x, torch.zeros_like(x)), -1).unsqueeze(-1)), -1)
 
 
 class _Moments(NamedTuple):
@@ -260,9 +294,7 @@ _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric ma
 
 def _moments(belief: Belief, points: Tensor) -> _Moments:
     """Return the moments at displacements ``(..., M, 2)`` [unit], in their dtype."""
-    rows = _rows(_TERMS).to(points)  # (J, 3, K)
-    lever = (powers(points, _TERMS) @ rows.flatten(1)).unflatten(-1, (3, COEFFICIENTS))  # (..., M, 3, K)
-    state = _state(belief).to(points)
+    lever, state = _levers(points), _state(belief).to(points)
     spread = (lever.flatten(-3, -2) @ state).unflatten(-2, (-1, 3))  # (..., M, 3, K + 2)
     mean, cross = spread[..., -2:].permute(*range(points.ndim - 2), -1, -2, -3).unbind(-3)
     product = spread[..., :-2] @ lever.mT
@@ -289,16 +321,18 @@ def _state(belief: Belief) -> Tensor:
 
 
 @cache
+@torch.inference_mode(False)  # kept for other modes, too
 def _rows(terms: int) -> Tensor:
     """Return the field at a displacement ``(J, 3, K)`` for each of its monomials."""
     return field_rows(HIGHEST, terms) @ closure().extend
 
 
 @cache
+@torch.inference_mode(False)  # kept for other modes, too
 def _around(count: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return the field at the points around the vehicle: its rows ``(K, 3 M)``, and for its covariance those of the
     upper triangle of the coefficients' covariance ``(K (K + 1) / 2, 6 M)``, and where these are in it, flattened."""
-    points = _unit_points(count)[1] / UNIT_KM
+    points = unit_points(count)[1] / UNIT_KM
     lever = torch.tensordot(powers(points, HIGHEST), _rows(HIGHEST), 1)  # (M, 3, K)
     first, second = torch.triu_indices(COEFFICIENTS, COEFFICIENTS)
     rows = []
@@ -339,22 +373,29 @@ def _covariance(goal: Destination, points: Tensor, moments: _Moments) -> tuple[T
     return residual, [xx, xy + x * cy + y * cx + x * y * variance, xz, yy, yz, zz + apart]
 
 
-def _carried(goal: Destination, points: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
+def _carried(goal: Destination, points: Tensor, heading: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return the destination's field in the axes that are carried from the vehicle ``(..., 3, M)``, turned so that
     the heading is their first, and the derivative of the angle of the meridians with respect to the latitude
     ``(..., M)``.
     """
+    (along, across, slope, *_), n, e = _meridians(goal.belief, points)
     north, east = points.unbind(-1)
-    meridian, vertical = (radius.to(points).unsqueeze(-1) / UNIT_KM for radius in curvature_radii(goal.belief.latitude))
-    latitude = torch.deg2rad(goal.belief.latitude).to(points).unsqueeze(-1)
-    n, e = north / meridian, east / vertical
-    along, across, slope, *_ = arc(torch.sin(latitude), torch.cos(latitude), n, e)
     x, y, z = (part.unsqueeze(-1) for part in goal.field.to(points).unbind(-1))
     x, y = x * along + y * across, y * along - x * across
     tilt_n, tilt_e = n - north / RADIUS, e - east / RADIUS  # of the vertical, more than on the sphere
     x, y, z = x - tilt_n * z, y - tilt_e * z, z + tilt_n * x + tilt_e * y
-    cos, sin = heading.unsqueeze(-2).unbind(-1)
-    return torch.stack((x * cos + y * sin, y * cos - x * sin, z), -2), slope
+    if heading is not None:
+        cos, sin = heading.unsqueeze(-2).unbind(-1)
+        x, y = x * cos + y * sin, y * cos - x * sin
+    return torch.stack((x, y, z), -2), slope
+
+
+def _meridians(belief: Belief, points: Tensor) -> tuple[Arc, Tensor, Tensor]:
+    """Return the great circles to displacements ``(..., M, 2)`` [unit], and their angles northward and eastward."""
+    radii = (radius.to(points).unsqueeze(-1) / UNIT_KM for radius in curvature_radii(belief.latitude))
+    n, e = (part / radius for part, radius in zip(points.unbind(-1), radii, strict=True))
+    latitude = torch.deg2rad(belief.latitude).to(points).unsqueeze(-1)
+    return arc(torch.sin(latitude), torch.cos(latitude), n, e), n, e
 
 
 def _inverse(entries: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
@@ -378,7 +419,7 @@ def _points(way: Way, heading: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     They are laid out along and across the way, so that they turn with it.
     """
-    normal, around = (points.to(way.displacement) for points in _unit_points(count))
+    normal, around = (points.to(way.displacement) for points in unit_points(count))
     distance, (cos, sin) = way.displacement.norm(dim=-1), heading.unbind(-1)
     turn = torch.stack((torch.stack((cos, -sin), -1), torch.stack((sin, cos), -1)), -2)  # columns: along, across
     covariance = turn.mT @ way.covariance @ turn * _SPREAD**2
@@ -400,7 +441,8 @@ _MASS = 0.5 + math.log(_FAR_KM / _NEAR_KM)  # of the density within the nearest 
 
 
 @cache
-def _unit_points(count: int) -> tuple[Tensor, Tensor]:
+@torch.inference_mode(False)  # kept for other modes, too
+def unit_points(count: int) -> tuple[Tensor, Tensor]:
     """Return quasi-random points: a quarter of a standard normal, and the others around the vehicle [km].
 
     The density of those is that of the inverse square of the distance, and constant within the nearest.

@@ -73,6 +73,7 @@ class Generators(NamedTuple):
 
 
 @cache
+@torch.inference_mode(False)  # kept for other modes, too
 def generators(degree: int) -> Generators:
     """Return the generators of translations and rotations for the degrees 1 to ``degree``.
 

@@ -88,6 +88,7 @@ class Closure(NamedTuple):
 
 
 @cache
+@torch.inference_mode(False)  # kept for other modes, too
 def closure() -> Closure:
     """Return the regression of the coefficients of higher degrees on those of a belief, under the spectrum.
 
@@ -145,6 +146,7 @@ class LatitudeCells(NamedTuple):
 
 
 @cache
+@torch.inference_mode(False)  # kept for other modes, too
 def latitude_cells() -> LatitudeCells:
     """Return the prior in each cell of latitude.
 

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from magrl import guidance
 from magrl.checks import check_number, check_tensor
-from magrl.tracking.filter import DISTANCE_SCALE_KM, ELEMENT_SCALES, FieldTrack, PerElement, _units
-from magrl.tracking.way import Way
+from magrl.tracking.destination import Way
 
 VISITED = 24
 """Number of past places that a search remembers."""
@@ -128,31 +127,30 @@ def arrival_weights(field: Tensor, target_field: Tensor, zeta: float) -> Tensor:
     return guidance.objective_weights(field, target_field, field.new_tensor(guidance.OBJECTIVE_FLOORS)) / zeta
 
 
-def arrival_ellipse(track: FieldTrack, weights: Tensor, scales: PerElement = ELEMENT_SCALES) -> Tensor:
-    """Return the matrix ``(..., 2, 2)`` [1/km^2] of the ellipse in which the objective F is below its threshold.
+def arrival_ellipse(gradient: Tensor, covariance: Tensor, weights: Tensor, radius_km: float | None = None) -> Tensor:
+    """Return the matrix ``(..., 2, 2)`` [1/km^2] of the ellipse in which an episode ends: d^T E d = 1 on its border.
 
-    It is the expected one: the less is known of the gradient, the smaller the ellipse.
+    Where the objective F ends it, it is the expected one: the less is known of the gradient, the smaller the ellipse.
 
     Args:
-        track: state of the filter.
+        gradient: ``(..., E, 2)`` expected gradient of each element, northward and eastward [per km].
+        covariance: ``(..., E, 2, 2)`` its covariance.
         weights: ``(..., E)`` those of :func:`arrival_weights`.
-        scales: those of :func:`~magrl.tracking.start`.
+        radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.
 
     Raises:
         ValueError: for shapes that do not match.
 
     Example:
-        >>> track = FieldTrack(torch.tensor([[0.0, 2.0, 0.0]]), torch.zeros(1, 3, 3))
-        >>> arrival_ellipse(track, torch.tensor([100.0]), scales=(1.0,))
+        >>> arrival_ellipse(torch.tensor([[0.02, 0.0]]), torch.zeros(1, 2, 2), torch.tensor([100.0]))
         tensor([[0.0400, 0.0000],
                 [0.0000, 0.0000]])
     """
-    unit = _units(track, scales)
-    check_tensor(unit.shape[-1], weights=weights)
-    per_km = weights * (unit / DISTANCE_SCALE_KM).square()
-    gradient = track.mean[..., 1:]
-    squares = gradient.unsqueeze(-1) * gradient.unsqueeze(-2) + track.covariance[..., 1:, 1:]
-    return (per_km[..., None, None] * squares).sum(-3)
+    check_tensor(gradient.shape[-2], weights=weights)
+    squares = gradient.unsqueeze(-1) * gradient.unsqueeze(-2) + covariance
+    if radius_km is not None:
+        return (torch.eye(2) / radius_km**2).to(squares).expand(*squares.shape[:-3], 2, 2)
+    return (weights[..., None, None] * squares).sum(-3)
 
 
 def _root(matrix: Tensor, least: float = _LEAST_KM2) -> Tensor:

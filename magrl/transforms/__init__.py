@@ -37,10 +37,9 @@ from magrl.transforms.rewards import SPLReward as SPLReward
 from magrl.transforms.rewards import TrueWay as TrueWay
 from magrl.transforms.scaling import MinMaxNorm as MinMaxNorm
 from magrl.transforms.sequences import ReadingObservation as ReadingObservation
-from magrl.transforms.track import NoiseScale as NoiseScale
 from magrl.transforms.track import PlannedMove as PlannedMove
 from magrl.transforms.track import SearchAim as SearchAim
-from magrl.transforms.track import TrackGradient as TrackGradient
+from magrl.transforms.track import TrackField as TrackField
 from magrl.transforms.views import AngleVector as AngleVector
 from magrl.transforms.views import ObservationView as ObservationView
 from magrl.transforms.views import TargetDifference as TargetDifference

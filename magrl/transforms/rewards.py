@@ -187,7 +187,7 @@ class EpisodeSum(StatefulTransform):
         >>> from torchrl.envs import TransformedEnv
         >>> env = TransformedEnv(GeomagneticNavEnv(seed=0), EpisodeSum(["reward_proximity"]))
         >>> after = env.rollout(3)["next"]
-        >>> bool(torch.equal(after["episode_reward_proximity"], after["reward_proximity"].cumsum(1)))
+        >>> torch.allclose(after["episode_reward_proximity"], after["reward_proximity"].cumsum(1))
         True
     """
 

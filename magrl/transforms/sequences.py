@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from magrl.field.elements import element_difference
-from magrl.tracking.learned_prior import features
-from magrl.tracking.priors import per_nanotesla
 from magrl.transforms.base import StatefulTransform
 
 _MOVE_KM = 50.0
 _LEAST_MOVE_KM = 0.5
 _DIFFERENCE_NT = 2000.0
 _RATE = 1.25  # unit of a change [nT/km]
+_LEAST_NT = 1000.0  # of the horizontal intensity; below, small angles no longer hold
+_FARTHEST = 6.0  # a feature; beyond, it is as at this value
+_FIELD_NT, _FIELD_RANGE_NT = (25_000.0, 45_000.0), (12_000.0, 15_000.0)  # of B_H and of the total intensity
+_FAR_NT = 1500.0  # unit of the difference to the target
 
 
 class ReadingObservation(StatefulTransform):
@@ -28,10 +32,9 @@ class ReadingObservation(StatefulTransform):
         in_keys: reading and target ``(..., 3)``: D [deg], I [deg], B_H [nT]; last move ``(..., 2)`` with the distance
             [km] first and the turn [rad] second; and the heading ``(..., 1)`` [rad], or no fourth key for a vehicle
             without a compass.
-        out_keys: one observation ``(..., 20)``: reading and remaining differences (:func:`magrl.tracking.features`,
-            12), the change of D, I, B_H per kilometer of the last move (3), how far along it the differences would be
-            least, and how well it fits them (2), cosine and sine of the heading, or else of the last turn, and the
-            distance of the move.
+        out_keys: one observation ``(..., 20)``: reading and remaining differences (:func:`features`, 12), the change of
+            D, I, B_H per kilometer of the last move (3), how far along it the differences would be least, and how well
+            it fits them (2), cosine and sine of the heading, or else of the last turn, and the distance of the move.
 
     Raises:
         ValueError: for another number of keys.
@@ -75,3 +78,35 @@ class ReadingObservation(StatefulTransform):
             moved / _MOVE_KM,
         )
         tensordict.set(self.out_keys[0], torch.cat(observed, -1))
+
+
+def features(reading: Tensor, target: Tensor) -> Tensor:
+    """Return the features of a reading and a target ``(..., 12)``.
+
+    They are sine and cosine of I and D, B_H, the total intensity, and the differences of the elements as field
+    components, with their absolute values.
+
+    Example:
+        >>> features(torch.tensor([0.0, 60.0, 25000.0]), torch.tensor([0.0, 60.0, 26500.0]))[8]
+        tensor(1.)
+    """
+    declination, inclination = torch.deg2rad(reading[..., :2]).unbind(-1)
+    strengths = torch.stack((reading[..., 2], reading[..., 2] / torch.cos(inclination).clamp_min(1e-3)), -1)
+    difference = element_difference(target, reading) / per_nanotesla(reading) / _FAR_NT
+    angles = (torch.sin(inclination), torch.cos(inclination), torch.sin(declination), torch.cos(declination))
+    strengths = (strengths - strengths.new_tensor(_FIELD_NT)) / strengths.new_tensor(_FIELD_RANGE_NT)
+    written = torch.cat((torch.stack(angles, -1), strengths, difference, difference.abs()), -1)
+    return written.clamp(-_FARTHEST, _FARTHEST)
+
+
+def per_nanotesla(elements: Tensor) -> Tensor:
+    """Return the change of D, I [deg] and B_H [nT] ``(..., 3)`` by a disturbance of 1 nT, above 0 for any reading.
+
+    Example:
+        >>> per_nanotesla(torch.tensor([0.0, 60.0, 20000.0])).round(decimals=4)
+        tensor([0.0029, 0.0014, 1.0000])
+    """
+    strength = elements[..., 2].clamp_min(_LEAST_NT)
+    declination = math.degrees(1) / strength
+    inclination = declination * torch.cos(torch.deg2rad(elements[..., 1])).abs()
+    return torch.stack((declination, inclination, torch.ones_like(strength)), -1)

@@ -22,11 +22,10 @@ from magrl.sensor_std import STD_KEYS
 from magrl.tracking import STEP_PRICE
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform
 from magrl.transforms.scaling import MinMaxNorm
-from magrl.transforms.track import IN_KEYS, TRACK_KEYS, PlannedMove, SearchAim, TrackGradient
+from magrl.transforms.track import BELIEF_KEYS, IN_KEYS, PlannedMove, SearchAim, TrackField, turned
 
 OBSERVATION_SIZE = 19
 """Numbers of :func:`track_observation`."""
-_ESTIMATES = ("field", "target_field", "estimated_field", "estimated_gradient", "aim", "way_covariance")
 _STD_UNITS = (1.0, 1.0, 100.0)
 _LEAST_STD = 0.002
 _LEAST_PRICE = 0.01
@@ -302,14 +301,14 @@ def _axes(matrix: Tensor, least: float) -> tuple[Tensor, Tensor]:
 class TrackObservation(StatefulTransform):
     """Write the observation of an agent that navigates by its own track, see :func:`track_observation`.
 
-    It stands after :class:`~magrl.transforms.TrackGradient`, :class:`~magrl.transforms.SearchAim` and
-    :class:`~magrl.transforms.PlannedMove` in the vehicle's frame; without the second, ``in_keys={"aim": "way"}``. The
+    It stands after :class:`~magrl.transforms.TrackField`, :class:`~magrl.transforms.SearchAim` and
+    :class:`~magrl.transforms.PlannedMove`; without the second, ``in_keys={"aim": "way"}``. The
     weights of the objective follow from the first reading, which is kept as state in the TensorDict.
 
     Args:
-        in_keys: reading and target ``(..., 3)``, estimated field ``(..., 3)``, its gradient ``(..., 3, 2)``, way to aim
-            at ``(..., 2)``, covariance of the estimated way ``(..., 2, 2)``, standard deviation of the noise
-            ``(..., 3)``, number of the step ``(..., 1)``, and planned displacement ``(..., 2)`` [km].
+        in_keys: reading and target ``(..., 3)``, heading ``(..., 1)`` [rad], estimated field ``(..., 3)``, its gradient
+            ``(..., 3, 2)``, way to aim at ``(..., 2)``, covariance of the mean way ``(..., 2, 2)``, standard deviation
+            of the noise ``(..., 3)``, number of the step ``(..., 1)``, and planned displacement ``(..., 2)`` [km].
         out_keys: observation ``(..., 19)`` and the first reading ``(..., 3)``.
         zeta: arrival threshold on the objective.
         max_steps: step limit.
@@ -322,15 +321,18 @@ class TrackObservation(StatefulTransform):
         >>> from magrl.envs import GeomagneticNavEnv
         >>> from magrl.transforms import SensorNoise
         >>> from torchrl.envs import Compose, TransformedEnv
-        >>> estimates = TrackGradient(std_keys=STD_KEYS, frame="vehicle"), SearchAim(zeta=0.01, frame="vehicle")
-        >>> plan = PlannedMove(max_move_km=50.0, max_steps=50, frame="vehicle")
+        >>> estimates = TrackField(std_keys=STD_KEYS), SearchAim(zeta=0.01)
+        >>> plan = PlannedMove(max_move_km=50.0, max_steps=50)
         >>> observation = TrackObservation(zeta=0.01, max_steps=50)
         >>> steps = Compose(SensorNoise((0.05, 0.05, 5.0)), *estimates, plan, observation)
         >>> TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), steps).rollout(3)["observation"].shape
         torch.Size([2, 3, 19])
     """
 
-    default_in_keys = (*_ESTIMATES, "sensor_std", "step_count", "planned_move")
+    default_in_keys = (
+        *("field", "target_field", "heading", "estimated_field", "estimated_gradient", "aim", "way_covariance"),
+        *("sensor_std", "step_count", "planned_move"),
+    )
     default_out_keys = ("observation", "first_field")
     optional_in_keys = ("step_price",)
     out_sizes = (OBSERVATION_SIZE,), (3,)
@@ -347,20 +349,24 @@ class TrackObservation(StatefulTransform):
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         (first,), seen = state, self._named(values)
-        target, aim = seen["target_field"], seen["aim"]
+        target, heading = seen["target_field"], seen["heading"]
+        for key in ("aim", "planned_move"):
+            seen[key] = turned(seen[key].unsqueeze(-2), heading).squeeze(-2)
+        seen["estimated_gradient"] = turned(seen["estimated_gradient"], heading)
+        seen["way_covariance"] = turned(turned(seen["way_covariance"], heading).mT, heading)
         if self.step_price is not None:
-            seen["step_price"] = torch.full_like(aim[..., :1], self.step_price)
+            seen["step_price"] = torch.full_like(heading, self.step_price)
         seen["remaining"] = element_difference(target, seen["estimated_field"])
         seen["weights"] = tracking.arrival_weights(first, target, self.zeta)
         # A policy may fly longer than it was trained for.
-        seen["time"] = (seen["step_count"].to(aim.dtype) / self.max_steps).clamp(max=1)
+        seen["time"] = (seen["step_count"].to(heading.dtype) / self.max_steps).clamp(max=1)
         observed = track_observation(seen)
         tensordict.set(self.out_keys[0], observed).set(self.out_keys[1], first)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackView(_View):
-    """Describe what an agent without a map observes: the estimates of a Kalman filter along its own track, and a plan.
+    """Describe what an agent without a map observes: the estimates along its own track, and a plan.
 
     Args:
         zeta: arrival threshold.
@@ -370,8 +376,11 @@ class TrackView(_View):
         range_km: prior standard deviation of the way along each axis [km].
         search: whether it observes the way to where the vehicle has not been (:class:`~magrl.transforms.SearchAim`), as
             suits environments that end the episode at arrival.
+        radius_km: distance from the destination at which the episode ends [km]; None where the objective ends it.
         step_price: price of a step [% of SPL]; a higher price gives fewer steps and a longer path. None where
             the agent observes it as ``step_price``, for training.
+        caution: weight of the uncertainty of the way in the plan.
+        crust_nt: standard deviation of the field of the crust in each axis [nT].
 
     Raises:
         ValueError: for a number out of its range.
@@ -384,9 +393,12 @@ class TrackView(_View):
 
     zeta: float
     max_steps: int
-    range_km: float = 300.0
+    range_km: float = tracking.RANGE_KM
     search: bool = True
+    radius_km: float | None = None
     step_price: float | None = STEP_PRICE
+    caution: float = tracking.CAUTION
+    crust_nt: float = 0.0
 
     size: ClassVar[int] = OBSERVATION_SIZE
     in_keys: ClassVar[tuple[str, ...]] = (*IN_KEYS, "step_count")
@@ -394,22 +406,31 @@ class TrackView(_View):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_number(0, above=True, zeta=self.zeta, range_km=self.range_km)
+        check_number(0, caution=self.caution, crust_nt=self.crust_nt)
         check_number(1, whole=True, max_steps=self.max_steps)
         check_type(bool, search=self.search)
-        if self.step_price is not None:
-            check_number(0, above=True, step_price=self.step_price)
+        check_number(0, above=True, optional=True, step_price=self.step_price, radius_km=self.radius_km)
 
     @property
     def state_keys(self) -> tuple[str, ...]:
         """Keys of the state that a step reads from the one before."""
-        return *TRACK_KEYS, "first_field", *(("visited", "arrival_weights") if self.search else ())
+        return *BELIEF_KEYS, "first_field", *(("visited", "arrival_weights") if self.search else ())
 
-    def observation_transforms(self) -> list[Transform]:
-        """Return the transforms from the public keys and standard deviations to ``observation`` ``(..., 19)``."""
-        track = TrackGradient(std_keys=STD_KEYS, range_km=self.range_km, frame="vehicle")
-        search = [SearchAim(zeta=self.zeta, frame="vehicle")] if self.search else []
+    def observation_transforms(self, *, tracked: bool = False) -> list[Transform]:
+        """Return the transforms from the public keys and standard deviations to ``observation`` ``(..., 19)``.
+
+        Args:
+            tracked: whether the environment has the first of them, :class:`~magrl.transforms.TrackField`.
+        """
+        world: dict[str, Any] = {"range_km": self.range_km, "crust_nt": self.crust_nt}
+        track = [] if tracked else [TrackField(std_keys=STD_KEYS, **world)]
+        search = [SearchAim(zeta=self.zeta, radius_km=self.radius_km)] if self.search else []
         aim = "aim" if self.search else "way"
         options: dict[str, Any] = {"max_steps": self.max_steps, "step_price": self.step_price}
-        limits: dict[str, Any] = {"max_move_km": self.max_move_km, "range_km": self.range_km, "frame": "vehicle"}
-        plan = PlannedMove(in_keys={"way": aim}, **limits, **options)
-        return [track, *search, plan, TrackObservation(in_keys={"aim": aim}, zeta=self.zeta, **options)]
+        plan: dict[str, Any] = {"max_move_km": self.max_move_km, "caution": self.caution, **world}
+        return [
+            *track,
+            *search,
+            PlannedMove(in_keys={"way": aim}, **plan, **options),
+            TrackObservation(in_keys={"aim": aim}, zeta=self.zeta, **options),
+        ]

@@ -25,7 +25,7 @@ from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, Geom
 from magrl.envs.navigation import anywhere_env
 from magrl.evaluation import episode_measures
 from magrl.field import elements_at
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorNoise, TrackGradient, TrackView
+from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorNoise, TrackField, TrackView
 
 ROOT = Path(__file__).parent.parent.parent
 PAPER = Scenario(field=Scenario().build_field())
@@ -260,7 +260,7 @@ def test_dict_observation_is_a_copy_of_the_public_keys() -> None:
 
 def test_keys_of_own_transforms_can_be_observed() -> None:
     """Also one of a name that "flat" uses; the transforms are cloned."""
-    parts = [NOISE, TrackGradient()]
+    parts = [NOISE, TrackField()]
     envs = [make(transforms=parts, observation=("field", "way")) for _ in range(2)]
     first, second = (env.reset(seed=0)[0] for env in envs)
     assert set(first) == set(envs[0].observation_space.spaces) == {"field", "way"}

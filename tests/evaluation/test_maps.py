@@ -18,7 +18,7 @@ from magrl.evaluation import episode_measures, evaluation_rollout, maps
 from magrl.evaluation.maps import coastlines, trajectories_figure, way_ellipse, write_gif
 from magrl.geodesy import geodesic
 from magrl.navigators import Geodesic, Secant
-from magrl.transforms import TrackGradient
+from magrl.transforms import TrackField
 
 
 def place(*degrees: float) -> torch.Tensor:
@@ -36,7 +36,7 @@ def flight() -> tuple[TensorDictBase, GeomagneticNavEnv]:
     tasks = Tasks(place(-17, 179.999)[None], place(-14, -172)[None])
     scenario = Scenario(region=Region((-25, -5), (170, 195)), tasks=tasks, objective_floors=None)
     base = GeomagneticNavEnv(scenario, seed=0, max_steps=3)
-    return TransformedEnv(base, TrackGradient(range_km=1000.0)).rollout(3, Geodesic()), base
+    return TransformedEnv(base, TrackField(range_km=1000.0)).rollout(3, Geodesic()), base
 
 
 def test_coastlines() -> None:

@@ -90,7 +90,7 @@ def test_a_policy_of_any_algorithm_is_a_file_or_a_folder(env: GeomagneticNavEnv,
 
 def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:
     for text in ("dowsing", "secant=runs/a", "secant:flown", f"td3:flown={run}"):
-        with pytest.raises(ValueError, match=f"unknown navigator '{text}': choose from anywhere, gg_td3=RUN, "):
+        with pytest.raises(ValueError, match=f"unknown navigator '{text}': choose from anywhere, kalman, gg_td3=RUN, "):
             make_navigator(text, env)
     for text, error, message in (
         ("gg_td3", ValueError, "gg_td3 needs the folder of a finished run: gg_td3=RUN"),

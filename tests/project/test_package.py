@@ -109,7 +109,6 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     }
     data |= {
         "field/weather.npz",
-        "tracking/learned_prior.pt",
         "agents/pretrained/anywhere.safetensors",
         "agents/pretrained/anywhere.md",
     }

@@ -43,7 +43,7 @@ def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
     assert 0.4 < td["true_way_scaled"].norm(dim=-1).mean() < 3.0
     torch.testing.assert_close(td["episode_reward"], td["reward"].cumsum(1))
     assert "episode_reward_proximity" not in td.keys()  # noqa: SIM118
-    assert PolicyConfig(VIEW, (8,)).make_actor().in_keys == ["observation", "planned_move"]
+    assert PolicyConfig(VIEW, (8,)).make_actor().in_keys == ["observation", "planned_move", "heading"]
     assert recipe.OBSERVED == ("observation", "true_way_scaled", "highest_spl")
 
 

@@ -1,76 +1,87 @@
-"""The decision to declare an arrival, by hand."""
+"""The decision to declare an arrival, of a vehicle that knows the gradients, against its errors by hand."""
+
+from __future__ import annotations
 
 import math
 
 import pytest
 import torch
-from support.tracks import F64, f64
+from support.tracks import F64, f64, randn
+from torch import Tensor
 
-from magrl.tracking import ELEMENT_SCALES, FieldTrack, approach, arrival_decision
+from magrl import tracking
+from magrl.sensor_std import SensorStd
+from magrl.tracking import ArrivalDecision, approach, arrival_decision, decision
+from magrl.tracking.belief import STATES
 
-SCALES = f64(*ELEMENT_SCALES)
+RADIUS_KM, UNITS = 25.0, f64(1.0, 1.0, 100.0)
 HERE = f64(0.0, 60.0, 20000.0)
 
 
-def vehicle(north_km: float, std: float = 0.0) -> tuple[FieldTrack, torch.Tensor]:
-    """A track with known gradients and the values at a target northward; I and D change by 1 unit per 100 km."""
-    gradient = f64((0.0, 1.0), (1.0, 0.0), (0.0, 0.0))
-    mean = torch.cat(((HERE / SCALES).unsqueeze(-1), gradient), -1)
-    covariance = torch.diag(f64(max(std, 1e-4) ** 2, 1e-10, 1e-10)).expand(3, 3, 3)
-    target = HERE + SCALES * gradient[:, 0] * north_km / 100
-    return FieldTrack(mean.unsqueeze(0), covariance.unsqueeze(0)), target.unsqueeze(0)
+def decide(north_km: float, noise: float, bias: float, left: int = 50) -> tuple[ArrivalDecision, Tensor]:
+    """The decision at a distance from the destination, with errors in units of degrees and 100 nT; and the gradient."""
+    errors = SensorStd(noise * UNITS, bias * UNITS)
+    belief = tracking.start(HERE, errors)
+    rows = torch.eye(STATES, dtype=F64)[3:16]  # all but the field and the errors of readings
+    cross = belief.covariance @ rows.mT
+    exact = rows @ cross + 1e-9 * torch.diag((rows @ cross).diagonal())
+    mean = belief.mean.index_add(0, torch.tensor([3]), f64(6000.0))  # D changes by 1 degree over 100 km eastward
+    belief = tracking.Belief(mean, belief.covariance - cross @ torch.linalg.solve(exact, cross.mT), belief.latitude)
+    target = tracking.elements(tracking.moved(belief, f64(north_km)[0], f64(0.0)[0])).value
+    goal = tracking.destination(belief, target, 300.0)
+    decided = arrival_decision(goal, tracking.posterior(goal, 512), errors, torch.tensor(left), RADIUS_KM)
+    return decided, tracking.elements(belief).gradient
 
 
-def decide(north_km: float, std: float, bias: float, left: int = 50, drift: float = 0.0):
-    track, target = vehicle(north_km, std)
-    noise = tuple(0.1 * scale for scale in ELEMENT_SCALES)
-    lasting = (tuple(each * scale for scale in ELEMENT_SCALES) for each in (bias, drift))
-    return arrival_decision(track, target, noise, *lasting, torch.tensor([left]), 25.0)
+@pytest.mark.parametrize("bias", [0.1, 0.2])
+def test_what_a_constant_error_leaves_is_all_that_can_be_attained(bias: float) -> None:
+    """However long one reads: the probability of the radius under the inverse of G^T (b b^T)^-1 G."""
+    decided, gradient = decide(5.0, 0.05, bias)
+    scaled = gradient / (bias * UNITS).unsqueeze(-1)
+    error = randn(50_000, 2) @ torch.linalg.cholesky(torch.linalg.inv(scaled.mT @ scaled)).mT
+    attainable = (error.norm(dim=-1) <= RADIUS_KM).double().mean()
+    assert decided.attainable.item() == pytest.approx(attainable.item(), abs=0.03)
+    assert decided.probability < decided.attainable
+    assert decide(5.0, 0.05, 0.0)[0].attainable > 0.99
 
 
-def test_what_a_constant_error_leaves_is_all_that_can_be_attained() -> None:
-    """An error of 0.2 units is one of 20 km eastward, by D, and of 10 km northward, however long one reads.
-
-    B_H is the same everywhere and shows its own error, with which that of I is correlated by -sin(60°).
-    """
-    north = torch.linspace(-25, 25, 2001, dtype=F64)
-    inside = torch.special.erf((625 - north.square()).sqrt() / (20 * 2**0.5))
-    expected = torch.trapezoid(inside * torch.exp(-((north / 10) ** 2) / 2) / (10 * (2 * math.pi) ** 0.5), north).item()
-    for std in (0.0, 0.3):
-        assert decide(0.0, std, 0.2).attainable.item() == pytest.approx(expected, abs=0.03)
-    done, not_yet = decide(0.0, 0.0, 0.2), decide(0.0, 0.3, 0.2)
-    assert done.declare.item()
-    assert not not_yet.declare.item()
-    assert done.probability > not_yet.probability
-    assert decide(0.0, 0.3, 0.2, left=0).declare.item()
+@pytest.mark.parametrize(
+    ("north_km", "noise", "declare"),
+    [(5.0, 1e-3, True), (15.0, 1e-3, True), (60.0, 1e-3, False), (400.0, 1e-3, False), (5.0, 0.3, False)],
+)
+def test_it_declares_where_it_is_sure_and_goes_on_elsewhere(north_km: float, noise: float, declare: bool) -> None:
+    decided, _ = decide(north_km, noise, 0.0)
+    assert decided.declare.item() is declare
+    assert (decided.probability > 0.99) == declare
+    if noise < 0.1:
+        assert decided.way.tolist() == pytest.approx([north_km, 0.0], abs=0.5)
 
 
-def test_readings_average_a_part_of_a_slow_error() -> None:
-    """A constant error of 0.1 and a slow one of 0.2, half of whose variance is left: 0.01 + 0.02."""
-    found = decide(0.0, 0.0, 0.05**0.5, drift=0.2)
-    alike = decide(0.0, 0.0, 0.03**0.5)
-    assert found.probability.item() == pytest.approx(alike.probability.item(), rel=1e-6)
-    assert found.attainable.item() == pytest.approx(alike.attainable.item(), rel=1e-6)
-    assert found.probability > decide(0.0, 0.0, 0.05**0.5).probability + 0.05
+def test_fewer_steps_are_worth_less_and_without_any_it_declares() -> None:
+    decided = [decide(5.0, 0.3, 0.1, left)[0] for left in (0, 1, 4, 32)]
+    assert [one.declare.item() for one in decided] == [True, False, False, False]
+    worth, attainable = (torch.stack([getattr(one, name) for one in decided]) for name in ("worth", "attainable"))
+    assert worth[0] == 0
+    assert attainable[0] == decided[0].probability
+    assert (worth.diff() > 0).all()
+    assert (attainable.diff() > 0).all()
 
 
-@pytest.mark.parametrize(("north_km", "declare"), [(5.0, True), (60.0, False), (400.0, False)])
-def test_it_declares_where_it_is_sure_and_goes_on_elsewhere(north_km: float, declare: bool) -> None:
-    decision = decide(north_km, 0.0, 0.0)
-    assert decision.declare.item() is declare
-    assert decision.posterior.way().displacement[0].tolist() == pytest.approx([north_km, 0.0], abs=0.1 * north_km)
+def test_a_vehicle_near_the_border_goes_nearer_as_far_as_readings_there_help() -> None:
+    """24 km away: one that is sure needs to go no nearer than 0.8 of the radius, another to a quarter of it."""
+    sure, unsure = decide(24.0, 1e-3, 0.0)[0], decide(24.0, 0.1, 0.2)[0]
+    assert sure.stop_km.item() == pytest.approx(20.0)
+    assert unsure.stop_km.item() == pytest.approx(6.25)  # the nearest place, as each estimate is another way
+    near = decide(20.0, 0.1, 0.0)[0]
+    assert 0.4 < near.probability < 0.7 < near.worth
 
 
-def test_a_vehicle_near_the_border_goes_nearer_if_readings_there_help() -> None:
-    """20 km away and 10 km unsure: to go there and read costs 5 % of the path, and makes it certain."""
-    assert not decide(20.0, 0.1, 0.0).declare.item()
-
-
-@pytest.mark.parametrize(("bias", "share"), [(0.0, 0.8), (0.2, 0.25)])
-def test_it_goes_no_nearer_than_readings_are_worth(bias: float, share: float) -> None:
-    """24 km away: one that is sure stops at once; a constant error of 20 km needs the nearest place that it may go to,
-    which is not the estimated one, as each new estimate is another way."""
-    assert decide(24.0, 0.0, bias).stop_km.item() == pytest.approx(share * 25)
+def test_the_probability_of_the_radius_is_that_of_samples() -> None:
+    root = 20 * randn(6, 2, 2)
+    covariance, apart = root @ root.mT, f64((0.0, 0.0), (15.0, -5.0), (-30.0, 20.0))
+    error = (randn(20_000, 2, seed=1) @ root.mT).unsqueeze(-2)
+    expected = ((error + apart).norm(dim=-1) <= RADIUS_KM).double().mean(-2)
+    torch.testing.assert_close(decision._within(covariance, apart, RADIUS_KM), expected, rtol=0, atol=0.04)
 
 
 def test_the_approach_turns_where_it_is_if_the_way_is_behind() -> None:

@@ -1,67 +1,158 @@
-"""The plan of the next move: what it predicts, what it weighs, and what it compares."""
+"""The plan of the next move: what a reading will teach, against the belief after it, and what the plan weighs."""
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
-from support.tracks import F64, STD, f64
+from support.tracks import F64, STD, f64, randn
 from torch import Tensor
+from torch.autograd.functional import jacobian
 
 from magrl import tracking
-from magrl.tracking import FieldTrack, WayPosterior, planning
+from magrl.geodesy import geodesic, move
+from magrl.sensor_std import SensorStd
+from magrl.tracking import Belief, Destination, DestinationPosterior, covariance_after, planning
+from magrl.tracking.belief import CONSTANT, MODEL_NT, SLOW
+from magrl.tracking.prior import DEGREE, closure
 
-RANGE_KM = 300.0
+RANGE_KM, KM = 300.0, f64(40.0)[0]
+HERE = f64(8.0, -16.0, 35000.0)
 NOISE = f64(*STD)
-READING = f64(8.0, -16.0, 35000.0)
-UNSURE = tracking.start(READING, tracking.dipole_prior(READING), STD)
-SLOPES = f64((20.0, 0.3, 0.2), (40.0, -0.2, 0.9), (200.0, 0.5, 0.5))
-SURE = FieldTrack(SLOPES, 1e-8 * torch.eye(3, dtype=F64).expand(3, 3, 3))
+WHITE = SensorStd(NOISE)
+SHIP = SensorStd(NOISE, f64(3.0, 0.5, 150.0), f64(2.9, 0.4, 140.0), f64(100.0, 100.0, 100.0))
 
 
-def predicted(
-    track: FieldTrack, moves: Tensor, left: Tensor, bias_std: Tensor | None = None, curvature: Tensor | None = None
-) -> Tensor:
-    options = NOISE, RANGE_KM, tracking.ELEMENT_SCALES, bias_std, curvature
-    nn, ne, ee = planning._covariance_after(track, moves, left, *options)
-    return torch.stack((nn, ne, ne, ee), -1).unflatten(-1, (2, 2))
+def flown(reading: Tensor, errors: SensorStd, legs: int, crust_nt: float = 0.0) -> Destination:
+    """A belief after some legs of 40 km, and a destination 150 km away from the expected one."""
+    belief = tracking.start(reading, errors, f64(0.3)[0], crust_nt)
+    for leg in range(legs):
+        course = f64(0.3 + 1.2 * leg)[0]
+        belief = tracking.moved(belief, KM, course, errors)
+        belief = tracking.read(belief, tracking.elements(belief).value + 0.5 * NOISE, errors.noise, course, crust_nt)
+    target = tracking.elements(tracking.moved(belief, f64(150.0)[0], f64(-0.7)[0])).value
+    return tracking.destination(belief, target + f64(0.1, 0.1, 20.0), RANGE_KM, crust_nt)
 
 
-def after(track: FieldTrack, move: Tensor) -> FieldTrack:
-    moved = tracking.predict(track, move, (0.0, 0.0, 0.0))
-    return tracking.update(moved, tracking.estimated_field(moved), NOISE)
+def polar(way: Tensor) -> tuple[Tensor, Tensor]:
+    return way.norm(), torch.atan2(way[1], way[0])
 
 
-@pytest.mark.parametrize("lasting", [{}, {"bias_std": f64(0.05, 0.01, 4.0), "curvature": f64(0.003, 0.004, 2.0)}])
-def test_the_predicted_covariance_is_that_of_the_filter_after_the_move(lasting: dict) -> None:
-    """Where the gradients are known, a move teaches nothing, and the formula is that of way_to with the relation."""
-    moves, left = f64((20.0, 10.0), (-5.0, 0.0)), f64((150.0, -40.0), (-60.0, 90.0))
-    found = predicted(SURE, moves, left, **lasting)
-    for index in range(2):
-        end = after(SURE, moves[index])
-        target = (end.mean[..., 0] + end.mean[..., 1:] @ (left[index] / 100)) * f64(*tracking.ELEMENT_SCALES)
-        shared = tracking.related(end, tracking.curl_relation)[1]
-        expected = tracking.way_to(end, target, RANGE_KM, shared=shared, **lasting).covariance
-        torch.testing.assert_close(found[index], expected, rtol=1e-3, atol=1e-9)
+def prediction(belief: Belief, way: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The field at the end of a way: covariance, slopes ``(6,)`` by differences over 2 km, and theirs ``(6, 6)``."""
+
+    def field(mean: Tensor, north: float, east: float) -> Tensor:
+        return tracking.moved(belief._replace(mean=mean), *polar(way + f64(north, east))).field
+
+    def slopes(mean: Tensor) -> Tensor:
+        ends = [field(mean, *end) - field(mean, *(-x for x in end)) for end in ((1.0, 0.0), (0.0, 1.0))]
+        return torch.cat(ends) / 2
+
+    one, six = jacobian(lambda mean: field(mean, 0.0, 0.0), belief.mean), jacobian(slopes, belief.mean)
+    return one @ belief.covariance @ one.mT, slopes(belief.mean), six @ belief.covariance @ six.mT
 
 
-def test_a_crossing_move_is_worth_more_than_one_along_the_way() -> None:
-    """After a straight leg, the gradients along it are known and those across it are not."""
-    track = after(UNSURE, f64(30.0, 0.0))
-    moves = f64((10.0, 0.0), (0.0, 10.0))
-    along, across = predicted(track, moves, f64(200.0, 200.0) - moves).diagonal(dim1=-2, dim2=-1).sum(-1)
-    assert across < 0.5 * along
+def flown_covariance(goal: Destination, way: Tensor, leg: Tensor, errors: SensorStd, readings: int = 1) -> Tensor:
+    """The covariance of a way by the belief after a leg and the expected readings at its end."""
+    origin = goal.belief.latitude, torch.zeros((), dtype=F64)
+    km, course = polar(leg)
+    after = tracking.moved(goal.belief, km, course, errors)
+    for _ in range(readings):
+        reading = tracking.elements(after).value + after.mean[CONSTANT] + after.mean[SLOW]
+        after = tracking.read(after, reading, errors.noise, course, (goal.noise - MODEL_NT**2) ** 0.5)
+    distance, bearing = geodesic(*move(*origin, course, km), *move(*origin, *polar(way)[::-1]))
+    covariance, _, later = prediction(after, distance * torch.stack((bearing.cos(), bearing.sin())))
+    _, slopes, now = prediction(goal.belief, way)
+    left_out = closure().left_out_nt * ((way - leg).norm() / 1000) ** DEGREE
+    precision = torch.linalg.inv(covariance + (left_out**2 + goal.noise) * torch.eye(3, dtype=F64))
+    squares = (slopes[:, None] * slopes + now - later).unflatten(0, (2, 3)).unflatten(-1, (2, 3)).transpose(1, 2)
+    return torch.linalg.inv((precision * squares).sum((-2, -1)) + torch.eye(2, dtype=F64) / RANGE_KM**2)
+
+
+def differs(found: Tensor, expected: Tensor) -> float:
+    return float((found - expected).norm() / expected.norm())
+
+
+@pytest.mark.parametrize("missing", [None, 0])
+@pytest.mark.parametrize(("reading", "legs"), [(HERE, 0), (f64(-10.0, 60.0, 20000.0), 3)], ids=["start", "track"])
+@pytest.mark.parametrize(("errors", "crust_nt"), [(WHITE, 0.0), (SHIP, 20.0)], ids=["white", "ship"])
+def test_the_forecast_is_the_covariance_after_the_leg_is_flown(
+    errors: SensorStd, crust_nt: float, reading: Tensor, legs: int, missing: int | None
+) -> None:
+    """By :func:`~magrl.tracking.moved`, :func:`~magrl.tracking.read` and differences of what is predicted."""
+    goal, moves = flown(reading, errors, legs, crust_nt), f64((30.0, 0.0), (-10.0, 40.0))
+    way = tracking.mode(goal).displacement
+    if missing is not None:
+        errors = errors._replace(noise=NOISE.index_fill(0, torch.tensor([missing]), math.inf))
+    for found, leg in zip(covariance_after(goal, way, moves, errors), moves, strict=True):
+        assert differs(found, flown_covariance(goal, way, leg, errors)) < 0.015
+
+
+def test_the_forecast_averages_the_noise_of_many_readings() -> None:
+    errors, leg = SensorStd(4 * NOISE), f64(20.0, -30.0)
+    goal = flown(HERE, errors, 2)
+    way = tracking.mode(goal).displacement
+    one, six = covariance_after(goal, way, leg.expand(2, 2), errors, torch.tensor([1, 6]))
+    assert differs(six, flown_covariance(goal, way, leg, errors, readings=6)) < 0.02
+    assert six.trace() < 0.8 * one.trace()
+
+
+@pytest.mark.parametrize("errors", [WHITE, SHIP], ids=["white", "ship"])
+def test_a_more_accurate_reading_never_increases_the_forecast(errors: SensorStd) -> None:
+    """In any direction; a missing reading is the least accurate."""
+    goal, moves = flown(HERE, errors, 1), 60 * randn(20, 2)
+    way, stds = tracking.mode(goal).displacement, (math.inf, 30.0, 3.0, 1.0, 0.3, 0.0)
+    noises = [NOISE * std if std else 0 * NOISE for std in stds]
+    after = torch.stack([covariance_after(goal, way, moves, errors._replace(noise=noise)) for noise in noises])
+    assert torch.linalg.eigvalsh(after[:-1] - after[1:]).amin() > -1e-4 * after.norm()
+    assert (after.diagonal(dim1=-2, dim2=-1).sum(-1)[1:].diff(dim=0) < 0).all()
+
+
+def plan(goal: Destination, price_km: float, errors: SensorStd, **options: float) -> tuple[float, float]:
+    """Length [km] of the move, and its angle to the way [deg]."""
+    posterior = tracking.posterior(goal)
+    aim = posterior.way().displacement.double()
+    planned = tracking.planned_move(goal, posterior, aim, errors, f64(price_km)[0], 50.0, **options)
+    (length, course), (_, ahead) = polar(planned), polar(aim)
+    return length.item(), abs(math.degrees(course - ahead))
+
+
+def test_the_plan_weighs_steps_path_and_what_is_learned() -> None:
+    """Cheap steps are short ones; where the way across is unknown, a move aside teaches it, and more so with noise."""
+    goal, noisy = flown(HERE, WHITE, 0), SensorStd(4 * NOISE)
+    cheap, dear = plan(goal, 0.1, WHITE), plan(goal, 100.0, WHITE)
+    assert plan(goal, 0.1, WHITE, caution=0.0) == pytest.approx((5.0, 0.0), abs=1e-4)
+    assert 5 < cheap[0] < dear[0] == pytest.approx(50.0)
+    assert cheap[1] > 9 > 1e-3 > dear[1]
+    assert plan(flown(HERE, noisy, 0), 0.1, noisy)[1] > cheap[1] + 9
+    assert plan(goal, 0.1, WHITE, caution=3.0)[0] > cheap[0]
+
+
+def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
+    goal = flown(HERE, WHITE, 2)
+    sure = goal._replace(belief=goal.belief._replace(covariance=1e-9 * goal.belief.covariance))
+    aims, prices, apart = f64((-90.0, 120.0), (0.0, 30.0)), f64(3.0, 1.0), f64((0.0, 5.0), (0.0, -5.0))
+
+    def planned(index: slice | int) -> Tensor:
+        belief = Belief(*(torch.stack(parts)[index] for parts in zip(sure.belief, goal.belief, strict=True)))
+        here = Destination(belief, goal.field.expand(2, 3)[index], goal.range, goal.noise)
+        points = aims[index].unsqueeze(-2) + apart + 100.0  # of which only the shape counts
+        posterior = DestinationPosterior(points, torch.full(points.shape[:-1], 0.5, dtype=F64))
+        return tracking.planned_move(here, posterior, aims[index], WHITE, prices[index], 50.0)
+
+    torch.testing.assert_close(planned(0), f64(-30.0, 40.0))
+    torch.testing.assert_close(planned(slice(None)), torch.stack((planned(0), planned(1))))
 
 
 def test_the_detour_by_hand() -> None:
-    """400 km and 300 km across."""
-    way, zero = f64(400.0, 0.0), f64(0.0)[0]
-    torch.testing.assert_close(planning._detour(way, (zero, zero, zero + 300.0**2)), f64(100.0)[0])
-    torch.testing.assert_close(planning._detour(0 * way, (zero, zero, zero + 300.0**2)), f64(300.0)[0])
-    along = 40.0**2 * 2 + zero, zero, zero
-    torch.testing.assert_close(planning._detour(way * 30 / 400, along), f64(20.0)[0])  # half of it: 50 - 30
+    """400 km and 300 km across; at the place itself; and 40 km along a way of 30 km, of which half counts."""
+    way, across = f64((400.0, 0.0), (0.0, 0.0), (30.0, 0.0)), torch.zeros(3, 2, 2, dtype=F64)
+    across[:2, 1, 1], across[2, 0, 0] = 300.0**2, 2 * 40.0**2
+    torch.testing.assert_close(planning._detour(way, across), f64(100.0, 300.0, 20.0))
 
 
-def test_the_moves_that_are_compared_and_the_price_of_a_step() -> None:
+def test_the_moves_that_are_compared() -> None:
     way = f64(0.0, 20.0)
     moves = planning._moves(way, tracking.LENGTHS, 50.0)
     assert moves.shape == ((len(tracking.LENGTHS) + 1) * len(planning.ANGLES_DEG), 2)
@@ -70,27 +161,19 @@ def test_the_moves_that_are_compared_and_the_price_of_a_step() -> None:
     assert moves.norm(dim=-1).max() == pytest.approx(50.0)
     for far, shortest in ((20, 10.0), (500, 50.0)):  # 400 km, 10000 km
         assert planning._moves(far * way, tracking.LENGTHS, 50.0).norm(dim=-1).min() == pytest.approx(shortest)
-    steps = torch.tensor([0, 10, 34, 49])
-    price = tracking.step_price(0.5, 400.0, 25 * way, steps, (0.0, 0.0, 0.0), max_steps=50, max_move_km=50.0)  # 2 km
-    assert price.tolist() == pytest.approx([2 * (50 / 35) ** 4, 2 * 2**4, 2 * 50**4, 2 * 50**4])  # 15 are for the way
+
+
+def test_the_price_of_a_step_rises_as_steps_run_out() -> None:
+    """Of 50 steps, 15 are for a way of 500 km; a poor reading keeps some in reserve, and a missing one none."""
+
+    def price(percent: object, range_km: float, way_km: float, steps: Tensor, std: object) -> list[float]:
+        return tracking.step_price(percent, range_km, f64(0.0, way_km), steps, std, 50, 50.0).tolist()
+
+    exact, steps = (0.0, 0.0, 0.0), torch.tensor([0, 10, 34, 49])
+    assert price(0.5, 400.0, 500.0, steps, exact) == pytest.approx([2 * (50 / x) ** 4 for x in (35, 25, 1, 1)])
     percent, steps = f64(0.25, 4.0, 4.0), torch.tensor([25, 20, 30])
-    price = tracking.step_price(percent, 200.0, f64(0.0, 0.0), steps, (0.0, 0.0, 0.0), 50, 50.0)
-    assert price.tolist() == pytest.approx([0.5 * 2**4, 8 * (5 / 3) ** 2, 2 * 2.5**4])
-    std = f64((0.0, 0.0, 0.0), (1.0, 0.15, 20.0), (1.0, 1.0, 1000.0), (1e4, 1e4, 1e4))  # the last is missing
-    price = tracking.step_price(0.5, 400.0, f64(0.0, 0.0), torch.tensor(21), std, 50, 50.0)
-    assert price.tolist() == pytest.approx([2 * (50 / 29) ** 4, 2 * 2**4, 2 * (50 / 19) ** 4, 2 * (50 / 29) ** 4])
-
-
-def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
-    ways, prices = f64((90.0, -120.0), (0.0, 30.0)), f64(1.0, 0.1)
-    apart, weights = f64((0.0, 20.0), (0.0, -20.0), (20.0, 0.0), (-20.0, 0.0)), f64(0.4, 0.2, 0.2, 0.2)
-
-    def plan(index: slice | int) -> Tensor:
-        track = FieldTrack(*(torch.stack(parts)[index] for parts in zip(SURE, UNSURE, strict=True)))
-        aim = ways[index]
-        points = aim.unsqueeze(-2) + apart + 100.0  # of which only the shape counts
-        posterior = WayPosterior(points, weights.expand(points.shape[:-1]))
-        return tracking.planned_move(track, aim, posterior, NOISE, prices[index], 50.0, RANGE_KM)
-
-    torch.testing.assert_close(plan(0), f64(30.0, -40.0))
-    torch.testing.assert_close(plan(slice(None)), torch.stack((plan(0), plan(1))))
+    expected = [0.5 * 2**4, 8 * (5 / 3) ** 2, 2 * 2.5**4]
+    assert price(percent, 200.0, 0.0, steps, exact) == pytest.approx(expected)
+    std = f64(exact, (1.0, 0.15, 20.0), (1.0, 1.0, 1000.0), (1e4, 1e4, 1e4))
+    expected = [2 * (50 / x) ** 4 for x in (29, 25, 19, 29)]
+    assert price(0.5, 400.0, 0.0, torch.tensor(21), std) == pytest.approx(expected)

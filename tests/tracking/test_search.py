@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from magrl.tracking import VISITED, FieldTrack, Way, aim, unvisited, unvisited_yet, visit
-from magrl.tracking.search import arrival_ellipse
+from magrl.tracking import VISITED, Way, arrival_ellipse, unvisited, unvisited_yet, visit
 
 LONG = torch.tensor([[36.0, 200.0], [200.0, 2500.0]])  # [km^2]: 6 km northward, 50 km eastward, correlated
 ELLIPSE = torch.diag(torch.tensor([1 / 20.0**2, 1 / 12.0**2]))
@@ -51,17 +50,8 @@ def test_short_moves_do_not_fill_the_memory() -> None:
 
 def test_the_ellipse_shrinks_with_the_uncertainty_of_the_gradient() -> None:
     """The expected square of g·d is that of the mean plus the variance: here 1 + 3 along the first axis."""
-    covariance = torch.diag(torch.tensor([0.0, 3.0, 5.0])).unsqueeze(0)
-    track = FieldTrack(torch.tensor([[7.0, 1.0, 2.0]]), covariance)
-    expected = torch.tensor([[4.0, 2.0], [2.0, 9.0]]) * 4 / 100**2
-    torch.testing.assert_close(arrival_ellipse(track, torch.tensor([4.0]), (1.0,)), expected)
-
-
-def test_the_aim_is_searched_in_the_axes_of_the_way() -> None:
-    """Heading east, arrival within 20 km northward and 2 km eastward: a place 10 km north of the mean excludes it."""
-    track = FieldTrack(torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), torch.zeros(2, 3, 3))
-    axes, mean = torch.tensor([[0.0, 1.0], [-1.0, 0.0]]), torch.tensor([0.0, -30.0])  # forward, to the right
-    for north, expected in ((40.0, False), (51.0, True)):
-        visited = torch.tensor([[north, 0.0]])
-        found = aim(track, Way(mean, LONG), visited, torch.tensor([25.0, 2500.0]), (1.0, 1.0), axes)
-        assert torch.equal(found, mean) == expected
+    gradient, covariance = torch.tensor([[1.0, 2.0]]), torch.diag(torch.tensor([3.0, 5.0])).expand(4, 1, 2, 2)
+    found = arrival_ellipse(gradient, covariance, torch.tensor([0.5]))
+    torch.testing.assert_close(found, 0.5 * torch.tensor([[4.0, 2.0], [2.0, 9.0]]).expand(4, 2, 2))
+    circle = arrival_ellipse(gradient, covariance, torch.tensor([0.5]), 25.0)
+    torch.testing.assert_close(circle, torch.eye(2).expand(4, 2, 2) / 625)

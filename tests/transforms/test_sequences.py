@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from magrl.tracking.learned_prior import features
 from magrl.transforms import ReadingObservation
+from magrl.transforms.sequences import features
 
 GRADIENT = torch.tensor([[0.01, -0.002], [0.004, 0.008], [3.0, -5.0]])  # D, I [deg/km], B_H [nT/km]; north, east
 START, WAY = torch.tensor([3.0, 60.0, 20000.0]), torch.tensor([120.0, -200.0])

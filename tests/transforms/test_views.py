@@ -1,14 +1,15 @@
-"""The observation of an agent without a map: its 15 numbers, its frame, its state, and the policy that reads it."""
+"""The observation of an agent without a map: its 19 numbers, its frame, its state, and the policy that reads it."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from support.readings import first_reading, moved
+from support.readings import first_reading
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
@@ -16,8 +17,7 @@ from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.guidance import OBJECTIVE_FLOORS
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking import dipole_prior
-from magrl.transforms import ObservationView, SensorNoise, TrackGradient, TrackView
+from magrl.transforms import ObservationView, SensorNoise, TrackField, TrackView
 from magrl.transforms.views import track_observation
 
 VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2)
@@ -79,36 +79,22 @@ def test_numbers_at_the_extremes() -> None:
     assert (far[1], far[3]) == (-1.0, 2500 / 400 - 0.5)
 
 
-def observed_track(turn: float) -> Tensor:
-    """The observations of three readings, with world and vehicle turned by an angle [rad] to the right.
-
-    With the prior of a dipole, without the relation of the gradients and without the plan, which uses it: there, true
-    north has a meaning, as the meridians converge.
-    """
-    free = {"prior": dipole_prior, "relation": None}
-    track = TrackGradient(std_keys=["sensor_std"], **free, range_km=VIEW.range_km, frame="vehicle")
-    observe = Compose(track, *VIEW.observation_transforms()[1:])
-    state, seen, observations = None, first_reading(), []
-    seen["heading"] += turn
-    for key in ("field", "target_field"):
-        seen[key][:, 0] += math.degrees(turn)
-    for step in range(3):
-        for key in ("field", "target_field"):
-            seen[key][:, 0] = torch.remainder(seen[key][:, 0] + 180, 360) - 180
-        seen["sensor_std"] = float64(STD).expand(4, 3)
-        seen["bias_std"] = seen["drift_std"] = torch.zeros(4, 3, dtype=torch.float64)
-        seen["step_count"] = torch.full((4, 1), step)
-        state = observe(seen.clone()) if state is None else observe(state.copy().set("next", seen.clone()))["next"]
-        observations.append(torch.cat((state["observation"][:, :15], state["observation"][:, 18:]), -1))
-        seen = moved(seen, 40.0, 0.7, float64([0.3, 0.4, -60.0]) / (1 + step))
-    return torch.stack(observations)
-
-
 def test_a_turn_of_world_and_vehicle_is_not_observed() -> None:
-    """D turns with the world, and passes 180 degrees."""
-    plain = observed_track(0.0)
-    torch.testing.assert_close(observed_track(3.0), plain, rtol=1e-5, atol=1e-5)
-    assert (plain[1:] - plain[:-1]).abs().amax(-1).min() > 0.01
+    """D turns with the world, and passes 180 degrees; a turn of the vehicle alone is observed."""
+    *estimate, observe = VIEW.observation_transforms()
+    seen = first_reading().set("step_count", torch.zeros(4, 1, dtype=torch.int64))
+    seen.update({key: float64(STD if key == "sensor_std" else (0.0,) * 3).expand(4, 3) for key in STD_KEYS})
+    seen = Compose(*estimate)(seen)
+    plain, other = observe(seen.clone())["observation"], seen.clone()
+    other["heading"] = seen["heading"] + 3.0
+    assert not torch.allclose(observe(other.clone())["observation"], plain)
+    turn = float64([[math.cos(3.0), -math.sin(3.0)], [math.sin(3.0), math.cos(3.0)]])
+    for key in ("field", "target_field", "estimated_field"):
+        other[key][:, 0] = torch.remainder(seen[key][:, 0] + math.degrees(3.0) + 180, 360) - 180
+    for key in ("aim", "planned_move", "estimated_gradient"):
+        other[key] = seen[key] @ turn.mT
+    other["way_covariance"] = turn @ seen["way_covariance"] @ turn.mT
+    torch.testing.assert_close(observe(other)["observation"], plain, rtol=1e-5, atol=1e-5)
 
 
 def test_weights_are_those_of_the_first_reading_of_each_row() -> None:
@@ -138,6 +124,35 @@ def test_policy_starts_again_where_the_batch_is_another(tmp_path: Path) -> None:
     for found in (agent, load_policy(tmp_path / "policy.pt")):
         found.check_fits(nav())
         assert torch.equal(found(middle.clone())["action"], expected)
+
+
+def test_a_policy_flies_by_the_belief_of_its_environment_as_by_its_own() -> None:
+    noise = SensorNoise(STD, seed=1)
+    own, given = (
+        TransformedEnv(nav(), Compose(noise.clone(), *track)).rollout(6, policy())["action"]
+        for track in ([], [TrackField(std_keys=STD_KEYS)])
+    )
+    torch.testing.assert_close(given, own)
+    other = TrackField(sensor_std=[20 * std for std in STD])
+    assert not torch.allclose(TransformedEnv(nav(), Compose(noise.clone(), other)).rollout(6, policy())["action"], own)
+
+
+@pytest.mark.parametrize(
+    ("option", "error"),
+    [
+        ({"zeta": 0.0}, ValueError),
+        ({"max_steps": 0}, ValueError),
+        ({"range_km": math.nan}, ValueError),
+        ({"radius_km": -1.0}, ValueError),
+        ({"step_price": 0.0}, ValueError),
+        ({"caution": -0.1}, ValueError),
+        ({"crust_nt": -1.0}, ValueError),
+        ({"search": 1}, TypeError),
+    ],
+)
+def test_bad_options_of_a_track_view_are_refused(option: dict, error: type[Exception]) -> None:
+    with pytest.raises(error, match=next(iter(option))):
+        replace(VIEW, **option)
 
 
 def test_bad_bounds_of_a_view_are_refused() -> None:

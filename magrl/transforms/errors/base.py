@@ -149,7 +149,7 @@ class EpisodeErrors(EpisodeNumbers):
         Args:
             field: ``(..., E)`` reading.
         """
-        return SensorStd(torch.zeros_like(field), torch.zeros_like(field), torch.zeros_like(field))
+        return SensorStd(*(torch.zeros_like(field) for _ in STD_KEYS))
 
     def farthest_km(self, max_move_km: float) -> float:
         """Return the longest path on the ground of a commanded move [km].

@@ -44,7 +44,7 @@ class Conditions:
     Example:
         >>> ship = Conditions("ship", 24.0, sensors={"noise": (0.02, 0.02, 5.0)}, north={"constant_deg": 0.1})
         >>> ship.std
-        SensorStd(noise=(0.02, 0.02, 5.0), bias=(0.1, 0.0, 0.0), drift=(0.0, 0.0, 0.0))
+        SensorStd(noise=(0.02, 0.02, 5.0), bias=(0.1, 0.0, 0.0), drift=(0.0, 0.0, 0.0), iron=(0.0, 0.0, 0.0))
     """
 
     name: str

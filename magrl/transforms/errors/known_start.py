@@ -14,6 +14,9 @@ from magrl.field.elements import element_difference
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms.base import StatefulTransform
 
+START_KEYS = ("start_error", "start_field", "start_std", "start_bias_std")
+"""Keys of what is known at the start; see :class:`KnownStart`."""
+
 
 def calibration(reading: Tensor, known: Tensor, sensor_std: SensorStd, known_std: Tensor) -> tuple[Tensor, SensorStd]:
     """Return the constant errors of the sensors, given a reading where the elements are known, and what is left.
@@ -39,7 +42,7 @@ def calibration(reading: Tensor, known: Tensor, sensor_std: SensorStd, known_std
         (tensor(0.3200), tensor(0.3842))
     """
     check_tensor(3, reading=reading, known=known)
-    noise, bias, slow = (std.square() for std in sensor_std)
+    noise, bias, slow = (std.square() for std in sensor_std[:3])
     constant, other = (bias - slow).clamp_min(0), noise + slow + known_std.square()
     gain = torch.where(constant > 0, constant / (constant + other), 0.0)
     return gain * element_difference(reading, known), sensor_std._replace(bias=(gain * other + slow).sqrt())
@@ -56,8 +59,9 @@ class KnownStart(StatefulTransform):
         sensor_std: accuracy of the sensors, of which the drift counts; noise and bias are those of the reading.
         known_std: standard deviations of the elements that are known at the start: D [deg], I [deg], B_H [nT].
         in_keys: reading, elements without errors, and standard deviations of noise and bias, all ``(..., 3)``.
-        out_keys: the reading without the error, the standard deviations of the bias that is left, and the error itself,
-            all ``(..., 3)``.
+        out_keys: the reading without the error, the standard deviations of the bias that is left, the error itself, the
+            known elements, their standard deviations, and the standard deviations of the bias before, all ``(..., 3)``.
+            From the last four, :class:`~magrl.transforms.TrackField` estimates the errors along the way.
 
     Raises:
         ValueError: for a standard deviation that is negative, or another number of keys.
@@ -74,9 +78,9 @@ class KnownStart(StatefulTransform):
     """
 
     default_in_keys = ("field", "true_field", "sensor_std", "bias_std")
-    default_out_keys = ("field", "bias_std", "start_error")
+    default_out_keys = ("field", "bias_std", *START_KEYS)
     in_sizes = (3, 3, 3, 3)
-    out_sizes = (3,), (3,), (3,)
+    out_sizes = ((3,),) * 6
     _std: Tensor
 
     def __init__(
@@ -93,11 +97,8 @@ class KnownStart(StatefulTransform):
         reading, known, noise, bias = values
         drift, known_std = self._std.to(reading.dtype)
         error, left = calibration(reading, known, SensorStd(noise, bias, drift), known_std)
-        self._write(tensordict, reading, left.bias, error)
+        self._advance(tensordict, values, [left.bias, error, known, known_std.expand_as(known).clone(), bias])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        self._write(tensordict, values[0], *state)
-
-    def _write(self, tensordict: TensorDictBase, reading: Tensor, bias_std: Tensor, error: Tensor) -> None:
-        for key, value in zip(self.out_keys, (element_difference(reading, error), bias_std, error), strict=True):
+        for key, value in zip(self.out_keys, (element_difference(values[0], state[1]), *state), strict=True):
             tensordict.set(key, value)

@@ -69,7 +69,7 @@ class SensorNoise(ReadingErrors):
         normal = math.sqrt(2) * torch.erfinv(2 * uniform - 1 + 2.0**-53)  # the shift keeps it finite and centered
         none = torch.zeros_like(episode.numbers)
         reading = values[0] + episode.numbers * normal.to(values[0].dtype)
-        self._measure(tensordict, values[0], reading, SensorStd(episode.numbers, none, none))
+        self._measure(tensordict, values[0], reading, SensorStd(episode.numbers, none, none, none))
         return episode.numbers
 
     def accuracy(self, field: Tensor) -> SensorStd:
@@ -136,7 +136,9 @@ class RandomSensorNoise(SensorNoise):
         if not episode.first:
             drift = gauss_markov(drift, drift_std, move[..., :1], DRIFT_KM, walk)
         reading = value + noise_std * noise + constant + drift
-        self._measure(tensordict, value, reading, SensorStd(noise_std, bias_std, drift_std))
+        self._measure(
+            tensordict, value, reading, SensorStd(noise_std, bias_std, drift_std, torch.zeros_like(noise_std))
+        )
         return torch.cat((noise_std, bias_std, constant, drift_std, drift), -1)
 
 

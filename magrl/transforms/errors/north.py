@@ -138,7 +138,7 @@ class NorthReferenceError(ReadingErrors):
         tensordict.set(self.out_keys[0], wrap_angle(heading - torch.deg2rad(error)))
         declination = wrap_longitude(field[..., :1] - error)
         growth = _secant(field[..., 1:2]) if position else torch.ones_like(declination)
-        accuracy = growth * self._accuracy.to(field.dtype).reshape(3, *[1] * (field.ndim - 1), -1)
+        accuracy = growth * self._accuracy.to(field.dtype).reshape(-1, *[1] * (field.ndim - 1), 3)
         self._measure(tensordict, field, torch.cat((declination, field[..., 1:]), -1), SensorStd(*accuracy))
         return torch.cat((constant, drift, error), -1)
 
@@ -151,7 +151,7 @@ class NorthReferenceError(ReadingErrors):
         """
         constant, drift, random = self.sizes
         of_declination = field.new_tensor((1.0, 0.0, 0.0)).expand_as(field)
-        return SensorStd(*(size * of_declination for size in (random, math.hypot(constant, drift), drift)))
+        return SensorStd(*(size * of_declination for size in (random, math.hypot(constant, drift), drift, 0.0)))
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Give the true heading to the environment."""

@@ -139,11 +139,11 @@ class SensorErrors(ReadingErrors):
 
         Example:
             >>> SensorErrors((1.0, 1.0), bias=(2.0, 0.0)).accuracy(torch.zeros(2))
-            SensorStd(noise=tensor([1., 1.]), bias=tensor([2., 0.]), drift=tensor([0., 0.]))
+            SensorStd(noise=tensor([1., 1.]), bias=tensor([2., 0.]), drift=tensor([0., 0.]), iron=tensor([0., 0.]))
         """
         noise, bias, scale, drift, resolution = self._sizes.to(field.dtype).square()
-        slow = drift.expand_as(field)  # an error of the vector varies with the heading
+        slow, iron = drift.expand_as(field), torch.zeros_like(field)  # an error of the vector varies with the heading
         if self.vector is not None:
-            slow = slow + self.vector.variance(field)
+            slow, iron = slow + self.vector.variance(field), self.vector.constant_std(field)
         noise, bias = (noise + resolution / 12).expand_as(field), bias + scale * field.square() + slow
-        return SensorStd(noise.sqrt(), bias.sqrt(), slow.sqrt())
+        return SensorStd(noise.sqrt(), bias.sqrt(), slow.sqrt(), iron)

@@ -128,6 +128,26 @@ class VectorErrors:
         horizontal = vector + attitude / per_radian2 * horizontal2 * tan2
         return torch.stack((declination, inclination, horizontal), -1)
 
+    def constant_std(self, elements: Tensor) -> Tensor:
+        """Return the standard deviation ``(..., 3)`` of the part that is constant in the vehicle's axes: forward,
+        right, down [nT].
+
+        An error of the attitude turns the vertical field into the horizontal plane.
+
+        Args:
+            elements: ``(..., 3)`` D [deg], I [deg], B_H [nT].
+
+        Example:
+            >>> VectorErrors(attitude_deg=(0.01, 0.01)).constant_std(torch.tensor([0.0, 60.0, 20000.0])).round()
+            tensor([6., 6., 0.])
+        """
+        hard, soft, attitude = self._mean_squares
+        down = torch.tan(torch.deg2rad(elements[..., 1])) * elements[..., 2]
+        total2 = elements[..., 2].square() + down.square()
+        constant = hard + soft * total2
+        across = constant + attitude / math.degrees(1) ** 2 * down.square()
+        return torch.stack((across, across, constant), -1).sqrt()
+
 
 def _leveling(attitude: Tensor) -> Tensor:
     """Return the rotation that errors of roll and pitch ``(..., 2)`` [rad] leave: ``(..., 3, 3)``."""

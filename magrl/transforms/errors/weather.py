@@ -143,7 +143,7 @@ class MagneticWeather(ReadingErrors):
         """
         change = elements_jacobian(field_vector(field))
         slow = (change @ self._moments.to(field) * change).sum(-1).sqrt()
-        return SensorStd(torch.zeros_like(field), slow, slow)
+        return SensorStd(torch.zeros_like(field), slow, slow, torch.zeros_like(field))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the elements without weather and the state; the measured elements are unbounded.

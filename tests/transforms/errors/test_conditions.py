@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from pathlib import Path
 
 import evaluate
@@ -14,13 +15,12 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import EnvBase
 
-from magrl.agents.pretrained import load_pretrained
+from magrl.agents import FieldPolicy, kalman, load_pretrained
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.navigators import make_navigator
 from magrl.field.elements import field_vector
 from magrl.field.records import weather_record
-from magrl.navigators import Kalman
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.transforms import (
     CONDITIONS,
@@ -124,39 +124,43 @@ def test_the_variances_of_all_errors_add_up() -> None:
     torch.testing.assert_close(std.drift, nanotesla * degrees)
     constant = torch.tensor([0.4, 0.0, 5.0], dtype=torch.float64)
     torch.testing.assert_close(std.bias, torch.hypot(constant, std.drift))
+    torch.testing.assert_close(std.iron, torch.tensor([10.0, 10.0, 10.0], dtype=torch.float64))
 
 
 def test_evaluations_repeat_and_seeds_differ() -> None:
     rollouts = []
     for seed in (0, 0, 1):
         env = with_conditions(nav(3, CONDITIONS["low-cost"].drift_km(50.0), max_steps=3), "low-cost", seed)
-        rollouts += [evaluation_rollout(env, Kalman(max_steps=3)) for _ in range(2)]
+        rollouts += [evaluation_rollout(env, kalman(max_steps=3)) for _ in range(2)]
     assert all((rollout == rollouts[0]).all() for rollout in rollouts[1:4])
     assert not torch.equal(rollouts[0]["field"], rollouts[4]["field"])
 
 
 def test_navigators_are_told_what_they_can_tell_apart() -> None:
     env, told = nav(2), SensorStd((0.3, 0.0, 3.0), (0.4, 0.1, 4.0))
-    for name in ("kalman", "secant"):
-        navigator = make_navigator(name, env, sensor_std=told)
-        assert navigator.sensor_std.tolist() == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0], [0.0] * 3]
-        assert torch.equal(navigator.reading_std(TensorDict()), navigator.sensor_std[0])
-        here = {"bias_std": torch.tensor([[0.9, 0.0, 4.0]]), "drift_std": torch.tensor([[0.8, 0.0, 0.0]])}
-        here = TensorDict(here, batch_size=1)  # larger at this latitude
-        assert navigator.reading_std(here)[0].tolist() == pytest.approx([0.5, 0.0, 3.0])
-        assert navigator.accuracy(here).bias[0].tolist() == pytest.approx([0.9, 0.1, 4.0])
+    secant = make_navigator("secant", env, sensor_std=told)
+    assert secant.sensor_std.tolist() == [[0.3, 0.0, 3.0], [0.4, 0.1, 4.0], [0.0] * 3, [0.0] * 3]
+    assert torch.equal(secant.reading_std(TensorDict()), secant.sensor_std[0])
+    here = {"bias_std": torch.tensor([[0.9, 0.0, 4.0]]), "drift_std": torch.tensor([[0.8, 0.0, 0.0]])}
+    here = TensorDict(here, batch_size=1)  # larger at this latitude
+    assert secant.reading_std(here)[0].tolist() == pytest.approx([0.5, 0.0, 3.0])
+    assert secant.accuracy(here).bias[0].tolist() == pytest.approx([0.9, 0.1, 4.0])
     matching = make_navigator("map_matching", env, sensor_std=told)
     assert matching.sensor_std[0].tolist() == pytest.approx([0.13**0.5, 0.05, 13**0.5], rel=1e-3)
     assert matching.sensor_std[1].tolist() == pytest.approx([0.4, 0.1, 4.0], rel=1e-3)
 
 
-def test_the_agent_heeds_constant_errors() -> None:
-    state, policy = nav(4).reset(), load_pretrained("anywhere")
+@pytest.mark.parametrize("make", [kalman, lambda: load_pretrained("anywhere")], ids=["kalman", "anywhere"])
+def test_agents_heed_all_errors_that_are_stated(make: Callable[[], FieldPolicy]) -> None:
+    """Each kind changes the move; without a statement, readings are perfect."""
+    state, policy, told = nav(4).reset(), make(), {}
     without = policy(state.clone())["action"]
-    zeros = torch.zeros_like(state["field"])
-    assert torch.equal(policy(state.clone().set("bias_std", zeros))["action"], without)
-    biased = policy(state.clone().set("bias_std", zeros + torch.tensor([3.0, 0.0, 0.0])))["action"]
-    assert not torch.allclose(biased, without)
+    assert torch.equal(policy(state.clone().update(dict.fromkeys(STD_KEYS, 0 * state["field"])))["action"], without)
+    actions = [without]
+    for key, std in zip(STD_KEYS, ((0.3, 0.3, 30.0), (3.0, 0.5, 90.0), (2.0, 0.4, 60.0), (40.0,) * 3), strict=True):
+        told[key] = torch.tensor(std).expand(4, 3)
+        actions.append(policy(state.clone().update(told))["action"])
+        assert not torch.allclose(actions[-1], actions[-2]), key
 
 
 # Commands
@@ -164,7 +168,7 @@ def test_the_agent_heeds_constant_errors() -> None:
 
 def test_evaluate_under_conditions(tmp_path: Path) -> None:
     out = tmp_path / "results"
-    config = evaluate.Config(("kalman",), tasks=5, errors="ship", out=out, wandb_mode="disabled")
+    config = evaluate.Config(("secant",), tasks=5, errors="ship", out=out, wandb_mode="disabled")
     config, (flight, _), navigators, _ = evaluate.prepare(config)
     assert {type(part) for part in flight.env.transform} >= {MotionError, NorthReferenceError}
     assert tuple(navigators[0][0].sensor_std[1].tolist()) == CONDITIONS["ship"].std.bias
@@ -189,7 +193,7 @@ def test_own_errors_in_a_file() -> None:
     )
     read = load_conditions(BOAT)
     for errors in (read, str(BOAT)):
-        flown = [with_conditions(nav(2, 8.0), each, 3).rollout(4, Kalman()) for each in (errors, boat)]
+        flown = [with_conditions(nav(2, 8.0), each, 3).rollout(4, kalman()) for each in (errors, boat)]
         torch.testing.assert_close(flown[0]["field"], flown[1]["field"], rtol=0, atol=0)
     assert (read.name, read.std) == (boat.name, boat.std)
     for recipe, places in ((fly, ["60.4N 5.3E", "62.0N 6.7W"]), (evaluate, ["secant"])):

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, SerialEnv
 from magrl.counters import advanced, counter_stream
 from magrl.envs.navigation import anywhere_env
 from magrl.envs.random_regions import planet_scenario
+from magrl.sensor_std import STD_KEYS
 from magrl.transforms import TRUE_KEYS, NorthReferenceError, SensorErrors, SensorNoise
 from magrl.transforms.errors.base import check_sizes, gauss_markov
 
@@ -98,8 +99,7 @@ def test_accuracy_adds_up_and_the_first_error_keeps_the_truth() -> None:
 
 def test_true_keys_are_those_that_are_written() -> None:
     keys = set(all_errors().reset().keys())
-    private = {key for key in keys - set(nav().reset().keys()) if key not in ("sensor_std", "bias_std", "drift_std")}
-    assert private == set(TRUE_KEYS)
+    assert keys - set(nav().reset().keys()) - set(STD_KEYS) == set(TRUE_KEYS)
 
 
 def test_data_without_an_environment() -> None:

@@ -11,6 +11,7 @@ from torchrl.envs import Compose, TransformedEnv, check_env_specs
 
 from magrl.sensor_std import SensorStd
 from magrl.transforms import CONDITIONS, Conditions, KnownStart, SensorErrors, calibration, with_conditions
+from magrl.transforms.errors.known_start import START_KEYS
 
 STD = (0.02, 0.02, 2.0), (0.5, 0.1, 20.0), (0.3, 0.05, 10.0), (0.1, 0.0, 0.0)  # noise, bias, drift, known
 
@@ -39,17 +40,23 @@ def test_without_other_errors_the_whole_difference_is_constant(bias: float, expe
 
 def test_the_error_of_the_start_is_subtracted_from_all_readings_of_an_episode() -> None:
     errors = SensorErrors((0.01, 0.01, 1.0), bias=(0.5, 0.2, 50.0), seed=3)
-    env = TransformedEnv(nav(3, max_steps=4), Compose(errors, KnownStart()))
+    env = TransformedEnv(nav(3, max_steps=4), Compose(errors, KnownStart(known_std=(0.02, 0.01, 3.0))))
     check_env_specs(env)
     rollout = env.rollout(9, break_when_any_done=False)
-    error = rollout["next", "start_error"]
+    error, first = rollout["next", "start_error"], rollout[:, 0]
+    assert torch.equal(first["start_field"], first["true_field"])
+    assert torch.equal(first["start_bias_std"], torch.tensor([0.5, 0.2, 50.0]).expand(3, 3))
+    assert torch.equal(first["start_std"], torch.tensor([0.02, 0.01, 3.0]).expand(3, 3))
+    for key in START_KEYS[1:]:  # what was known then is kept
+        assert torch.equal(rollout["next", key][:, :4], first[key].unsqueeze(1).expand(-1, 4, -1))
     assert torch.equal(error[:, :4], rollout["start_error"][:, :1].expand(-1, 4, -1))
     assert not torch.equal(error[:, 4], error[:, 3])  # another episode, other errors
     bias = rollout["next", "sensor_error"][..., :3]
     torch.testing.assert_close(error, bias, rtol=0, atol=5.0)
     left = (rollout["next", "field"] - rollout["next", "true_field"])[..., :2]
     assert left.abs().max() < 0.1 < bias[..., 0].abs().max()
-    assert rollout["next", "bias_std"].amax((0, 1)).tolist() == pytest.approx([0.01, 0.01, 1.0], rel=0.01)
+    expected = [math.hypot(*pair) for pair in ((0.01, 0.02), (0.01, 0.01), (1.0, 3.0))]  # noise, known
+    assert rollout["next", "bias_std"].amax((0, 1)).tolist() == pytest.approx(expected, rel=0.01)
 
 
 def test_conditions_state_what_is_left_where_the_start_is_known() -> None:

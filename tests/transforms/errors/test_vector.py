@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from magrl.field.elements import field_vector
 from magrl.transforms import VectorErrors
 
 F64 = torch.float64
@@ -55,6 +56,18 @@ def test_variance_of_a_vector_is_that_of_its_errors() -> None:
     heading = 6.28 * torch.rand(100_000, 1, generator=draw, dtype=F64)
     error = vector.disturb(elements.expand(100_000, 3), heading, constants) - elements
     torch.testing.assert_close(error.var(0), vector.variance(elements), rtol=0.02, atol=0)
+
+
+def test_the_constant_part_is_the_mean_error_over_the_headings() -> None:
+    """In the vehicle's axes: hard iron, and the vertical field that an error of the attitude turns into the level."""
+    vector, draw = VectorErrors((60.0,) * 3, attitude_deg=(0.2, 0.2)), torch.Generator().manual_seed(0)
+    constants = vector.constants(torch.randn(20_000, 14, generator=draw, dtype=F64))
+    elements = torch.tensor([8.0, 50.0, 30000.0], dtype=F64)
+    mean = torch.zeros(20_000, 3, dtype=F64)
+    for heading in torch.arange(8, dtype=F64).unsqueeze(-1) * math.pi / 4:
+        for sign, read in ((1, vector.disturb(elements.expand(20_000, 3), heading, constants)), (-1, elements)):
+            mean += sign / 8 * field_vector(read - torch.tensor([1.0, 0.0, 0.0]) * torch.rad2deg(heading))
+    torch.testing.assert_close(mean.std(0), vector.constant_std(elements), rtol=0.02, atol=0)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,119 @@
+"""What readings after a move will teach of the way to the destination, before they are made."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from magrl.field.elements import elements_jacobian
+from magrl.sensor_std import SensorStd
+from magrl.tracking.belief import COEFFICIENTS, LASTING_KM, lasting_covariances
+from magrl.tracking.destination import (
+    _DIFFERENCE_KM,
+    _ENTRIES,
+    _TERMS,
+    Destination,
+    _carried,
+    _inverse,
+    _levers,
+    _meridians,
+    _rows,
+    _with_latitude,
+    inverse2,
+)
+from magrl.tracking.harmonics import UNIT_KM, powers, turning
+from magrl.tracking.prior import DEGREE, closure
+
+
+def covariance_after(
+    goal: Destination, place: Tensor, moves: Tensor, errors: SensorStd, readings: Tensor | float = 1.0
+) -> Tensor:
+    """Return the expected covariance of the way ``(..., M, 2, 2)`` [km^2] after moves and readings at their ends.
+
+    The covariance of the predicted field at a place, after a reading, does not depend on what will be read. Its slopes
+    there, which divide a difference of the field, do: their mean square is that of the present estimate plus what the
+    reading will take from their covariance.
+
+    Args:
+        goal: the destination.
+        place: ``(..., 2)`` estimated displacement to the destination [km], where the field is linearized.
+        moves: ``(..., M, 2)`` displacements to the places of the readings [km].
+        errors: accuracy of the readings, tensors ``(..., 3)``.
+        readings: number of readings at each place, whose noise is averaged: a number or ``(M,)``.
+
+    Example:
+        >>> from magrl.tracking import destination, start
+        >>> here, errors = torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0]))
+        >>> goal = destination(start(here, errors), torch.tensor([3.0, 66.0, 17500.0]), 300.0)
+        >>> moves = torch.tensor([[50.0, 0.0], [0.0, 50.0]])
+        >>> covariance_after(goal, torch.tensor([90.0, 0.0]), moves, errors).shape
+        torch.Size([2, 2, 2])
+    """
+    belief, place, moves = goal.belief, place.to(goal.field) / UNIT_KM, moves.to(goal.field) / UNIT_KM
+    eye, apart = torch.eye(3).to(place), _DIFFERENCE_KM / UNIT_KM
+    corners = place.unsqueeze(-2) + torch.cat((torch.zeros(1, 2), torch.eye(2))).to(place) * apart
+    target, slope = _carried(goal, corners)
+    at_place = _with_latitude(_levers(corners), target.mT, slope)  # (..., 3, 3, K + 1)
+    residual = target.mT - (at_place @ belief.mean[..., None, : COEFFICIENTS + 1, None]).squeeze(-1)
+    value, derivatives = at_place[..., 0, :, :], (at_place[..., 1:, :, :] - at_place[..., :1, :, :]) / apart
+    at_place = torch.cat((value, derivatives.flatten(-3, -2)), -2)  # (..., 9, K + 1)
+    slopes = (residual[..., :1, :] - residual[..., 1:, :]).flatten(-2) / apart  # of the prediction: 3 north, 3 east
+    reading, noise = _readings(goal, moves.float(), errors, readings)
+    covariance, state = belief.covariance, COEFFICIENTS + 1
+    spread = covariance.float() @ reading.flatten(-3, -2).mT  # (..., S, 3 M)
+    shared = (at_place.float() @ spread[..., :state, :]).unflatten(-1, (-1, 3))  # (..., 9, M, 3)
+    shared = _entries_first(shared.movedim(-3, -2))  # (9, 3, ..., M)
+    total = _entries_first(reading @ spread.unflatten(-1, (-1, 3)).movedim(-2, -3) + noise)
+    gain = _product(shared, _inverse_entries(total))
+    now = value @ covariance[..., :state, :state] @ value.mT
+    left = (place.unsqueeze(-2) - moves).square().sum(-1) ** DEGREE * closure().left_out_nt ** 2 + goal.noise
+    after = _entries_first(now.unsqueeze(-3) + left[..., None, None] * eye) - _product(gain[:3], shared[:3])
+    weight = _inverse_entries(after)
+    slopes = slopes.movedim(-1, 0).float().unsqueeze(-1)  # (6, ..., 1)
+    squares = _product(gain[3:], shared[3:]) + slopes.unsqueeze(0) * slopes.unsqueeze(1)
+    blocks = squares[:3, :3], squares[:3, 3:], squares[3:, 3:]
+    (nn, ne, ee), ridge = ((weight * block).sum((0, 1)) for block in blocks), goal.range**-2
+    return inverse2(torch.stack((nn + ridge, ne, ne, ee + ridge), -1).unflatten(-1, (2, 2)).to(place)) * UNIT_KM**2
+
+
+def _readings(goal: Destination, moves: Tensor, errors: SensorStd, readings: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Return the rows ``(..., M, 3, S)`` of readings of D, I, B_H after moves [unit], and their noise
+    ``(..., M, 3, 3)``, both in the dtype of the moves."""
+    belief, mean = goal.belief, goal.belief.mean[..., None, :COEFFICIENTS, None].to(moves)
+    noise = torch.as_tensor(errors.noise).to(moves)
+    present = noise < math.inf
+    jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(belief.field), 0.0).unsqueeze(-3).to(moves)
+    terms, monomials = _rows(_TERMS).to(moves), powers(moves, _TERMS)
+    field = monomials @ (terms @ mean).squeeze(-1)  # (..., M, 3)
+    levers = (monomials @ (jacobian @ terms).flatten(-2)).unflatten(-1, (3, COEFFICIENTS))  # on the elements
+    x, y, slope = field[..., 0], field[..., 1], _meridians(belief, moves)[0].slope.unsqueeze(-1)
+    turned = (torch.stack((-y, x), -1) @ jacobian[..., 0, :, :2].mT) * slope  # by the offset of the latitude
+    rows = torch.cat((levers, turned.unsqueeze(-1)), -1)
+    distance, count = moves.norm(dim=-1), torch.as_tensor(readings).to(rows)
+    kept = torch.exp(-distance * (UNIT_KM / LASTING_KM)).unsqueeze(-1)
+    own = torch.diag_embed(present.to(rows)).unsqueeze(-3).expand(*rows.shape[:-1], 3)
+    ahead = moves / (distance * count).clamp_min(1e-9).unsqueeze(-1)  # readings turn with the vehicle between them
+    iron = jacobian @ turning(ahead[..., 0], ahead[..., 1], 1)
+    white = torch.where(present, noise, 1.0).square().unsqueeze(-2)
+    white = white / count.unsqueeze(-1)
+    fresh = (1 - kept.square()).unsqueeze(-1) * lasting_covariances(belief.field, errors)[1].to(moves).unsqueeze(-3)
+    noise = torch.diag_embed(white) + fresh + goal.noise * jacobian @ jacobian.mT
+    return torch.cat((rows, own, kept.unsqueeze(-1) * own, iron), -1), noise
+
+
+def _entries_first(matrix: Tensor) -> Tensor:
+    """Return matrices ``(..., M, I, J)`` as ``(I, J, ..., M)`` in single precision: many small matrices are slow."""
+    return matrix.float().movedim((-2, -1), (0, 1)).contiguous()
+
+
+def _product(left: Tensor, right: Tensor) -> Tensor:
+    """Return the products of matrices ``(I, K, ...)`` with the transposes of ``(J, K, ...)``."""
+    return (left.unsqueeze(1) * right.unsqueeze(0)).sum(2)
+
+
+def _inverse_entries(matrix: Tensor) -> Tensor:
+    """Return the inverses of symmetric matrices ``(3, 3, ...)``."""
+    (a, b, c, d, e, f), _ = _inverse([matrix[i, j] for i, j in _ENTRIES])
+    return torch.stack((a, b, c, b, d, e, c, e, f)).unflatten(0, (3, 3))
