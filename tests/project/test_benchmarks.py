@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks import __main__ as bench
-from benchmarks import env, onboard, update
+from benchmarks import accelerator, env, onboard, update
 from benchmarks.timing import Row, alternate
 
 
@@ -75,3 +75,12 @@ def test_timed_functions_run() -> None:
         stock.update(update.transitions(update.OBSERVATION_SIZE, 4))
     assert all((one != other).any() for one, other in zip(before, stock.loss.parameters(), strict=True))
     assert onboard.row("secant", repeats=3).magrl_ms > 0
+
+
+def test_the_cost_by_number_of_vehicles(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(accelerator, "SECONDS", 0.0)  # a part runs once
+    accelerator.main(["--device", "cpu", "--vehicles", "2", "3"])
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    assert rows[0] == "| µs per vehicle | 2 | 3 |"
+    assert len(rows) == 7
+    assert all(float(cost) > 0 for row in rows[2:] for cost in row.split("|")[2:4])
