@@ -12,7 +12,7 @@ train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two c
 fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; seconds
 	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" $(ARGS)
 
-anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; half an hour on one core
+anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; three quarters of an hour on one core
 	OMP_NUM_THREADS=1 $(RECIPE)/ppo_anywhere.py $(ARGS)
 
 replay: runs/td3_gradient_guided-fast-seed0/eval.json  ## write a replay page, replay.html in the run folder
