@@ -41,7 +41,7 @@ def test_a_track_is_that_of_a_textbook_kalman_filter() -> None:
 
 def test_exact_readings_correct_the_gradient_along_the_move_alone() -> None:
     """Broyden's update, and a declination that crosses 180 degrees."""
-    gradient, truth, move = randn(3, 2), randn(3, 2, seed=1), f64(3.0, -4.0)
+    gradient, truth, move = randn(3, 2), f64((1.0, 0.0), (2.0, -1.0), (0.0, 5.0)), f64(3.0, -4.0)
     track = start(f64(179.0, 0.0, 0.0), GradientPrior(gradient, torch.ones(3, 2)), NONE)
     periods = f64(360.0, 0.0, 0.0)
     after = wrapped(f64(179.0, 0.0, 0.0) + truth @ move, periods)

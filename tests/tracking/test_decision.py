@@ -72,8 +72,12 @@ def test_a_vehicle_near_the_border_goes_nearer_as_far_as_readings_there_help() -
     sure, unsure = decide(24.0, 1e-3, 0.0)[0], decide(24.0, 0.1, 0.2)[0]
     assert sure.stop_km.item() == pytest.approx(20.0)
     assert unsure.stop_km.item() == pytest.approx(6.25)  # the nearest place, as each estimate is another way
+    assert decide(5.0, 1e-3, 0.0)[0].stop_km.item() == pytest.approx(6.25)  # although it is nearer
     near = decide(20.0, 0.1, 0.0)[0]
     assert 0.4 < near.probability < 0.7 < near.worth
+    barely = near._replace(probability=near.worth)
+    assert barely.declare.item()
+    assert not barely._replace(worth=near.worth * 1.001).declare.item()
 
 
 def test_the_probability_of_the_radius_is_that_of_samples() -> None:
