@@ -22,8 +22,10 @@ from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import FieldModel
 from magrl.geodesy import move
 from magrl.navigators import Secant
-from magrl.sensor_std import STD_KEYS
+from magrl.sensor_std import STD_KEYS, SensorStd
+from magrl.tracking import DestinationPosterior
 from magrl.transforms import DeclareArrival, SensorErrors, TrackField
+from magrl.transforms.track import POSTERIOR_KEYS, belief_of
 
 STD, BIAS = (0.05, 0.05, 5.0), (0.1, 0.1, 10.0)
 
@@ -96,6 +98,23 @@ def test_every_navigator_can_be_flown(navigator) -> None:
     assert summary["success_rate"] + summary["false_arrival_rate"] == 100
     assert 80 < summary["spl_to_arrival"] < summary["spl"]
     assert summary["navigation_error_km_declared"] < 20
+
+
+def test_the_decision_is_that_of_the_pure_function() -> None:
+    """With the accuracy that comes with the readings, by the steps that are left."""
+    world = {"std_keys": STD_KEYS, "range_km": 350.0, "crust_nt": 20.0}
+    declare = DeclareArrival(25.0, max_steps=12, **world)
+    steps = Compose(SensorErrors(STD, bias=BIAS, seed=1), TrackField(**world), declare)
+    rollout = TransformedEnv(declared(6, max_steps=12), steps).rollout(11, Secant(), break_when_any_done=False)
+    for seen in rollout.unbind(1):
+        goal = tracking.destination(belief_of(seen), seen["target_field"], 350.0, 20.0)
+        posterior = DestinationPosterior(*(seen[key] for key in POSTERIOR_KEYS))
+        left = 11 - seen["step_count"].squeeze(-1)
+        decision = tracking.arrival_decision(goal, posterior, SensorStd.read(seen), left, 25.0)
+        expected = decision.probability, decision.worth, decision.way, decision.stop_km
+        for key, value in zip(declare.default_out_keys, expected, strict=True):
+            torch.testing.assert_close(seen[key].flatten(), value.float().flatten(), msg=key)
+    assert rollout["arrival_worth"].unique().numel() > 20
 
 
 def test_declarations_are_as_often_right_as_they_say_and_confidence_prevents_false_ones() -> None:

@@ -31,6 +31,14 @@ def nanotesla(change: Tensor, at: Tensor) -> Tensor:
     return torch.deg2rad(change) * torch.stack((at[2], total, torch.rad2deg(torch.tensor(1.0))))
 
 
+def test_the_features_by_hand() -> None:
+    """A total intensity of 50 000 nT; differences of 1500, -750 and 15 000 nT, of which the last is limited."""
+    reading, degree = torch.tensor([30.0, 60.0, 25000.0]), math.degrees(1) / 25000
+    target = reading + torch.tensor([1500 * degree, -750 * degree / 2, 15000.0])
+    expected = [3**0.5 / 2, 0.5, 0.5, 3**0.5 / 2, 0.0, 1 / 3, 1.0, -0.5, 6.0, 1.0, 0.5, 6.0]
+    torch.testing.assert_close(features(reading, target), torch.tensor(expected), rtol=1e-4, atol=1e-4)
+
+
 def test_a_start_has_no_change() -> None:
     first = flight(0.5, 20.0)["observation"][0]
     assert torch.equal(first[:12], features(START, START + GRADIENT @ WAY))

@@ -148,7 +148,7 @@ def test_the_noise_is_scaled_as_the_readings_show() -> None:
     """By the pure function, in place of what is stated; 20 readings at one place show a noise of 4 times that."""
     track = TrackField(std_keys=STD_KEYS, estimate_noise=True)
     first = with_std(first_reading(), *[1.0] * 4).update({key: torch.zeros(4, 3).double() for key in STD_KEYS[1:]})
-    after = moved(first, 40.0, 0.3, f64(0.5, 0.2, 50.0)).update(first.select(*STD_KEYS))
+    after = moved(first, 0.5, 0.3, f64(0.5, 0.4, 50.0)).update(first.select(*STD_KEYS))
     before = track(first.clone())
     seen = track(before.clone().set("next", after.clone()))["next"]
     none, course = torch.zeros(4, 3).double(), after["heading"].squeeze(-1)
@@ -157,6 +157,7 @@ def test_the_noise_is_scaled_as_the_readings_show() -> None:
     estimate = tracking.noise_estimate(NoiseEstimate(none, none), new, first["sensor_std"])
     torch.testing.assert_close(tuple(seen[key] for key in NOISE_KEYS[1:]), tuple(estimate))
     torch.testing.assert_close(seen["sensor_std"], first["sensor_std"] * estimate.factor)
+    assert (estimate.factor > 1.2).all()
     belief = tracking.read(belief, after["field"], seen["sensor_std"], course)
     torch.testing.assert_close(tuple(belief_of(seen)), tuple(belief))
     draw = torch.randn(20, 4, 3, generator=torch.Generator().manual_seed(0)).double()
@@ -229,17 +230,20 @@ def test_aim_and_plan_are_those_of_the_pure_functions() -> None:
         torch.testing.assert_close(seen["planned_move"], move.float())
 
 
-def test_a_place_without_an_arrival_is_left() -> None:
+@pytest.mark.parametrize("radius_km", [None, 25.0])
+def test_a_place_without_an_arrival_is_left(radius_km: float | None) -> None:
     """A vehicle that is where it expects the destination to be, and has not arrived, aims elsewhere."""
-    seen, search = first_reading(1), SearchAim(zeta=0.01, radius_km=25.0)
-    seen = TrackField(sensor_std=SIZES)(seen)
-    seen["way"] = f64((0.0, 1.0))
-    first = search(seen)
-    assert first["aim"].tolist() == [[0.0, 1.0]]
-    still = seen.clone().set("move", f64((5.0, 0.0)))
-    after = search(first.clone().set("next", still))["next"]
-    assert after["aim"].norm() > 20
-    assert (first["arrival_weights"] == after["arrival_weights"]).all()
+    search = SearchAim(zeta=0.01, radius_km=radius_km)
+    seen = TrackField(sensor_std=SIZES)(first_reading()).set("way", f64((0.0, 1.0)).expand(4, 2))
+    first = search(seen.clone())
+    assert torch.equal(first["aim"], seen["way"])
+    after = search(first.clone().set("next", seen.clone().set("move", f64((5.0, 0.0)).expand(4, 2))))["next"]
+    local, weights = tracking.elements(belief_of(seen)), first["arrival_weights"]
+    ellipse = tracking.arrival_ellipse(local.gradient, local.covariance[..., 1:, 1:], weights, radius_km)
+    aim = tracking.unvisited(Way(seen["way"], seen["way_covariance"]), after["visited"], ellipse)
+    torch.testing.assert_close(after["aim"], aim)
+    assert (aim.norm(dim=-1) > 10).all()
+    assert torch.equal(after["arrival_weights"], weights)
 
 
 def test_each_vehicle_may_have_its_own_price_of_a_step() -> None:
