@@ -98,7 +98,8 @@ def _readings(goal: Destination, moves: Tensor, errors: SensorStd, readings: Ten
     iron = jacobian @ turning(ahead[..., 0], ahead[..., 1], 1)
     white = torch.where(present, noise, 1.0).square().unsqueeze(-2)
     white = white / count.unsqueeze(-1)
-    fresh = (1 - kept.square()).unsqueeze(-1) * lasting_covariances(belief.field, errors)[1].to(moves).unsqueeze(-3)
+    slow = lasting_covariances(belief.field, errors)[1].to(moves).unsqueeze(-3)
+    fresh = (1 - kept.square()).unsqueeze(-1) * (own @ slow @ own)  # a missing element has none
     noise = torch.diag_embed(white) + fresh + goal.noise * jacobian @ jacobian.mT
     return torch.cat((rows, own, kept.unsqueeze(-1) * own, iron), -1), noise
 
