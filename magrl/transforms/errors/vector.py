@@ -132,7 +132,8 @@ class VectorErrors:
         """Return the standard deviation ``(..., 3)`` of the part that is constant in the vehicle's axes: forward,
         right, down [nT].
 
-        An error of the attitude turns the vertical field into the horizontal plane.
+        An error of the attitude turns the vertical field into the horizontal plane; of what soft iron adds, the part by
+        the vertical field is constant.
 
         Args:
             elements: ``(..., 3)`` D [deg], I [deg], B_H [nT].
@@ -142,10 +143,9 @@ class VectorErrors:
             tensor([6., 6., 0.])
         """
         hard, soft, attitude = self._mean_squares
-        down = torch.tan(torch.deg2rad(elements[..., 1])) * elements[..., 2]
-        total2 = elements[..., 2].square() + down.square()
-        constant = hard + soft * total2
-        across = constant + attitude / math.degrees(1) ** 2 * down.square()
+        down2 = (torch.tan(torch.deg2rad(elements[..., 1])) * elements[..., 2]).square()
+        constant = hard + soft * down2
+        across = constant + attitude / math.degrees(1) ** 2 * down2
         return torch.stack((across, across, constant), -1).sqrt()
 
 

@@ -59,8 +59,8 @@ def test_variance_of_a_vector_is_that_of_its_errors() -> None:
 
 
 def test_the_constant_part_is_the_mean_error_over_the_headings() -> None:
-    """In the vehicle's axes: hard iron, and the vertical field that an error of the attitude turns into the level."""
-    vector, draw = VectorErrors((60.0,) * 3, attitude_deg=(0.2, 0.2)), torch.Generator().manual_seed(0)
+    """In the vehicle's axes: hard iron, and the vertical field as soft iron and an error of the attitude turn it."""
+    vector, draw = VectorErrors((60.0,) * 3, ((2e-3,) * 3,) * 3, (0.2, 0.2)), torch.Generator().manual_seed(0)
     constants = vector.constants(torch.randn(20_000, 14, generator=draw, dtype=F64))
     elements = torch.tensor([8.0, 50.0, 30000.0], dtype=F64)
     mean = torch.zeros(20_000, 3, dtype=F64)
