@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -23,7 +22,7 @@ from magrl.checks import check_number, check_tensor
 from magrl.field.elements import field_vector
 from magrl.geodesy import curvature_radii
 from magrl.tracking.belief import COEFFICIENTS, MODEL_NT, Belief
-from magrl.tracking.harmonics import RADIUS, UNIT_KM, Arc, arc, field_rows, powers, turning
+from magrl.tracking.harmonics import RADIUS, UNIT_KM, Arc, arc, constant, field_rows, powers, turning
 from magrl.tracking.prior import DEGREE, HIGHEST, closure
 
 RANGE_KM = 400.0
@@ -320,15 +319,13 @@ def _state(belief: Belief) -> Tensor:
     return torch.cat((block[..., :-1], mean, block[..., -1:]), -1)
 
 
-@cache
-@torch.inference_mode(False)  # kept for other modes, too
+@constant
 def _rows(terms: int) -> Tensor:
     """Return the field at a displacement ``(J, 3, K)`` for each of its monomials."""
     return field_rows(HIGHEST, terms) @ closure().extend
 
 
-@cache
-@torch.inference_mode(False)  # kept for other modes, too
+@constant
 def _around(count: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return the field at the points around the vehicle: its rows ``(K, 3 M)``, and for its covariance those of the
     upper triangle of the coefficients' covariance ``(K (K + 1) / 2, 6 M)``, and where these are in it, flattened."""
@@ -440,8 +437,7 @@ def _points(way: Way, heading: Tensor, count: int) -> tuple[Tensor, Tensor]:
 _MASS = 0.5 + math.log(_FAR_KM / _NEAR_KM)  # of the density within the nearest distance and beyond, over 2 pi
 
 
-@cache
-@torch.inference_mode(False)  # kept for other modes, too
+@constant
 def unit_points(count: int) -> tuple[Tensor, Tensor]:
     """Return quasi-random points: a quarter of a standard normal, and the others around the vehicle [km].
 

@@ -23,18 +23,41 @@ equations, SIAM Journal on Scientific Computing 16 (1995), with another sign of 
 from __future__ import annotations
 
 import math
-from functools import cache
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from magrl.geodesy import REFERENCE_RADIUS_KM
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 UNIT_KM = 1000.0
 """Unit of length of the coefficients [km]."""
 RADIUS = REFERENCE_RADIUS_KM / UNIT_KM
 """Radius of the sphere on which the vehicle moves [unit]; :mod:`~magrl.tracking` corrects for the ellipsoid."""
+
+
+def constant(function: Callable[P, T]) -> Callable[P, T]:
+    """Compute the value of a function once for each argument; in a compiled graph it is a constant.
+
+    It is kept for other modes, too, where the first call is in inference mode.
+
+    Example:
+        >>> constant(size)(3)
+        15
+    """
+    cached = cache(torch.inference_mode(False)(function))
+
+    @torch.compiler.assume_constant_result
+    @wraps(function)
+    def value(*args: P.args, **options: P.kwargs) -> T:
+        return cached(*args, **options)
+
+    return value
 
 
 def size(degree: int) -> int:
@@ -72,8 +95,7 @@ class Generators(NamedTuple):
     turn: Tensor
 
 
-@cache
-@torch.inference_mode(False)  # kept for other modes, too
+@constant
 def generators(degree: int) -> Generators:
     """Return the generators of translations and rotations for the degrees 1 to ``degree``.
 

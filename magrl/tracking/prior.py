@@ -12,14 +12,13 @@ So the local coefficients are normal, too, and only their part by the axial dipo
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from magrl.field.planets import gauss_moments
-from magrl.tracking.harmonics import RADIUS, field_rows, generators, orders, size
+from magrl.tracking.harmonics import RADIUS, constant, field_rows, generators, orders, size
 
 DEGREE = 3
 """Highest degree of the coefficients that a belief holds; with 4, nothing is gained (random planets)."""
@@ -87,8 +86,7 @@ class Closure(NamedTuple):
     left_out_nt: float
 
 
-@cache
-@torch.inference_mode(False)  # kept for other modes, too
+@constant
 def closure() -> Closure:
     """Return the regression of the coefficients of higher degrees on those of a belief, under the spectrum.
 
@@ -145,8 +143,7 @@ class LatitudeCells(NamedTuple):
     covariance: Tensor
 
 
-@cache
-@torch.inference_mode(False)  # kept for other modes, too
+@constant
 def latitude_cells() -> LatitudeCells:
     """Return the prior in each cell of latitude.
 

@@ -109,10 +109,14 @@ def test_partial_reset_restarts_the_chosen_rows_alone() -> None:
         assert not torch.equal(after[key][chosen], td[key][chosen]), key
 
 
-def test_a_step_depends_on_its_state_and_public_keys_alone() -> None:
-    """As stored data are stepped again, by another transform."""
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_step_depends_on_its_state_and_public_keys_alone(compiled: bool) -> None:
+    """As stored data are stepped again, by another transform; compiled as one graph, too."""
     rollout, transform = flown(tracked(sensor_std=STD)), TrackField(sensor_std=STD)
     known = rollout.select(*BELIEF_KEYS, *(("next", key) for key in IN_KEYS))
+    if compiled:
+        torch.compiler.reset()
+        transform = torch.compile(transform, fullgraph=True, backend="eager")
     again = transform(known)
     for key in NEXT:
         torch.testing.assert_close(again[key], rollout[key], rtol=1e-4, atol=1e-4, msg=str(key))
