@@ -50,7 +50,7 @@ def constant(function: Callable[P, T]) -> Callable[P, T]:
         >>> constant(size)(3)
         15
     """
-    cached = cache(torch.inference_mode(False)(function))
+    cached: Callable[P, T] = cache(torch.inference_mode(False)(function))  # type: ignore[assignment]
 
     @torch.compiler.assume_constant_result
     @wraps(function)
