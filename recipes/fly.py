@@ -41,7 +41,7 @@ from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 RECIPE = "fly.py"
-RULES = {"told": "objective", "alone": "declared"}
+RULES = {"with_signal": "objective", "without_signal": "declared"}
 """Rules of arrival of the two flights: with an arrival signal, and declared by the vehicle within 25 km."""
 ARRIVAL_KM = 400.0
 """Distance up to which the arrival threshold is 0.01; beyond, it decreases so that the arrival radius is constant."""
@@ -137,7 +137,7 @@ def check_files(config: Config) -> None:
 
 
 def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
-    """Return environment and navigator of a vehicle with an arrival signal (``told``) and without (``alone``).
+    """Return environment and navigator of a vehicle with an arrival signal and without.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -214,25 +214,32 @@ def fly(config: Config) -> dict[str, Any]:
         name: {"outcome": outcome(flight)} | {key: value[0].item() for key, value in episode_measures(flight).items()}
         for name, flight in steps.items()
     }
-    base, first, name = flights["told"][0].base_env, steps["told"][0, 0], config.navigator.partition("=")[0]
+    base, first, name = (
+        flights["with_signal"][0].base_env,
+        steps["with_signal"][0, 0],
+        config.navigator.partition("=")[0],
+    )
     result = {
         **{key: value for key, value in asdict(config).items() if key not in ("out", "export", "animate")},
         "navigator": name,
         "needs": needs(name),
         **{key: getattr(base, key) for key in ("zeta", "max_steps")},
         **{key: first[key].tolist() for key in ("start_position", "target_position", "target_field")},
-        **measures["told"],
-        "alone": measures["alone"],
+        **measures["with_signal"],
+        "without_signal": measures["without_signal"],
     }
     write_json(config.out / "flight.json", result)
-    titles = {name: f"{name}: {values['outcome']}, {values['length_km']:.0f} km" for name, values in measures.items()}
-    titles["told"] = f"{config.start} to {config.destination}: {name}, {titles['told']}"
+    titles = {
+        rule: f"{rule.replace('_', ' an arrival ')}: {values['outcome']}, {values['length_km']:.0f} km"
+        for rule, values in measures.items()
+    }
+    title = titles["with_signal"] = f"{config.start} to {config.destination}: {name} {titles['with_signal']}"
     figure = trajectories_figure({titles[name]: flight for name, flight in steps.items()}, base.field, base.region)
     figure.savefig(config.out / "flight.png", dpi=120)
     if config.export:
-        export.write_tracks(config.export, export.tracks(steps["told"], [titles["told"]], navigator=name))
+        export.write_tracks(config.export, export.tracks(steps["with_signal"], [title], navigator=name))
     if config.animate:
-        write_gif(config.animate, steps["told"], base.field, base.region, titles["told"])
+        write_gif(config.animate, steps["with_signal"], base.field, base.region, title)
     return result
 
 
@@ -252,11 +259,11 @@ def summary(result: dict[str, Any]) -> str:
         "path": f"{result['length_km']:.0f} km; the shortest is {result['shortest_km']:.0f} km",
         "efficiency": f"{100 * result['path_efficiency']:.1f} %",
         "distance left": f"{result['navigation_error_km']:.1f} km",
-        "alone": "{outcome}: {steps} steps, {length_km:.0f} km, {navigation_error_km:.1f} km left".format(
-            **result["alone"]
+        "without signal": "{outcome}: {steps} steps, {length_km:.0f} km, {navigation_error_km:.1f} km left".format(
+            **result["without_signal"]
         ),
     }
-    return "\n".join(f"{name:14}{text}" for name, text in rows.items())
+    return "\n".join(f"{name:16}{text}" for name, text in rows.items())
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -42,6 +42,7 @@ LOST_SURPRISE = 20.0
 right accuracy, it stayed below 7 in simulation, under the conditions of four vehicles."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 2
+_UNCHECKED = "the sign of D and the compass were not checked: give here or near in start"
 _NOT_STARTED = "the vehicle has no destination yet: call start(target) first"
 
 
@@ -58,7 +59,7 @@ class Command:
         confidence: estimated probability that the destination is within ``arrival_km``.
         stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
             the distance is then 0.
-        reason: why to stop, as text.
+        reason: why to stop, as text; in the first command, what was not checked.
         radius_km: radius that holds the destination with the ``confidence`` of the options.
 
     Example:
@@ -297,6 +298,8 @@ class Onboard:
         way, probability = posterior.way(), decision.probability.item()
         radius = posterior.radius(self.options.confidence).item()
         stop, reason = self._stop(way, decision, radius, declared=action[2:] > [0.0])
+        if not (stop or self._steps or self._here or self._near):
+            reason = _UNCHECKED
         if stop:
             action = [0.0, 0.0]
         elif decision.way.norm() < self.options.arrival_km:

@@ -22,7 +22,7 @@ def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
     track, movie = tmp_path / "tracks" / "flight.geojson", tmp_path / "new" / "flight.gif"
     options = ("--navigator", "secant", "--out", str(tmp_path), "--start-heading", "270")
     recipe.main(["-33.9 18.4", "-33.6, 18.9", *options, "--export", str(track), "--animate", str(movie)])
-    assert "outcome       arrived\n" in capsys.readouterr().out
+    assert "outcome         arrived\n" in capsys.readouterr().out
     result = json.loads((tmp_path / "flight.json").read_text())
     assert result["start_position"] == pytest.approx([-33.9, 18.4])
     assert (result["zeta"], result["needs"]) == (0.01, "nothing")
@@ -48,9 +48,11 @@ def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distanc
 
 
 @pytest.mark.usefixtures("without_figure")
-def test_a_vehicle_that_is_alone_declares_its_arrival(tmp_path: Path) -> None:
+def test_a_vehicle_without_a_signal_declares_its_arrival(tmp_path: Path) -> None:
     config = recipe.Config("60.4N 5.3E", "60.2N 1.1W", errors="ship", navigator="kalman", out=tmp_path)
-    alone, calibrated = (recipe.fly(replace(config, known_start=known))["alone"] for known in (None, (0.0, 0.0, 0.0)))
+    alone, calibrated = (
+        recipe.fly(replace(config, known_start=known))["without_signal"] for known in (None, (0.0, 0.0, 0.0))
+    )
     for result in (alone, calibrated):
         right = result["navigation_error_km"] <= 25
         assert result["outcome"] == "declared its arrival" + ("" if right else ", falsely")

@@ -9,6 +9,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +180,7 @@ def test_a_place_near_the_start_checks_the_first_reading_and_nothing_else(tmp_pa
         vehicle.step(-8.0, -7.7, 35603.0, heading=0.0)
     other.start(TARGET)
     reading = elements_at(IGRF("2026-06-30"), torch.tensor([59.1, 5.3], dtype=torch.float64)).tolist()
-    assert vehicle.step(*reading, heading=0.0) == other.step(*reading, heading=0.0)
+    assert vehicle.step(*reading, heading=0.0) == replace(other.step(*reading, heading=0.0), reason="")
     with pytest.raises(ValueError, match="need a date"):
         vehicle.start(TARGET, near=(60.4, 5.3))
     with pytest.raises(ValueError, match="from the target"):
@@ -645,6 +646,19 @@ def test_an_element_that_is_stated_as_useless_never_ends_a_way(useless: int, std
 
 
 # Confidence
+
+
+@pytest.mark.parametrize("known", [{}, {"near": (73.0, 0.0)}, {"here": (3.5, 73.0, 15000.0)}], ids=str)
+def test_the_first_command_says_what_was_not_checked(known: dict[str, Any]) -> None:
+    vehicle = Onboard("secant", sensor_std=NOISE)
+    date = {"date": "2026-06-30"} if "near" in known else {}
+    here = elements_at(IGRF("2026-06-30"), torch.tensor([[73.0, 0.0]]))[0].tolist() if date else (3.5, 73.0, 15000.0)
+    vehicle.start((here[0] - 4.0, *here[1:]), **known, **date)
+    reasons = [vehicle.step(*here, 290.0, distance).reason for distance in (0.0, 6.0)]
+    assert reasons == [
+        ("" if known else "the sign of D and the compass were not checked: give here or near in start"),
+        "",
+    ]
 
 
 @pytest.mark.parametrize(("arrival_km", "stop"), [(25.0, None), (400.0, "arrived")])
