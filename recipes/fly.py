@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magrl.checks import check_number
-from magrl.envs import Scenario, Tasks
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation import Flight, episode_measures, export, places, with_declaration
 from magrl.evaluation.maps import trajectories_figure, write_gif
 from magrl.evaluation.navigators import needs
@@ -201,6 +201,24 @@ def outcome(steps: TensorDictBase) -> str:
     return "left the region" if last["terminated"].item() else "reached the step limit"
 
 
+def draw(
+    config: Config, steps: dict[str, TensorDictBase], measures: dict[str, dict[str, Any]], base: GeomagneticNavEnv
+) -> None:
+    """Write the picture and, where asked for, the tracks and the animation."""
+    navigator = config.navigator.partition("=")[0]
+    titles = [
+        f"{rule.replace('_', ' an arrival ')}: {values['outcome']}, {values['length_km']:.0f} km"
+        for rule, values in measures.items()
+    ]
+    title = titles[0] = f"{config.start} to {config.destination}: {navigator} {titles[0]}"
+    figure = trajectories_figure(dict(zip(titles, steps.values(), strict=True)), base.field, base.region)
+    figure.savefig(config.out / "flight.png", dpi=120)
+    if config.export:
+        export.write_tracks(config.export, export.tracks(steps["with_signal"], [title], navigator=navigator))
+    if config.animate:
+        write_gif(config.animate, steps["with_signal"], base.field, base.region, title)
+
+
 def fly(config: Config) -> dict[str, Any]:
     """Fly with and without an arrival signal, write the files and return the content of ``flight.json``.
 
@@ -214,11 +232,8 @@ def fly(config: Config) -> dict[str, Any]:
         name: {"outcome": outcome(flight)} | {key: value[0].item() for key, value in episode_measures(flight).items()}
         for name, flight in steps.items()
     }
-    base, first, name = (
-        flights["with_signal"][0].base_env,
-        steps["with_signal"][0, 0],
-        config.navigator.partition("=")[0],
-    )
+    base, first = flights["with_signal"][0].base_env, steps["with_signal"][0, 0]
+    name = config.navigator.partition("=")[0]
     result = {
         **{key: value for key, value in asdict(config).items() if key not in ("out", "export", "animate")},
         "navigator": name,
@@ -229,17 +244,7 @@ def fly(config: Config) -> dict[str, Any]:
         "without_signal": measures["without_signal"],
     }
     write_json(config.out / "flight.json", result)
-    titles = {
-        rule: f"{rule.replace('_', ' an arrival ')}: {values['outcome']}, {values['length_km']:.0f} km"
-        for rule, values in measures.items()
-    }
-    title = titles["with_signal"] = f"{config.start} to {config.destination}: {name} {titles['with_signal']}"
-    figure = trajectories_figure({titles[name]: flight for name, flight in steps.items()}, base.field, base.region)
-    figure.savefig(config.out / "flight.png", dpi=120)
-    if config.export:
-        export.write_tracks(config.export, export.tracks(steps["with_signal"], [title], navigator=name))
-    if config.animate:
-        write_gif(config.animate, steps["with_signal"], base.field, base.region, title)
+    draw(config, steps, measures, base)
     return result
 
 

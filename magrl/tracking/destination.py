@@ -29,7 +29,7 @@ RANGE_KM = 400.0
 """Default of the prior standard deviation of the way along each axis [km]."""
 _AT_ONCE = 13  # moves whose distances to all points are held at once
 _CANDIDATES = 16  # points among which that with most mass around it is chosen
-_NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out
+_NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out; none is farther
 _SPREAD = 1.5  # standard deviations of the points around the mode, over those of the mode
 _LEAST_KM = 0.1  # standard deviation of the points around the mode
 _LEAST_WEIGHT = 1e-12  # below, products of weights would be denormal numbers, which are slow
@@ -215,6 +215,7 @@ def mode(goal: Destination) -> Way:
         nr, er = nr - ridge * place[..., 0], er - ridge * place[..., 1]
         determinant = (nn * ee - ne * ne).unsqueeze(-1)
         place = place + torch.stack((ee * nr - ne * er, nn * er - ne * nr), -1) / determinant
+        place = place * (_FAR_KM / UNIT_KM / place.norm(dim=-1, keepdim=True)).clamp_max(1)
     matrix = torch.stack((ee, -ne, -ne, nn), -1) / determinant
     return Way(place * UNIT_KM, matrix.unflatten(-1, (2, 2)) * UNIT_KM**2)
 
@@ -249,7 +250,8 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
     near, around = (points / UNIT_KM).split((count // 4, count - count // 4), -2)
     parts = (near, _moments(goal.belief, near)), (around, _moments_around(goal.belief, heading, count))
     logarithms = [_log_density(goal, *part) for part in parts]
-    weights = torch.softmax(torch.cat(logarithms, -1) - density.log(), -1)
+    far = points.norm(dim=-1) > _FAR_KM  # where the polynomials do not hold
+    weights = torch.softmax((torch.cat(logarithms, -1) - density.log()).masked_fill(far, -torch.inf), -1)
     return DestinationPosterior(points, weights.where(weights > _LEAST_WEIGHT, 0.0))
 
 

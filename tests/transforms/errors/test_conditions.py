@@ -225,7 +225,7 @@ def test_fly_under_conditions(tmp_path: Path) -> None:
     """With a heading that was chosen, which is the true one; the measured one has the error of the north reference."""
     options = {"errors": "underwater", "start_heading": 90.0, "max_steps": 2}
     config = fly.Config("60.4N 5.3E", "64.1N 21.9W", navigator="secant", out=tmp_path, **options)
-    steps = fly.rollout(*fly.prepare(config)["told"], 90.0)
+    steps = fly.rollout(*fly.prepare(config)["with_signal"], 90.0)
     north = torch.rad2deg(steps["true_heading"] - steps["heading"])[0, 0]
     torch.testing.assert_close(steps["true_heading"][0, 0], torch.tensor([torch.pi / 2]))
     torch.testing.assert_close(north, steps["north_error"][0, 0, 2:], atol=1e-4, rtol=0)
