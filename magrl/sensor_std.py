@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ class SensorStd(NamedTuple):
 
     Args:
         noise: of errors that are new in each reading.
-        bias: of all others.
+        bias: of all others. Infinite for D: the vehicle has no true north, and its headings are from magnetic north.
         drift: of those that vary along the way or with the heading; at most ``bias``.
         iron: of the part of them that is a constant field in the vehicle's axes: forward, right, down [nT].
 
@@ -34,6 +35,16 @@ class SensorStd(NamedTuple):
     bias: Any = _NONE
     drift: Any = _NONE
     iron: Any = _NONE
+
+    @property
+    def magnetic(self) -> bool:
+        """Whether the vehicle has no true north, of plain numbers.
+
+        Example:
+            >>> SensorStd(bias=(math.inf, 0.0, 0.0)).magnetic
+            True
+        """
+        return math.isinf(self.bias[0])
 
     @classmethod
     def of(cls, sensor_std: SensorStd | Sequence[float], count: int = 3) -> SensorStd:
@@ -52,7 +63,8 @@ class SensorStd(NamedTuple):
         """
         given = sensor_std if isinstance(sensor_std, SensorStd) else (sensor_std, *[(0.0,) * count] * 3)
         for name, values in zip(cls._fields, given, strict=True):
-            check_numbers(count, 0, **{f"sensor_std.{name}": values})
+            north = name == "bias" and count == 3 and list(values)[:1] == [math.inf]
+            check_numbers(count, 0, **{f"sensor_std.{name}": (0.0, *values[1:]) if north else values})
         return cls(*(tuple(map(float, values)) for values in given))
 
     @classmethod

@@ -12,6 +12,10 @@ such as that of hard iron. Both steps are those of a Kalman filter:
 - A reading measures the field: D, I, B_H are a vector in the local axes, and their errors are carried over to it by
   the Jacobian at the reading. So nothing is linearized but errors.
 
+A vehicle that has no north reference but its compass measures I and B_H, and its headings are from magnetic north. Its
+axes are those of magnetic north where it is: the field has no eastward part there, exactly. They are turned after each
+move by how much D has changed along it, as the belief expects; the latitude is not known (NaN) and not needed.
+
 All functions batch over leading dimensions.
 """
 
@@ -28,8 +32,8 @@ from magrl.checks import check_tensor
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
 from magrl.geodesy import curvature_radii
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.harmonics import UNIT_KM, arc, generators, size, turning
-from magrl.tracking.prior import DEGREE, closure, expected
+from magrl.tracking.harmonics import RADIUS, UNIT_KM, arc, generators, size, turning
+from magrl.tracking.prior import ANGLES, DEGREE, closure, expected
 
 COEFFICIENTS = size(DEGREE)
 """Number of coefficients of a belief; the latitude's offset [rad] has this index in the state."""
@@ -50,7 +54,8 @@ random planets, and more after many."""
 
 
 class Belief(NamedTuple):
-    """Mean ``(..., S)`` and covariance ``(..., S, S)`` of the state, and the reference latitude ``(...)`` [deg].
+    """Mean ``(..., S)`` and covariance ``(..., S, S)`` of the state, and the reference latitude ``(...)`` [deg]: NaN in
+    the axes of magnetic north.
 
     Example:
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
@@ -66,6 +71,17 @@ class Belief(NamedTuple):
     def field(self) -> Tensor:
         """Expected field ``(..., 3)`` north, east, down [nT]."""
         return self.mean[..., :3]
+
+    @property
+    def magnetic(self) -> Tensor:
+        """Whether the axes are those of magnetic north ``(...)``."""
+        return self.latitude.isnan()
+
+    @property
+    def measured(self) -> Tensor:
+        """Whether a reading measures D, I, B_H ``(..., 3)``."""
+        north = ~self.magnetic
+        return torch.stack((north, torch.ones_like(north), torch.ones_like(north)), -1)
 
 
 class Innovation(NamedTuple):
@@ -106,6 +122,8 @@ def start(reading: Tensor, errors: SensorStd, heading: Tensor | None = None, cru
 def before(near: Tensor, errors: SensorStd) -> Belief:
     """Return the belief before any reading, where the elements are about ``near``; other arguments as :func:`start`.
 
+    Where the constant error of D has no limit (infinite), the vehicle has no true north, and D does not count.
+
     Where the start's true elements are known: ``read(known(before(elements, errors), elements, std), reading, ...)``.
 
     Example:
@@ -113,15 +131,22 @@ def before(near: Tensor, errors: SensorStd) -> Belief:
         torch.Size([25])
     """
     check_tensor(3, near=near)
-    near = near.double()
+    near, magnetic = near.double(), torch.as_tensor(errors.bias)[..., 0].isinf().expand(near.shape[:-1])
     mean, covariance = expected(field_vector(near))
+    if torch.compiler.is_compiling() or torch.compiler.is_exporting() or magnetic.any():  # its table is large
+        north = torch.where(magnetic.unsqueeze(-1), near * near.new_tensor((0.0, 1.0, 1.0)), near)
+        unknown = expected(field_vector(north), ANGLES)
+        mean, covariance = (
+            torch.where(magnetic.reshape(*magnetic.shape, *[1] * n), new, old)
+            for n, new, old in zip((1, 2), (unknown[0], _without(unknown[1], 1)), (mean, covariance), strict=True)
+        )
     constant, slow, iron = (kind.expand(*near.shape, 3) for kind in lasting_covariances(mean[..., :3], errors))
     count = STATES - COEFFICIENTS - 1
     variances = sum(
         pad(kind, (part.start, STATES - part.stop) * 2)
         for kind, part in zip((constant, slow, iron), (CONSTANT, SLOW, IRON), strict=True)
     )
-    latitude = torch.rad2deg(mean[..., -1])
+    latitude = torch.rad2deg(mean[..., -1]).masked_fill(magnetic, math.nan)
     return Belief(pad(mean[..., :-1], (0, count + 1)), pad(covariance, (0, count, 0, count)) + variances, latitude)
 
 
@@ -144,6 +169,7 @@ def lasting_covariances(field: Tensor, errors: SensorStd) -> tuple[Tensor, Tenso
         tensor([0.1600, 0.0000, 0.0000], dtype=torch.float64)
     """
     bias, drift, iron = (torch.as_tensor(std).to(field.device, torch.float64).square() for std in errors[1:])
+    bias = torch.where(bias < math.inf, bias, 0.0)  # that of D, which is then no reading
     level = iron[..., :2].mean(-1)
     axes = torch.stack((level, level, iron[..., 2]), -1)
     spread = elements_jacobian(field.double()).square() @ axes.unsqueeze(-1)
@@ -160,7 +186,7 @@ def moved(belief: Belief, distance: Tensor, course: Tensor, errors: SensorStd = 
     Args:
         belief: that before the move.
         distance: ``(...)`` [km], to about 200; divide longer moves.
-        course: ``(...)`` at the start of the move [rad, clockwise from true north].
+        course: ``(...)`` at the start of the move [rad, clockwise from north].
         errors: accuracy of the readings, tensors ``(..., 3)``.
 
     Example:
@@ -173,8 +199,8 @@ def moved(belief: Belief, distance: Tensor, course: Tensor, errors: SensorStd = 
     latitude = torch.deg2rad(belief.latitude)
     sin, cos = torch.sin(latitude), torch.cos(latitude)
     north, east = distance * torch.cos(course), distance * torch.sin(course)
-    middle = belief.latitude + torch.rad2deg(north / curvature_radii(belief.latitude)[0]) / 2
-    meridian, vertical = curvature_radii(middle)
+    middle = belief.latitude + torch.rad2deg(north / radii(belief.latitude)[0]) / 2
+    meridian, vertical = radii(middle)
     angles = north / meridian, east / vertical
     turn = arc(sin, cos, *angles)
     matrix = turning(turn.cos_turn, turn.sin_turn, DEGREE) @ _carry(north / UNIT_KM, east / UNIT_KM, *angles)
@@ -191,7 +217,37 @@ def moved(belief: Belief, distance: Tensor, course: Tensor, errors: SensorStd = 
     fresh = (1 - kept.square()).unsqueeze(-1) * lasting_covariances(belief.field, errors)[1]
     noise = noise + pad(fresh, (SLOW.start, STATES - SLOW.stop) * 2)
     mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
-    return Belief(mean, step @ belief.covariance @ step.mT + noise, after)
+    return _to_magnetic_north(Belief(mean, step @ belief.covariance @ step.mT + noise, after))
+
+
+def _to_magnetic_north(belief: Belief) -> Belief:
+    """Return a belief with its axes turned to magnetic north, where they are such; D there depends on the state."""
+    x, y = (
+        torch.where(belief.magnetic, part, other)
+        for part, other in zip(belief.mean[..., :2].unbind(-1), (1.0, 0.0), strict=True)
+    )
+    level = torch.hypot(x, y)
+    turn = turning(x / level, -y / level, DEGREE)
+    mean = (turn @ belief.mean[..., :COEFFICIENTS, None]).squeeze(-1)
+    per_eastward = (generators(DEGREE).turn[2].to(mean) @ mean.unsqueeze(-1)) / level[..., None, None]
+    slope = torch.where(belief.magnetic[..., None, None], turn - per_eastward * turn[..., 1:2, :], turn)
+    rest = belief.mean.shape[-1] - COEFFICIENTS
+    step = pad(slope, (0, rest, 0, rest))
+    step = step + torch.diag_embed(pad(torch.zeros_like(mean), (0, rest), value=1.0))
+    mean = torch.cat((mean, belief.mean[..., COEFFICIENTS:]), -1)
+    return Belief(mean, step @ belief.covariance @ step.mT, belief.latitude)
+
+
+def radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the radii of curvature [km] along the meridian and across it; that of the sphere where a latitude is NaN.
+
+    Example:
+        >>> radii(torch.tensor(math.nan))[0]
+        tensor(6371.2002)
+    """
+    known, middle = ~latitude.isnan(), RADIUS * UNIT_KM
+    meridian, vertical = (torch.where(known, radius, middle) for radius in curvature_radii(latitude))
+    return meridian, vertical
 
 
 def innovation(
@@ -220,7 +276,7 @@ def innovation(
     """
     check_tensor(3, reading=reading, sensor_std=sensor_std)
     reading, sensor_std = reading.double(), sensor_std.double()
-    present = (sensor_std < math.inf) & (reading == reading)
+    present = (sensor_std < math.inf) & (reading == reading) & belief.measured
     vector = field_vector(torch.where(present, reading, _elements(belief.field)))
     jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(vector), 0.0)
     rows = pad(jacobian, (0, COEFFICIENTS - 2))
@@ -309,6 +365,8 @@ class LocalElements(NamedTuple):
 def elements(belief: Belief) -> LocalElements:
     """Return the expected elements at the vehicle, their gradients, and how sure they are.
 
+    From magnetic north, D is 0 everywhere.
+
     Example:
         >>> here = elements(start(torch.tensor([0.0, 60.0, 20000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0]))))
         >>> (100 * here.gradient).round(decimals=1)  # change over 100 km
@@ -318,7 +376,8 @@ def elements(belief: Belief) -> LocalElements:
     """
     mean, derivative = belief.mean[..., :COEFFICIENTS], closed_derivatives().to(belief.mean)
     turn, latitude = generators(DEGREE).turn.to(mean), torch.deg2rad(belief.latitude)
-    meridian, vertical = (radius.unsqueeze(-1).unsqueeze(-1) for radius in curvature_radii(belief.latitude))
+    meridian, vertical = (radius.unsqueeze(-1).unsqueeze(-1) for radius in radii(belief.latitude))
+    latitude = torch.where(belief.magnetic, 0.0, latitude)
     sin, cos = (wave(latitude)[..., None, None] for wave in (torch.sin, torch.cos))
     north = derivative[0, :3] / UNIT_KM + turn[0, :3] / meridian
     east = derivative[1, :3] / UNIT_KM + turn[1, :3] / vertical + sin / (cos * vertical) * turn[2, :3]
@@ -328,9 +387,16 @@ def elements(belief: Belief) -> LocalElements:
     column = torch.stack((0 * column, 0 * column, column), -3)
     rows = torch.cat((rows, column), -1).transpose(-3, -2)  # (..., E, 3, K + 1): value, northward, eastward
     state = COEFFICIENTS + 1
+    rows = rows.where(belief.measured[..., None, None], 0.0)
     slopes = (rows[..., 1:, :] @ belief.mean[..., None, :state, None]).squeeze(-1)
     covariance = rows @ belief.covariance[..., None, :state, :state] @ rows.mT
     return LocalElements(_elements(belief.field), slopes, covariance)
+
+
+def _without(covariance: Tensor, index: int) -> Tensor:
+    """Return a covariance given the value of one entry."""
+    column = covariance[..., index]
+    return covariance - column.unsqueeze(-1) * column.unsqueeze(-2) / column[..., index, None, None]
 
 
 def _elements(field: Tensor) -> Tensor:

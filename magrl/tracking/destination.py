@@ -20,8 +20,7 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_tensor
 from magrl.field.elements import field_vector
-from magrl.geodesy import curvature_radii
-from magrl.tracking.belief import COEFFICIENTS, MODEL_NT, Belief
+from magrl.tracking.belief import COEFFICIENTS, MODEL_NT, Belief, radii
 from magrl.tracking.harmonics import RADIUS, UNIT_KM, Arc, arc, constant, field_rows, powers, turning
 from magrl.tracking.prior import DEGREE, HIGHEST, closure
 
@@ -31,6 +30,7 @@ _AT_ONCE = 13  # moves whose distances to all points are held at once
 _CANDIDATES = 16  # points among which that with most mass around it is chosen
 _NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out; none is farther
 _SPREAD = 1.5  # standard deviations of the points around the mode, over those of the mode
+_LEAST_NT = 1.0  # horizontal field whose direction is north
 _LEAST_KM = 0.1  # standard deviation of the points around the mode
 _LEAST_WEIGHT = 1e-12  # below, products of weights would be denormal numbers, which are slow
 _TERMS = 5  # degree of the polynomials for the field there: 1.6 nT of error at 1000 km, 0.1 at 700
@@ -48,6 +48,31 @@ class Way(NamedTuple):
 
     displacement: Tensor
     covariance: Tensor
+
+    def axes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the standard deviations [km] along the long axis of the ellipse and across it, and the direction of
+        the long axis [deg, clockwise from north, 0 to 180], each ``(...)``.
+
+        Where two elements do not determine a place, the way is known across a line, and not along it.
+
+        Example:
+            >>> Way(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).axes()
+            (tensor(30.), tensor(10.), tensor(90.))
+        """
+        (nn, ne), (_, ee) = (row.unbind(-1) for row in self.covariance.unbind(-2))
+        middle, half = (nn + ee) / 2, torch.hypot((nn - ee) / 2, ne)
+        bearing = torch.rad2deg(torch.atan2(2 * ne, nn - ee)) / 2
+        return (middle + half).sqrt(), (middle - half).clamp_min(0).sqrt(), bearing.remainder(180)
+
+    def ellipse(self) -> str:
+        """Return the axes of one way as text.
+
+        Example:
+            >>> Way(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).ellipse()
+            '± 10 km across, ± 30 km along 090°'
+        """
+        along, across, bearing = (axis.item() for axis in self.axes())
+        return f"± {across:.0f} km across, ± {along:.0f} km along {bearing:03.0f}°"
 
 
 class DestinationPosterior(NamedTuple):
@@ -368,8 +393,28 @@ def _covariance(goal: Destination, points: Tensor, moments: _Moments) -> tuple[T
     apart = points.square().sum(-1) ** DEGREE * closure().left_out_nt ** 2 + goal.noise
     xx, xy, xz, yy, yz, zz = moments.entries
     xx, xz = xx + 2 * x * cx + x * x * variance + apart, xz + x * cz
-    yy, yz = yy + 2 * y * cy + y * y * variance + apart, yz + y * cz
-    return residual, [xx, xy + x * cy + y * cx + x * y * variance, xz, yy, yz, zz + apart]
+    xy, yy, yz = xy + x * cy + y * cx + x * y * variance, yy + 2 * y * cy + y * y * variance + apart, yz + y * cz
+    return _without_declination(goal, residual, [xx, xy, xz, yy, yz, zz + apart], moments.mean)
+
+
+def _without_declination(
+    goal: Destination, residual: Tensor, covariance: list[Tensor], mean: Tensor
+) -> tuple[Tensor, list[Tensor]]:
+    """Return a residual ``(..., 3, M)`` and its covariance along the predicted magnetic north and downward, where the
+    belief's axes are those of magnetic north: D of the destination is then not comparable.
+
+    The second of the axes is left with a residual of 0.
+    """
+    xx, xy, xz, yy, yz, zz = covariance
+    north, east = mean[..., 0, :], mean[..., 1, :]
+    level = torch.hypot(north, east).clamp_min(_LEAST_NT)
+    cos, sin, none = north / level, east / level, torch.zeros_like(level)
+    along = torch.hypot(*goal.field[..., :2].to(mean).unbind(-1)).unsqueeze(-1) - level
+    other = cos * cos * xx + 2 * cos * sin * xy + sin * sin * yy, none, cos * xz + sin * yz
+    magnetic = goal.belief.magnetic.unsqueeze(-1)
+    turned = [*other, none + goal.noise, none, zz]
+    residual = torch.where(magnetic.unsqueeze(-1), torch.stack((along, none, residual[..., 2, :]), -2), residual)
+    return residual, [torch.where(magnetic, new, old) for new, old in zip(turned, covariance, strict=True)]
 
 
 def _carried(goal: Destination, points: Tensor, heading: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -391,8 +436,8 @@ def _carried(goal: Destination, points: Tensor, heading: Tensor | None = None) -
 
 def _meridians(belief: Belief, points: Tensor) -> tuple[Arc, Tensor, Tensor]:
     """Return the great circles to displacements ``(..., M, 2)`` [unit], and their angles northward and eastward."""
-    radii = (radius.to(points).unsqueeze(-1) / UNIT_KM for radius in curvature_radii(belief.latitude))
-    n, e = (part / radius for part, radius in zip(points.unbind(-1), radii, strict=True))
+    radius = (radius.to(points).unsqueeze(-1) / UNIT_KM for radius in radii(belief.latitude))
+    n, e = (part / length for part, length in zip(points.unbind(-1), radius, strict=True))
     latitude = torch.deg2rad(belief.latitude).to(points).unsqueeze(-1)
     return arc(torch.sin(latitude), torch.cos(latitude), n, e), n, e
 

@@ -57,6 +57,7 @@ def covariance_after(
     target, slope = _carried(goal, corners)
     at_place = _with_latitude(_levers(corners), target.mT, slope)  # (..., 3, 3, K + 1)
     residual = target.mT - (at_place @ belief.mean[..., None, : COEFFICIENTS + 1, None]).squeeze(-1)
+    at_place, residual = _comparable(goal, at_place, residual)
     value, derivatives = at_place[..., 0, :, :], (at_place[..., 1:, :, :] - at_place[..., :1, :, :]) / apart
     at_place = torch.cat((value, derivatives.flatten(-3, -2)), -2)  # (..., 9, K + 1)
     slopes = (residual[..., :1, :] - residual[..., 1:, :]).flatten(-2) / apart  # of the prediction: 3 north, 3 east
@@ -78,12 +79,26 @@ def covariance_after(
     return inverse2(torch.stack((nn + ridge, ne, ne, ee + ridge), -1).unflatten(-1, (2, 2)).to(place)) * UNIT_KM**2
 
 
+def _comparable(goal: Destination, rows: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """Return rows ``(..., M, 3, K)`` of the field at places and residuals ``(..., M, 3)`` along the predicted magnetic
+    north and downward, where the belief's axes are those of magnetic north: D there is not comparable."""
+    field = (rows @ goal.belief.mean[..., None, : rows.shape[-1], None]).squeeze(-1)
+    north, east, _ = field.unbind(-1)
+    level = torch.hypot(north, east)
+    along = torch.hypot(*goal.field[..., :2].unbind(-1)).unsqueeze(-1) - level
+    magnetic, none = goal.belief.magnetic[..., None, None], torch.zeros_like(level)
+    ahead = (torch.stack((north, east), -1) / level.unsqueeze(-1)).unsqueeze(-2) @ rows[..., :2, :]
+    turned = torch.cat((ahead, 0 * ahead, rows[..., 2:, :]), -2)
+    residual = torch.where(magnetic, torch.stack((along, none, residual[..., 2]), -1), residual)
+    return torch.where(magnetic.unsqueeze(-1), turned, rows), residual
+
+
 def _readings(goal: Destination, moves: Tensor, errors: SensorStd, readings: Tensor | float) -> tuple[Tensor, Tensor]:
     """Return the rows ``(..., M, 3, S)`` of readings of D, I, B_H after moves [unit], and their noise
     ``(..., M, 3, 3)``, both in the dtype of the moves."""
     belief, mean = goal.belief, goal.belief.mean[..., None, :COEFFICIENTS, None].to(moves)
     noise = torch.as_tensor(errors.noise).to(moves)
-    present = noise < math.inf
+    present = (noise < math.inf) & belief.measured
     jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(belief.field), 0.0).unsqueeze(-3).to(moves)
     terms, monomials = _rows(_TERMS).to(moves), powers(moves, _TERMS)
     field = monomials @ (terms @ mean).squeeze(-1)  # (..., M, 3)

@@ -197,8 +197,10 @@ def arc(sin: Tensor, cos: Tensor, north: Tensor, east: Tensor) -> Arc:
     sin(phi') = sin(phi) (1 - theta^2 K) + cos(phi) n S and cos(phi') (cos(gamma), sin(gamma)) =
     (cos(phi) (1 - n^2 K) - sin(phi) n S, e (sin(phi) S + cos(phi) n K)).
 
+    Where the latitude is not known, axes are not turned: gamma and the derivatives are those of no turn.
+
     Args:
-        sin: ``(...)`` sine of the latitude at the start.
+        sin: ``(...)`` sine of the latitude at the start; NaN where it is not known.
         cos: ``(...)`` its cosine.
         north: ``(...)`` angle n of the way northward [rad], below 1.
         east: ``(...)`` angle e of the way eastward [rad].
@@ -214,7 +216,10 @@ def arc(sin: Tensor, cos: Tensor, north: Tensor, east: Tensor) -> Arc:
     cos_end = torch.sqrt(along * along + across * across).clamp_min(LEAST_COS)
     sin_end = sin * (1 - square * k) + cos * north * s
     rate = (cos * (1 - square * k) - sin * north * s) / cos_end
-    return Arc(along / cos_end, across / cos_end, east * s / cos_end.square(), rate, sin_end, cos_end)
+    known, slope = ~sin.isnan(), east * s / cos_end.square()
+    cos_turn = torch.where(known, along / cos_end, 1.0)
+    sin_turn, slope, rate = (torch.where(known, part, 0.0) for part in (across / cos_end, slope, rate))
+    return Arc(cos_turn, sin_turn, slope, rate, sin_end, cos_end)
 
 
 def field_rows(degree: int, terms: int) -> Tensor:

@@ -18,10 +18,12 @@ import torch
 from torch import Tensor
 
 from magrl.field.planets import gauss_moments
-from magrl.tracking.harmonics import RADIUS, constant, field_rows, generators, orders, size
+from magrl.tracking.harmonics import RADIUS, constant, field_rows, generators, orders, size, turning
 
 DEGREE = 3
 """Highest degree of the coefficients that a belief holds; with 4, nothing is gained (random planets)."""
+ANGLES = 12
+"""Number of directions of true north from magnetic north, where it is not known."""
 CELLS = 36
 """Number of cells of latitude. Their 5 degrees are less than what a first reading leaves of it (about 10)."""
 HIGHEST = 8
@@ -144,12 +146,16 @@ class LatitudeCells(NamedTuple):
 
 
 @constant
-def latitude_cells() -> LatitudeCells:
+def latitude_cells(angles: int = 1) -> LatitudeCells:
     """Return the prior in each cell of latitude.
+
+    Args:
+        angles: number of directions of the axes, evenly around: 1 for axes that point northward, more for axes of an
+            unknown direction. There are as many cells for each latitude.
 
     Example:
         >>> latitude_cells().mean[-1, :3].round()  # 2.5 degrees from the north pole
-        tensor([ 1196.,    -0., 54797.], dtype=torch.float64)
+        tensor([ 1196.,     0., 54797.], dtype=torch.float64)
     """
     axial, axial_variance, variance = gauss_moments()
     edge = torch.linspace(-math.pi / 2, math.pi / 2, CELLS + 1, dtype=torch.float64)
@@ -161,15 +167,22 @@ def latitude_cells() -> LatitudeCells:
     joint = local_covariance(variance, DEGREE) + axial_part
     joint = torch.nn.functional.pad(joint, (0, 1, 0, 1))
     joint[:, -1, -1] = (math.pi / CELLS) ** 2 / 12
-    field = joint[:, :3, :3]
-    precision = torch.linalg.inv(field)
+    field = joint[:, :3, :3].clone()
+    around = 2 * math.pi * torch.arange(angles, dtype=torch.float64) / angles
+    turn = turning(torch.cos(around), torch.sin(around), DEGREE)
+    mean = (turn @ (axial * unit)[:, None, :, None]).squeeze(-1).flatten(0, 1)
+    turn = torch.nn.functional.pad(turn, (0, 1, 0, 1))
+    turn[:, -1, -1] = 1.0
+    joint, latitude = (turn @ joint.unsqueeze(1) @ turn.mT).flatten(0, 1), latitude.repeat_interleave(angles)
+    field = joint[:, :3, :3].clone()
+    precision = torch.linalg.inv(field).contiguous()
     gain = joint[:, 3:, :3] @ precision
     rest = joint[:, 3:, 3:] - gain @ joint[:, :3, 3:]
     log_weight = torch.log(torch.cos(latitude)) + torch.logdet(precision) / 2
-    return LatitudeCells(latitude, log_weight, axial * unit, field, precision, gain, rest)
+    return LatitudeCells(latitude, log_weight, mean, field, precision, gain, rest)
 
 
-def expected(field: Tensor) -> tuple[Tensor, Tensor]:
+def expected(field: Tensor, angles: int = 1) -> tuple[Tensor, Tensor]:
     """Return the prior around a first reading, whose own information is still to be added.
 
     The cells of latitude, weighted by the likelihood of the field, are joined to one normal distribution with their
@@ -177,6 +190,7 @@ def expected(field: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         field: ``(..., 3)`` north, east, down [nT].
+        angles: as of :func:`latitude_cells`.
 
     Returns:
         Mean ``(..., K + 1)`` of the coefficients and the latitude [rad], and covariance ``(..., K + 1, K + 1)``.
@@ -186,7 +200,7 @@ def expected(field: Tensor) -> tuple[Tensor, Tensor]:
         >>> round(math.degrees(mean[-1]))  # latitude
         47
     """
-    cells = LatitudeCells(*(x.to(field) for x in latitude_cells()))
+    cells = LatitudeCells(*(x.to(field) for x in latitude_cells(angles)))
     apart = field.unsqueeze(-2) - cells.mean[:, :3]  # (..., C, 3)
     square = (apart.unsqueeze(-2) @ cells.precision @ apart.unsqueeze(-1)).squeeze((-2, -1))
     weight = torch.softmax(cells.log_weight - square / 2, -1)

@@ -14,7 +14,7 @@ from magrl.field import IGRF, FieldBank, SphericalHarmonicField, elements_at, ra
 from magrl.field.elements import elements_gradient, elements_jacobian, field_vector, measured_elements
 from magrl.field.harmonics import basis, field_table
 from magrl.geodesy import geodesic, move
-from magrl.sensor_std import SensorStd
+from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import Belief, before, destination, elements, innovation, known, mode, moved, posterior, read, start
 from magrl.tracking.belief import COEFFICIENTS, CONSTANT, IRON, LASTING_KM, MODEL_NT, SLOW, STATES, lasting_covariances
 from magrl.tracking.destination import log_density
@@ -217,18 +217,17 @@ def test_the_posterior_is_the_integral_of_its_density() -> None:
 
 def test_a_destination_beyond_the_reach_of_the_model_is_within_it() -> None:
     """Honolulu to Tokyo, 6200 km: Gauss-Newton steps without a limit end 20 000 km away, where nothing is a number."""
-    here = f64(21.3).expand(1), f64(-157.9).expand(1)
-    target, std = elements_at(IGRF("2025-01-01"), f64((35.7, 139.7))), f64(0.0, 0.0, 0.0).expand(1, 3)
+    field, here, std = IGRF("2025-01-01"), (f64(21.3).expand(1), f64(-157.9).expand(1)), torch.zeros(1, 3)
+    target, belief = elements_at(field, f64((35.7, 139.7))), start(elements_at(field, torch.stack(here, -1)), PERFECT)
     for course in f64(4.0, 4.8, 5.6):
-        reading = elements_at(IGRF("2025-01-01"), torch.stack(here, -1))
-        belief = start(reading, SensorStd(std)) if course == 4 else read(belief, reading, std)
         there = destination(belief, target, 400.0)
         assert mode(there).displacement.norm() < 2001
         places = posterior(there)
         torch.testing.assert_close(places.weights.sum(), torch.tensor(1.0), atol=1e-4, rtol=0)
         assert places.points[places.weights > 0].norm(dim=-1).max() < 2001
-        move_made = f64(50.0).expand(1), course.expand(1)
-        here, belief = move(*here, *reversed(move_made)), moved(belief, *move_made)
+        leg = f64(50.0).expand(1), course.expand(1)
+        here, belief = move(*here, *leg[::-1]), moved(belief, *leg)
+        belief = read(belief, elements_at(field, torch.stack(here, -1)), std)
 
 
 def test_it_is_as_sure_as_it_is_right_on_random_planets() -> None:

@@ -1,0 +1,114 @@
+"""The belief in the axes of magnetic north: what a vehicle knows that measures I and B_H alone."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from support.tracks import F64, STD, f64, randn
+
+from magrl.field import FieldBank, random_planets
+from magrl.field.elements import measured_elements
+from magrl.geodesy import geodesic, move
+from magrl.sensor_std import SensorStd
+from magrl.tracking import Belief, covariance_after, destination, elements, innovation, moved, posterior, read, start
+from magrl.tracking.belief import COEFFICIENTS, STATES
+from magrl.tracking.harmonics import turning
+from magrl.tracking.prior import CELLS, expected, latitude_cells
+
+COMPASS = SensorStd(f64(*STD), f64(math.inf, 0.0, 0.0), f64(0.0, 0.0, 0.0), f64(0.0, 0.0, 0.0))
+NOISE, COUNT = f64(*STD), 200
+
+
+def test_the_prior_does_not_depend_on_the_direction_of_true_north() -> None:
+    """Turning the field by the angle between two cells permutes them, and turns what is expected."""
+    field, angle = f64(15000.0, 3000.0, 45000.0), math.pi / 2
+    turn = turning(f64(math.cos(angle))[0], f64(math.sin(angle))[0], 3)
+    (mean, covariance), (other, spread) = expected(field, 12), expected(turn[:3, :3] @ field, 12)
+    torch.testing.assert_close(other[:-1], turn @ mean[:-1])
+    torch.testing.assert_close(spread[:-1, :-1], turn @ covariance[:-1, :-1] @ turn.mT, rtol=1e-6, atol=1e-3)
+    assert latitude_cells(12).mean.shape == (12 * CELLS, COEFFICIENTS)
+
+
+def test_a_reading_leaves_declination_out() -> None:
+    reading = f64(0.0, 60.0, 20000.0)
+    belief = start(reading, COMPASS)
+    assert belief.latitude.isnan()
+    assert belief.covariance[1].abs().max() < 1e-6  # the field has no eastward part
+    other = start(f64(77.0, 60.0, 20000.0), COMPASS)
+    torch.testing.assert_close(other.mean, belief.mean)
+    new = innovation(belief, f64(5.0, 60.1, 20010.0), NOISE)
+    assert not new.rows[0].any()
+    assert new.residual[0] == 0
+    local = elements(belief)
+    assert local.value[0] == 0
+    assert not local.gradient[0].any()
+
+
+@pytest.mark.parametrize("course", [0.7, 4.0])
+def test_a_move_turns_the_axes_to_magnetic_north_at_its_end(course: float) -> None:
+    """The turn depends on the state: the covariance after it is that of samples, and the eastward field stays 0."""
+    mean = start(f64(0.0, 55.0, 22000.0), COMPASS).mean
+    spread = 1e-2 * torch.diag(torch.cat((f64(20.0, 0.0, 20.0), 100 + 0 * mean[3:COEFFICIENTS])))
+    covariance = torch.zeros(STATES, STATES, dtype=F64)
+    covariance[:COEFFICIENTS, :COEFFICIENTS] = spread @ spread
+    unknown, way = f64(math.nan)[0], (f64(60.0), f64(course))
+    belief = moved(Belief(mean.expand(1, -1), covariance.expand(1, -1, -1), unknown.expand(1)), *way)
+    samples = mean + torch.nn.functional.pad(randn(4000, COEFFICIENTS, seed=1) @ spread, (0, STATES - COEFFICIENTS))
+    sure = Belief(samples, torch.zeros(4000, STATES, STATES, dtype=F64), unknown.expand(4000))
+    after = moved(sure, way[0].expand(4000), way[1].expand(4000))
+    assert after.mean[:, 1].abs().max() < 1e-6
+    fresh = after.covariance[0]  # that of the degrees that are left out
+    sampled = torch.cov(after.mean.mT) + fresh
+    scale = sampled.diagonal().clamp_min(1e-12).sqrt()
+    known = scale > 1e-3
+    ratio = ((belief.covariance[0] - sampled) / scale / scale.unsqueeze(-1))[known][:, known]
+    assert ratio.abs().max() < 0.12
+    assert belief.covariance[0, 1].abs().max() < 1e-6
+
+
+def test_it_is_as_sure_as_it_is_right_on_random_planets() -> None:
+    """Flights of eight moves by the compass on 200 planets: NEES of the way and of the innovations."""
+    draw = [torch.rand(COUNT, generator=torch.Generator().manual_seed(seed)).double() for seed in (2, 3)]
+    latitude, heading = torch.rad2deg(torch.asin(1.7 * draw[0] - 0.85)), 6 * draw[1]
+    edges = torch.stack((latitude - 9, latitude + 9), -1), f64((-20.0, 20.0)).expand(COUNT, 2)
+    own = torch.arange(COUNT)
+    bank = FieldBank.build(random_planets(COUNT, seed=11), own, *edges, degree=20, tolerance_nt=1.0)
+    here = latitude, torch.zeros_like(latitude)
+    place = move(*here, heading, 300 + 20 * randn(COUNT, seed=5))
+    target = measured_elements(bank(*place, own))
+    noise, ratios, squares = NOISE * randn(9, COUNT, 3), [], []
+    for step in range(8):
+        true = measured_elements(bank(*here, own))
+        declination, reading = torch.deg2rad(true[:, 0]), true + noise[step]
+        errors = COMPASS._replace(bias=COMPASS.bias.expand(COUNT, 3))
+        if step == 0:
+            belief = start(reading, errors)
+        else:
+            squares.append(innovation(belief, reading, NOISE.expand(COUNT, 3)).square().mean() / 2)
+            belief = read(belief, reading, NOISE.expand(COUNT, 3))
+        distance, bearing = geodesic(*here, *place)
+        way = posterior(destination(belief, target, 220.0)).way()
+        bearing = bearing - declination
+        error = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1) - way.displacement
+        ratios.append((error * torch.linalg.solve(way.covariance.double(), error)).sum(-1).mean() / 2)
+        compass, km = heading + 1.2 * math.sin(2 * step), torch.full_like(heading, 45.0)
+        here, belief = move(*here, compass + declination, km), moved(belief, km, compass)
+    assert 0.7 < torch.stack(squares).mean() < 1.3
+    assert 0.6 < torch.stack(ratios).mean() < 1.3
+
+
+def test_the_destination_and_the_forecast_leave_its_declination_out() -> None:
+    """The elements of the destination may have any D, and the forecast is that of readings of I and B_H."""
+    belief = start(f64(0.0, 60.0, 20000.0), COMPASS)
+    goals = [destination(belief, f64(d, 61.0, 19500.0), 300.0) for d in (0.0, 50.0)]
+    first, second = (posterior(goal) for goal in goals)
+    torch.testing.assert_close(first, second)
+    moves = f64((40.0, 0.0), (0.0, 40.0))
+    after = [covariance_after(goal, f64(100.0, 0.0), moves, COMPASS) for goal in goals]
+    torch.testing.assert_close(*after)
+    worse = COMPASS._replace(noise=f64(1e3, *STD[1:]))
+    torch.testing.assert_close(covariance_after(goals[0], f64(100.0, 0.0), moves, worse), after[0])
+    along = after[0].diagonal(dim1=-2, dim2=-1)
+    assert (along[:, 1] > 9 * along[:, 0]).all()  # known northward, and hardly eastward
