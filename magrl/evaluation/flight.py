@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
@@ -13,6 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from magrl.agents.exported import TrainedPolicy
+from magrl.checks import check_choice
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.metrics import episode_measures
 from magrl.evaluation.navigators import make_navigator
@@ -21,8 +23,10 @@ from magrl.evaluation.scenarios import with_declaration
 from magrl.navigators import Navigator
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms import Conditions, conditions_named, with_conditions, with_sensor_noise
+from magrl.transforms.errors.conditions import MAGNETIC
 
 Errors: TypeAlias = Conditions | Sequence[float] | str | Path
+NORTHS = ("true", MAGNETIC)
 
 
 class Flight:
@@ -33,6 +37,8 @@ class Flight:
         errors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real vehicle:
             :class:`~magrl.transforms.Conditions`, a name of :data:`magrl.transforms.CONDITIONS`, or a file of
             conditions (:func:`magrl.transforms.load_conditions`).
+        north: ``"true"``, or ``"magnetic"`` for vehicles that have no true north: they measure I and B_H, and steer by
+            their compass (:class:`magrl.transforms.MagneticNorth`), whatever ``errors`` say of a north reference.
         known_start: standard deviations of the elements at a known start, where the vehicles calibrate their sensors
             (:class:`magrl.transforms.KnownStart`). With the errors of a real vehicle.
         confidence: minimum probability at which navigators declare an arrival, with arrival ``"declared"``.
@@ -63,6 +69,7 @@ class Flight:
         scenario: Scenario,
         *,
         errors: Errors = PERFECT.noise,
+        north: str = "true",
         known_start: Sequence[float] | None = None,
         confidence: float = 0.0,
         num_envs: int | None = None,
@@ -74,6 +81,10 @@ class Flight:
         tasks = 1 if scenario.tasks is None else len(scenario.tasks.start)
         options |= {"num_envs": tasks if num_envs is None else num_envs, "seed": seed, "device": device}
         errors = conditions_named(str(errors)) if isinstance(errors, str | Path) else errors
+        check_choice(NORTHS, north=north)
+        if north == MAGNETIC:
+            conditions = errors if isinstance(errors, Conditions) else Conditions("noise", sensors={"noise": errors})
+            errors = replace(conditions, north=MAGNETIC)
         if isinstance(errors, Conditions):
             drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
             self.base = self.env_class(scenario, **drift | options)

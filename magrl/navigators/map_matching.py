@@ -21,7 +21,7 @@ from magrl.field.elements import element_difference, elements_gradient, measured
 from magrl.field.model import device_of
 from magrl.geodesy import steer
 from magrl.navigators.base import Navigator, displacement_to
-from magrl.navigators.quasi_newton import QuasiNewton, first_places, visit_place
+from magrl.navigators.quasi_newton import first_places, search_options, visit_place
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import SLOPES, Way
 
@@ -119,7 +119,8 @@ class MapMatching(Navigator):
         self._place(copy.deepcopy(Regions.of(region)).to(device_of(field)))
         std = torch.tensor((FLOOR, map_error, *SensorStd.of(sensor_std)), dtype=torch.float64)
         floor, error, noise, bias, drift, iron = std.to(self.grid.device).square()
-        self.target_std = nn.Buffer((floor + error).sqrt())
+        self.magnetic = bool(bias[0].isinf())
+        self.target_std = nn.Buffer(torch.where(bias < math.inf, floor + error, math.inf).sqrt())
         variances = SensorStd(floor + error + noise + BIAS_SHARE * bias, floor + bias, drift, iron)
         self.sensor_std = nn.Buffer(torch.stack(variances).sqrt())
         # Two elements give a position, so that the second smallest of the three counts.
@@ -138,7 +139,8 @@ class MapMatching(Navigator):
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
-        return {"field": env.field, "region": env.edge, **QuasiNewton.env_options(env, sensor_std)}
+        shared = {"sensor_std": sensor_std, "zeta": env.zeta, **search_options(env)}
+        return {"field": env.field, "region": env.edge, **shared}
 
     def _place(self, region: Regions) -> None:
         """Keep the region, and the elements on a grid of it."""
@@ -172,7 +174,16 @@ class MapMatching(Navigator):
         if self.search:
             way = torch.stack((distance * torch.cos(bearing), distance * torch.sin(bearing)), -1)
             distance, bearing = geodesy.polar(self._unvisited(way, here, seen, memory))
-        return steer(seen["heading"].squeeze(-1).double(), bearing, distance, self.max_move_km, self.max_turn_rad)
+        heading = self._true_heading(seen, here.unsqueeze(1)).squeeze(-1)
+        return steer(heading, bearing, distance, self.max_move_km, self.max_turn_rad)
+
+    def _true_heading(self, seen: TensorDictBase, position: Tensor) -> Tensor:
+        """Return the heading from true north ``(P, H)`` [rad] at positions ``(P, H, 2)``, by the map's D."""
+        heading = seen["heading"].double().expand(position.shape[:-1])
+        if not self.magnetic:
+            return heading
+        index = self._region(seen).unsqueeze(-1).expand(position.shape[:-1])
+        return heading + torch.deg2rad(elements_at(self.map, position, index)[..., 0])
 
     def _unvisited(self, way: Tensor, here: Tensor, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
         """Return the way ``(P, 2)`` [km] to the most probable destination where the vehicle has not been.
@@ -185,7 +196,7 @@ class MapMatching(Navigator):
         prior = torch.diag_embed(torch.full_like(here, PRIOR_KM**2)).unsqueeze(1)
         constant = update(prior, jacobian, residual)[1].squeeze(1)
         covariance = best(memory["covariance"], memory["misfit"]) + constant
-        gradient = jacobian.squeeze(1) * std.unsqueeze(-1)
+        gradient = (jacobian.squeeze(1) * std.unsqueeze(-1)).nan_to_num(0.0)  # D, where its error has no limit
         nothing = torch.zeros(2, 2).to(gradient)  # the map states no error of its gradient
         ellipse = tracking.arrival_ellipse(gradient, nothing, memory["weights"], self.radius_km)
         return tracking.unvisited(Way(way, covariance), memory["visited"], ellipse)
@@ -202,7 +213,8 @@ class MapMatching(Navigator):
     def _track(self, seen: TensorDictBase, memory: TensorDictBase) -> TensorDictBase:
         """Dead-reckon the last move of each hypothesis, and correct it by the reading at its end."""
         region, length = self._region(seen), seen["move"][:, :1].double()
-        position = self._moved(memory["position"], seen["heading"].double(), length, region)
+        heading = self._true_heading(seen, memory["position"])
+        position = self._moved(memory["position"], heading, length, region)
         growth = self.map_error_km**2 * length / FORGET_KM
         covariance = memory["covariance"] + torch.diag_embed(growth.unsqueeze(-1).expand_as(position))
         std = SensorStd(*self.sensor_std).at(seen).noise

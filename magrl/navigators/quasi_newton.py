@@ -88,7 +88,8 @@ class QuasiNewton(Navigator):
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
-        return {"sensor_std": sensor_std, "zeta": env.zeta, **search_options(env)}
+        elements = {"elements": NAMES[1:]} if sensor_std.magnetic else {}
+        return {"sensor_std": sensor_std, "zeta": env.zeta, **search_options(env), **elements}
 
     def _register(self, name: str, values: Sequence[Any]) -> None:
         self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)

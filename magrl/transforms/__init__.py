@@ -17,6 +17,7 @@ from magrl.transforms.errors.conditions import load_conditions as load_condition
 from magrl.transforms.errors.conditions import with_conditions as with_conditions
 from magrl.transforms.errors.known_start import KnownStart as KnownStart
 from magrl.transforms.errors.known_start import calibration as calibration
+from magrl.transforms.errors.magnetic_north import MagneticNorth as MagneticNorth
 from magrl.transforms.errors.motion import MotionError as MotionError
 from magrl.transforms.errors.noise import RandomSensorNoise as RandomSensorNoise
 from magrl.transforms.errors.noise import SensorNoise as SensorNoise

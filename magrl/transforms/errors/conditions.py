@@ -17,11 +17,15 @@ from magrl.files import read_document
 from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.errors.known_start import KnownStart, calibration
+from magrl.transforms.errors.magnetic_north import MagneticNorth
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NorthReferenceError, north_reference
 from magrl.transforms.errors.sensors import SensorErrors
 from magrl.transforms.errors.vector import VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
+
+MAGNETIC = "magnetic"
+"""North of a vehicle without a true-north reference."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,8 @@ class Conditions:
         speed_km_h: speed of the vehicle [km/h], for currents, the drift of a gyrocompass and the weather.
         sensors: options of :class:`~magrl.transforms.SensorErrors`.
         north: unit of :data:`~magrl.transforms.NORTH_REFERENCES`, or options of
-            :class:`~magrl.transforms.NorthReferenceError`; None without an error.
+            :class:`~magrl.transforms.NorthReferenceError`; None without an error; ``"magnetic"`` for a vehicle that has
+            no true north (:class:`~magrl.transforms.MagneticNorth`).
         motion: options of :class:`~magrl.transforms.MotionError`; None without an error.
         weather: options of :class:`~magrl.transforms.MagneticWeather`; None without weather.
 
@@ -79,7 +84,9 @@ class Conditions:
         if self.weather is not None:
             errors.append(MagneticWeather(**self.weather, speed_km_h=self.speed_km_h, seed=seed))
         errors.append(SensorErrors(**self.sensors, seed=seed))
-        if isinstance(self.north, str):
+        if self.north == MAGNETIC:
+            errors.append(MagneticNorth())
+        elif isinstance(self.north, str):
             errors.append(north_reference(self.north, speed_km_h=self.speed_km_h, seed=seed))
         elif self.north:
             errors.append(NorthReferenceError(**self.north, seed=seed))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ def calibration(reading: Tensor, known: Tensor, sensor_std: SensorStd, known_std
 
     With ``c^2 = bias^2 - drift^2`` and ``m^2 = noise^2 + drift^2 + known_std^2``, the difference of reading and known
     elements has the variance ``c^2 + m^2``. The error is ``c^2 / (c^2 + m^2)`` times the difference, and ``c^2 m^2 /
-    (c^2 + m^2) + drift^2`` is the variance that is left.
+    (c^2 + m^2) + drift^2`` is the variance that is left. An element whose bias is infinite is not measured.
 
     Args:
         reading: ``(..., 3)`` D [deg], I [deg], B_H [nT], the first reading.
@@ -43,9 +44,10 @@ def calibration(reading: Tensor, known: Tensor, sensor_std: SensorStd, known_std
     """
     check_tensor(3, reading=reading, known=known)
     noise, bias, slow = (std.square() for std in sensor_std[:3])
-    constant, other = (bias - slow).clamp_min(0), noise + slow + known_std.square()
+    constant, other = torch.where(bias < math.inf, bias - slow, 0.0).clamp_min(0), noise + slow + known_std.square()
     gain = torch.where(constant > 0, constant / (constant + other), 0.0)
-    return gain * element_difference(reading, known), sensor_std._replace(bias=(gain * other + slow).sqrt())
+    left = torch.where(bias < math.inf, gain * other + slow, math.inf).sqrt()
+    return gain * element_difference(reading, known), sensor_std._replace(bias=left)
 
 
 class KnownStart(StatefulTransform):
@@ -96,6 +98,7 @@ class KnownStart(StatefulTransform):
     def _begin(self, tensordict: TensorDictBase, values: list[Tensor], mask: Tensor | None) -> None:  # noqa: ARG002
         reading, known, noise, bias = values
         drift, known_std = self._std.to(reading.dtype)
+        known = torch.where(bias < math.inf, known, reading)  # what is not measured is not told, either
         error, left = calibration(reading, known, SensorStd(noise, bias, drift), known_std)
         self._advance(tensordict, values, [left.bias, error, known, known_std.expand_as(known).clone(), bias])
 

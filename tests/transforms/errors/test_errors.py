@@ -10,13 +10,13 @@ import pytest
 import torch
 from support.errors import STD, actions, all_errors, assert_same, every_error, flown, nav, under
 from tensordict import TensorDict
-from torchrl.envs import EnvBase, SerialEnv
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 
 from magrl.counters import advanced, counter_stream
 from magrl.envs.navigation import anywhere_env
 from magrl.envs.random_regions import planet_scenario
 from magrl.sensor_std import STD_KEYS
-from magrl.transforms import TRUE_KEYS, NorthReferenceError, SensorErrors, SensorNoise
+from magrl.transforms import TRUE_KEYS, MagneticNorth, NorthReferenceError, SensorErrors, SensorNoise
 from magrl.transforms.errors.base import check_sizes, gauss_markov
 
 ERRORS = ("motion_error", "weather_clock", "sensor_error", "north_error")
@@ -98,7 +98,7 @@ def test_accuracy_adds_up_and_the_first_error_keeps_the_truth() -> None:
 
 
 def test_true_keys_are_those_that_are_written() -> None:
-    keys = set(all_errors().reset().keys())
+    keys = set(TransformedEnv(all_errors(), MagneticNorth(), auto_unwrap=True).reset().keys())
     assert keys - set(nav().reset().keys()) - set(STD_KEYS) == set(TRUE_KEYS)
 
 

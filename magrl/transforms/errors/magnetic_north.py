@@ -1,0 +1,116 @@
+"""Magnetic north: a vehicle without a true-north reference steers by its compass and never knows D."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite
+
+from magrl.geodesy import wrap_angle
+from magrl.sensor_std import SensorStd
+from magrl.transforms.errors.base import Episode, ReadingErrors
+
+
+class MagneticNorth(ReadingErrors):
+    """Measure headings from magnetic north: the vehicle has a magnetometer and an accelerometer, and no true north.
+
+    D is the direction of magnetic north from the vehicle's own north, so it reads 0 everywhere, and that of the
+    destination is 0, too. That it tells nothing is stated by a ``bias_std`` of infinity. A move starts along the
+    vehicle's heading from magnetic north and keeps its course on the ground; at its end, the vehicle turns to the same
+    heading from magnetic north there. So headings tell nothing of how D changes along the way. (It changes by 0.3
+    degrees over 50 km on the mean; a vehicle that follows its needle ends 0.2 km beside this one.)
+
+    It stands after all errors of readings: the compass shows the direction of the measured field. The true heading, D
+    and the destination's D are kept at ``true_heading``, ``true_field`` and ``true_target_field`` and given back to the
+    environment for its step.
+
+    Args:
+        in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, and those of the destination.
+
+    Raises:
+        ValueError: for another number of keys.
+        KeyError: for a step from a TensorDict without the true values.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> state = TransformedEnv(GeomagneticNavEnv(num_envs=1, seed=0), MagneticNorth()).reset()
+        >>> state["field"][0, 0], state["heading"].rad2deg().round(), state["true_field"][0, 0].round()
+        (tensor(0.), tensor([[-9.]]), tensor(9.))
+    """
+
+    channel = 6
+    true_keys = ("true_field", "true_heading", "true_target_field")
+    default_in_keys = ("heading", "field", "target_field")
+    default_out_keys = default_in_keys
+    numbers_key, stream_key = "compass_declination", "compass_stream"
+    reading = 1
+    in_sizes = (1, 3, 3)
+    size = 1
+
+    def __init__(self, in_keys: tuple[NestedKey, ...] = default_in_keys) -> None:
+        super().__init__(in_keys, in_keys)
+        self.in_keys_inv, self.out_keys_inv = [self.in_keys[0], self.in_keys[2]], list(self.true_keys[1:])
+        self._set_accuracy()
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it."""
+        return [*super().state_keys, *self.true_keys[1:]]
+
+    def _constants(self, stream: Tensor) -> Tensor:
+        return torch.zeros_like(stream.unsqueeze(-1), dtype=torch.get_default_dtype())
+
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
+        heading, field, target = values
+        declination = field[..., :1]
+        own = wrap_angle(heading - torch.deg2rad(declination if episode.first else episode.numbers))
+        tensordict.set(self.true_keys[1], wrap_angle(own + torch.deg2rad(declination)))
+        tensordict.set(self.true_keys[2], target)
+        tensordict.set(self.out_keys[0], own)
+        tensordict.set(self.out_keys[2], _without_declination(target))
+        self._measure(tensordict, field, _without_declination(field))
+        return declination
+
+    def accuracy(self, field: Tensor) -> SensorStd:
+        """Return the standard deviations that are added to a reading, each ``(..., 3)``.
+
+        Example:
+            >>> MagneticNorth().accuracy(torch.zeros(3)).bias
+            tensor([inf, 0., 0.])
+        """
+        none = torch.zeros_like(field)
+        return SensorStd(none, none + field.new_tensor((math.inf, 0.0, 0.0)), none, none)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Give the true heading and the elements of the destination to the environment."""
+        state = self._state(tensordict)
+        if state is not None:
+            tensordict.set(self.in_keys_inv[0], state[-2]).set(self.in_keys_inv[1], state[-1])
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add what is true and the state; the elements are unbounded."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        for true, key in zip(self.true_keys[1:], self.in_keys_inv, strict=True):
+            leaf = observation_spec[key]
+            observation_spec[true] = leaf.clone()
+            self._add(observation_spec, leaf, key, *leaf.shape[-1:])
+        return observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Make the state, and the elements of the destination without D, part of the input."""
+        input_spec = super().transform_input_spec(input_spec)
+        state, key = input_spec["full_state_spec"], self.in_keys_inv[1]
+        if state is not None and key in state.keys(True, True):
+            self._add(state, state[key], key, *state[key].shape[-1:])
+        return input_spec
+
+
+def _without_declination(elements: Tensor) -> Tensor:
+    """Return D, I, B_H ``(..., 3)`` with D as 0."""
+    return torch.cat((torch.zeros_like(elements[..., :1]), elements[..., 1:]), -1)
