@@ -77,7 +77,8 @@ class Estimator:
         course, errors = seen["heading"].squeeze(-1), SensorStd.read(seen)
         reading = seen["field"] + seen.get(START_KEYS[0], 0.0)  # as it was read
         belief = tracking.moved(self.belief, seen["move"][..., 0], course, errors)
-        return tracking.innovation(belief, reading, errors.noise, course).square().item() / 3
+        square = tracking.innovation(belief, reading, errors.noise, course).square()
+        return (square / belief.measured.sum(-1)).item()
 
     @property
     def steepest_inclination(self) -> float:

@@ -6,6 +6,7 @@ A number may be one of Python, NumPy or torch; it becomes a finite Python float.
 from __future__ import annotations
 
 import hashlib
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -43,7 +44,7 @@ def _accuracy(value: Any) -> SensorStd:
     whole = isinstance(value, SensorStd) or (isinstance(value, list) and isinstance(value[0], list))
     sensor_std = SensorStd.of(SensorStd(*map(_plain, value)) if whole else value)
     for name, std in sensor_std._asdict().items():
-        if max(std) > OUTAGE_STD:
+        if max(std[1:] if name == "bias" and sensor_std.magnetic else std) > OUTAGE_STD:
             raise ValueError(f"sensor_std.{name} must be at most {OUTAGE_STD:g}, that of an outage, got {max(std):g}")
         if 0 < std[2] < LEAST_STD_NT:
             raise ValueError(
@@ -57,6 +58,8 @@ class Options(CheckedModel):
     """Hold the options of :class:`~magrl.onboard.Onboard`.
 
     Args:
+        north: ``"true"``: headings are from true north, and D is measured; or ``"magnetic"``: they are from magnetic
+            north, those of a compass, and D is not measured.
         sensor_std: accuracy of the sensors, a :class:`~magrl.sensor_std.SensorStd`; three numbers are white noise of
             D [deg], I [deg], B_H [nT]. A noise that is not 0 is corrected by what the readings show
             (:class:`~magrl.transforms.TrackField`). The drift is what a known start does not show, and what readings
@@ -76,6 +79,7 @@ class Options(CheckedModel):
 looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
     """
 
+    north: Literal["true", "magnetic"] = "true"
     sensor_std: Annotated[SensorStd, BeforeValidator(_accuracy)] = PERFECT
     max_move_km: Number | None = Field(None, gt=0, le=1000)
     max_turn_deg: Number | None = Field(None, gt=0, le=180)
@@ -84,6 +88,18 @@ looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
     confidence: Number = Field(0.8, ge=0, le=1)
     navigator: str = ""
     weights: str = ""
+
+    @property
+    def magnetic(self) -> bool:
+        """Whether the vehicle has no true north."""
+        return self.north == "magnetic"
+
+    @property
+    def accuracy(self) -> SensorStd:
+        """Accuracy of the sensors; where D is not measured, its error has no limit."""
+        if not self.magnetic:
+            return self.sensor_std
+        return self.sensor_std._replace(bias=(math.inf, *self.sensor_std.bias[1:]))
 
 
 class Step(CheckedModel):
@@ -134,7 +150,7 @@ class Journal(CheckedModel):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[9] = 9
+    format: Literal[10] = 10
     options: Annotated[Options, _LAX]
     target: Triple
     here: Numbers | None = None

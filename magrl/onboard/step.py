@@ -161,7 +161,9 @@ def write_step(path: Path | str, policy: FieldPolicy) -> None:
     if Path(path).suffix not in (".pt2", ".onnx"):
         raise ValueError(f"a file of a step must end with .pt2 or .onnx, got {str(path)!r}")
     module = VehicleStep(copy.deepcopy(policy).cpu()).eval()
-    examples = torch.ones(3), torch.ones(3), torch.zeros(2), torch.zeros(4, 3)
+    accuracy = torch.zeros(4, 3)
+    accuracy[1, 0] = math.inf  # no true north: the constants of this are needed, too
+    examples = torch.ones(3), torch.ones(3), torch.zeros(2), accuracy
     with torch.no_grad():
         module(*examples, *first_state())  # computes the constants of the model, which are no part of the step
         exported = torch.export.export(module, (*examples, *first_state()), strict=False)

@@ -1,6 +1,7 @@
 """Navigation on board one vehicle: plain numbers in, a command out, without an environment.
 
-Angles are in degrees, clockwise from true north, distances in kilometers, and intensities in nanotesla.
+Angles are in degrees, clockwise from the vehicle's north, true or magnetic, distances in kilometers, and intensities in
+nanotesla.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import copy
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,9 @@ from magrl import tracking
 from magrl.agents import FieldPolicy, kalman, load_pretrained
 from magrl.checks import check_type
 from magrl.envs.geomagnetic import PUBLIC_KEYS
+from magrl.field.elements import NAMES
 from magrl.navigators import Secant
+from magrl.onboard.command import Command
 from magrl.onboard.estimator import Estimator
 from magrl.onboard.journal import Journal, Options, Step
 from magrl.onboard.limits import check_move, measured, move_limits, out_of_range, stuck, unchanged_km, view_of
@@ -42,45 +44,11 @@ LOST_SURPRISE = 20.0
 right accuracy, it stayed below 7 in simulation, under the conditions of four vehicles."""
 Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 2
-_UNCHECKED = "the sign of D and the compass were not checked: give here or near in start"
+_UNCHECKED = {
+    "true": "the sign of D and the compass were not checked: give here or near in start",
+    "magnetic": "the compass was not checked: give here or near in start",
+}
 _NOT_STARTED = "the vehicle has no destination yet: call start(target) first"
-
-
-@dataclass(frozen=True)
-class Command:
-    """Hold the command of a step and the estimates of the destination.
-
-    Args:
-        distance_km: distance to move; 0 to stay and read again.
-        turn_deg: turn before the move, to the right.
-        heading_deg: heading after that turn, 0 to 360: what to steer.
-        way_km: mean of the way to the destination, northward and eastward.
-        way_covariance_km2: its covariance, by rows.
-        confidence: estimated probability that the destination is within ``arrival_km``.
-        stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
-            the distance is then 0.
-        reason: why to stop, as text; in the first command, what was not checked.
-        radius_km: radius that holds the destination with the ``confidence`` of the options.
-
-    Example:
-        >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
-        5.0
-    """
-
-    distance_km: float
-    turn_deg: float
-    heading_deg: float
-    way_km: tuple[float, float]
-    way_covariance_km2: tuple[tuple[float, float], tuple[float, float]]
-    confidence: float
-    stop: str | None = None
-    reason: str = ""
-    radius_km: float = math.inf
-
-    @property
-    def error_km(self) -> float:
-        """Root mean square error of the estimated way: the root of the trace of its covariance [km]."""
-        return math.sqrt(self.way_covariance_km2[0][0] + self.way_covariance_km2[1][1])
 
 
 class Onboard:
@@ -118,7 +86,7 @@ class Onboard:
         source = load_pretrained("anywhere") if navigator == "anywhere" else navigator
         policy = None if isinstance(source, str) else source
         self.max_move_km, self.max_turn_deg = move_limits(policy, given.max_move_km, given.max_turn_deg)
-        self.options, self._sensor_std = given, given.sensor_std
+        self.options, self._sensor_std = given, given.accuracy
         if isinstance(policy, FieldPolicy) and isinstance(view_of(policy), TrackView):  # nothing signals the arrival
             policy = policy.adapted(search=False, max_steps=given.max_steps)
         self._source = source if policy is None else copy.deepcopy(policy).cpu()
@@ -137,7 +105,8 @@ class Onboard:
             return copy.deepcopy(self._source)
         options, bounds = self.options, (self.max_move_km, math.radians(self.max_turn_deg))
         if self._source == "secant":
-            return Secant(*bounds, sensor_std=self._sensor_std)
+            elements = NAMES[1:] if options.magnetic else NAMES
+            return Secant(*bounds, elements=elements, sensor_std=self._sensor_std)
         if self._source == "kalman":
             limits = {"max_move_km": bounds[0], "max_turn_rad": bounds[1], "max_steps": options.max_steps}
             return kalman(**limits, search=False)
@@ -145,7 +114,7 @@ class Onboard:
 
     def start(
         self,
-        target: Sequence[float],
+        target: Sequence[float | None],
         here: Sequence[float] | None = None,
         *,
         here_std: Sequence[float] | None = None,
@@ -158,7 +127,8 @@ class Onboard:
         all readings (:func:`magrl.transforms.calibration`); and a reading that does not fit the place raises an error.
 
         Args:
-            target: elements of the destination.
+            target: elements of the destination; D does not count where the vehicle's north is magnetic, and may be
+                None.
             here: elements at the start; or its latitude and longitude [deg], with a ``date``.
             here_std: standard deviations of the elements at the start: by default 0 for elements, and for a position
                 those of a model of the core (:data:`magrl.onboard.start.MODEL_STD`).
@@ -169,6 +139,7 @@ class Onboard:
         Raises:
             ValueError: for elements that are not possible on the Earth, or beyond the range of the policy.
         """
+        target = self._comparable(target) if len(target) == 3 else target
         given: dict[str, Any] = {"target": target, "here": here, "here_std": here_std, "near": near, "date": date}
         journal = Journal(options=self.options, **given)
         check_earth_reading(*journal.target, what="the target")
@@ -177,7 +148,9 @@ class Onboard:
         here, near, goal = journal.here, journal.near, journal.target
         nearby = None if near is None else nearby_elements(near, date, goal, self._longest_way())
         elements = None if here is None else known_elements(here, journal.here_std, date)
-        self._near, self._here, self._journal, self.target = nearby, elements, journal, goal
+        self._near = nearby and (self._comparable(nearby[0]), nearby[1])
+        self._here = elements and (self._comparable(elements[0]), elements[1])
+        self._journal, self.target = journal, goal
         self._error, self._sensor_std = self._calibrated()
         self.navigator = self._new_navigator()
         self._estimator = Estimator(self.navigator)
@@ -200,7 +173,8 @@ class Onboard:
     ) -> Command:
         """Return what to do after a move.
 
-        An element that could not be read is None: the vehicle goes on by dead reckoning. A way that is longer than a
+        An element that could not be read is None: the vehicle goes on by dead reckoning. From magnetic north, D is
+        always None, and the heading of a move is that at its start. A way that is longer than a
         move is reported in parts, each but the last without a reading.
 
         Args:
@@ -219,6 +193,10 @@ class Onboard:
         if self.target is None:
             raise RuntimeError(_NOT_STARTED)
         given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
+        if self.options.magnetic and declination is not None:
+            raise ValueError(
+                f"declination {declination!r}: headings are from magnetic north, and D is not measured: None"
+            )
         step = Step(**given, heading=heading, distance=distance, time=time)
         if self._last_command is None or not step.repeats(self._steps[-1]):
             self._last_command = self._move(step)
@@ -227,19 +205,20 @@ class Onboard:
 
     def _move(self, step: Step) -> Command:
         """Return what to do after a new move."""
-        raw: Any = tuple(old if new is None else new for new, old in zip(step.reading, self._raw, strict=True))
+        read = self._comparable(step.reading)
+        raw: Any = tuple(old if new is None else new for new, old in zip(read, self._raw, strict=True))
         check_earth_reading(*raw)
         error = self._error if self._last else self._calibrated(raw)[0]
         reading = math.remainder(raw[0] - error[0], 360), raw[1] - error[1], raw[2] - error[2]
         self._check(step, reading)
         course = math.remainder(math.radians(step.heading), 2 * math.pi)
         turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
-        noise = zip(step.reading, self._sensor_std.noise, strict=True)
+        noise = zip(read, self._sensor_std.noise, strict=True)
         std = self._sensor_std._replace(noise=[OUTAGE_STD if new is None else sigma for new, sigma in noise])
         with torch.inference_mode():
             self._error = error
             seen = self._seen(reading, course, (step.distance, turn), std)
-            if self._last and step.reading != (None, None, None):
+            if self._last and read[1:] != (None, None):
                 self._surprises = (*self._surprises, self._estimator.surprise(seen))[-_SURPRISES:]
             action = self._estimator.act(seen)
             self._last = (*reading, course)
@@ -248,16 +227,21 @@ class Onboard:
 
     def _remember(self, step: Step, raw: Values) -> None:
         """Keep what later steps are compared with."""
-        self._unchanged = unchanged_km(self._unchanged, self._raw, step.reading, step.distance)
+        read = self._comparable(step.reading)
+        self._unchanged = unchanged_km(self._unchanged, self._raw, read, step.distance)
         self._raw = raw
-        self._unread_km = self._unread_km + step.distance if None in step.reading else 0.0
+        self._unread_km = self._unread_km + step.distance if None in read else 0.0
         declination, inclination, _, course = self._last
         first, north = self._northward or (inclination, 0.0)
         self._northward = first, north + step.distance * math.cos(course - math.radians(declination))
 
+    def _comparable(self, elements: Any) -> Any:
+        """Return D, I, B_H, with 0 for D where the vehicle does not measure it."""
+        return (0.0, *elements[1:]) if self.options.magnetic else elements
+
     def _calibrated(self, reading: Elements | None = None) -> tuple[Values, SensorStd]:
         """Return the constant error of readings, as far as it is known, and the accuracy without it."""
-        stated = self.options.sensor_std
+        stated = self.options.accuracy
         if reading and self._near:
             check_start(reading, self._near[0], stated, self._near[1])
         return ((0.0, 0.0, 0.0), stated) if self._here is None else calibrated(*self._here, stated, reading)
@@ -284,7 +268,7 @@ class Onboard:
         rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
         rows |= dict(zip(STD_KEYS, std, strict=True))
         if self._here is not None:
-            known = self._error, *self._here, self.options.sensor_std.bias
+            known = self._error, *self._here, self.options.accuracy.bias
             rows |= dict(zip(START_KEYS, known, strict=True))
         seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
         seen |= {"step_count": torch.tensor([[len(self._steps)]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
@@ -299,7 +283,7 @@ class Onboard:
         radius = posterior.radius(self.options.confidence).item()
         stop, reason = self._stop(way, decision, radius, declared=action[2:] > [0.0])
         if not (stop or self._steps or self._here or self._near):
-            reason = _UNCHECKED
+            reason = _UNCHECKED[self.options.north]
         if stop:
             action = [0.0, 0.0]
         elif decision.way.norm() < self.options.arrival_km:
@@ -314,6 +298,7 @@ class Onboard:
     def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float, declared: bool) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""
         options, useful = self.options, measured(self._sensor_std.noise)
+        useful = (useful[0] and not options.magnetic, *useful[1:])
         if text := stuck([km * use for km, use in zip(self._unchanged, useful, strict=True)], self.max_move_km):
             return "lost", text
         level = sum(self._surprises) / max(len(self._surprises), 1)
