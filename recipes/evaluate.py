@@ -5,6 +5,7 @@
     python recipes/evaluate.py secant --scenario my.toml --export tracks.geojson    # own tasks, tracks for a map
     python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --errors 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --errors ship                    # errors of a real vehicle
+    python recipes/evaluate.py kalman --errors 0.05 0.05 5 --north magnetic     # without a true-north reference
     python recipes/evaluate.py secant kalman --arrival distance --arrival-radius-km 25 --max-steps 80 --altitude-km -3
     python recipes/evaluate.py policy:SAC=sac.safetensors secant                # a policy of another algorithm
 
@@ -87,6 +88,8 @@ class Config(ScenarioOptions):
     """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
     vehicle, which are laboratory, aircraft, ship, underwater, low-cost, or a file (.toml or .json, docs/conditions.md);
     by default the noise of the runs, or 0."""
+    north: Literal["true", "magnetic"] = "true"
+    """North of the vehicles: true (they measure D), or magnetic (a compass; they measure I and B_H alone)."""
     known_start: Noise | None = None
     """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
     calibrated, with the errors of a real vehicle; by default the start is unknown."""
@@ -169,7 +172,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         config, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        options = {key: getattr(config, key) for key in ("errors", "known_start", "confidence", "seed")}
+        options = {key: getattr(config, key) for key in ("errors", "north", "known_start", "confidence", "seed")}
         flights = [Flight(scenario, **options), Flight(example, **options)]
         options = {"mode": config.mode, "map_date": config.map_date}
         navigators = [tuple(flight.navigator(text, **options) for flight in flights) for text in config.navigators]
@@ -226,7 +229,7 @@ def settings(config: Config, env: GeomagneticNavEnv) -> dict[str, Any]:
         "arrival": env.arrival.rule,
         "arrival_radius_km": env.arrival.radius_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        **{key: getattr(config, key) for key in ("tasks", "known_start", "map_date", "mode", "seed")},
+        **{key: getattr(config, key) for key in ("tasks", "north", "known_start", "map_date", "mode", "seed")},
         "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
         **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
         **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
@@ -247,6 +250,7 @@ def write(config: Config, env: GeomagneticNavEnv, results: Results) -> None:
     lines = {
         "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
         "Date of the map of map matching": config.map_date,
+        "North": config.north != "true" and config.north,
         "Conditions": isinstance(config.errors, str) and config.errors,
         "Known start, standard deviations of D, I, B_H": config.known_start and text(*config.known_start),
         "Standard deviations of the noise on D, I and B_H": noisy and text(*config.errors),

@@ -4,6 +4,7 @@
     python recipes/fly.py "60.4N 5.3E" "D=-11.1 I=75.2 BH=13000"         # a destination by its magnetic elements
     python recipes/fly.py "38.7, -9.1" "40.7, -74.0" --errors 0.05 0.05 5 --navigator secant --export track.geojson
     python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors underwater         # with the errors of a real vehicle
+    python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors 0 0.05 5 --north magnetic  # with a compass, without D
 
 The agent measures declination D, inclination I and horizontal intensity B_H, and knows their values at the destination.
 It never observes a position: coordinates serve the simulation, the score and the picture only.
@@ -28,6 +29,7 @@ from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
 from magrl.sensor_std import STD_KEYS
+from magrl.tracking import Way
 from magrl.training import UsageError, command, parse
 from magrl.transforms import TrackField, conditions_named
 
@@ -62,6 +64,8 @@ class Config:
     """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
     vehicle, which are laboratory, aircraft, ship, underwater, low-cost, or a file (.toml or .json,
     docs/conditions.md)."""
+    north: Literal["true", "magnetic"] = "true"
+    """North of the vehicle: true (it measures D), or magnetic (a compass: it measures I and B_H alone)."""
     known_start: tuple[float, float, float] | None = None
     """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
     calibrated, with the errors of a real vehicle; by default the start is unknown."""
@@ -156,6 +160,7 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
             flight = Flight(
                 scenario,
                 errors=config.errors,
+                north=config.north,
                 known_start=config.known_start,
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
@@ -233,6 +238,7 @@ def fly(config: Config) -> dict[str, Any]:
         for name, flight in steps.items()
     }
     base, first = flights["with_signal"][0].base_env, steps["with_signal"][0, 0]
+    last = steps["without_signal"]["next"][0, -1]
     name = config.navigator.partition("=")[0]
     result = {
         **{key: value for key, value in asdict(config).items() if key not in ("out", "export", "animate")},
@@ -241,7 +247,7 @@ def fly(config: Config) -> dict[str, Any]:
         **{key: getattr(base, key) for key in ("zeta", "max_steps")},
         **{key: first[key].tolist() for key in ("start_position", "target_position", "target_field")},
         **measures["with_signal"],
-        "without_signal": measures["without_signal"],
+        "without_signal": measures["without_signal"] | {"ellipse": Way(last["way"], last["way_covariance"]).ellipse()},
     }
     write_json(config.out / "flight.json", result)
     draw(config, steps, measures, base)
@@ -258,15 +264,15 @@ def summary(result: dict[str, Any]) -> str:
         "outcome": result["outcome"],
         "navigator": f"{result['navigator']}, which needs {result['needs']} beside its readings",
         "errors": errors,
+        "north": result["north"],
         "start": ends[0],
         "destination": f"{ends[1]}, {places.elements_text(torch.tensor(result['target_field']))}",
         "steps": f"{result['steps']} of at most {result['max_steps']}",
         "path": f"{result['length_km']:.0f} km; the shortest is {result['shortest_km']:.0f} km",
         "efficiency": f"{100 * result['path_efficiency']:.1f} %",
         "distance left": f"{result['navigation_error_km']:.1f} km",
-        "without signal": "{outcome}: {steps} steps, {length_km:.0f} km, {navigation_error_km:.1f} km left".format(
-            **result["without_signal"]
-        ),
+        "without signal": "{outcome}: {steps} steps, {length_km:.0f} km, {navigation_error_km:.1f} km left, "
+        "estimated to {ellipse}".format(**result["without_signal"]),
     }
     return "\n".join(f"{name:16}{text}" for name, text in rows.items())
 

@@ -3,10 +3,13 @@
     python recipes/replay_log.py docs/examples/log.csv --noise 0.02 0.02 2
     python recipes/replay_log.py track.csv --target -11.6 75.4 13240 --navigator kalman
     python recipes/replay_log.py track.csv --declination dec_deg --horizontal H_nT --every-km 20
+    python recipes/replay_log.py track.csv --north magnetic --noise 0 0.1 20     # as a vehicle without true north
 
 Each row of the log holds a reading of D [deg], I [deg], B_H [nT], and the heading [deg] and the length [km] of the move
 since the row before; in the first row, the length is 0. The destination is that of the last row, unless --target gives
-its elements. Where the log has positions, the estimates are compared with them; the navigator does not read them.
+its elements. With --north magnetic, D only converts the headings: the navigator gets I, B_H and headings from
+magnetic north, whatever the north of the log is. Where the log has positions, the estimates are compared with them; the
+navigator does not read them.
 Writes log.csv, log.md and log.png.
 """
 
@@ -16,15 +19,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from magrl.agents import load_policy
 from magrl.evaluation.tables import markdown_table
+from magrl.field import IGRF, elements_at
 from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
-from magrl.logs import checked_times, joined, mistakes
+from magrl.logs import joined, mistakes, read_readings
 from magrl.onboard import Onboard
 from magrl.sensor_std import SensorStd
+from magrl.tracking import Way
 from magrl.training import UsageError, command, parse
 
 import numpy as np
@@ -37,12 +43,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 RECIPE = "replay_log.py"
-ELEMENTS = [*NAMES]
+ELEMENTS, PLACE = [*NAMES], ("latitude", "longitude")
 OPTIONS = {"D": "declination", "I": "inclination", "B_H": "horizontal"}
 """Options that name the columns of the elements."""
 COMMANDED = ["move_km", "turn_deg", "steer_deg", "north_km", "east_km", "error_km", "confidence", "stop", "covariance"]
 """Columns of what the navigator would have commanded and estimated."""
-FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}"}
+FORMATS = {"confidence": "{:.2f}", "row": "{:.0f}", "time": "{}", "stop": "{}"}
 """Formats of the columns of log.md that do not have one decimal."""
 
 
@@ -58,6 +64,8 @@ class Config:
     """Elements at the destination, D [deg], I [deg], B_H [nT]; by default those of the last row."""
     target_position: tuple[float, float] | None = None
     """Latitude, longitude of the destination [deg], for comparison only; without --target those of the last row."""
+    north: Literal["true", "magnetic"] = "true"
+    """North of the vehicle: true (D is measured), or magnetic (it has a compass, and D tells nothing)."""
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -89,65 +97,42 @@ class Config:
 
 
 def read_log(config: Config) -> pd.DataFrame:
-    """Return the columns of the log, the number of each row in the file, and in ``attrs`` the notes on its times.
-
-    Raises:
-        UsageError: for a file that cannot be read, a missing column, or a value that is not a number.
-        ValueError: for times that run backward.
-    """
-    try:
-        raw = pd.read_csv(config.log, dtype=str, skipinitialspace=True)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot read {config.log}: {error}") from error
-    log = pd.DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
-    wanted = [*ELEMENTS, "heading", "distance"]
-    if config.latitude in raw or config.longitude in raw:
-        wanted += ["latitude", "longitude"]
-    for column in wanted:
-        option = OPTIONS.get(column, column)
-        name = getattr(config, option)
-        if name not in raw:
-            raise UsageError(f"no column of {config.log} is {name!r}: name one of {[*raw]} by --{option}")
-        log[column] = pd.to_numeric(raw[name], errors="coerce")
-        bad = ~np.isfinite(log[column])
-        if bad.any():
-            row = int(bad.idxmax())
-            raise UsageError(f"row {row + 1} of {config.log}: {name} is {raw[name][row]!r}, which is not a number")
-    if len(log) < 2:
-        raise UsageError(f"{config.log} must hold at least two rows, got {len(log)}")
-    log.attrs = {"notes": [], "date": config.date}
-    if config.time not in raw:
-        return log
-    log.insert(1, "time", raw[config.time])
-    new, notes, date = checked_times(log["time"])
-    log.attrs = {"notes": notes, "date": config.date or date}
-    return log[new].reset_index(drop=True)
+    """Return the columns of the log, see :func:`magrl.logs.read_readings`."""
+    names = {key: getattr(config, OPTIONS.get(key, key)) for key in (*ELEMENTS, "heading", "distance", *PLACE)}
+    log = read_readings(config.log, names, config.time)
+    log.attrs["date"] = config.date or log.attrs["date"]
+    return log
 
 
-def replay(config: Config, log: pd.DataFrame) -> pd.DataFrame:
-    """Return what the navigator would have commanded and estimated after each row, beside the row itself.
+def replay(config: Config, log: pd.DataFrame, date: str | None = None) -> pd.DataFrame:
+    """Return what the navigator would have commanded and estimated after each row, beside the row itself, and the
+    direction of its north from true north, ``north_deg``.
 
     Raises:
         UsageError: for a row that no vehicle can have recorded, with its number.
     """
     navigator = load_policy(config.navigator) if config.navigator.endswith(".safetensors") else config.navigator
     sensor_std = SensorStd(config.noise, config.bias)
-    board = Onboard(navigator, sensor_std=sensor_std, max_steps=len(log) + 1, arrival_km=config.arrival_km)
+    magnetic = config.north == "magnetic"
+    options = {"north": config.north, "max_steps": len(log) + 1, "arrival_km": config.arrival_km}
+    board = Onboard(navigator, sensor_std=sensor_std, **options)
     board.start(log[ELEMENTS].iloc[-1].tolist() if config.target is None else config.target)
-    commands = []
-    for _, row in log.iterrows():
-        heading = row["heading"]
+    commands, north = [], log["D"].shift(1, fill_value=log["D"][0]) * magnetic  # of headings, from that of the log
+    for (_, row), east in zip(log.iterrows(), north, strict=True):
+        heading = math.remainder(row["heading"] - east, 360)
         if abs(heading) <= 2 * math.pi:
             # On board, a small heading may be the one commanded in radians; here no command was followed. The same
             # course as a large number is not compared. A log in radians is named in notes().
             heading -= math.copysign(360, heading)
         try:
-            order = board.step(*row[ELEMENTS], heading, row["distance"])
+            declination = None if magnetic else row["D"]
+            order = board.step(declination, row["I"], row["B_H"], heading, row["distance"])
         except ValueError as error:
             raise UsageError(f"row {row['row']:.0f} of {config.log}: {error}") from error
         row = (order.distance_km, order.turn_deg, order.heading_deg, *order.way_km, order.error_km, order.confidence)
         commands.append((*row, order.stop or "", order.way_covariance_km2))
-    return pd.concat((log.reset_index(drop=True), pd.DataFrame(commands, columns=COMMANDED)), axis=1)
+    table = pd.concat((log.reset_index(drop=True), pd.DataFrame(commands, columns=COMMANDED)), axis=1)
+    return table.assign(north_deg=vehicle_north(log, date).numpy() * magnetic)
 
 
 def with_truth(config: Config, table: pd.DataFrame) -> pd.DataFrame:
@@ -159,9 +144,23 @@ def with_truth(config: Config, table: pd.DataFrame) -> pd.DataFrame:
     check_positions(*place.unbind(-1))
     check_positions(*target)
     distance, bearing = geodesic(*place.unbind(-1), *target.expand_as(place).unbind(-1))
-    north, east = (distance * torch.cos(bearing)).numpy(), (distance * torch.sin(bearing)).numpy()
+    bearing = bearing - torch.deg2rad(torch.tensor(table["north_deg"].to_numpy(dtype=float)))
+    north, east = ((distance * wave(bearing)).numpy() for wave in (torch.cos, torch.sin))
     miss = np.hypot(table["north_km"] - north, table["east_km"] - east)
     return table.assign(true_north_km=north, true_east_km=east, miss_km=miss)
+
+
+def vehicle_north(log: pd.DataFrame, date: str | None) -> torch.Tensor:
+    """Return the direction of magnetic north ``(T,)`` [deg]: of IGRF, or without positions and date as logged."""
+    if date is None or "latitude" not in log:
+        return torch.tensor(log["D"].to_numpy(dtype=float))
+    return elements_at(IGRF(date), torch.tensor(log[["latitude", "longitude"]].to_numpy(dtype=float)))[:, 0]
+
+
+def last_way(table: pd.DataFrame) -> Way:
+    """Return the estimate after the last row."""
+    last = table.iloc[-1]
+    return Way(torch.tensor([last["north_km"], last["east_km"]]), torch.tensor(last["covariance"]))
 
 
 def places(table: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
@@ -203,6 +202,7 @@ def figure(table: pd.DataFrame, title: str) -> Figure:
 def draw_track(axes: Axes, table: pd.DataFrame) -> PathCollection:
     """Draw the track, commanded headings and estimates of the destination, and return the dots of these."""
     place, turn = places(table)
+    turn = turn + np.radians(table["north_deg"].to_numpy(dtype=float))
     way = table[["north_km", "east_km"]].to_numpy(dtype=float)
     steer = np.radians(table["steer_deg"].to_numpy(dtype=float)) + turn
     axes.plot(place[:, 1], place[:, 0], "-", color="0.4", label="track")
@@ -211,10 +211,9 @@ def draw_track(axes: Axes, table: pd.DataFrame) -> PathCollection:
     guess = place + turned(way, turn)
     look = {"c": np.arange(len(table)), "cmap": "viridis", "s": 18, "zorder": 3, "label": "estimated target"}
     dots = axes.scatter(guess[:, 1], guess[:, 0], **look)
-    values, vectors = np.linalg.eigh(np.array(table["covariance"].iloc[-1]))
-    size = 4 * np.sqrt(np.maximum(values, 0))
-    angle = math.degrees(math.atan2(vectors[0, 1], vectors[1, 1]))
-    axes.add_patch(Ellipse(guess[-1, ::-1], size[1], size[0], angle=angle, fill=False, color="#D55E00"))
+    along, across, bearing = (x.item() for x in last_way(table).axes())
+    angle = 90 - bearing - math.degrees(turn[-1])
+    axes.add_patch(Ellipse(guess[-1, ::-1], 4 * along, 4 * across, angle=angle, fill=False, color="#D55E00"))
     if "miss_km" in table:
         target = place[0] + table[["true_north_km", "true_east_km"]].to_numpy(dtype=float)[0]
         axes.plot(target[1], target[0], "*", color="#D55E00", markersize=14, zorder=2, label="true target")
@@ -239,14 +238,10 @@ def draw_distance(axes: Axes, table: pd.DataFrame) -> None:
 
 def markdown(table: pd.DataFrame) -> str:
     """Return the table with rounded numbers."""
-    hidden = [*ELEMENTS, "latitude", "longitude", "covariance"]
-    shown = table.drop(columns=[name for name in hidden if name in table])
-
-    cells = [
-        [FORMATS.get(name, "{:.1f}").format(x) if isinstance(x, (int, float)) else x for x in shown[name]]
-        for name in shown
-    ]
-    return markdown_table(list(shown), zip(*cells, strict=True))
+    hidden = [*ELEMENTS, "latitude", "longitude", "covariance", "north_deg"]
+    shown = table.drop(columns=hidden, errors="ignore")
+    text = shown.apply(lambda column: column.map(FORMATS.get(column.name, "{:.1f}").format))
+    return markdown_table(list(shown), text.to_numpy())
 
 
 def notes(table: pd.DataFrame) -> list[str]:
@@ -263,7 +258,7 @@ def notes(table: pd.DataFrame) -> list[str]:
         halfway, end = table[["miss_km", "error_km"]].iloc[[len(table) // 2, -1]].to_numpy(float)
         text = "Error of the estimated way {}: {:.1f} km; stated {:.1f} km.".format
         lines += [text("halfway", *halfway), text("at the end", *end)]
-    return lines
+    return [*lines, f"The destination is estimated to {last_way(table).ellipse()}."]
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -277,7 +272,7 @@ def main(args: Sequence[str] | None = None) -> None:
         log = read_log(config)
         for name in ("log.csv", "log.md", "log.png"):
             check_writable(config.out / name)
-        table = with_truth(config, replay(config, joined(log, config.every_km)))
+        table = with_truth(config, replay(config, joined(log, config.every_km), log.attrs["date"]))
         warnings = log.attrs["notes"] + mistakes(log, log.attrs["date"])
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error

@@ -6,9 +6,9 @@ from magrl.logs.comparison import difference_from_igrf as difference_from_igrf
 from magrl.logs.comparison import mistakes as mistakes
 from magrl.logs.readers import read_log as read_log
 from magrl.logs.readings import joined as joined
+from magrl.logs.readings import read_readings as read_readings
 from magrl.logs.readings import readings_of as readings_of
 from magrl.logs.samples import Log as Log
-from magrl.logs.samples import checked_times as checked_times
 from magrl.logs.samples import samples_of as samples_of
 from magrl.logs.vectors import MeasuredElements as MeasuredElements
 from magrl.logs.vectors import attitude_of as attitude_of

@@ -126,10 +126,16 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     missing = "" if iron else "; no calibration: give --bias of your sensors"
     if std.isna().any():
         noise, missing = "D I B_H", f"; too few samples for --noise: give that of your sensors{missing}"
+    magnetic = "" if (options.north or log.north) == "true" else " --north magnetic"
+    if magnetic:
+        lines.append(
+            "the heading is not from true north, so D tells nothing of the place: the vehicle navigates by I, B_H and "
+            "magnetic headings, and where their contours are nearly parallel, it finds a line and not a place"
+        )
     return [
         *lines,
         f"{len(table)} readings, moves of {table['distance'][1:].mean():.3g} km: {out}",
-        f"replay: python recipes/replay_log.py {out} --noise {noise} --bias {bias}{missing}",
+        f"replay: python recipes/replay_log.py {out}{magnetic} --noise {noise} --bias {bias}{missing}",
     ]
 
 

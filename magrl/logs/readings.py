@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 import pandas
 import torch
@@ -12,7 +15,7 @@ from magrl.checks import check_choice, check_number
 from magrl.field.elements import NAMES, elements_jacobian, measured_elements
 from magrl.geodesy import geodesic
 from magrl.logs.calibration import Calibration
-from magrl.logs.samples import ATTITUDE, AXES, Array, Log
+from magrl.logs.samples import ATTITUDE, AXES, Array, Log, checked_times
 from magrl.logs.vectors import NORTHS, axes_of_elements, rotation
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
@@ -78,6 +81,55 @@ def readings_of(
     groups = samples[clean].groupby(part[clean])
     table = _readings(groups.mean(), _covariance(field[clean], part[clean]), north)
     return table.assign(samples=groups.size(), spikes=np.bincount(part[~clean], minlength=len(table)))
+
+
+def read_readings(path: Path | str, names: Mapping[str, str], time: str | None = None) -> DataFrame:
+    """Return the readings of a CSV file with a header, one for each move.
+
+    Args:
+        path: the file.
+        names: its columns by ``D``, ``I``, ``B_H``, ``heading``, ``distance``, and optionally ``latitude`` and
+            ``longitude``, which the file may lack.
+        time: its column of the time, numbers or ISO 8601, which it may lack.
+
+    Returns:
+        Columns of these names, ``row``, the number of each in the file, and ``time``; without rows that repeat the time
+        of the row before. ``attrs`` has the ``notes`` on the times, and their ``date``.
+
+    Raises:
+        ValueError: for a file that cannot be read, a missing column, a value that is not a number, or times that run
+            backward.
+
+    Example:
+        >>> read_readings("nowhere.csv", {})
+        Traceback (most recent call last):
+        ValueError: cannot read nowhere.csv: [Errno 2] No such file or directory: 'nowhere.csv'
+    """
+    try:
+        raw = pandas.read_csv(path, dtype=str, skipinitialspace=True)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    log = DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
+    located = any(names.get(key) in raw for key in ("latitude", "longitude"))
+    for key, name in names.items():
+        if key in ("latitude", "longitude") and not located:
+            continue
+        if name not in raw:
+            raise ValueError(f"no column of {path} is {name!r}: name that of {key}, one of {[*raw]}")
+        log[key] = pandas.to_numeric(raw[name], errors="coerce")
+        bad = ~np.isfinite(log[key])
+        if bad.any():
+            row = int(bad.idxmax())
+            raise ValueError(f"row {row + 1} of {path}: {name} is {raw[name][row]!r}, which is not a number")
+    if len(log) < 2:
+        raise ValueError(f"{path} must hold at least two rows, got {len(log)}")
+    log.attrs = {"notes": [], "date": None}
+    if time in raw:
+        log.insert(1, "time", raw[time])
+        new, notes, date = checked_times(log["time"])
+        log = log[new].reset_index(drop=True)
+        log.attrs = {"notes": notes, "date": date}
+    return log
 
 
 def joined(table: DataFrame, every_km: float) -> DataFrame:

@@ -74,7 +74,7 @@ def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(tmp_path: Pa
 @pytest.mark.parametrize(
     ("change", "arguments", "message"),
     [
-        (("B_H", "H"), (), "is 'B_H': name one of \\['time', 'D', 'I', 'H'.*by --horizontal"),
+        (("B_H", "H"), (), "is 'B_H': name that of B_H, one of \\['time', 'D', 'I', 'H'"),
         (("1.310", "x"), (), r"row 2 of .*: D is 'x', which is not a number"),
         (("14271.7", "14.27"), (), r"row 2 of .*microtesla"),
         (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
