@@ -49,8 +49,12 @@ class Flights:
     """Radius in which vehicles declare their arrival [km]; by default they get a signal, by the paper's rule."""
     confidence: float = 0.0
     """Minimum probability at which vehicles declare their arrival."""
+    signal_km: float | None = None
+    """Radius in which a signal ends the episode [km]."""
+    north: str = "true"
+    """North of the vehicles, ``"true"`` or ``"magnetic"``; a navigator may have another one as an option."""
     known_start: Sequence[float] | None = None
-    """Standard deviations of the elements at the start, where the vehicles know them."""
+    """Standard deviations of the elements at the start, where the vehicles know them; also an option of a navigator."""
     box: bool = False
     """Whether the tasks are those of the paper's box, ``test-1000``, in place of random regions."""
 
@@ -73,6 +77,7 @@ class Flights:
         earth = Scenario() if self.box else earth_scenario(self.regions, SEED, **size, start_heading="random")
         tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, SEED)
         rule: dict[str, Any] = {"arrival": "declared", "arrival_radius_km": self.within_km} if self.within_km else {}
+        rule |= {"arrival": "distance", "arrival_radius_km": self.signal_km} if self.signal_km else {}
         scenario = earth.replace(max_steps=self.max_steps, **rule)
         return scenario.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
 
@@ -80,12 +85,15 @@ class Flights:
     def measures(self) -> list[str]:
         """Measures in a cell of a table."""
         last = [] if self.box else ["false_arrival_rate" if self.within_km else "steps"]
-        return [*["success_rate_within_25km"] * self.far, "success_rate", "spl", *last]
+        return [*["success_rate_within_25km"] * (self.far and not self.signal_km), "success_rate", "spl", *last]
 
     def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
         """Return an episode of each task."""
-        flight = Flight(self.scenario, errors=errors, known_start=self.known_start, confidence=self.confidence)
-        return flown(flight, navigator)
+        given = {"north": self.north, "known_start": self.known_start}
+        own = navigator if isinstance(navigator, Mapping) else {"name": navigator}
+        options = {key: own.get(key, value) for key, value in given.items()}
+        flight = Flight(self.scenario, errors=errors, confidence=self.confidence, **options)
+        return flown(flight, {key: value for key, value in own.items() if key not in given})
 
     def episodes(self, navigator: Spec, errors: Errors) -> list[Measures]:
         """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""
