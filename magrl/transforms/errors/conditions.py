@@ -136,6 +136,8 @@ class Conditions:
 
 _CALIBRATED = VectorErrors(hard_iron_nt=(5.0,) * 3, soft_iron=((1e-4,) * 3,) * 3, attitude_deg=(0.01, 0.01))
 _MEMS = VectorErrors(hard_iron_nt=(30.0,) * 3, soft_iron=((5e-4,) * 3,) * 3, attitude_deg=(0.05, 0.05))
+_SWUNG = VectorErrors(hard_iron_nt=(100.0,) * 3, soft_iron=((1e-3,) * 3,) * 3, attitude_deg=(0.2, 0.2))
+_PHONE = VectorErrors(hard_iron_nt=(300.0,) * 3, soft_iron=((2e-3,) * 3,) * 3, attitude_deg=(0.3, 0.3))
 _MONTH = {"record": "boulder-2016", "span_h": 480.0}
 
 CONDITIONS: Mapping[str, Conditions] = {
@@ -181,6 +183,30 @@ CONDITIONS: Mapping[str, Conditions] = {
             motion={"log_scale": 0.05, "log_noise": 0.01, "current_km_h": 0.9},
             weather=_MONTH,
         ),
+        Conditions(
+            "boat",
+            12.0,
+            sensors={"noise": (0.1, 0.05, 30.0), "resolution": (0.0, 0.0, 13.0), "vector": _MEMS},
+            north=MAGNETIC,
+            motion={"log_scale": 0.02, "current_km_h": 0.9},
+            weather=_MONTH,
+        ),
+        Conditions(
+            "drone",
+            90.0,
+            sensors={"noise": (0.2, 0.1, 50.0), "resolution": (0.0, 0.0, 13.0), "vector": _SWUNG},
+            north=MAGNETIC,
+            motion={"log_scale": 0.03, "current_km_h": 7.0},
+            weather={"record": "quiet"},
+        ),
+        Conditions(
+            "phone",
+            12.0,
+            sensors={"noise": (0.3, 0.15, 80.0), "resolution": (0.0, 0.0, 150.0), "vector": _PHONE},
+            north=MAGNETIC,
+            motion={"log_scale": 0.05, "current_km_h": 0.9},
+            weather=_MONTH,
+        ),
     )
 }
 """Presets. We take a standard's limit as two standard deviations. Values marked "chosen" have no source: we did not
@@ -196,7 +222,10 @@ Readings:
 - Roll and pitch: 0.01 degrees (chosen, as of the fiber-optic gyrocompass Octans); low-cost 0.05 degrees (chosen).
 - Resolution 13 nT: PNI RM3100 at 200 cycles (support article of PNI). Drift and outages: chosen.
 
-North: see :data:`~magrl.transforms.NORTH_REFERENCES`.
+- Boat, drone, phone: hard iron 30, 100, 300 nT, soft iron 5e-4, 1e-3, 2e-3, roll and pitch 0.05, 0.2, 0.3 degrees, and
+  noise of means of readings (all chosen). Resolution of the phone 150 nT: AKM AK09918 (data sheet 016014242-E-00).
+
+North: see :data:`~magrl.transforms.NORTH_REFERENCES`; boat, drone and phone have a compass alone.
 
 Motion:
 
@@ -206,6 +235,7 @@ Motion:
 - Underwater: Doppler velocity log to 0.4 % (chosen, as Teledyne RDI Workhorse Navigator); current and eddies of 0.1 m/s
   (chosen).
 - Low-cost: log to 10 % (chosen), current as for the ship.
+- Boat, drone, phone: log to 4, 6, 10 %, and an unknown current, or wind, of 0.9, 7, 0.9 km/h (chosen).
 
 Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, 20 days of a month for the others (chosen).
 """
