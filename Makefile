@@ -69,7 +69,7 @@ RUNS_figure-noise := $(NOISY)
 RUNS_figure-paper-run := $(WHOLE)
 RUNS_figure-sequences := $(MEMORY)
 TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' recipes/tables/tables.toml)
-FIGURES ?= section-4 noise conditions globe prices reliability $(shell sed -n 's/^\[curves\.\([a-z-]*\)\]$$/\1/p' recipes/tables/figures.toml)
+FIGURES ?= section-4 noise conditions globe two-elements prices reliability $(shell sed -n 's/^\[curves\.\([a-z-]*\)\]$$/\1/p' recipes/tables/figures.toml)
 
 tables: $(TABLES:%=table-%)  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
 	$(RECIPE)/tables/publish.py README.md $(wildcard docs/*.md)

@@ -243,9 +243,11 @@ def fly(config: Config) -> dict[str, Any]:
     result = {
         **{key: value for key, value in asdict(config).items() if key not in ("out", "export", "animate")},
         "navigator": name,
+        "north": "true" if first.get("true_target_field", None) is None else "magnetic",  # also of a preset
         "needs": needs(name),
         **{key: getattr(base, key) for key in ("zeta", "max_steps")},
-        **{key: first[key].tolist() for key in ("start_position", "target_position", "target_field")},
+        **{key: first[key].tolist() for key in ("start_position", "target_position")},
+        "target_field": first.get("true_target_field", first["target_field"]).tolist(),
         **measures["with_signal"],
         "without_signal": measures["without_signal"] | {"ellipse": Way(last["way"], last["way_covariance"]).ellipse()},
     }
@@ -256,9 +258,8 @@ def fly(config: Config) -> dict[str, Any]:
 
 def summary(result: dict[str, Any]) -> str:
     """Return the result of a flight as text."""
-    errors = result["errors"] if any(result["errors"]) else "none"
-    if not isinstance(errors, str):
-        errors = "{:g} deg, {:g} deg, {:g} nT".format(*errors)
+    errors = result["errors"]
+    errors = errors if isinstance(errors, str) else "{:g} deg, {:g} deg, {:g} nT".format(*errors)
     ends = ["{:.2f}, {:.2f}".format(*result[key]) for key in ("start_position", "target_position")]
     rows = {
         "outcome": result["outcome"],
@@ -282,8 +283,7 @@ def main(args: Sequence[str] | None = None) -> None:
     words = sys.argv[1:] if args is None else args
     spaced = [f" {word}" if word[:1] == "-" and word[1:2].isdigit() else word for word in words]  # "-33.9 18.4"
     config = parse(Config, RECIPE, __doc__, spaced)
-    config = replace(config, start=config.start.strip(), destination=config.destination.strip())
-    print(summary(fly(config)))
+    print(summary(fly(replace(config, start=config.start.strip(), destination=config.destination.strip()))))
     print(f"The picture is {config.out / 'flight.png'}")
 
 

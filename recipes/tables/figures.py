@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
 from flights import Flights, matching, reliability
-from globe import earth_tasks, globe_map, measured
+from globe import earth_tasks, globe_map, measured, two_elements_map
 from grid import RUNS, declared
 
 RECIPE = "figures.py"
@@ -187,6 +187,7 @@ FIGURES: Mapping[str, Callable[..., Figures]] = {
     "noise": noise,
     "conditions": conditions,
     "globe": globe,
+    "two-elements": lambda: {"figures/two-elements": two_elements_map()[0]},
     "prices": prices,
     "reliability": reliability_diagram,
 }

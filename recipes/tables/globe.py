@@ -145,6 +145,25 @@ def globe_map(tasks: Tasks, measures: Measures) -> Figure:
     return figure
 
 
+def two_elements_map() -> tuple[Figure, float]:
+    """Return the map of the angle between the gradients of I and B_H, without which two elements give a line and not a
+    place, and the share of the Earth between 60 degrees south and north where it is below 5 degrees."""
+    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    axes = figure.add_subplot(projection="mollweide")
+    latitude, longitude = torch.arange(-89.5, 90.0).double(), torch.arange(-180.0, 181.0).double()
+    places = torch.stack(torch.meshgrid(latitude, longitude, indexing="ij"), -1)
+    north, east = elements_gradient_at(FIELD, places)[..., 1:, :].unbind(-1)
+    bearing = torch.rad2deg(torch.atan2(east, north))
+    angle = 90 - (bearing.diff(dim=-1).squeeze(-1).remainder(180) - 90).abs()
+    where = np.radians(longitude.numpy()), np.radians(latitude.numpy())
+    filled = axes.contourf(*where, angle, [0, 5, 10, 20, 45, 90], cmap="viridis")
+    axes.plot(*np.radians(coastlines()).T[::-1], color="white", lw=0.6)
+    axes.set(xticklabels=[], yticklabels=[])
+    figure.colorbar(filled, shrink=0.7, pad=0.02, label="angle between the gradients of I and B_H [°]")
+    weight = torch.cos(torch.deg2rad(latitude)) * (latitude.abs() < 60)
+    return figure, float((weight @ (angle < 5).double().mean(-1)) / weight.sum())
+
+
 def draw_field(axes: Axes) -> None:
     """Draw the dip poles, where B_H is weak, and where gradients are nearly parallel."""
     latitude, longitude = torch.arange(-89.5, 90.0).double(), torch.arange(-180.0, 181.0).double()
