@@ -1,0 +1,157 @@
+"""Make the table of a measured field: does the destination lie where a vehicle on a recorded track states it?
+
+    python recipes/tables/measured.py swarm.csv --out docs/results
+
+The log is one of recipes/replay_log.py with positions and, above sea level, `altitude_km`. Each piece of the track is a
+flight from its first row to its last. The vehicle reads D, I, B_H of the log with white noise. The destination's
+elements, and those of a known start, are of the log, as from a survey, or of IGRF at its altitude.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from magrl.evaluation.tables import markdown_table
+from magrl.field import IGRF, elements_at
+from magrl.geodesy import geodesic
+from magrl.logs import read_readings
+from magrl.onboard.start import MODEL_STD
+from magrl.sensor_std import SensorStd
+from magrl.tracking import Belief, before, destination, known, moved, posterior, read
+from magrl.tracking.destination import log_density
+from magrl.training import command
+
+import pandas
+import torch
+import tyro
+from matplotlib.figure import Figure
+from torch import Tensor
+
+RECIPE = "measured.py"
+NAMES = ("D", "I", "B_H", "heading", "distance", "latitude", "longitude")
+SLOW = (0.05, 0.03, 15.0)
+"""Standard deviations of what varies along the way, crust and currents, on D, I [deg], B_H [nT]: 15 nT; chosen."""
+RANGE_KM = {(300.0, 500.0): 400.0, (1200.0, 1800.0): 1000.0}
+"""Prior standard deviation of the way [km] for pieces of a length."""
+PROBABILITIES = (0.5, 0.9, 0.95)
+
+
+@dataclass(frozen=True)
+class Track:
+    """Rows of a log ``(T, ...)``: readings, IGRF there, headings [rad], moves [km], positions [deg]."""
+
+    field: Tensor
+    model: Tensor
+    heading: Tensor
+    distance: Tensor
+    position: Tensor
+
+
+def read_track(path: Path, date: str | None = None) -> Track:
+    """Return the rows of a log, and IGRF at their altitude."""
+    log = read_readings(path, dict(zip(NAMES, NAMES, strict=True)), "time")
+    values = torch.tensor(log[list(NAMES)].to_numpy(float))
+    height = pandas.read_csv(path).get("altitude_km", pandas.Series([0.0] * len(log))).mean()
+    model = IGRF(date or log.attrs["date"], altitude_km=float(height))
+    heading = torch.deg2rad(values[:, 3])
+    return Track(values[:, :3], elements_at(model, values[:, 5:]), heading, values[:, 4], values[:, 5:])
+
+
+def pieces(track: Track, low_km: float, high_km: float) -> Tensor:
+    """Return the rows of all pieces of about the mean length, ``(P, T)``."""
+    rows = round((low_km + high_km) / 2 / track.distance[1:].mean().item()) + 1
+    return torch.arange(len(track.distance)).unfold(0, rows, 1)
+
+
+def flown(track: Track, rows: Tensor, noise: Tensor, target: Tensor, start: Tensor | None, range_km: float) -> Tensor:
+    """Return for each reading ``(P, T - 1)`` the stated probability of the region whose border is at the destination,
+    the error of the estimated way and the distance left [km], ``(P, T - 1, 3)``.
+
+    A region holds all places that are more probable than those on its border, so that it is right if the first is
+    uniform from 0 to 1.
+
+    Args:
+        track: the log.
+        rows: pieces.
+        noise: standard deviations of the white noise.
+        target: elements of the destinations ``(P, 3)``.
+        start: known elements at the start ``(P, 3)``; None where they are not known.
+        range_km: prior standard deviation of the way.
+    """
+    generator = torch.Generator().manual_seed(0)
+    reading = track.field[rows] + noise * torch.randn(*rows.shape, 3, generator=generator).double()
+    std = noise.expand(len(rows), 3)
+    errors = SensorStd(std, *(torch.tensor(x).double().expand_as(std) for x in (MODEL_STD, SLOW, (0.0,) * 3)))
+    near = reading[:, 0] if start is None else start
+    belief: Belief = before(near, errors)
+    belief = belief if start is None else known(belief, start, torch.full_like(start, 1e-3))
+    found = []
+    for step in range(rows.shape[1] - 1):
+        if step:
+            belief = moved(belief, track.distance[rows[:, step]], track.heading[rows[:, step]], errors)
+        belief = read(belief, reading[:, step], std)
+        goal = destination(belief, target, range_km)
+        places = posterior(goal, 1024)
+        here, there = (track.position[rows[:, index]].unbind(-1) for index in (step, -1))
+        left, bearing = geodesic(*here, *there)
+        true = left.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
+        density = [log_density(goal, points.double()) for points in (places.points, true.unsqueeze(-2))]
+        inside = (places.weights * (density[0] > density[1])).sum(-1)
+        found.append(torch.stack((inside.double(), (places.way().displacement - true).norm(dim=-1), left), -1))
+    return torch.stack(found, 1)
+
+
+def cells(
+    track: Track, length: tuple[float, float], noise: Tensor, source: str, start: bool
+) -> tuple[list[str], Tensor]:
+    """Return coverage and errors of all pieces of a length as text, and what they are made of."""
+    rows, elements = pieces(track, *length), track.field if source == "measured" else track.model
+    first = elements[rows[:, 0]] if start else None
+    result = flown(track, rows, noise, elements[rows[:, -1]], first, RANGE_KM[length])
+    inside, error, left = result.unbind(-1)
+    covered = " / ".join(f"{100 * (inside <= p).double().mean():.0f}" for p in PROBABILITIES)
+    halfway = error[:, rows.shape[1] // 2].median()
+    return [covered, f"{halfway:.0f} / {error[:, -1].median():.0f}"], torch.stack((left, error), -1)
+
+
+def make(
+    log: tyro.conf.Positional[Path],
+    *,
+    noise: tuple[float, float, float] = (0.05, 0.05, 5.0),
+    date: str | None = None,
+    out: Path | None = None,
+) -> None:
+    """Print the table, or write it and its figure.
+
+    Args:
+        log: Log with positions.
+        noise: White noise that is added to D [deg], I [deg], B_H [nT].
+        date: Date of IGRF; by default that of the log.
+        out: Folder of measured.md and of figures/measured.png.
+    """
+    track, std, table = read_track(log, date), torch.tensor(noise).double(), []
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    panels = dict(zip(RANGE_KM, figure.subplots(1, 2), strict=True))
+    for source, start in (("measured", False), ("measured", True), ("IGRF", False), ("IGRF", True)):
+        row = [source, "known" if start else "not known"]
+        for length, axes in panels.items():
+            texts, drawn = cells(track, length, std, source, start)
+            row += texts
+            left, error = drawn.median(0).values.T
+            axes.plot(left, error, "-o", ms=3, label=f"destination {source}, start {row[1]}")
+            axes.set(xlabel="distance left [km]", title="{:g}–{:g} km".format(*length), yscale="log")
+            axes.set_ylabel("median error of the way [km]")
+        table.append(row)
+    panels[next(iter(panels))].legend(fontsize=7)
+    heads = [text.format(*length) for length in panels for text in ("{:g}–{:g} km: covered", "error, half / end")]
+    text = markdown_table(["destination", "start", *heads], table)
+    if out is None:
+        print(text)
+        return
+    (out / "measured.md").write_text(text.rstrip() + "\n")
+    figure.savefig(out.parent / "figures" / "measured.png", dpi=110)
+
+
+if __name__ == "__main__":
+    command(RECIPE, lambda: tyro.cli(make, prog=RECIPE, description=__doc__))

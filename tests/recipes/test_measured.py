@@ -1,0 +1,45 @@
+"""The table of a measured field, on a synthetic log of the same form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import torch
+from support.recipes import load
+
+from magrl.field import IGRF, elements_at
+from magrl.geodesy import move
+
+recipe = load("tables/measured")
+SHIFT = torch.tensor([0.1, 0.05, -120.0], dtype=torch.float64)
+"""Constant difference of the measured field from IGRF."""
+
+
+def write_log(path: Path) -> None:
+    """A track of 1700 km southward at 460 km of altitude, a row every 43 km."""
+    along = 42.5 * torch.arange(41, dtype=torch.float64)
+    start = torch.full_like(along, -10.0), torch.full_like(along, -30.0)
+    place = torch.stack(move(*start, torch.full_like(along, 3.0), along), -1)
+    elements = elements_at(IGRF("2016-01-01", altitude_km=460.0), place) + SHIFT
+    rows = torch.cat((place, torch.full_like(place[:, :1], 460.0), elements), -1)
+    table = pd.DataFrame(rows.numpy(), columns=["latitude", "longitude", "altitude_km", "D", "I", "B_H"])
+    table = table.assign(heading=torch.rad2deg(torch.tensor(3.0)).item(), distance=42.5, time="2016-01-01 00:00:00")
+    table["time"] = pd.to_datetime(table["time"]) + pd.to_timedelta(6 * table.index, unit="s")
+    table.loc[0, "distance"] = 0.0
+    table.to_csv(path, index=False)
+
+
+def test_a_known_start_removes_what_is_constant(tmp_path: Path) -> None:
+    """The regions hold the destination, and errors are small where target and readings have the same difference."""
+    write_log(tmp_path / "log.csv")
+    track = recipe.read_track(tmp_path / "log.csv")
+    torch.testing.assert_close(track.field - track.model, SHIFT.expand_as(track.field), atol=1e-6, rtol=0)
+    noise, found = torch.tensor([0.02, 0.02, 2.0]).double(), {}
+    for source, start in (("measured", True), ("IGRF", False), ("IGRF", True)):
+        texts, drawn = recipe.cells(track, (300.0, 500.0), noise, source, start)
+        found[source, start] = drawn[:, -1, 1].median()
+        assert min(map(int, texts[0].split(" / "))) > 60
+    assert found["IGRF", False] > 3 * found["IGRF", True]
+    assert found["IGRF", True] < 10
+    assert found["measured", True] < 10
