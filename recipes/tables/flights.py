@@ -30,6 +30,8 @@ LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
 """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
 DRIFT_KM = 40.0
 """How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
+MEASURES = ("success_rate", "spl")
+"""Measures in a cell of a table."""
 SEED = 3 * paper.FIRST_RESERVED_SEED
 """Seed of regions and tasks, beyond those of trainings and of frozen sets."""
 
@@ -58,11 +60,6 @@ class Flights:
     box: bool = False
     """Whether the tasks are those of the paper's box, ``test-1000``, in place of random regions."""
 
-    @property
-    def far(self) -> bool:
-        """Whether tasks are longer than the paper's."""
-        return self.distance_km[1] > paper.DISTANCE_KM[1]
-
     @cached_property
     def errors(self) -> dict[str, Errors]:
         """Errors by the headings of their columns."""
@@ -72,7 +69,8 @@ class Flights:
     @cached_property
     def scenario(self) -> Scenario:
         """Scenario of the tasks, with room for all errors of motion."""
-        size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if self.far else {"max_latitude": 70}
+        far = self.distance_km[1] > paper.DISTANCE_KM[1]
+        size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"max_latitude": 70}
         size |= {"distance_range_km": tuple(self.distance_km), "max_move_km": 50.0 + DRIFT_KM * bool(self.conditions)}
         earth = Scenario() if self.box else earth_scenario(self.regions, SEED, **size, start_heading="random")
         tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, SEED)
@@ -80,12 +78,6 @@ class Flights:
         rule |= {"arrival": "distance", "arrival_radius_km": self.signal_km} if self.signal_km else {}
         scenario = earth.replace(max_steps=self.max_steps, **rule)
         return scenario.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
-
-    @property
-    def measures(self) -> list[str]:
-        """Measures in a cell of a table."""
-        last = [] if self.box else ["false_arrival_rate" if self.within_km else "steps"]
-        return [*["success_rate_within_25km"] * (self.far and not self.signal_km), "success_rate", "spl", *last]
 
     def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
         """Return an episode of each task."""

@@ -23,7 +23,7 @@ from magrl.guidance import OBJECTIVE_FLOORS
 
 import numpy as np
 import torch
-from flights import SEED, Errors, Measures, Spec, cell, flown
+from flights import MEASURES, SEED, Errors, Measures, Spec, cell, flown
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -42,8 +42,6 @@ BANDS = {
     "weakest": ("weakest change on the way {} to {}", (0, 0.05, 0.1, 0.2, 0.5, math.inf)),
 }
 """Rows of the table: by property of a task, the label of a band, and the ends of the bands."""
-
-MEASURES = ("success_rate", "spl", "steps")
 
 
 class GlobeEnv(GeomagneticNavEnv):

@@ -35,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from evaluate import Config, evaluate
 
 import globe
-from flights import Flights, Spec, cell, names, paired_difference, runs_of
+from flights import MEASURES, Flights, Spec, cell, names, paired_difference, runs_of
 
 RECIPE = "grid.py"
 FILE, RUNS = Path(__file__).parent / "tables.toml", Path("runs")
@@ -51,7 +51,7 @@ def flights(navigators: Sequence[Spec], *, against: Sequence[Spec] = (), **optio
     for navigator in tqdm(navigators, unit="row"):
         episodes = [made.episodes(navigator, errors) for errors in made.errors.values()]
         spl[names(navigator)[0]] = [runs[0]["spl"] for runs in episodes]
-        rows.append([*names(navigator), *(cell(runs, made.measures) for runs in episodes)])
+        rows.append([*names(navigator), *(cell(runs, MEASURES) for runs in episodes)])
     first, region = names(navigators[0])[0], made.scenario.tasks.region
     for other in [names(navigator)[0] for navigator in against if names(navigator)[0] in spl]:
         differences = (paired_difference(*pair, region) for pair in zip(spl[first], spl[other], strict=True))
