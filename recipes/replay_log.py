@@ -32,6 +32,7 @@ from magrl.onboard import Onboard
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Way
 from magrl.training import UsageError, command, parse
+from magrl.transforms.errors.sensors import OUTAGE_STD
 
 import numpy as np
 import pandas as pd
@@ -273,7 +274,8 @@ def main(args: Sequence[str] | None = None) -> None:
         for name in ("log.csv", "log.md", "log.png"):
             check_writable(config.out / name)
         table = with_truth(config, replay(config, joined(log, config.every_km), log.attrs["date"]))
-        warnings = log.attrs["notes"] + mistakes(log, log.attrs["date"])
+        checked = log.assign(D_std=OUTAGE_STD * (config.north == "magnetic"))
+        warnings = log.attrs["notes"] + mistakes(checked, log.attrs["date"])
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
     table.drop(columns="covariance").to_csv(config.out / "log.csv", index=False)

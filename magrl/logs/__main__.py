@@ -31,6 +31,12 @@ _DIGITS = {"time": 2, "D": 4, "I": 4, "B_H": 2, "heading": 3, "distance": 4, "la
 _DIGITS |= {"altitude": 4, "D_std": 4, "I_std": 4, "B_H_std": 2}
 
 
+_NO_NORTH = (
+    "the heading is not from true north, so D tells nothing of the place: the vehicle navigates by I, B_H and magnetic "
+    "headings, and where their contours are nearly parallel, it finds a line and not a place"
+)
+
+
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     arguments = argparse.ArgumentParser(
@@ -126,14 +132,10 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     missing = "" if iron else "; no calibration: give --bias of your sensors"
     if std.isna().any():
         noise, missing = "D I B_H", f"; too few samples for --noise: give that of your sensors{missing}"
-    magnetic = "" if (options.north or log.north) == "true" else " --north magnetic"
-    if magnetic:
-        lines.append(
-            "the heading is not from true north, so D tells nothing of the place: the vehicle navigates by I, B_H and "
-            "magnetic headings, and where their contours are nearly parallel, it finds a line and not a place"
-        )
+    magnetic = "" if (options.north or log.north) == "true" and "heading" in log.samples else " --north magnetic"
     return [
         *lines,
+        *[_NO_NORTH] * bool(magnetic),
         f"{len(table)} readings, moves of {table['distance'][1:].mean():.3g} km: {out}",
         f"replay: python recipes/replay_log.py {out}{magnetic} --noise {noise} --bias {bias}{missing}",
     ]

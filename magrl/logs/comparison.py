@@ -14,6 +14,7 @@ from magrl.field.elements import NAMES, element_difference, measured_elements
 from magrl.geodesy import geodesic
 from magrl.onboard.readings import check_earth_reading
 from magrl.onboard.start import MODEL_D_NT, MODEL_STD, misfit
+from magrl.transforms.errors.sensors import OUTAGE_STD
 
 MOST_SPIKES = 0.2
 """Share of readings up to which those that do not fit are spikes, and not a mistake in all; chosen."""
@@ -47,7 +48,8 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     (:data:`~magrl.onboard.start.MODEL_STD`), and moves with the positions.
 
     Args:
-        readings: columns of :func:`~magrl.logs.readings_of` or ``recipes/replay_log.py``.
+        readings: columns of :func:`~magrl.logs.readings_of` or ``recipes/replay_log.py``. Where D is not measured
+            (``D_std``), it converts the headings.
         date: date for IGRF; without it, moves alone are compared.
 
     Example:
@@ -71,6 +73,9 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
         worst = float(place[:, 0].abs().max())
         return [*texts, f"latitude {worst:g} is outside -90 to 90: latitude and longitude are swapped"]
     expected = elements if date is None else _igrf_elements(place, date)
+    if "D_std" in rows and (rows["D_std"] >= OUTAGE_STD).all():  # D tells where the heading's north is
+        rows = rows.assign(heading=rows["heading"] + (expected - elements)[:, 0].numpy())
+        elements = torch.cat((expected[:, :1], elements[:, 1:]), -1)
     return texts + _field_mistakes(elements, expected, place, date) + _move_mistakes(rows, place[:, :2], expected[:, 0])
 
 

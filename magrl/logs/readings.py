@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pandas
 import torch
 from numpy.typing import NDArray
 from pandas import DataFrame
+from torch import Tensor
 
 from magrl.checks import check_choice, check_number
 from magrl.field.elements import NAMES, elements_jacobian, measured_elements
@@ -40,7 +42,7 @@ def readings_of(
     positions where it has neither.
 
     Args:
-        log: samples with a heading.
+        log: samples. Without a heading, it is that of a compass: the horizontal field, leveled by roll and pitch.
         every_km: least length of a move.
         every_s: duration of a move [s], in place of a length.
         north: north of the heading, one of :data:`~magrl.logs.vectors.NORTHS`; default that of the log.
@@ -53,7 +55,7 @@ def readings_of(
         three, ``samples``, and ``spikes``.
 
     Raises:
-        ValueError: for a log without a heading or a motion, or an unknown north.
+        ValueError: for a log without a motion, an unknown north, or without a heading from that north.
 
     Example:
         >>> import pandas
@@ -63,13 +65,15 @@ def readings_of(
         >>> readings_of(log, every_km=25.0, north="true")[["B_H", "distance"]].round().values.tolist()
         [[19998.0, 0.0], [19992.0, 25.0], [19987.0, 25.0], [19982.0, 25.0]]
     """
+    axes = log.tensor(*AXES) if calibration is None else calibration.apply(log.tensor(*AXES))
+    if "heading" not in log.samples and north in (None, "magnetic"):
+        log = with_compass(log, axes)
     north = north or log.north
     if north is None:
         raise ValueError(f"the log does not state the north of the heading: give north, one of {', '.join(NORTHS)}")
     check_choice(NORTHS, north=north)
     check_number(0, above=True, every_km=every_km)
     check_number(0, above=True, optional=True, every_s=every_s)
-    axes = log.tensor(*AXES) if calibration is None else calibration.apply(log.tensor(*AXES))
     field = (rotation(log.tensor(*ATTITUDE)) @ axes.unsqueeze(-1)).squeeze(-1).numpy()
     path, time = _path(log), log.samples["time"].to_numpy(float)
     part = _parts_km(path, every_km) if every_s is None else _parts_s(time, every_s)
@@ -81,6 +85,24 @@ def readings_of(
     groups = samples[clean].groupby(part[clean])
     table = _readings(groups.mean(), _covariance(field[clean], part[clean]), north)
     return table.assign(samples=groups.size(), spikes=np.bincount(part[~clean], minlength=len(table)))
+
+
+def with_compass(log: Log, axes: Tensor) -> Log:
+    """Return a log with headings from magnetic north, of its own field.
+
+    Args:
+        log: samples without a heading, with roll and pitch, or of a vehicle that is level.
+        axes: ``(N, 3)`` the field, forward, right, down [nT].
+
+    Example:
+        >>> log = Log(DataFrame({"time": [0.0], "x": [0.0], "y": [-20000.0], "z": [40000.0]}), "by hand")
+        >>> with_compass(log, log.tensor("x", "y", "z")).samples["heading"].tolist()  # magnetic north is to the left
+        [90.0]
+    """
+    tilt = torch.nn.functional.pad(log.tensor(*ATTITUDE[:2]), (0, 1))
+    forward, right, _ = (rotation(tilt) @ axes.unsqueeze(-1)).squeeze(-1).unbind(-1)
+    heading = torch.rad2deg(torch.atan2(-right, forward)).remainder(360)
+    return replace(log, samples=log.samples.assign(heading=heading.numpy()), north="magnetic")
 
 
 def read_readings(path: Path | str, names: Mapping[str, str], time: str | None = None) -> DataFrame:

@@ -73,7 +73,11 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
     elsewhere = elsewhere.with_tasks(elsewhere.random_tasks(2, seed=0))
     for call, error, message in (
         (lambda: evaluate("secant", Scenario()), ValueError, "the scenario has no tasks to fly"),
-        (lambda: evaluate("secant", "figure-4-1", errors="yacht"), ValueError, "conditions must be one of 'laboratory'"),
+        (
+            lambda: evaluate("secant", "figure-4-1", errors="yacht"),
+            ValueError,
+            "conditions must be one of 'laboratory'",
+        ),
         (lambda: evaluate("secant", "figure-4-1", known_start=(0, 0, 0)), ValueError, "needs conditions"),
         (lambda: evaluate(agent, elsewhere), ValueError, "trained"),
         (lambda: evaluate(agent, "figure-4-1", max_turn_deg=20), ValueError, "up to 90°, the environment .* and 20°"),

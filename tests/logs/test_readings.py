@@ -96,11 +96,26 @@ def test_a_magnetic_heading_and_a_calibration() -> None:
         assert (readings_of(sailed(), north=north)["D_std"] == OUTAGE_STD).all()
 
 
+def test_a_log_without_a_heading_has_that_of_its_compass() -> None:
+    """The field's own direction, leveled: the heading from true north less D, which then reads 0."""
+    whole = readings_of(sailed(), north="true")
+    alone = readings_of(Log(sailed().samples.drop(columns="heading"), "by hand"))
+    assert (alone["D_std"] == OUTAGE_STD).all()
+    assert alone["D"].abs().max() < 1e-6
+    turned = (whole["heading"] - whole["D"] - alone["heading"] + 180) % 360 - 180
+    assert turned[1:].abs().max() < 0.05
+    assert alone["I"].tolist() == pytest.approx(whole["I"].tolist())
+
+
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
         (lambda log: Log(log.samples, "by hand"), {}, "does not state the north of the heading: give north"),
-        (lambda log: Log(log.samples.drop(columns="heading"), "", "true"), {}, "the log has no heading, only time, x"),
+        (
+            lambda log: Log(log.samples.drop(columns="heading"), ""),
+            {"north": "true"},
+            "the log has no heading, only time, x",
+        ),
         (
             lambda log: Log(log.samples.drop(columns="speed"), "", "true"),
             {},
