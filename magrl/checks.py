@@ -11,13 +11,12 @@ import os
 import sys
 from collections.abc import Callable, Collection, Iterable
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Self
 
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 from tensordict import TensorDictBase
 from torch import Tensor
-from typing_extensions import Self
 
 
 def check_finite(data: TensorDictBase | Iterable[tuple[str, Tensor]], what: str) -> None:

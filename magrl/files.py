@@ -6,13 +6,13 @@ import hashlib
 import json
 import math
 import os
+import tomllib
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
-import tomli
 import torch
 from torch import Tensor
 
@@ -248,7 +248,7 @@ def read_document(path: Path) -> Any:
         >>> read_document(path)
         {'speed_km_h': 15.0}
     """
-    parsers: dict[str, Callable[[str], Any]] = {".toml": tomli.loads, ".json": _json}
+    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
     if path.suffix.lower() not in parsers:
         raise ValueError(f"the file must end in .toml or .json, got {path.suffix!r}")
     with path.open("rb") as file:

@@ -6,12 +6,11 @@ import copy
 import datetime
 import math
 from functools import lru_cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from torch import Tensor
-from typing_extensions import Self
 
 from magrl import guidance, paper
 from magrl.checks import CheckedModel, check_number, check_numbers, short

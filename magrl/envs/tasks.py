@@ -8,11 +8,10 @@ saved to repeat them.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from magrl import paper
 from magrl.checks import check_choice, check_number, check_numbers, check_tensor, check_type

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import numpy as np
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from magrl.checks import check_number, check_tensor, require
 from magrl.field import harmonics

@@ -49,7 +49,7 @@ def parse_date(date: Date) -> datetime.datetime:
             raise ValueError(f"date {date!r} is not in a year between 1 and 9999")
         return moment
     if isinstance(date, datetime.datetime):
-        return date.astimezone(datetime.timezone.utc).replace(tzinfo=None) if date.tzinfo else date
+        return date.astimezone(datetime.UTC).replace(tzinfo=None) if date.tzinfo else date
     if isinstance(date, datetime.date):
         return datetime.datetime(date.year, date.month, date.day)
     if isinstance(date, bool) or not isinstance(date, Real):

@@ -8,11 +8,10 @@ inside and out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from magrl.checks import check_tensor
 from magrl.field.elements import elements_gradient, measured_elements

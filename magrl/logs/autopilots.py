@@ -286,7 +286,7 @@ def _nmea_time(message: Any) -> float | None:
         return None
     with suppress(TypeError, ValueError):  # blank fields, or no date
         date = message.date if message.msgID == "RMC" else datetime.date(message.year, message.month, message.day)
-        return datetime.datetime.combine(date, message.time, datetime.timezone.utc).timestamp()
+        return datetime.datetime.combine(date, message.time, datetime.UTC).timestamp()
     return None
 
 

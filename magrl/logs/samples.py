@@ -85,7 +85,7 @@ def date_of(time: float) -> str | None:
         >>> date_of(1.8e9), date_of(3600.0)
         ('2027-01-15', None)
     """
-    return datetime.datetime.fromtimestamp(time, datetime.timezone.utc).date().isoformat() if time > _EPOCH else None
+    return datetime.datetime.fromtimestamp(time, datetime.UTC).date().isoformat() if time > _EPOCH else None
 
 
 def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[str]]:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from magrl import geodesy, tracking
 from magrl.checks import check_number, check_numbers, check_type

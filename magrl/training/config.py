@@ -6,13 +6,12 @@ import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import torch
 import tyro
 from pydantic import AfterValidator, Field, model_validator
 from torchrl.envs import Transform
-from typing_extensions import Self
 
 from magrl import paper
 from magrl.checks import CheckedModel, UsageError, check_type

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Self
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -24,7 +24,6 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from tqdm import tqdm
-from typing_extensions import Self
 
 from magrl import paper
 from magrl.agents import FieldPolicy, save_policy

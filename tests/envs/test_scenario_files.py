@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
-import tomllib
 import torch
 
 from magrl.envs import GeomagneticNavEnv, Region, Regions, load_scenario
@@ -154,7 +154,6 @@ def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, 
     [
         ("a.yaml", b"", "the file must end in .toml or .json, got '.yaml'"),
         ("a.toml", b"[region", "the file is not valid TOML"),
-        ("a.toml", b".".join([b"a"] * 50_000) + b"=1", "key has more than the allowed 1000 parts"),
         ("a.json", b'{"region": 1, "region": 2}', "the key 'region' is repeated"),
         ("a.json", b"[" * 100_000, "JSON"),
         (
@@ -165,7 +164,7 @@ def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, 
         ("a.json", b" " * (MAX_FILE_BYTES + 1), f"the file holds more than {MAX_FILE_BYTES} bytes"),
         ("a.json", b"[]", "a scenario file must hold a table, got []"),
     ],
-    ids=range(8),
+    ids=range(7),
 )
 def test_unreadable_files(tmp_path: Path, name: str, content: bytes, says: str) -> None:
     (tmp_path / name).write_bytes(content)

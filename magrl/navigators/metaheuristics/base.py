@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from typing_extensions import Self
 
 from magrl import guidance
 from magrl.checks import check_choice, check_number, check_numbers
