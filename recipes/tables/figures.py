@@ -187,7 +187,7 @@ FIGURES: Mapping[str, Callable[..., Figures]] = {
     "noise": noise,
     "conditions": conditions,
     "globe": globe,
-    "two-elements": lambda: {"figures/two-elements": two_elements_map()[0]},
+    "two-elements": lambda: {"figures/two-elements": two_elements_map()},
     "prices": prices,
     "reliability": reliability_diagram,
 }

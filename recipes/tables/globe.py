@@ -143,9 +143,9 @@ def globe_map(tasks: Tasks, measures: Measures) -> Figure:
     return figure
 
 
-def two_elements_map() -> tuple[Figure, float]:
-    """Return the map of the angle between the gradients of I and B_H, without which two elements give a line and not a
-    place, and the share of the Earth between 60 degrees south and north where it is below 5 degrees."""
+def two_elements_map() -> Figure:
+    """Return the map of the angle between the gradients of I and B_H: where it is small, two elements give a line and
+    not a place."""
     figure = Figure(figsize=(9, 4.6), layout="constrained")
     axes = figure.add_subplot(projection="mollweide")
     latitude, longitude = torch.arange(-89.5, 90.0).double(), torch.arange(-180.0, 181.0).double()
@@ -156,10 +156,11 @@ def two_elements_map() -> tuple[Figure, float]:
     where = np.radians(longitude.numpy()), np.radians(latitude.numpy())
     filled = axes.contourf(*where, angle, [0, 5, 10, 20, 45, 90], cmap="viridis")
     axes.plot(*np.radians(coastlines()).T[::-1], color="white", lw=0.6)
-    axes.set(xticklabels=[], yticklabels=[])
-    figure.colorbar(filled, shrink=0.7, pad=0.02, label="angle between the gradients of I and B_H [°]")
     weight = torch.cos(torch.deg2rad(latitude)) * (latitude.abs() < 60)
-    return figure, float((weight @ (angle < 5).double().mean(-1)) / weight.sum())
+    share = (weight @ (angle < 5).double().mean(-1)) / weight.sum()
+    axes.set(xticklabels=[], yticklabels=[], title=f"below 5° at {100 * share:.0f} % of places between 60° S and 60° N")
+    figure.colorbar(filled, shrink=0.7, pad=0.02, label="angle between the gradients of I and B_H [°]")
+    return figure
 
 
 def draw_field(axes: Axes) -> None:

@@ -2,7 +2,7 @@
 
     python recipes/tables/measured.py swarm.csv --out docs/results
 
-The log is one of recipes/replay_log.py with positions and, above sea level, `altitude_km`. Each piece of the track is a
+The log is one of recipes/replay_log.py with positions and their `altitude_km`. Each piece of the track is a
 flight from its first row to its last. The vehicle reads D, I, B_H of the log with white noise. The destination's
 elements, and those of a known start, are of the log, as from a survey, or of IGRF at its altitude.
 """
@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from magrl.evaluation.tables import markdown_table
-from magrl.field import IGRF, elements_at
+from magrl.field import IGRF
+from magrl.field.elements import measured_elements
 from magrl.geodesy import geodesic
 from magrl.logs import read_readings
 from magrl.onboard.start import MODEL_STD
@@ -22,14 +23,13 @@ from magrl.tracking import Belief, before, destination, known, moved, posterior,
 from magrl.tracking.destination import log_density
 from magrl.training import command
 
-import pandas
 import torch
 import tyro
 from matplotlib.figure import Figure
 from torch import Tensor
 
 RECIPE = "measured.py"
-NAMES = ("D", "I", "B_H", "heading", "distance", "latitude", "longitude")
+NAMES = ("D", "I", "B_H", "heading", "distance", "latitude", "longitude", "altitude_km")
 SLOW = (0.05, 0.03, 15.0)
 """Standard deviations of what varies along the way, crust and currents, on D, I [deg], B_H [nT]: 15 nT; chosen."""
 RANGE_KM = {(300.0, 500.0): 400.0, (1200.0, 1800.0): 1000.0}
@@ -49,13 +49,11 @@ class Track:
 
 
 def read_track(path: Path, date: str | None = None) -> Track:
-    """Return the rows of a log, and IGRF at their altitude."""
+    """Return the rows of a log, and IGRF at the altitude of each."""
     log = read_readings(path, dict(zip(NAMES, NAMES, strict=True)), "time")
     values = torch.tensor(log[list(NAMES)].to_numpy(float))
-    height = pandas.read_csv(path).get("altitude_km", pandas.Series([0.0] * len(log))).mean()
-    model = IGRF(date or log.attrs["date"], altitude_km=float(height))
-    heading = torch.deg2rad(values[:, 3])
-    return Track(values[:, :3], elements_at(model, values[:, 5:]), heading, values[:, 4], values[:, 5:])
+    model = measured_elements(IGRF(date or log.attrs["date"])(*values[:, 5:].unbind(-1)))
+    return Track(values[:, :3], model, torch.deg2rad(values[:, 3]), values[:, 4], values[:, 5:7])
 
 
 def pieces(track: Track, low_km: float, high_km: float) -> Tensor:
@@ -125,7 +123,7 @@ def make(
     """Print the table, or write it and its figure.
 
     Args:
-        log: Log with positions.
+        log: Log with positions and altitudes.
         noise: White noise that is added to D [deg], I [deg], B_H [nT].
         date: Date of IGRF; by default that of the log.
         out: Folder of measured.md and of figures/measured.png.

@@ -21,8 +21,9 @@ class MagneticNorth(ReadingErrors):
     D is the direction of magnetic north from the vehicle's own north, so it reads 0 everywhere, and that of the
     destination is 0, too. That it tells nothing is stated by a ``bias_std`` of infinity. A move starts along the
     vehicle's heading from magnetic north and keeps its course on the ground; at its end, the vehicle turns to the same
-    heading from magnetic north there. So headings tell nothing of how D changes along the way. (It changes by 0.3
-    degrees over 50 km on the mean; a vehicle that follows its needle ends 0.2 km beside this one.)
+    heading from magnetic north there. So headings tell nothing of how D changes along the way. (On the Earth up to 60
+    degrees of latitude, it changes by 0.2 degrees over 50 km on the mean, and a vehicle that follows its needle ends
+    0.1 km beside this one.)
 
     It stands after all errors of readings: the compass shows the direction of the measured field. The true heading, D
     and the destination's D are kept at ``true_heading``, ``true_field`` and ``true_target_field`` and given back to the
