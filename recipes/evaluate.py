@@ -89,7 +89,8 @@ class Config(ScenarioOptions):
     vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, phone, or a file (.toml or .json,
     docs/conditions.md); by default the noise of the runs, or 0."""
     north: Literal["true", "magnetic"] = "true"
-    """North of the vehicles: true (they measure D), or magnetic (a compass; they measure I and B_H alone)."""
+    """North of the vehicles: true (they measure D), or magnetic (a compass; they measure I and B_H alone). A boat, a
+    drone and a phone have a compass in any case."""
     known_start: Noise | None = None
     """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
     calibrated, with the errors of a real vehicle; by default the start is unknown."""
@@ -174,6 +175,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
         options = {key: getattr(config, key) for key in ("errors", "north", "known_start", "confidence", "seed")}
         flights = [Flight(scenario, **options), Flight(example, **options)]
+        config = replace(config, north="magnetic" if flights[0].sensor_std.magnetic else "true")  # also by a preset
         options = {"mode": config.mode, "map_date": config.map_date}
         navigators = [tuple(flight.navigator(text, **options) for flight in flights) for text in config.navigators]
         if config.export:

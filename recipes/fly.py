@@ -65,7 +65,8 @@ class Config:
     vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, phone, or a file (.toml or .json,
     docs/conditions.md)."""
     north: Literal["true", "magnetic"] = "true"
-    """North of the vehicle: true (it measures D), or magnetic (a compass: it measures I and B_H alone)."""
+    """North of the vehicle: true (it measures D), or magnetic (a compass: it measures I and B_H alone). A boat, a drone
+    and a phone have a compass in any case."""
     known_start: tuple[float, float, float] | None = None
     """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
     calibrated, with the errors of a real vehicle; by default the start is unknown."""

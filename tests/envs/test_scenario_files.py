@@ -154,6 +154,7 @@ def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, 
     [
         ("a.yaml", b"", "the file must end in .toml or .json, got '.yaml'"),
         ("a.toml", b"[region", "the file is not valid TOML"),
+        ("a.toml", b".".join([b"a"] * 50_000) + b"=1", "key"),
         ("a.json", b'{"region": 1, "region": 2}', "the key 'region' is repeated"),
         ("a.json", b"[" * 100_000, "JSON"),
         (
@@ -164,7 +165,7 @@ def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, 
         ("a.json", b" " * (MAX_FILE_BYTES + 1), f"the file holds more than {MAX_FILE_BYTES} bytes"),
         ("a.json", b"[]", "a scenario file must hold a table, got []"),
     ],
-    ids=range(7),
+    ids=range(8),
 )
 def test_unreadable_files(tmp_path: Path, name: str, content: bytes, says: str) -> None:
     (tmp_path / name).write_bytes(content)

@@ -14,6 +14,7 @@ from tensordict import TensorDict
 from magrl.envs import Scenario, Tasks
 from magrl.field import IGRF
 from magrl.training import UsageError
+from magrl.transforms import CONDITIONS
 
 sys.path.insert(0, str(RECIPES / "tables"))
 import figures
@@ -109,6 +110,8 @@ def test_vehicles_that_declare_are_right_or_wrong() -> None:
     assert sure == "0.0 / 0.0"
     right, spl = map(float, bold.split(" / "))
     assert 0 < spl < right
+    ends = flights.Flights(**options).summaries("secant", CONDITIONS["ship"])[0]
+    assert (ends["success_rate"], ends["success_rate"] + ends["false_arrival_rate"]) == (right, 100)
 
 
 def test_tasks_of_the_box_are_frozen_and_start_northward() -> None:

@@ -12,14 +12,14 @@ from typing import Any
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from magrl.checks import check_numbers, check_type
+from magrl.checks import check_choice, check_numbers, check_type
 from magrl.files import read_document
 from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
 from magrl.transforms.errors.known_start import KnownStart, calibration
 from magrl.transforms.errors.magnetic_north import MagneticNorth
 from magrl.transforms.errors.motion import MotionError
-from magrl.transforms.errors.north import NorthReferenceError, north_reference
+from magrl.transforms.errors.north import NORTH_REFERENCES, NorthReferenceError, north_reference
 from magrl.transforms.errors.sensors import SensorErrors
 from magrl.transforms.errors.vector import VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
@@ -87,6 +87,7 @@ class Conditions:
         if self.north == MAGNETIC:
             errors.append(MagneticNorth())
         elif isinstance(self.north, str):
+            check_choice((MAGNETIC, *NORTH_REFERENCES), north=self.north)
             errors.append(north_reference(self.north, speed_km_h=self.speed_km_h, seed=seed))
         elif self.north:
             errors.append(NorthReferenceError(**self.north, seed=seed))

@@ -212,7 +212,7 @@ def test_own_errors_in_a_file() -> None:
         ("[motion]\ncurrent = 3", r"mine\.toml: .*unexpected keyword argument 'current'"),
         ("[sensors]\nnoise = [0.1, 0.1, -1]", r"mine\.toml: noise must .*got -1"),
         ("[sensors.vector]\nhard_iron_nt = 3", r"mine\.toml: hard_iron_nt must be 3 .*got 3"),
-        ("north = 'best'", r"mine\.toml: .*must be one of 'fiber-optic'"),
+        ("north = 'best'", r"mine\.toml: .*must be one of 'magnetic', 'fiber-optic'"),
         ("[north", r"mine\.toml: the file is not valid TOML"),
         (None, r"No such file.*mine\.toml"),
     ],
