@@ -12,6 +12,7 @@ import torch
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move
 from magrl.logs import difference_from_igrf, mistakes
+from magrl.transforms.errors.sensors import OUTAGE_STD
 
 DATE = "2026-06-30"
 
@@ -35,6 +36,8 @@ def log() -> pandas.DataFrame:
 def test_a_log_without_mistake() -> None:
     assert mistakes(log(), DATE) == []
     assert mistakes(log().drop(columns="latitude"), DATE) == []
+    compass = log().assign(D=0.0, D_std=OUTAGE_STD, heading=log()["heading"] - log()["D"])
+    assert mistakes(compass, DATE) == []
     assert difference_from_igrf(log(), DATE).mean(0).abs().lt(torch.tensor([0.1, 0.05, 40.0])).all()
 
 
