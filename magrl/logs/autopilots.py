@@ -30,12 +30,21 @@ _Rows = dict[tuple[str, ...], dict[str, list[tuple[float, ...]]]]
 _QUATERNION, _PLACE = ("w", "x", "y", "z"), ("latitude", "longitude")
 
 
-def _package(module: str, package: str) -> Any:
-    """Return a module of the extra ``logs``."""
+def package(module: str, package: str) -> Any:
+    """Return a module of the extra ``logs``.
+
+    Raises:
+        ImportError: if the package is not installed, with the command that installs it.
+
+    Example:
+        >>> package("wave_reader", "wave-reader")
+        Traceback (most recent call last):
+        ImportError: this needs the package wave-reader: pip install 'magrl[logs]'
+    """
     try:
         return import_module(module)
     except ImportError as error:
-        raise ImportError(f"this format needs the package {package}: pip install 'magrl[logs]'") from error
+        raise ImportError(f"this needs the package {package}: pip install 'magrl[logs]'") from error
 
 
 def _recording(
@@ -90,7 +99,7 @@ _MAGNETOMETERS = {"vehicle_magnetometer": _GAUSS, "sensor_combined": _GAUSS, "se
 def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     """Read a log of PX4 (ULog) with pyulog: see :func:`~magrl.logs.read_log`. Times are UTC where GNSS gives it."""
     with path.open("rb") as file:
-        log = _package("pyulog", "pyulog").ULog(file)
+        log = package("pyulog", "pyulog").ULog(file)
     instances = sorted(log.data_list, key=lambda item: item.multi_id)
     topics = {item.name: item.data for item in reversed(instances)}  # the first instance of each
     fields, used = _px4_fields(instances, topics)
@@ -168,7 +177,7 @@ def read_ardupilot(path: Path, sensor: str | None = None) -> Recording:
     with path.open("rb") as file:
         flash = file.read(2) == b"\xa3\x95"
     module, name = ("DFReader", "DFReader_binary") if flash else ("mavutil", "mavlogfile")
-    reader = getattr(_package(f"pymavlink.{module}", "pymavlink"), name)
+    reader = getattr(package(f"pymavlink.{module}", "pymavlink"), name)
     rows: _Rows = defaultdict(lambda: defaultdict(list))
     with closing(reader(str(path))) as log:
         while message := log.recv_match(type=[*_MESSAGES, "PARM"]):
@@ -197,11 +206,10 @@ def read_bag(path: Path, sensor: str | None = None) -> Recording:
     Times are those of the headers. The axes and the attitude of ROS, forward, left, up and east, north, up (REP 103),
     become FRD and NED. The bag does not state the north of the heading, which is that of the Imu.
     """
-    package = _package("rosbags.highlevel", "rosbags")
-    store = _package("rosbags.typesys", "rosbags")
+    highlevel, store = package("rosbags.highlevel", "rosbags"), package("rosbags.typesys", "rosbags")
     rows: _Rows = defaultdict(lambda: defaultdict(list))
     whole = path if path.is_dir() or path.suffix == ".bag" else path.parent
-    with package.AnyReader([whole], default_typestore=store.get_typestore(store.Stores.LATEST)) as bag:
+    with highlevel.AnyReader([whole], default_typestore=store.get_typestore(store.Stores.LATEST)) as bag:
         for connection, recorded, raw in bag.messages([topic for topic in bag.connections if topic.msgtype in _ROS]):
             columns, values_of = _ROS[connection.msgtype]
             message = bag.deserialize(raw, connection.msgtype)
@@ -259,14 +267,14 @@ def read_nmea(path: Path) -> Recording:
     the water go first. Names of transducers are those of columns, such as ``MAG_X_UT``, or ``PTCH`` and ``ROLL``.
     """
     rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    reader, now = _package("pynmeagps", "pynmeagps").NMEAReader, None
+    reader, now = package("pynmeagps", "pynmeagps").NMEAReader, None
     for line in path.read_bytes().splitlines(keepends=True):
         tag = re.match(rb"\\[^\\]*\bc:(\d+)", line)
         for _, message in reader(io.BytesIO(line), quitonerror=0):
             if any(getattr(message, field, None) == value for field, value in _INVALID.items()):
                 continue
             now = int(tag[1]) / (1000 if len(tag[1]) > 11 else 1) if tag else _nmea_time(message) or now
-            for name, value in _nmea_values(message):
+            for name, value in nmea_values(message):
                 if now:
                     rows[name].append((now, value))
     if not rows:
@@ -290,8 +298,17 @@ def _nmea_time(message: Any) -> float | None:
     return None
 
 
-def _nmea_values(message: Any) -> Iterator[tuple[str, float]]:
-    """Yield the columns of a sentence and their values."""
+def nmea_values(message: Any) -> Iterator[tuple[str, float]]:
+    """Yield the columns of a sentence and their values.
+
+    Args:
+        message: sentence of pynmeagps.
+
+    Example:
+        >>> from pynmeagps import NMEAReader
+        >>> list(nmea_values(NMEAReader.parse("$HEHDT,290.0,T*24")))
+        [('heading_true', 290.0)]
+    """
     for name, (field, unit) in _SENTENCES.get(message.msgID, {}).items():
         value = getattr(message, field, "")
         if isinstance(value, (int, float)):

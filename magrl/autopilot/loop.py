@@ -1,0 +1,237 @@
+"""The loop of a vehicle: measurements in, a heading to steer out, one step of the navigator for each move."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from pandas import DataFrame
+
+from magrl.checks import check_number
+from magrl.field.elements import NAMES
+from magrl.logs import Calibration, Log, readings_of
+from magrl.logs.samples import ATTITUDE, AXES
+from magrl.onboard import Command, Onboard
+
+FASTEST_M_S = 1000.0
+"""A greater speed is an error of the message; chosen [m/s]."""
+STALE_S = 2.0
+"""A sample of the field counts if the attitude is at most as old; chosen [s]."""
+TURN_S = 120.0
+"""A turn on the spot ends at the latest after this time; chosen [s]."""
+_ALIGNED_DEG = 10.0  # the turn is made
+_RESET_S = 60.0  # a clock that runs back by more was set, as by a restart of the autopilot
+_SHORT_KM = 1.0  # a shorter way is that of a turn, not a move
+_LEAST_SAMPLES = 3
+_ONE_READING_KM = 1e9
+_Place = tuple[float, float]
+
+
+class Measurement(NamedTuple):
+    """Content of one message of an autopilot; None for what it does not have.
+
+    ``time`` is in seconds of the vehicle's clock; ``x``, ``y``, ``z`` is the field, forward, right, down [nT];
+    ``roll``, ``pitch``, ``heading`` are in degrees; ``speed`` is forward, in m/s.
+
+    Example:
+        >>> Measurement(12.5, heading=290.0, speed=None).heading
+        290.0
+    """
+
+    time: float
+    x: float | None = None
+    y: float | None = None
+    z: float | None = None
+    roll: float | None = None
+    pitch: float | None = None
+    heading: float | None = None
+    speed: float | None = None
+
+    @property
+    def possible(self) -> bool:
+        """Whether all numbers can be true."""
+        numbers = [value for value in self if value is not None]
+        tilt, speed = self.pitch or 0.0, self.speed or 0.0
+        return all(map(math.isfinite, numbers)) and abs(tilt) <= 90 and 0 <= speed <= FASTEST_M_S
+
+
+class Loop:
+    """Steer a vehicle by :class:`~magrl.onboard.Onboard` from the messages of its autopilot.
+
+    The loop integrates the moves from heading and speed. At the end of a move it averages the field over ``read_s``
+    seconds, without spikes, and reports the mean of the field at the mean of its places: one step a move. A field that
+    does not change in any digit, that is missing or that the vehicle rejects is reported as missing, and the vehicle
+    continues by dead reckoning. Messages may come late, twice or out of order.
+
+    The heading is from true north, or, where that of the vehicle is magnetic, of any reference that turns slowly: the
+    loop measures its angle from magnetic north at each reading.
+
+    Args:
+        vehicle: the navigator, after :meth:`~magrl.onboard.Onboard.start`.
+        read_s: duration of a reading [s].
+        calibration: correction of the axes.
+
+    Raises:
+        ValueError: for a vehicle before its start, or a duration that is not positive.
+
+    Example:
+        >>> vehicle = Onboard("secant")
+        >>> vehicle.start((-11.6, 75.4, 13240.0))
+        >>> loop, rest = Loop(vehicle, read_s=4.0), (14200.0, 49000.0, 0.0, 0.0, 290.0, 50.0)
+        >>> for time in range(5):
+        ...     command = loop.take(Measurement(float(time), 4900.0 + time, *rest))
+        >>> command.stop, loop.steer_deg
+        (None, 290.0)
+    """
+
+    def __init__(self, vehicle: Onboard, *, read_s: float = 30.0, calibration: Calibration | None = None) -> None:
+        check_number(0, above=True, read_s=read_s)
+        if vehicle.target is None:
+            raise ValueError("the vehicle has no target: call start before it is steered")
+        self.vehicle, self.read_s, self.calibration = vehicle, read_s, calibration
+        self.now: float | None = None
+        self.command: Command | None = None
+        self.note = ""
+        """What the last reading lacked, as text; empty if nothing."""
+        self._latest: dict[str, tuple[float, float]] = {}  # times and values of the quantities
+        self._place, self._origin, self._path = (0.0, 0.0), (0.0, 0.0), 0.0  # [km]; the origin is that of a reading
+        self._offset = 0.0  # of the autopilot's north from that of the vehicle [deg]
+        self._since = -math.inf  # time of the last command, or the start of the reading
+        self._reading: list[tuple[float, ...]] | None = []
+
+    @property
+    def steer_deg(self) -> float | None:
+        """Heading to steer, in the reference of the autopilot; None before the first reading."""
+        return None if self.command is None else (self.command.heading_deg + self._offset) % 360
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Quantities that the loop has not received: nothing is commanded before they come."""
+        needed = [*AXES, *ATTITUDE, "speed"]
+        return tuple(name for name in needed if name not in self._latest)
+
+    def take(self, measurement: Measurement) -> Command | None:
+        """Take a message, and return the command if a move has ended with it.
+
+        Raises:
+            RuntimeError: after a command to stop.
+        """
+        if self.command and self.command.stop:
+            raise RuntimeError(f"the vehicle has stopped: {self.command.reason}")
+        if not measurement.possible:
+            return None
+        self._advance(measurement.time)
+        values = measurement._asdict()
+        new = [name for name, value in values.items() if value is not None and self._is_new(name, measurement.time)]
+        self._latest |= {name: (measurement.time, values[name]) for name in new}
+        if self.missing:
+            return None
+        if self._reading is None and self._is_there():
+            self._reading, self._since = [], measurement.time
+        if self._reading is None:
+            return None
+        return self._read(sampled="x" in new)
+
+    def _is_new(self, name: str, time: float) -> bool:
+        """Return whether a value is newer than the last one of its name."""
+        return name != "time" and (name not in self._latest or time > self._latest[name][0])
+
+    def _advance(self, time: float) -> None:
+        """Move on with the last heading and speed up to a time."""
+        if self.now is None or time < self.now - _RESET_S:
+            self.now = time
+            self._latest = {name: (-math.inf, value) for name, (_, value) in self._latest.items()}
+            self._since = min(self._since, time)
+        elif time > self.now:
+            if not self.missing:
+                length = self._value("speed") * (time - self.now) / 1000
+                course = math.radians(self._value("heading") - self._offset)
+                self._place = self._place[0] + length * math.cos(course), self._place[1] + length * math.sin(course)
+                self._path += length
+            self.now = time
+
+    def _value(self, name: str) -> float:
+        return self._latest[name][1]
+
+    def _is_there(self) -> bool:
+        """Return whether the move is made, so that the reading in its middle is at its end."""
+        command, now = self.command, self.now or 0.0
+        assert command is not None
+        if command.distance_km == 0:
+            turn = math.remainder(self._value("heading") - self._offset - command.heading_deg, 360)
+            return abs(turn) <= _ALIGNED_DEG or now - self._since >= TURN_S
+        away = math.dist(self._place, self._origin) + self._value("speed") * self.read_s / 2000
+        return away >= command.distance_km or self._path >= 2 * command.distance_km
+
+    def _read(self, *, sampled: bool) -> Command | None:
+        """Add a sample to the reading, and return the command after the last one."""
+        assert self._reading is not None
+        assert self.now is not None
+        if self._since == -math.inf:  # the first reading begins
+            self._since = self.now
+        fresh = all(self.now - self._latest[name][0] <= STALE_S for name in ATTITUDE)
+        if sampled and fresh:
+            self._reading.append((self.now, *map(self._value, (*AXES, *ATTITUDE)), *self._place))
+        if self.now - self._since < self.read_s:
+            return None
+        rows, self._reading = np.array(self._reading), None
+        self.command = self._step(rows)
+        self._since, self._path = self.now, 0.0
+        if self.command is None:
+            self._reading = []
+        return self.command
+
+    def _step(self, rows: np.ndarray) -> Command | None:
+        """Report the move and its reading; None where the first reading is not possible."""
+        first = self.command is None
+        reading, heading, text = self._mean(rows)
+        place: _Place = tuple(rows[:, -2:].mean(0).tolist()) if len(rows) else self._place
+        north, east = (new - old for new, old in zip(place, self._origin, strict=True))
+        distance = 0.0 if first else math.hypot(north, east)
+        if distance < _SHORT_KM:
+            distance = 0.0
+        else:
+            heading = math.degrees(math.atan2(east, north))
+        try:
+            command = None if first and text else self._report(reading, heading, distance)
+        except ValueError as error:
+            text = str(error)
+            command = None if first else self._report((None, None, None), heading, distance)
+        self.note = text
+        if command is not None:
+            self._origin = place
+        return command
+
+    def _report(self, reading: Sequence[float | None], heading: float, distance: float) -> Command:
+        """Report a move to the vehicle, in parts where it is longer than one move."""
+        heading = heading % 360
+        heading -= 360 * (heading < 7)  # a small one could be taken for radians
+        longest = self.vehicle.max_move_km
+        while distance > longest:
+            self.vehicle.step(None, None, None, heading, longest)
+            distance -= longest
+        declination, inclination, level = reading
+        return self.vehicle.step(declination, inclination, level, heading, distance)
+
+    def _mean(self, rows: np.ndarray) -> tuple[Sequence[float | None], float, str]:
+        """Return the reading, the heading, and what is missing. The angle of a magnetic heading is measured anew."""
+        heading = self._value("heading") - self._offset
+        if len(rows) < _LEAST_SAMPLES:
+            return (None, None, None), heading, "no sample of the field with an attitude"
+        if len(rows) > _LEAST_SAMPLES and not np.ptp(rows[:, 1:4], 0).any():
+            return (None, None, None), heading, "the field does not change in any digit: the magnetometer is stuck"
+        samples = DataFrame(rows[:, :7], columns=["time", *AXES, *ATTITUDE]).assign(distance=0.0)
+        north = self.vehicle.options.north
+        if north == "magnetic":
+            samples = samples.drop(columns="heading")
+        log = Log(samples, "autopilot", north)
+        mean = readings_of(log, every_km=_ONE_READING_KM, calibration=self.calibration).iloc[0]
+        declination, inclination, level = (float(mean[name]) for name in NAMES)
+        if north == "true":
+            return (declination, inclination, level), heading, ""
+        shown = np.radians(rows[:, 6])
+        shown = math.degrees(math.atan2(np.sin(shown).mean(), np.cos(shown).mean()))
+        self._offset = shown - float(mean["heading"])
+        return (None, inclination, level), self._value("heading") - self._offset, ""

@@ -1,0 +1,512 @@
+"""Steering an autopilot: flights of simulated vehicles through the loop and its links, restarts, damaged messages."""
+
+from __future__ import annotations
+
+import math
+import random
+import runpy
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from magrl.autopilot import Loop, Measurement, fly
+from magrl.autopilot.__main__ import main, parser, vehicle
+from magrl.autopilot.mavlink import MavlinkLink, Messages
+from magrl.autopilot.nmea import NmeaLink, Sentences
+from magrl.field import IGRF, elements_at
+from magrl.geodesy import geodesic, move
+from magrl.logs import axes_of_elements, read_log
+from magrl.onboard import Command, Onboard
+
+pytest.importorskip("pymavlink")
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+FIELD = IGRF("2026-01-01")
+HERE, THERE = (60.0, 5.0), (61.2, 4.0)  # 144 km apart
+SPEED, STEP_S = 60.0, 10.0
+OFFSET = 17.0  # of the autopilot's heading from true north, where the vehicle has a compass [deg]
+EXAMPLE = Path(__file__).parent.parent.parent / "docs" / "examples" / "jsbsim_vehicle.py"
+
+
+def elements(place: tuple[float, float]) -> list[float]:
+    return elements_at(FIELD, torch.tensor(place, dtype=torch.float64)).tolist()
+
+
+class World:
+    """A vehicle that turns at once and moves at a constant speed, as a link."""
+
+    period_s = 1.0
+
+    def __init__(self, north: str = "true", noise: float = 20.0, speed: float = SPEED, step_s: float = STEP_S) -> None:
+        self.speed, self.step_s = speed, step_s
+        self.place, self.time, self.heading = HERE, 0.0, 320.0
+        self.north, self.rng, self.noise = north, random.Random(0), noise
+        self.said: list[str] = []
+
+    @property
+    def left_km(self) -> float:
+        place = torch.tensor([*self.place, *THERE], dtype=torch.float64)
+        return geodesic(*place)[0].item()
+
+    def __iter__(self) -> Iterator[Measurement]:
+        while self.time < 20_000:
+            yield from self.messages()
+
+    def messages(self) -> Iterator[Measurement]:
+        """Move on and measure."""
+        self.time += self.step_s
+        length = torch.tensor(self.speed * self.step_s / 1000, dtype=torch.float64)
+        here, course = torch.tensor(self.place, dtype=torch.float64), torch.tensor(math.radians(self.heading))
+        self.place = tuple(value.item() for value in move(*here, course, length))
+        attitude = 1.0 + 0.1 * self.rng.random(), -2.0, self.heading
+        axes = axes_of_elements(torch.tensor(elements(self.place)), torch.tensor(attitude))
+        shown = self.heading - OFFSET * (self.north == "magnetic")
+        yield Measurement(self.time, roll=attitude[0], pitch=attitude[1], heading=shown % 360)
+        yield Measurement(self.time + 0.01, *(self.rng.gauss(value, self.noise) for value in axes.tolist()))
+        yield Measurement(self.time + 0.02, speed=self.speed)
+
+    def steer(self, heading_deg: float) -> None:
+        self.heading = heading_deg + OFFSET * (self.north == "magnetic")
+
+    def report(self, command: Command, text: str) -> None:
+        self.said.append(text or f"{command.heading_deg}")
+
+
+def loop(north: str = "true") -> Loop:
+    board = Onboard("anywhere", north=north, sensor_std=(0.05 * (north == "true"), 0.05, 20.0))
+    board.start([None if north == "magnetic" else elements(THERE)[0], *elements(THERE)[1:]])
+    return Loop(board, read_s=60.0)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> tuple[World, list[Command], Path]:
+    """A flight with true north."""
+    world, folder = World(), tmp_path_factory.mktemp("flight")
+    return world, list(fly(loop(), world, folder)), folder
+
+
+def test_a_vehicle_arrives(flown) -> None:
+    world, commands, folder = flown
+    assert commands[-1].stop == "arrived"
+    assert world.left_km < 25
+    assert world.time * SPEED / 1000 < 3 * 144
+    assert world.said[-1].startswith("within 25 km")
+    assert read_log(folder / "messages.csv").north == "true"  # the record is a log
+
+
+def test_a_vehicle_with_a_compass_arrives_by_the_heading_of_its_autopilot(tmp_path) -> None:
+    world = World("magnetic")
+    flight = loop("magnetic")
+    commands = list(fly(flight, world, tmp_path))
+    assert commands[-1].stop
+    assert world.left_km < 25
+    declination = elements(world.place)[0]
+    assert flight.steer_deg == pytest.approx((commands[-1].heading_deg + declination - OFFSET) % 360, abs=0.5)
+
+
+def test_one_step_is_made_at_the_end_of_each_move(monkeypatch, tmp_path) -> None:
+    moves, step = [], Onboard.step
+    monkeypatch.setattr(Onboard, "step", lambda self, *a, **k: moves.append(a[4]) or step(self, *a, **k))
+    commands = list(fly(loop(), World(), tmp_path))
+    assert len(moves) == len(commands)
+    for made, command in zip(moves[1:], commands, strict=False):
+        if command.distance_km > 5:
+            assert made == pytest.approx(command.distance_km, abs=SPEED * STEP_S / 1000)
+
+
+@pytest.mark.parametrize("number", range(20))
+def test_a_killed_flight_continues_with_the_same_commands(flown, number, tmp_path) -> None:
+    lines = (flown[2] / "messages.csv").read_text().splitlines(keepends=True)
+    cut = random.Random(number).randrange(2, len(lines))
+    for name in ("start.json", "loop.json"):
+        (tmp_path / name).write_bytes((flown[2] / name).read_bytes())
+    (tmp_path / "messages.csv").write_text("".join(lines[:cut]) + lines[cut][: number % 7])  # the last line is torn
+    world = World()
+    rest = [Measurement(*(float(x) if x else None for x in line.strip().split(","))) for line in lines[cut:]]
+    world.__class__ = type("Rest", (World,), {"__iter__": lambda _: iter(rest)})
+    assert list(fly(loop(), world, tmp_path)) == flown[1]
+    assert (tmp_path / "messages.csv").read_text() == "".join(lines)
+
+
+def test_a_flight_with_other_options_is_refused(flown) -> None:
+    with pytest.raises(ValueError, match="another target or other options of the loop"):
+        list(fly(Loop(loop().vehicle, read_s=10.0), [], flown[2]))
+
+
+def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
+    class Late(World):
+        def messages(self) -> Iterator[Measurement]:
+            messages = [*super().messages()]
+            order = messages + messages[:2] if self.rng.random() < 0.5 else messages[::-1]
+            old = Measurement(self.time - 3 * STEP_S, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0)
+            yield from (*order, old)
+
+    world = Late(noise=0.0)
+    assert [*fly(loop(), world, tmp_path)][-1].stop == "arrived"
+    assert world.left_km < 25
+
+
+def test_the_clock_of_an_autopilot_may_start_anew() -> None:
+    flight, world = loop(), World()
+    for number in range(200):
+        for message in world.messages():
+            flight.take(message._replace(time=message.time - 1000.0 * (number > 100)))
+    assert flight.now == pytest.approx(1000.0, abs=STEP_S)
+    assert math.hypot(*flight._place) > 30  # it moves on after that
+
+
+# Readings
+
+
+def readings(change: Callable[[int, Measurement], Measurement | None], steps: int = 60) -> Loop:
+    """A loop after messages that a function changes; None leaves one out."""
+    flight, world = loop(), World()
+    for number in range(steps):
+        for message in world.messages():
+            changed = change(number, message)
+            if changed:
+                flight.take(changed)
+        if flight.steer_deg is not None:
+            world.steer(flight.steer_deg)
+    return flight
+
+
+def stuck(number: int, message: Measurement) -> Measurement:
+    return message if message.x is None or number < 9 else message._replace(x=5000.0, y=14000.0, z=49000.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (stuck, "the magnetometer is stuck"),
+        (lambda n, m: m if m.x is None or n < 9 else None, "no sample of the field"),
+        (lambda n, m: m if m.x is None or n < 9 else m._replace(x=-m.x), "changed from"),
+        (lambda _, m: m._replace(time=m.time - 5.0) if m.heading else m, "no sample of the field with an attitude"),
+    ],
+)
+def test_a_bad_reading_is_named_and_the_vehicle_goes_on(change, text) -> None:
+    flight = readings(change, 100)
+    assert text in flight.note
+    first = "attitude" in text
+    assert (flight.command is None) == first  # nothing is commanded before the first reading
+    if not first:
+        assert flight.vehicle._steps[-1].inclination is None
+
+
+def test_an_impossible_message_does_not_count() -> None:
+    bad = [{"x": math.nan}, {"heading": math.inf}, {"pitch": 91.0}, {"speed": -1.0}, {"speed": 1e4}]
+    assert not any(Measurement(0.0, **values).possible for values in bad)
+    spiked = readings(lambda n, m: m._replace(pitch=400.0) if n % 2 and m.pitch else m)
+    assert spiked.vehicle._steps[0].inclination == pytest.approx(elements(HERE)[1], abs=0.1)
+
+
+def test_a_long_way_is_reported_in_parts() -> None:
+    flight = readings(lambda _, m: m, 10)
+    before = len(flight.vehicle._steps)
+    messages = (m._replace(time=m.time + gap) for gap in (2000.0, 2100.0) for m in World().messages())
+    while len(flight.vehicle._steps) == before:  # it was not heard of for half an hour
+        flight.take(next(messages))
+    assert [step.distance for step in flight.vehicle._steps][-3:-1] == [50.0, 50.0]
+
+
+def test_a_loop_is_refused_without_a_start_and_after_the_end(flown) -> None:
+    with pytest.raises(ValueError, match="call start"):
+        Loop(Onboard("secant"))
+    flight = loop()
+    flight.command = flown[1][-1]
+    with pytest.raises(RuntimeError, match="has stopped: within 25 km"):
+        flight.take(Measurement(0.0))
+
+
+# Links
+
+
+class Line:
+    """A connection of pymavlink: what it receives, and what was sent."""
+
+    def __init__(self, messages: list[Any]) -> None:
+        self.messages, self.sent = iter(messages), []
+        self.mav = mavlink.MAVLink(self)
+
+    def write(self, content: bytes) -> None:
+        self.sent += mavlink.MAVLink(None).parse_buffer(content)
+
+    def recv_match(self, **_: Any) -> Any:
+        return next(self.messages, None)
+
+
+def packed(*messages: Any, system: int = 1) -> list[Any]:
+    source = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+    return [mavlink.MAVLink(None).parse_buffer(message.pack(source))[0] for message in messages]
+
+
+def heartbeat(kind: int = 1, autopilot: int = 3) -> Any:
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3)
+
+
+def received(link: MavlinkLink, count: int = 0) -> list[Measurement | None]:
+    """What comes before the silence after some messages."""
+    return [*islice(link, count + 1)][:count]
+
+
+def test_mavlink_is_read_in_our_units_from_one_vehicle() -> None:
+    attitude = mavlink.MAVLink_attitude_quaternion_message(5000, math.sqrt(0.5), 0, 0, math.sqrt(0.5), 0, 0, 0)
+    imu = mavlink.MAVLink_highres_imu_message(5_100_000, *[0] * 6, 0.15, -0.02, 0.5, *[0] * 4, 0x1C0)
+    coarse = mavlink.MAVLink_scaled_imu_message(5200, *[0] * 6, 150, 0, 500)
+    line = Line([*packed(heartbeat(), attitude, imu, coarse, mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0))])
+    line.messages = iter([*line.messages, *packed(attitude, system=9)])
+    turned, field, ignored, speed = received(MavlinkLink(line), 4)
+    assert turned == pytest.approx(Measurement(5.0, roll=0.0, pitch=0.0, heading=90.0), abs=1e-4)
+    assert field[:4] == pytest.approx((5.1, 15000.0, -2000.0, 50000.0), abs=1e-2)
+    assert ignored is None
+    assert speed == Measurement(5.0, speed=50.0)
+    asked = [message.param1 for message in line.sent if message.get_type() == "COMMAND_LONG"]
+    assert {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_VFR_HUD} <= set(asked)
+
+
+def test_a_coarse_magnetometer_is_taken_after_three_seconds_and_another_clock_is_set_aside() -> None:
+    messages = Messages("groundspeed")
+    for time in (0, 3):
+        messages.measurement(mavlink.MAVLink_attitude_message(1000 * time, *[0.0] * 6))
+        raw = mavlink.MAVLink_raw_imu_message(10**15 + time, *[0] * 6, 150, 0, 500)
+        found = messages.measurement(raw)
+        assert (found is None) == (time == 0)
+    assert found == Measurement(3.0, 15000.0, 0.0, 50000.0)
+    assert messages.measurement(mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)).speed == 40
+
+
+@pytest.mark.parametrize(("kind", "name"), [(1, "COMMAND_INT"), (10, "SET_POSITION_TARGET_LOCAL_NED")])
+def test_mavlink_steers(kind, name) -> None:
+    line = Line(packed(heartbeat(kind)))
+    link = MavlinkLink(line, cruise_m_s=5.0)
+    received(link)
+    link.steer(120.0)
+    sent = line.sent[-1]
+    assert sent.get_type() == name
+    assert (sent.target_system, sent.target_component) == (1, 1)
+    if kind == 1:
+        assert (sent.command, sent.param1, sent.param2) == (mavlink.MAV_CMD_GUIDED_CHANGE_HEADING, 1, 120)
+    else:
+        assert (sent.vx, sent.vy, sent.yaw) == pytest.approx((-2.5, 4.3301, 2.0944), abs=1e-3)
+        ignored = mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+        assert sent.type_mask & ignored == ignored
+        used = mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+        assert not sent.type_mask & used
+
+
+def test_mavlink_reports(flown) -> None:
+    line = Line([])
+    MavlinkLink(line).report(flown[1][-1], "within 25 km")
+    values = {message.name: message.value for message in line.sent[:-1]}
+    assert values["mg_north"] == pytest.approx(flown[1][-1].way_km[0], rel=1e-5)
+    assert line.sent[-1].text == "magrl arrived: within 25 km"
+
+
+def test_an_autopilot_that_cannot_be_steered_is_named() -> None:
+    with pytest.raises(ValueError, match="PX4 accepts no heading"):
+        next(iter(MavlinkLink(Line(packed(heartbeat(1, 12))))))
+    with pytest.raises(ValueError, match="state cruise_m_s"):
+        next(iter(MavlinkLink(Line(packed(heartbeat(10))))))
+
+
+def sentence(content: str) -> bytes:
+    checksum = 0
+    for byte in content.encode():
+        checksum ^= byte
+    return f"${content}*{checksum:02X}\r\n".encode()
+
+
+def nmea(world: World) -> Iterator[bytes]:
+    """The sentences of a ship's instruments."""
+    for message in world.messages():
+        if message.heading is not None:
+            yield sentence(f"HEHDT,{message.heading:.1f},T")
+        if message.x is not None:
+            axes = ",".join(f"G,{message[1 + n]:.1f},,MAG_{axis}_NT" for n, axis in enumerate("XYZ"))
+            yield sentence(f"IIXDR,{axes},A,{1.0:.1f},D,ROLL,A,-2.0,D,PTCH")
+        if message.speed is not None:
+            yield sentence(f"VWVHW,,T,,M,{message.speed * 3600 / 1852:.2f},N,,K")
+
+
+def test_nmea_over_udp_steers_a_ship() -> None:
+    world, found = World(), []
+    link = NmeaLink("udp:0")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ship:
+        ship.settimeout(10)
+        for line in (*nmea(world), b"$HEHDT,nonsense*00"):
+            ship.sendto(line, ("127.0.0.1", link.port.port))
+        for item in link:
+            found.append(item)
+            if item is None or len(found) == 3:
+                break
+        link.steer(120.0)
+        assert ship.recv(99) == sentence("ECHSC,120.0,T,,M")
+        assert ship.recv(99).startswith(b"$ECAPB,A,A,0.00,R,N,V,V,120.0,T,MAGRL,120.0,T,120.0,T*")
+        link.report(Command(1.0, 0.0, 0.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.5), "")
+        assert ship.recv(99) == sentence("PMGRL,WAY,90.0,-12.0,5.0,0.50,")
+    link.port.close()
+    heading, field, speed = found
+    assert heading.heading == pytest.approx(320.0)
+    assert (field.roll, field.pitch) == (1.0, -2.0)
+    assert math.hypot(field.x, field.y, field.z) == pytest.approx(50_900, abs=700)
+    assert speed.speed == pytest.approx(SPEED, abs=0.01)
+
+
+def test_a_serial_port_is_read_and_written() -> None:
+    link = NmeaLink("loop://,4800", level=True, north="magnetic")
+    link.port.send(sentence("HCHDM,350.0,M"))
+    assert next(iter(link)).heading == 350.0
+    link.steer(20.0)
+    assert link.port.receive() == [sentence("ECHSC,,T,20.0,M").strip()]
+    link.port.close()
+
+
+@pytest.mark.parametrize("kind", ["mavlink", "nmea"])
+def test_mutated_messages_do_no_harm(kind) -> None:
+    """2000 messages of which a bit, a byte or a field is changed: no error, and no heading out of range."""
+    rng, world, flight = random.Random(0), World(speed=300.0, step_s=3.0), loop()
+    source, buffer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
+    buffer.robust_parsing = True
+    messages, sentences, commands, count = Messages(), Sentences(), [], 0
+
+    def take(content: bytes) -> None:
+        if kind == "nmea":
+            found = [*sentences.measurements(content, world.time)]
+        else:
+            parsed = buffer.parse_buffer(content) or ()
+            found = [messages.measurement(message) for message in parsed if message.get_type() in messages.names]
+        for item in filter(None, found):
+            ended = flight.command and flight.command.stop
+            commands.extend([] if ended else [flight.take(item)])
+
+    while count < 2000:
+        for content in [*nmea(world)] if kind == "nmea" else [m.pack(source) for m in encoded(world, rng)]:
+            for _ in range(2):
+                count += 1
+                damaged = bytearray(content)
+                damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+                whole = kind == "nmea" and rng.random() < 0.5  # with a checksum that fits
+                take(sentence(damaged[1:-5].decode("latin1")) if whole else bytes(damaged))
+            take(content)
+        if flight.steer_deg is not None:
+            world.steer(flight.steer_deg)
+    sent = [command for command in commands if command]
+    assert len(sent) > 3
+    assert all(0 <= command.heading_deg <= 360 and 0 <= command.distance_km <= 50 for command in sent)
+
+
+def encoded(world: World, rng: random.Random) -> Iterator[Any]:
+    """Messages of MAVLink, some of which have numbers that cannot be true."""
+    for message in world.messages():
+        ms = int(1000 * message.time)
+        wrong = rng.choice([math.nan, math.inf, -1e30, 1e30, 0.0])
+        if message.heading is not None:
+            angles = [math.radians(value) for value in message[4:7]]
+            yield mavlink.MAVLink_attitude_message(ms, wrong, *angles[1:], 0, 0, 0)
+            yield mavlink.MAVLink_attitude_message(ms, *angles, 0, 0, 0)
+        if message.x is not None:
+            axes = [value / 1e5 for value in message[1:4]]
+            if rng.random() < 0.2:
+                yield mavlink.MAVLink_highres_imu_message(1000 * ms, *[0] * 6, wrong, *axes[1:], *[0] * 4, 0)
+            yield mavlink.MAVLink_highres_imu_message(1000 * ms, *[0] * 6, *axes, *[0] * 4, 0)
+        if message.speed is not None:
+            yield mavlink.MAVLink_vfr_hud_message(wrong, wrong, 0, 0, 0, 0)
+            yield mavlink.MAVLink_vfr_hud_message(message.speed, 0, 0, 0, 0, 0)
+
+
+# The command
+
+
+def test_the_command_looks_up_its_destination_and_names_what_is_missing(capsys) -> None:
+    options = parser().parse_args(["udp:0", "--to", *map(str, THERE), "--date", "2026-01-01", "--navigator", "secant"])
+    assert vehicle(options).target == pytest.approx(elements(THERE), rel=1e-6)
+    with pytest.raises(SystemExit):
+        main(["udp:0", "--nmea", "--to", "61", "5"])
+    assert "--to and --here need --date" in capsys.readouterr().err
+
+
+def test_the_command_flies_a_recorded_flight_again(flown, monkeypatch, capsys) -> None:
+    target = map(repr, loop().vehicle.target)
+    monkeypatch.setattr("magrl.autopilot.__main__.link", lambda _: World())
+    noise = ["--noise", "0.05", "0.05", "20", "--read-s", "60"]
+    main(["udp:0", "--target", *target, *noise, "--out", str(flown[2])])
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) == 1 + len(flown[1])
+    assert "stop: arrived, within 25 km" in shown
+
+
+@pytest.mark.slow
+def test_a_cessna_of_jsbsim_arrives_in_spite_of_faults(tmp_path) -> None:
+    """200 km in wind; the flight is interrupted, the magnetometer sticks for a while, and messages come twice."""
+    pytest.importorskip("jsbsim")
+    example = runpy.run_path(str(EXAMPLE))
+    rng = random.Random(5)
+    here, there, heading, wind = example["task"](rng, 200.0, 12.0)
+    aircraft = example["Cessna"](here, heading, wind, rng)
+    line = example["Loopback"](aircraft)
+    receive = line.recv_match
+
+    def faulty(**_: Any) -> Any:
+        aircraft.stuck = 1500 < aircraft.time < 1800
+        message = receive()
+        if rng.random() < 0.1 and line._queue:  # out of order, and twice
+            line._queue.append(line._queue.popleft())
+            line._queue.append(line._queue[-1])
+        return message
+
+    line.recv_match = faulty
+    commands: list[Command] = []
+    for limit in (8, 200):
+        board = Onboard("anywhere", sensor_std=example["NOISE"])
+        board.start(example["elements"](there))
+        again = []
+        for command in fly(Loop(board), MavlinkLink(line), tmp_path):
+            again.append(command)
+            if len(again) == limit:
+                break
+        assert again[: len(commands)] == commands
+        commands = again
+        line._queue.extendleft([heartbeat()])
+    assert commands[-1].stop == "arrived"
+    assert example["EARTH"].Inverse(*aircraft.place, *there)["s12"] < 25_000
+
+
+@pytest.mark.slow
+def test_two_processes_fly_over_udp(tmp_path) -> None:
+    pytest.importorskip("jsbsim")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    aircraft = [
+        sys.executable,
+        str(EXAMPLE),
+        "--link",
+        f"udpout:127.0.0.1:{port}",
+        "--speedup",
+        "60",
+        "--distance",
+        "40",
+    ]
+    with subprocess.Popen(aircraft, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            words = next(line for line in process.stdout if "magrl.autopilot" in line).split()
+            command = [
+                sys.executable,
+                *words[1:3],
+                f"udpin:127.0.0.1:{port}",
+                *words[4:],
+                "--out",
+                str(tmp_path / "out"),
+            ]
+            shown = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
+        finally:
+            process.kill()
+    assert "stop: arrived" in shown
