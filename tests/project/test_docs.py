@@ -181,7 +181,7 @@ def numbers(bounds: str) -> list[float]:
 
 
 def check_keys(documented: dict[str, list[str]], specs: Composite) -> None:
-    for key, (shape, dtype, _, bounds, _) in documented.items():
+    for key, (shape, dtype, _, bounds, *_) in documented.items():
         spec = specs[key]
         assert shape.strip("`") == f"[N, {', '.join(map(str, spec.shape[1:]))}]", key
         assert dtype == str(spec.dtype).removeprefix("torch."), key
