@@ -44,7 +44,6 @@ docs: $(VENV)/.installed-docs  ## build the documentation in build/docs
 
 bench: $(VENV)/.installed-dev  ## run the benchmarks; about four minutes on two cores
 	$(RUN)/python -m benchmarks $(ARGS)
-	$(RECIPE)/tables/publish.py docs/architecture.md
 
 mutate: $(VENV)/.installed-mutation  ## run mutation tests of the mathematics; ten minutes on one core
 	$(RUN)/mutmut run $(ARGS)

@@ -1,4 +1,4 @@
-"""Every figure of docs/architecture.md, measured side by side: `python -m benchmarks`, about four minutes on two cores.
+"""Every figure of docs/results/performance.md, side by side: `python -m benchmarks`, about four minutes on two cores.
 
 Prints each part as it is measured. `--only PART` measures one part. Results are written to runs/benchmarks.json, and
 for the documents where --publish is given.

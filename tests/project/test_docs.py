@@ -41,7 +41,6 @@ BUDGET = {
     "= 400_000, 500": "= 256, 4",
     "num_envs=512)": "num_envs=8)",
     '"batch_size": 2048': '"batch_size": 256',
-    "anywhere_env(1000": "anywhere_env(8",
     '"sac.safetensors"), "test-1000"': '"sac.safetensors"), "figure-4-1"',
     "= 100_000, 1024, 1000": "= 128, 4, 2",
     "earth_scenario(64, ": "earth_scenario(2, max_steps=5, ",
@@ -182,7 +181,7 @@ def numbers(bounds: str) -> list[float]:
 
 
 def check_keys(documented: dict[str, list[str]], specs: Composite) -> None:
-    for key, (shape, dtype, _, bounds, _) in documented.items():
+    for key, (shape, dtype, _, bounds, *_) in documented.items():
         spec = specs[key]
         assert shape.strip("`") == f"[N, {', '.join(map(str, spec.shape[1:]))}]", key
         assert dtype == str(spec.dtype).removeprefix("torch."), key

@@ -193,9 +193,33 @@ class ReadingErrors(EpisodeErrors):
         out_keys: of the transform.
         seed: seed of the errors.
 
+    :meth:`_disturb` returns the numbers of the next step, so that a drift keeps its value. :meth:`accuracy` knows no
+    time: of an error that grows, it is the mean over an episode.
+
     Example:
-        >>> ReadingErrors(["field"], ["measured"]).true_keys
-        ('true_field',)
+        >>> from magrl.counters import stream_normal
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> from torchrl.envs import TransformedEnv
+        >>> class TemperatureError(ReadingErrors):
+        ...     channel = 8  # a number that no other error has
+        ...     numbers_key, stream_key = "temperature_error", "temperature_stream"  # privileged keys of its state
+        ...     size = draws = 1  # numbers of an episode, and random numbers at its start
+        ...     def __init__(self, std_nt, **options):
+        ...         super().__init__(["field"], ["field"], **options)
+        ...         self.std_nt, self.in_sizes = std_nt, (3,)
+        ...         self._set_accuracy()
+        ...     def _constants(self, stream):  # the errors of new episodes
+        ...         return self.std_nt * stream_normal(stream, self.draws)
+        ...     def _disturb(self, tensordict, values, episode):
+        ...         shift = torch.cat((torch.zeros_like(values[0][..., :2]), episode.numbers), -1)
+        ...         self._measure(tensordict, values[0], values[0] + shift)
+        ...         return episode.numbers  # for the next step
+        ...     def accuracy(self, field):
+        ...         none = torch.zeros_like(field)
+        ...         return SensorStd(none, field.new_tensor((0.0, 0.0, self.std_nt)).expand_as(field), none, none)
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=4, seed=0), TemperatureError(10.0))
+        >>> env.rollout(2)["bias_std"][0, 0]
+        tensor([ 0.,  0., 10.])
     """
 
     default_out_keys: ClassVar[Keys] = ("field",)
