@@ -13,9 +13,8 @@ from magrl import paper
 from magrl.envs import Scenario, Tasks, earth_scenario, named_tasks
 from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import label, needs
 from magrl.evaluation.runs import NO_NOISE, Noise
-from magrl.evaluation.tables import mean_of_runs
+from magrl.evaluation.tables import about, mean_of_runs
 from magrl.geodesy import geodesic
 from magrl.transforms import Conditions, conditions_named
 
@@ -168,10 +167,11 @@ def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
 
 
 def names(navigator: Spec) -> list[str]:
-    """Return the label of a navigator, with the options that are given, and what it needs."""
+    """Return the label of a navigator, with its options, what it was trained on, and what it is given.
+
+    A start that is known exactly has no numbers.
+    """
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
-    name = options.pop("name").partition("=")[0]
-    return [
-        ", ".join([label(name), *(f"{key.replace('_', ' ')} {value}" for key, value in options.items())]),
-        needs(name),
-    ]
+    text, *known = about(options.pop("name").partition("=")[0])
+    shown = {key: value if isinstance(value, str) or any(value) else "" for key, value in options.items()}
+    return [", ".join([text, *(f"{key.replace('_', ' ')} {value}".strip() for key, value in shown.items())]), *known]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from magrl.evaluation.navigators import check_distinct
-from magrl.evaluation.tables import markdown_table
+from magrl.evaluation.tables import ABOUT, markdown_table
 from magrl.files import check_writable
 from magrl.training import UsageError, command
 
@@ -51,8 +51,8 @@ def flights(navigators: Sequence[Spec], *, against: Sequence[Spec] = (), **optio
     first, region = names(navigators[0])[0], made.scenario.tasks.region
     for other in [names(navigator)[0] for navigator in against if names(navigator)[0] in spl]:
         differences = (paired_difference(*pair, region) for pair in zip(spl[first], spl[other], strict=True))
-        rows.append([f"{first} − {other}, SPL", "—", *differences])
-    return markdown_table(["navigator", "needs", *made.errors], rows)
+        rows.append([f"{first} − {other}, SPL", "—", "—", *differences])
+    return markdown_table([*ABOUT, *made.errors], rows)
 
 
 def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> str:
