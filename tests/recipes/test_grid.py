@@ -36,6 +36,7 @@ def test_tables_and_errors_declare_options_that_exist() -> None:
         if options.pop("kind") == "flights":
             del options["navigators"]
             options.pop("against", None)
+            options.pop("measures", None)
             columns = options.get("conditions") or options.get("levels", flights.LEVELS)
             assert len(flights.Flights(**options).errors) == len(columns)
     for error in grid.declared(figures.FILE)["errors"].values():
