@@ -36,6 +36,8 @@ NOTEBOOK = ROOT / "docs" / "tutorial.ipynb"
 CELLS = json.loads(NOTEBOOK.read_text())["cells"]
 BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
+DDPG = ROOT / "docs" / "examples" / "ddpg_anywhere.py"
+EXAMPLES += [(DDPG, DDPG.read_text())]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
 BUDGET = {
     "total_frames = 60_000": "total_frames = 128",
