@@ -169,6 +169,16 @@ def test_tables_are_those_that_were_measured(page: Path) -> None:
         assert len(set(lines)) == len(lines), f"{name} has a row twice"
 
 
+def test_the_verdict_of_the_reproduction_has_the_numbers_that_were_measured() -> None:
+    results = publish.selected((ROOT / "docs/results/paper-run.md").read_text(), "navigator | SR % | SPL % | TNT steps")
+    lines = TEXTS[ROOT / "docs/reproduction.md"].partition("| steps |\n")[2].splitlines()[1:5]
+    for line, result in zip(lines, results.splitlines()[2:], strict=True):
+        name, *shown = (cell.strip() for cell in line.strip("|").split("|"))
+        agent, *measured = (cell.strip() for cell in result.strip("|").split("|"))
+        assert name.startswith(agent)
+        assert shown == [cell.partition(" ")[0] for cell in measured]
+
+
 def test_options_of_the_environment_and_fields_of_the_scenario() -> None:
     parameters = inspect.signature(GeomagneticNavEnv.__init__).parameters.values()
     options = {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD and p.name != "self"}
