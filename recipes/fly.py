@@ -24,7 +24,7 @@ from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation import Flight, episode_measures, export, places, with_declaration
 from magrl.evaluation.maps import trajectories_figure, write_gif
-from magrl.evaluation.navigators import needs, trained_on
+from magrl.evaluation.navigators import needs
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
@@ -245,7 +245,6 @@ def fly(config: Config) -> dict[str, Any]:
         **{key: value for key, value in asdict(config).items() if key not in ("out", "export", "animate")},
         "navigator": name,
         "north": "true" if first.get("true_target_field", None) is None else "magnetic",  # also of a preset
-        "trained_on": trained_on(name),
         "needs": needs(name),
         **{key: getattr(base, key) for key in ("zeta", "max_steps")},
         **{key: first[key].tolist() for key in ("start_position", "target_position")},
@@ -265,7 +264,7 @@ def summary(result: dict[str, Any]) -> str:
     ends = ["{:.2f}, {:.2f}".format(*result[key]) for key in ("start_position", "target_position")]
     rows = {
         "outcome": result["outcome"],
-        "navigator": "{navigator}, trained on {trained_on}, given {needs} beside its readings".format(**result),
+        "navigator": f"{result['navigator']}, given {result['needs']} beside its readings",
         "errors": errors,
         "north": result["north"],
         "start": ends[0],
