@@ -264,7 +264,7 @@ def summary(result: dict[str, Any]) -> str:
     ends = ["{:.2f}, {:.2f}".format(*result[key]) for key in ("start_position", "target_position")]
     rows = {
         "outcome": result["outcome"],
-        "navigator": f"{result['navigator']}, which needs {result['needs']} beside its readings",
+        "navigator": f"{result['navigator']}, given {result['needs']} beside its readings",
         "errors": errors,
         "north": result["north"],
         "start": ends[0],

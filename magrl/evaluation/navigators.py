@@ -20,11 +20,13 @@ from magrl.transforms import TrackView
 
 
 class TrainedAgent(NamedTuple):
-    """Labels of a kind of trained agent in figures and tables, and its ``needs``, as in :class:`Navigator`."""
+    """Labels of a kind of trained agent in figures and tables, what it was trained on, and its ``needs``, as in
+    :class:`Navigator`."""
 
     label: str
     description: str
-    needs: str = "training in the region"
+    trained_on: str = "the region"
+    needs: str = Navigator.needs
     options: tuple[str, ...] = ()
 
 
@@ -32,13 +34,17 @@ OWN = "policy"
 """Name of policies of any algorithm, given by a file or a folder with ``policy.safetensors``, and a label."""
 PRETRAINED = ("anywhere", "kalman")
 """Names of the agents in the library; ``kalman`` has no network."""
+SPECTRUM = "the field's spectrum"
+"""What agents without a map need: their belief has the spectrum of the Earth's field as its prior."""
+UNTRAINED = "nothing"
+"""What a navigator without training was trained on."""
 TRAINED = {
     "gg_td3": TrainedAgent("Gradient-Guided TD3", "Gradient-Guided TD3"),
     "gg_td3_noise": TrainedAgent("Gradient-Guided TD3, trained with noise", "Gradient-Guided TD3, trained with noise"),
     "td3": TrainedAgent("TD3", "TD3"),
-    "anywhere": TrainedAgent("anywhere", "anywhere (PPO on random planets)", Navigator.needs),
-    OWN: TrainedAgent("own policy", "own policy", "training"),
-    "kalman": TrainedAgent("Kalman", "Kalman (dual control)", Navigator.needs),
+    "anywhere": TrainedAgent("anywhere", "anywhere (PPO)", "random planets", SPECTRUM),
+    OWN: TrainedAgent("own policy", "own policy", "tasks of its own"),
+    "kalman": TrainedAgent("Kalman", "Kalman (dual control)", UNTRAINED, SPECTRUM),
 }
 """Trained agents, which take a run folder; ``anywhere`` without one is the pretrained policy."""
 
@@ -160,14 +166,27 @@ def needs(name: str, default_mode: str = "look-ahead") -> str:
 
     Example:
         >>> needs("secant"), needs("mean_jacobian"), needs("td3")
-        ('nothing', 'a map of the region', 'training in the region')
-        >>> needs("pso"), needs("pso:flown"), needs("policy:SAC")
-        ('the field at other places', 'nothing', 'training')
+        ('nothing', 'a map of the region', 'nothing')
+        >>> needs("pso"), needs("pso:flown"), needs("kalman")
+        ('the field at other places', 'nothing', "the field's spectrum")
     """
     base, option, _ = parse_navigator(name)
     kind = _kind(base)
     flown = "mode" in kind.options and (option or default_mode) == "flown"
     return Navigator.needs if flown else kind.needs
+
+
+def trained_on(name: str) -> str:
+    """Return what a navigator was trained on, for a column of a table.
+
+    Raises:
+        ValueError: for an unknown name.
+
+    Example:
+        >>> trained_on("td3"), trained_on("anywhere"), trained_on("kalman"), trained_on("policy:SAC")
+        ('the region', 'random planets', 'nothing', 'tasks of its own')
+    """
+    return getattr(_kind(parse_navigator(name).name), "trained_on", UNTRAINED)
 
 
 def label(name: str, default_mode: str = "look-ahead") -> str:

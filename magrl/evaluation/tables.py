@@ -14,7 +14,7 @@ import torch
 
 from magrl import paper
 from magrl.evaluation.intervals import interquartile_mean, stratified_bootstrap
-from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, needs, parse_navigator
+from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, needs, parse_navigator, trained_on
 
 Summary = Mapping[str, float | None]
 """From :func:`magrl.evaluation.summarize`; a measure without a value is NaN, or None where it was read from a file."""
@@ -60,6 +60,9 @@ are shown where vehicles declare their arrival."""
 
 INTERVALS = ("success_rate", "spl", "spl_to_arrival", "path_efficiency", "steps")
 """Measures that are shown with an interval."""
+
+ABOUT = ("navigator", "trained on", "given")
+"""First columns of tables: what each navigator is."""
 
 
 def known_values(values: Iterable[float | None]) -> list[float]:
@@ -141,7 +144,7 @@ def comparison_table(
     Example:
         >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
         >>> print(comparison_table({"td3": [measures]}).splitlines()[2])
-        | TD3, paper | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — |
+        | TD3, paper | — | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — |
     """
     rows, shown = list[list[object]](), set[str]()
     columns = _kilometers(summaries, kilometers) | COLUMNS
@@ -150,9 +153,22 @@ def comparison_table(
         if published and base in paper.TABLE_2 and base not in shown:
             shown.add(base)
             published_row = [paper.TABLE_2[base]._asdict()]
-            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", 1, *_cells(published_row, columns)])
-        rows.append([label(name, mode), needs(name, mode), len(results), *_cells(results, columns)])
-    return markdown_table(["navigator", "needs", "runs", *columns], rows) + "\n"
+            rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", "—", 1, *_cells(published_row, columns)])
+        rows.append([*about(name, mode), len(results), *_cells(results, columns)])
+    return markdown_table([*ABOUT, "runs", *columns], rows) + "\n"
+
+
+def about(name: str, default_mode: str = "look-ahead") -> list[str]:
+    """Return the label of a navigator, what it was trained on and what it is given, for the columns :data:`ABOUT`.
+
+    Raises:
+        ValueError: for an unknown name.
+
+    Example:
+        >>> about("pso:flown")
+        ['PSO, flown', 'nothing', 'nothing']
+    """
+    return [label(name, default_mode), trained_on(name), needs(name, default_mode)]
 
 
 def _kilometers(summaries: Summaries, wanted: bool) -> dict[str, tuple[str, str]]:
@@ -205,5 +221,5 @@ def short_table(summaries: Summaries, mode: str = "look-ahead", *, kilometers: b
         | 1.0 | — | 1.0 | 1.0 |
     """
     columns = _kilometers(summaries, kilometers) | SHORT_COLUMNS
-    rows = [[label(name, mode), needs(name, mode), *_cells(results, columns)] for name, results in summaries.items()]
-    return markdown_table(["navigator", "needs", *columns], rows) + "\n"
+    rows = [[*about(name, mode), *_cells(results, columns)] for name, results in summaries.items()]
+    return markdown_table([*ABOUT, *columns], rows) + "\n"

@@ -13,9 +13,8 @@ from magrl import paper
 from magrl.envs import Scenario, Tasks, earth_scenario, named_tasks
 from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import label, needs
 from magrl.evaluation.runs import NO_NOISE, Noise
-from magrl.evaluation.tables import mean_of_runs
+from magrl.evaluation.tables import about, mean_of_runs
 from magrl.geodesy import geodesic
 from magrl.transforms import Conditions, conditions_named
 
@@ -32,6 +31,8 @@ DRIFT_KM = 40.0
 """How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
 MEASURES = ("success_rate", "spl")
 """Measures in a cell of a table."""
+OWN_OPTIONS = ("north", "known_start", "confidence")
+"""Options of all flights that a navigator may have by itself."""
 SEED = 3 * paper.FIRST_RESERVED_SEED
 """Seed of regions and tasks, beyond those of trainings and of frozen sets."""
 
@@ -50,7 +51,7 @@ class Flights:
     within_km: float | None = None
     """Radius in which vehicles declare their arrival [km]; by default they get a signal, by the paper's rule."""
     confidence: float = 0.0
-    """Minimum probability at which vehicles declare their arrival."""
+    """Minimum probability at which vehicles declare their arrival; also an option of a navigator."""
     signal_km: float | None = None
     """Radius in which a signal ends the episode [km]."""
     north: str = "true"
@@ -81,10 +82,10 @@ class Flights:
 
     def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
         """Return an episode of each task."""
-        given = {"north": self.north, "known_start": self.known_start}
+        given = {key: getattr(self, key) for key in OWN_OPTIONS}
         own = navigator if isinstance(navigator, Mapping) else {"name": navigator}
         options = {key: own.get(key, value) for key, value in given.items()}
-        flight = Flight(self.scenario, errors=errors, confidence=self.confidence, **options)
+        flight = Flight(self.scenario, errors=errors, **options)
         return flown(flight, {key: value for key, value in own.items() if key not in given})
 
     def episodes(self, navigator: Spec, errors: Errors) -> list[Measures]:
@@ -168,10 +169,11 @@ def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
 
 
 def names(navigator: Spec) -> list[str]:
-    """Return the label of a navigator, with the options that are given, and what it needs."""
+    """Return the label of a navigator, with its options, what it was trained on, and what it is given.
+
+    A start that is known exactly has no numbers.
+    """
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
-    name = options.pop("name").partition("=")[0]
-    return [
-        ", ".join([label(name), *(f"{key.replace('_', ' ')} {value}" for key, value in options.items())]),
-        needs(name),
-    ]
+    text, *known = about(options.pop("name").partition("=")[0])
+    shown = {key: "" if value == [0.0, 0.0, 0.0] else value for key, value in options.items()}
+    return [", ".join([text, *(f"{key.replace('_', ' ')} {value}".strip() for key, value in shown.items())]), *known]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from magrl.evaluation.navigators import check_distinct
-from magrl.evaluation.tables import markdown_table
+from magrl.evaluation.tables import ABOUT, markdown_table
 from magrl.files import check_writable
 from magrl.training import UsageError, command
 
@@ -37,22 +37,28 @@ RECIPE = "grid.py"
 FILE, RUNS = Path(__file__).parent / "tables.toml", Path("runs")
 
 
-def flights(navigators: Sequence[Spec], *, against: Sequence[Spec] = (), **options: Any) -> str:
+def flights(
+    navigators: Sequence[Spec],
+    *,
+    against: Sequence[Spec] = (),
+    measures: Sequence[str] = MEASURES,
+    **options: Any,
+) -> str:
     """Return a row for each navigator, and a column for each level of noise, or each of some conditions.
 
-    The last rows are differences of SPL between the first navigator and those that it is compared ``against``. The
-    other options are those of :class:`Flights`.
+    A cell has the ``measures``. The last rows are differences of SPL between the first navigator and those that it is
+    compared ``against``. The other options are those of :class:`Flights`.
     """
     made, rows, spl = Flights(**options), [], {}
     for navigator in tqdm(navigators, unit="row"):
         episodes = [made.episodes(navigator, errors) for errors in made.errors.values()]
         spl[names(navigator)[0]] = [runs[0]["spl"] for runs in episodes]
-        rows.append([*names(navigator), *(cell(runs, MEASURES) for runs in episodes)])
+        rows.append([*names(navigator), *(cell(runs, measures) for runs in episodes)])
     first, region = names(navigators[0])[0], made.scenario.tasks.region
     for other in [names(navigator)[0] for navigator in against if names(navigator)[0] in spl]:
         differences = (paired_difference(*pair, region) for pair in zip(spl[first], spl[other], strict=True))
-        rows.append([f"{first} − {other}, SPL", "—", *differences])
-    return markdown_table(["navigator", "needs", *made.errors], rows)
+        rows.append([f"{first} − {other}, SPL", "—", "—", *differences])
+    return markdown_table([*ABOUT, *made.errors], rows)
 
 
 def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> str:

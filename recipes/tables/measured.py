@@ -9,6 +9,7 @@ elements, and those of a known start, are of the log, as from a survey, or of IG
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -108,9 +109,9 @@ def cells(
     first = elements[rows[:, 0]] if start else None
     result = flown(track, rows, noise, elements[rows[:, -1]], first, RANGE_KM[length])
     inside, error, left = result.unbind(-1)
-    covered = " / ".join(f"{100 * (inside <= p).double().mean():.0f}" for p in PROBABILITIES)
+    covered = [f"{100 * (inside <= p).double().mean():.0f}" for p in PROBABILITIES]
     halfway = error[:, rows.shape[1] // 2].median()
-    return [covered, f"{halfway:.0f} / {error[:, -1].median():.0f}"], torch.stack((left, error), -1)
+    return [*covered, f"{halfway:.0f}", f"{error[:, -1].median():.0f}"], torch.stack((left, error), -1)
 
 
 def make(
@@ -131,19 +132,18 @@ def make(
     track, std, table = read_track(log, date), torch.tensor(noise).double(), []
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     panels = dict(zip(RANGE_KM, figure.subplots(1, 2), strict=True))
-    for source, start in (("measured", False), ("measured", True), ("IGRF", False), ("IGRF", True)):
-        row = [source, "known" if start else "not known"]
-        for length, axes in panels.items():
+    for length, axes in panels.items():
+        for source, start in itertools.product(("measured", "IGRF"), (False, True)):
             texts, drawn = cells(track, length, std, source, start)
-            row += texts
+            known_or_not = "known" if start else "not known"
+            table.append(["{:g}–{:g} km".format(*length), source, known_or_not, *texts])
             left, error = drawn.median(0).values.T
-            axes.plot(left, error, "-o", ms=3, label=f"destination {source}, start {row[1]}")
-            axes.set(xlabel="distance left [km]", title="{:g}–{:g} km".format(*length), yscale="log")
-            axes.set_ylabel("median error of the way [km]")
-        table.append(row)
+            axes.plot(left, error, "-o", ms=3, label=f"destination {source}, start {known_or_not}")
+        axes.set(xlabel="distance left [km]", title="{:g}–{:g} km".format(*length), yscale="log")
+        axes.set_ylabel("median error of the way [km]")
     panels[next(iter(panels))].legend(fontsize=7)
-    heads = [text.format(*length) for length in panels for text in ("{:g}–{:g} km: covered", "error, half / end")]
-    text = markdown_table(["destination", "start", *heads], table)
+    heads = [*(f"in the {100 * p:.0f} % region, %" for p in PROBABILITIES), "error halfway, km", "error at the end, km"]
+    text = markdown_table(["distance", "destination", "start", *heads], table)
     if out is None:
         print(text)
         return

@@ -2,7 +2,8 @@
 
     python recipes/tables/publish.py README.md docs/reproduction.md
 
-A document marks the place and the file of a table by `<!-- table: docs/results/NAME.md -->` and `<!-- end -->`.
+A document marks the place and the file of a table by `<!-- table: docs/results/NAME.md -->` and `<!-- end -->`. Names
+of columns after the file, as in `<!-- table: docs/results/NAME.md | navigator | SPL % -->`, leave out the others.
 """
 
 from __future__ import annotations
@@ -12,20 +13,37 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from magrl.evaluation.tables import markdown_table
 from magrl.training import UsageError, command
 
-BLOCK = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- table: ([^\s|]+)(?: \| (.*?))? -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def selected(table: str, columns: str | None) -> str:
+    """Return some columns of a table, by their headings with ``|`` between them; without any, the whole table.
+
+    Raises:
+        UsageError: for a heading that the table lacks.
+    """
+    if columns is None:
+        return table
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    heads = [head.strip() for head in columns.split("|")]
+    if missing := [head for head in heads if head not in rows[0]]:
+        raise UsageError(f"the table has no column {', '.join(missing)}: choose from {', '.join(rows[0])}")
+    chosen = [[row[rows[0].index(head)] for head in heads] for row in rows]
+    return markdown_table(chosen[0], chosen[2:])
 
 
 def publish(documents: Sequence[Path], root: Path = Path()) -> None:
     """Fill all documents, or none where one cannot be read or lacks a table; tables are in a folder ``root``.
 
     Raises:
-        UsageError: for a missing document or table.
+        UsageError: for a missing document, table or column.
     """
 
     def block(match: re.Match[str]) -> str:
-        return f"{match[1]}\n{(root / match[2]).read_text().strip()}\n\n{match[3]}"
+        return f"{match[1]}\n{selected((root / match[2]).read_text().strip(), match[3])}\n\n{match[4]}"
 
     try:
         texts = {document: BLOCK.sub(block, document.read_text()) for document in documents}

@@ -60,7 +60,7 @@ def test_tables_have_the_papers_row_and_notes(results: Path, run: Path) -> None:
     lines = (results / "table.md").read_text().splitlines()
     labels = [line.split("|")[1].strip() for line in lines[2:9]]
     assert labels[:2] == ["Gradient-Guided TD3, paper", "Gradient-Guided TD3"]
-    assert lines[2].split("|")[4:8] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
+    assert lines[2].split("|")[5:9] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
     short = (results / "short.md").read_text().splitlines()
     assert [line.split("|")[1].strip() for line in short[2:6]] == [name for name in labels if ", paper" not in name]
     assert short[-1] == f"Warning: {run} is not a finished training: it holds no eval.json."

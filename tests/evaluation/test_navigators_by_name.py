@@ -20,6 +20,7 @@ from magrl.evaluation.navigators import (
     label,
     make_navigator,
     needs,
+    trained_on,
 )
 from magrl.navigators import NAVIGATORS
 from magrl.navigators.secant import probe_length
@@ -60,8 +61,8 @@ def test_labels_and_needs_of_a_metaheuristic_depend_on_its_mode(env: Geomagnetic
         assert label(name, default) == ("PSO, flown" if flown else "PSO, look-ahead (an oracle)")
         assert needs(name, default) == navigator.needs == ("nothing" if flown else "the field at other places")
     assert label("ga:look-ahead", "flown") == "GA, look-ahead (an oracle)"
-    assert needs("policy:flown") == "training"
-    for function in (label, needs):
+    assert (trained_on("policy:flown"), needs("policy:flown")) == ("tasks of its own", "nothing")
+    for function in (label, needs, trained_on):
         with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
             function("dowsing")
 
@@ -85,7 +86,7 @@ def test_a_policy_of_any_algorithm_is_a_file_or_a_folder(env: GeomagneticNavEnv,
     action = make_navigator(f"policy:straight={tmp_path / 'own.safetensors'}", env)(env.reset())["action"]
     assert action.tolist() == [[25, 0]] * 2
     assert isinstance(make_navigator(f"policy={run}", env), FieldPolicy)
-    assert (label("policy:SAC"), label("policy"), needs("policy:SAC")) == ("SAC", "own policy", "training")
+    assert (label("policy:SAC"), label("policy")) == ("SAC", "own policy")
 
 
 def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:

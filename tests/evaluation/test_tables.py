@@ -43,7 +43,11 @@ def test_rows_of_one_and_of_several_runs() -> None:
     several = [{**one, "spl": spl} for spl in RUNS]
     head, _, published, guided, secant = comparison_table({"gg_td3": several, "secant": [one]}).splitlines()
     rows = [dict(zip(cells(head), cells(line), strict=True)) for line in (published, guided, secant)]
-    assert [row["needs"] for row in rows] == ["—", "training in the region", "nothing"]
+    assert [(row["trained on"], row["given"]) for row in rows] == [
+        ("—", "—"),
+        ("the region", "nothing"),
+        ("nothing", "nothing"),
+    ]
     assert [row["runs"] for row in rows] == ["1", "4", "1"]
     assert [row["SPL %"] for row in rows] == ["88.41", "98.50 [97.00–100.00]", "99.00 (98.00–99.50)"]
     assert [row["worst run, SPL %"] for row in rows] == ["—", "97.00", "—"]
@@ -51,7 +55,7 @@ def test_rows_of_one_and_of_several_runs() -> None:
     assert [row["SPL to arrival %"] for row in rows] == ["—", "96.00 [96.00–96.00]", "96.00"]
     assert [row["smoothness °"] for row in rows] == ["—", "170.0", "170.0"]
     head, _, guided, _ = short_table({"gg_td3": several, "secant": [one]}).splitlines()
-    assert cells(guided)[2:5] == ["100.0 [100.0–100.0]", "98.5 [97.0–100.0]", "97.0"]
+    assert cells(guided)[3:6] == ["100.0 [100.0–100.0]", "98.5 [97.0–100.0]", "97.0"]
     with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
         comparison_table({"dowsing": [one]})
 
@@ -65,9 +69,9 @@ def test_columns_of_kilometers_come_first() -> None:
     """False arrivals are shown where vehicles declare their arrival."""
     run = {"spl": 90.0, "success_rate_within_25km": 95.0, "final_distance_km_median": 8.0}
     head, _, row = short_table({"secant": [run]}, kilometers=True).splitlines()
-    assert cells(head)[2:5] == ["within 25 km %", "final distance, median km", "SR %"]
-    assert cells(row)[2:4] == ["95.0", "8.0"]
+    assert cells(head)[3:6] == ["within 25 km %", "final distance, median km", "SR %"]
+    assert cells(row)[3:5] == ["95.0", "8.0"]
     declared = comparison_table({"secant": [run | {"false_arrival_rate": 1.5}]}, kilometers=True).splitlines()
-    assert cells(declared[0])[3:6] == ["within 25 km %", "final distance, median km", "false arrivals %"]
-    assert cells(declared[2])[5] == "1.5"
+    assert cells(declared[0])[4:7] == ["within 25 km %", "final distance, median km", "false arrivals %"]
+    assert cells(declared[2])[6] == "1.5"
     assert "paper" not in comparison_table({"ga": [run]}, published=False)

@@ -36,6 +36,7 @@ def test_tables_and_errors_declare_options_that_exist() -> None:
         if options.pop("kind") == "flights":
             del options["navigators"]
             options.pop("against", None)
+            options.pop("measures", None)
             columns = options.get("conditions") or options.get("levels", flights.LEVELS)
             assert len(flights.Flights(**options).errors) == len(columns)
     for error in grid.declared(figures.FILE)["errors"].values():
@@ -76,6 +77,16 @@ def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
     assert page.read_text() == "x\n<!-- table: a.md -->\n\n| 1 |\n\n<!-- end -->\ny"
 
 
+def test_a_document_may_show_some_columns(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    (tmp_path / "a.md").write_text("| name | SPL % | steps |\n|---|---|---|\n| secant | 99.0 | 8 |\n")
+    page.write_text("<!-- table: a.md | steps | name -->\n<!-- end -->")
+    publish.publish((page,), tmp_path)
+    assert page.read_text().splitlines()[2:5] == ["| steps | name |", "|---|---|", "| 8 | secant |"]
+    with pytest.raises(UsageError, match="no column SR %: choose from name, SPL %, steps"):
+        publish.selected("| name | SPL % | steps |", "SR %")
+
+
 # Flights
 
 
@@ -90,23 +101,23 @@ def few_regions(monkeypatch) -> None:
 def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> None:
     oracle, old = "geodesic", {"name": "map_matching", "map_date": "2015-01-01"}
     table = rows(grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], tasks=8))
-    assert table[0] == ["navigator", "needs", "0, 0, 0", "0.5, 0.1, 20"]
-    assert table[2][2] == "100.0 / 100.0"
+    assert table[0] == ["navigator", "trained on", "given", "0, 0, 0", "0.5, 0.1, 20"]
+    assert table[2][3] == "100.0 / 100.0"
     assert table[3][0] == "map matching (Kalman filter), map date 2015-01-01"
     assert table[4][0] == f"{table[2][0]} − {table[3][0]}, SPL"
-    assert table[4][2].strip("*").startswith("+")
-    assert rows(grid.flights([oracle], tasks=2, max_steps=1))[2][2] == "0.0 / 0.0"
+    assert table[4][3].strip("*").startswith("+")
+    assert rows(grid.flights([oracle], tasks=2, max_steps=1))[2][3] == "0.0 / 0.0"
     far = rows(grid.flights([oracle], tasks=2, distance_km=(1200, 1300), max_steps=60))
-    assert far[2][2] == "100.0 / 100.0"
+    assert far[2][3] == "100.0 / 100.0"
     grid.make(("conditions",), navigators=(oracle,), tasks=2, out=tmp_path / "new")
     head, _, row = rows((tmp_path / "new" / "conditions.md").read_text())
-    assert head == ["navigator", "needs", "aircraft", "ship", "underwater", "low-cost"]
-    assert row[2] == "100.0 / 100.0"
+    assert head == ["navigator", "trained on", "given", "aircraft", "ship", "underwater", "low-cost"]
+    assert row[3] == "100.0 / 100.0"
 
 
 def test_vehicles_that_declare_are_right_or_wrong() -> None:
     options = {"conditions": ["ship"], "tasks": 4, "within_km": 25, "max_steps": 20}
-    sure, bold = (rows(grid.flights(["secant"], confidence=least, **options))[2][2] for least in (1.0, 0.0))
+    sure, bold = (rows(grid.flights(["secant"], confidence=least, **options))[2][3] for least in (1.0, 0.0))
     assert sure == "0.0 / 0.0"
     right, spl = map(float, bold.split(" / "))
     assert 0 < spl < right
@@ -116,7 +127,7 @@ def test_vehicles_that_declare_are_right_or_wrong() -> None:
 
 def test_tasks_of_the_box_are_frozen_and_start_northward() -> None:
     table = rows(grid.flights(["geodesic"], box=True, tasks=3, levels=[(0, 0, 0)]))
-    assert table[2][2] == "100.0 / 100.0"
+    assert table[2][3] == "100.0 / 100.0"
     scenario = flights.Flights(box=True, tasks=3).scenario
     assert scenario.start_heading == "north"
     assert scenario.tasks.start.tolist() == flights.named_tasks("test-1000").start[:3].tolist()
