@@ -3,9 +3,11 @@
     python docs/examples/jsbsim_vehicle.py --flights 20                  # both ends in one process, as fast as it goes
     python docs/examples/jsbsim_vehicle.py --link udpout:127.0.0.1:14550 --speedup 30     # beside magrl.autopilot
 
-The aircraft has the heading and altitude hold of its model c172x. Its magnetometer reads the field of ppigrf with white
-noise; attitude and airspeed are true. The wind is constant, and the vehicle does not know it.
-With --link, it prints the place of the destination and the command that steers it there.
+The aircraft has the heading and altitude hold of its model c172x. Its magnetometer reads the field of ppigrf, with
+noise of .05 degrees and 5 nT on D, I and B_H of a reading; or, with --tilt, with errors of roll, pitch and heading,
+whose effect on a reading is stated to the navigator. The airspeed is true. The wind is constant, and the vehicle does
+not know it.
+With --link, it prints the command that steers it to its destination.
 """
 
 from __future__ import annotations
@@ -23,11 +25,13 @@ from typing import Any
 
 from magrl.autopilot import Loop, fly
 from magrl.autopilot.mavlink import MavlinkLink
+from magrl.logs import elements_of_axes
 from magrl.onboard import Onboard
 
 import jsbsim
 import numpy as np
 import ppigrf
+import torch
 from geographiclib.geodesic import Geodesic
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -35,10 +39,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 DATE = datetime.datetime(2026, 1, 1)
 ALTITUDE_KM, AIRSPEED_KN, STEP_S = 1.5, 100.0, 0.1
 NOISE = (0.05, 0.05, 5.0)
-AXIS_NT = 50.0
-"""Noise of a sample of an axis [nT]: at 10 Hz, 30 s average it to 3 nT."""
-TILT_DEG = 0.05
-"""Error of roll, pitch and heading, constant over a reading [deg]."""
+"""Noise of D [deg], I [deg], B_H [nT] of a reading of 30 s."""
+AXIS_NT = 10.0
+"""Noise of a sample of an axis [nT], which a reading averages."""
 EARTH = Geodesic.WGS84
 Place = tuple[float, float]
 
@@ -51,7 +54,12 @@ def vector(place: Place) -> np.ndarray:
 
 def elements(place: Place) -> tuple[float, float, float]:
     """Return D [deg], I [deg], B_H [nT]."""
-    north, east, down = vector(place)
+    return elements_of(vector(place))
+
+
+def elements_of(field: np.ndarray) -> tuple[float, float, float]:
+    """Return D [deg], I [deg], B_H [nT] of a field, north, east, down [nT]."""
+    north, east, down = field
     level = math.hypot(north, east)
     return math.degrees(math.atan2(east, north)), math.degrees(math.atan2(down, level)), level
 
@@ -77,9 +85,12 @@ class Cessna:
         heading_deg: at the start.
         wind: northward and eastward [m/s].
         rng: random numbers of the sensors.
+        tilt_deg: error of roll, pitch and heading; 0 for :data:`NOISE`.
     """
 
-    def __init__(self, place: Place, heading_deg: float, wind: Place, rng: random.Random) -> None:
+    def __init__(
+        self, place: Place, heading_deg: float, wind: Place, rng: random.Random, tilt_deg: float = 0.0
+    ) -> None:
         self._model = model = jsbsim.FGFDMExec(None)
         model.set_debug_level(0)
         model.load_model("c172x")
@@ -94,7 +105,8 @@ class Cessna:
         model["fcs/throttle-cmd-norm"], model["fcs/mixture-cmd-norm"] = 0.8, 0.9
         model["ap/altitude_setpoint"], model["ap/altitude_hold"] = ALTITUDE_KM / 0.3048e-3, 1
         model["ap/heading_setpoint"], model["ap/heading_hold"] = heading_deg, 1
-        self._rng, self._tilt, self.path_km, self.stuck = rng, (0.0, 0.0, 0.0), 0.0, False
+        self._rng, self._tilt_deg, self.path_km, self.stuck = rng, tilt_deg, 0.0, False
+        self._errors: list[float] = []
         self._field, self._axes = vector(place), np.zeros(3)
 
     @property
@@ -121,18 +133,27 @@ class Cessna:
         step = round(self.time / STEP_S)
         if step % 50 == 0:  # over 5 s, the field changes by 1 to 3 nT
             self._field = vector(self.place)
-        if step % 300 == 0:
-            self._tilt = tuple(math.radians(self._rng.gauss(0, TILT_DEG)) for _ in range(3))
+        if step % 300 == 1:
+            self._errors = [self._rng.gauss(0, math.sqrt(1.5)) for _ in range(3)]  # a reading averages two
         true = [self._model[f"attitude/{name}-rad"] for name in ("phi", "theta", "psi")]
         ms = int(1000 * self.time)
-        shown = quaternion(*(angle + error for angle, error in zip(true, self._tilt, strict=True)))
+        shown = quaternion(*(t + math.radians(self._tilt_deg * e) for t, e in zip(true, self._errors, strict=True)))
         yield mavlink.MAVLink_attitude_quaternion_message(ms, *shown, 0, 0, 0)
         if not self.stuck:
-            self._axes = self._rotation(true).T @ self._field
+            self._axes = self._rotation(true).T @ self._noisy(self._field)
             self._axes += [self._rng.gauss(0, AXIS_NT) for _ in range(3)]
         yield mavlink.MAVLink_highres_imu_message(1000 * ms, *[0] * 6, *(self._axes / 1e5), *[0] * 4, 0x1C0)
         airspeed, ground = (self._model[f"velocities/{name}-fps"] * 0.3048 for name in ("vt", "vg"))
         yield mavlink.MAVLink_vfr_hud_message(airspeed, ground, round(math.degrees(true[2])) % 360, 80, 1500, 0)
+
+    def _noisy(self, field: np.ndarray) -> np.ndarray:
+        """Return the field with the errors of D, I, B_H."""
+        if self._tilt_deg:
+            return field
+        elements = elements_of(field)
+        declination, inclination, level = (x + s * e for x, s, e in zip(elements, NOISE, self._errors, strict=True))
+        east, down = math.radians(declination), math.radians(inclination)
+        return level * np.array([math.cos(east), math.sin(east), math.tan(down)])
 
     @staticmethod
     def _rotation(attitude: list[float]) -> np.ndarray:
@@ -177,12 +198,20 @@ def task(rng: random.Random, distance_km: float, most_wind: float) -> tuple[Plac
     return here, (there["lat2"], there["lon2"]), rng.uniform(0, 360), wind
 
 
+def stated(place: Place, tilt_deg: float) -> tuple[float, ...]:
+    """Return the standard deviations of a reading near a place: D [deg], I [deg], B_H [nT]."""
+    if not tilt_deg:
+        return NOISE
+    field, level = torch.from_numpy(vector(place)), torch.zeros(3, dtype=torch.float64)
+    return tuple(elements_of_axes(field, level, north="true", attitude_std_deg=[tilt_deg] * 3).std.tolist())
+
+
 def flight(number: int, options: argparse.Namespace) -> tuple[str, float, bool]:
     """Fly in one process, and return how it stopped, the distance left [km], and whether it circled."""
     rng = random.Random(1000 * options.seed + number)
     here, there, heading, wind = task(rng, options.distance, options.wind)
-    aircraft = Cessna(here, heading, wind, rng)
-    board = Onboard(options.navigator, sensor_std=NOISE)
+    aircraft = Cessna(here, heading, wind, rng, options.tilt)
+    board = Onboard(options.navigator, sensor_std=stated(there, options.tilt))
     board.start(elements(there))
     loop, moves, stop = Loop(board), 0, "out of time"
     with tempfile.TemporaryDirectory() as folder:
@@ -202,13 +231,11 @@ def serve(options: argparse.Namespace) -> None:
     """Fly behind a link until it is interrupted."""
     rng = random.Random(options.seed)
     here, there, heading, wind = task(rng, options.distance, options.wind)
-    aircraft = Cessna(here, heading, wind, rng)
+    aircraft = Cessna(here, heading, wind, rng, options.tilt)
     line = mavutil.mavlink_connection(options.link, source_system=1, source_component=1, dialect="ardupilotmega")
-    noise = " ".join(map(str, NOISE))
-    print(
-        f"python -m magrl.autopilot udpin:127.0.0.1:14550 --to {there[0]:.4f} {there[1]:.4f} --date 2026-01-01", end=" "
-    )
-    print(f"--altitude {ALTITUDE_KM} --noise {noise} --read-s 30", flush=True)
+    noise = " ".join(f"{value:.3g}" for value in stated(there, options.tilt))
+    place = f"{there[0]:.4f} {there[1]:.4f} --date {DATE:%Y-%m-%d} --altitude {ALTITUDE_KM}"
+    print(f"python -m magrl.autopilot udpin:127.0.0.1:14550 --to {place} --noise {noise}", flush=True)
     due, begun = 0.0, time.monotonic()
     while True:
         for message in aircraft.messages():
@@ -234,6 +261,7 @@ def main() -> None:
     parser.add_argument("--navigator", default="anywhere", help="anywhere, kalman or secant")
     parser.add_argument("--distance", type=float, default=200.0, help="of the destination [km]; default 200")
     parser.add_argument("--wind", type=float, default=12.0, help="strongest wind [m/s]; default 12")
+    parser.add_argument("--tilt", type=float, default=0.0, help="error of roll, pitch, heading [deg]; default NOISE")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if options.link:

@@ -14,6 +14,7 @@ from magrl.field.elements import NAMES
 from magrl.logs import Calibration, Log, readings_of
 from magrl.logs.samples import ATTITUDE, AXES
 from magrl.onboard import Command, Onboard
+from magrl.onboard.limits import LONGER
 
 FASTEST_M_S = 1000.0
 """A greater speed is an error of the message; chosen [m/s]."""
@@ -209,7 +210,7 @@ class Loop:
         heading = heading % 360
         heading -= 360 * (heading < 7)  # a small one could be taken for radians
         longest = self.vehicle.max_move_km
-        while distance > longest:
+        while distance > LONGER * longest:
             self.vehicle.step(None, None, None, heading, longest)
             distance -= longest
         declination, inclination, level = reading

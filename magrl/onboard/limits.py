@@ -17,7 +17,8 @@ LEAST_NT = 2000.0
 STUCK_KM = (100.0, 400.0)
 """Path without a change of any element, and of one element, after which a sensor counts as stuck, but at least 2 and 8
 of the longest moves [km]. Coarse readings of one element can stay equal that long; chosen."""
-_LONGER = 1.1  # than the longest move
+LONGER = 1.1
+"""A move may be as many times as long as the longest one that is commanded."""
 
 View = ObservationView | TrackView | None
 Path = tuple[float, float, float]
@@ -163,7 +164,7 @@ def check_move(heading_deg: float, distance_km: float, steer_deg: float | None, 
         Traceback (most recent call last):
         ValueError: heading 1.0472 looks like radians: the vehicle was to steer 60.0 deg; degrees are expected
     """
-    if distance_km > _LONGER * max_move_km:
+    if distance_km > LONGER * max_move_km:
         raise ValueError(
             f"distance {distance_km:g} km is longer than the longest move of this vehicle, {max_move_km:g} km: it must "
             "be in kilometers, and since the last step; report a longer way in parts, None for the readings between"
