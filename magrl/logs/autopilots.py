@@ -201,15 +201,17 @@ def _tables(rows: _Rows) -> dict[tuple[str, ...], Mapping[str, Array]]:
 
 
 def read_bag(path: Path, sensor: str | None = None) -> Recording:
-    """Read a bag of ROS 1 (.bag) or 2 (its folder, or a file in it) with rosbags: a topic of each type that is needed.
+    """Read a bag of ROS 1 (.bag) or 2 with rosbags: a topic of each type that is needed.
+
+    A bag of ROS 2 is its folder, a file in it, or a single file (.mcap, .db3) without the folder's metadata.yaml.
 
     Times are those of the headers. The axes and the attitude of ROS, forward, left, up and east, north, up (REP 103),
     become FRD and NED. The bag does not state the north of the heading, which is that of the Imu.
     """
     highlevel, store = package("rosbags.highlevel", "rosbags"), package("rosbags.typesys", "rosbags")
     rows: _Rows = defaultdict(lambda: defaultdict(list))
-    whole = path if path.is_dir() or path.suffix == ".bag" else path.parent
-    with highlevel.AnyReader([whole], default_typestore=store.get_typestore(store.Stores.LATEST)) as bag:
+    in_folder = path.suffix in (".db3", ".mcap") and (path.parent / "metadata.yaml").is_file()
+    with highlevel.AnyReader([path.parent if in_folder else path], default_typestore=store.get_typestore(store.Stores.LATEST)) as bag:
         for connection, recorded, raw in bag.messages([topic for topic in bag.connections if topic.msgtype in _ROS]):
             columns, values_of = _ROS[connection.msgtype]
             message = bag.deserialize(raw, connection.msgtype)

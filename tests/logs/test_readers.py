@@ -17,6 +17,7 @@ from pymavlink.dialects.v20.ardupilotmega import (
     MAVLink_raw_imu_message,
 )
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from support.logs import ATTITUDE, AXES, ELEMENTS, PLACE, UTC, dataflash, nmea, quaternions, ulog
@@ -114,11 +115,12 @@ def test_telemetry(tmp_path: Path) -> None:
     assert log.tensor("latitude", "longitude")[0].tolist() == pytest.approx(PLACE, abs=1e-6)
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_ros(tmp_path: Path, version: int) -> None:
+@pytest.mark.parametrize(("version", "storage"), [(1, "bag"), (2, "db3"), (2, "mcap")])
+def test_ros(tmp_path: Path, version: int, storage: str) -> None:
     """Axes and attitude are those of ROS: forward, left, up; east, north, up.
 
-    Recorded .5 s late and in another order, beside an Imu without attitude and a magnetometer of zeros.
+    Recorded .5 s late and in another order, beside an Imu without attitude and a magnetometer of zeros. A file of a
+    folder is read with the metadata of the folder and without.
     """
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
     kind = {
@@ -126,7 +128,8 @@ def test_ros(tmp_path: Path, version: int) -> None:
     }
     zeros, unknown, place = np.zeros(9), np.array([-1.0, *[0.0] * 8]), (*PLACE, 0.0)
     path = tmp_path / ("log.bag" if version == 1 else "log")
-    with Writer1(path) if version == 1 else Writer2(path, version=9) as writer:
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Writer1(path) if version == 1 else Writer2(path, version=9, storage_plugin=plugin) as writer:
         types = {"/dead": "MagneticField", "/mag": "MagneticField", "/accelerometer": "Imu", "/imu": "Imu"}
         types |= {"/fix": "NavSatFix"}
         topics = {
@@ -161,7 +164,9 @@ def test_ros(tmp_path: Path, version: int) -> None:
     with pytest.raises(ValueError, match="no sample has a field"):
         read_log(path, sensor="/dead")
     if version == 2:
-        check(read_log(next(path.glob("*.db3"))))
+        check(read_log(next(path.glob(f"*.{storage}"))))
+        (path / "metadata.yaml").unlink()
+        check(read_log(next(path.glob(f"*.{storage}"))))
 
 
 def test_nmea(tmp_path: Path) -> None:
