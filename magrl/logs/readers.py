@@ -24,8 +24,9 @@ def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) 
     """Read the log of a vehicle, which may be in several files, such as one of the magnetometer and one of the heading.
 
     Args:
-        paths: files, recognized by their content: CSV, PX4 (ULog), ArduPilot (DataFlash, telemetry), ROS, NMEA 0183; or
-            a folder of ROS 2. Columns of later ones replace those of earlier ones; all have one clock.
+        paths: files, recognized by their content: CSV, PX4 (ULog), ArduPilot (DataFlash), MAVLink (telemetry), ROS,
+            NMEA 0183, observatories (IAGA-2002); or a folder of ROS 2. Columns of later ones replace those of earlier
+            ones; all have one clock.
         frame: axes of CSV files, one of :data:`~magrl.logs.vectors.FRAMES`; the attitude is that of FRD and NED.
         sensor: magnetometer of those that a log of PX4, ArduPilot or ROS has; by default a healthy one that was used.
 
@@ -126,7 +127,7 @@ def _numbers(column: Series) -> Array:
 
 _FORMATS: Sequence[tuple[bytes, Callable[..., Recording]]] = (
     (rb"ULog", read_ulg),
-    (rb"\xa3\x95|\0.{7}[\xfd\xfe]", read_ardupilot),
+    (rb"\xa3\x95|\0.{7}[\xfd\xfe]|([^\n]*\n)*?FMT, ?\d+,", read_ardupilot),
     (rb"#ROSBAG|SQLite format 3|\x89MCAP", read_bag),
     (rb"([^\n]*\n)*?[^\n,]*[$!][A-Z]{2}[A-Z\d]{3},", read_nmea),
     (rb"[^\0]*\Z", read_csv),

@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 import struct
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 import torch
+from pymavlink.DFReader import DFReader_binary
 from pymavlink.dialects.v20.ardupilotmega import (
     MAVLink,
     MAVLink_attitude_message,
+    MAVLink_attitude_quaternion_message,
     MAVLink_gps_raw_int_message,
+    MAVLink_highres_imu_message,
     MAVLink_raw_imu_message,
+    MAVLink_vfr_hud_message,
 )
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -96,23 +102,51 @@ def test_ardupilot_has_the_magnetometer_that_is_used_and_healthy(tmp_path: Path,
     assert torch.allclose(log.tensor("x", "y", "z"), 0.5 * AXES, atol=1)
 
 
-def test_telemetry(tmp_path: Path) -> None:
-    """Milligauss and radians; positions without a fix do not count."""
+def test_ardupilot_as_text(tmp_path: Path) -> None:
+    """The same messages as lines, after a line of another program."""
+    path, text = written(tmp_path / "log.bin", dataflash()), "ArduCopter V4.5.7\n"
+    with closing(DFReader_binary(str(path))) as reader:
+        while message := reader.recv_msg():
+            values = (str(getattr(message, name)) for name in message.get_fieldnames())
+            text += ", ".join([message.get_type(), *values]) + "\n"
+    log, same = read_log(written(tmp_path / "log.log", text.encode())), read_log(path)
+    check(log)
+    pandas.testing.assert_frame_equal(log.samples, same.samples)
+    assert log.source == "ArduPilot DataFlash, text: GPS, MAG, ATT"
+
+
+def telemetry(path: Path, kind: str, air: float) -> Path:
+    """Telemetry of ArduPilot or PX4; positions without a fix do not count."""
     link, parts = MAVLink(None), []
-    for row, (field, angles) in enumerate(zip((AXES / 100).round().tolist(), ATTITUDE.tolist(), strict=True)):
+    for row, (field, angles, q) in enumerate(
+        zip(AXES.tolist(), ATTITUDE.tolist(), quaternions(ATTITUDE).tolist(), strict=True)
+    ):
         place = [round(x * 1e7) for x in PLACE] if row else [0, 0]
         zeros = (0,) * 6
-        messages = (
-            MAVLink_raw_imu_message(0, *zeros, *map(int, field)),
-            MAVLink_attitude_message(0, *map(math.radians, angles), 0, 0, 0),
-            MAVLink_gps_raw_int_message(0, 3 if row else 1, *place, *zeros),
-        )
+        imu = MAVLink_raw_imu_message(0, *zeros, *(round(axis / 100) for axis in field))
+        attitude = MAVLink_attitude_message(0, *map(math.radians, angles), 0, 0, 0)
+        if kind == "PX4":
+            imu = MAVLink_highres_imu_message(0, *zeros, *(axis / 1e5 for axis in field), 0, 0, 0, 0, 0, 1)
+            attitude = MAVLink_attitude_quaternion_message(0, *q, 0, 0, 0)
+        fix = MAVLink_gps_raw_int_message(0, 3 if row else 1, *place, *zeros)
+        messages = imu, attitude, fix, MAVLink_vfr_hud_message(air, 20.0, 0, 0, 0.0, 0.0)
         stamp = struct.pack(">Q", int((UTC + row) * 1e6))
         parts += [stamp + message.pack(link) for message in messages]
-    log = read_log(written(tmp_path / "log.tlog", b"".join(parts)))
+    return written(path, b"".join(parts))
+
+
+@pytest.mark.parametrize(("kind", "air"), [("ArduPilot", 25.0), ("PX4", math.nan), ("PX4", 0.0)])
+def test_telemetry(tmp_path: Path, kind: str, air: float) -> None:
+    """Milligauss or gauss, radians or quaternions; airspeed, or groundspeed without an airspeed sensor."""
+    log = read_log(telemetry(tmp_path / "log.tlog", kind, air))
     found = elements_of_axes(log.tensor("x", "y", "z"), log.tensor("roll", "pitch", "heading"), north="true").elements
-    assert (found - ELEMENTS).abs().amax(0).lt(torch.tensor([0.3, 0.2, 100.0])).all(), "whole milligauss"
+    limits = torch.tensor([0.3, 0.2, 100.0]) if kind == "ArduPilot" else torch.tensor([0.001, 0.001, 1.0])
+    assert (found - ELEMENTS).abs().amax(0).lt(limits).all(), "whole milligauss, or float32"
     assert log.tensor("latitude", "longitude")[0].tolist() == pytest.approx(PLACE, abs=1e-6)
+    assert log.samples["speed"].tolist() == [air if air > 0 else 20.0] * 12
+    speed = "airspeed" if air > 0 else "groundspeed"
+    names = {"ArduPilot": ["RAW_IMU", "ATTITUDE"], "PX4": ["HIGHRES_IMU:1", "ATTITUDE_QUATERNION"]}[kind]
+    assert log.source == f"MAVLink telemetry: {', '.join([*names, 'GPS_RAW_INT', f'VFR_HUD.{speed}'])}"
 
 
 @pytest.mark.parametrize(("version", "storage"), [(1, "bag"), (2, "db3"), (2, "mcap")])
