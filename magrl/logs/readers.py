@@ -1,4 +1,4 @@
-"""Read the log of a vehicle: CSV files, and the formats of autopilots, ROS and ships."""
+"""Read the log of a vehicle: CSV files, and the formats of autopilots, ROS, ships and observatories."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pandas import Series
 
 from magrl.checks import check_choice, short
 from magrl.logs.autopilots import read_ardupilot, read_bag, read_nmea, read_ulg
-from magrl.logs.samples import AXES, Array, Log, Recording, samples_of, times_of
+from magrl.logs.samples import ATTITUDE, AXES, Array, Log, Recording, samples_of, times_of
 from magrl.logs.units import EARTH_NT, column_of, guess_unit
 from magrl.logs.vectors import FRAMES
 
@@ -45,7 +45,9 @@ def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) 
     recordings = []
     for path in map(Path, paths):
         reader = _reader(path)
-        options = {} if reader is read_nmea else {"frame": frame} if reader is read_csv else {"sensor": sensor}
+        options = {"frame": frame} if reader is read_csv else {"sensor": sensor}
+        if reader in (read_nmea, read_iaga):
+            options = {}
         try:
             recordings.append(reader(path, **options))
         except ImportError:
@@ -73,7 +75,8 @@ def _reader(path: Path) -> Callable[..., Recording]:
             if re.match(pattern, start, re.DOTALL):
                 return reader
     raise ValueError(
-        f"a log is a file of CSV, PX4, ArduPilot, ROS, NMEA 0183, or a folder of ROS 2 that exists, got {str(path)!r}"
+        f"a log is a file of CSV, PX4, ArduPilot, MAVLink, ROS, NMEA 0183 or IAGA-2002, or a folder of ROS 2 that "
+        f"exists, got {str(path)!r}"
     )
 
 
@@ -125,10 +128,44 @@ def _numbers(column: Series) -> Array:
     return numbers.to_numpy(float)
 
 
+def read_iaga(path: Path) -> Recording:
+    """Read the record of an observatory (IAGA-2002) as that of a fixed vehicle with axes north, east, down.
+
+    Rows without X, Y, Z or H, D, Z are left out. The attitude is zero; the header has the position and the altitude.
+    """
+    head, _, body = path.read_text(errors="replace").partition("\nDATE ")
+    station = dict(re.findall(r"^ *(\w[\w ]*?) {2,}(\S.*?) *\|", head, re.MULTILINE))
+    header, _, rows = body.partition("\n")
+    letters = [name[-1] for name in header.strip("| \r").split()[2:]]
+    table = pandas.read_csv(io.StringIO(rows), sep=r"\s+", names=["date", "time", "day", *letters], index_col=False)
+    table[letters] = table[letters].where(table[letters] < _IAGA_MISSING)
+    if {*"HDZ"} <= {*letters}:
+        angle = np.radians(table["D"] / 60)
+        table = table.assign(X=table["H"] * np.cos(angle), Y=table["H"] * np.sin(angle))
+    elif not {*"XYZ"} <= {*letters}:
+        raise ValueError(f"its components are {', '.join(letters)}: a record of X, Y, Z or of H, D, Z is needed")
+    table = table.dropna(subset=[*"XYZ"]).reset_index(drop=True)
+    time, notes = times_of((table["date"] + "T" + table["time"] + "Z").rename("time"))
+    columns = dict(zip(AXES, (table[name] for name in "XYZ"), strict=True)) | dict.fromkeys(ATTITUDE, 0.0)
+    columns |= {name: unit * float(station[key]) for key, (name, unit) in _STATION.items() if key in station}
+    if "variation" in station.get("Data Type", "").lower():
+        notes.append("the data are variations without the baselines of the observatory: they are not the whole field")
+    streams = {name: (time, np.zeros(len(time)) + values) for name, values in columns.items()}
+    return Recording(streams, f"IAGA-2002: {station.get('Station Name', path.stem)}", "true", notes)
+
+
+_IAGA_MISSING = 88888.0  # not recorded; 99999 is missing
+_STATION = {
+    "Geodetic Latitude": ("latitude", 1.0),
+    "Geodetic Longitude": ("longitude", 1.0),
+    "Elevation": ("altitude", 1e-3),
+}
+"""Fields of the header of IAGA-2002: column, and its unit."""
 _FORMATS: Sequence[tuple[bytes, Callable[..., Recording]]] = (
     (rb"ULog", read_ulg),
     (rb"\xa3\x95|\0.{7}[\xfd\xfe]|([^\n]*\n)*?FMT, ?\d+,", read_ardupilot),
     (rb"#ROSBAG|SQLite format 3|\x89MCAP", read_bag),
+    (rb"\s*Format +IAGA-2002", read_iaga),
     (rb"([^\n]*\n)*?[^\n,]*[$!][A-Z]{2}[A-Z\d]{3},", read_nmea),
     (rb"[^\0]*\Z", read_csv),
 )

@@ -28,7 +28,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from support.logs import ATTITUDE, AXES, ELEMENTS, PLACE, UTC, dataflash, nmea, quaternions, ulog
 
-from magrl.logs import Log, elements_of_axes, from_enu, read_log
+from magrl.logs import Log, axes_of_elements, elements_of_axes, from_enu, read_log
 
 
 def check(log: Log, *, date: str | None = "2026-06-30") -> None:
@@ -239,6 +239,39 @@ def test_the_deviation_of_a_compass_counts(tmp_path: Path) -> None:
     lines = [line for line in content.splitlines(keepends=True) if b"HDT" not in line and b"E,3.0,E" not in line]
     log = read_log(written(tmp_path / "log.nmea", b"".join([lines[0], lines[-1], *lines[1:], lines[-1]])))
     assert log.samples["heading"].tolist() == pytest.approx([175.0] * len(log.samples))
+
+
+def iaga(names: str, rows: list[tuple[float, ...]], kind: str = "definitive") -> bytes:
+    """A record of an observatory: https://www.ngdc.noaa.gov/IAGA/vdat/IAGA2002/iaga2002format.html."""
+    head = {"Format": "IAGA-2002", "Station Name": "Zurich", "IAGA CODE": "ZUR", "Geodetic Latitude": PLACE[0]}
+    head |= {"Geodetic Longitude": PLACE[1] + 360, "Elevation": 600, "Reported": names, "Data Type": kind}
+    lines = [f" {name:<23}{value:<45}|" for name, value in head.items()]
+    lines += [f" # {'a comment with $GPRMC, in it':<66}|", f"{'DATE       TIME         DOY':<30}"]
+    lines[-1] += "".join(f" ZUR{name}     " for name in names) + "  |"
+    for minute, values in enumerate(rows):
+        time = f"2026-06-30 12:{minute:02}:00.000 181   "
+        lines.append(time + "".join(f" {value:9.2f}" for value in values))
+    return "\r\n".join([*lines, ""]).encode()
+
+
+@pytest.mark.parametrize("names", ["XYZF", "HDZF", "DHZF"])
+def test_observatory(tmp_path: Path, names: str) -> None:
+    """A fixed vehicle with axes north, east, down; D is in minutes of arc; rows with a missing value do not count."""
+    (d, _, h), (x, y, z) = ELEMENTS.tolist(), axes_of_elements(ELEMENTS, torch.zeros(3).double()).tolist()
+    values = {"X": x, "Y": y, "Z": z, "H": h, "D": 60 * d, "F": 99999.0}
+    whole = tuple(values[name] for name in names)
+    rows = [whole, (*whole[:2], 99999.0, 0.0), (88888.0, *whole[1:]), (*whole[:3], 48000.0)]
+    path = written(tmp_path / "zur.min", iaga(names, rows))
+    log = read_log(path)
+    assert log.tensor("roll", "pitch", "heading").abs().max() == 0
+    found = elements_of_axes(log.tensor("x", "y", "z"), torch.zeros(2, 3).double(), north="true").elements
+    assert torch.allclose(found, ELEMENTS.expand(2, 3), atol=0.01)
+    assert log.tensor("latitude", "longitude", "altitude")[0].tolist() == pytest.approx([*PLACE, 0.6])
+    assert np.diff(log.samples["time"]).tolist() == [180.0]
+    assert (log.date, log.north, log.source, log.notes) == ("2026-06-30", "true", "IAGA-2002: Zurich", ())
+    assert "without the baselines" in read_log(written(path, iaga(names, rows, "variation"))).notes[0]
+    with pytest.raises(ValueError, match="its components are H, E, Z, F: a record of X, Y, Z or of H, D, Z is needed"):
+        read_log(written(path, iaga("HEZF", rows)))
 
 
 @pytest.mark.parametrize("separator", [",", " ", "\t", "; "])
