@@ -297,7 +297,7 @@ def read_nmea(path: Path) -> Recording:
     for line in path.read_bytes().splitlines(keepends=True):
         tag = re.match(rb"\\[^\\]*\bc:(\d+)", line)
         for _, message in reader(io.BytesIO(line), quitonerror=0):
-            if any(getattr(message, field, None) == value for field, value in _INVALID.items()):
+            if message is None or any(getattr(message, field, None) == value for field, value in _INVALID.items()):
                 continue
             now = int(tag[1]) / (1000 if len(tag[1]) > 11 else 1) if tag else _nmea_time(message) or now
             for name, value in nmea_values(message):

@@ -232,6 +232,8 @@ def test_nmea(tmp_path: Path) -> None:
 def test_sentences_that_say_nothing(tmp_path: Path, sentence: str) -> None:
     log, same = (read_log(written(tmp_path / "log.log", nmea(*extra))) for extra in ((sentence,), ()))
     assert log.samples.equals(same.samples)
+    damaged = f"${sentence}\r\n".encode()  # without a checksum
+    assert read_log(written(tmp_path / "log.log", nmea() + damaged)).samples.equals(same.samples)
 
 
 def test_the_deviation_of_a_compass_counts(tmp_path: Path) -> None:
