@@ -80,7 +80,7 @@ def readings_of(
     samples = pandas.DataFrame(np.column_stack((time, path, field)), columns=["time", *_PATH, *_FIELD])
     for name in _MEANS:
         if name in log.samples:
-            samples[name] = np.unwrap(log.samples[name], period=360)
+            samples[name] = log.samples[name] if name == "altitude" else np.unwrap(log.samples[name], period=360)
     clean = ~_spikes(field, part)
     groups = samples[clean].groupby(part[clean])
     table = _readings(groups.mean(), _covariance(field[clean], part[clean]), north)
@@ -111,7 +111,7 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     Args:
         path: the file.
         names: its columns by ``D``, ``I``, ``B_H``, ``heading``, ``distance``, and optionally ``latitude`` and
-            ``longitude``, which the file may lack.
+            ``longitude``, and ``altitude`` [km], which the file may lack.
         time: its column of the time, numbers or ISO 8601, which it may lack.
 
     Returns:
@@ -134,7 +134,7 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     log = DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
     located = any(names.get(key) in raw for key in ("latitude", "longitude"))
     for key, name in names.items():
-        if key in ("latitude", "longitude") and not located:
+        if (key in ("latitude", "longitude") and not located) or (key == "altitude" and name not in raw):
             continue
         if name not in raw:
             raise ValueError(f"no column of {path} is {name!r}: name that of {key}, one of {[*raw]}")

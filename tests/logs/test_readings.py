@@ -53,6 +53,11 @@ def test_distances_speeds_or_positions(motion: str) -> None:
         assert table["longitude"].iloc[[0, -1]].tolist() == pytest.approx([179.94, -179.7], abs=0.01)
 
 
+def test_the_altitude_is_a_mean_and_not_an_angle() -> None:
+    table = readings_of(sailed(speed=60 / 3.6, altitude=np.repeat([0.0, 400.0], 3000)), every_km=25.0)
+    assert table["altitude"].tolist() == pytest.approx([0, 0, 400, 400], abs=1)
+
+
 def test_spikes_do_not_count() -> None:
     noise = np.random.default_rng(0).normal(0, 30, (6000, 3))
     noise[::100] = 30000
