@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas
-from pandas import Series
+from pandas import DataFrame, Series
 
 from magrl.checks import check_choice, short
 from magrl.logs.autopilots import read_ardupilot, read_bag, read_nmea, read_ulg
 from magrl.logs.samples import ATTITUDE, AXES, Array, Log, Recording, samples_of, times_of
-from magrl.logs.units import EARTH_NT, column_of, guess_unit
+from magrl.logs.units import column_of, intensity_mistake
 from magrl.logs.vectors import FRAMES
 
 _NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
@@ -55,9 +55,8 @@ def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) 
         except Exception as error:  # whatever the packages raise for a foreign or damaged file
             raise ValueError(f"cannot read {path}: {error}") from error
     samples, notes = samples_of({name: pair for recording in recordings for name, pair in recording.streams.items()})
-    length = float(np.sqrt(np.square(samples[list(AXES)]).sum(axis=1)).median())
-    if unit := guess_unit(length, EARTH_NT):
-        notes.append(f"the total intensity is {length:g}, which looks like {unit}: name the columns mag_x_{unit}, ...")
+    if mistake := intensity_mistake(float(np.sqrt(np.square(samples[list(AXES)]).sum(axis=1)).median())):
+        notes.append(mistake)
     norths = [recording.north for recording in recordings if "heading" in recording.streams]
     more = [note for recording in recordings for note in recording.notes]
     source = "; ".join(recording.source for recording in recordings)
@@ -96,14 +95,7 @@ def read_csv(path: Path, frame: str = "FRD") -> Recording:
         raise ValueError("the table has no row")
     cut = lines[-1].count(comma) < lines[0].count(comma)
     raw = raw[:-1] if cut else raw
-    headers: dict[str, tuple[str, float]] = {}
-    for header in raw:
-        if column := column_of(header):
-            if column[0] in headers:
-                raise ValueError(f"{headers[column[0]][0]!r} and {header!r} are both the {column[0]}: keep one of them")
-            headers[column[0]] = header, column[1]
-    if "time" not in headers:
-        raise ValueError(f"no column is the time, among {', '.join(raw)}: name it time, or time_ms")
+    headers = _headers(raw)
     time, notes = times_of(raw[headers["time"][0]], headers["time"][1])
     values = {name: factor * _numbers(raw[header]) for name, (header, factor) in headers.items() if name != "time"}
     valid = {name: np.isfinite(time) & np.isfinite(series) for name, series in values.items()}
@@ -116,6 +108,27 @@ def read_csv(path: Path, frame: str = "FRD") -> Recording:
     north = "true" if "true" in heading else "magnetic" if "mag" in heading else None
     streams = {name: (time[valid[name]], series[valid[name]]) for name, series in values.items()}
     return Recording(streams, f"CSV, {len(raw)} rows", north, notes)
+
+
+def _headers(raw: DataFrame) -> dict[str, tuple[str, float]]:
+    """Return the header and the unit of each column that is known; raise an error that names all that are wrong."""
+    headers: dict[str, tuple[str, float]] = {}
+    wrong = []
+    for header in raw:
+        try:
+            column = column_of(header)
+        except ValueError as error:
+            wrong.append(str(error))
+            continue
+        if column and column[0] in headers:
+            wrong.append(f"{headers[column[0]][0]!r} and {header!r} are both the {column[0]}: keep one of them")
+        elif column:
+            headers[column[0]] = header, column[1]
+    if "time" not in headers:
+        wrong.append(f"no column is the time, among {', '.join(raw)}: name it time, or time_ms")
+    if wrong:
+        raise ValueError("; ".join(wrong))
+    return headers
 
 
 def _numbers(column: Series) -> Array:

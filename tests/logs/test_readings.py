@@ -126,6 +126,11 @@ def test_a_log_without_a_heading_has_that_of_its_compass() -> None:
             {},
             "neither distances nor speeds nor positions",
         ),
+        (
+            lambda log: Log(log.samples.drop(columns="speed"), "by hand"),
+            {},
+            "does not state the north .*; the log has neither",
+        ),
         (lambda log: log, {"every_km": 0.0}, "every_km must be a finite number above 0"),
         (lambda log: log, {"north": "grid"}, "north must be one of 'true', 'magnetic', 'model', got 'grid'"),
     ],
