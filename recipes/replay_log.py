@@ -23,11 +23,10 @@ from typing import Literal
 
 from magrl.agents import load_policy
 from magrl.evaluation.tables import markdown_table
-from magrl.field import IGRF, elements_at
 from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
-from magrl.logs import joined, mistakes, read_readings
+from magrl.logs import difference_from_igrf, joined, mistakes, read_readings
 from magrl.onboard import Onboard
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Way
@@ -93,13 +92,16 @@ class Config:
     """Column of the true latitude [deg]; optional, together with the longitude."""
     longitude: str = "longitude"
     """Column of the true longitude [deg]."""
+    altitude: str = "altitude"
+    """Column of the altitude [km], at which readings are compared with IGRF; optional, by default sea level."""
     out: Path = Path("runs/replay_log")
     """Folder of log.csv, log.md and log.png, which are replaced."""
 
 
 def read_log(config: Config) -> pd.DataFrame:
     """Return the columns of the log, see :func:`magrl.logs.read_readings`."""
-    names = {key: getattr(config, OPTIONS.get(key, key)) for key in (*ELEMENTS, "heading", "distance", *PLACE)}
+    keys = (*ELEMENTS, "heading", "distance", *PLACE, "altitude")
+    names = {key: getattr(config, OPTIONS.get(key, key)) for key in keys}
     log = read_readings(config.log, names, config.time)
     log.attrs["date"] = config.date or log.attrs["date"]
     return log
@@ -155,7 +157,7 @@ def vehicle_north(log: pd.DataFrame, date: str | None) -> torch.Tensor:
     """Return the direction of magnetic north ``(T,)`` [deg]: of IGRF, or without positions and date as logged."""
     if date is None or "latitude" not in log:
         return torch.tensor(log["D"].to_numpy(dtype=float))
-    return elements_at(IGRF(date), torch.tensor(log[["latitude", "longitude"]].to_numpy(dtype=float)))[:, 0]
+    return torch.tensor(log["D"].to_numpy(dtype=float)) - difference_from_igrf(log, date)[:, 0]
 
 
 def last_way(table: pd.DataFrame) -> Way:
@@ -239,7 +241,7 @@ def draw_distance(axes: Axes, table: pd.DataFrame) -> None:
 
 def markdown(table: pd.DataFrame) -> str:
     """Return the table with rounded numbers."""
-    hidden = [*ELEMENTS, "latitude", "longitude", "covariance", "north_deg"]
+    hidden = [*ELEMENTS, *PLACE, "altitude", "covariance", "north_deg"]
     shown = table.drop(columns=hidden, errors="ignore")
     text = shown.apply(lambda column: column.map(FORMATS.get(column.name, "{:.1f}").format))
     return markdown_table(list(shown), text.to_numpy())

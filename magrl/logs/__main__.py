@@ -5,17 +5,20 @@
     python recipes/replay_log.py way_readings.csv                                            # what would be commanded
 
 Logs are CSV files (columns such as time_s, mag_x_nT, mag_y_uT, roll_deg, heading_true_deg, speed_kn, lat, lon) and
-those of autopilots and ships (docs/onboard.md). The axes are forward, right, down, the angles roll, pitch, heading.
+those of autopilots, ships and observatories (docs/onboard.md). The axes are forward, right, down, the angles roll,
+pitch, heading.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas
+from pandas import DataFrame, Series
 
 from magrl.checks import command
 from magrl.field.elements import NAMES
@@ -23,8 +26,9 @@ from magrl.files import check_writable
 from magrl.logs.calibration import Calibration, calibrate
 from magrl.logs.comparison import difference_from_igrf, mistakes
 from magrl.logs.readers import read_log
-from magrl.logs.readings import STD_NAMES, readings_of
+from magrl.logs.readings import STD_NAMES, obstacles, readings_of
 from magrl.logs.samples import ATTITUDE, AXES, Log
+from magrl.logs.units import intensity_mistake
 from magrl.logs.vectors import FRAMES, NORTHS
 
 _DIGITS = {"time": 2, "D": 4, "I": 4, "B_H": 2, "heading": 3, "distance": 4, "latitude": 6, "longitude": 6}
@@ -70,7 +74,8 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def _main(options: argparse.Namespace) -> None:
     log = read_log(*options.log, frame=options.frame, sensor=options.sensor)
-    print("\n".join(summary(log)))
+    notes = [] if options.calibrate else [f"note: {text}" for text in remarks(log, options)]
+    print("\n".join([*summary(log), *notes]), flush=True)
     date = options.date or log.date
     lines = swing(log, options, date) if options.calibrate else way(log, options, date)
     print("\n".join(lines))
@@ -81,13 +86,35 @@ def summary(log: Log) -> list[str]:
     samples = log.samples
     time = samples["time"].to_numpy(float)
     rate = f"{1 / np.median(np.diff(time)):.3g} Hz" if len(time) > 1 else "one sample"
-    total = np.sqrt(np.square(samples[list(AXES)]).sum(axis=1))
+    total = _totals(log)
     return [
         f"{log.source}: {len(samples)} samples in {time[-1] - time[0]:.4g} s, {rate}, date {log.date or 'unknown'}",
         f"columns: {', '.join(samples)}; north of the heading: {log.north or 'not stated'}",
         f"total intensity as logged: {total.median():.0f} nT, from {total.min():.0f} to {total.max():.0f}",
-        *(f"note: {note}" for note in log.notes),
+        *(f"note: {note}" for note in log.notes if note != intensity_mistake(total.median())),
     ]
+
+
+def remarks(log: Log, options: argparse.Namespace) -> list[str]:
+    """Return what makes readings less accurate and does not prevent them, with the remedy."""
+    texts = []
+    if missing := " and ".join(name for name in ATTITUDE[:2] if name not in log.samples):
+        texts.append(f"no {missing}: the vehicle is taken as level, and I is wrong by up to its tilt; log both angles")
+    if _north(log, options) in ("magnetic", "model"):
+        texts.append(_NO_NORTH)
+    if not options.calibration:
+        texts.append("no calibration: iron remains, unless the autopilot corrected it; swing, and give --calibration")
+    return texts
+
+
+def _north(log: Log, options: argparse.Namespace) -> str | None:
+    """Return the north of the heading; that of a log without a heading is magnetic."""
+    return (options.north or log.north) if "heading" in log.samples else "magnetic"
+
+
+def _totals(log: Log) -> Series:
+    """Return the total intensity of each sample [nT]."""
+    return np.sqrt(np.square(log.samples[list(AXES)]).sum(axis=1))
 
 
 def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
@@ -97,7 +124,7 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
         if "latitude" not in log.samples:
             raise ValueError("the log has no position: state the place of the swing by --here, such as --here 60.4 5.3")
         here = log.tensor("latitude", "longitude").median(0).values.tolist()
-    attitude = log.tensor(*ATTITUDE) if (options.north or log.north) == "true" and "heading" in log.samples else None
+    attitude = log.tensor(*ATTITUDE) if _north(log, options) == "true" else None
     settings = {"date": date if len(here) == 2 else None, "alignment_deg": options.alignment_deg}
     calibration = calibrate(log.tensor(*AXES), here, attitude_deg=attitude, **settings)
     check_writable(options.calibrate)
@@ -112,18 +139,34 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
 
 
 def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
-    """Write the readings of a log, and return them beside IGRF, with the likely mistakes."""
-    out = options.out or options.log[0].with_name(f"{options.log[0].stem}_readings.csv")
+    """Write the readings of a log, and return them beside IGRF, with the likely mistakes.
+
+    Raises:
+        ValueError: if anything prevents readings; all that is wrong is printed before.
+    """
     iron = Calibration.load(options.calibration) if options.calibration else None
-    table = readings_of(log, every_km=options.every_km, every_s=options.every_s, north=options.north, calibration=iron)
-    first = table.iloc[0]
-    lines = [f"first reading: {_elements(first[list(NAMES)])}; {int(table['spikes'].sum())} spikes left out"]
+    settings = {"every_km": options.every_km, "every_s": options.every_s, "calibration": iron}
+    mistake = intensity_mistake(_totals(log).median())
+    wrong = [*filter(None, [mistake]), *obstacles(log, options.north)]
+    if wrong:
+        if not mistake and not obstacles(log, "true"):  # the north alone is missing, and D may show it
+            wrong += mistakes(readings_of(log, north="true", **settings), date)
+        print("\n".join(f"error: {text}" for text in wrong), file=sys.stderr)
+        raise ValueError("no readings: correct what is named above")
+    table = readings_of(log, north=options.north, **settings)
+    lines = [f"first reading: {_elements(table.iloc[0][list(NAMES)])}; {int(table['spikes'].sum())} spikes left out"]
     if "latitude" in table and date:
         mean = difference_from_igrf(table, date).mean(0)
         lines.append(f"minus IGRF of {date}, mean of {len(table)}: {_elements(mean)}")
     lines += [f"warning: {text}" for text in mistakes(table, date)]
     if len(table) < 2:
         return [*lines, "one reading: no file is written; choose shorter moves by --every-km or --every-s"]
+    return [*lines, *_written(table, log, options, iron)]
+
+
+def _written(table: DataFrame, log: Log, options: argparse.Namespace, iron: Calibration | None) -> list[str]:
+    """Write readings, and return the file and the command of a replay."""
+    out = options.out or options.log[0].with_name(f"{options.log[0].stem}_readings.csv")
     check_writable(out)
     stamp = pandas.to_datetime(table["time"], unit="s", utc=True).dt.strftime("%Y-%m-%dT%H:%M:%SZ")
     table.round(_DIGITS).assign(**({"time": stamp} if log.date else {})).to_csv(out, index=False)
@@ -132,10 +175,8 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     missing = "" if iron else "; no calibration: give --bias of your sensors"
     if std.isna().any():
         noise, missing = "D I B_H", f"; too few samples for --noise: give that of your sensors{missing}"
-    magnetic = "" if (options.north or log.north) == "true" and "heading" in log.samples else " --north magnetic"
+    magnetic = "" if _north(log, options) == "true" else " --north magnetic"
     return [
-        *lines,
-        *[_NO_NORTH] * bool(magnetic),
         f"{len(table)} readings, moves of {table['distance'][1:].mean():.3g} km: {out}",
         f"replay: python recipes/replay_log.py {out}{magnetic} --noise {noise} --bias {bias}{missing}",
     ]

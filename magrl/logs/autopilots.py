@@ -27,6 +27,7 @@ MODEL_NORTH = (
 )
 NOT_CALIBRATED = "the magnetometer is as it was measured, without the calibration of the autopilot"
 _Rows = dict[tuple[str, ...], dict[str, list[tuple[float, ...]]]]
+_Tables = dict[tuple[str, ...], Mapping[str, Array]]
 _QUATERNION, _PLACE = ("w", "x", "y", "z"), ("latitude", "longitude")
 
 
@@ -103,7 +104,7 @@ def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     instances = sorted(log.data_list, key=lambda item: item.multi_id)
     topics = {item.name: item.data for item in reversed(instances)}  # the first instance of each
     fields, used = _px4_fields(instances, topics)
-    tables: dict[tuple[str, ...], Mapping[str, Array]] = {AXES: fields}
+    tables: _Tables = {AXES: fields}
     if "vehicle_attitude" in topics:
         tables[_QUATERNION] = _px4_table(topics, "vehicle_attitude", [f"q[{index}]" for index in range(4)])
     position = topics.get("vehicle_gps_position", {})
@@ -153,13 +154,17 @@ def _is_cut(path: Path) -> bool:
     return position != len(content)
 
 
-# ArduPilot
+# ArduPilot and MAVLink
 
+_SPEEDS = ("airspeed", "groundspeed")
 _MESSAGES: dict[str, tuple[tuple[str, ...], Sequence[str], float]] = {
     "ATT": (ATTITUDE, ("Roll", "Pitch", "Yaw"), 1.0),
     "ATTITUDE": (ATTITUDE, ("roll", "pitch", "yaw"), UNITS["angle"]["rad"]),
     "GPS": (_PLACE, ("Lat", "Lng"), 1.0),
+    "ATTITUDE_QUATERNION": (_QUATERNION, ("q1", "q2", "q3", "q4"), 1.0),
     "GPS_RAW_INT": (_PLACE, ("lat", "lon"), 1e-7),
+    "VFR_HUD": (_SPEEDS, _SPEEDS, 1.0),
+    "HIGHRES_IMU": (AXES, ("xmag", "ymag", "zmag"), FIELD_NT["gauss"]),
 }
 """Messages of DataFlash and of telemetry: columns, their fields, and their unit."""
 _RAW = dict.fromkeys(("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3"), ("xmag", "ymag", "zmag"))
@@ -167,32 +172,50 @@ _MAGS = {"MAG": ("MagX", "MagY", "MagZ")} | _RAW
 _MESSAGES |= {name: (AXES, fields, FIELD_NT["milligauss"]) for name, fields in _MAGS.items()}
 _USE = {"MAG": "COMPASS_USE", "MAG:1": "COMPASS_USE2", "MAG:2": "COMPASS_USE3"}
 """Magnetometers, and the parameter by which the vehicle uses them."""
+_KINDS = {
+    b"\xa3": ("ArduPilot DataFlash", "DFReader", "DFReader_binary"),
+    b"F": ("ArduPilot DataFlash, text", "DFReader", "DFReader_text"),
+    b"\0": ("MAVLink telemetry", "mavutil", "mavlogfile"),
+}
+"""Name of the format, module and reader of pymavlink, by the first byte; a text may have other lines before FMT."""
 
 
 def read_ardupilot(path: Path, sensor: str | None = None) -> Recording:
-    """Read a log of ArduPilot with pymavlink, DataFlash or telemetry: a magnetometer with its offsets, attitude, GNSS.
+    """Read a log of ArduPilot (DataFlash, binary or text) or telemetry of MAVLink (also of PX4) with pymavlink.
 
-    The magnetometer is the first that COMPASS_USE lets the vehicle use and whose messages are healthy.
+    The magnetometer, with its offsets, is the first that COMPASS_USE lets the vehicle use and whose messages are
+    healthy. The speed is that through the air where it is measured, else that over ground.
     """
     with path.open("rb") as file:
-        flash = file.read(2) == b"\xa3\x95"
-    module, name = ("DFReader", "DFReader_binary") if flash else ("mavutil", "mavlogfile")
+        kind, module, name = _KINDS.get(file.read(1), _KINDS[b"F"])
     reader = getattr(package(f"pymavlink.{module}", "pymavlink"), name)
     rows: _Rows = defaultdict(lambda: defaultdict(list))
     with closing(reader(str(path))) as log:
         while message := log.recv_match(type=[*_MESSAGES, "PARM"]):
-            name, number = message.get_type(), getattr(message, "I", 0)
+            name = message.get_type()
+            number = getattr(message, "id" if "id" in message.get_fieldnames() else "I", 0)
             fixed = min(getattr(message, "Status", 3), getattr(message, "fix_type", 3)) >= 3
             if name in _MESSAGES and fixed and getattr(message, "Health", 1):
                 columns, fields, unit = _MESSAGES[name]
                 values = (unit * getattr(message, field) for field in fields)
                 rows[columns][f"{name}:{number}" if number else name].append((message._timestamp, *values))
     used = [name for name, parameter in _USE.items() if log.params.get(parameter, 1)]
-    recording = _recording(f"ArduPilot {'DataFlash' if flash else 'telemetry'}", _tables(rows), sensor, used)
+    recording = _recording(kind, _one_speed_and_attitude(_tables(rows)), sensor, used)
     return recording._replace(north="model", notes=[MODEL_NORTH, *recording.notes])
 
 
-def _tables(rows: _Rows) -> dict[tuple[str, ...], Mapping[str, Array]]:
+def _one_speed_and_attitude(tables: _Tables) -> _Tables:
+    """Return tables with one speed, through the air where it is measured, and one attitude."""
+    speeds = tables.pop(_SPEEDS, {})
+    if ATTITUDE in tables:
+        tables.pop(_QUATERNION, None)
+    for name, rows in speeds.items():
+        column = 1 if np.median(rows[:, 1]) > 0 else 2  # zero or NaN without an airspeed sensor
+        tables[("speed",)] = {f"{name}.{_SPEEDS[column - 1]}": rows[np.isfinite(rows[:, column])][:, [0, column]]}
+    return tables
+
+
+def _tables(rows: _Rows) -> _Tables:
     """Return rows of each sensor as an array, in the order of their times, and sensors in that of their names."""
     return {columns: {name: np.array(sorted(some[name])) for name in sorted(some)} for columns, some in rows.items()}
 
@@ -201,14 +224,17 @@ def _tables(rows: _Rows) -> dict[tuple[str, ...], Mapping[str, Array]]:
 
 
 def read_bag(path: Path, sensor: str | None = None) -> Recording:
-    """Read a bag of ROS 1 (.bag) or 2 (its folder, or a file in it) with rosbags: a topic of each type that is needed.
+    """Read a bag of ROS 1 (.bag) or 2 with rosbags: a topic of each type that is needed.
+
+    A bag of ROS 2 is its folder, a file in it, or a single file (.mcap, .db3) without the folder's metadata.yaml.
 
     Times are those of the headers. The axes and the attitude of ROS, forward, left, up and east, north, up (REP 103),
     become FRD and NED. The bag does not state the north of the heading, which is that of the Imu.
     """
     highlevel, store = package("rosbags.highlevel", "rosbags"), package("rosbags.typesys", "rosbags")
     rows: _Rows = defaultdict(lambda: defaultdict(list))
-    whole = path if path.is_dir() or path.suffix == ".bag" else path.parent
+    lone = path.suffix == ".bag" or not (path.parent / "metadata.yaml").is_file()
+    whole = path if path.is_dir() or lone else path.parent
     with highlevel.AnyReader([whole], default_typestore=store.get_typestore(store.Stores.LATEST)) as bag:
         for connection, recorded, raw in bag.messages([topic for topic in bag.connections if topic.msgtype in _ROS]):
             columns, values_of = _ROS[connection.msgtype]
@@ -271,7 +297,7 @@ def read_nmea(path: Path) -> Recording:
     for line in path.read_bytes().splitlines(keepends=True):
         tag = re.match(rb"\\[^\\]*\bc:(\d+)", line)
         for _, message in reader(io.BytesIO(line), quitonerror=0):
-            if any(getattr(message, field, None) == value for field, value in _INVALID.items()):
+            if message is None or any(getattr(message, field, None) == value for field, value in _INVALID.items()):
                 continue
             now = int(tag[1]) / (1000 if len(tag[1]) > 11 else 1) if tag else _nmea_time(message) or now
             for name, value in nmea_values(message):

@@ -135,12 +135,13 @@ def _other_cause(elements: Tensor, place: Tensor, date: str) -> str:
     """Return the cause of readings that no mistake in D, I, B_H explains: other positions that fit, or none."""
     latitude, longitude, altitude = place.unbind(-1)
     places = {
-        "latitude and longitude are swapped": (longitude, latitude),
-        "longitudes are positive toward the west, and east is expected": (latitude, -longitude),
-        "latitudes are positive toward the south, and north is expected": (-latitude, longitude),
+        "latitude and longitude are swapped": (longitude, latitude, altitude),
+        "longitudes are positive toward the west, and east is expected": (latitude, -longitude, altitude),
+        "latitudes are positive toward the south, and north is expected": (-latitude, longitude, altitude),
+        "altitudes are in meters, and kilometers are expected": (latitude, longitude, altitude / 1000),
     }
     for cause, coordinates in places.items():
-        there = torch.stack((*coordinates, altitude), -1)
+        there = torch.stack(coordinates, -1)
         if there[:, 0].abs().max() > 90:
             continue
         if sum(deviation is None for deviation in _misfits(elements, _igrf_elements(there, date))) > len(place) / 2:

@@ -65,12 +65,12 @@ def readings_of(
         >>> readings_of(log, every_km=25.0, north="true")[["B_H", "distance"]].round().values.tolist()
         [[19998.0, 0.0], [19992.0, 25.0], [19987.0, 25.0], [19982.0, 25.0]]
     """
+    if texts := obstacles(log, north):
+        raise ValueError("; ".join(texts))
     axes = log.tensor(*AXES) if calibration is None else calibration.apply(log.tensor(*AXES))
     if "heading" not in log.samples and north in (None, "magnetic"):
         log = with_compass(log, axes)
-    north = north or log.north
-    if north is None:
-        raise ValueError(f"the log does not state the north of the heading: give north, one of {', '.join(NORTHS)}")
+    north = north or log.north or ""
     check_choice(NORTHS, north=north)
     check_number(0, above=True, every_km=every_km)
     check_number(0, above=True, optional=True, every_s=every_s)
@@ -80,11 +80,36 @@ def readings_of(
     samples = pandas.DataFrame(np.column_stack((time, path, field)), columns=["time", *_PATH, *_FIELD])
     for name in _MEANS:
         if name in log.samples:
-            samples[name] = np.unwrap(log.samples[name], period=360)
+            samples[name] = log.samples[name] if name == "altitude" else np.unwrap(log.samples[name], period=360)
     clean = ~_spikes(field, part)
     groups = samples[clean].groupby(part[clean])
     table = _readings(groups.mean(), _covariance(field[clean], part[clean]), north)
     return table.assign(samples=groups.size(), spikes=np.bincount(part[~clean], minlength=len(table)))
+
+
+def obstacles(log: Log, north: str | None = None) -> list[str]:
+    """Return all that a log lacks for :func:`readings_of`, as sentences with the remedy; none where nothing is missing.
+
+    Args:
+        log: samples.
+        north: north of the heading; default that of the log.
+
+    Example:
+        >>> obstacles(Log(DataFrame({"time": [0.0], "x": [0.0], "y": [0.0], "z": [0.0], "speed": [1.0]}), "by hand"))
+        []
+    """
+    texts, columns = [], log.samples.columns
+    if "heading" in columns and not (north or log.north):
+        texts.append(f"the log does not state the north of the heading: give north, one of {', '.join(NORTHS)}")
+    elif "heading" not in columns and north in ("true", "model"):
+        texts.append(
+            f"the log has no heading, only {', '.join(columns)}: log it, or give north magnetic, for a compass"
+        )
+    if not {"distance", "speed"} & {*columns} and not {"latitude", "longitude"} <= {*columns}:
+        texts.append(
+            "the log has neither distances nor speeds nor positions, for the moves between readings: log one of them"
+        )
+    return texts
 
 
 def with_compass(log: Log, axes: Tensor) -> Log:
@@ -111,7 +136,7 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     Args:
         path: the file.
         names: its columns by ``D``, ``I``, ``B_H``, ``heading``, ``distance``, and optionally ``latitude`` and
-            ``longitude``, which the file may lack.
+            ``longitude``, and ``altitude`` [km], which the file may lack.
         time: its column of the time, numbers or ISO 8601, which it may lack.
 
     Returns:
@@ -134,7 +159,7 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     log = DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
     located = any(names.get(key) in raw for key in ("latitude", "longitude"))
     for key, name in names.items():
-        if key in ("latitude", "longitude") and not located:
+        if (key in ("latitude", "longitude") and not located) or (key == "altitude" and name not in raw):
             continue
         if name not in raw:
             raise ValueError(f"no column of {path} is {name!r}: name that of {key}, one of {[*raw]}")
@@ -194,12 +219,10 @@ def _path(log: Log) -> Array:
         step = np.diff(samples["time"], prepend=samples["time"].iloc[0])
         length = samples["distance"] if "distance" in samples else samples["speed"] * step / 1000
         heading = np.radians(samples["heading"])
-    elif "latitude" in samples and "longitude" in samples:
+    else:
         place = log.tensor("latitude", "longitude")
         distance, bearing = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))
         length, heading = (np.concatenate(([0.0], values.numpy())) for values in (distance, bearing))
-    else:
-        raise ValueError("the log has neither distances nor speeds nor positions: readings need the moves between them")
     return np.cumsum(np.stack((length * np.cos(heading), length * np.sin(heading)), -1), 0)
 
 

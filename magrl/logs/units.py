@@ -76,3 +76,22 @@ def guess_unit(length: float, total_nt: float) -> str | None:
     """
     fitting = [unit for unit, size in FIELD_NT.items() if 0.55 < length * size / total_nt < 1.45]
     return fitting[0] if fitting and fitting[0] != "nanotesla" else None
+
+
+def intensity_mistake(total: float) -> str | None:
+    """Return what is wrong with a total intensity that is not the Earth's, as a sentence with the remedy.
+
+    Args:
+        total: median total intensity of a log [nT].
+
+    Example:
+        >>> intensity_mistake(48.0)
+        'the total intensity is 48, which looks like microtesla: name the columns mag_x_microtesla, ...'
+    """
+    if unit := guess_unit(total, EARTH_NT):
+        return f"the total intensity is {total:g}, which looks like {unit}: name the columns mag_x_{unit}, ..."
+    if 0.25 < total / EARTH_NT < 4:
+        return None
+    return (
+        f"the total intensity is {total:g}, where about {EARTH_NT:.0f} nT are expected: scale raw counts to nanotesla"
+    )

@@ -92,6 +92,39 @@ def test_a_short_log_is_compared_and_its_noise_is_to_be_stated(folder: Path, cap
     assert "--noise D I B_H --bias 0 0 0; too few samples for --noise" in capsys.readouterr().out
 
 
+MOTION = "neither distances nor speeds nor positions"
+MICROTESLA = "total intensity is .*, which looks like microtesla: name the columns"
+NORTH = "does not state the north of the heading: give north"
+
+
+@pytest.mark.parametrize(
+    ("change", "errors"),
+    [
+        (lambda t: t[["time", "mag_x", "mag_y", "mag_z", "heading"]], [MICROTESLA, NORTH, MOTION]),
+        (lambda t: t.drop(columns=["roll_deg", "pitch_deg"]), [MICROTESLA, NORTH]),
+        (
+            lambda t: t.assign(mag_x=1000 * t["mag_x"], mag_y=1000 * t["mag_y"], mag_z=-1000 * t["mag_z"]),
+            [NORTH, "15 of 15 readings do not fit IGRF.*fits with .*-I: the axes point .*up"],
+        ),
+    ],
+)
+def test_all_that_is_wrong_is_said_in_one_run(folder: Path, capsys, change, errors: list[str]) -> None:
+    table = pd.read_csv(folder / "raw" / "way.csv")
+    path, names = folder / "wrong.csv", {f"mag_{axis}_uT": f"mag_{axis}" for axis in "xyz"}
+    change(table.rename(columns=names | {"heading_true_deg": "heading"})).to_csv(path, index=False)
+    with pytest.raises(SystemExit, match="2"):
+        main([str(path)])
+    out, err = capsys.readouterr()
+    lines = re.findall(r"^error: (.*)", err, re.MULTILINE)
+    assert len(lines) == len(errors)
+    assert all(map(re.search, errors, lines))
+    assert err.splitlines()[-1] == "python -m magrl.logs: no readings: correct what is named above"
+    assert ("note: no roll and pitch: the vehicle is taken as level" in out) == (MICROTESLA in errors)
+    assert "note: no calibration: " in out
+    assert "microtesla" not in out
+    assert not path.with_name("wrong_readings.csv").exists()
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [

@@ -5,23 +5,30 @@ from __future__ import annotations
 import math
 import struct
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 import torch
+from pymavlink.DFReader import DFReader_binary
 from pymavlink.dialects.v20.ardupilotmega import (
     MAVLink,
     MAVLink_attitude_message,
+    MAVLink_attitude_quaternion_message,
     MAVLink_gps_raw_int_message,
+    MAVLink_highres_imu_message,
     MAVLink_raw_imu_message,
+    MAVLink_vfr_hud_message,
 )
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from support.logs import ATTITUDE, AXES, ELEMENTS, PLACE, UTC, dataflash, nmea, quaternions, ulog
 
-from magrl.logs import Log, elements_of_axes, from_enu, read_log
+from magrl.logs import Log, axes_of_elements, elements_of_axes, from_enu, read_log
 
 
 def check(log: Log, *, date: str | None = "2026-06-30") -> None:
@@ -95,30 +102,59 @@ def test_ardupilot_has_the_magnetometer_that_is_used_and_healthy(tmp_path: Path,
     assert torch.allclose(log.tensor("x", "y", "z"), 0.5 * AXES, atol=1)
 
 
-def test_telemetry(tmp_path: Path) -> None:
-    """Milligauss and radians; positions without a fix do not count."""
+def test_ardupilot_as_text(tmp_path: Path) -> None:
+    """The same messages as lines, after a line of another program."""
+    path, text = written(tmp_path / "log.bin", dataflash()), "ArduCopter V4.5.7\n"
+    with closing(DFReader_binary(str(path))) as reader:
+        while message := reader.recv_msg():
+            values = (str(getattr(message, name)) for name in message.get_fieldnames())
+            text += ", ".join([message.get_type(), *values]) + "\n"
+    log, same = read_log(written(tmp_path / "log.log", text.encode())), read_log(path)
+    check(log)
+    pandas.testing.assert_frame_equal(log.samples, same.samples)
+    assert log.source == "ArduPilot DataFlash, text: GPS, MAG, ATT"
+
+
+def telemetry(path: Path, kind: str, air: float) -> Path:
+    """Telemetry of ArduPilot or PX4; positions without a fix do not count."""
     link, parts = MAVLink(None), []
-    for row, (field, angles) in enumerate(zip((AXES / 100).round().tolist(), ATTITUDE.tolist(), strict=True)):
+    for row, (field, angles, q) in enumerate(
+        zip(AXES.tolist(), ATTITUDE.tolist(), quaternions(ATTITUDE).tolist(), strict=True)
+    ):
         place = [round(x * 1e7) for x in PLACE] if row else [0, 0]
         zeros = (0,) * 6
-        messages = (
-            MAVLink_raw_imu_message(0, *zeros, *map(int, field)),
-            MAVLink_attitude_message(0, *map(math.radians, angles), 0, 0, 0),
-            MAVLink_gps_raw_int_message(0, 3 if row else 1, *place, *zeros),
-        )
+        imu = MAVLink_raw_imu_message(0, *zeros, *(round(axis / 100) for axis in field))
+        attitude = MAVLink_attitude_message(0, *map(math.radians, angles), 0, 0, 0)
+        if kind == "PX4":
+            imu = MAVLink_highres_imu_message(0, *zeros, *(axis / 1e5 for axis in field), 0, 0, 0, 0, 0, 1)
+            attitude = MAVLink_attitude_quaternion_message(0, *q, 0, 0, 0)
+        fix = MAVLink_gps_raw_int_message(0, 3 if row else 1, *place, *zeros)
+        messages = imu, attitude, fix, MAVLink_vfr_hud_message(air, 20.0, 0, 0, 0.0, 0.0)
         stamp = struct.pack(">Q", int((UTC + row) * 1e6))
         parts += [stamp + message.pack(link) for message in messages]
-    log = read_log(written(tmp_path / "log.tlog", b"".join(parts)))
+    return written(path, b"".join(parts))
+
+
+@pytest.mark.parametrize(("kind", "air"), [("ArduPilot", 25.0), ("PX4", math.nan), ("PX4", 0.0)])
+def test_telemetry(tmp_path: Path, kind: str, air: float) -> None:
+    """Milligauss or gauss, radians or quaternions; airspeed, or groundspeed without an airspeed sensor."""
+    log = read_log(telemetry(tmp_path / "log.tlog", kind, air))
     found = elements_of_axes(log.tensor("x", "y", "z"), log.tensor("roll", "pitch", "heading"), north="true").elements
-    assert (found - ELEMENTS).abs().amax(0).lt(torch.tensor([0.3, 0.2, 100.0])).all(), "whole milligauss"
+    limits = torch.tensor([0.3, 0.2, 100.0]) if kind == "ArduPilot" else torch.tensor([0.001, 0.001, 1.0])
+    assert (found - ELEMENTS).abs().amax(0).lt(limits).all(), "whole milligauss, or float32"
     assert log.tensor("latitude", "longitude")[0].tolist() == pytest.approx(PLACE, abs=1e-6)
+    assert log.samples["speed"].tolist() == [air if air > 0 else 20.0] * 12
+    speed = "airspeed" if air > 0 else "groundspeed"
+    names = {"ArduPilot": ["RAW_IMU", "ATTITUDE"], "PX4": ["HIGHRES_IMU:1", "ATTITUDE_QUATERNION"]}[kind]
+    assert log.source == f"MAVLink telemetry: {', '.join([*names, 'GPS_RAW_INT', f'VFR_HUD.{speed}'])}"
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_ros(tmp_path: Path, version: int) -> None:
+@pytest.mark.parametrize(("version", "storage"), [(1, "bag"), (2, "db3"), (2, "mcap")])
+def test_ros(tmp_path: Path, version: int, storage: str) -> None:
     """Axes and attitude are those of ROS: forward, left, up; east, north, up.
 
-    Recorded .5 s late and in another order, beside an Imu without attitude and a magnetometer of zeros.
+    Recorded .5 s late and in another order, beside an Imu without attitude and a magnetometer of zeros. A file of a
+    folder is read with the metadata of the folder and without.
     """
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
     kind = {
@@ -126,7 +162,8 @@ def test_ros(tmp_path: Path, version: int) -> None:
     }
     zeros, unknown, place = np.zeros(9), np.array([-1.0, *[0.0] * 8]), (*PLACE, 0.0)
     path = tmp_path / ("log.bag" if version == 1 else "log")
-    with Writer1(path) if version == 1 else Writer2(path, version=9) as writer:
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Writer1(path) if version == 1 else Writer2(path, version=9, storage_plugin=plugin) as writer:
         types = {"/dead": "MagneticField", "/mag": "MagneticField", "/accelerometer": "Imu", "/imu": "Imu"}
         types |= {"/fix": "NavSatFix"}
         topics = {
@@ -161,7 +198,9 @@ def test_ros(tmp_path: Path, version: int) -> None:
     with pytest.raises(ValueError, match="no sample has a field"):
         read_log(path, sensor="/dead")
     if version == 2:
-        check(read_log(next(path.glob("*.db3"))))
+        check(read_log(next(path.glob(f"*.{storage}"))))
+        (path / "metadata.yaml").unlink()
+        check(read_log(next(path.glob(f"*.{storage}"))))
 
 
 def test_nmea(tmp_path: Path) -> None:
@@ -193,6 +232,8 @@ def test_nmea(tmp_path: Path) -> None:
 def test_sentences_that_say_nothing(tmp_path: Path, sentence: str) -> None:
     log, same = (read_log(written(tmp_path / "log.log", nmea(*extra))) for extra in ((sentence,), ()))
     assert log.samples.equals(same.samples)
+    damaged = f"${sentence}\r\n".encode()  # without a checksum
+    assert read_log(written(tmp_path / "log.log", nmea() + damaged)).samples.equals(same.samples)
 
 
 def test_the_deviation_of_a_compass_counts(tmp_path: Path) -> None:
@@ -200,6 +241,39 @@ def test_the_deviation_of_a_compass_counts(tmp_path: Path) -> None:
     lines = [line for line in content.splitlines(keepends=True) if b"HDT" not in line and b"E,3.0,E" not in line]
     log = read_log(written(tmp_path / "log.nmea", b"".join([lines[0], lines[-1], *lines[1:], lines[-1]])))
     assert log.samples["heading"].tolist() == pytest.approx([175.0] * len(log.samples))
+
+
+def iaga(names: str, rows: list[tuple[float, ...]], kind: str = "definitive") -> bytes:
+    """A record of an observatory: https://www.ngdc.noaa.gov/IAGA/vdat/IAGA2002/iaga2002format.html."""
+    head = {"Format": "IAGA-2002", "Station Name": "Zurich", "IAGA CODE": "ZUR", "Geodetic Latitude": PLACE[0]}
+    head |= {"Geodetic Longitude": PLACE[1] + 360, "Elevation": 600, "Reported": names, "Data Type": kind}
+    lines = [f" {name:<23}{value:<45}|" for name, value in head.items()]
+    lines += [f" # {'a comment with $GPRMC, in it':<66}|", f"{'DATE       TIME         DOY':<30}"]
+    lines[-1] += "".join(f" ZUR{name}     " for name in names) + "  |"
+    for minute, values in enumerate(rows):
+        time = f"2026-06-30 12:{minute:02}:00.000 181   "
+        lines.append(time + "".join(f" {value:9.2f}" for value in values))
+    return "\r\n".join([*lines, ""]).encode()
+
+
+@pytest.mark.parametrize("names", ["XYZF", "HDZF", "DHZF"])
+def test_observatory(tmp_path: Path, names: str) -> None:
+    """A fixed vehicle with axes north, east, down; D is in minutes of arc; rows with a missing value do not count."""
+    (d, _, h), (x, y, z) = ELEMENTS.tolist(), axes_of_elements(ELEMENTS, torch.zeros(3).double()).tolist()
+    values = {"X": x, "Y": y, "Z": z, "H": h, "D": 60 * d, "F": 99999.0}
+    whole = tuple(values[name] for name in names)
+    rows = [whole, (*whole[:2], 99999.0, 0.0), (88888.0, *whole[1:]), (*whole[:3], 48000.0)]
+    path = written(tmp_path / "zur.min", iaga(names, rows))
+    log = read_log(path)
+    assert log.tensor("roll", "pitch", "heading").abs().max() == 0
+    found = elements_of_axes(log.tensor("x", "y", "z"), torch.zeros(2, 3).double(), north="true").elements
+    assert torch.allclose(found, ELEMENTS.expand(2, 3), atol=0.01)
+    assert log.tensor("latitude", "longitude", "altitude")[0].tolist() == pytest.approx([*PLACE, 0.6])
+    assert np.diff(log.samples["time"]).tolist() == [180.0]
+    assert (log.date, log.north, log.source, log.notes) == ("2026-06-30", "true", "IAGA-2002: Zurich", ())
+    assert "without the baselines" in read_log(written(path, iaga(names, rows, "variation"))).notes[0]
+    with pytest.raises(ValueError, match="its components are H, E, Z, F: a record of X, Y, Z or of H, D, Z is needed"):
+        read_log(written(path, iaga("HEZF", rows)))
 
 
 @pytest.mark.parametrize("separator", [",", " ", "\t", "; "])

@@ -53,6 +53,11 @@ def test_distances_speeds_or_positions(motion: str) -> None:
         assert table["longitude"].iloc[[0, -1]].tolist() == pytest.approx([179.94, -179.7], abs=0.01)
 
 
+def test_the_altitude_is_a_mean_and_not_an_angle() -> None:
+    table = readings_of(sailed(speed=60 / 3.6, altitude=np.repeat([0.0, 400.0], 3000)), every_km=25.0)
+    assert table["altitude"].tolist() == pytest.approx([0, 0, 400, 400], abs=1)
+
+
 def test_spikes_do_not_count() -> None:
     noise = np.random.default_rng(0).normal(0, 30, (6000, 3))
     noise[::100] = 30000
@@ -120,6 +125,11 @@ def test_a_log_without_a_heading_has_that_of_its_compass() -> None:
             lambda log: Log(log.samples.drop(columns="speed"), "", "true"),
             {},
             "neither distances nor speeds nor positions",
+        ),
+        (
+            lambda log: Log(log.samples.drop(columns="speed"), "by hand"),
+            {},
+            "does not state the north .*; the log has neither",
         ),
         (lambda log: log, {"every_km": 0.0}, "every_km must be a finite number above 0"),
         (lambda log: log, {"north": "grid"}, "north must be one of 'true', 'magnetic', 'model', got 'grid'"),

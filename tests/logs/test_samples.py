@@ -87,6 +87,7 @@ def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
         (["2026-06-30T12:00:00,1,1,1,0"], "the times have no time zone: they are taken as UTC"),
         (["0,0.15,0,0.48,0"], "the total intensity is 0.50.*, which looks like gauss: name the columns mag_x_gauss"),
         (["0,15,0,48,0"], "the total intensity is 50.2.*, which looks like microtesla"),
+        (["0,90,0,-4095,0"], "the total intensity is 4095.*, where about 48000 nT are expected: scale raw counts"),
         ([*ROWS, "3,0,0,0,40"], "1 sample of three zeros left out"),
     ],
 )
@@ -110,6 +111,7 @@ def test_notes(tmp_path: Path, rows, note: str) -> None:
         ),
         (ROWS, HEADER.replace("heading_true_deg", "bx"), "'mag_x_nT' and 'bx' are both the x: keep one of them"),
         (ROWS, HEADER.replace("heading_true_deg", "speed"), "column 'speed' has no unit: .*speed_kn"),
+        (ROWS, "clock,x,bx,y,speed", "are both the x: .*; column 'speed' has .*; no column is the time"),
     ],
 )
 def test_files_that_are_refused(tmp_path: Path, rows, header: str, message: str) -> None:

@@ -8,7 +8,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import replay_log as recipe
+import torch
 
+from magrl.field import IGRF, elements_at
 from magrl.training import UsageError
 
 ROOT = Path(__file__).parent.parent.parent
@@ -69,6 +71,25 @@ def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(tmp_path: Pa
     wrong.assign(I=-wrong["I"]).to_csv(path, index=False)
     recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "b")])
     assert "4 of 4 readings do not fit IGRF" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("km", "warned"), [(450.0, False), (0.45, True)])
+def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) -> None:
+    """A log from 450 km fits IGRF there, also the direction of its north; an altitude of 450 m is named."""
+    log = pd.read_csv(LOG)[:4]
+    elements = elements_at(IGRF("2025-01-01", altitude_km=km), torch.tensor(log[["latitude", "longitude"]].to_numpy()))
+    log[["D", "I", "B_H"]] = elements.numpy()
+    log.assign(km=450.0).to_csv(tmp_path / "log.csv", index=False)
+    options = ["--date", "2025-01-01", "--altitude", "km", "--north", "magnetic", "--out", str(tmp_path / "out")]
+    recipe.main([str(tmp_path / "log.csv"), *NOISE, *options])
+    said = capsys.readouterr().out
+    assert ("they fit if altitudes are in meters" in said) == warned
+    assert ("do not fit IGRF" in said) == warned
+    table = pd.read_csv(tmp_path / "out" / "log.csv")
+    if not warned:
+        assert table["north_deg"].tolist() == pytest.approx(log["D"].tolist(), abs=1e-4)
+        recipe.main([str(tmp_path / "log.csv"), *NOISE, *options, "--altitude", "none"])
+        assert "4 of 4 readings do not fit IGRF" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
