@@ -23,6 +23,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 import magrl
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
+from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
@@ -141,7 +142,7 @@ def test_scripts_options_and_targets_exist(page: Path) -> None:
                 assert re.search(rf"{flag}(?![\w-])", help_text(script)), f"{script} has no {flag}"
             assert rest[0] == "-m" or (ROOT / script).is_file(), script
     recipes = [str(path.relative_to(ROOT)) for path in ROOT.glob("recipes/*.py")]
-    known = "".join(map(help_text, [*recipes, "-m magrl.field", "-m magrl.logs"]))
+    known = "".join(map(help_text, [*recipes, "-m magrl.benchmark", "-m magrl.field", "-m magrl.logs"]))
     for flag in re.findall(r"`(--[\w-]+)", TEXTS[page]):
         assert re.search(rf"{flag}(?![\w-])", known), f"no script has {flag}"
 
@@ -163,6 +164,14 @@ def test_tables_are_those_that_were_measured(page: Path) -> None:
         assert table.strip() == (ROOT / name).read_text().strip(), name
         lines = re.findall(r"^\| \w.*", table, re.MULTILINE)
         assert len(set(lines)) == len(lines), f"{name} has a row twice"
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/results/*.csv.gz")), ids=lambda path: path.name)
+def test_episodes_give_the_numbers_of_their_table(path: Path) -> None:
+    lines = [line.strip("| ").split(" | ") for line in path.with_name(f"{path.name[:-7]}.md").read_text().splitlines()]
+    cells = {(row[0], level): cell for row in lines[2:] for level, cell in zip(lines[0][2:], row[2:], strict=True)}
+    ends = read_episodes(path).groupby(["navigator", "level"])[["success", "spl"]].mean() * 100
+    assert {key: "{:.1f} / {:.1f}".format(*mean) for key, mean in ends.iterrows()}.items() <= cells.items()
 
 
 def test_options_of_the_environment_and_fields_of_the_scenario() -> None:
