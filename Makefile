@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere replay test test-slow test-newest check format docs bench mutate tables figures pictures help clean
+.PHONY: train fly anywhere replay test test-slow test-newest matrix check format docs bench mutate tables figures pictures help clean
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RECIPE)/td3_gradient_guided.py $(ARGS)
@@ -28,6 +28,11 @@ test-newest:  ## run the fast tests with the newest release of TorchRL, in build
 	$(MAKE) VENV=build/newest build/newest/.installed-dev
 	build/newest/bin/pip install --quiet --disable-pip-version-check --upgrade torchrl tensordict
 	-$(MAKE) VENV=build/newest test
+
+matrix:  ## run the fast tests with each of Python 3.11 to 3.13 that is installed, in build/python3.X
+	for name in python3.11 python3.12 python3.13; do \
+	  ! $$name --version || $(MAKE) PYTHON=$$name VENV=build/$$name test || exit 1; \
+	done
 
 check: $(VENV)/.installed-dev  ## check lint, format and types
 	$(RUN)/ruff check .

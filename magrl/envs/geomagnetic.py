@@ -78,6 +78,11 @@ class GeomagneticNavEnv(EnvBase):
         TypeError: for an unknown option, with the list of options.
         ValueError: for an option out of its range, naming it and its value.
 
+    Attributes:
+        vehicle: ``(N,)`` number of each vehicle, from 0 on. With its seed and its episode it determines task, start
+            heading and errors, so that an environment of few vehicles with other numbers repeats episodes of a larger
+            one.
+
     Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
     move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
     ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
@@ -205,7 +210,7 @@ class GeomagneticNavEnv(EnvBase):
             mask = tensordict.get("_reset", mask).reshape(self.num_envs)
         chosen = mask.nonzero().squeeze(-1)
         # The rows of the others are placeholders: the base class puts their running state back.
-        rows = self._start_of(chosen if len(chosen) else self.vehicle[:1])
+        rows = self._start_of(chosen if len(chosen) else torch.zeros_like(self.vehicle[:1]))
         start = rows[(mask.cumsum(0) - 1).clamp_min(0)]
         # Counted out of place: a rollout or a checkpoint may hold the old tensor.
         self.episode = self.episode.index_add(0, chosen, torch.ones_like(chosen))
@@ -218,9 +223,9 @@ class GeomagneticNavEnv(EnvBase):
         specs.check_state(state["objective_weights"])
         return state
 
-    def _start_of(self, vehicle: Tensor) -> TensorDict:
-        """Return the first observation of the next episode of some vehicles, ``(P,)``."""
-        episode = self.episode[vehicle]
+    def _start_of(self, row: Tensor) -> TensorDict:
+        """Return the first observation of the next episode of the vehicles in some rows, ``(P,)``."""
+        vehicle, episode = self.vehicle[row], self.episode[row]
         start, target, region = self._tasks(vehicle, episode)
         field, target_field = elements_at(self.field, torch.stack((start, target)), region)
         # Rounded as the vehicle observes it: a move of length 0 must not change the objective.

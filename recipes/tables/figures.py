@@ -96,7 +96,7 @@ def curves(name: str) -> Figures:
 def noise(tasks: int | None = None) -> Figures:
     """Return SPL over the noise, from the flights of table noise."""
     options = declared()["noise"] | ({"tasks": tasks} if tasks else {})
-    flights = Flights(**{key: value for key, value in options.items() if key not in ("kind", "navigators")})
+    flights = Flights.of(**{key: value for key, value in options.items() if key not in ("kind", "navigators")})
     levels = {
         name: {pilot.partition("=")[0]: flights.summaries(pilot, errors) for pilot in options["navigators"]}
         for name, errors in flights.errors.items()

@@ -5,88 +5,52 @@ from __future__ import annotations
 import glob
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from dataclasses import asdict
+from typing import Any, NamedTuple
 
-from magrl import paper
-from magrl.envs import Scenario, Tasks, earth_scenario, named_tasks
+from magrl.benchmark.tracks import TRACKS, Track
 from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.runs import NO_NOISE, Noise
+from magrl.evaluation.runs import Noise
 from magrl.evaluation.tables import about, mean_of_runs
 from magrl.geodesy import geodesic
-from magrl.transforms import Conditions, conditions_named
+from magrl.transforms import Conditions
 
 import torch
+from pandas import DataFrame
 from tensordict import TensorDictBase
 from torch import Tensor
 
 Errors, Measures = Noise | Conditions, Mapping[str, Tensor]
 Spec = str | Mapping[str, Any]
 """Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
-LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
-"""Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
-DRIFT_KM = 40.0
-"""How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
 MEASURES = ("success_rate", "spl")
 """Measures in a cell of a table."""
 OWN_OPTIONS = ("north", "known_start", "confidence")
 """Options of all flights that a navigator may have by itself."""
-SEED = 3 * paper.FIRST_RESERVED_SEED
-"""Seed of regions and tasks, beyond those of trainings and of frozen sets."""
 
 
-@dataclass(frozen=True)
-class Flights:
-    """Tasks that navigators fly under several errors, and how they end."""
+class Table(NamedTuple):
+    """A table of the documentation, and the episodes that it summarizes."""
 
-    conditions: Sequence[str] = ()
-    """Errors of real vehicles; by default there is white noise of several levels."""
-    levels: Sequence[Noise] = LEVELS
-    tasks: int = 1000
-    regions: int = 128
-    distance_km: Sequence[float] = paper.DISTANCE_KM
-    max_steps: int = 50
-    within_km: float | None = None
-    """Radius in which vehicles declare their arrival [km]; by default they get a signal, by the paper's rule."""
-    confidence: float = 0.0
-    """Minimum probability at which vehicles declare their arrival; also an option of a navigator."""
-    signal_km: float | None = None
-    """Radius in which a signal ends the episode [km]."""
-    north: str = "true"
-    """North of the vehicles, ``"true"`` or ``"magnetic"``; a navigator may have another one as an option."""
-    known_start: Sequence[float] | None = None
-    """Standard deviations of the elements at the start, where the vehicles know them; also an option of a navigator."""
-    box: bool = False
-    """Whether the tasks are those of the paper's box, ``test-1000``, in place of random regions."""
+    text: str
+    episodes: list[DataFrame]
 
-    @cached_property
-    def errors(self) -> dict[str, Errors]:
-        """Errors by the headings of their columns."""
-        levels: dict[str, Errors] = {", ".join(f"{std:g}" for std in noise): noise for noise in self.levels}
-        return {name: conditions_named(name) for name in self.conditions} or levels
 
-    @cached_property
-    def scenario(self) -> Scenario:
-        """Scenario of the tasks, with room for all errors of motion."""
-        far = self.distance_km[1] > paper.DISTANCE_KM[1]
-        size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"max_latitude": 70}
-        size |= {"distance_range_km": tuple(self.distance_km), "max_move_km": 50.0 + DRIFT_KM * bool(self.conditions)}
-        earth = Scenario() if self.box else earth_scenario(self.regions, SEED, **size, start_heading="random")
-        tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, SEED)
-        rule: dict[str, Any] = {"arrival": "declared", "arrival_radius_km": self.within_km} if self.within_km else {}
-        rule |= {"arrival": "distance", "arrival_radius_km": self.signal_km} if self.signal_km else {}
-        scenario = earth.replace(max_steps=self.max_steps, **rule)
-        return scenario.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
+class Flights(Track):
+    """A track that navigators of tables fly."""
+
+    @classmethod
+    def of(cls, track: str | None = None, **options: Any) -> Flights:
+        """Return a track of the benchmark with other options, or one that these options declare."""
+        return cls(**(asdict(TRACKS[track]) if track else {}) | options)
 
     def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
         """Return an episode of each task."""
         given = {key: getattr(self, key) for key in OWN_OPTIONS}
         own = navigator if isinstance(navigator, Mapping) else {"name": navigator}
         options = {key: own.get(key, value) for key, value in given.items()}
-        flight = Flight(self.scenario, errors=errors, **options)
-        return flown(flight, {key: value for key, value in own.items() if key not in given})
+        return flown(self.flight(errors, **options), {key: value for key, value in own.items() if key not in given})
 
     def episodes(self, navigator: Spec, errors: Errors) -> list[Measures]:
         """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""

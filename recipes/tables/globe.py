@@ -10,6 +10,8 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 
+from magrl.benchmark import episode_table
+from magrl.benchmark.tracks import SEED
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks
 from magrl.envs.specs import state_spec
 from magrl.envs.tasks import task_set
@@ -23,7 +25,7 @@ from magrl.guidance import OBJECTIVE_FLOORS
 
 import numpy as np
 import torch
-from flights import MEASURES, SEED, Errors, Measures, Spec, cell, flown
+from flights import MEASURES, Errors, Measures, Spec, Table, cell, flown, names
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -119,11 +121,16 @@ def table(results: Mapping[str, Measures], sorted_by: Measures) -> str:
     return markdown_table(["tasks", "number", *results], rows)
 
 
-def globe(navigators: Sequence[Spec], *, tasks: int = 10_000, noise: Noise = (0.05, 0.05, 5.0)) -> str:
+def globe(navigators: Sequence[Spec], *, tasks: int = 10_000, noise: Noise = (0.05, 0.05, 5.0)) -> Table:
     """Return a row for each band of tasks, with perfect and with noisy sensors, of one navigator."""
     (navigator,), ends = navigators, earth_tasks(tasks)
     levels = {"perfect sensors": NO_NOISE, "{:g}°, {:g}°, {:g} nT".format(*noise): noise}
-    return table({name: measured(navigator, ends, level) for name, level in levels.items()}, properties(ends))
+    results = {name: measured(navigator, ends, level) for name, level in levels.items()}
+    episodes = [
+        episode_table(values, ends.region, navigator=names(navigator)[0], level=level)
+        for level, values in results.items()
+    ]
+    return Table(table(results, properties(ends)), episodes)
 
 
 def globe_map(tasks: Tasks, measures: Measures) -> Figure:

@@ -1,6 +1,6 @@
 """Make the tables that recipes/tables/tables.toml declares: navigators by errors, tasks and runs.
 
-    python recipes/tables/grid.py earth conditions --out docs/results        # writes earth.md and conditions.md
+    python recipes/tables/grid.py earth conditions --out docs/results        # writes earth.md, earth.csv.gz, ...
     python recipes/tables/grid.py earth --navigators policy:MINE=mine.safetensors  # the same table of other navigators
     python recipes/tables/grid.py earth --tasks 200                          # faster
 
@@ -18,12 +18,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from magrl.benchmark import episode_table, write_episodes
+from magrl.benchmark.episodes import COLUMNS
 from magrl.evaluation.navigators import check_distinct
 from magrl.evaluation.tables import ABOUT, markdown_table
-from magrl.files import check_writable
+from magrl.files import check_writable, read_document
 from magrl.training import UsageError, command
 
 import tyro
+from pandas import read_csv
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
@@ -31,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from evaluate import Config, evaluate
 
 import globe
-from flights import MEASURES, Flights, Spec, cell, names, paired_difference, runs_of
+from flights import MEASURES, Flights, Spec, Table, cell, names, paired_difference, runs_of
 
 RECIPE = "grid.py"
 FILE, RUNS = Path(__file__).parent / "tables.toml", Path("runs")
@@ -43,33 +46,41 @@ def flights(
     against: Sequence[Spec] = (),
     measures: Sequence[str] = MEASURES,
     **options: Any,
-) -> str:
+) -> Table:
     """Return a row for each navigator, and a column for each level of noise, or each of some conditions.
 
     A cell has the ``measures``. The last rows are differences of SPL between the first navigator and those that it is
-    compared ``against``. The other options are those of :class:`Flights`.
+    compared ``against``. The other options are those of :meth:`Flights.of`.
     """
-    made, rows, spl = Flights(**options), [], {}
+    made, rows, spl, tables = Flights.of(**options), [], {}, []
+    region = made.scenario.tasks.region
     for navigator in tqdm(navigators, unit="row"):
-        episodes = [made.episodes(navigator, errors) for errors in made.errors.values()]
-        spl[names(navigator)[0]] = [runs[0]["spl"] for runs in episodes]
-        rows.append([*names(navigator), *(cell(runs, measures) for runs in episodes)])
-    first, region = names(navigators[0])[0], made.scenario.tasks.region
+        about = names(navigator)
+        episodes = {level: made.episodes(navigator, errors) for level, errors in made.errors.items()}
+        spl[about[0]] = [runs[0]["spl"] for runs in episodes.values()]
+        rows.append([*about, *(cell(runs, measures) for runs in episodes.values())])
+        for level, runs in episodes.items():
+            labels = {"navigator": about[0], "level": level, "seed": made.seed}
+            tables += [episode_table(run, region, run=number, **labels) for number, run in enumerate(runs)]
+    first = names(navigators[0])[0]
     for other in [names(navigator)[0] for navigator in against if names(navigator)[0] in spl]:
         differences = (paired_difference(*pair, region) for pair in zip(spl[first], spl[other], strict=True))
         rows.append([f"{first} − {other}, SPL", "—", "—", *differences])
-    return markdown_table([*ABOUT, *made.errors], rows)
+    return Table(markdown_table([*ABOUT, *made.errors], rows), tables)
 
 
-def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> str:
+def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> Table:
     """Return the table of recipes/evaluate.py, whose results are in a folder, which is replaced."""
     shutil.rmtree(folder, ignore_errors=True)
     every = tuple(run for navigator in navigators for run in runs_of(navigator))
     evaluate(Config(navigators=every, out=folder, **options))
-    return (folder / "table.md").read_text()
+    level = ", ".join(f"{std:g}" for std in read_document(folder / "settings.json")["errors"])
+    episodes = read_csv(folder / "episodes.csv").rename(columns={"navigation_error_km": "final_distance_km"})
+    added = {"track": "", "level": level, "region": 0, "seed": 0, "false_arrival": False}
+    return Table((folder / "table.md").read_text(), [episodes.assign(**added)[list(COLUMNS)]])
 
 
-KINDS: Mapping[str, Callable[..., str]] = {"flights": flights, "globe": globe.globe, "evaluation": evaluation}
+KINDS: Mapping[str, Callable[..., Table]] = {"flights": flights, "globe": globe.globe, "evaluation": evaluation}
 """Function of each kind of table; its arguments are the options in the file."""
 
 
@@ -93,7 +104,7 @@ def make(
         navigators: Navigators in place of those of the table, as in recipes/evaluate.py.
         tasks: Number of tasks in place of that of the table.
         confidence: Minimum probability at which vehicles declare their arrival, in place of 0.
-        out: Folder of the tables, which are replaced; by default they are printed.
+        out: Folder of the tables and their episodes, which are replaced; by default tables are printed.
 
     Raises:
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
@@ -106,17 +117,19 @@ def make(
     for name in tables or specs:
         try:
             with tempfile.TemporaryDirectory() as folder:  # a table that is changed replaces no results
-                text = table(**specs[name] | changes, folder=(Path(folder) if changes else RUNS) / name)
+                made = table(**specs[name] | changes, folder=(Path(folder) if changes else RUNS) / name)
         except (ValueError, OSError, TypeError) as error:
             raise UsageError(f"{name}: {error}") from error
         if out is None:
-            print(text)
-        else:
-            check_writable(out / f"{name}.md")
-            (out / f"{name}.md").write_text(text.rstrip() + "\n")
+            print(made.text)
+            continue
+        check_writable(out / f"{name}.md")
+        (out / f"{name}.md").write_text(made.text.rstrip() + "\n")
+        track = specs[name].get("track", name)
+        write_episodes(out / f"{name}.csv.gz", [episodes.assign(track=track) for episodes in made.episodes])
 
 
-def table(kind: str, *, folder: Path, **options: Any) -> str:
+def table(kind: str, *, folder: Path, **options: Any) -> Table:
     """Return a table of a kind; results of an evaluation are in a folder."""
     return KINDS[kind](**options, **({"folder": folder} if kind == "evaluation" else {}))
 

@@ -24,6 +24,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 import magrl
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
+from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
@@ -143,7 +144,8 @@ def test_scripts_options_and_targets_exist(page: Path) -> None:
                 assert re.search(rf"{flag}(?![\w-])", help_text(script)), f"{script} has no {flag}"
             assert rest[0] == "-m" or (ROOT / script).is_file(), script
     recipes = [str(path.relative_to(ROOT)) for path in ROOT.glob("recipes/*.py")]
-    known = "".join(map(help_text, [*recipes, "-m magrl.autopilot", "-m magrl.field", "-m magrl.logs"]))
+    modules = ("autopilot", "benchmark", "field", "logs")
+    known = "".join(map(help_text, [*recipes, *(f"-m magrl.{name}" for name in modules)]))
     for flag in re.findall(r"`(--[\w-]+)", TEXTS[page]):
         assert re.search(rf"{flag}(?![\w-])", known), f"no script has {flag}"
 
@@ -176,6 +178,14 @@ def test_the_verdict_of_the_reproduction_has_the_numbers_that_were_measured() ->
         agent, *measured = (cell.strip() for cell in result.strip("|").split("|"))
         assert name.startswith(agent)
         assert shown == [cell.partition(" ")[0] for cell in measured]
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/results/*.csv.gz")), ids=lambda path: path.name)
+def test_episodes_give_the_numbers_of_their_table(path: Path) -> None:
+    lines = [line.strip("| ").split(" | ") for line in path.with_name(f"{path.name[:-7]}.md").read_text().splitlines()]
+    cells = {(row[0], level): cell for row in lines[2:] for level, cell in zip(lines[0][3:], row[3:], strict=True)}
+    ends = read_episodes(path).groupby(["navigator", "level"])[["success", "spl"]].mean() * 100
+    assert {key: "{:.1f} / {:.1f}".format(*mean) for key, mean in ends.iterrows()}.items() <= cells.items()
 
 
 def test_options_of_the_environment_and_fields_of_the_scenario() -> None:

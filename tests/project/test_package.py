@@ -1,6 +1,7 @@
 """What a user gets with `pip install`: the wheel, alone, in an environment that has never seen this tree."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -31,6 +32,7 @@ from magrl import agents, envs, field, navigators, transforms
 assert not {"matplotlib", "pandas", "wandb", "tqdm", "tyro"} & (set(sys.modules) - theirs), "imports are not light"
 import gymnasium
 
+assert magrl.evaluate("anywhere", "figure-4-1")["success"].all()
 assert gymnasium.make("magrl/GeomagneticNavigation-v0").reset(seed=0)[0].shape == (13,)
 
 import torch
@@ -119,10 +121,17 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     assert any(path.name == "LICENSE" for path in held)
 
 
+def test_the_hook_before_a_commit_has_the_version_of_ruff() -> None:
+    (version,) = re.findall(r"^ruff==(.*)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    assert f"rev: v{version} " in (ROOT / ".pre-commit-config.yaml").read_text()
+
+
 @pytest.mark.slow
 def test_wheel_works_without_the_tree(python: Path, tmp_path: Path) -> None:
     assert len(run(python, "-c", TOUR, cwd=tmp_path).splitlines()) == 2
     assert (tmp_path / "episodes.png").stat().st_size > 10_000
+    assert "verify" in run(python, "-m", "magrl.benchmark", "--help", cwd=tmp_path)
+    assert "--calibrate" in run(python, "-m", "magrl.logs", "--help", cwd=tmp_path)
 
 
 @pytest.mark.slow

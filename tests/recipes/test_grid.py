@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 from support.recipes import RECIPES
 from tensordict import TensorDict
 
+from magrl.benchmark import read_episodes, tracks
+from magrl.benchmark.episodes import COLUMNS
 from magrl.envs import Scenario, Tasks
 from magrl.field import IGRF
 from magrl.training import UsageError
@@ -37,8 +39,8 @@ def test_tables_and_errors_declare_options_that_exist() -> None:
             del options["navigators"]
             options.pop("against", None)
             options.pop("measures", None)
-            columns = options.get("conditions") or options.get("levels", flights.LEVELS)
-            assert len(flights.Flights(**options).errors) == len(columns)
+            made = flights.Flights.of(**options)
+            assert len(made.errors) == len(made.conditions or made.levels)
     for error in grid.declared(figures.FILE)["errors"].values():
         for size in error["sizes"]:
             assert not figures.one_error(error["lines"], size).perfect
@@ -92,22 +94,22 @@ def test_a_document_may_show_some_columns(tmp_path: Path) -> None:
 
 @pytest.fixture(autouse=True)
 def few_regions(monkeypatch) -> None:
-    earth = flights.earth_scenario
+    earth = tracks.earth_scenario
     monkeypatch.setattr(
-        flights, "earth_scenario", lambda count, *rest, **options: earth(min(count, 4), *rest, **options)
+        tracks, "earth_scenario", lambda count, *rest, **options: earth(min(count, 4), *rest, **options)
     )
 
 
 def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> None:
     oracle, old = "geodesic", {"name": "map_matching", "map_date": "2015-01-01"}
-    table = rows(grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], tasks=8))
+    table = rows(grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], tasks=8).text)
     assert table[0] == ["navigator", "trained on", "given", "0, 0, 0", "0.5, 0.1, 20"]
     assert table[2][3] == "100.0 / 100.0"
     assert table[3][0] == "map matching (Kalman filter), map date 2015-01-01"
     assert table[4][0] == f"{table[2][0]} − {table[3][0]}, SPL"
     assert table[4][3].strip("*").startswith("+")
-    assert rows(grid.flights([oracle], tasks=2, max_steps=1))[2][3] == "0.0 / 0.0"
-    far = rows(grid.flights([oracle], tasks=2, distance_km=(1200, 1300), max_steps=60))
+    assert rows(grid.flights([oracle], tasks=2, max_steps=1).text)[2][3] == "0.0 / 0.0"
+    far = rows(grid.flights([oracle], tasks=2, distance_km=(1200, 1300), max_steps=60).text)
     assert far[2][3] == "100.0 / 100.0"
     grid.make(("conditions",), navigators=(oracle,), tasks=2, out=tmp_path / "new")
     head, _, row = rows((tmp_path / "new" / "conditions.md").read_text())
@@ -115,9 +117,24 @@ def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> 
     assert row[3] == "100.0 / 100.0"
 
 
+def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path) -> None:
+    grid.make(("north-declared",), navigators=("secant", "kalman"), tasks=3, out=tmp_path)
+    table, episodes = (
+        rows((tmp_path / "north-declared.md").read_text()),
+        read_episodes(tmp_path / "north-declared.csv.gz"),
+    )
+    assert set(episodes["track"]) == {"north-v1"}
+    assert episodes["task"].tolist() == 6 * [0, 1, 2]
+    ends = episodes.groupby(["navigator", "level"])[["success", "spl"]].mean() * 100
+    for name, _, _, *cells in table[2:4]:
+        for level, cell in zip(table[0][3:], cells, strict=True):
+            assert cell == "{:.1f} / {:.1f}".format(*ends.loc[(name, level)])
+    assert episodes["final_distance_km"].between(0, 25)[episodes["success"]].all()
+
+
 def test_vehicles_that_declare_are_right_or_wrong() -> None:
     options = {"conditions": ["ship"], "tasks": 4, "within_km": 25, "max_steps": 20}
-    sure, bold = (rows(grid.flights(["secant"], confidence=least, **options))[2][3] for least in (1.0, 0.0))
+    sure, bold = (rows(grid.flights(["secant"], confidence=least, **options).text)[2][3] for least in (1.0, 0.0))
     assert sure == "0.0 / 0.0"
     right, spl = map(float, bold.split(" / "))
     assert 0 < spl < right
@@ -126,11 +143,11 @@ def test_vehicles_that_declare_are_right_or_wrong() -> None:
 
 
 def test_tasks_of_the_box_are_frozen_and_start_northward() -> None:
-    table = rows(grid.flights(["geodesic"], box=True, tasks=3, levels=[(0, 0, 0)]))
+    table = rows(grid.flights(["geodesic"], box=True, tasks=3, levels=[(0, 0, 0)]).text)
     assert table[2][3] == "100.0 / 100.0"
     scenario = flights.Flights(box=True, tasks=3).scenario
     assert scenario.start_heading == "north"
-    assert scenario.tasks.start.tolist() == flights.named_tasks("test-1000").start[:3].tolist()
+    assert scenario.tasks.start.tolist() == tracks.named_tasks("test-1000").start[:3].tolist()
 
 
 def test_several_runs_have_the_range_of_their_spl(tmp_path: Path) -> None:
@@ -217,7 +234,7 @@ def test_table_has_every_task_once_in_each_group(monkeypatch) -> None:
         assert sum(int(row[1]) for row in table if row[0].startswith(group)) == 4, group
     assert table[-1] == ["weakest change on the way 0.5 and more", "2", "100.0 / 95.0"]
     monkeypatch.setattr(globe, "CHUNK", 3)  # flown in parts
-    assert "| all | 4 | 100.0 / 100.0 |" in globe.globe(["geodesic"], tasks=4)
+    assert "| all | 4 | 100.0 / 100.0 |" in globe.globe(["geodesic"], tasks=4).text
 
 
 def test_map_shows_the_dip_poles_and_the_failures() -> None:
@@ -270,7 +287,9 @@ def test_evaluations_are_tables_and_figures_of_section_4(tmp_path: Path, monkeyp
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("evaluate.trajectories_figure", lambda *_, **__: Figure())
     navigators = ["secant", "parallel"]
-    text = grid.evaluation(navigators, folder=Path("runs/comparison"), tasks=3, wandb_mode="disabled")
-    assert [row[0] for row in rows(text)[2:4]] == ["secant (quasi-Newton)", "parallel (true gradient, an oracle)"]
+    table = grid.evaluation(navigators, folder=Path("runs/comparison"), tasks=3, wandb_mode="disabled")
+    assert [list(episodes) for episodes in table.episodes] == [list(COLUMNS)]
+    assert len(table.episodes[0]) == 6
+    assert [row[0] for row in rows(table.text)[2:4]] == ["secant (quasi-Newton)", "parallel (true gradient, an oracle)"]
     made = figures.section_4()
     assert [label.get_text() for label in made["results/fig-4-6-boxes"].axes[0].get_xticklabels()] == navigators

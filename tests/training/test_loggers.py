@@ -8,6 +8,7 @@ import os
 import re
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -208,6 +209,14 @@ def test_missing_tensorboard_is_named(tmp_path: Path, monkeypatch) -> None:
         open_log("tensorboard", tmp_path, {}, "disabled")
     assert not list(tmp_path.iterdir())
     check_logger("csv")
+
+
+def test_without_wandb_a_run_goes_on(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    log = open_log("wandb", tmp_path, {}, "offline")
+    log.row({"frames": 512, "eval_spl": 90.0})
+    log.close()
+    assert capsys.readouterr().err.startswith("wandb failed and is disabled for the rest of this run: import of wandb")
 
 
 def test_failing_loggers_are_reported_and_disabled(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -1,0 +1,248 @@
+"""Submissions to the benchmark: a folder with episodes, their record and the policy, which others verify by flying it.
+
+A policy is a file of :func:`magrl.save_policy`, or the name of a navigator of the library: verifying runs no code of
+the submitter.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import platform
+import secrets
+import shutil
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import pandas
+import torch
+from pydantic import Field
+from torch import Tensor
+
+import magrl
+from magrl.agents import FieldPolicy, load_policy
+from magrl.agents.exported import TrainedPolicy
+from magrl.benchmark.episodes import episode_table, read_episodes, write_episodes
+from magrl.benchmark.tracks import TRACKS, Track
+from magrl.checks import CheckedModel, check_choice, check_number
+from magrl.envs import Tasks
+from magrl.evaluation import episode_measures
+from magrl.evaluation.navigators import PRETRAINED
+from magrl.files import read_document, write_json
+from magrl.navigators import NAVIGATORS
+from magrl.sensor_std import STD_KEYS
+
+BUILT_IN = (*PRETRAINED, *(name for name, kind in NAVIGATORS.items() if "mode" not in kind.options))
+"""Navigators that need no file. Random numbers of metaheuristics depend on the batch, so that no part is repeated."""
+RECORD, EPISODES, POLICY = "run.json", "episodes.csv.gz", "policy.safetensors"
+PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "safetensors")
+TOLERANCE = {"spl": 1e-3, "final_distance_km": 0.1}
+"""Largest difference of a repeated episode. Other sizes of the batch change SPL by 1e-7 and distances by 0.1 m."""
+MOST_DIFFERENT = {True: 0.02, False: 0.5}
+"""Largest share of repeated episodes that may end differently, on the same platform and on another one. With other
+instructions of the processor, 11 of 150 episodes of ``anywhere`` did on alone-v1, and 48 of 200 on vehicles-v1."""
+STANDARD_ERRORS = 4.0
+"""By how many standard errors a claimed SPL may exceed the one that is flown."""
+MARGIN = 0.005
+"""What it may exceed it by beyond that: a few tasks, all flown alike, have no standard error."""
+
+
+class Submission(CheckedModel):
+    """What ``run.json`` states.
+
+    Example:
+        >>> Submission(magrl="0.2.0", track="mars-v1", declared={}, policy="secant", tasks=3, episodes_sha256="")
+        Traceback (most recent call last):
+        ValueError: policy_sha256 is missing; platform is missing
+    """
+
+    format: Literal[1] = 1
+    magrl: str
+    """Version of the library."""
+    track: str
+    declared: dict[str, Any]
+    """Declaration of the track, with the digest of its tasks and its seeds."""
+    policy: str
+    """Name of a navigator of the library, or that of the file in the folder."""
+    policy_sha256: str | None
+    tasks: int = Field(ge=1)
+    """Number of tasks that were flown, from the first on."""
+    episodes_sha256: str
+    platform: dict[str, str]
+    """Versions of Python and of libraries, instructions of the processor, and number of threads: they decide the last
+    bits of a number, and so how some episodes end."""
+
+
+def run(policy: str, track: str, out: Path, tasks: int | None = None) -> pandas.DataFrame:
+    """Fly a track and write the folder of a submission.
+
+    Args:
+        policy: policy file, ``.safetensors``, or one of :data:`BUILT_IN`.
+        track: one of :data:`~magrl.benchmark.TRACKS`.
+        out: folder, new or empty.
+        tasks: number of tasks for a trial; by default all.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        ValueError: for a policy that is refused, an unknown track, or a number of tasks that it does not have.
+        FileNotFoundError: for a missing policy.
+        FileExistsError: for a folder that holds files.
+
+    Example:
+        >>> import tempfile
+        >>> len(run("geodesic", "earth-v1", Path(tempfile.mkdtemp()), tasks=2))
+        6
+    """
+    check_choice(TRACKS, track=track)
+    chosen = TRACKS[track]
+    count = chosen.tasks if tasks is None else tasks
+    check_number(1, chosen.tasks, whole=True, tasks=count)
+    navigator = _policy(policy, chosen)
+    out.mkdir(parents=True, exist_ok=True)
+    if any(out.iterdir()):
+        raise FileExistsError(f"{out} holds files: choose a new folder")
+    if isinstance(navigator, TrainedPolicy):
+        shutil.copyfile(policy, out / POLICY)
+    name = POLICY if isinstance(navigator, TrainedPolicy) else navigator
+    episodes = _flown(navigator, chosen, torch.arange(count)).assign(track=track, navigator=Path(policy).name)
+    write_episodes(out / EPISODES, [episodes])
+    record = Submission(
+        magrl=magrl.__version__,
+        track=track,
+        declared=chosen.record(),
+        policy=name,
+        policy_sha256=_sha256(out / POLICY) if name == POLICY else None,
+        tasks=count,
+        episodes_sha256=_sha256(out / EPISODES),
+        platform=_platform(),
+    )
+    write_json(out / RECORD, record.model_dump())
+    return episodes
+
+
+def verify(folder: Path, tasks: int = 32, seed: int | None = None) -> tuple[list[str], list[str]]:
+    """Compare a submission with flights of its policy.
+
+    Some of its tasks, drawn at random, are flown again and must end alike. New tasks, which the submitter has not seen,
+    must not be flown worse than claimed.
+
+    Args:
+        folder: folder of :func:`run`.
+        tasks: number of tasks that are repeated, and of new tasks.
+        seed: seed of both draws; by default a secret one.
+
+    Returns:
+        What was found, and the contradictions, in sentences; without any, the submission is verified.
+
+    Raises:
+        ValueError: for a folder that is no submission, of an unknown track, or with a policy that is refused.
+        FileNotFoundError: for a missing file.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> _ = run("geodesic", "earth-v1", folder, tasks=4)
+        >>> verify(folder, tasks=2, seed=0)[1]
+        []
+    """
+    check_number(2, whole=True, tasks=tasks)
+    seed = secrets.randbelow(2**31) if seed is None else seed
+    record = Submission(**read_document(folder / RECORD))
+    check_choice(TRACKS, track=record.track)
+    check_choice((POLICY, *BUILT_IN), policy=record.policy)
+    track, claimed = TRACKS[record.track], read_episodes(folder / EPISODES)
+    navigator = _policy(str(folder / POLICY) if record.policy == POLICY else record.policy, track)
+    wrong = list(_contradictions(folder, record, track, claimed))
+    notes = [f"{record.track}, {record.policy}: {record.tasks} of {track.tasks} tasks, seed of this check {seed}"]
+    if wrong:
+        return notes, wrong
+    draw = torch.randperm(record.tasks, generator=torch.Generator().manual_seed(seed))[:tasks].sort().values
+    again = _flown(navigator, track, draw)
+    seen = claimed[claimed["task"].isin(draw.tolist())].reset_index(drop=True)
+    different, same = _different(seen, again), record.platform == _platform()
+    where = "the same platform" if same else f"another platform, {record.platform}"
+    notes.append(f"repeated, flown on {where}: {len(again) - different} of {len(again)} episodes end alike")
+    if different > MOST_DIFFERENT[same] * len(again):
+        wrong.append(f"{different} of {len(again)} repeated episodes end differently")
+    new = _flown(navigator, track, torch.arange(tasks), track.scenario.random_tasks(tasks, seed), seed)
+    for what, claim, flown in (("repeated tasks", seen, again), ("new tasks", claimed, new)):
+        for level in track.errors:
+            pair = [100 * table.loc[table["level"] == level, "spl"] for table in (claim, flown)]
+            text, exceeds = _compared(*pair, paired=claim is seen)
+            (wrong if exceeds else notes).append(f"{what}, {level}: {text}")
+    return notes, wrong
+
+
+def _compared(claim: pandas.Series, flown: pandas.Series, *, paired: bool) -> tuple[str, bool]:
+    """Return both means and the standard error of their difference in a text, and whether the claim is too high."""
+    parts = [claim - flown] if paired else [claim, flown]
+    error = math.sqrt(sum(values.var(ddof=0) / len(values) for values in parts))
+    text = f"SPL {claim.mean():.1f} % claimed, {flown.mean():.1f} % flown, standard error {error:.1f}"
+    return text, not claim.mean() - flown.mean() <= STANDARD_ERRORS * error + 100 * MARGIN
+
+
+def _policy(text: str, track: Track) -> TrainedPolicy | str:
+    """Return the policy of a file, or the name of a navigator of the library; raise for any other."""
+    if not text.endswith(".safetensors"):
+        if text not in BUILT_IN:
+            names = ", ".join(BUILT_IN)
+            raise ValueError(f"refused {text!r}: submit a file of magrl.save_policy (.safetensors), or one of {names}")
+        return text
+    policy = load_policy(text)
+    reads = {*policy.in_keys, *(STD_KEYS if isinstance(policy, FieldPolicy) and policy.state_keys else ())}
+    if hidden := sorted(reads - set(track.keys)):
+        raise ValueError(f"refused {text!r}: it reads {', '.join(hidden)}, which this track does not give")
+    return policy
+
+
+def _flown(
+    policy: TrainedPolicy | str, track: Track, vehicle: Tensor, tasks: Tasks | None = None, seed: int | None = None
+) -> pandas.DataFrame:
+    """Return an episode of each level and vehicle, whose number is that of its task; with a seed, of other tasks."""
+    tables = []
+    for level, errors in track.errors.items():
+        changes = {} if seed is None else {"seed": seed}
+        flight = track.flight(errors, tasks, num_envs=len(vehicle), **changes)
+        flight.base.vehicle = vehicle
+        assert flight.base.tasks is not None
+        measures, region = episode_measures(flight.fly(policy)), flight.base.tasks.region[vehicle]
+        table = episode_table(measures, region, level=level, seed=flight.seed)
+        tables.append(table.assign(task=vehicle.tolist()))
+    return pandas.concat(tables, ignore_index=True)
+
+
+def _contradictions(folder: Path, record: Submission, track: Track, claimed: pandas.DataFrame) -> Iterator[str]:
+    """Yield what is wrong with a submission before anything is flown."""
+    if record.declared != track.record():
+        yield f"{record.track} is another track in magrl {magrl.__version__} than in the {record.magrl} of the record"
+    if record.policy == POLICY and _sha256(folder / POLICY) != record.policy_sha256:
+        yield f"{POLICY} is not the file of the record"
+    if _sha256(folder / EPISODES) != record.episodes_sha256:
+        yield f"{EPISODES} is not the file of the record"
+    rows = [(record.track, level, task) for level in track.errors for task in range(min(record.tasks, track.tasks))]
+    if record.tasks > track.tasks or list(map(tuple, claimed[["track", "level", "task"]].values)) != rows:
+        yield f"the episodes are not one of each level and each of {record.tasks} tasks, in their order"
+
+
+def _different(claimed: pandas.DataFrame, again: pandas.DataFrame) -> int:
+    """Return the number of episodes that end differently."""
+    alike = pandas.Series(True, again.index)
+    for name in ("region", "seed", "success", "steps", "false_arrival"):
+        alike &= claimed[name] == again[name]
+    for name, most in TOLERANCE.items():
+        alike &= (claimed[name] - again[name]).abs() <= most
+    return int((~alike).sum())
+
+
+def _platform() -> dict[str, str]:
+    """Return what decides the last bits of a number."""
+    versions = {"python": platform.python_version()} | {package: version(package) for package in PACKAGES}
+    return versions | {"cpu": torch.backends.cpu.get_cpu_capability(), "threads": str(torch.get_num_threads())}
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,147 @@
+"""Tracks of the benchmark: all that decides its numbers, except the navigator. A track with a version is frozen."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from magrl import paper
+from magrl.envs import PUBLIC_KEYS, Scenario, Tasks, earth_scenario, named_tasks
+from magrl.evaluation import Flight
+from magrl.evaluation.runs import NO_NOISE, Noise
+from magrl.sensor_std import STD_KEYS
+from magrl.transforms import Conditions, conditions_named
+
+LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
+"""Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
+VEHICLES = ("aircraft", "ship", "underwater", "low-cost")
+"""Conditions of vehicles with true north."""
+DRIFT_KM = 40.0
+"""How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
+SEED = 3 * paper.FIRST_RESERVED_SEED
+"""Seed of regions and tasks, beyond those of trainings and of frozen sets."""
+READINGS = (*PUBLIC_KEYS, "step_count")
+"""Keys of the readings, without the accuracy of the sensors."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """Tasks and errors under which navigators fly them.
+
+    Example:
+        >>> TRACKS["alone-v1"].max_steps, TRACKS["alone-v1"].within_km
+        (80, 25)
+    """
+
+    conditions: Sequence[str] = ()
+    """Errors of real vehicles; by default there is white noise of several levels."""
+    levels: Sequence[Noise] = LEVELS
+    """Standard deviations of white noise on D [deg], I [deg], B_H [nT]."""
+    tasks: int = 1000
+    """Number of tasks."""
+    regions: int = 128
+    """Number of random regions of the Earth."""
+    distance_km: Sequence[float] = paper.DISTANCE_KM
+    """Shortest and longest distance of a task [km]."""
+    max_steps: int = 50
+    """Moves after which an episode ends."""
+    within_km: float | None = None
+    """Radius in which vehicles declare their arrival [km]; by default they get a signal, by the paper's rule."""
+    confidence: float = 0.0
+    """Minimum probability at which vehicles declare their arrival."""
+    signal_km: float | None = None
+    """Radius in which a signal ends the episode [km]."""
+    north: str = "true"
+    """North of the vehicles, ``"true"`` or ``"magnetic"``."""
+    known_start: Sequence[float] | None = None
+    """Standard deviations of the elements at the start, where the vehicles know them."""
+    box: bool = False
+    """Whether the tasks are those of the paper's box, ``test-1000``, in place of random regions."""
+    date: str = "2025-01-01"
+    """Date of IGRF-14 outside the paper's box."""
+    task_seed: int = SEED
+    """Seed of regions and tasks."""
+    seed: int = 0
+    """Seed of errors and of random start headings."""
+    keys: Sequence[str] = (*READINGS, *STD_KEYS)
+    """Keys that a trained policy may read."""
+
+    @cached_property
+    def errors(self) -> dict[str, Noise | Conditions]:
+        """Errors by the name of their level: of a vehicle, or the three standard deviations of white noise."""
+        levels: dict[str, Noise | Conditions] = {", ".join(f"{std:g}" for std in noise): noise for noise in self.levels}
+        return {name: conditions_named(name) for name in self.conditions} or levels
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """Scenario of the tasks, with room for all errors of motion."""
+        far = self.distance_km[1] > paper.DISTANCE_KM[1]
+        size: dict[str, Any] = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"max_latitude": 70}
+        size |= {"distance_range_km": tuple(self.distance_km), "max_move_km": 50.0 + DRIFT_KM * bool(self.conditions)}
+        size |= {"date": self.date, "start_heading": "random"}
+        earth = Scenario() if self.box else earth_scenario(self.regions, self.task_seed, **size)
+        tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, self.task_seed)
+        rule: dict[str, Any] = {"arrival": "declared", "arrival_radius_km": self.within_km} if self.within_km else {}
+        rule |= {"arrival": "distance", "arrival_radius_km": self.signal_km} if self.signal_km else {}
+        scenario = earth.replace(max_steps=self.max_steps, **rule)
+        return scenario.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
+
+    def flight(self, errors: Noise | Conditions, tasks: Tasks | None = None, **changes: Any) -> Flight:
+        """Return vehicles with some errors, one for each task.
+
+        Args:
+            errors: of a level of :attr:`errors`.
+            tasks: tasks in place of those of the track.
+            changes: options of :class:`~magrl.evaluation.Flight` in place of those of the track.
+        """
+        scenario = self.scenario if tasks is None else self.scenario.with_tasks(tasks)
+        options = {name: getattr(self, name) for name in ("north", "known_start", "confidence", "seed")}
+        return Flight(scenario, errors=errors, **options | changes)
+
+    def record(self) -> dict[str, Any]:
+        """Return the declaration of the track as plain data, and the digest of its tasks."""
+        ends = self.scenario.tasks
+        assert ends is not None
+        declared: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return declared | {"tasks_sha256": digest(torch.cat((*ends[:2], ends.region.unsqueeze(-1)), -1))}
+
+
+def digest(values: Tensor, digits: int = 6) -> str:
+    """Return the SHA-256 of columns of numbers ``(..., C)``, rounded to some digits of the largest number of each.
+
+    On another processor the last bits differ: in float64 by less than 1e-12, so that a number is rounded to another
+    value with a probability below 1e-6. Numbers that were computed in float32 differ in the seventh digit: take four.
+
+    Args:
+        values: finite numbers.
+        digits: number of digits.
+
+    Example:
+        >>> one, other = torch.tensor([[3.0], [0.5]]), torch.tensor([[3.0], [0.5 + 1e-9]])
+        >>> digest(one) == digest(other), digest(one) == digest(one + 1e-4)
+        (True, False)
+    """
+    columns = values.detach().cpu().double().reshape(-1, values.shape[-1])
+    largest = columns.abs().amax(0).clamp_min(1e-6)
+    rounded = (columns / 10 ** (largest.log10().floor() - digits + 1)).round().long()
+    return hashlib.sha256(rounded.numpy().tobytes()).hexdigest()
+
+
+TRACKS = {
+    "box-v1": Track(box=True, levels=(NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))),
+    "earth-v1": Track(tasks=2000),
+    "alone-v1": Track(within_km=25, max_steps=80),
+    "vehicles-v1": Track(within_km=25, max_steps=80, conditions=VEHICLES),
+    "north-v1": Track(
+        within_km=25, max_steps=80, north="magnetic", levels=(NO_NOISE, (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))
+    ),
+    "sequences-v1": Track(keys=READINGS),
+}
+"""Tracks by name and version. Published numbers rest on them: for a change, add a track with the next version."""

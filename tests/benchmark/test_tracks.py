@@ -1,0 +1,143 @@
+"""What published numbers rest on is frozen: tasks, readings under errors, and what environments answer to actions.
+
+Other processors change the last bits of a number. So digests hold six digits of the largest of a column, which come
+from float64; four of readings with errors, which are added in float32; and the observations of networks are compared as
+means. All were seen to agree under ATEN_CPU_CAPABILITY=default, avx2 and avx512, and MKL_CBWR=COMPATIBLE.
+"""
+
+import hashlib
+import json
+import random
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import magrl  # noqa: F401 - registers the environments
+from magrl.benchmark.tracks import TRACKS, digest
+from magrl.envs import PUBLIC_KEYS, TASK_SETS, named_tasks
+from magrl.evaluation.rollout import next_rollout
+from magrl.sensor_std import STD_KEYS
+
+NEW_VERSION = "published numbers would change: keep this track as it is, and make a new version for the change"
+RECORDS = {
+    "box-v1": "e532e868b7a49993",
+    "earth-v1": "49f64964da2779f5",
+    "alone-v1": "9d5691e12866b3c3",
+    "vehicles-v1": "a956d9a08616de62",
+    "north-v1": "e35c4d00c50322a3",
+    "sequences-v1": "0097b5789b370ad7",
+}
+READINGS = {
+    "box-v1": "5fac2cb5615240f7",
+    "earth-v1": "c2cfc057ec3fe921",
+    "alone-v1": "c2cfc057ec3fe921",
+    "vehicles-v1": "7ab8483ada0f53bf",
+    "north-v1": "2eec445c2d5edf17",
+    "sequences-v1": "c2cfc057ec3fe921",
+}
+SETS = {
+    "test-1000": "a86aacd1afedb688",
+    "paper-100": "82cb3cd8bee75af2",
+    "figure-4-1": "a7aac085136a6d62",
+}
+TRACES = {
+    "magrl/GeomagneticNavigation-v0": "6d64f11a0907054f",
+    "magrl/GeomagneticNavigationAnywhere-v0": "5600acc5bd7da56e",
+}
+MEANS = {
+    "magrl/GeomagneticNavigation-v0": [
+        0.22458,
+        -0.3584,
+        0.05918,
+        0.37456,
+        -0.48508,
+        -0.17514,
+        0.02501,
+        0.0003,
+        0.29998,
+        -0.25337,
+        -0.46864,
+        -0.06487,
+        0.01349,
+        -11.43383,
+    ],
+    "magrl/GeomagneticNavigationAnywhere-v0": [
+        -0.1953,
+        -0.03781,
+        1.35628,
+        0.92961,
+        0.22239,
+        0.23468,
+        -0.08085,
+        0.25462,
+        0.20382,
+        0.03782,
+        1.95011,
+        0.49,
+        0.48101,
+        0.56369,
+        0.22157,
+        -0.19772,
+        -0.03299,
+        0.24071,
+        0.80472,
+        -0.25,
+    ],
+}
+FIRST, SIZE = np.array([1, 0]), np.array([25, 1.5])  # of actions in km and rad, from those in [-1, 1]
+IDS = sorted(name for name in gymnasium.registry if name.startswith("magrl/"))
+
+
+def actions(count: int, steps: int) -> np.ndarray:
+    """Actions in [-1, 1], from a generator that Python promises to keep: ``(steps, count, 2)``."""
+    draw = random.Random(0)
+    return np.array([[[draw.uniform(-1, 1) for _ in "dt"] for _ in range(count)] for _ in range(steps)], np.float32)
+
+
+@pytest.mark.parametrize("name", TRACKS)
+def test_declaration_and_tasks_of_a_track_are_frozen(name: str) -> None:
+    record = json.dumps(TRACKS[name].record(), sort_keys=True)
+    assert hashlib.sha256(record.encode()).hexdigest()[:16] == RECORDS[name], NEW_VERSION
+
+
+@pytest.mark.parametrize("name", TRACKS)
+def test_readings_of_a_track_are_frozen(name: str) -> None:
+    """What eight vehicles read in 20 moves that do not depend on it, and the accuracy that they know, at each level."""
+    track, parts = TRACKS[name], []
+    for errors in track.errors.values():
+        flight = track.flight(errors, num_envs=8)
+        moves = iter(torch.from_numpy((actions(8, 20) + FIRST) * SIZE).float())
+
+        def act(seen, moves=moves, declares=flight.base.arrival.declared):
+            return seen.set("action", torch.nn.functional.pad(next(moves), (0, int(declares)), value=-1))
+
+        flight.base.max_steps = 20
+        after = next_rollout(flight.env, act)["next"]
+        values = [after[key] for key in (*PUBLIC_KEYS, "position", "success")]
+        values += [after.get(key, torch.zeros_like(after["field"])) for key in STD_KEYS]
+        parts.append(torch.cat([value.double().nan_to_num(posinf=-1) for value in values], -1).flatten(0, -2))
+    assert digest(torch.cat(parts), digits=4)[:16] == READINGS[name], NEW_VERSION
+
+
+@pytest.mark.parametrize("name", TASK_SETS)
+def test_task_sets_are_frozen(name: str) -> None:
+    assert digest(torch.cat(named_tasks(name)[:2], -1))[:16] == SETS[name], NEW_VERSION
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_environments_of_gymnasium_answer_to_actions_as_ever(name: str) -> None:
+    raw = {"observation": "dict", "scale_actions": False, "reward": "base"}  # its numbers come from float64
+    default, plain = (gymnasium.make_vec(name, num_envs=4, **options) for options in ({}, raw))
+    default.reset(seed=0)
+    plain.reset(seed=0)
+    means, rows = [], []
+    for action in actions(4, 50):
+        observation, reward, *_ = default.step(action)
+        means.append(np.concatenate([observation, reward[:, None]], 1))
+        readings, *results, _ = plain.step((action + FIRST) * SIZE)
+        rows.append(np.concatenate([*(readings[key] for key in PUBLIC_KEYS), np.stack(results, 1)], 1))
+    assert digest(torch.from_numpy(np.stack(rows)))[:16] == TRACES[name], NEW_VERSION
+    mean = np.stack(means).mean((0, 1), dtype=float)
+    assert mean == pytest.approx(np.array(MEANS[name]), abs=1e-4), NEW_VERSION
