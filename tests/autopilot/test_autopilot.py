@@ -42,13 +42,14 @@ def elements(place: tuple[float, float]) -> list[float]:
 class World:
     """A vehicle that turns at once and moves at a constant speed, as a link."""
 
-    period_s = 1.0
+    period_s = 55.0
 
     def __init__(self, north: str = "true", noise: float = 20.0, speed: float = SPEED, step_s: float = STEP_S) -> None:
         self.speed, self.step_s = speed, step_s
         self.place, self.time, self.heading = HERE, 0.0, 320.0
         self.north, self.rng, self.noise = north, random.Random(0), noise
         self.said: list[str] = []
+        self.steered = 0
 
     @property
     def left_km(self) -> float:
@@ -73,6 +74,7 @@ class World:
         yield Measurement(self.time + 0.02, speed=self.speed)
 
     def steer(self, heading_deg: float) -> None:
+        self.steered += 1
         self.heading = heading_deg + OFFSET * (self.north == "magnetic")
 
     def report(self, command: Command, text: str) -> None:
@@ -98,6 +100,7 @@ def test_a_vehicle_arrives(flown) -> None:
     assert world.left_km < 25
     assert world.time * SPEED / 1000 < 3 * 144
     assert world.said[-1].startswith("within 25 km")
+    assert world.time / 60 < world.steered < world.time / 50 + len(commands)  # with each command, and now and then
     assert read_log(folder / "messages.csv").north == "true"  # the record is a log
 
 
@@ -216,6 +219,17 @@ def test_a_long_way_is_reported_in_parts() -> None:
     assert [step.distance for step in flight.vehicle._steps][-3:-1] == [50.0, 50.0]
 
 
+def test_a_vehicle_that_does_not_get_ahead_reads_again() -> None:
+    flight, world = readings(lambda _, m: m, 8), World()
+    world.time = 80.0
+    assert flight.command.distance_km > 10
+    while len(flight.vehicle._steps) < 2:
+        world.heading += 30.0  # it circles
+        for message in world.messages():
+            flight.take(message)
+        assert world.time < 1000
+
+
 def test_a_loop_is_refused_without_a_start_and_after_the_end(flown) -> None:
     with pytest.raises(ValueError, match="call start"):
         Loop(Onboard("secant"))
@@ -262,10 +276,11 @@ def test_mavlink_is_read_in_our_units_from_one_vehicle() -> None:
     coarse = mavlink.MAVLink_scaled_imu_message(5200, *[0] * 6, 150, 0, 500)
     line = Line([*packed(heartbeat(), attitude, imu, coarse, mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0))])
     line.messages = iter([*line.messages, *packed(attitude, system=9)])
-    turned, field, ignored, speed = received(MavlinkLink(line), 4)
+    turned, field, ignored, speed, silence = received(MavlinkLink(line), 5)
     assert turned == pytest.approx(Measurement(5.0, roll=0.0, pitch=0.0, heading=90.0), abs=1e-4)
     assert field[:4] == pytest.approx((5.1, 15000.0, -2000.0, 50000.0), abs=1e-2)
     assert ignored is None
+    assert silence is None
     assert speed == Measurement(5.0, speed=50.0)
     asked = [message.param1 for message in line.sent if message.get_type() == "COMMAND_LONG"]
     assert {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_VFR_HUD} <= set(asked)
@@ -357,6 +372,15 @@ def test_nmea_over_udp_steers_a_ship() -> None:
     assert (field.roll, field.pitch) == (1.0, -2.0)
     assert math.hypot(field.x, field.y, field.z) == pytest.approx(50_900, abs=700)
     assert speed.speed == pytest.approx(SPEED, abs=0.01)
+
+
+def test_sentences_of_another_north_or_speed_do_not_count() -> None:
+    lines = [sentence("HCHDM,350.0,M"), sentence("GPVTG,,T,,M,10.0,N,18.5,K,A")]
+    counted = [
+        [len([*kind.measurements(line, 0.0)]) for line in lines]
+        for kind in (Sentences(), Sentences("magnetic", "ground"))
+    ]
+    assert counted == [[0, 0], [1, 1]]
 
 
 def test_a_serial_port_is_read_and_written() -> None:
