@@ -5,7 +5,7 @@
     python recipes/replay_log.py way_readings.csv                                            # what would be commanded
 
 Logs are CSV files (columns such as time_s, mag_x_nT, mag_y_uT, roll_deg, heading_true_deg, speed_kn, lat, lon) and
-those of autopilots, ships and observatories (docs/onboard.md). The axes are forward, right, down, the angles roll,
+those of autopilots, ships and observatories (docs/logs.md). The axes are forward, right, down, the angles roll,
 pitch, heading.
 """
 

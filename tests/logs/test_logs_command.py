@@ -1,4 +1,4 @@
-"""The command, and the story of docs/onboard.md from a raw log to a replay: its commands run as they are written."""
+"""The command, and the story of docs/logs.md from a raw log to a replay: its commands run as they are written."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from magrl.logs import Calibration
 from magrl.logs.__main__ import main
 
 ROOT = Path(__file__).parent.parent.parent
-PAGE = (ROOT / "docs" / "onboard.md").read_text()
-COMMANDS = re.findall(r"```sh\n(.*?)```", PAGE[PAGE.index("### From a raw log to a replay") :], re.DOTALL)[0]
+PAGE = (ROOT / "docs" / "logs.md").read_text()
+COMMANDS = re.findall(r"```sh\n(.*?)```", PAGE[PAGE.index("## From a raw log to a replay") :], re.DOTALL)[0]
 
 
 @pytest.fixture(scope="module")
