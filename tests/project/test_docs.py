@@ -37,8 +37,8 @@ NOTEBOOK = ROOT / "docs" / "tutorial.ipynb"
 CELLS = json.loads(NOTEBOOK.read_text())["cells"]
 BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
-DDPG = ROOT / "docs" / "examples" / "ddpg_anywhere.py"
-EXAMPLES += [(DDPG, DDPG.read_text())]
+SCRIPTS = [ROOT / "docs" / "examples" / name for name in ("ddpg_anywhere.py", "turns.py", "onnx_step.py")]
+EXAMPLES += [(path, path.read_text()) for path in SCRIPTS]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
 BUDGET = {
     "total_frames = 60_000": "total_frames = 128",
