@@ -25,6 +25,7 @@ from magrl.checks import command
 from magrl.field import IGRF, elements_at
 from magrl.logs import Calibration
 from magrl.onboard import Command, Onboard
+from magrl.onboard.start import known_elements
 from magrl.sensor_std import SensorStd
 
 
@@ -43,15 +44,15 @@ def parser() -> argparse.ArgumentParser:
     add("--here", type=float, nargs=2, metavar=("LAT", "LON"), help="start, where it is known")
     add("--navigator", default="anywhere", help="anywhere, kalman, secant, or a policy file; default anywhere")
     add("--north", choices=("true", "magnetic"), default="true", help="north of the vehicle; default true")
-    add("--noise", type=float, nargs=3, default=(0.0, 0.0, 0.0), help="standard deviations of readings [deg deg nT]")
-    add("--bias", type=float, nargs=3, default=(0.0, 0.0, 0.0), help="those of constant errors [deg deg nT]")
+    add("--noise", type=float, nargs=3, required=True, help="standard deviations of readings [deg deg nT]")
+    add("--bias", type=float, nargs=3, help="those of constant errors [deg deg nT]; default those of --calibration")
     add("--calibration", type=Path, help="file of a calibration, of python -m magrl.logs --calibrate")
     add("--read-s", type=float, default=30.0, help="duration of a reading [s]; default 30")
     add("--arrival-km", type=float, default=25.0, help="radius of the destination [km]; default 25")
     add("--confidence", type=float, default=0.8, help="least probability of arrival to stop; default 0.8")
     add("--nmea", action="store_true", help="the link is NMEA 0183; default MAVLink")
     add("--level", action="store_true", help="NMEA: the magnetometer is level, without XDR of PTCH and ROLL")
-    add("--speed", help="airspeed or groundspeed (MAVLink), water or ground (NMEA); default the first")
+    add("--speed", help="airspeed or groundspeed (MAVLink), water or ground (NMEA); default by the vehicle")
     add("--sensor", choices=SENSORS, help="MAVLink: message of the magnetometer; default HIGHRES_IMU if it comes")
     add("--steering", choices=STEERING, help="MAVLink: how to steer; default by the type of the vehicle")
     add("--cruise", type=float, help="MAVLink: speed to command with --steering velocity [m/s]")
@@ -67,11 +68,11 @@ def main(args: Sequence[str] | None = None) -> None:
 def _main(options: argparse.Namespace) -> None:
     if (options.to or options.here) and not options.date:
         raise ValueError("--to and --here need --date, that of the flight, for IGRF")
-    loop = Loop(
-        vehicle(options),
-        read_s=options.read_s,
-        calibration=Calibration.load(options.calibration) if options.calibration else None,
-    )
+    calibration = Calibration.load(options.calibration) if options.calibration else None
+    options.bias = options.bias or (calibration.std if calibration else (0.0, 0.0, 0.0))
+    loop = Loop(vehicle(options), read_s=options.read_s, calibration=calibration)
+    if (options.out / "start.json").exists():
+        print(f"continues the flight in {options.out}, whose commands come first; for a new one, give another --out")
     print(f"target: D, I, B_H = {', '.join(f'{value:.2f}' for value in loop.vehicle.target)}; flight: {options.out}")
     try:
         for number, order in enumerate(fly(loop, _Waiting(link(options), loop), options.out)):
@@ -88,7 +89,7 @@ def vehicle(options: argparse.Namespace) -> Onboard:
     places = [place and elements_at(field, torch.tensor(place)).tolist() for place in (options.to, here)]
     settings = {"arrival_km": options.arrival_km, "confidence": options.confidence, "north": options.north}
     board = Onboard(policy, sensor_std=SensorStd(options.noise, options.bias), **settings)
-    board.start(target or places[0], places[1])
+    board.start(target or places[0], places[1], here_std=known_elements(here, date=options.date)[1] if here else None)
     return board
 
 
@@ -115,13 +116,16 @@ class _Waiting:
     """Link that says what it waits for, where no message comes."""
 
     def __init__(self, link: Link, loop: Loop) -> None:
-        self._link, self._loop, self.period_s = link, loop, link.period_s
+        self._link, self._loop, self.period_s, self._said = link, loop, link.period_s, ""
         self.steer, self.report = link.steer, link.report
 
     def __iter__(self) -> Iterator[Measurement | None]:
         for number, measurement in enumerate(self._link):
             if (measurement is None or number % 100 == 99) and self._loop.command is None and self._loop.missing:
                 print(f"waiting for {', '.join(self._loop.missing)}", flush=True)
+            if self._loop.command is None and self._loop.note != self._said:
+                self._said = self._loop.note
+                print(f"the first reading is refused: {self._said}", flush=True)
             yield measurement
 
 

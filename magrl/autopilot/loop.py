@@ -186,43 +186,53 @@ class Loop:
 
     def _step(self, rows: np.ndarray) -> Command | None:
         """Report the move and its reading; None where the first reading is not possible."""
-        first = self.command is None
-        reading, heading, text = self._mean(rows)
+        reading, heading, offset, self.note = self._mean(rows)
         place: _Place = tuple(rows[:, -2:].mean(0).tolist()) if len(rows) else self._place
         north, east = (new - old for new, old in zip(place, self._origin, strict=True))
-        distance = 0.0 if first else math.hypot(north, east)
+        distance = 0.0 if self.command is None else math.hypot(north, east)
         if distance < _SHORT_KM:
             distance = 0.0
         else:
             heading = math.degrees(math.atan2(east, north))
-        try:
-            command = None if first and text else self._report(reading, heading, distance)
-        except ValueError as error:
-            text = str(error)
-            command = None if first else self._report((None, None, None), heading, distance)
-        self.note = text
+        command = None if self.command is None and self.note else self._report(reading, heading, distance)
+        if not self.note:
+            self._offset = offset
         if command is not None:
             self._origin = place
         return command
 
-    def _report(self, reading: Sequence[float | None], heading: float, distance: float) -> Command:
-        """Report a move to the vehicle, in parts where it is longer than one move."""
+    def _report(self, reading: Sequence[float | None], heading: float, distance: float) -> Command | None:
+        """Report a move, in parts where it is longer than one move, and without a reading that is refused.
+
+        Returns None where the first reading is refused.
+        """
         heading = heading % 360
         heading -= 360 * (heading < 7)  # a small one could be taken for radians
         longest = self.vehicle.max_move_km
         while distance > LONGER * longest:
-            self.vehicle.step(None, None, None, heading, longest)
+            self.vehicle.step(None, None, None, heading, longest)  # the reading at the end decides
             distance -= longest
         declination, inclination, level = reading
-        return self.vehicle.step(declination, inclination, level, heading, distance)
+        try:
+            return self.vehicle.step(declination, inclination, level, heading, distance)
+        except ValueError as error:
+            self.note = str(error)
+        return None if self.command is None else self.vehicle.step(None, None, None, heading, distance)
 
-    def _mean(self, rows: np.ndarray) -> tuple[Sequence[float | None], float, str]:
-        """Return the reading, the heading, and what is missing. The angle of a magnetic heading is measured anew."""
-        heading = self._value("heading") - self._offset
+    def _mean(self, rows: np.ndarray) -> tuple[Sequence[float | None], float, float, str]:
+        """Return the reading, the heading, the angle of the autopilot's north from that of the vehicle, and a text that
+        says what is missing."""
+        offset = self._offset
+        heading = self._value("heading") - offset
         if len(rows) < _LEAST_SAMPLES:
-            return (None, None, None), heading, "no sample of the field with an attitude"
+            return (None, None, None), heading, offset, "no sample of the field with an attitude"
         if len(rows) > _LEAST_SAMPLES and not np.ptp(rows[:, 1:4], 0).any():
-            return (None, None, None), heading, "the field does not change in any digit: the magnetometer is stuck"
+            return (
+                (None, None, None),
+                heading,
+                offset,
+                "the field does not change in any digit: the magnetometer is stuck",
+            )
         samples = DataFrame(rows[:, :7], columns=["time", *AXES, *ATTITUDE]).assign(distance=0.0)
         north = self.vehicle.options.north
         if north == "magnetic":
@@ -231,8 +241,8 @@ class Loop:
         mean = readings_of(log, every_km=_ONE_READING_KM, calibration=self.calibration).iloc[0]
         declination, inclination, level = (float(mean[name]) for name in NAMES)
         if north == "true":
-            return (declination, inclination, level), heading, ""
+            return (declination, inclination, level), heading, offset, ""
         shown = np.radians(rows[:, 6])
         shown = math.degrees(math.atan2(np.sin(shown).mean(), np.cos(shown).mean()))
-        self._offset = shown - float(mean["heading"])
-        return (None, inclination, level), self._value("heading") - self._offset, ""
+        offset = shown - float(mean["heading"])
+        return (None, inclination, level), self._value("heading") - offset, offset, ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -30,7 +31,12 @@ _ATTITUDE = "ATTITUDE", "ATTITUDE_QUATERNION"
 _WAIT_S = 3.0  # for HIGHRES_IMU, before a coarser message is taken
 _CLOCKS_S = 60.0  # a message whose clock differs by more has another one
 _VELOCITY_AND_YAW = 0b100111000111  # type_mask: position, acceleration and yaw rate are ignored
+_VELOCITY = 0b110111000111  # a Rover of ArduPilot takes a velocity with a yaw to the south for one backward
+_ROVERS = (10, 11)  # MAV_TYPE_GROUND_ROVER, MAV_TYPE_SURFACE_BOAT
 _FIXED_WING = 1  # MAV_TYPE_FIXED_WING
+_WINGS = (_FIXED_WING, *range(19, 26))  # and vehicles that start and land vertically
+_BEATS = 10  # heartbeats, of about 1 Hz, after which the messages are asked for again
+_CHANGE_HEADING = 43002  # MAV_CMD_GUIDED_CHANGE_HEADING
 _SEVERITY = 5  # MAV_SEVERITY_NOTICE
 _TEXT = 50  # characters of a STATUSTEXT
 
@@ -53,13 +59,16 @@ class Messages:
         if sensor is not None:
             check_choice(SENSORS, sensor=sensor)
         self.names = (*_ATTITUDE, "VFR_HUD", *([sensor] if sensor else SENSORS))
-        self._speed, self._sensor = speed, sensor
+        self.speed, self._sensor = speed, sensor
         self._first: float | None = None
-        self._now = 0.0
+        self._now: float | None = None
 
     def measurement(self, message: Any) -> Measurement | None:
-        """Return the content of a message; None for one that does not count."""
-        name, time = message.get_type(), self._time(message)
+        """Return the content of a message; None for one that does not count, and before the first attitude."""
+        name = message.get_type()
+        if self._now is None and name not in _ATTITUDE:
+            return None
+        time = self._time(message)
         if name in _ATTITUDE:
             self._now = time
             if name == "ATTITUDE":
@@ -68,7 +77,7 @@ class Messages:
                 angles = attitude_of(torch.tensor([message.q1, message.q2, message.q3, message.q4])).tolist()
             return Measurement(time, **dict(zip(ATTITUDE, angles, strict=True)))
         if name == "VFR_HUD":
-            return Measurement(time, speed=getattr(message, self._speed))
+            return Measurement(time, speed=getattr(message, self.speed))
         if name not in SENSORS or not self._chosen(name, time):
             return None
         axes = (SENSORS[name] * getattr(message, axis) for axis in ("xmag", "ymag", "zmag"))
@@ -76,13 +85,12 @@ class Messages:
 
     def _time(self, message: Any) -> float:
         """Return the time of a message, or that of the last attitude where it has none, or that of another clock."""
+        now = self._now or 0.0
         own = getattr(message, "time_boot_ms", None)
-        time = self._now if own is None else own / 1e3
+        time = now if own is None else own / 1e3
         if hasattr(message, "time_usec"):
             time = message.time_usec / 1e6
-        if message.get_type() in _ATTITUDE or abs(time - self._now) <= _CLOCKS_S:
-            return time
-        return self._now
+        return time if message.get_type() in _ATTITUDE or abs(time - now) <= _CLOCKS_S else now
 
     def _chosen(self, name: str, time: float) -> bool:
         """Return whether a message is that of the magnetometer; the first one that may be is chosen."""
@@ -106,7 +114,8 @@ class MavlinkLink:
             ``"udpin:0.0.0.0:14550"`` or ``"/dev/ttyUSB0,57600"``.
         steering: one of :data:`STEERING`; by default by the type of the vehicle.
         cruise_m_s: speed to command with ``"velocity"`` [m/s].
-        speed: ``"airspeed"`` or ``"groundspeed"`` of VFR_HUD, with which the moves are integrated.
+        speed: ``"airspeed"`` or ``"groundspeed"`` of VFR_HUD, with which the moves are integrated; by default the
+            airspeed of a fixed wing, the ground speed of others.
         sensor: message of the magnetometer, one of :data:`SENSORS`.
 
     Raises:
@@ -127,60 +136,84 @@ class MavlinkLink:
         *,
         steering: str | None = None,
         cruise_m_s: float | None = None,
-        speed: str = "airspeed",
+        speed: str | None = None,
         sensor: str | None = None,
     ) -> None:
         if steering is not None:
             check_choice(STEERING, steering=steering)
         if steering == "velocity" and cruise_m_s is None:
             raise ValueError("steering by velocity needs cruise_m_s, the speed to command")
-        self._messages = Messages(speed, sensor)
+        self._messages, self._speed = Messages(speed or "airspeed", sensor), speed
         self._connection = _connected(connection) if isinstance(connection, str) else connection
         self._steering, self._cruise = steering, cruise_m_s
         self._vehicle: tuple[int, int] | None = None  # system and component of the autopilot
+        self._mask, self._beats, self._refused = _VELOCITY_AND_YAW, 0, 0
 
     def __iter__(self) -> Iterator[Measurement | None]:
         """Iterate over the messages of the autopilot."""
         while True:
-            message = self._connection.recv_match(type=["HEARTBEAT", *self._messages.names], blocking=True, timeout=1.0)
+            kinds = ["HEARTBEAT", "COMMAND_ACK", *self._messages.names]
+            message = self._connection.recv_match(type=kinds, blocking=True, timeout=1.0)
             if message is None:
                 yield None
             elif message.get_type() == "HEARTBEAT":
                 self._meet(message)
-            elif self._vehicle == (message.get_srcSystem(), message.get_srcComponent()):
+            elif self._vehicle != (message.get_srcSystem(), message.get_srcComponent()):
+                continue
+            elif message.get_type() == "COMMAND_ACK":
+                self._hear(message)
+            else:
                 yield self._messages.measurement(message)
 
     def _meet(self, heartbeat: Any) -> None:
-        """Learn the autopilot from its heartbeat, and ask for the messages."""
-        mav, component = self._connection.mav, heartbeat.get_srcComponent()
+        """Learn the autopilot from its heartbeat, and ask for the messages, now and then again."""
+        mav, source = self._connection.mav, (heartbeat.get_srcSystem(), heartbeat.get_srcComponent())
         mav.heartbeat_send(18, 8, 0, 0, 4)  # an onboard controller without an autopilot, active
-        if self._vehicle or component != 1:
+        if source != (self._vehicle or (source[0], 1)):
             return
-        self._vehicle = heartbeat.get_srcSystem(), component
+        if self._vehicle is None:
+            self._vehicle = source
+            self._learn(heartbeat.type, heartbeat.autopilot)
+        dialect = package("pymavlink.dialects.v20.ardupilotmega", "pymavlink")
+        for name in self._messages.names if self._beats % _BEATS == 0 else ():
+            number = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
+            mav.command_long_send(*source, 511, 0, number, 1e6 / RATE_HZ, 0, 0, 0, 0, 0)  # SET_MESSAGE_INTERVAL
+        self._beats += 1
+
+    def _learn(self, kind: int, autopilot: int) -> None:
+        """Choose how to steer a type of vehicle."""
         if self._steering is None:
-            self._steering = "heading" if heartbeat.type == _FIXED_WING else "velocity"
-        if self._steering == "heading" and heartbeat.autopilot == 12:  # MAV_AUTOPILOT_PX4
+            self._steering = "heading" if kind == _FIXED_WING else "velocity"
+        if autopilot == 12 and kind in _WINGS:  # MAV_AUTOPILOT_PX4
             raise ValueError("PX4 accepts no heading by MAVLink on a fixed wing: steer it by another program")
         if self._steering == "velocity" and self._cruise is None:
             raise ValueError("this vehicle is steered by velocity: state cruise_m_s, the speed to command")
-        dialect = package("pymavlink.dialects.v20.ardupilotmega", "pymavlink")
-        for name in self._messages.names:
-            number = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
-            mav.command_long_send(*self._vehicle, 511, 0, number, 1e6 / RATE_HZ, 0, 0, 0, 0, 0)  # SET_MESSAGE_INTERVAL
+        self._mask = _VELOCITY if kind in _ROVERS else _VELOCITY_AND_YAW
+        self._messages.speed = self._speed or ("airspeed" if kind == _FIXED_WING else "groundspeed")
+
+    def _hear(self, answer: Any) -> None:
+        """Warn of a heading that the autopilot refuses."""
+        if answer.command == _CHANGE_HEADING:
+            if answer.result and answer.result != self._refused:
+                warnings.warn(
+                    f"the autopilot refuses the heading (result {answer.result}): is it in GUIDED?", stacklevel=2
+                )
+            self._refused = answer.result
 
     def steer(self, heading_deg: float) -> None:
         """Send a heading."""
         assert self._vehicle is not None
         mav = self._connection.mav
         if self._steering == "heading":  # MAV_FRAME_GLOBAL, MAV_CMD_GUIDED_CHANGE_HEADING, HEADING_TYPE_HEADING
-            mav.command_int_send(*self._vehicle, 0, 43002, 0, 0, 1, heading_deg, CENTRIPETAL_M_S2, 0, 0, 0, 0)
+            heading = round(heading_deg, 2) % 360
+            mav.command_int_send(*self._vehicle, 0, _CHANGE_HEADING, 0, 0, 1, heading, CENTRIPETAL_M_S2, 0, 0, 0, 0)
             return
         assert self._cruise is not None
         yaw = math.radians(heading_deg)
         velocity = self._cruise * math.cos(yaw), self._cruise * math.sin(yaw), 0.0
         rest = (0.0, 0.0, 0.0)
         mav.set_position_target_local_ned_send(
-            0, *self._vehicle, 1, _VELOCITY_AND_YAW, *rest, *velocity, *rest, math.remainder(yaw, 2 * math.pi), 0.0
+            0, *self._vehicle, 1, self._mask, *rest, *velocity, *rest, math.remainder(yaw, 2 * math.pi), 0.0
         )
 
     def report(self, command: Command, text: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from magrl.autopilot.loop import Measurement
 from magrl.checks import check_choice
-from magrl.logs.autopilots import nmea_values, package
+from magrl.logs.autopilots import INVALID, nmea_values, package
 from magrl.logs.samples import AXES
 from magrl.onboard import Command
 
@@ -50,7 +50,9 @@ class Sentences:
             message = self._reader.parse(line)
         except Exception:  # whatever the package raises for a foreign sentence
             return
-        pairs = () if message is None else nmea_values(message)
+        if message is None or any(getattr(message, field, None) == value for field, value in INVALID.items()):
+            return
+        pairs = nmea_values(message)
         values = {_NAMES.get(name, name): value for name, value in pairs if name in self._kinds or name not in _NAMES}
         values = {name: value for name, value in values.items() if name in _QUANTITIES}
         axes = [name for name in AXES if name in values]
@@ -85,6 +87,7 @@ class NmeaLink:
 
     def __init__(self, address: str, *, north: str = "true", **options: Any) -> None:
         self._sentences, self._north = Sentences(north, **options), north[0].upper()
+        self._zero = time.time() - time.monotonic()  # the clock of the computer may be set in flight
         self.port = _Udp(int(address[4:])) if address.startswith("udp:") else _serial(address)
 
     def __iter__(self) -> Iterator[Measurement | None]:
@@ -94,7 +97,7 @@ class NmeaLink:
             if not lines:
                 yield None
             for line in lines:
-                yield from self._sentences.measurements(line, time.time())
+                yield from self._sentences.measurements(line, self._zero + time.monotonic())
 
     def steer(self, heading_deg: float) -> None:
         """Send a heading."""

@@ -282,7 +282,7 @@ _SENTENCES: Mapping[str, Mapping[str, tuple[str, float]]] = {
 }
 """Columns of each sentence: name of the field, and its unit."""
 _CHOICES = {"heading": ("heading_true", "heading_magnetic"), "speed": ("speed_water", "speed_ground")}
-_INVALID = {"status": "V", "mi": "V", "posMode": "N", "quality": 0}
+INVALID = {"status": "V", "mi": "V", "posMode": "N", "quality": 0}
 """Fields of a sentence whose values are not valid."""
 
 
@@ -297,7 +297,7 @@ def read_nmea(path: Path) -> Recording:
     for line in path.read_bytes().splitlines(keepends=True):
         tag = re.match(rb"\\[^\\]*\bc:(\d+)", line)
         for _, message in reader(io.BytesIO(line), quitonerror=0):
-            if message is None or any(getattr(message, field, None) == value for field, value in _INVALID.items()):
+            if message is None or any(getattr(message, field, None) == value for field, value in INVALID.items()):
                 continue
             now = int(tag[1]) / (1000 if len(tag[1]) > 11 else 1) if tag else _nmea_time(message) or now
             for name, value in nmea_values(message):

@@ -210,13 +210,30 @@ def test_an_impossible_message_does_not_count() -> None:
     assert spiked.vehicle._steps[0].inclination == pytest.approx(elements(HERE)[1], abs=0.1)
 
 
-def test_a_long_way_is_reported_in_parts() -> None:
+@pytest.mark.parametrize("good", [True, False])
+def test_a_long_way_is_reported_in_parts_and_once(good) -> None:
     flight = readings(lambda _, m: m, 10)
     before = len(flight.vehicle._steps)
     messages = (m._replace(time=m.time + gap) for gap in (2000.0, 2100.0) for m in World().messages())
     while len(flight.vehicle._steps) == before:  # it was not heard of for half an hour
-        flight.take(next(messages))
-    assert [step.distance for step in flight.vehicle._steps][-3:-1] == [50.0, 50.0]
+        message = next(messages)
+        flight.take(message if good or message.x is None else message._replace(x=-message.x))
+    distances = [step.distance for step in flight.vehicle._steps][before:]
+    assert distances[:2] == [50.0, 50.0]
+    assert sum(distances) == pytest.approx(math.dist(flight._origin, (0.0, 0.0)), abs=5.0)
+
+
+def test_a_refused_reading_does_not_turn_the_vehicle() -> None:
+    flight, world, shown = loop("magnetic"), World("magnetic"), 0.0
+    while len(flight.vehicle._steps) < 2:
+        for message in world.messages():
+            wrong = flight.command and message.x is not None
+            flight.take(message._replace(x=message.y, y=message.z) if wrong else message)
+        if flight.steer_deg is not None:
+            world.steer(flight.steer_deg)
+            shown = flight._offset if len(flight.vehicle._steps) < 2 else shown
+    assert "not possible" in flight.note or "changed from" in flight.note
+    assert flight._offset == shown != 0.0
 
 
 def test_a_vehicle_that_does_not_get_ahead_reads_again() -> None:
@@ -288,16 +305,21 @@ def test_mavlink_is_read_in_our_units_from_one_vehicle() -> None:
 
 def test_a_coarse_magnetometer_is_taken_after_three_seconds_and_another_clock_is_set_aside() -> None:
     messages = Messages("groundspeed")
+    speed = mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)
+    assert messages.measurement(speed) is None  # its time is not known before the first attitude
     for time in (0, 3):
         messages.measurement(mavlink.MAVLink_attitude_message(1000 * time, *[0.0] * 6))
         raw = mavlink.MAVLink_raw_imu_message(10**15 + time, *[0] * 6, 150, 0, 500)
         found = messages.measurement(raw)
         assert (found is None) == (time == 0)
     assert found == Measurement(3.0, 15000.0, 0.0, 50000.0)
-    assert messages.measurement(mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)).speed == 40
+    assert messages.measurement(speed) == Measurement(3.0, speed=40.0)
 
 
-@pytest.mark.parametrize(("kind", "name"), [(1, "COMMAND_INT"), (10, "SET_POSITION_TARGET_LOCAL_NED")])
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [(1, "COMMAND_INT"), (2, "SET_POSITION_TARGET_LOCAL_NED"), (10, "SET_POSITION_TARGET_LOCAL_NED")],
+)
 def test_mavlink_steers(kind, name) -> None:
     line = Line(packed(heartbeat(kind)))
     link = MavlinkLink(line, cruise_m_s=5.0)
@@ -312,8 +334,20 @@ def test_mavlink_steers(kind, name) -> None:
         assert (sent.vx, sent.vy, sent.yaw) == pytest.approx((-2.5, 4.3301, 2.0944), abs=1e-3)
         ignored = mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
         assert sent.type_mask & ignored == ignored
-        used = mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
-        assert not sent.type_mask & used
+        assert not sent.type_mask & mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
+        yaw_ignored = bool(sent.type_mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE)
+        assert yaw_ignored == (kind == 10)  # a Rover would drive to the south backward
+        assert link._messages.speed == "groundspeed"
+
+
+def test_a_refused_heading_and_lost_requests_are_noticed() -> None:
+    answer = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_GUIDED_CHANGE_HEADING, 4)
+    line = Line(packed(*[heartbeat()] * 11, answer, answer))
+    with pytest.warns(UserWarning, match="is it in GUIDED") as warned:
+        received(MavlinkLink(line))
+    assert len(warned) == 1
+    asked = [m.param1 for m in line.sent if m.get_type() == "COMMAND_LONG"]
+    assert asked.count(mavlink.MAVLINK_MSG_ID_VFR_HUD) == 2
 
 
 def test_mavlink_reports(flown) -> None:
@@ -327,6 +361,8 @@ def test_mavlink_reports(flown) -> None:
 def test_an_autopilot_that_cannot_be_steered_is_named() -> None:
     with pytest.raises(ValueError, match="PX4 accepts no heading"):
         next(iter(MavlinkLink(Line(packed(heartbeat(1, 12))))))
+    with pytest.raises(ValueError, match="PX4 accepts no heading"):
+        next(iter(MavlinkLink(Line(packed(heartbeat(22, 12))), cruise_m_s=20.0)))
     with pytest.raises(ValueError, match="state cruise_m_s"):
         next(iter(MavlinkLink(Line(packed(heartbeat(10))))))
 
@@ -375,6 +411,7 @@ def test_nmea_over_udp_steers_a_ship() -> None:
 
 
 def test_sentences_of_another_north_or_speed_do_not_count() -> None:
+    assert not [*Sentences().measurements(sentence("HETHS,290.0,V"), 0.0)]  # marked as not valid
     lines = [sentence("HCHDM,350.0,M"), sentence("GPVTG,,T,,M,10.0,N,18.5,K,A")]
     counted = [
         [len([*kind.measurements(line, 0.0)]) for line in lines]
@@ -449,10 +486,13 @@ def encoded(world: World, rng: random.Random) -> Iterator[Any]:
 
 
 def test_the_command_looks_up_its_destination_and_names_what_is_missing(capsys) -> None:
-    options = parser().parse_args(["udp:0", "--to", *map(str, THERE), "--date", "2026-01-01", "--navigator", "secant"])
-    assert vehicle(options).target == pytest.approx(elements(THERE), rel=1e-6)
+    words = ["--to", *map(str, THERE), "--noise", "0.05", "0.05", "5"]
+    here = ["--here", *map(str, HERE), "--date", "2026-01-01", "--navigator", "secant", "--bias", "0", "0", "0"]
+    board = vehicle(parser().parse_args(["udp:0", *words, *here]))
+    assert board.target == pytest.approx(elements(THERE), rel=1e-6)
+    assert board._here[1][1:] == (0.2, 133.0)  # a place is known as well as a model of the core
     with pytest.raises(SystemExit):
-        main(["udp:0", "--nmea", "--to", "61", "5"])
+        main(["udp:0", "--nmea", *words])
     assert "--to and --here need --date" in capsys.readouterr().err
 
 
@@ -462,7 +502,8 @@ def test_the_command_flies_a_recorded_flight_again(flown, monkeypatch, capsys) -
     noise = ["--noise", "0.05", "0.05", "20", "--read-s", "60"]
     main(["udp:0", "--target", *target, *noise, "--out", str(flown[2])])
     shown = capsys.readouterr().out
-    assert len(shown.splitlines()) == 1 + len(flown[1])
+    assert shown.startswith(f"continues the flight in {flown[2]}")
+    assert len(shown.splitlines()) == 2 + len(flown[1])
     assert "stop: arrived, within 25 km" in shown
 
 
