@@ -96,6 +96,8 @@ class Conditions:
     def drift_km(self, max_move_km: float) -> float:
         """Return how much farther than a longest move the errors may carry a vehicle, rounded up [km].
 
+        It is at least 1 with errors of motion: they turn a move, which an environment without drift does not allow.
+
         Args:
             max_move_km: longest move that a policy may command [km].
 
@@ -107,7 +109,7 @@ class Conditions:
             (0.0, 4.0)
         """
         farthest_km = max(error.farthest_km(max_move_km) for error in self.transforms())
-        return float(max(0, math.ceil(farthest_km - max_move_km)))
+        return float(max(self.motion is not None, math.ceil(farthest_km - max_move_km)))
 
     @cached_property
     def std(self) -> SensorStd:

@@ -49,6 +49,12 @@ def under(name: str, num_envs: int = 2, seed: int = 0) -> EnvBase:
     return with_conditions(nav(num_envs, CONDITIONS[name].drift_km(50.0)), name, seed)
 
 
+def test_an_error_of_the_compass_in_motion_alone_flies() -> None:
+    compass = Conditions("compass", motion={"compass_deg": 5.0})
+    env = with_conditions(nav(2, compass.drift_km(50.0)), compass, seed=0)
+    assert env.rollout(2)["next", "true_move"].shape[-1] == 2
+
+
 def test_order_of_the_errors() -> None:
     order = [MotionError, MagneticWeather, SensorErrors, NorthReferenceError]
     assert [type(part) for part in CONDITIONS["low-cost"].transforms()] == order
