@@ -223,16 +223,11 @@ class Loop:
         """Return the reading, the heading, the angle of the autopilot's north from that of the vehicle, and a text that
         says what is missing."""
         offset = self._offset
-        heading = self._value("heading") - offset
+        nothing = (None, None, None), self._value("heading") - offset, offset
         if len(rows) < _LEAST_SAMPLES:
-            return (None, None, None), heading, offset, "no sample of the field with an attitude"
+            return *nothing, "no sample of the field with an attitude"
         if len(rows) > _LEAST_SAMPLES and not np.ptp(rows[:, 1:4], 0).any():
-            return (
-                (None, None, None),
-                heading,
-                offset,
-                "the field does not change in any digit: the magnetometer is stuck",
-            )
+            return *nothing, "the field does not change in any digit: the magnetometer is stuck"
         samples = DataFrame(rows[:, :7], columns=["time", *AXES, *ATTITUDE]).assign(distance=0.0)
         north = self.vehicle.options.north
         if north == "magnetic":
@@ -241,7 +236,7 @@ class Loop:
         mean = readings_of(log, every_km=_ONE_READING_KM, calibration=self.calibration).iloc[0]
         declination, inclination, level = (float(mean[name]) for name in NAMES)
         if north == "true":
-            return (declination, inclination, level), heading, offset, ""
+            return (declination, inclination, level), self._value("heading"), offset, ""
         shown = np.radians(rows[:, 6])
         shown = math.degrees(math.atan2(np.sin(shown).mean(), np.cos(shown).mean()))
         offset = shown - float(mean["heading"])

@@ -158,6 +158,7 @@ class MavlinkLink:
                 yield None
             elif message.get_type() == "HEARTBEAT":
                 self._meet(message)
+                yield None
             elif self._vehicle != (message.get_srcSystem(), message.get_srcComponent()):
                 continue
             elif message.get_type() == "COMMAND_ACK":

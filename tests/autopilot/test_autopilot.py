@@ -293,11 +293,10 @@ def test_mavlink_is_read_in_our_units_from_one_vehicle() -> None:
     coarse = mavlink.MAVLink_scaled_imu_message(5200, *[0] * 6, 150, 0, 500)
     line = Line([*packed(heartbeat(), attitude, imu, coarse, mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0))])
     line.messages = iter([*line.messages, *packed(attitude, system=9)])
-    turned, field, ignored, speed, silence = received(MavlinkLink(line), 5)
+    beat, turned, field, ignored, speed, silence = received(MavlinkLink(line), 6)
     assert turned == pytest.approx(Measurement(5.0, roll=0.0, pitch=0.0, heading=90.0), abs=1e-4)
     assert field[:4] == pytest.approx((5.1, 15000.0, -2000.0, 50000.0), abs=1e-2)
-    assert ignored is None
-    assert silence is None
+    assert [beat, ignored, silence] == [None] * 3
     assert speed == Measurement(5.0, speed=50.0)
     asked = [message.param1 for message in line.sent if message.get_type() == "COMMAND_LONG"]
     assert {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_VFR_HUD} <= set(asked)
@@ -344,7 +343,7 @@ def test_a_refused_heading_and_lost_requests_are_noticed() -> None:
     answer = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_GUIDED_CHANGE_HEADING, 4)
     line = Line(packed(*[heartbeat()] * 11, answer, answer))
     with pytest.warns(UserWarning, match="is it in GUIDED") as warned:
-        received(MavlinkLink(line))
+        received(MavlinkLink(line), 11)
     assert len(warned) == 1
     asked = [m.param1 for m in line.sent if m.get_type() == "COMMAND_LONG"]
     assert asked.count(mavlink.MAVLINK_MSG_ID_VFR_HUD) == 2
