@@ -19,7 +19,7 @@ from magrl.sensor_std import STD_KEYS
 from magrl.transforms import ObservationView
 
 EXAMPLES = {key: torch.zeros(1, size) for key, size in zip(PUBLIC_KEYS, (3, 3, 2, 1), strict=True)}
-EXAMPLES |= {key: torch.zeros(1, 3) for key in STD_KEYS} | {"step_count": torch.zeros(1, 1, dtype=torch.int64)}
+EXAMPLES |= {key: torch.zeros(1, 3) for key in STD_KEYS} | {"elapsed_steps": torch.zeros(1, 1, dtype=torch.int64)}
 """A value of each key of the plain environment that a policy may read, for traces: ``(1, ...)`` zeros."""
 READ_KEYS = tuple(EXAMPLES)
 """Keys of the plain environment that an exported policy may read."""
@@ -68,10 +68,10 @@ class TrainedPolicy(TensorDictModuleBase):
 
     def _state_before(self, seen: TensorDictBase) -> tuple[TensorDictBase | None, Tensor]:
         """Return the state before a step and a mask of new episodes ``(..., 1)``; repeated calls return the same."""
-        stored, starts = self.state, seen["step_count"] == 0
+        stored, starts = self.state, seen["elapsed_steps"] == 0
         if stored is None or stored.shape != seen.shape or stored.device != seen.device:
             return None, torch.ones_like(starts)
-        again = stored["step"] == seen["step_count"]
+        again = stored["step"] == seen["elapsed_steps"]
         before = torch.where(again.squeeze(-1), stored["before"], stored.select(*self.state_keys))
         return before, starts | (again & stored["starts"])
 
@@ -79,7 +79,7 @@ class TrainedPolicy(TensorDictModuleBase):
         self, seen: TensorDictBase, before: TensorDictBase | None, starts: Tensor, state: TensorDictBase
     ) -> None:
         """Store the state for the next step, and the state before this one."""
-        begun = {"step": seen["step_count"].clone(), "starts": starts, "before": state if before is None else before}
+        begun = {"step": seen["elapsed_steps"].clone(), "starts": starts, "before": state if before is None else before}
         self.state = state.clone(recurse=False).update(begun)
 
 
@@ -125,8 +125,8 @@ class ExportedPolicy(TrainedPolicy):
         check_type(Tensor, **states)
         if not in_keys or not all(key in READ_KEYS for key in in_keys):
             raise ValueError(f"in_keys must be among {', '.join(READ_KEYS)}, got {in_keys}")
-        if states and "step_count" not in in_keys:
-            raise ValueError(f"a policy with a state must read step_count, got {in_keys}")
+        if states and "elapsed_steps" not in in_keys:
+            raise ValueError(f"a policy with a state must read elapsed_steps, got {in_keys}")
         inputs = len(in_keys) + len(states) + bool(states)
         if (program.num_inputs, len(program.outputs)) != (inputs, 1 + len(states)):
             raise ValueError(

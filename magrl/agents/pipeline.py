@@ -114,7 +114,7 @@ def _exported(actor: TensorDictModuleBase, env: EnvBase) -> ExportedPolicy:
         first_state = [start[key][:1] for key in pipeline.state_keys]
         inputs = [start[key] for key in pipeline.in_keys]
         if first_state:
-            inputs = [torch.ones_like(start["step_count"], dtype=torch.bool), *inputs, *first_state]
+            inputs = [torch.ones_like(start["elapsed_steps"], dtype=torch.bool), *inputs, *first_state]
         program = trace_program(pipeline, inputs)
         view = None if isinstance(base.field, FieldBank) else base.observation_view()
         policy = ExportedPolicy(pipeline.in_keys, program, view, first_state, base.arrival.declared)
@@ -191,7 +191,7 @@ class _Pipeline(nn.Module):
         keys = [unravel_key(key) for part in before if isinstance(part, StatefulTransform) for key in part.state_keys]
         self.transform_state = list(dict.fromkeys(keys))
         self.marks = "is_init" in _keys(actor.in_keys)
-        needed = needed | ({"step_count"} if self.state_keys or self.marks else set())
+        needed = needed | ({"elapsed_steps"} if self.state_keys or self.marks else set())
         self.in_keys = [key for key in READ_KEYS if key in needed]
         fixed = (part.to_observation_norm() if hasattr(part, "to_observation_norm") else part for part in before)
         self.before, self.actor = nn.ModuleList(fixed), actor
@@ -228,7 +228,7 @@ class _Pipeline(nn.Module):
                     first[key] = _where(starts, first[key], moved[key])
             seen = first
         if starts is None and self.marks:
-            starts = seen["step_count"] == 0
+            starts = seen["elapsed_steps"] == 0
         if starts is not None:
             for key, value in zip(self.policy_state, self.first, strict=True):
                 seen[key] = _where(starts, value, state[key])

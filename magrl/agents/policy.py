@@ -76,7 +76,7 @@ class FieldPolicy(TrainedPolicy):
     """A trained agent as a navigator of the plain environment, in physical units.
 
     A policy that reads its own track (:class:`~magrl.transforms.TrackView`) keeps its own state for each vehicle from
-    the start of an episode (``step_count`` 0) on. Another call in the same step begins with the same state as the
+    the start of an episode (``elapsed_steps`` 0) on. Another call in the same step begins with the same state as the
     first, so that calling it twice on one state changes nothing. Such a policy reads the accuracy of the readings
     (:data:`magrl.sensor_std.STD_KEYS`); without these keys it is perfect. Where the environment has a
     :class:`~magrl.transforms.TrackField`, it reads that belief and computes none of its own.

@@ -27,7 +27,7 @@ DRIFT_KM = 40.0
 """How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
 SEED = 3 * paper.FIRST_RESERVED_SEED
 """Seed of regions and tasks, beyond those of trainings and of frozen sets."""
-READINGS = (*PUBLIC_KEYS, "step_count")
+READINGS = (*PUBLIC_KEYS, "elapsed_steps")
 """Keys of the readings, without the accuracy of the sensors."""
 
 

@@ -35,7 +35,7 @@ from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
 from magrl.transforms.views import ObservationView
 
 PUBLIC_KEYS = ("field", "target_field", "move", "heading")
-"""Keys that every policy may read, beside ``step_count``."""
+"""Keys that every policy may read, beside ``elapsed_steps``."""
 PRIVILEGED_KEYS = (
     "position",
     "target_position",
@@ -84,7 +84,7 @@ class GeomagneticNavEnv(EnvBase):
             one.
 
     Keys (``N = num_envs``): ``field``, ``target_field`` ``(N, 3)`` D [deg], I [deg], B_H [nT]; ``move`` ``(N, 2)`` last
-    move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``step_count`` ``(N, 1)``; and privileged ``position``,
+    move [km] and turn [rad]; ``heading`` ``(N, 1)`` [rad]; ``elapsed_steps`` ``(N, 1)``; and privileged ``position``,
     ``target_position``, ``start_position`` ``(N, 2)`` [deg], ``objective``, ``success`` ``(N, 1)``,
     ``objective_weights`` ``(N, 3)``, the index of the region, ``region`` ``(N, 1)``, ``episode_stream`` ``(N, 1)``,
     int64, of seed, vehicle and episode, for random numbers of transforms, and the terms of ``reward``,
@@ -240,7 +240,7 @@ class GeomagneticNavEnv(EnvBase):
                 "target_field": target_field.float(),
                 "move": zeros.float(),
                 "heading": heading.float(),
-                "step_count": torch.zeros_like(vehicle).unsqueeze(-1),
+                "elapsed_steps": torch.zeros_like(vehicle).unsqueeze(-1),
                 "position": start,
                 "target_position": target,
                 "start_position": start,
@@ -271,7 +271,7 @@ class GeomagneticNavEnv(EnvBase):
         weights = tensordict["objective_weights"].double()
         specs.check_state(weights)
         objective = guidance.objective(field, tensordict["target_field"].double(), weights)
-        step = tensordict["step_count"] + 1
+        step = tensordict["elapsed_steps"] + 1
         ended, right = self.arrival(action, objective, position, tensordict["target_position"])
         arrived, terminated = right & ended & ~lost, ended | lost
         truncated = (step >= self.max_steps) & ~terminated
@@ -281,7 +281,7 @@ class GeomagneticNavEnv(EnvBase):
                 "field": field.float(),
                 "move": action[:, :2].float(),
                 "heading": heading.float().unsqueeze(-1),
-                "step_count": step,
+                "elapsed_steps": step,
                 "position": position,
                 "objective": objective.float(),
                 "success": arrived,

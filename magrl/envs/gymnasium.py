@@ -321,7 +321,7 @@ def _measures(end: TensorDictBase, length_km: Tensor) -> dict[str, NDArray[Any]]
     measures = {
         "success": success,
         "is_success": success,  # the name that stable-baselines3 and Gymnasium-Robotics read
-        "steps": end["step_count"].squeeze(-1),
+        "steps": end["elapsed_steps"].squeeze(-1),
         **({"false_arrival": end["declared"].squeeze(-1) & ~success} if "declared" in end.keys() else {}),  # noqa: SIM118
         **path_measures(success, end["start_position"], end["position"], end["target_position"], length_km),
     }

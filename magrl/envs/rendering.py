@@ -158,7 +158,7 @@ class TrackRecorder:
         >>> recorder, step = TrackRecorder(length=3), torch.tensor([[0]])
         >>> for k in range(2):
         ...     place = torch.tensor([[-2.0 - k, 162.0]])
-        ...     recorder.add(TensorDict(position=place, target_position=place, step_count=step + k, region=step))
+        ...     recorder.add(TensorDict(position=place, target_position=place, elapsed_steps=step + k, region=step))
         >>> recorder.track(0)
         tensor([[ -2., 162.],
                 [ -3., 162.]])
@@ -171,7 +171,7 @@ class TrackRecorder:
         """Record a state of every vehicle; at a partial reset, only the rows ``started`` ``(N,)`` are new."""
         if torch.compiler.is_compiling():
             return
-        entry: tuple[Tensor, ...] = tuple(state[key] for key in ("position", "step_count", "target_position", "region"))
+        entry = tuple(state[key] for key in ("position", "elapsed_steps", "target_position", "region"))
         if started is not None and self._states:
             new, last = started.unsqueeze(-1), self._states.pop()
             entry = tuple(torch.where(new, a, b) for a, b in zip(entry, last, strict=True))

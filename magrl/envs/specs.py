@@ -26,7 +26,7 @@ CONSTANT_KEYS = (
     EPISODE_STREAM,
 )
 """Keys that keep their values throughout an episode."""
-STATE_KEYS = (*CONSTANT_KEYS, "heading", "step_count", "position", "objective", DISPLACEMENT)
+STATE_KEYS = (*CONSTANT_KEYS, "heading", "elapsed_steps", "position", "objective", DISPLACEMENT)
 """Keys that a step reads: the state of an episode."""
 
 
@@ -115,7 +115,7 @@ def observation_spec(
         target_field=field.clone(),
         move=float_bounds(highest_move * torch.tensor((0, -1)), highest_move),
         heading=Bounded(-math.pi, math.pi, (1,), dtype=torch.float32),
-        step_count=Unbounded((1,), dtype=torch.int64),
+        elapsed_steps=Unbounded((1,), dtype=torch.int64),
         position=POSITION.clone(),
         target_position=POSITION.clone(),
         start_position=POSITION.clone(),

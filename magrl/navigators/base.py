@@ -63,7 +63,7 @@ def element_indices(elements: Sequence[str], least: int) -> list[int]:
 class Navigator(TensorDictModuleBase):
     """Base class of untrained policies: action bounds, and a memory of each vehicle for the length of an episode.
 
-    A subclass sets its ``in_keys``, returns the memory at the start of an episode (``step_count`` 0) in
+    A subclass sets its ``in_keys``, returns the memory at the start of an episode (``elapsed_steps`` 0) in
     :meth:`first_memory`, and chooses the next move in :meth:`decide`. :meth:`decide` is called once for each step of a
     vehicle, so that calling the navigator twice on one state changes nothing; if ``done`` is among the ``in_keys``, it
     is not called after the end of an episode. With the class attributes below, and a place in the list of
@@ -82,7 +82,7 @@ class Navigator(TensorDictModuleBase):
         >>> class DueEast(Navigator):
         ...     def __init__(self):
         ...         super().__init__(max_move_km=50.0, max_turn_rad=math.pi / 2)
-        ...         self.in_keys = ["heading", "step_count"]
+        ...         self.in_keys = ["heading", "elapsed_steps"]
         ...
         ...     def decide(self, seen, memory):
         ...         heading = seen["heading"].squeeze(-1)
@@ -148,7 +148,7 @@ class Navigator(TensorDictModuleBase):
         """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]."""
         seen = tensordict.select(*self.in_keys).update(tensordict.select(*STD_KEYS, strict=False))
         self.memory = memory = self._recall(seen)
-        step = seen["step_count"].squeeze(-1)
+        step = seen["elapsed_steps"].squeeze(-1)
         if "done" in self.in_keys:  # a rollout steps all vehicles until the last one is done
             memory["over"] = memory["over"] | seen["done"].squeeze(-1)
             memory["action"] = torch.where(memory["over"].unsqueeze(-1), 0.0, memory["action"])
@@ -162,7 +162,7 @@ class Navigator(TensorDictModuleBase):
 
     def _recall(self, seen: TensorDictBase) -> TensorDictBase:
         """Return the memory of the batch, reset where an episode starts."""
-        step = seen["step_count"].squeeze(-1)
+        step = seen["elapsed_steps"].squeeze(-1)
         common = {"action": seen["heading"].new_zeros(len(step), 2), "decided_at": torch.full_like(step, -1)}
         common |= {"field_readings": torch.zeros_like(step), "over": torch.zeros_like(step, dtype=torch.bool)}
         first = TensorDict(self.first_memory(seen) | common, batch_size=step.shape, device=step.device)

@@ -32,7 +32,7 @@ class Geodesic(Navigator):
     name = label = "geodesic"
     description = "geodesic (both positions, an oracle)"
     oracle, needs = True, "the position"
-    in_keys: ClassVar[list[str]] = ["position", "target_position", "heading", "step_count"]
+    in_keys: ClassVar[list[str]] = ["position", "target_position", "heading", "elapsed_steps"]
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
         distance, bearing = geodesy.geodesic(*seen["position"].unbind(-1), *seen["target_position"].unbind(-1))

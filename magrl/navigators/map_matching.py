@@ -113,7 +113,7 @@ class MapMatching(Navigator):
         check_type(bool, search=search)
         self.hypotheses, bank = int(hypotheses), isinstance(field, FieldBank)
         self.zeta, self.search, self.radius_km = float(zeta), search, radius_km
-        self.in_keys = ["field", "target_field", "heading", "move", "step_count", *(["region"] if bank else [])]
+        self.in_keys = ["field", "target_field", "heading", "move", "elapsed_steps", *(["region"] if bank else [])]
         self.map = field
         self._place(copy.deepcopy(Regions.of(region)).to(device_of(field)))
         std = torch.tensor((FLOOR, map_error, *SensorStd.of(sensor_std)), dtype=torch.float64)
@@ -269,7 +269,7 @@ class MapMatching(Navigator):
 
     def _region(self, seen: TensorDictBase) -> Tensor:
         """Return the number of the region of each vehicle ``(P,)``."""
-        return seen.get("region", torch.zeros_like(seen["step_count"])).squeeze(-1)
+        return seen.get("region", torch.zeros_like(seen["elapsed_steps"])).squeeze(-1)
 
 
 def update(covariance: Tensor, jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:

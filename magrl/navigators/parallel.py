@@ -58,7 +58,7 @@ class ParallelApproach(Navigator):
         super().__init__(max_move_km, max_turn_rad)
         if not hasattr(field, "value_and_gradient"):
             raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
-        self.in_keys = ["field", "target_field", "heading", "position", "step_count", "region"]
+        self.in_keys = ["field", "target_field", "heading", "position", "elapsed_steps", "region"]
         self.field, self.elements = field, element_indices(NAMES if pair is None else pair, 2)
 
     @staticmethod

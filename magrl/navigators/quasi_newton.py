@@ -80,7 +80,7 @@ class QuasiNewton(Navigator):
         check_type(bool, search=search)
         check_number(0, above=True, optional=True, radius_km=radius_km)
         self.zeta, self.search, self.radius_km = float(zeta), search, radius_km
-        self.in_keys = ["field", "target_field", "heading", "move", "step_count"]
+        self.in_keys = ["field", "target_field", "heading", "move", "elapsed_steps"]
         self.elements = element_indices(elements, 2)
         self._register("sensor_std", SensorStd.of(sensor_std))
         self._register("periods", [PERIODS[i] for i in self.elements])
@@ -117,7 +117,7 @@ class QuasiNewton(Navigator):
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         reading, target = (seen[key].double()[:, self.elements] for key in ("field", "target_field"))
         track = filtering.start(reading, self.prior(reading, target), self.reading_std(seen))
-        decisions = torch.zeros_like(seen["step_count"].squeeze(-1))
+        decisions = torch.zeros_like(seen["elapsed_steps"].squeeze(-1))
         return {**track._asdict(), "decisions": decisions, **first_places(seen, self.zeta)}
 
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -204,7 +204,7 @@ def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
 
     Example:
         >>> from tensordict import TensorDict
-        >>> seen = TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]], "step_count": [[1]]}, 1)
+        >>> seen = TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]], "elapsed_steps": [[1]]}, 1)
         >>> memory = TensorDict({"visited": torch.full((1, 24, 2), 100.0)}, 1)
         >>> visit_place(seen, memory)
         >>> memory["visited"][0, :2]
@@ -212,4 +212,4 @@ def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
                 [ 70., 100.]], dtype=torch.float64)
     """
     visited = tracking.visit(memory["visited"].double(), displacement(seen))
-    memory["visited"] = torch.where((seen["step_count"] == 0).unsqueeze(-1), memory["visited"].double(), visited)
+    memory["visited"] = torch.where((seen["elapsed_steps"] == 0).unsqueeze(-1), memory["visited"].double(), visited)

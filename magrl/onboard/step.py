@@ -127,7 +127,7 @@ class VehicleStep(nn.Module):
         belief = Belief(*(torch.where(starts, new, old) for new, old in zip(begun, after, strict=True)))
         now = dict(zip(TRACK_KEYS, tracked(belief, target_field, self.view.range_km, crust_nt), strict=True))
         now |= dict(zip(STD_KEYS, errors, strict=True)) | {"field": field, "target_field": target_field}
-        now |= {"heading": heading.reshape(1), "step_count": step.reshape(1)}
+        now |= {"heading": heading.reshape(1), "elapsed_steps": step.reshape(1)}
         first = {"first_field": torch.where(starts, field, first_field).unsqueeze(0)}
         batch = TensorDict({key: value.unsqueeze(0) for key, value in now.items()}, [1])
         observed = self.observe(TensorDict(first, [1]).set("next", batch))["next"]

@@ -95,7 +95,7 @@ class Onboard:
         content = b"".join(value.cpu().numpy().tobytes() for value in weights if isinstance(value, torch.Tensor))
         resolved = {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "navigator": name}
         self.options = given.replace(**resolved, weights=hashlib.sha256(content).hexdigest())
-        if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *STD_KEYS, "step_count", "done"}):
+        if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *STD_KEYS, "elapsed_steps", "done"}):
             raise ValueError(f"{name} reads {', '.join(unknown)}, which a vehicle does not know")
         self._view, self._estimator = view_of(self.navigator), Estimator(self.navigator)
 
@@ -271,7 +271,7 @@ class Onboard:
             known = self._error, *self._here, self.options.accuracy.bias
             rows |= dict(zip(START_KEYS, known, strict=True))
         seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
-        seen |= {"step_count": torch.tensor([[len(self._steps)]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
+        seen |= {"elapsed_steps": torch.tensor([[len(self._steps)]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
         return TensorDict(seen, [1], device="cpu")
 
     def _command(self, seen: TensorDictBase, action: list[float], course: float) -> Command:

@@ -59,7 +59,7 @@ class DeclareArrival(ObservationTransform):
         (tensor(20), tensor(20))
     """
 
-    default_in_keys = ("target_field", *BELIEF_KEYS, *POSTERIOR_KEYS, "heading", "step_count")
+    default_in_keys = ("target_field", *BELIEF_KEYS, *POSTERIOR_KEYS, "heading", "elapsed_steps")
     default_out_keys = ("arrival_probability", "arrival_worth", "arrival_way", "arrival_stop")
     optional_in_keys = STD_KEYS
     in_sizes = (3, None, None, 1, 2, None, 1, 1, 3, 3, 3, 3)
@@ -89,7 +89,7 @@ class DeclareArrival(ObservationTransform):
         seen = self._named(values)
         target, none = seen["target_field"], torch.zeros_like(seen["target_field"])
         errors = SensorStd(*(seen.get(key, none) for key in STD_KEYS))
-        left = self.max_steps - 1 - seen["step_count"].squeeze(-1)
+        left = self.max_steps - 1 - seen["elapsed_steps"].squeeze(-1)
         goal = tracking.destination(belief_of(seen), target, self.range_km, self.crust_nt)
         posterior = DestinationPosterior(*(seen[key] for key in POSTERIOR_KEYS))
         decision = tracking.arrival_decision(goal, posterior, errors, left, self.radius_km)

@@ -272,7 +272,7 @@ class PlannedMove(StatefulTransform):
         torch.Size([2, 3, 2])
     """
 
-    default_in_keys = ("target_field", "step_count", *BELIEF_KEYS, *POSTERIOR_KEYS, "way", *STD_KEYS)
+    default_in_keys = ("target_field", "elapsed_steps", *BELIEF_KEYS, *POSTERIOR_KEYS, "way", *STD_KEYS)
     default_out_keys = ("planned_move",)
     optional_in_keys = ("step_price",)
     in_sizes = (3, 1, STATES, STATES, 1, 2, None, 2, 3, 3, 3, 3, 1)
@@ -306,7 +306,7 @@ class PlannedMove(StatefulTransform):
         errors, aim = SensorStd.read(seen), seen["way"].double()
         goal = tracking.destination(belief_of(seen), seen["target_field"], self.range_km, self.crust_nt)
         posterior = DestinationPosterior(*(seen[key] for key in POSTERIOR_KEYS))
-        std, step = errors.noise, seen["step_count"].squeeze(-1)
+        std, step = errors.noise, seen["elapsed_steps"].squeeze(-1)
         price = tracking.step_price(price, PRICE_KM, aim, step, std, self.max_steps, self.max_move_km)
         move = tracking.planned_move(goal, posterior, aim, errors, price, self.max_move_km, self.caution)
         tensordict.set(self.out_keys[0], move.to(seen["target_field"].dtype))

@@ -331,7 +331,7 @@ class TrackObservation(StatefulTransform):
 
     default_in_keys = (
         *("field", "target_field", "heading", "estimated_field", "estimated_gradient", "aim", "way_covariance"),
-        *("sensor_std", "step_count", "planned_move"),
+        *("sensor_std", "elapsed_steps", "planned_move"),
     )
     default_out_keys = ("observation", "first_field")
     optional_in_keys = ("step_price",)
@@ -359,7 +359,7 @@ class TrackObservation(StatefulTransform):
         seen["remaining"] = element_difference(target, seen["estimated_field"])
         seen["weights"] = tracking.arrival_weights(first, target, self.zeta)
         # A policy may fly longer than it was trained for.
-        seen["time"] = (seen["step_count"].to(heading.dtype) / self.max_steps).clamp(max=1)
+        seen["time"] = (seen["elapsed_steps"].to(heading.dtype) / self.max_steps).clamp(max=1)
         observed = track_observation(seen)
         tensordict.set(self.out_keys[0], observed).set(self.out_keys[1], first)
 
@@ -401,7 +401,7 @@ class TrackView(_View):
     crust_nt: float = 0.0
 
     size: ClassVar[int] = OBSERVATION_SIZE
-    in_keys: ClassVar[tuple[str, ...]] = (*IN_KEYS, "step_count")
+    in_keys: ClassVar[tuple[str, ...]] = (*IN_KEYS, "elapsed_steps")
 
     def __post_init__(self) -> None:
         super().__post_init__()

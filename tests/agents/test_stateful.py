@@ -174,7 +174,7 @@ def test_a_policy_declares_its_arrival(tmp_path: Path) -> None:
     base = GeomagneticNavEnv(num_envs=5, seed=3, arrival="declared")
     view = base.observation_view()
     transforms = [*view.observation_transforms(), view.action_transform(declared=True)]
-    actor = TensorDictModule(declaring, ["observation", "step_count"], ["action"])
+    actor = TensorDictModule(declaring, ["observation", "elapsed_steps"], ["action"])
     save_policy(tmp_path / "own.pt", actor, TransformedEnv(base, Compose(*transforms)))
     policy = load_policy(tmp_path / "own.pt")
     episodes = evaluate(policy, "paper-100", arrival="declared")

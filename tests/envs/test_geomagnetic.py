@@ -17,6 +17,7 @@ from ppigrf import igrf
 from ppigrf.ppigrf import shc_fn_igrf13
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.collectors import Collector
 from torchrl.envs import (
     FrameSkipTransform,
     NoopResetEnv,
@@ -123,12 +124,19 @@ def test_transforms_of_torchrl_that_need_one_reward(transform: Transform) -> Non
     check_env_specs(env)
 
 
+def test_a_collector_cuts_episodes() -> None:
+    collector = Collector(make(2), frames_per_batch=90, total_frames=90, max_frames_per_traj=20)
+    (data,) = collector
+    assert torch.equal(data["elapsed_steps"], data["step_count"])  # the latter by TorchRL's StepCounter
+    assert (data["next", "truncated"].cumsum(1)[:, -1] == 2).all()
+
+
 ENTRIES = {
     "field": (3, torch.float32),
     "target_field": (3, torch.float32),
     "move": (2, torch.float32),
     "heading": (1, torch.float32),
-    "step_count": (1, torch.int64),
+    "elapsed_steps": (1, torch.int64),
     "position": (2, torch.float64),
     "target_position": (2, torch.float64),
     "start_position": (2, torch.float64),
@@ -152,7 +160,7 @@ def test_keys_shapes_and_dtypes() -> None:
             key: ((5, size), dtype) for key, (size, dtype) in entries.items()
         }
     assert set(env.observation_spec.keys()) == set(ENTRIES)
-    assert {*PUBLIC_KEYS, "step_count"} == set(env.observation_spec.keys()) - set(PRIVILEGED_KEYS)
+    assert {*PUBLIC_KEYS, "elapsed_steps"} == set(env.observation_spec.keys()) - set(PRIVILEGED_KEYS)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -179,7 +187,7 @@ def test_first_observation_is_that_of_the_paper() -> None:
     assert td["objective"].item() == pytest.approx(3.0, rel=1e-6)  # each element is the whole of its way off
     weights = 1 / (elements_by_ppigrf(*TARGET) - elements_by_ppigrf(*START)).square()
     assert td["objective_weights"].tolist() == pytest.approx(weights.tolist(), rel=1e-5)
-    assert td["heading"].item() == td["step_count"].item() == 0
+    assert td["heading"].item() == td["elapsed_steps"].item() == 0
     assert td["move"].tolist() == [0.0, 0.0]
     assert not td["success"]
     assert not td["done"]
@@ -199,7 +207,7 @@ def test_one_move_by_hand(turn: float, end: tuple[float, float]) -> None:
     assert after["position"].tolist() == pytest.approx(end, abs=1e-7)  # a centimeter
     assert after["heading"].item() == pytest.approx(turn, abs=1e-6)
     assert after["move"].tolist() == pytest.approx([50.0, turn], abs=1e-6)
-    assert after["step_count"].item() == 1
+    assert after["elapsed_steps"].item() == 1
 
     origin, here, there = (elements_by_ppigrf(*place) for place in (START, end, TARGET))
     assert after["field"].tolist() == pytest.approx(here.tolist(), rel=1e-6, abs=1e-5)
@@ -279,7 +287,7 @@ def test_ends_and_rewards_of_many_episodes() -> None:
     assert not (after["terminated"] & after["truncated"]).any()
     assert torch.equal(after["done"], after["terminated"] | after["truncated"])
     assert (after["success"] <= after["terminated"]).all()
-    assert torch.equal(after["truncated"], (after["step_count"] == env.max_steps) & ~after["terminated"])
+    assert torch.equal(after["truncated"], (after["elapsed_steps"] == env.max_steps) & ~after["terminated"])
     destination, proximity = (after[term].double() for term in REWARD_TERMS)
     torch.testing.assert_close(after["reward"].double(), destination + proximity, rtol=1e-6, atol=1e-6)
     assert torch.equal(destination, 200 * after["success"].double())
@@ -346,11 +354,11 @@ def test_partial_reset_leaves_the_others_as_they_were(mask: list[int]) -> None:
     chosen = torch.tensor(mask, dtype=torch.bool)
     after = env.reset(td.set("_reset", chosen.unsqueeze(-1)))
     assert_same(after.select(*ENTRIES, *FLAGS)[~chosen], before.select(*ENTRIES, *FLAGS)[~chosen])
-    assert (after["step_count"][chosen] == 0).all()
+    assert (after["elapsed_steps"][chosen] == 0).all()
     assert (after["position"] != before["position"])[chosen].all()
     assert torch.equal(after["position"][chosen], after["start_position"][chosen])
     step = env.step(after.set("action", torch.full((5, 2), 1.0)))["next"]
-    assert step["step_count"].flatten().tolist() == [1 if m else 4 for m in mask]
+    assert step["elapsed_steps"].flatten().tolist() == [1 if m else 4 for m in mask]
 
 
 def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
@@ -358,11 +366,11 @@ def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
     for env in (make(3), navigation_env(3)):  # TorchRL hides the merge from an environment under transforms
         with pytest.raises(ValueError, match=r"no state .*: to reset the others alone, set '_reset' in the TensorDict"):
             env.rand_step(env.reset(TensorDict(_reset=mask, batch_size=[3])))
-        assert (env.reset(TensorDict(_reset=torch.ones_like(mask), batch_size=[3]))["step_count"] == 0).all()
+        assert (env.reset(TensorDict(_reset=torch.ones_like(mask), batch_size=[3]))["elapsed_steps"] == 0).all()
     batch = SerialEnv(2, lambda: make(3))
     td = batch.step_mdp(batch.rand_step(batch.reset()))
     after = batch.reset(td.set("_reset", torch.stack((mask, ~mask)).unsqueeze(-1)))
-    assert after["step_count"].flatten().tolist() == [0, 1, 0, 1, 0, 1]
+    assert after["elapsed_steps"].flatten().tolist() == [0, 1, 0, 1, 0, 1]
 
 
 # ---------------------------------------------------------------------------------------------------------------------

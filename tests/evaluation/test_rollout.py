@@ -108,7 +108,7 @@ def test_a_vehicle_without_a_finite_action_fails_alone() -> None:
     """The others fly as they do without it."""
 
     def broken(tensordict: TensorDict) -> TensorDict:
-        hurt = (tensordict["step_count"] == 2) & (tensordict["target_position"] == target).all(-1, keepdim=True)
+        hurt = (tensordict["elapsed_steps"] == 2) & (tensordict["target_position"] == target).all(-1, keepdim=True)
         action = secant(tensordict)["action"]
         return tensordict.set("action", torch.where(hurt, math.nan, action))
 

@@ -123,7 +123,7 @@ def test_two_probing_legs_give_the_jacobian(turn: float) -> None:
     for step, position in enumerate(legs.cumsum(0)):
         reading = start + truth @ position
         seen = {"field": reading, "target_field": start + 1, "heading": torch.tensor([turn * (step == 2)])}
-        seen |= {"move": torch.tensor([10.0 * (step > 0), 0.0]), "step_count": torch.tensor([step])}
+        seen |= {"move": torch.tensor([10.0 * (step > 0), 0.0]), "elapsed_steps": torch.tensor([step])}
         navigator(TensorDict(seen).unsqueeze(0))
         found.append(navigator.memory["mean"][0, :, 1:])
     size = torch.tensor([0.004, 0.015, 4.0], dtype=torch.float64)
@@ -272,7 +272,7 @@ def test_secant_stands_a_field_without_change() -> None:
     state = GeomagneticNavEnv(num_envs=2, seed=0).reset()
     navigator = Secant()
     for step in range(5):
-        state["step_count"] = torch.full((2, 1), step)
+        state["elapsed_steps"] = torch.full((2, 1), step)
         state["move"] = torch.tensor([[10.0, 0.0]]).expand(2, 2) * (step > 0)
         assert torch.isfinite(navigator(state)["action"]).all()
 

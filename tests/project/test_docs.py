@@ -229,7 +229,7 @@ def test_tables_of_keys() -> None:
     check_keys(documented, specs)
     readers = {key: row[-1] for key, row in documented.items()}
     public = {key for key, reader in readers.items() if reader == "all policies"}
-    assert public == {*PUBLIC_KEYS, "step_count"}
+    assert public == {*PUBLIC_KEYS, "elapsed_steps"}
     trained = {key for key, reader in readers.items() if reader in ("training", "written by policies")}
     assert readers.keys() - public - trained == {*PRIVILEGED_KEYS, "region"}
 

@@ -99,6 +99,6 @@ def test_the_saved_policy_flies_as_the_trained_actor(tmp_path, monkeypatch, comp
     monkeypatch.setattr("magrl.training.run.evaluation_rollout", noted_rollout)
     recipe.train(small(recipe, tmp_path / "run", noise=(0.05, 0.05, 5.0), observe_heading=compass))
     policy = load_policy(tmp_path / "run" / "policy.safetensors")
-    assert policy.in_keys == ["field", "target_field", "move", *["heading"] * compass, "step_count"]
+    assert policy.in_keys == ["field", "target_field", "move", *["heading"] * compass, "elapsed_steps"]
     found = evaluation_rollout(plain[-1](), policy)
     assert torch.equal(found["next", "position"], flown[-1]["next", "position"])

@@ -109,7 +109,7 @@ def test_the_decision_is_that_of_the_pure_function() -> None:
     for seen in rollout.unbind(1):
         goal = tracking.destination(belief_of(seen), seen["target_field"], 350.0, 20.0)
         posterior = DestinationPosterior(*(seen[key] for key in POSTERIOR_KEYS))
-        left = 11 - seen["step_count"].squeeze(-1)
+        left = 11 - seen["elapsed_steps"].squeeze(-1)
         decision = tracking.arrival_decision(goal, posterior, SensorStd.read(seen), left, 25.0)
         expected = decision.probability, decision.worth, decision.way, decision.stop_km
         for key, value in zip(declare.default_out_keys, expected, strict=True):

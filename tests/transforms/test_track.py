@@ -228,7 +228,8 @@ def test_aim_and_plan_are_those_of_the_pure_functions() -> None:
         aim = tracking.unvisited(way, visited.double(), ellipse)
         torch.testing.assert_close(seen["aim"], aim.float())
         goal = tracking.destination(belief, seen["target_field"], **WORLD)
-        posterior, step = DestinationPosterior(*(seen[key] for key in POSTERIOR_KEYS)), seen["step_count"].squeeze(-1)
+        posterior = DestinationPosterior(*(seen[key] for key in POSTERIOR_KEYS))
+        step = seen["elapsed_steps"].squeeze(-1)
         price = tracking.step_price(0.5, 300.0, seen["aim"].double(), step, errors.noise, 50, 50.0)
         move = tracking.planned_move(goal, posterior, seen["aim"].double(), errors, price, 50.0)
         torch.testing.assert_close(seen["planned_move"], move.float())
@@ -252,7 +253,7 @@ def test_a_place_without_an_arrival_is_left(radius_km: float | None) -> None:
 
 def test_each_vehicle_may_have_its_own_price_of_a_step() -> None:
     """With a higher price moves are longer; without caution they are nearer to the way."""
-    seen = TrackField(sensor_std=SIZES)(first_reading()).set("step_count", torch.zeros(4, 1, dtype=torch.int64))
+    seen = TrackField(sensor_std=SIZES)(first_reading()).set("elapsed_steps", torch.zeros(4, 1, dtype=torch.int64))
     seen = with_std(seen, *[1.0] * 4).set("step_price", f64(0.1, 0.1, 30.0, 30.0).unsqueeze(-1))
     own = PlannedMove(step_price=None, **PLAN)(seen.clone())["planned_move"]
     cheap, dear, careless = (

@@ -82,7 +82,7 @@ def test_numbers_at_the_extremes() -> None:
 def test_a_turn_of_world_and_vehicle_is_not_observed() -> None:
     """D turns with the world, and passes 180 degrees; a turn of the vehicle alone is observed."""
     *estimate, observe = VIEW.observation_transforms()
-    seen = first_reading().set("step_count", torch.zeros(4, 1, dtype=torch.int64))
+    seen = first_reading().set("elapsed_steps", torch.zeros(4, 1, dtype=torch.int64))
     seen.update({key: float64(STD if key == "sensor_std" else (0.0,) * 3).expand(4, 3) for key in STD_KEYS})
     seen = Compose(*estimate)(seen)
     plain, other = observe(seen.clone())["observation"], seen.clone()

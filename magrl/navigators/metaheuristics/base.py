@@ -136,7 +136,7 @@ class Metaheuristic(Navigator):
         self.objective_floors = tuple(objective_floors)
         self.generator = torch.Generator().manual_seed(seed)
         private = ["position", "objective_weights", "done"] if self.oracle else ["field"]
-        self.in_keys = ["target_field", "heading", "step_count", *private]
+        self.in_keys = ["target_field", "heading", "elapsed_steps", *private]
 
     @classmethod
     def for_env(cls, env: GeomagneticNavEnv, *, mode: str = "look-ahead", **options: Any) -> Self:
@@ -188,7 +188,7 @@ class Metaheuristic(Navigator):
         here, there = seen["field"].double(), seen["target_field"].double()
         weights = guidance.objective_weights(here, there, here.new_tensor(self.objective_floors))
         state = self.first_state(here)
-        fitness, moves = torch.zeros_like(state["population"][..., 0]), torch.zeros_like(seen["step_count"].squeeze(-1))
+        fitness, moves = torch.zeros_like(state["population"][..., 0]), torch.zeros_like(seen["elapsed_steps"][:, 0])
         objective = torch.ones_like(here[:, 0])
         return {"weights": weights, "objective": objective, "fitness": fitness, "moves": moves, "state": state}
 
