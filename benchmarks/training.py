@@ -30,7 +30,7 @@ CONFIG = recipe.Config().replace(layer_norm=False, wandb_mode="disabled", eval_t
 def sb3(frames: int) -> float:
     """Return the seconds of stable-baselines3 for so many frames, with networks, batch and updates of the recipe."""
     began, c = time.perf_counter(), CONFIG
-    envs = gymnasium.make_vec(ENV_ID, num_envs=c.num_envs, vectorization_mode="vector_entry_point", seed=0)
+    envs = gymnasium.make_vec(ENV_ID, num_envs=c.num_envs, autoreset_mode="SameStep", seed=0)
     model = TD3(
         "MlpPolicy",
         BatchedVecEnv(TransformRewards(envs, lambda reward: c.reward_scale * reward)),

@@ -49,7 +49,8 @@ class Config:
 
 def make_model(config: Config) -> OffPolicyAlgorithm:
     """Return an agent with the networks, the discount and the reward scale of the recipes' preset `fast`."""
-    envs = TransformReward(gymnasium.make_vec(ENV_ID, num_envs=config.num_envs), lambda reward: 0.05 * reward)
+    envs = gymnasium.make_vec(ENV_ID, num_envs=config.num_envs, autoreset_mode="SameStep")
+    envs = TransformReward(envs, lambda reward: 0.05 * reward)
     settings: dict[str, Any] = {
         "learning_starts": config.learning_starts,
         "learning_rate": config.learning_rate,
@@ -80,9 +81,9 @@ def evaluate(model: OffPolicyAlgorithm, num_tasks: int) -> dict[str, float]:
         actions, _ = model.predict(observations, deterministic=True)
         observations, *_, info = envs.step(actions)
         if info:
-            new = info["_final_info"] & np.isnan(first["success"])
+            new = info["_success"] & np.isnan(first["success"])
             for name, values in first.items():
-                values[new] = info["final_info"][name][new]
+                values[new] = info[name][new]
     return {name: float(values.mean()) for name, values in first.items()}
 
 

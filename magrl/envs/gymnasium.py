@@ -77,11 +77,11 @@ _SPEC: Any = property(lambda env: getattr(env, "limited_spec", None), _keep_spec
 class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """A batch of vehicles: ``gymnasium.make_vec("magrl/GeomagneticNavigation-v0", num_envs=N, **options)``.
 
-    All move in one batched step. The autoreset mode is that of Gymnasium. With ``SAME_STEP``, a vehicle whose episode
-    ends starts the next in the same step: the observation returned is the first of the new episode,
-    ``info["final_obs"]`` the last of the old one and ``info["final_info"]`` its measures, each with its mask
-    ``_final_obs``, ``_final_info``. With ``NEXT_STEP``, the next step starts it, whatever the action; with
-    ``DISABLED``, ``reset(options={"reset_mask": ended})``. In both, ``info`` has the measures and their masks.
+    All move in one batched step. The autoreset modes are those of Gymnasium. With ``NEXT_STEP``, the step after the end
+    of an episode starts the next, whatever the action; with ``DISABLED``, ``reset(options={"reset_mask": ended})``.
+    In both, ``info`` has the measures and their masks. With ``SAME_STEP``, the next episode starts in the step in which
+    one ends: the observation returned is the first of the new episode, ``info["final_obs"]`` the last of the old one
+    and ``info["final_info"]`` its measures, each with its mask ``_final_obs``, ``_final_info``.
 
     ``reset(seed=s)`` is the first reset of the TorchRL environment of ``N`` vehicles and seed ``s``: each row has
     its own episodes; those of row 0 are the ones of the single environment.
@@ -89,7 +89,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
     Args:
         num_envs: vehicles in the batch.
         render_mode: None, or ``"rgb_array"``: an image of each vehicle.
-        autoreset_mode: mode, or its value: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``.
+        autoreset_mode: mode, or its value: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
         max_episode_steps: Gymnasium's name of ``max_steps``.
         **options: of :func:`navigation_env`.
 
@@ -115,7 +115,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         num_envs: int = 1,
         *,
         render_mode: str | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:

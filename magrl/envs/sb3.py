@@ -32,7 +32,7 @@ class BatchedVecEnv(VecEnv):
 
     Example:
         >>> from magrl.envs.gymnasium import ENV_ID
-        >>> envs = gymnasium.make_vec(ENV_ID, num_envs=4)
+        >>> envs = gymnasium.make_vec(ENV_ID, num_envs=4, autoreset_mode="SameStep")
         >>> BatchedVecEnv(envs).reset().shape
         (4, 13)
     """
@@ -40,7 +40,7 @@ class BatchedVecEnv(VecEnv):
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(f"stable-baselines3 needs environments of AutoresetMode.SAME_STEP, got {mode}")
+            raise ValueError(f"stable-baselines3 needs make_vec(..., autoreset_mode='SameStep'), got {mode}")
         self.envs = envs
         self._actions: np.ndarray | None = None
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)

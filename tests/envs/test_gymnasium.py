@@ -76,8 +76,8 @@ def equal(array: np.ndarray, tensor: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("reward", ["guided", "base"])
 def test_batch_flies_as_in_torchrl(reward: str) -> None:
-    envs, env = make_vec(reward=reward, **SHORT), torchrl_env(NUM, 11, guided=reward == "guided")
-    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    envs = make_vec(reward=reward, autoreset_mode="SameStep", **SHORT)
+    env = torchrl_env(NUM, 11, guided=reward == "guided")
     state, ends, arrivals = env.reset(), 0, 0
     equal(envs.reset(seed=11)[0], state["observation"])
     for actions in random_actions(NUM, 0):
@@ -117,7 +117,7 @@ def test_one_vehicle_flies_as_in_torchrl() -> None:
 
 def test_a_batch_is_wrapped_by_torchrl_again() -> None:
     """The observation at the end of an episode is its last one, and the next episode follows."""
-    wrapped, env = GymWrapper(make_vec(max_steps=3)), torchrl_env(NUM, 11, max_steps=3)
+    wrapped, env = GymWrapper(make_vec(max_steps=3, autoreset_mode="SameStep")), torchrl_env(NUM, 11, max_steps=3)
     state, reference = wrapped.reset(seed=11), env.reset()
     for actions in torch.from_numpy(random_actions(NUM, 0, 3)):
         step, state = wrapped.step_and_maybe_reset(state.set("action", actions))
@@ -135,7 +135,7 @@ def test_a_batch_is_wrapped_by_torchrl_again() -> None:
 def test_a_batch_without_a_map_flies_as_in_torchrl(start_heading: str | None) -> None:
     given = {"start_heading": start_heading} if start_heading else {}
     options = {"scenario": planet_scenario(3, seed=0, distance_range_km=(60, 200), **given), "max_steps": 8}
-    envs = gymnasium.make_vec(ANYWHERE_ID, num_envs=NUM, **options)
+    envs = gymnasium.make_vec(ANYWHERE_ID, num_envs=NUM, autoreset_mode="SameStep", **options)
     env = anywhere_env(NUM, seed=11, **options)
     state = env.reset()
     assert (state["heading"] == 0).all() == bool(start_heading)
@@ -178,7 +178,7 @@ def test_a_scenario_of_many_regions(options: dict) -> None:
 
 # Modes of autoreset
 
-MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
+MODES = {"default": {}, "disabled": {"autoreset_mode": "Disabled"}}
 
 
 def ended_after(envs: gymnasium.vector.VectorEnv, step: tuple) -> tuple:
@@ -191,11 +191,10 @@ def ended_after(envs: gymnasium.vector.VectorEnv, step: tuple) -> tuple:
     return *step, step[0]
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
-    single = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
-    batch, reference = make_vec(1, autoreset_mode=mode.value, **SHORT), make_vec(1, **single, **SHORT)
-    assert batch.metadata["autoreset_mode"] is batch.autoreset_mode is mode
+@pytest.mark.parametrize("mode", MODES.values(), ids=MODES)
+def test_modes_are_those_of_gymnasium(mode: dict) -> None:
+    batch, reference = make_vec(1, **mode, **SHORT), make_vec(1, vectorization_mode="sync", vector_kwargs=mode, **SHORT)
+    assert batch.metadata["autoreset_mode"] is batch.autoreset_mode is reference.metadata["autoreset_mode"]
     np.testing.assert_array_equal(batch.reset(seed=4)[0], reference.reset(seed=4)[0])
     for actions in random_actions(1, 2, 30):
         flown = [ended_after(envs, envs.step(actions)) for envs in (batch, reference)]
@@ -206,17 +205,17 @@ def test_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
         assert all(info[name][0] == last[name][0] for name in info)
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_modes_fly_the_same_episodes(mode: AutoresetMode) -> None:
+@pytest.mark.parametrize("mode", MODES.values(), ids=MODES)
+def test_modes_fly_the_same_episodes(mode: dict) -> None:
     flights = []
-    for envs in (make_vec(autoreset_mode=mode, **SHORT), make_vec(**SHORT)):
+    for envs in (make_vec(**mode, **SHORT), make_vec(autoreset_mode="SameStep", **SHORT)):
         steps: list[list[tuple]] = [[] for _ in range(NUM)]
         state, idle = envs.reset(seed=11)[0], np.zeros(NUM, dtype=bool)
         for _ in range(24):
             *step, _, after = ended_after(envs, envs.step(np.sin(9 * state[:, :2])))
             for row in np.flatnonzero(~idle):
                 steps[row].append((*state[row], *(value[row] for value in step[1:])))
-            if mode is AutoresetMode.NEXT_STEP and envs.metadata["autoreset_mode"] is mode:
+            if envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
                 assert not step[1][idle].any()
                 idle = step[2] | step[3]
             state = after
@@ -227,7 +226,7 @@ def test_modes_fly_the_same_episodes(mode: AutoresetMode) -> None:
 
 
 def test_wrappers_that_need_the_next_step() -> None:
-    envs = NormalizeObservation(make_vec(autoreset_mode="NextStep", **SHORT))
+    envs = NormalizeObservation(make_vec(**SHORT))
     envs.reset(seed=0)
     assert np.isfinite(envs.step(random_actions(NUM, 0, 1)[0])[0]).all()
 
@@ -291,12 +290,11 @@ def test_measures_are_those_of_metrics() -> None:
     seen = none = np.zeros(NUM, dtype=bool)
     for now in actions.astype(np.float32)[: SHORT["max_steps"]]:
         *_, info = envs.step(now)
-        for index in np.flatnonzero(info.get("_final_info", none) & ~seen):
+        for index in np.flatnonzero(info.get("_success", none) & ~seen):
             for name in ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl"):
-                value = info["final_info"][name][index]
-                assert value == pytest.approx(expected[name][index].item(), rel=1e-9), name
-                assert info["final_info"][f"_{name}"][index]
-        seen = seen | info.get("_final_info", none)
+                assert info[name][index] == pytest.approx(expected[name][index].item(), rel=1e-9), name
+                assert info[f"_{name}"][index]
+        seen = seen | info.get("_success", none)
     assert seen.all()
     assert expected["success"].any()
 
@@ -423,7 +421,8 @@ def test_batched_environment_under_stable_baselines3() -> None:
     pytest.importorskip("stable_baselines3")
     from magrl.envs.sb3 import BatchedVecEnv
 
-    vec_env, envs, ended = BatchedVecEnv(make_vec(**SHORT)), make_vec(**SHORT), 0
+    options, ended = {"autoreset_mode": "SameStep", **SHORT}, 0
+    vec_env, envs = BatchedVecEnv(make_vec(**options)), make_vec(**options)
     vec_env.seed(9)
     np.testing.assert_array_equal(vec_env.reset(), envs.reset(seed=9)[0])
     for actions in random_actions(NUM, 6, 15):
@@ -438,8 +437,8 @@ def test_batched_environment_under_stable_baselines3() -> None:
             assert infos[index]["is_success"] == info["final_info"]["success"][index]
             ended += 1
     assert ended > NUM
-    with pytest.raises(ValueError, match="NEXT_STEP"):
-        BatchedVecEnv(gymnasium.make_vec(ENV_ID, num_envs=1, vectorization_mode="sync", **SHORT))
+    with pytest.raises(ValueError, match=r"autoreset_mode='SameStep'\), got .*NEXT_STEP"):
+        BatchedVecEnv(make_vec(1))
 
 
 def test_stable_baselines3_makes_environments_without_a_map(monkeypatch) -> None:

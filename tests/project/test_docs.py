@@ -44,7 +44,7 @@ BUDGET = {
     "total_frames = 60_000": "total_frames = 128",
     "= 512, 1024, 8": "= 64, 64, 1",
     "= 400_000, 500": "= 256, 4",
-    "num_envs=512)": "num_envs=8)",
+    "num_envs=512, ": "num_envs=8, ",
     '"batch_size": 2048': '"batch_size": 256',
     '"sac.safetensors"), "test-1000"': '"sac.safetensors"), "figure-4-1"',
     "= 100_000, 1024, 1000": "= 128, 4, 2",
