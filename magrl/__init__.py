@@ -5,6 +5,8 @@ Gymnasium. The names in ``magrl.__all__``, those of ``__init__.pyi``, are loaded
 does not load torch.
 """
 
+import importlib as _importlib
+import multiprocessing as _multiprocessing
 import os as _os
 
 import gymnasium as _gymnasium
@@ -14,12 +16,23 @@ _os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # spinning threads slow each o
 
 __version__ = "0.2.0"
 
-__getattr__, __dir__, __all__ = _lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = _lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name, or a class for Gymnasium; the latter does not change how the program starts processes."""
+    if not name.endswith(("GymEnv", "VectorEnv")):
+        return _load(name)
+    method = _multiprocessing.get_start_method(allow_none=True)
+    module = _importlib.import_module("magrl.envs.gymnasium")
+    _multiprocessing.set_start_method(method, force=True)  # importing TorchRL sets "spawn"
+    return getattr(module, name)
+
 
 for _name, _kind in (("GeomagneticNavigation", "GeomagneticNav"), ("GeomagneticNavigationAnywhere", "Anywhere")):
     if f"magrl/{_name}-v0" not in _gymnasium.registry:
         _gymnasium.register(
             f"magrl/{_name}-v0",
-            entry_point=f"magrl.envs.gymnasium:{_kind}GymEnv",
-            vector_entry_point=f"magrl.envs.gymnasium:{_kind}VectorEnv",
+            entry_point=f"magrl:{_kind}GymEnv",
+            vector_entry_point=f"magrl:{_kind}VectorEnv",
         )

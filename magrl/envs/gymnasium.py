@@ -8,6 +8,7 @@ recipes, and only convert tensors to arrays: the same seed and the same actions 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -34,6 +35,8 @@ ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v0"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 VectorStep = tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
 _NAMED: dict[str, tuple[str, ...]] = {"flat": ("observation",), "track": ("observation",), "dict": PUBLIC_KEYS}
+# A forked process lacks the threads of its parent, and would wait for them.
+os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def _box(*specs: TensorSpec) -> spaces.Space[Any]:

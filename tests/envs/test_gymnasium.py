@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import math
+import os
 import subprocess
 import sys
 import warnings
@@ -369,8 +370,9 @@ def test_bad_calls() -> None:
 
 
 def test_importing_magrl_registers_the_id_and_nothing_heavy() -> None:
+    """How processes start stays the choice of the program, and a forked one does not wait for threads of its parent."""
     code = f"""
-import sys, warnings
+import multiprocessing, sys, warnings
 import gymnasium
 warnings.simplefilter("error")
 import magrl
@@ -380,9 +382,16 @@ del sys.modules["magrl"]
 import magrl  # a second import keeps the registration
 assert gymnasium.spec({ENV_ID!r}) is before
 print(heavy)
+warnings.simplefilter("ignore")  # newer versions of Python warn of a fork
+gymnasium.make({ENV_ID!r}).reset(seed=0)
+print(multiprocessing.get_start_method(allow_none=True))
+envs = gymnasium.make_vec({ENV_ID!r}, 1, "async", {{"context": "fork"}})
+print(envs.reset(seed=0)[0].shape)
+envs.close()
 """
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.split() == ["[]"], done.stderr
+    command = {"args": [sys.executable, "-W", "ignore", "-c", code], "env": {**os.environ, "OMP_NUM_THREADS": "2"}}
+    done = subprocess.run(**command, capture_output=True, text=True, check=False, timeout=100)
+    assert done.stdout.splitlines() == ["[]", "None", "(1, 13)"], done.stderr
     assert type(make().unwrapped) is GeomagneticNavGymEnv
     assert type(make_vec(1)) is GeomagneticNavVectorEnv
 
