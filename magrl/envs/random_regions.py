@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -53,8 +54,7 @@ def earth_scenario(
         seed: random seed; the result is a pure function of the arguments.
         date: date of the field, as in :class:`Scenario`.
         generation: generation of IGRF, 13 or 14.
-        crust: whether the field is that of :class:`~magrl.field.WMMHR` (degree 133, 2025 to 2030) in place of IGRF. Its
-            expansions have degree 52 by default, and take 0.5 s a region to build.
+        crust: whether the field is that of :class:`~magrl.field.WMMHR` (degree 133, 2025 to 2030) in place of IGRF.
         **options: of :func:`region_scenario`.
 
     Raises:
@@ -68,7 +68,7 @@ def earth_scenario(
     """
     check_type(bool, crust=crust)
     earth = wmmhr_coefficients(date) if crust else igrf_coefficients(date, generation)
-    scenario = region_scenario(earth.unsqueeze(0), count, seed, **({"degree": 52} if crust else {}) | options)
+    scenario = region_scenario(earth.unsqueeze(0), count, seed, **options)
     return scenario.replace(date=parse_date(date), generation=generation)
 
 
@@ -82,7 +82,7 @@ def region_scenario(
     min_intensity_nt: float = 8000.0,
     margin_deg: float = 5.0,
     max_move_km: float = 50.0,
-    degree: int = 12,
+    degree: int | None = None,
     tolerance_nt: float = 0.1,
     **options: Any,
 ) -> Scenario:
@@ -100,7 +100,8 @@ def region_scenario(
         min_intensity_nt: lowest B_H in a region [nT].
         margin_deg: how far beyond its region a vehicle may stray before it is lost [deg].
         max_move_km: longest move of the environment; the field ends one move beyond the margin.
-        degree: degree of the expansions of the field; larger regions need a higher one.
+        degree: degree of the expansions of the field; by default as high as the tolerance requires, from 12 on, or from
+            52 on for a field of degree 133.
         tolerance_nt: largest error of the expansions [nT].
         **options: further fields of :class:`Scenario`, such as ``distance_range_km`` and ``distance_law``.
 
@@ -113,7 +114,7 @@ def region_scenario(
 
     Example:
         >>> far = region_scenario(random_planets(1, seed=0), count=2, seed=0,
-        ...                       half_size_deg=20, degree=16, distance_range_km=(150, 1800), distance_law="log")
+        ...                       half_size_deg=20, distance_range_km=(150, 1800), distance_law="log")
         >>> len(far.region)
         2
     """
@@ -123,14 +124,20 @@ def region_scenario(
     check_number(0, max_latitude, above=True, half_size_deg=half_size_deg)
     check_number(0, min_intensity_nt=min_intensity_nt, margin_deg=margin_deg, max_move_km=max_move_km)
     planet = torch.arange(count) // REGIONS_PER_PLANET % len(gauss)
+    lowest = 12 + max(0, gauss.shape[-1] - 14) // 3
+    *lower, highest = range(lowest, 3 * lowest, 4) if degree is None else [degree]
 
     def draw(number: Tensor, attempt: int) -> Regions:
         return _drawn_regions(seed, number, attempt, half_size_deg, max_latitude)
 
     def expand(regions: Regions, planet: Tensor, tolerance_nt: float) -> tuple[Regions, FieldBank]:
         boxes = regions.expanded(margin_deg).reachable(max_move_km)
-        edges = boxes.latitude, boxes.longitude
-        return boxes, FieldBank.build(gauss, planet, *edges, degree=degree, tolerance_nt=tolerance_nt)
+        build = partial(FieldBank.build, gauss, planet, boxes.latitude, boxes.longitude)
+        for tried in lower:
+            bank = build(degree=tried, tolerance_nt=_ANY_ERROR)
+            if bank.error_nt.max() <= tolerance_nt:
+                return boxes, bank
+        return boxes, build(degree=highest, tolerance_nt=tolerance_nt)
 
     regions = _placed_regions(draw, expand, planet, min_intensity_nt)
     return Scenario(

@@ -145,6 +145,15 @@ def test_regions_of_the_earth() -> None:
     assert (str(scenario.date.date()), scenario.generation) == ("2015-07-01", 14)
 
 
+@pytest.mark.parametrize(
+    "options", [{"half_size_deg": 30.0}, {"tolerance_nt": 1e-6}, {"crust": True, "max_move_km": 500.0}], ids=str
+)
+def test_the_degree_of_the_expansions_follows_from_the_tolerance(options: dict) -> None:
+    bank = earth_scenario(1, 0, **options).field
+    assert bank.degree > (52 if "crust" in options else earth_scenario(1, 0).field.degree) >= 12
+    assert bank.error_nt <= options.get("tolerance_nt", 0.1)
+
+
 def test_specs_and_seeds() -> None:
     check_env_specs(make(7), break_when_any_done="both")
     one, again = fly(make(40, max_steps=9)), fly(make(40, max_steps=9))
