@@ -191,7 +191,7 @@ def stuck(number: int, message: Measurement) -> Measurement:
         (stuck, "the magnetometer is stuck"),
         (lambda n, m: m if m.x is None or n < 9 else None, "no sample of the field"),
         (lambda n, m: m if m.x is None or n < 9 else m._replace(x=-m.x), "changed from"),
-        (lambda _, m: m._replace(time=m.time - 5.0) if m.heading else m, "no sample of the field with an attitude"),
+        (lambda n, m: m._replace(heading=None) if n else m, "no sample of the field with an attitude"),
     ],
 )
 def test_a_bad_reading_is_named_and_the_vehicle_goes_on(change, text) -> None:

@@ -107,6 +107,14 @@ def test_a_move_takes_the_field_and_its_gradient_along(latitude: float, course: 
     assert ((found.gradient - elements_gradient(value, gradient)).norm(dim=-1) < f64(3e-4, 3e-5, 0.02)).all()
 
 
+def test_a_move_adds_what_the_model_leaves_out_in_proportion_to_the_square_of_its_length() -> None:
+    belief = start(f64(5.0, 60.0, 20000.0), SensorStd(NOISE))
+    sure = belief._replace(covariance=torch.zeros_like(belief.covariance))
+    near, far = (moved(sure, f64(km)[0], f64(0.8)[0]).covariance for km in (50.0, 150.0))
+    torch.testing.assert_close(far, 9 * near)
+    assert near.diagonal().any()
+
+
 def test_a_reading_is_the_update_of_a_textbook() -> None:
     """With all errors, iron and a missing element: P and x by the information form."""
     errors = SensorStd(NOISE, f64(0.6, 0.5, 150.0), f64(0.5, 0.4, 130.0), f64(100.0, 80.0, 50.0))

@@ -146,10 +146,10 @@ def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
 
 
 def test_the_detour_by_hand() -> None:
-    """400 km and 300 km across; at the place itself; and 40 km along a way of 30 km, of which half counts."""
-    way, across = f64((400.0, 0.0), (0.0, 0.0), (30.0, 0.0)), torch.zeros(3, 2, 2, dtype=F64)
-    across[:2, 1, 1], across[2, 0, 0] = 300.0**2, 2 * 40.0**2
-    torch.testing.assert_close(planning._detour(way, across), f64(100.0, 300.0, 20.0))
+    """400 km and 300 km across; at the place itself; and 80 km along a way of 60 km, of which a fifth counts."""
+    way, across = f64((400.0, 0.0), (0.0, 0.0), (60.0, 0.0)), torch.zeros(3, 2, 2, dtype=F64)
+    across[:2, 1, 1], across[2, 0, 0] = 300.0**2, 5 * 80.0**2
+    torch.testing.assert_close(planning._detour(way, across), f64(100.0, 300.0, 40.0))
 
 
 def test_the_moves_that_are_compared() -> None:
