@@ -18,6 +18,7 @@ from ppigrf.ppigrf import shc_fn_igrf13
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
 from torchrl.envs import (
     FrameSkipTransform,
     NoopResetEnv,
@@ -129,6 +130,14 @@ def test_a_collector_cuts_episodes() -> None:
     (data,) = collector
     assert torch.equal(data["elapsed_steps"], data["step_count"])  # the latter by TorchRL's StepCounter
     assert (data["next", "truncated"].cumsum(1)[:, -1] == 2).all()
+
+
+def test_a_prioritized_buffer_samples() -> None:
+    pytest.importorskip("torchrl._torchrl", reason="this TorchRL is built for another torch", exc_type=ImportError)
+    buffer = TensorDictPrioritizedReplayBuffer(alpha=1.0, beta=1.0, storage=LazyTensorStorage(20), batch_size=8)
+    buffer.extend(make(2).rollout(10).flatten())
+    buffer.update_priority(torch.arange(20), torch.arange(20) == 3)
+    assert (buffer.sample()["elapsed_steps"] == 3).all()
 
 
 ENTRIES = {
