@@ -5,7 +5,6 @@ Gymnasium. The names in ``magrl.__all__``, those of ``__init__.pyi``, are loaded
 does not load torch.
 """
 
-import importlib as _importlib
 import multiprocessing as _multiprocessing
 import os as _os
 
@@ -24,9 +23,10 @@ def __getattr__(name: str) -> object:
     if not name.endswith(("GymEnv", "VectorEnv")):
         return _load(name)
     method = _multiprocessing.get_start_method(allow_none=True)
-    module = _importlib.import_module("magrl.envs.gymnasium")
+    from magrl.envs import gymnasium
+
     _multiprocessing.set_start_method(method, force=True)  # importing TorchRL sets "spawn"
-    return getattr(module, name)
+    return getattr(gymnasium, name)
 
 
 for _name, _kind in (("GeomagneticNavigation", "GeomagneticNav"), ("GeomagneticNavigationAnywhere", "Anywhere")):

@@ -111,7 +111,6 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
     spec = _SPEC
     make_env: ClassVar[Callable[..., TransformedEnv]] = staticmethod(navigation_env)
     """Function that makes the environment."""
-    default_observation: ClassVar[str] = "flat"
 
     def __init__(
         self,
@@ -127,7 +126,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)  # where TorchRL's GymWrapper reads it
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
-        observation = options.get("observation", self.default_observation)
+        observation = options.get("observation", "flat")
         self._flat = observation in ("flat", "track")
         self.torchrl_env = self.make_env(num_envs, render_mode=render_mode, **options)
         self._keys = _NAMED[observation] if isinstance(observation, str) else tuple(observation)
@@ -297,7 +296,6 @@ class AnywhereVectorEnv(GeomagneticNavVectorEnv):
     """
 
     make_env = staticmethod(anywhere_env)
-    default_observation = "track"
 
 
 class AnywhereGymEnv(GeomagneticNavGymEnv):

@@ -124,11 +124,10 @@ def region_scenario(
     check_number(0, max_latitude, above=True, half_size_deg=half_size_deg)
     check_number(0, min_intensity_nt=min_intensity_nt, margin_deg=margin_deg, max_move_km=max_move_km)
     planet = torch.arange(count) // REGIONS_PER_PLANET % len(gauss)
+    # Regions of the default size need 12 for a field of degree 13 and 52 for one of degree 133.
     lowest = 12 + max(0, gauss.shape[-1] - 14) // 3
     *lower, highest = range(lowest, 3 * lowest, 4) if degree is None else [degree]
-
-    def draw(number: Tensor, attempt: int) -> Regions:
-        return _drawn_regions(seed, number, attempt, half_size_deg, max_latitude)
+    draw = partial(_drawn_regions, seed, half_size_deg, max_latitude)
 
     def expand(regions: Regions, planet: Tensor, tolerance_nt: float) -> tuple[Regions, FieldBank]:
         boxes = regions.expanded(margin_deg).reachable(max_move_km)
@@ -140,13 +139,8 @@ def region_scenario(
         return boxes, build(degree=highest, tolerance_nt=tolerance_nt)
 
     regions = _placed_regions(draw, expand, planet, min_intensity_nt)
-    return Scenario(
-        region=regions,
-        field=expand(regions, planet, tolerance_nt)[1],
-        margin_deg=margin_deg,
-        objective_floors=None,
-        **options,
-    )
+    _, bank = expand(regions, planet, tolerance_nt)
+    return Scenario(region=regions, field=bank, margin_deg=margin_deg, objective_floors=None, **options)
 
 
 def _placed_regions(
@@ -176,7 +170,7 @@ def _placed_regions(
 _ANY_ERROR = 1e9  # of an expansion by which places are chosen [nT]; that of the scenario is checked
 
 
-def _drawn_regions(seed: int, number: Tensor, attempt: int, half_size_deg: float, max_latitude: float) -> Regions:
+def _drawn_regions(seed: int, half_size_deg: float, max_latitude: float, number: Tensor, attempt: int) -> Regions:
     """Return boxes whose middles are uniform on the sphere between the latitudes that they may not cross."""
     uniform = counter_uniform(seed, torch.stack((number, torch.full_like(number, attempt)), -1), 2)
     highest = math.sin(math.radians(max_latitude - half_size_deg))

@@ -17,14 +17,7 @@ REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Privileged keys of the terms whose sum is ``reward``; 0 at a reset."""
 DECLARED = "declared"
 """Flag that the vehicle has declared its arrival, where it must."""
-CONSTANT_KEYS = (
-    "target_field",
-    "target_position",
-    "start_position",
-    "objective_weights",
-    "region",
-    EPISODE_STREAM,
-)
+CONSTANT_KEYS = ("target_field", "target_position", "start_position", "objective_weights", "region", EPISODE_STREAM)
 """Keys that keep their values throughout an episode."""
 STATE_KEYS = (*CONSTANT_KEYS, "heading", "elapsed_steps", "position", "objective", DISPLACEMENT)
 """Keys that a step reads: the state of an episode."""

@@ -204,10 +204,8 @@ class PlanetConfig(RunConfig):
     @property
     def regions(self) -> dict[str, Any]:
         """Options of the regions: large enough for the longest task, and how the distances are drawn."""
-        if self.distance_range_km[1] > 500:
-            size = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
-        else:
-            size = {"half_size_deg": 10, "degree": 12, "max_latitude": 70}
+        far = {"half_size_deg": 20, "degree": 16, "max_latitude": 75, "distance_law": "log"}
+        size = far if self.distance_range_km[1] > 500 else {"max_latitude": 70}
         reach_km = self.max_move_km + self.limits["drift_km"]
         return {"distance_range_km": self.distance_range_km, "max_move_km": reach_km, **size}
 
