@@ -11,14 +11,17 @@ written to the folder of the flight; the same command continues a flight that wa
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import logging
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import torch
 
 from magrl.agents import load_policy
 from magrl.autopilot.flight import Link, fly
-from magrl.autopilot.loop import Loop, Measurement
+from magrl.autopilot.loop import LOG, Loop
 from magrl.autopilot.mavlink import SENSORS, STEERING, MavlinkLink
 from magrl.autopilot.nmea import NmeaLink
 from magrl.checks import command
@@ -27,6 +30,9 @@ from magrl.logs import Calibration
 from magrl.onboard import Command, Onboard
 from magrl.onboard.start import known_elements
 from magrl.sensor_std import SensorStd
+
+_MAVLINK = ("speed", "sensor", "steering", "cruise_m_s", "autopilot")
+_NMEA = ("speed", "level", "sources")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -53,9 +59,11 @@ def parser() -> argparse.ArgumentParser:
     add("--nmea", action="store_true", help="the link is NMEA 0183; default MAVLink")
     add("--level", action="store_true", help="NMEA: the magnetometer is level, without XDR of PTCH and ROLL")
     add("--speed", help="airspeed or groundspeed (MAVLink), water or ground (NMEA); default by the vehicle")
+    add("--sources", nargs="+", help="NMEA: sentences that count, such as HEHDT IIXDR; default the first ones")
+    add("--autopilot", type=int, nargs=2, metavar=("SYSTEM", "COMPONENT"), help="MAVLink: default the first one")
     add("--sensor", choices=SENSORS, help="MAVLink: message of the magnetometer; default HIGHRES_IMU if it comes")
     add("--steering", choices=STEERING, help="MAVLink: how to steer; default by the type of the vehicle")
-    add("--cruise", type=float, help="MAVLink: speed to command with --steering velocity [m/s]")
+    add("--cruise", type=float, dest="cruise_m_s", help="MAVLink: speed to command with --steering velocity [m/s]")
     add("--out", type=Path, default=Path("runs/autopilot"), help="folder of the flight; default runs/autopilot")
     return arguments
 
@@ -66,19 +74,22 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _main(options: argparse.Namespace) -> None:
-    if (options.to or options.here) and not options.date:
-        raise ValueError("--to and --here need --date, that of the flight, for IGRF")
+    if bool(options.to or options.here) != bool(options.date) or (options.altitude and not options.date):
+        raise ValueError("--to and --here need --date, that of the flight, for IGRF; --date and --altitude need them")
     calibration = Calibration.load(options.calibration) if options.calibration else None
     options.bias = options.bias or (calibration.std if calibration else (0.0, 0.0, 0.0))
-    loop = Loop(vehicle(options), read_s=options.read_s, calibration=calibration)
-    if (options.out / "start.json").exists():
-        print(f"continues the flight in {options.out}, whose commands come first; for a new one, give another --out")
-    print(f"target: D, I, B_H = {', '.join(f'{value:.2f}' for value in loop.vehicle.target)}; flight: {options.out}")
+    loop, connection = Loop(vehicle(options), read_s=options.read_s, calibration=calibration), link(options)
+    LOG.handlers, logging.raiseExceptions = [logging.StreamHandler(sys.stdout), _Radio(connection)], False
+    LOG.setLevel(logging.INFO)
+    say = LOG.getChild("commands").info  # each one, however often
+    if (options.out / "messages.csv").exists():
+        say(f"continues the flight in {options.out} with its last command; for a new one, give another --out")
+    say(f"target: D, I, B_H = {', '.join(f'{x:.2f}' for x in loop.vehicle.target)}; flight: {options.out}")
     try:
-        for number, order in enumerate(fly(loop, _Waiting(link(options), loop), options.out)):
-            print(line(number, order, loop.note), flush=True)
+        for number, order in enumerate(fly(loop, connection, options.out)):
+            say(line(number, order, loop.note))
     except KeyboardInterrupt:
-        print(f"interrupted; the same command continues the flight in {options.out}")
+        say(f"interrupted; the same command continues the flight in {options.out}")
 
 
 def vehicle(options: argparse.Namespace) -> Onboard:
@@ -95,38 +106,37 @@ def vehicle(options: argparse.Namespace) -> Onboard:
 
 def link(options: argparse.Namespace) -> Link:
     """Return the link that the options name."""
-    speed = {"speed": options.speed} if options.speed else {}
-    if options.nmea:
-        return NmeaLink(options.address, north=options.north, level=options.level, **speed)
-    settings = {"steering": options.steering, "cruise_m_s": options.cruise, "sensor": options.sensor}
-    return MavlinkLink(options.address, **settings, **speed)
+    kind, names = (NmeaLink, _NMEA) if options.nmea else (MavlinkLink, _MAVLINK)
+    given = {name: value for name in (*_NMEA, *_MAVLINK) if (value := getattr(options, name)) not in (None, False)}
+    if unused := ", ".join(f"--{name.removesuffix('_m_s')}" for name in given if name not in names):
+        raise ValueError(f"{unused} has no effect {'with' if options.nmea else 'without'} --nmea: leave it out")
+    given |= {"north": options.north} if options.nmea else {}
+    try:
+        return kind(options.address, **given)
+    except (OSError, OverflowError) as error:
+        raise ValueError(f"cannot open {options.address}: {error}") from error
 
 
 def line(number: int, order: Command, note: str) -> str:
     """Return a command as text."""
     north, east = order.way_km
-    end = f"; stop: {order.stop}, {order.reason}" if order.stop else ""
+    texts = f"stop: {order.stop}, {order.reason}" if order.stop else order.reason, note
     return (
         f"{number}: steer {order.heading_deg:.0f} deg for {order.distance_km:.1f} km; to go {north:.0f} km north, "
-        f"{east:.0f} km east, within {order.radius_km:.0f} km{end}{f'; {note}' if note else ''}"
+        f"{east:.0f} km east, within {order.radius_km:.0f} km" + "".join(f"; {text}" for text in texts if text)
     )
 
 
-class _Waiting:
-    """Link that says what it waits for, where no message comes."""
+class _Radio(logging.Handler):
+    """Send what is logged to the operator."""
 
-    def __init__(self, link: Link, loop: Loop) -> None:
-        self._link, self._loop, self.period_s, self._said = link, loop, link.period_s, ""
-        self.steer, self.report = link.steer, link.report
+    def __init__(self, link: Link) -> None:
+        super().__init__(logging.WARNING)
+        self._link = link
 
-    def __iter__(self) -> Iterator[Measurement | None]:
-        for number, measurement in enumerate(self._link):
-            if (measurement is None or number % 100 == 99) and self._loop.command is None and self._loop.missing:
-                print(f"waiting for {', '.join(self._loop.missing)}", flush=True)
-            if self._loop.command is None and self._loop.note != self._said:
-                self._said = self._loop.note
-                print(f"the first reading is refused: {self._said}", flush=True)
-            yield measurement
+    def emit(self, record: logging.LogRecord) -> None:
+        with suppress(OSError):
+            self._link.report(None, record.getMessage())
 
 
 if __name__ == "__main__":

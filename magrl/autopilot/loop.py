@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import numpy as np
 from pandas import DataFrame
@@ -16,25 +19,90 @@ from magrl.logs.samples import ATTITUDE, AXES
 from magrl.onboard import Command, Onboard
 from magrl.onboard.limits import LONGER
 
+LOG = logging.getLogger("magrl.autopilot")
+"""What an operator must know; what is said again and again, once in :data:`SELDOM_S`."""
+SELDOM_S = 600.0
+"""Time after which the same is logged again [s]."""
 FASTEST_M_S = 1000.0
 """A greater speed is an error of the message; chosen [m/s]."""
 STALE_S = 2.0
 """A sample of the field counts if the attitude is at most as old; chosen [s]."""
+GREATEST = 1e11
+"""A greater number is an error of the message; as a time, it would have no digits for milliseconds; chosen."""
+GAP_S = 3600.0
+"""A longer silence counts as this one; chosen [s]."""
+LATE_S, AHEAD_S = 60.0, 15.0
+"""A message may be as much earlier than the one before, and later than the time since then explains; chosen [s]."""
 TURN_S = 120.0
 """A turn on the spot ends at the latest after this time; chosen [s]."""
 _ALIGNED_DEG = 10.0  # the turn is made
-_RESET_S = 60.0  # a clock that runs back by more was set, as by a restart of the autopilot
 _SHORT_KM = 1.0  # a shorter way is that of a turn, not a move
 _LEAST_SAMPLES = 3
 _ONE_READING_KM = 1e9
+_QUANTITIES = (*AXES, *ATTITUDE, "speed")
+NO_STATE = ("vehicle", "read_s", "calibration", "command", "heard", "_shift")
+"""Attributes of a loop that are given, or known from the vehicle; the others are its state, which is plain data."""
+_ZERO = time.time() - time.monotonic()
+_SAID: dict[str, float] = {}  # what was logged, and when
 _Place = tuple[float, float]
+
+
+def _is_due(record: logging.LogRecord) -> bool:
+    """Return whether a kind of message was not logged for a while."""
+    due = clock() - _SAID.get(record.msg, -math.inf) >= SELDOM_S
+    if due:
+        _SAID[record.msg] = clock()
+    return due
+
+
+LOG.addFilter(_is_due)
+
+
+def clock() -> float:
+    """Return the time [s], by a clock that is not set while the program runs.
+
+    Example:
+        >>> clock() <= clock()
+        True
+    """
+    return _ZERO + time.monotonic()
+
+
+@contextmanager
+def tolerated(what: str, pause_s: float = 0.0) -> Iterator[None]:
+    """Log an error of the system and go on, after a pause.
+
+    Example:
+        >>> with tolerated("the heading is not sent"):
+        ...     raise OSError("network is unreachable")
+    """
+    try:
+        yield
+    except OSError as error:
+        LOG.warning(f"{what}: %s", error)
+        time.sleep(pause_s)
+
+
+def patient(receive: Callable[[], Any]) -> Iterator[Any]:
+    """Yield what a function receives, again and again; None after an error of the system.
+
+    Example:
+        >>> next(patient(lambda: "$HEHDT,290.0,T*24"))
+        '$HEHDT,290.0,T*24'
+    """
+    while True:
+        item = None
+        with tolerated("nothing is received", pause_s=1.0):
+            item = receive()
+        yield item
 
 
 class Measurement(NamedTuple):
     """Content of one message of an autopilot; None for what it does not have.
 
     ``time`` is in seconds of the vehicle's clock; ``x``, ``y``, ``z`` is the field, forward, right, down [nT];
-    ``roll``, ``pitch``, ``heading`` are in degrees; ``speed`` is forward, in m/s.
+    ``roll``, ``pitch``, ``heading`` are in degrees; ``speed`` is forward, in m/s; ``received`` is the time of receipt,
+    in seconds of :func:`clock`, with which ``time`` is compared. The loop fills it in, unless a simulator states it.
 
     Example:
         >>> Measurement(12.5, heading=290.0, speed=None).heading
@@ -49,13 +117,14 @@ class Measurement(NamedTuple):
     pitch: float | None = None
     heading: float | None = None
     speed: float | None = None
+    received: float | None = None
 
     @property
     def possible(self) -> bool:
         """Whether all numbers can be true."""
         numbers = [value for value in self if value is not None]
         tilt, speed = self.pitch or 0.0, self.speed or 0.0
-        return all(map(math.isfinite, numbers)) and abs(tilt) <= 90 and 0 <= speed <= FASTEST_M_S
+        return all(abs(x) <= GREATEST for x in numbers) and abs(tilt) <= 90 and 0 <= speed <= FASTEST_M_S
 
 
 class Loop:
@@ -64,7 +133,8 @@ class Loop:
     The loop integrates the moves from heading and speed. At the end of a move it averages the field over ``read_s``
     seconds, without spikes, and reports the mean of the field at the mean of its places: one step a move. A field that
     does not change in any digit, that is missing or that the vehicle rejects is reported as missing, and the vehicle
-    continues by dead reckoning. Messages may come late, twice or out of order.
+    continues by dead reckoning. Messages may come late, twice or out of order. The time is that of the vehicle's clock;
+    where it runs backward, or ahead of the time of receipt, the time of receipt counts.
 
     The heading is from true north, or, where that of the vehicle is magnetic, of any reference that turns slowly: the
     loop measures its angle from magnetic north at each reading.
@@ -92,7 +162,10 @@ class Loop:
         if vehicle.target is None:
             raise ValueError("the vehicle has no target: call start before it is steered")
         self.vehicle, self.read_s, self.calibration = vehicle, read_s, calibration
-        self.now: float | None = None
+        self.now = -math.inf
+        """Time of the last message [s]."""
+        self.heard: Measurement | None = None
+        """The last message, with the time that is believed; None for one that does not count."""
         self.command: Command | None = None
         self.note = ""
         """What the last reading lacked, as text; empty if nothing."""
@@ -101,6 +174,8 @@ class Loop:
         self._offset = 0.0  # of the autopilot's north from that of the vehicle [deg]
         self._since = -math.inf  # time of the last command, or the start of the reading
         self._reading: list[tuple[float, ...]] | None = []
+        self._received, self._slack = 0.0, 0.0  # receipt of the last message; how far the vehicle's clock is behind [s]
+        self._shift = 0.0  # of the vehicle's clock, where it jumped [s]
 
     @property
     def steer_deg(self) -> float | None:
@@ -110,8 +185,7 @@ class Loop:
     @property
     def missing(self) -> tuple[str, ...]:
         """Quantities that the loop has not received: nothing is commanded before they come."""
-        needed = [*AXES, *ATTITUDE, "speed"]
-        return tuple(name for name in needed if name not in self._latest)
+        return tuple(name for name in _QUANTITIES if name not in self._latest)
 
     def take(self, measurement: Measurement) -> Command | None:
         """Take a message, and return the command if a move has ended with it.
@@ -121,55 +195,66 @@ class Loop:
         """
         if self.command and self.command.stop:
             raise RuntimeError(f"the vehicle has stopped: {self.command.reason}")
+        self.heard = None
         if not measurement.possible:
+            LOG.warning("a message does not count, since a value is not possible: %s", measurement)
             return None
-        self._advance(measurement.time)
-        values = measurement._asdict()
-        new = [name for name, value in values.items() if value is not None and self._is_new(name, measurement.time)]
-        self._latest |= {name: (measurement.time, values[name]) for name in new}
+        received = clock() if measurement.received is None else measurement.received
+        if self.now == -math.inf:
+            self.now, self._received = measurement.time, received
+        time = self._believed(measurement.time, received)
+        self.heard = measurement = measurement._replace(time=time, received=received)
+        self._advance(time)
+        values = [(name, value) for name in _QUANTITIES if (value := getattr(measurement, name)) is not None]
+        new = {name: (time, value) for name, value in values if time > self._latest.get(name, (-math.inf, 0.0))[0]}
+        self._latest |= new
         if self.missing:
             return None
         if self._reading is None and self._is_there():
-            self._reading, self._since = [], measurement.time
+            self._reading, self._since = [], time
         if self._reading is None:
             return None
         return self._read(sampled="x" in new)
 
-    def _is_new(self, name: str, time: float) -> bool:
-        """Return whether a value is newer than the last one of its name."""
-        return name != "time" and (name not in self._latest or time > self._latest[name][0])
+    def _believed(self, time: float, received: float) -> float:
+        """Return the time of a message: that of the vehicle's clock, or the time of receipt where that clock jumps."""
+        self._slack = min(self._slack + max(received - self._received, 0.0), GAP_S)
+        self._received, ahead = received, time + self._shift - self.now
+        if not -LATE_S <= ahead <= self._slack + AHEAD_S:
+            LOG.warning("the vehicle's clock jumps by %.0f s: not believed, %.0f s count", ahead, self._slack)
+            ahead = self._slack
+            self._shift = self.now + ahead - time
+        elif ahead <= 0 and self._slack > LATE_S:
+            LOG.warning("the vehicle's clock is %.0f s behind the time of receipt", self._slack)
+        self._slack -= min(max(ahead, 0.0), self._slack)
+        return time + self._shift
 
     def _advance(self, time: float) -> None:
         """Move on with the last heading and speed up to a time."""
-        if self.now is None or time < self.now - _RESET_S:
-            self.now = time
-            self._latest = {name: (-math.inf, value) for name, (_, value) in self._latest.items()}
-            self._since = min(self._since, time)
-        elif time > self.now:
-            if not self.missing:
-                length = self._value("speed") * (time - self.now) / 1000
-                course = math.radians(self._value("heading") - self._offset)
-                self._place = self._place[0] + length * math.cos(course), self._place[1] + length * math.sin(course)
-                self._path += length
-            self.now = time
+        seconds, self.now = max(time - self.now, 0.0), max(time, self.now)
+        if seconds > LATE_S:
+            LOG.warning("no message for %.0f s: the vehicle is taken to have kept its heading and speed", seconds)
+        if not self.missing:
+            length, course = self._value("speed") * seconds / 1000, math.radians(self._value("heading") - self._offset)
+            self._place = self._place[0] + length * math.cos(course), self._place[1] + length * math.sin(course)
+            self._path += length
 
     def _value(self, name: str) -> float:
         return self._latest[name][1]
 
     def _is_there(self) -> bool:
         """Return whether the move is made, so that the reading in its middle is at its end."""
-        command, now = self.command, self.now or 0.0
+        command = self.command
         assert command is not None
         if command.distance_km == 0:
             turn = math.remainder(self._value("heading") - self._offset - command.heading_deg, 360)
-            return abs(turn) <= _ALIGNED_DEG or now - self._since >= TURN_S
+            return abs(turn) <= _ALIGNED_DEG or self.now - self._since >= TURN_S
         away = math.dist(self._place, self._origin) + self._value("speed") * self.read_s / 2000
         return away >= command.distance_km or self._path >= 2 * command.distance_km
 
     def _read(self, *, sampled: bool) -> Command | None:
         """Add a sample to the reading, and return the command after the last one."""
         assert self._reading is not None
-        assert self.now is not None
         if self._since == -math.inf:  # the first reading begins
             self._since = self.now
         fresh = all(self.now - self._latest[name][0] <= STALE_S for name in ATTITUDE)

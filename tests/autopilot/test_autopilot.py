@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import random
 import runpy
@@ -18,6 +19,7 @@ import torch
 
 from magrl.autopilot import Loop, Measurement, fly
 from magrl.autopilot.__main__ import main, parser, vehicle
+from magrl.autopilot.loop import _SAID, LOG
 from magrl.autopilot.mavlink import MavlinkLink, Messages
 from magrl.autopilot.nmea import NmeaLink, Sentences
 from magrl.field import IGRF, elements_at
@@ -33,6 +35,13 @@ HERE, THERE = (60.0, 5.0), (61.2, 4.0)  # 144 km apart
 SPEED, STEP_S = 60.0, 10.0
 OFFSET = 17.0  # of the autopilot's heading from true north, where the vehicle has a compass [deg]
 EXAMPLE = Path(__file__).parent.parent.parent / "docs" / "examples" / "jsbsim_vehicle.py"
+
+
+@pytest.fixture(autouse=True)
+def _forget() -> None:
+    """Nothing was logged before a test."""
+    _SAID.clear()
+    LOG.handlers.clear()
 
 
 def elements(place: tuple[float, float]) -> list[float]:
@@ -69,9 +78,10 @@ class World:
         attitude = 1.0 + 0.1 * self.rng.random(), -2.0, self.heading
         axes = axes_of_elements(torch.tensor(elements(self.place)), torch.tensor(attitude))
         shown = self.heading - OFFSET * (self.north == "magnetic")
-        yield Measurement(self.time, roll=attitude[0], pitch=attitude[1], heading=shown % 360)
-        yield Measurement(self.time + 0.01, *(self.rng.gauss(value, self.noise) for value in axes.tolist()))
-        yield Measurement(self.time + 0.02, speed=self.speed)
+        field = [self.rng.gauss(value, self.noise) for value in axes.tolist()]
+        yield Measurement(self.time, None, None, None, *attitude[:2], shown % 360, received=self.time)
+        yield Measurement(self.time + 0.01, *field, received=self.time)
+        yield Measurement(self.time + 0.02, speed=self.speed, received=self.time)
 
     def steer(self, heading_deg: float) -> None:
         self.steered += 1
@@ -91,7 +101,9 @@ def loop(north: str = "true") -> Loop:
 def flown(tmp_path_factory) -> tuple[World, list[Command], Path]:
     """A flight with true north."""
     world, folder = World(), tmp_path_factory.mktemp("flight")
-    return world, list(fly(loop(), world, folder)), folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("magrl.autopilot.flight.clock", lambda: world.time)
+        return world, list(fly(loop(), world, folder)), folder
 
 
 def test_a_vehicle_arrives(flown) -> None:
@@ -124,23 +136,145 @@ def test_one_step_is_made_at_the_end_of_each_move(monkeypatch, tmp_path) -> None
             assert made == pytest.approx(command.distance_km, abs=SPEED * STEP_S / 1000)
 
 
-@pytest.mark.parametrize("number", range(20))
-def test_a_killed_flight_continues_with_the_same_commands(flown, number, tmp_path) -> None:
-    lines = (flown[2] / "messages.csv").read_text().splitlines(keepends=True)
-    cut = random.Random(number).randrange(2, len(lines))
-    for name in ("start.json", "loop.json"):
-        (tmp_path / name).write_bytes((flown[2] / name).read_bytes())
-    (tmp_path / "messages.csv").write_text("".join(lines[:cut]) + lines[cut][: number % 7])  # the last line is torn
-    world = World()
-    rest = [Measurement(*(float(x) if x else None for x in line.strip().split(","))) for line in lines[cut:]]
-    world.__class__ = type("Rest", (World,), {"__iter__": lambda _: iter(rest)})
-    assert list(fly(loop(), world, tmp_path)) == flown[1]
-    assert (tmp_path / "messages.csv").read_text() == "".join(lines)
+class Played(World):
+    """Messages of a record."""
+
+    def __init__(self, lines: list[str]) -> None:
+        super().__init__()
+        self.lines = lines
+
+    def __iter__(self) -> Iterator[Measurement]:
+        for line in self.lines:
+            yield Measurement(*(float(cell) if cell else None for cell in line.strip().split(",")))
 
 
-def test_a_flight_with_other_options_is_refused(flown) -> None:
-    with pytest.raises(ValueError, match="another target or other options of the loop"):
-        list(fly(Loop(loop().vehicle, read_s=10.0), [], flown[2]))
+def record(folder: Path) -> list[str]:
+    """The lines of a record, the header first."""
+    return (folder / "messages.csv").read_text().splitlines(keepends=True)
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_a_killed_flight_continues_with_the_same_commands(flown, number, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("magrl.autopilot.flight.STATE_LINES", 10 + 90 * number)
+    lines, repeated = record(flown[2]), []
+    cut, other = sorted(random.Random(number).sample(range(2, len(lines)), 2))
+    before = [*fly(loop(), Played(lines[1:cut]), tmp_path)]
+    with (tmp_path / "messages.csv").open("a") as file:
+        file.write(lines[cut][: number % 7])  # the last line is torn
+    flight, take = loop(), Loop.take
+    monkeypatch.setattr(Loop, "take", lambda self, *a: repeated.append(a) or take(self, *a))
+    after = [*fly(flight, Played([]), tmp_path)]
+    assert after == before[-1:]
+    assert len(repeated) <= 10 + 90 * number  # of a state beside the messages
+    if number % 2:
+        (tmp_path / "flight.json").write_text(number // 2 * "{")  # damaged: all messages are repeated
+    after = [*fly(loop(), Played(lines[cut:other]), tmp_path), *[*fly(loop(), Played(lines[other:]), tmp_path)][1:]]
+    assert before + after[len(before[-1:]) :] == flown[1] or not before
+    assert record(tmp_path) == lines
+
+
+@pytest.mark.parametrize(
+    "damage", ["\n", "{line},5.0\n", "\0\0\0\n", "9.0,1.0\n", "{line}x\n", ",1.0,,,,,,,\n", "\udcff\n"]
+)
+def test_what_comes_before_a_damaged_line_is_used(flown, damage, tmp_path, caplog) -> None:
+    lines, cut = record(flown[2]), 150
+    before = [*fly(loop(), Played(lines[1:cut]), tmp_path)]
+    bad = damage.format(line=lines[cut].strip()).encode(errors="surrogateescape")
+    (tmp_path / "messages.csv").write_bytes("".join(lines[:cut]).encode() + bad + "".join(lines[cut + 5 :]).encode())
+    flight = loop()
+    assert [*fly(flight, Played([]), tmp_path)] == before[-1:]
+    assert caplog.text.count("is no message") == caplog.text.count(f"line {cut + 1} of {tmp_path}/messages.csv") == 1
+    assert flight.now == pytest.approx(float(lines[cut - 1].split(",")[0]), abs=0.05)
+    _SAID.clear()
+    again = [*fly(loop(), Played(lines[cut : cut + 100]), tmp_path)]
+    assert [*fly(loop(), Played([]), tmp_path)] == again[-1:] == flown[1][len(before) - 2 + len(again) :][:1]
+    assert caplog.text.count("is no message") == 1  # it is said once
+
+
+CHANGES: list[tuple[str, dict[str, Any]]] = [
+    ("target", {"target": (-11.0, 75.4, 13240.0)}),
+    ("here", {"here": (60.0, 5.0), "date": "2026-01-01"}),
+    ("near", {"near": (60.0, 5.0), "date": "2026-01-01"}),
+    ("confidence", {"confidence": 0.9}),
+    ("sensor_std", {"sensor_std": (0.1, 0.1, 20.0)}),
+    ("north", {"north": "magnetic"}),
+    ("weights", {"navigator": "kalman"}),
+    ("read_s", {"read_s": 10.0}),
+]
+
+
+@pytest.mark.parametrize(("name", "change"), CHANGES)
+def test_a_flight_with_other_options_is_refused(name, change, tmp_path) -> None:
+    def made(target: Any = (-11.6, 75.4, 13240.0), read_s: float = 30.0, **rest: Any) -> Loop:
+        start = {key: rest.pop(key) for key in ("here", "near", "date") if key in rest}
+        board = Onboard(rest.pop("navigator", "secant"), **rest)
+        board.start(target, **start)
+        return Loop(board, read_s=read_s)
+
+    assert [*fly(made(), Played([]), tmp_path)] == []
+    assert [*fly(made(), Played([]), tmp_path)] == []
+    with pytest.raises(ValueError, match=rf"is of a flight with.* {name} ") as error:
+        [*fly(made(**change), Played([]), tmp_path)]
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_has_one_process(tmp_path) -> None:
+    first = fly(loop(), World(), tmp_path)
+    next(first)
+    with pytest.raises(ValueError, match="another process"):
+        next(fly(loop(), World(), tmp_path))
+    first.close()
+    assert next(fly(loop(), World(), tmp_path))
+
+
+def full(*_: Any) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+class Full:
+    """A file on a disk that is full now and then, where a part of what is written fits."""
+
+    left = 800
+
+    def __init__(self, file: Any, rng: random.Random) -> None:
+        self.file, self.rng = file, rng
+        self.close = file.close
+
+    def write(self, content: bytes) -> int:
+        self.left -= 1
+        if self.left > 0 and self.rng.random() < 0.7:
+            full()
+        return self.file.write(content[: self.rng.randrange(200)])
+
+
+def test_errors_of_the_system_do_not_end_the_steering(flown, tmp_path, caplog, monkeypatch) -> None:
+    rng, lines, opened = random.Random(0), record(flown[2]), Path.open
+
+    class Broken(Played):
+        def steer(self, *_: Any) -> None:
+            self.steered += 1
+            if rng.random() < 0.5:
+                raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+        report = steer
+
+    def write(path: Path, content: bytes) -> None:
+        full() if rng.random() < 0.5 else path.write_bytes(content)
+
+    def disk(path: Path, mode: str, **options: Any) -> Any:
+        return Full(opened(path, mode, **options), rng) if mode == "ab" else opened(path, mode, **options)
+
+    [*fly(loop(), Played([]), tmp_path)]
+    monkeypatch.setattr("magrl.autopilot.flight.STATE_LINES", 5)
+    monkeypatch.setattr("magrl.autopilot.flight.write_atomically", write)
+    monkeypatch.setattr(Path, "open", disk)
+    link = Broken(lines[1:])
+    assert [*fly(loop(), link, tmp_path)] == flown[1]
+    assert link.steered >= 2 * len(flown[1]) - 1
+    assert record(tmp_path) == lines
+    for text in ("the heading is not sent", "the command is not reported", "messages wait", "the state of the flight"):
+        assert len([line for line in caplog.messages if text in line]) == 1  # not each time
+    assert [*fly(loop(), Played([]), tmp_path)] == flown[1][-1:]
 
 
 def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
@@ -148,7 +282,7 @@ def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
         def messages(self) -> Iterator[Measurement]:
             messages = [*super().messages()]
             order = messages + messages[:2] if self.rng.random() < 0.5 else messages[::-1]
-            old = Measurement(self.time - 3 * STEP_S, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0)
+            old = Measurement(self.time - 3 * STEP_S, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0, self.time)
             yield from (*order, old)
 
     world = Late(noise=0.0)
@@ -156,13 +290,23 @@ def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
     assert world.left_km < 25
 
 
-def test_the_clock_of_an_autopilot_may_start_anew() -> None:
-    flight, world = loop(), World()
-    for number in range(200):
-        for message in world.messages():
-            flight.take(message._replace(time=message.time - 1000.0 * (number > 100)))
-    assert flight.now == pytest.approx(1000.0, abs=STEP_S)
-    assert math.hypot(*flight._place) > 30  # it moves on after that
+@pytest.mark.parametrize("number", range(6))
+def test_no_clock_moves_the_vehicle(number, caplog) -> None:
+    """Times that are wrong once or from then on, and silence, against the time of receipt."""
+    rng, flight, now, shift = random.Random(number), loop(), 0.0, 0.0
+    jumps = (2**32 / 1e3, 30 * 86400.0, 3600.0, 61.0, -1000.0, -2.6e6, math.nan, 1e18)
+    for _ in range(3000):
+        now += 600.0 if number % 2 and rng.random() < 0.002 else 1.0
+        shift += rng.choice(jumps[:-2]) if rng.random() < 0.01 else 0.0
+        once = rng.choice([*jumps, -now - shift]) if rng.random() < 0.05 else 0.0
+        flight.take(Measurement(now + shift + once, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, SPEED, received=now))
+    assert flight._place == (pytest.approx(SPEED * now / 1000, abs=2.0), 0.0)
+    assert "not believed" in caplog.text
+    assert "does not count" in caplog.text
+    assert ("no message for" in caplog.text) == bool(number % 2)
+    place = flight._place[0]
+    flight.take(Measurement(now + 9000.0, speed=SPEED, received=now + 9000.0))
+    assert flight._place[0] - place == pytest.approx(SPEED * 3.6, abs=2.0)  # of an hour at most
 
 
 # Readings
@@ -214,7 +358,7 @@ def test_an_impossible_message_does_not_count() -> None:
 def test_a_long_way_is_reported_in_parts_and_once(good) -> None:
     flight = readings(lambda _, m: m, 10)
     before = len(flight.vehicle._steps)
-    messages = (m._replace(time=m.time + gap) for gap in (2000.0, 2100.0) for m in World().messages())
+    messages = (m._replace(time=m.time + gap, received=gap) for gap in (2000.0, 2100.0) for m in World().messages())
     while len(flight.vehicle._steps) == before:  # it was not heard of for half an hour
         message = next(messages)
         flight.take(message if good or message.x is None else message._replace(x=-message.x))
@@ -302,19 +446,6 @@ def test_mavlink_is_read_in_our_units_from_one_vehicle() -> None:
     assert {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_VFR_HUD} <= set(asked)
 
 
-def test_a_coarse_magnetometer_is_taken_after_three_seconds_and_another_clock_is_set_aside() -> None:
-    messages = Messages("groundspeed")
-    speed = mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)
-    assert messages.measurement(speed) is None  # its time is not known before the first attitude
-    for time in (0, 3):
-        messages.measurement(mavlink.MAVLink_attitude_message(1000 * time, *[0.0] * 6))
-        raw = mavlink.MAVLink_raw_imu_message(10**15 + time, *[0] * 6, 150, 0, 500)
-        found = messages.measurement(raw)
-        assert (found is None) == (time == 0)
-    assert found == Measurement(3.0, 15000.0, 0.0, 50000.0)
-    assert messages.measurement(speed) == Measurement(3.0, speed=40.0)
-
-
 @pytest.mark.parametrize(
     ("kind", "name"),
     [(1, "COMMAND_INT"), (2, "SET_POSITION_TARGET_LOCAL_NED"), (10, "SET_POSITION_TARGET_LOCAL_NED")],
@@ -339,16 +470,6 @@ def test_mavlink_steers(kind, name) -> None:
         assert link._messages.speed == "groundspeed"
 
 
-def test_a_refused_heading_and_lost_requests_are_noticed() -> None:
-    answer = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_GUIDED_CHANGE_HEADING, 4)
-    line = Line(packed(*[heartbeat()] * 11, answer, answer))
-    with pytest.warns(UserWarning, match="is it in GUIDED") as warned:
-        received(MavlinkLink(line), 11)
-    assert len(warned) == 1
-    asked = [m.param1 for m in line.sent if m.get_type() == "COMMAND_LONG"]
-    assert asked.count(mavlink.MAVLINK_MSG_ID_VFR_HUD) == 2
-
-
 def test_mavlink_reports(flown) -> None:
     line = Line([])
     MavlinkLink(line).report(flown[1][-1], "within 25 km")
@@ -364,6 +485,29 @@ def test_an_autopilot_that_cannot_be_steered_is_named() -> None:
         next(iter(MavlinkLink(Line(packed(heartbeat(22, 12))), cruise_m_s=20.0)))
     with pytest.raises(ValueError, match="state cruise_m_s"):
         next(iter(MavlinkLink(Line(packed(heartbeat(10))))))
+
+
+def test_a_coarse_magnetometer_is_taken_after_three_seconds_and_another_clock_is_set_aside() -> None:
+    messages = Messages("groundspeed")
+    speed = mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)
+    assert messages.measurement(speed) is None  # its time is not known before the first attitude
+    for time in (0, 3):
+        messages.measurement(mavlink.MAVLink_attitude_message(1000 * time, *[0.0] * 6))
+        raw = mavlink.MAVLink_raw_imu_message(10**15 + time, *[0] * 6, 150, 0, 500)
+        found = messages.measurement(raw)
+        assert (found is None) == (time == 0)
+    assert found == Measurement(3.0, 15000.0, 0.0, 50000.0)
+    assert messages.measurement(speed) == Measurement(3.0, speed=40.0)
+
+
+def test_a_refused_heading_and_lost_requests_are_noticed() -> None:
+    answer = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_GUIDED_CHANGE_HEADING, 4)
+    line = Line(packed(*[heartbeat()] * 11, answer, answer))
+    with pytest.warns(UserWarning, match="is it in GUIDED") as warned:
+        received(MavlinkLink(line), 11)
+    assert len(warned) == 1
+    asked = [m.param1 for m in line.sent if m.get_type() == "COMMAND_LONG"]
+    assert asked.count(mavlink.MAVLINK_MSG_ID_VFR_HUD) == 2
 
 
 def sentence(content: str) -> bytes:
@@ -495,15 +639,25 @@ def test_the_command_looks_up_its_destination_and_names_what_is_missing(capsys) 
     assert "--to and --here need --date" in capsys.readouterr().err
 
 
-def test_the_command_flies_a_recorded_flight_again(flown, monkeypatch, capsys) -> None:
+def test_the_command_flies_on(flown, monkeypatch, capsys, tmp_path) -> None:
     target = map(repr, loop().vehicle.target)
     monkeypatch.setattr("magrl.autopilot.__main__.link", lambda _: World())
     noise = ["--noise", "0.05", "0.05", "20", "--read-s", "60"]
-    main(["udp:0", "--target", *target, *noise, "--out", str(flown[2])])
+    command = ["udp:0", "--target", *target, *noise, "--out", str(tmp_path)]
+    main(command)
     shown = capsys.readouterr().out
-    assert shown.startswith(f"continues the flight in {flown[2]}")
-    assert len(shown.splitlines()) == 2 + len(flown[1])
+    lines = shown.splitlines()
+    assert len(lines) == 1 + len(flown[1])
+    assert lines[1].endswith("; the sign of D and the compass were not checked: give here or near in start")
     assert "stop: arrived, within 25 km" in shown
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.stdout, "write", full)
+        main([*command[:-1], str(tmp_path / "full")])  # nothing can be printed
+    assert record(tmp_path / "full") == record(tmp_path)
+    main(command)
+    again = capsys.readouterr().out.splitlines()
+    assert again[0].startswith(f"continues the flight in {tmp_path}")
+    assert again[2:] == [lines[-1].replace(f"{len(flown[1]) - 1}:", "0:", 1)]
 
 
 @pytest.mark.slow
