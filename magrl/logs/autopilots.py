@@ -6,7 +6,7 @@ import datetime
 import io
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from importlib import import_module
 from pathlib import Path
@@ -268,39 +268,45 @@ _ROS: Mapping[str, tuple[tuple[str, ...], Callable[[Any], Sequence[float]]]] = {
 
 # NMEA 0183
 
-_KNOT = UNITS["speed"]["kn"]
-_SENTENCES: Mapping[str, Mapping[str, tuple[str, float]]] = {
-    "HDT": {"heading_true": ("headingT", 1.0)},
-    "THS": {"heading_true": ("headt", 1.0)},
-    "HDG": {"heading_magnetic": ("headingM", 1.0)},
-    "HDM": {"heading_magnetic": ("headingM", 1.0)},
-    "VHW": {"speed_water": ("spdN", _KNOT)},
-    "VTG": {"speed_ground": ("sogn", _KNOT)},
-    "RMC": {"latitude": ("lat", 1.0), "longitude": ("lon", 1.0), "speed_ground": ("spd", _KNOT)},
-    "GGA": {"latitude": ("lat", 1.0), "longitude": ("lon", 1.0)},
-    "GLL": {"latitude": ("lat", 1.0), "longitude": ("lon", 1.0)},
+_KNOT, _KM_H = UNITS["speed"]["kn"], UNITS["speed"]["km_h"]
+_FIX = ("latitude", "lat", 1.0), ("longitude", "lon", 1.0)
+_SENTENCES: Mapping[str, Sequence[tuple[str, str, float]]] = {
+    "HDT": [("heading_true", "headingT", 1.0)],
+    "THS": [("heading_true", "headt", 1.0)],
+    "HDG": [("heading_magnetic", "headingM", 1.0)],
+    "HDM": [("heading_magnetic", "headingM", 1.0)],
+    "VHW": [("speed_water", "spdK", _KM_H), ("speed_water", "spdN", _KNOT)],
+    "VBW": [("speed_water", "longwaterspd", _KNOT), ("speed_ground", "longgroundspd", _KNOT)],
+    "VTG": [("speed_ground", "sogk", _KM_H), ("speed_ground", "sogn", _KNOT)],
+    "RMC": [*_FIX, ("speed_ground", "spd", _KNOT)],
+    "GGA": _FIX,
+    "GLL": _FIX,
 }
-"""Columns of each sentence: name of the field, and its unit."""
+"""Columns of each sentence: names, their fields, and units, of which the last one goes first."""
+_TRANSDUCER = ("tdrtype", "dataunit", "tdrid", "data")
+_TILT = {("A", "D", "ROLL"): ("roll", 1.0)} | dict.fromkeys([("A", "D", "PTCH"), ("A", "D", "PITCH")], ("pitch", 1.0))
+"""Columns and units of transducers that are angles in degrees, by kind, unit and name."""
 _CHOICES = {"heading": ("heading_true", "heading_magnetic"), "speed": ("speed_water", "speed_ground")}
-INVALID = {"status": "V", "mi": "V", "posMode": "N", "quality": 0}
-"""Fields of a sentence whose values are not valid."""
+INVALID = {"status": ("V",), "mi": ("V", "S", "M"), "posMode": ("N", "S", "M"), "quality": (0, 7, 8)}
+"""Fields of a sentence whose values are not valid, or simulated, or entered by hand."""
 
 
 def read_nmea(path: Path) -> Recording:
     """Read sentences of NMEA 0183 with pynmeagps: heading, speed, position, and transducers (XDR) by their names.
 
     Sentences have the time of their TAG block, or of the last RMC or ZDA. A heading from true north and a speed through
-    the water go first. Names of transducers are those of columns, such as ``MAG_X_UT``, or ``PTCH`` and ``ROLL``.
+    the water go first. Transducers are axes of the magnetometer, such as ``MAG_X_UT``, and the angles ``PTCH`` and
+    ``ROLL``; others do not count.
     """
     rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
     reader, now = package("pynmeagps", "pynmeagps").NMEAReader, None
     for line in path.read_bytes().splitlines(keepends=True):
         tag = re.match(rb"\\[^\\]*\bc:(\d+)", line)
         for _, message in reader(io.BytesIO(line), quitonerror=0):
-            if message is None or any(getattr(message, field, None) == value for field, value in INVALID.items()):
+            if message is None or any(getattr(message, field, None) in values for field, values in INVALID.items()):
                 continue
             now = int(tag[1]) / (1000 if len(tag[1]) > 11 else 1) if tag else _nmea_time(message) or now
-            for name, value in nmea_values(message):
+            for name, value in nmea_values(message).items():
                 if now:
                     rows[name].append((now, value))
     if not rows:
@@ -324,26 +330,28 @@ def _nmea_time(message: Any) -> float | None:
     return None
 
 
-def nmea_values(message: Any) -> Iterator[tuple[str, float]]:
-    """Yield the columns of a sentence and their values.
+def nmea_values(message: Any) -> dict[str, float]:
+    """Return the columns of a sentence and their values.
 
     Args:
         message: sentence of pynmeagps.
 
     Example:
         >>> from pynmeagps import NMEAReader
-        >>> list(nmea_values(NMEAReader.parse("$HEHDT,290.0,T*24")))
-        [('heading_true', 290.0)]
+        >>> nmea_values(NMEAReader.parse("$HEHDT,290.0,T*24"))
+        {'heading_true': 290.0}
     """
-    for name, (field, unit) in _SENTENCES.get(message.msgID, {}).items():
-        value = getattr(message, field, "")
-        if isinstance(value, (int, float)):
-            yield name, unit * value + _deviation(message)
-    for number in range(1, 10) if message.msgID == "XDR" else ():
-        name, value = (getattr(message, f"{field}_{number:02}", "") for field in ("tdrid", "data"))
-        column = column_of({"PTCH": "PITCH"}.get(name, name))
+    values = {}
+    for name, field, factor in _SENTENCES.get(message.msgID, ()):
+        value, status = getattr(message, field, ""), getattr(message, f"{field.removeprefix('long')}status", "A")  # VBW
+        if isinstance(value, (int, float)) and status != "V" and ("heading" not in name or 0 <= value <= 360):
+            values[name] = factor * value + _deviation(message)
+    for number in range(1, 100 if message.msgID == "XDR" else 1):
+        kind, unit, title, value = (getattr(message, f"{field}_{number:02}", "") for field in _TRANSDUCER)
+        column = _TILT.get((kind, unit, title)) or (column_of(title) if re.match("(?i)MAG_?[XYZ]", title) else None)
         if column and isinstance(value, (int, float)):
-            yield column[0], column[1] * value
+            values[column[0]] = column[1] * value
+    return values
 
 
 def _deviation(message: Any) -> float:

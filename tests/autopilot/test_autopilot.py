@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import torch
+from support.logs import nmea as log_of_a_ship
 
 from magrl.autopilot import Loop, Measurement, fly
 from magrl.autopilot.__main__ import main, parser, vehicle
@@ -470,6 +471,19 @@ def test_mavlink_steers(kind, name) -> None:
         assert link._messages.speed == "groundspeed"
 
 
+def test_a_coarse_magnetometer_is_taken_after_three_seconds_and_another_clock_is_set_aside() -> None:
+    messages = Messages("groundspeed")
+    speed = mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)
+    assert messages.measurement(speed) is None  # its time is not known before the first attitude
+    for time in (0, 3):
+        messages.measurement(mavlink.MAVLink_attitude_message(1000 * time, *[0.0] * 6))
+        raw = mavlink.MAVLink_raw_imu_message(10**15 + time, *[0] * 6, 150, 0, 500)
+        found = messages.measurement(raw)
+        assert (found is None) == (time == 0)
+    assert found == Measurement(3.0, 15000.0, 0.0, 50000.0)
+    assert messages.measurement(speed) == Measurement(3.0, speed=40.0)
+
+
 def test_mavlink_reports(flown) -> None:
     line = Line([])
     MavlinkLink(line).report(flown[1][-1], "within 25 km")
@@ -485,19 +499,6 @@ def test_an_autopilot_that_cannot_be_steered_is_named() -> None:
         next(iter(MavlinkLink(Line(packed(heartbeat(22, 12))), cruise_m_s=20.0)))
     with pytest.raises(ValueError, match="state cruise_m_s"):
         next(iter(MavlinkLink(Line(packed(heartbeat(10))))))
-
-
-def test_a_coarse_magnetometer_is_taken_after_three_seconds_and_another_clock_is_set_aside() -> None:
-    messages = Messages("groundspeed")
-    speed = mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)
-    assert messages.measurement(speed) is None  # its time is not known before the first attitude
-    for time in (0, 3):
-        messages.measurement(mavlink.MAVLink_attitude_message(1000 * time, *[0.0] * 6))
-        raw = mavlink.MAVLink_raw_imu_message(10**15 + time, *[0] * 6, 150, 0, 500)
-        found = messages.measurement(raw)
-        assert (found is None) == (time == 0)
-    assert found == Measurement(3.0, 15000.0, 0.0, 50000.0)
-    assert messages.measurement(speed) == Measurement(3.0, speed=40.0)
 
 
 def test_a_refused_heading_and_lost_requests_are_noticed() -> None:
@@ -540,6 +541,9 @@ def test_nmea_over_udp_steers_a_ship() -> None:
             found.append(item)
             if item is None or len(found) == 3:
                 break
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:  # it does not get the answers
+            other.sendto(sentence("GPGSV,1,1,00"), ("127.0.0.1", link.port.port))
+            next(iter(link))
         link.steer(120.0)
         assert ship.recv(99) == sentence("ECHSC,120.0,T,,M")
         assert ship.recv(99).startswith(b"$ECAPB,A,A,0.00,R,N,V,V,120.0,T,MAGRL,120.0,T,120.0,T*")
@@ -553,22 +557,107 @@ def test_nmea_over_udp_steers_a_ship() -> None:
     assert speed.speed == pytest.approx(SPEED, abs=0.01)
 
 
+def read(*contents: str, **options: Any) -> list[dict[str, float]]:
+    """What sentences say, that comes one a second."""
+    kind = Sentences(**options)
+    found = [item for n, content in enumerate(contents) for item in kind.measurements(sentence(content), float(n))]
+    return [{k: v for k, v in item._asdict().items() if v is not None and k != "time"} for item in found]
+
+
+SPEEDS = ["VWVHW,,T,,M,10.0,N,18.52,K", "VWVHW,,T,,M,,N,18.52,K", "VWVBW,10.0,0.0,A,9.0,0.0,V,,V,,V"]
+SPEEDS += ["GPVTG,,T,,M,10.0,N,18.52,K,A", "GPVTG,,T,,M,,N,18.52,K,A", "VWVBW,9.0,0.0,V,10.0,0.0,A,,V,,V"]
+
+
 def test_sentences_of_another_north_or_speed_do_not_count() -> None:
-    assert not [*Sentences().measurements(sentence("HETHS,290.0,V"), 0.0)]  # marked as not valid
-    lines = [sentence("HCHDM,350.0,M"), sentence("GPVTG,,T,,M,10.0,N,18.5,K,A")]
-    counted = [
-        [len([*kind.measurements(line, 0.0)]) for line in lines]
-        for kind in (Sentences(), Sentences("magnetic", "ground"))
+    for line in SPEEDS:
+        water = SPEEDS.index(line) < 3
+        assert read(line, speed="water" if water else "ground") == [{"speed": pytest.approx(10 * 1852 / 3600)}]
+        assert read(line, speed="ground" if water else "water") == []
+    assert [read("HCHDM,350.0,M", north=north) for north in ("true", "magnetic")] == [[], [{"heading": 350.0}]]
+
+
+@pytest.mark.parametrize("line", ["HETHS,290.0,V", "HETHS,290.0,S", "HETHS,290.0,M", "HEHDT,720.0,T", "HEHDT,-1.0,T"])
+def test_a_heading_that_is_not_valid_does_not_count(line) -> None:
+    assert read(line, "HEHDT,290.0,T") == [{"heading": 290.0}]
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_an_unknown_transducer_changes_nothing(number, tmp_path) -> None:
+    """Names of columns of a log, with and without units, of any kind."""
+    rng, axes = random.Random(number), "G,1.0,,MAG_X_NT,G,2.0,,MAG_Y_NT,G,3.0,,MAG_Z_NT"
+    names = [
+        "SPEED",
+        "SOG",
+        "STW",
+        "YAW",
+        "HEADING",
+        "HEADING_TRUE",
+        "X",
+        "Y",
+        "Z",
+        "B_X",
+        "ACC_X",
+        "X_G",
+        "MAGNET",
+        "T",
     ]
-    assert counted == [[0, 0], [1, 1]]
+    names += [
+        "TIME",
+        "DISTANCE",
+        "DEPTH",
+        "LAT",
+        "LON",
+        "ALT",
+        "MAG_HEADING",
+        "SPEED_KN",
+        "",
+        "PTCH",
+        "ROLL",
+        "PITCH",
+        "é",
+    ]
+    lines = []
+    for _ in range(100):
+        kinds = [(rng.choice("ACDFGHNPRTUV"), rng.choice(["", "N", "C", "R", "M", "X"]), name) for name in names]
+        group = ",".join(
+            f"{kind},{rng.choice(['5.0', '', '-1e9'])},{unit},{name}" for kind, unit, name in rng.sample(kinds, 6)
+        )
+        lines.append(rng.choice(["YX", "II", "SD"]) + f"XDR,{group}")
+    assert read(*lines, f"IIXDR,{axes}", "YXXDR,A,1.0,D,ROLL,A,2.0,D,PTCH") == [
+        {"x": 1.0, "y": 2.0, "z": 3.0},
+        {"roll": 1.0, "pitch": 2.0},
+    ]
+    paths = tmp_path / "a.log", tmp_path / "b.log"
+    for path, extra in zip(paths, ((), lines), strict=True):
+        path.write_bytes(log_of_a_ship(*extra))
+    logs = [read_log(path) for path in paths]
+    assert logs[0].samples.equals(logs[1].samples)
+    assert logs[0].north == logs[1].north
+
+
+@pytest.mark.parametrize(("north", "one", "other"), [("true", "HEHDT", "GPHDT"), ("magnetic", "HCHDM", "HCHDG")])
+def test_of_two_sources_the_first_or_the_named_one_counts(north, one, other, caplog) -> None:
+    lines = [f"{one},290.0,T", f"{other},20.0,,,,", f"{one},291.0,T", f"{other},300.0,,,,", "VWVHW,,T,,M,10.0,N,,K"]
+    found = read(*lines, "IIVBW,19.0,0.0,A,,,V,,V,,V", north=north)
+    assert [item["heading"] for item in found if "heading" in item] == [290.0, 291.0]
+    assert len(found) == 3
+    assert caplog.messages == [
+        f"heading of {other} does not count: it is 20.0, that of {one} was 290.0",
+        "speed of IIVBW does not count: it is 9.8, that of VWVHW was 5.1",
+    ]
+    assert read(*lines, north=north, sources=[other]) == [{"heading": 20.0}, {"heading": 300.0}]
+    caplog.clear()
+    _SAID.clear()
+    read(lines[0], *20 * ["GPGSA"], lines[3], north=north)
+    assert len(caplog.messages) == 1  # it agrees, but the first one is silent
 
 
 def test_a_serial_port_is_read_and_written() -> None:
     link = NmeaLink("loop://,4800", level=True, north="magnetic")
-    link.port.send(sentence("HCHDM,350.0,M"))
+    link.port.write(sentence("HCHDM,350.0,M"))
     assert next(iter(link)).heading == 350.0
     link.steer(20.0)
-    assert link.port.receive() == [sentence("ECHSC,,T,20.0,M").strip()]
+    assert link.port.readline() == sentence("ECHSC,,T,20.0,M")
     link.port.close()
 
 
