@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 
-from magrl.autopilot.loop import Measurement
+from magrl.autopilot.loop import LOG, Measurement, patient, tolerated
 from magrl.checks import check_choice
 from magrl.field.elements import FIELD_NT
 from magrl.logs import attitude_of
@@ -28,7 +27,7 @@ SENSORS: Mapping[str, float] = {"HIGHRES_IMU": FIELD_NT["gauss"]} | dict.fromkey
 )
 """Messages with a magnetometer, and their unit [nT]. Those of integers have steps of 100 nT."""
 _ATTITUDE = "ATTITUDE", "ATTITUDE_QUATERNION"
-_WAIT_S = 3.0  # for HIGHRES_IMU, before a coarser message is taken
+_WAIT = 30  # coarser messages, before one of them is taken in place of HIGHRES_IMU
 _CLOCKS_S = 60.0  # a message whose clock differs by more has another one
 _VELOCITY_AND_YAW = 0b100111000111  # type_mask: position, acceleration and yaw rate are ignored
 _VELOCITY = 0b110111000111  # a Rover of ArduPilot takes a velocity with a yaw to the south for one backward
@@ -36,8 +35,10 @@ _ROVERS = (10, 11)  # MAV_TYPE_GROUND_ROVER, MAV_TYPE_SURFACE_BOAT
 _FIXED_WING = 1  # MAV_TYPE_FIXED_WING
 _WINGS = (_FIXED_WING, *range(19, 26))  # and vehicles that start and land vertically
 _BEATS = 10  # heartbeats, of about 1 Hz, after which the messages are asked for again
+_OTHERS = (5, 6)  # MAV_TYPE_ANTENNA_TRACKER, MAV_TYPE_GCS
 _CHANGE_HEADING = 43002  # MAV_CMD_GUIDED_CHANGE_HEADING
 _SEVERITY = 5  # MAV_SEVERITY_NOTICE
+_DIALECT = "pymavlink.dialects.v20.ardupilotmega"
 _TEXT = 50  # characters of a STATUSTEXT
 
 
@@ -46,7 +47,7 @@ class Messages:
 
     Args:
         speed: ``"airspeed"`` or ``"groundspeed"`` of VFR_HUD.
-        sensor: one of :data:`SENSORS`; by default HIGHRES_IMU, or the first of the others after three seconds.
+        sensor: one of :data:`SENSORS`; by default HIGHRES_IMU, or one of the others after 30 of these.
 
     Example:
         >>> from pymavlink.dialects.v20 import common
@@ -56,11 +57,11 @@ class Messages:
 
     def __init__(self, speed: str = "airspeed", sensor: str | None = None) -> None:
         check_choice(("airspeed", "groundspeed"), speed=speed)
-        if sensor is not None:
-            check_choice(SENSORS, sensor=sensor)
+        check_choice((None, *SENSORS), sensor=sensor)
         self.names = (*_ATTITUDE, "VFR_HUD", *([sensor] if sensor else SENSORS))
-        self.speed, self._sensor = speed, sensor
-        self._first: float | None = None
+        self.speed, self._wanted = speed, sensor or "HIGHRES_IMU"
+        self._wait = math.inf if sensor else _WAIT
+        self._sensor: tuple[str, int] | None = None  # name and number of the chosen one
         self._now: float | None = None
 
     def measurement(self, message: Any) -> Measurement | None:
@@ -78,7 +79,7 @@ class Messages:
             return Measurement(time, **dict(zip(ATTITUDE, angles, strict=True)))
         if name == "VFR_HUD":
             return Measurement(time, speed=getattr(message, self.speed))
-        if name not in SENSORS or not self._chosen(name, time):
+        if name not in SENSORS or not self._chosen(name, getattr(message, "id", 0)):
             return None
         axes = (SENSORS[name] * getattr(message, axis) for axis in ("xmag", "ymag", "zmag"))
         return Measurement(time, *axes)
@@ -86,18 +87,15 @@ class Messages:
     def _time(self, message: Any) -> float:
         """Return the time of a message, or that of the last attitude where it has none, or that of another clock."""
         now = self._now or 0.0
-        own = getattr(message, "time_boot_ms", None)
-        time = now if own is None else own / 1e3
-        if hasattr(message, "time_usec"):
-            time = message.time_usec / 1e6
-        return time if message.get_type() in _ATTITUDE or abs(time - now) <= _CLOCKS_S else now
+        own = getattr(message, "time_usec", 1e3 * getattr(message, "time_boot_ms", 1e3 * now)) / 1e6
+        return own if message.get_type() in _ATTITUDE or abs(own - now) <= _CLOCKS_S else now
 
-    def _chosen(self, name: str, time: float) -> bool:
+    def _chosen(self, name: str, number: int) -> bool:
         """Return whether a message is that of the magnetometer; the first one that may be is chosen."""
-        self._first = time if self._first is None else self._first
-        if self._sensor is None and (name == "HIGHRES_IMU" or time - self._first >= _WAIT_S):
-            self._sensor = name
-        return name == self._sensor
+        self._wait -= 1
+        if self._sensor is None and (name == self._wanted or self._wait < 0):
+            self._sensor = name, number
+        return self._sensor == (name, number)
 
 
 class MavlinkLink:
@@ -117,15 +115,16 @@ class MavlinkLink:
         speed: ``"airspeed"`` or ``"groundspeed"`` of VFR_HUD, with which the moves are integrated; by default the
             airspeed of a fixed wing, the ground speed of others.
         sensor: message of the magnetometer, one of :data:`SENSORS`.
+        autopilot: numbers of the system and the component to steer; by default the first autopilot that can be steered.
 
     Raises:
         ImportError: without pymavlink.
-        ValueError: for an unknown option, or ``"velocity"`` without a speed.
+        ValueError: for an unknown option, ``"velocity"`` without a speed, or ``"heading"`` with one.
 
     Example:
         >>> MavlinkLink(None, steering="velocity")
         Traceback (most recent call last):
-        ValueError: steering by velocity needs cruise_m_s, the speed to command
+        ValueError: steering by velocity, and it alone, needs cruise_m_s, the speed to command
     """
 
     period_s = 0.4  # PX4 leaves OFFBOARD below 2 Hz
@@ -138,72 +137,73 @@ class MavlinkLink:
         cruise_m_s: float | None = None,
         speed: str | None = None,
         sensor: str | None = None,
+        autopilot: Sequence[int] | None = None,
     ) -> None:
-        if steering is not None:
-            check_choice(STEERING, steering=steering)
-        if steering == "velocity" and cruise_m_s is None:
-            raise ValueError("steering by velocity needs cruise_m_s, the speed to command")
+        check_choice((None, *STEERING), steering=steering)
+        if steering and (steering == "velocity") != (cruise_m_s is not None):
+            raise ValueError("steering by velocity, and it alone, needs cruise_m_s, the speed to command")
         self._messages, self._speed = Messages(speed or "airspeed", sensor), speed
         self._connection = _connected(connection) if isinstance(connection, str) else connection
         self._steering, self._cruise = steering, cruise_m_s
+        self._wanted = autopilot and tuple(autopilot)
         self._vehicle: tuple[int, int] | None = None  # system and component of the autopilot
-        self._mask, self._beats, self._refused = _VELOCITY_AND_YAW, 0, 0
+        self._mask, self._beats, self._texts = _VELOCITY_AND_YAW, 0, 0
 
     def __iter__(self) -> Iterator[Measurement | None]:
         """Iterate over the messages of the autopilot."""
-        while True:
-            kinds = ["HEARTBEAT", "COMMAND_ACK", *self._messages.names]
-            message = self._connection.recv_match(type=kinds, blocking=True, timeout=1.0)
-            if message is None:
-                yield None
-            elif message.get_type() == "HEARTBEAT":
-                self._meet(message)
-                yield None
-            elif self._vehicle != (message.get_srcSystem(), message.get_srcComponent()):
-                continue
-            elif message.get_type() == "COMMAND_ACK":
-                self._hear(message)
-            else:
-                yield self._messages.measurement(message)
+        return patient(self._receive)
 
-    def _meet(self, heartbeat: Any) -> None:
+    def _receive(self) -> Measurement | None:
+        """Return the content of the next message; None for one that is not of the autopilot, or where none comes."""
+        kinds = ["HEARTBEAT", "COMMAND_ACK", *self._messages.names]
+        message = self._connection.recv_match(type=kinds, blocking=True, timeout=1.0)
+        if message is None:
+            return None
+        kind, source = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
+        if kind == "HEARTBEAT":
+            with tolerated("nothing is sent to the autopilot"):
+                self._meet(message, source)
+        elif source == self._vehicle and kind != "COMMAND_ACK":
+            return self._messages.measurement(message)
+        elif source == self._vehicle and message.command == _CHANGE_HEADING and message.result:
+            LOG.warning("the autopilot refuses the heading (result %d): is it in GUIDED?", message.result)
+        return None
+
+    def _meet(self, heartbeat: Any, source: tuple[int, int]) -> None:
         """Learn the autopilot from its heartbeat, and ask for the messages, now and then again."""
-        mav, source = self._connection.mav, (heartbeat.get_srcSystem(), heartbeat.get_srcComponent())
+        mav = self._connection.mav
         mav.heartbeat_send(18, 8, 0, 0, 4)  # an onboard controller without an autopilot, active
-        if source != (self._vehicle or (source[0], 1)):
+        is_autopilot = heartbeat.autopilot != 8 and heartbeat.type not in _OTHERS  # MAV_AUTOPILOT_INVALID
+        if not (source == self._wanted if self._wanted else is_autopilot):
             return
-        if self._vehicle is None:
+        obstacle = "" if self._vehicle else self._obstacle(heartbeat.type, heartbeat.autopilot)
+        if not (self._vehicle or obstacle):
             self._vehicle = source
-            self._learn(heartbeat.type, heartbeat.autopilot)
-        dialect = package("pymavlink.dialects.v20.ardupilotmega", "pymavlink")
+        if source != self._vehicle:
+            LOG.warning(f"system, component {source} is not steered: %s", obstacle or "another one is")
+            return
+        mav.srcSystem = source[0]
+        dialect = package(_DIALECT, "pymavlink")
         for name in self._messages.names if self._beats % _BEATS == 0 else ():
             number = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
             mav.command_long_send(*source, 511, 0, number, 1e6 / RATE_HZ, 0, 0, 0, 0, 0)  # SET_MESSAGE_INTERVAL
         self._beats += 1
 
-    def _learn(self, kind: int, autopilot: int) -> None:
-        """Choose how to steer a type of vehicle."""
-        if self._steering is None:
-            self._steering = "heading" if kind == _FIXED_WING else "velocity"
+    def _obstacle(self, kind: int, autopilot: int) -> str:
+        """Choose how to steer a type of vehicle, or return why it cannot be steered."""
+        steering = self._steering or ("heading" if kind == _FIXED_WING else "velocity")
         if autopilot == 12 and kind in _WINGS:  # MAV_AUTOPILOT_PX4
-            raise ValueError("PX4 accepts no heading by MAVLink on a fixed wing: steer it by another program")
-        if self._steering == "velocity" and self._cruise is None:
-            raise ValueError("this vehicle is steered by velocity: state cruise_m_s, the speed to command")
-        self._mask = _VELOCITY if kind in _ROVERS else _VELOCITY_AND_YAW
+            return "PX4 accepts no heading by MAVLink on a fixed wing: steer it by another program"
+        if steering == "velocity" and self._cruise is None:
+            return "this vehicle is steered by velocity: state cruise_m_s, the speed to command"
+        self._steering, self._mask = steering, _VELOCITY if kind in _ROVERS else _VELOCITY_AND_YAW
         self._messages.speed = self._speed or ("airspeed" if kind == _FIXED_WING else "groundspeed")
-
-    def _hear(self, answer: Any) -> None:
-        """Warn of a heading that the autopilot refuses."""
-        if answer.command == _CHANGE_HEADING:
-            if answer.result and answer.result != self._refused:
-                warnings.warn(
-                    f"the autopilot refuses the heading (result {answer.result}): is it in GUIDED?", stacklevel=2
-                )
-            self._refused = answer.result
+        return ""
 
     def steer(self, heading_deg: float) -> None:
         """Send a heading."""
-        assert self._vehicle is not None
+        if self._vehicle is None:
+            return
         mav = self._connection.mav
         if self._steering == "heading":  # MAV_FRAME_GLOBAL, MAV_CMD_GUIDED_CHANGE_HEADING, HEADING_TYPE_HEADING
             heading = round(heading_deg, 2) % 360
@@ -212,25 +212,28 @@ class MavlinkLink:
         assert self._cruise is not None
         yaw = math.radians(heading_deg)
         velocity = self._cruise * math.cos(yaw), self._cruise * math.sin(yaw), 0.0
-        rest = (0.0, 0.0, 0.0)
-        mav.set_position_target_local_ned_send(
-            0, *self._vehicle, 1, self._mask, *rest, *velocity, *rest, math.remainder(yaw, 2 * math.pi), 0.0
-        )
+        rest, yaw = (0.0, 0.0, 0.0), math.remainder(yaw, 2 * math.pi)
+        mav.set_position_target_local_ned_send(0, *self._vehicle, 1, self._mask, *rest, *velocity, *rest, yaw, 0.0)
 
-    def report(self, command: Command, text: str) -> None:
+    def report(self, command: Command | None, text: str) -> None:
         """Send the estimated way and a text."""
         mav = self._connection.mav
-        values = {"mg_north": command.way_km[0], "mg_east": command.way_km[1]}
-        values |= {"mg_error": command.error_km, "mg_conf": command.confidence}
-        for name, value in values.items():
-            mav.named_value_float_send(0, name.encode(), value)
-        if text:
-            mav.statustext_send(_SEVERITY, f"magrl {command.stop or ''}: {text}".encode("ascii", "replace")[:_TEXT])
+        if command:
+            values = (*command.way_km, command.error_km, command.confidence)
+            for name, value in zip((b"mg_north", b"mg_east", b"mg_error", b"mg_conf"), values, strict=True):
+                mav.named_value_float_send(0, name, value)
+        start = f"magrl {command.stop}" if command and command.stop else "magrl"
+        content = f"{start}: {text}".encode("ascii", "replace")
+        self._texts = self._texts % 65535 + 1  # the number of the text, of which each part but the last is full
+        numbered = isinstance(mav, package(_DIALECT, "pymavlink").MAVLink)  # MAVLink 1 has no numbers
+        for part in range(len(content) // _TEXT + 1 if text else 0):
+            numbers = (self._texts, part) if numbered else ()
+            mav.statustext_send(_SEVERITY, content[part * _TEXT : (part + 1) * _TEXT], *numbers)
 
 
 def _connected(address: str) -> Any:
     """Return the connection of an address, with the rate of a serial port after a comma."""
     name, _, baud = address.partition(",")
     mavutil = package("pymavlink.mavutil", "pymavlink")
-    source = {"source_system": 1, "source_component": 191}  # MAV_COMP_ID_ONBOARD_COMPUTER
-    return mavutil.mavlink_connection(name, baud=int(baud or 115200), dialect="ardupilotmega", **source)
+    options = {"source_system": 1, "source_component": 191, "autoreconnect": True}  # MAV_COMP_ID_ONBOARD_COMPUTER
+    return mavutil.mavlink_connection(name, baud=int(baud or 115200), dialect="ardupilotmega", **options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import math
 import random
 import runpy
@@ -29,6 +30,7 @@ from magrl.logs import axes_of_elements, read_log
 from magrl.onboard import Command, Onboard
 
 pytest.importorskip("pymavlink")
+from pymavlink.dialects.v10 import ardupilotmega as mavlink_1
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 FIELD = IGRF("2026-01-01")
@@ -418,8 +420,8 @@ class Line:
         return next(self.messages, None)
 
 
-def packed(*messages: Any, system: int = 1) -> list[Any]:
-    source = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+def packed(*messages: Any, system: int = 1, component: int = 1) -> list[Any]:
+    source = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
     return [mavlink.MAVLink(None).parse_buffer(message.pack(source))[0] for message in messages]
 
 
@@ -447,6 +449,19 @@ def test_mavlink_is_read_in_our_units_from_one_vehicle() -> None:
     assert {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_VFR_HUD} <= set(asked)
 
 
+def test_a_coarse_magnetometer_is_taken_after_some_messages_and_another_clock_is_set_aside() -> None:
+    messages = Messages("groundspeed")
+    speed = mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)
+    assert messages.measurement(speed) is None  # its time is not known before the first attitude
+    messages.measurement(mavlink.MAVLink_attitude_message(2**32 - 1, *[0.0] * 6))  # a clock that ran out
+    messages.measurement(mavlink.MAVLink_attitude_message(3000, *[0.0] * 6))
+    raw = [mavlink.MAVLink_raw_imu_message(10**15 + n, *[0] * 6, 150, 0, 500, id=n % 2) for n in range(64)]
+    found = [messages.measurement(message) for message in raw]
+    assert found[:30] == [None] * 30
+    assert found[30:] == [Measurement(3.0, 15000.0, 0.0, 50000.0), None] * 17  # of one of two
+    assert messages.measurement(speed) == Measurement(3.0, speed=40.0)
+
+
 @pytest.mark.parametrize(
     ("kind", "name"),
     [(1, "COMMAND_INT"), (2, "SET_POSITION_TARGET_LOCAL_NED"), (10, "SET_POSITION_TARGET_LOCAL_NED")],
@@ -471,44 +486,105 @@ def test_mavlink_steers(kind, name) -> None:
         assert link._messages.speed == "groundspeed"
 
 
-def test_a_coarse_magnetometer_is_taken_after_three_seconds_and_another_clock_is_set_aside() -> None:
-    messages = Messages("groundspeed")
-    speed = mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)
-    assert messages.measurement(speed) is None  # its time is not known before the first attitude
-    for time in (0, 3):
-        messages.measurement(mavlink.MAVLink_attitude_message(1000 * time, *[0.0] * 6))
-        raw = mavlink.MAVLink_raw_imu_message(10**15 + time, *[0] * 6, 150, 0, 500)
-        found = messages.measurement(raw)
-        assert (found is None) == (time == 0)
-    assert found == Measurement(3.0, 15000.0, 0.0, 50000.0)
-    assert messages.measurement(speed) == Measurement(3.0, speed=40.0)
-
-
-def test_mavlink_reports(flown) -> None:
-    line = Line([])
-    MavlinkLink(line).report(flown[1][-1], "within 25 km")
-    values = {message.name: message.value for message in line.sent[:-1]}
-    assert values["mg_north"] == pytest.approx(flown[1][-1].way_km[0], rel=1e-5)
-    assert line.sent[-1].text == "magrl arrived: within 25 km"
-
-
-def test_an_autopilot_that_cannot_be_steered_is_named() -> None:
-    with pytest.raises(ValueError, match="PX4 accepts no heading"):
-        next(iter(MavlinkLink(Line(packed(heartbeat(1, 12))))))
-    with pytest.raises(ValueError, match="PX4 accepts no heading"):
-        next(iter(MavlinkLink(Line(packed(heartbeat(22, 12))), cruise_m_s=20.0)))
-    with pytest.raises(ValueError, match="state cruise_m_s"):
-        next(iter(MavlinkLink(Line(packed(heartbeat(10))))))
-
-
-def test_a_refused_heading_and_lost_requests_are_noticed() -> None:
+def test_a_refused_heading_and_lost_requests_are_noticed(caplog) -> None:
     answer = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_GUIDED_CHANGE_HEADING, 4)
     line = Line(packed(*[heartbeat()] * 11, answer, answer))
-    with pytest.warns(UserWarning, match="is it in GUIDED") as warned:
-        received(MavlinkLink(line), 11)
-    assert len(warned) == 1
+    received(MavlinkLink(line), 13)
+    assert caplog.text.count("is it in GUIDED") == 1
     asked = [m.param1 for m in line.sent if m.get_type() == "COMMAND_LONG"]
     assert asked.count(mavlink.MAVLINK_MSG_ID_VFR_HUD) == 2
+
+
+def test_reports_are_whole(flown) -> None:
+    line, texts = Line([]), []
+    link, order = MavlinkLink(line), flown[1][-1]
+    link.report(order, "")
+    values = {message.name: message.value for message in line.sent}
+    assert values["mg_north"] == pytest.approx(order.way_km[0], rel=1e-5)
+    for length in (1, 36, 37, 91, 200):  # the last part of a text is not full
+        line.sent.clear()
+        link.report(order, "x" * length)
+        parts = [message for message in line.sent if message.get_type() == "STATUSTEXT"]
+        assert "".join(part.text for part in parts) == "magrl arrived: " + "x" * length
+        assert [part.chunk_seq for part in parts] == [*range(len(parts))]
+        assert all(len(part.text) == 50 for part in parts[:-1])
+        assert len(parts[-1].text) < 50
+        texts.append({part.id for part in parts})
+    assert len(set().union(*texts)) == len(texts)
+    line.sent.clear()
+    line.mav = mavlink_1.MAVLink(line)
+    link.report(None, "x" * 60)
+    assert "".join(part.text for part in line.sent) == "magrl: " + "x" * 60
+    ship = NmeaLink("loop://,4800")
+    ship.report(None, "The sign of D ± the compass, not checked: " + 40 * "x")
+    told = [ship.port.readline().decode().split("*")[0].split(",", 4) for _ in range(2)]
+    assert [part[1:3] for part in told] == [["02", "01"], ["02", "02"]]
+    assert "".join(part[4] for part in told) == "The sign of D ; the compass; not checked: " + 40 * "x"
+
+
+FOREIGN = [(6, 8, 255, 1), (18, 8, 1, 191), (26, 8, 7, 154), (27, 8, 9, 156), (5, 3, 3, 1), (1, 12, 4, 1), (2, 3, 5, 1)]
+"""Ground station, onboard computer, gimbal, ADS-B, antenna tracker, a fixed wing of PX4, a copter without a speed."""
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_only_an_autopilot_that_can_be_steered_is_steered(number, caplog) -> None:
+    def beat(kind: int, autopilot: int, system: int, component: int) -> Any:
+        return packed(heartbeat(kind, autopilot), system=system, component=component)[0]
+
+    others = [beat(*source) for source in random.Random(number).sample(FOREIGN, len(FOREIGN))]
+    mine, attitude = beat(1, 3, 7, 1), mavlink.MAVLink_attitude_message(1000, *[0.0] * 6)
+    foreign, own = packed(attitude, system=1), packed(attitude, system=7)
+    line = Line([*others, mine, *foreign, *own, beat(1, 3, 8, 1), *others])
+    link = MavlinkLink(line)
+    link.steer(10.0)  # nobody is there yet
+    assert [item is not None for item in received(link, 18)].index(True) == 9
+    link.steer(120.0)
+    assert (line.sent[-1].target_system, line.sent[-1].target_component) == (7, 1)
+    assert line.sent[-1].get_srcSystem() == 7
+    assert {message.target_system for message in line.sent if message.get_type() == "COMMAND_LONG"} == {7}
+    assert "is not steered: PX4 accepts no heading" in caplog.text
+    line.messages = iter([mine, beat(1, 3, 8, 2), *others])
+    link = MavlinkLink(line, autopilot=(8, 2))
+    received(link, 9)
+    link.steer(120.0)
+    assert (line.sent[-1].target_system, line.sent[-1].target_component) == (8, 2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "autopilot", "options", "text"),
+    [
+        (1, 12, {}, "PX4 accepts no heading"),
+        (22, 12, {"cruise_m_s": 20.0}, "PX4 accepts no heading"),
+        (10, 3, {}, "state cruise_m_s"),
+    ],
+)
+def test_an_autopilot_that_cannot_be_steered_as_stated_is_named(kind, autopilot, options, text, caplog) -> None:
+    received(MavlinkLink(Line(packed(heartbeat(kind, autopilot))), **options))
+    assert text in caplog.text
+
+
+def test_a_link_that_fails_goes_on(monkeypatch, caplog) -> None:
+    monkeypatch.setattr("time.sleep", lambda _: None)
+
+    class Torn(Line):
+        def recv_match(self, **options: Any) -> Any:
+            message = super().recv_match(**options)
+            if isinstance(message, OSError):
+                raise message
+            return message
+
+    attitude = packed(mavlink.MAVLink_attitude_message(1000, *[0.0] * 6))
+    link = MavlinkLink(Torn([OSError("unplugged"), *packed(heartbeat()), OSError("unplugged"), *attitude]))
+    assert [item and item.heading for item in islice(link, 4)] == [None, None, None, 0.0]
+    ship = NmeaLink("loop://,4800")
+    items = iter(ship)
+    ship.port.close()  # as if it was unplugged
+    with pytest.raises(OSError, match="not open"):
+        ship.steer(1.0)
+    assert next(items) is None
+    ship.port.write(sentence("HEHDT,290.0,T"))
+    assert next(items).heading == 290.0
+    assert "nothing is received: unplugged" in caplog.text
 
 
 def sentence(content: str) -> bytes:
@@ -747,6 +823,39 @@ def test_the_command_flies_on(flown, monkeypatch, capsys, tmp_path) -> None:
     again = capsys.readouterr().out.splitlines()
     assert again[0].startswith(f"continues the flight in {tmp_path}")
     assert again[2:] == [lines[-1].replace(f"{len(flown[1]) - 1}:", "0:", 1)]
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["udp:99999", "--nmea"], "cannot open udp:99999: "),
+        (["udp:abc", "--nmea"], "'abc'"),
+        (["/dev/none,4800", "--nmea"], "cannot open /dev/none,4800: "),
+        (["udpin:0.0.0.0:99999"], "cannot open udpin:0.0.0.0:99999: "),
+        (["udpin:0.0.0.0"], "host:port"),
+        (["/dev/none,fast"], "'fast'"),
+        (
+            ["udp:0", "--nmea", "--steering", "velocity", "--cruise", "5"],
+            "--steering, --cruise has no effect with --nmea",
+        ),
+        (["udp:0", "--nmea", "--autopilot", "1", "1"], "--autopilot has no effect"),
+        (["udpin:0.0.0.0:0", "--level", "--sources", "HEHDT"], "--level, --sources has no effect without --nmea"),
+        (["udp:0", "--nmea", "--date", "2026-01-01"], "--date and --altitude need them"),
+        (["udp:0", "--nmea", "--altitude", "1"], "--date and --altitude need them"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves a socket open
+def test_a_wrong_command_is_refused_in_one_line(words, text, capsys, tmp_path) -> None:
+    with pytest.raises(SystemExit) as status:
+        main(
+            [*words, "--target", "-11.6", "75.4", "13240", "--noise", "0.05", "0.05", "5", "--out", str(tmp_path / "x")]
+        )
+    gc.collect()
+    shown = capsys.readouterr().err
+    assert status.value.code == 2
+    assert text in shown
+    assert shown.count("\n") == 1
+    assert not (tmp_path / "x").exists()
 
 
 @pytest.mark.slow
