@@ -10,9 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_pretrained, make_actor
-from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv
+from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
 from magrl.navigators import NAVIGATORS
+from magrl.sensor_std import STD_KEYS
 from magrl.transforms import CONDITIONS, TRUE_KEYS, MagneticNorth, ReadingObservation
 from magrl.transforms.errors.base import EPISODE_STREAM
 
@@ -22,6 +23,7 @@ CONDITION = CONDITIONS["low-cost"]
 PRIVATE = {*PRIVILEGED_KEYS, *TRUE_KEYS}
 COMPASS = {"compass_declination", "compass_stream", "true_target_field"}
 TOLD = ["sensor_std", "bias_std", "drift_std"]
+PUBLIC = {*PUBLIC_KEYS, *STD_KEYS, "step_count", "done", "terminated", "truncated"}
 
 
 def base_env(seed: int = 5) -> GeomagneticNavEnv:
@@ -33,7 +35,8 @@ def states(request: pytest.FixtureRequest) -> list[TensorDict]:
     torch.manual_seed(0)
     env, magnetic = TransformedEnv(base_env(), every_error()), request.param == "magnetic"
     rollout = (TransformedEnv(env, MagneticNorth(), auto_unwrap=True) if magnetic else env).rollout(6)
-    assert set(rollout.keys()) >= PRIVATE - (set() if magnetic else COMPASS)
+    private = PRIVATE - (set() if magnetic else COMPASS)
+    assert set(rollout.keys()) - {"action", "next"} == private | PUBLIC, "a key is in one of the lists"
     return list(rollout.exclude("action", "next").unbind(1))
 
 

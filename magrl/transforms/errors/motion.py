@@ -66,7 +66,8 @@ class MotionError(EpisodeErrors):
 
     channel = 4
     default_in_keys = ("move", "heading", "position")
-    default_out_keys = true_keys = ("true_move", "true_course")
+    default_out_keys = ("true_move", "true_course")
+    true_keys = (*default_out_keys, DISPLACEMENT)
     numbers_key, stream_key = "motion_error", "motion_stream"
     in_sizes = (2, 1, 2)
     size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2
