@@ -7,6 +7,7 @@ import json
 import math
 import os
 import tomllib
+import uuid
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -77,16 +78,15 @@ def write_atomically(path: Path, content: bytes) -> None:
         >>> path.read_bytes()
         b'content'
     """
-    aside = path.with_name(f"{path.name}.aside")
+    aside = path.with_name(f".{uuid.uuid4().hex}.aside")  # of this call: another writer of the file has its own
     try:
-        with aside.open("wb") as file:
+        with aside.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(aside, path)
-    except Exception:
+    finally:
         aside.unlink(missing_ok=True)
-        raise
     _sync_folder(path.parent)
 
 

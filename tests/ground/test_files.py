@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import os
 import pickle
 import tracemalloc
 from pathlib import Path
@@ -15,7 +16,15 @@ from safetensors.torch import save
 from tensordict import TensorDict
 from torch import nn
 
-from magrl.files import DamagedFileError, check_writable, json_ready, load_tensors, save_tensors, write_json
+from magrl.files import (
+    DamagedFileError,
+    check_writable,
+    json_ready,
+    load_tensors,
+    save_tensors,
+    write_atomically,
+    write_json,
+)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch) -> None:
@@ -29,6 +38,20 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch) -> None
     with pytest.raises(OSError, match="disk full"):
         save_tensors([2], path)
     assert load_tensors(path) == [1]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_another_writer_of_the_same_file_does_not_disturb(tmp_path: Path, monkeypatch) -> None:
+    path, sync = tmp_path / "file", os.fsync
+
+    def write_another(handle: int) -> None:
+        monkeypatch.undo()
+        write_atomically(path, b"another")
+        sync(handle)
+
+    monkeypatch.setattr("os.fsync", write_another)
+    write_atomically(path, b"one")
+    assert path.read_bytes() == b"one"
     assert list(tmp_path.iterdir()) == [path]
 
 
