@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import tomllib
 import uuid
 from collections import Counter, OrderedDict
@@ -248,7 +249,7 @@ def read_document(path: Path) -> Any:
         >>> read_document(path)
         {'speed_km_h': 15.0}
     """
-    parsers: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": _json}
+    parsers: dict[str, Callable[[str], Any]] = {".toml": _toml, ".json": _json}
     if path.suffix.lower() not in parsers:
         raise ValueError(f"the file must end in .toml or .json, got {path.suffix!r}")
     with path.open("rb") as file:
@@ -259,6 +260,21 @@ def read_document(path: Path) -> Any:
         return parsers[path.suffix.lower()](content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"the file is not valid {path.suffix[1:].upper()}: {error}") from error
+
+
+_TOML_TEXT = re.compile(
+    r"""#[^\n]*+|"{3}(?:\\.|[^\\])*?(?:"{3,5}|\Z)|'{3}.*?(?:'{3,5}|\Z)|"(?:\\.|[^"\\\n])*+"?|'[^'\n]*+'?""", re.DOTALL
+)
+"""Comments and quoted texts of TOML."""
+_LONG_KEY = re.compile(
+    r"(?:\.[^.=,\[\]{}\n]*+){16}"
+)  # the time and memory of tomllib grow with the square of its parts
+
+
+def _toml(text: str) -> Any:
+    if _LONG_KEY.search(_TOML_TEXT.sub("", text)):
+        raise ValueError("a key has more than 16 parts")
+    return tomllib.loads(text)
 
 
 def _json(text: str) -> Any:

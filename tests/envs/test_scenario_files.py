@@ -18,7 +18,8 @@ from magrl.files import MAX_FILE_BYTES
 ROOT = Path(__file__).parent.parent.parent
 AZORES = Regions.of(Region((36, 46), (-32, -22)))
 TOML = """
-date = 2026-07-01
+# .........................
+date = 2026-07-01 # .........................
 generation = 14
 altitude_km = 10.0
 margin_deg = 4
@@ -30,7 +31,7 @@ latitude = [36, 46]
 longitude = [-32, -22]
 
 [[tasks]]
-name = "Ponta Delgada to Flores"
+name = "Ponta Delgada to \\".................."
 start = [37.74, -25.67]
 target = [39.45, -31.13]
 
@@ -56,7 +57,7 @@ def test_a_file_holds_all_of_a_scenario(tmp_path: Path) -> None:
         assert (str(scenario.date)[:10], scenario.generation, scenario.altitude_km) == ("2026-07-01", 14, 10.0)
         assert (scenario.distance_range_km, scenario.margin_deg) == ((200, 400), 4)
         assert scenario.objective_floors == (0.1, 0.3, 100)
-        assert scenario.names == ("Ponta Delgada to Flores", "task 2")
+        assert scenario.names == ('Ponta Delgada to "..................', "task 2")
         assert scenario.tasks is not None
         assert scenario.tasks.start.flatten().tolist() == pytest.approx([37.74, -25.67, 40, -30], abs=1e-12)
         assert scenario.tasks.target.flatten().tolist() == pytest.approx([39.45, -31.13, 42, -28], abs=1e-12)
@@ -154,7 +155,9 @@ def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, 
     [
         ("a.yaml", b"", "the file must end in .toml or .json, got '.yaml'"),
         ("a.toml", b"[region", "the file is not valid TOML"),
-        ("a.toml", b".".join([b"a"] * 50_000) + b"=1", "key"),
+        ("a.toml", b".".join([b'"a#"'] * 2000) + b"=1", "not valid TOML: a key has more than 16 parts"),
+        ("a.toml", b"[" + b" . ".join([b"a"] * 2000) + b"]", "a key has more than 16 parts"),
+        ("a.toml", b'a = ["""b"""", {' + b".".join([b"'a'"] * 2000) + b" = 1}]", "a key has more than 16 parts"),
         ("a.json", b'{"region": 1, "region": 2}', "the key 'region' is repeated"),
         ("a.json", b"[" * 100_000, "JSON"),
         (
@@ -165,7 +168,7 @@ def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, 
         ("a.json", b" " * (MAX_FILE_BYTES + 1), f"the file holds more than {MAX_FILE_BYTES} bytes"),
         ("a.json", b"[]", "a scenario file must hold a table, got []"),
     ],
-    ids=range(8),
+    ids=range(10),
 )
 def test_unreadable_files(tmp_path: Path, name: str, content: bytes, says: str) -> None:
     (tmp_path / name).write_bytes(content)
