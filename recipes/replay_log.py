@@ -123,10 +123,6 @@ def replay(config: Config, log: pd.DataFrame, date: str | None = None) -> pd.Dat
     commands, north = [], log["D"].shift(1, fill_value=log["D"][0]) * magnetic  # of headings, from that of the log
     for (_, row), east in zip(log.iterrows(), north, strict=True):
         heading = math.remainder(row["heading"] - east, 360)
-        if abs(heading) <= 2 * math.pi:
-            # On board, a small heading may be the one commanded in radians; here no command was followed. The same
-            # course as a large number is not compared. A log in radians is named in notes().
-            heading -= math.copysign(360, heading)
         try:
             declination = None if magnetic else row["D"]
             order = board.step(declination, row["I"], row["B_H"], heading, row["distance"])

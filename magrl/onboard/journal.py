@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -122,6 +123,29 @@ class Step(CheckedModel):
     def reading(self) -> Reading:
         """D [deg], I [deg], B_H [nT]; None for an element that is missing."""
         return self.declination, self.inclination, self.horizontal_intensity
+
+    def in_radians(self, before: Sequence[float], steer_deg: float) -> tuple[float, ...]:
+        """Return the commanded headings that were reported in radians, by the moves before and by this one in a row.
+
+        A heading may equal the commanded one in radians by chance; two that differ do not.
+
+        Args:
+            before: those before this move.
+            steer_deg: commanded heading of this move.
+
+        Example:
+            >>> step = Step(declination=3, inclination=73, horizontal_intensity=15000, heading=1.9199)
+            >>> step.in_radians((60.0,), 110.0), step.in_radians((60.0,), 120.0)
+            ((60.0, 110.0), ())
+        """
+
+        def apart(heading_deg: float) -> float:
+            return abs(math.remainder(heading_deg - steer_deg, 360))
+
+        if abs(self.heading) > 2 * math.pi or apart(math.degrees(self.heading)) > 0.5:
+            return ()
+        known = min(map(apart, (self.heading, *before))) < 10  # the move shows nothing new
+        return tuple(before) if known else (*before, steer_deg)
 
     def repeats(self, before: Step) -> bool:
         """Return whether this repeats the message of the step before, by its time.

@@ -144,40 +144,21 @@ def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
     return f"no change of {', '.join(names)} over {least_km:.0f} km: a sensor is stuck" if names else ""
 
 
-def check_move(heading_deg: float, distance_km: float, steer_deg: float | None, max_move_km: float) -> None:
+def check_move(distance_km: float, max_move_km: float) -> None:
     """Raise unless a vehicle can have made a move.
 
-    A heading in radians is a small one in degrees. It is recognized if, in radians, it equals the commanded heading.
-
     Args:
-        heading_deg: heading of the move, -360 to 360.
         distance_km: its length.
-        steer_deg: commanded heading; None without one.
         max_move_km: longest move; a vehicle may drift a tenth farther.
 
     Raises:
         ValueError: naming the value and what would be right.
 
     Example:
-        >>> check_move(60.0, 30.0, 60.0, max_move_km=50.0)
-        >>> check_move(1.0472, 30.0, 60.0, max_move_km=50.0)
-        Traceback (most recent call last):
-        ValueError: heading 1.0472 looks like radians: the vehicle was to steer 60.0 deg; degrees are expected
+        >>> check_move(30.0, max_move_km=50.0)
     """
     if distance_km > LONGER * max_move_km:
         raise ValueError(
             f"distance {distance_km:g} km is longer than the longest move of this vehicle, {max_move_km:g} km: it must "
             "be in kilometers, and since the last step; report a longer way in parts, None for the readings between"
         )
-    if steer_deg is None or abs(heading_deg) > 2 * math.pi or _apart(heading_deg, steer_deg) < 10:
-        return
-    if _apart(math.degrees(heading_deg), steer_deg) < 0.5:
-        raise ValueError(
-            f"heading {heading_deg!r} looks like radians: the vehicle was to steer {steer_deg:.1f} deg; degrees are "
-            "expected"
-        )
-
-
-def _apart(one: float, other: float) -> float:
-    """Return the angle between two headings [deg]."""
-    return abs(math.remainder(one - other, 360))

@@ -160,6 +160,7 @@ class Onboard:
         self._last, self._surprises = Values(), Values()  # the last reading with its course
         self._unchanged = (0.0, 0.0, 0.0)  # path since each element last changed [km]
         self._unread_km = 0.0  # path since the last complete reading
+        self._radians = Values()  # commanded headings that were reported in radians
         self._northward = Values()  # the first inclination, and how far magnetic north the vehicle has come [km]
 
     def step(
@@ -234,6 +235,8 @@ class Onboard:
         declination, inclination, _, course = self._last
         first, north = self._northward or (inclination, 0.0)
         self._northward = first, north + step.distance * math.cos(course - math.radians(declination))
+        if self._last_command:
+            self._radians = step.in_radians(self._radians, self._last_command.heading_deg)
 
     def _comparable(self, elements: Any) -> Any:
         """Return D, I, B_H, with 0 for D where the vehicle does not measure it."""
@@ -247,9 +250,8 @@ class Onboard:
         return ((0.0, 0.0, 0.0), stated) if self._here is None else calibrated(*self._here, stated, reading)
 
     def _check(self, step: Step, reading: Elements) -> None:
-        """Raise unless a reading, a heading and a distance are possible, and possible together."""
-        steer_deg = self._last_command.heading_deg if self._last_command else None
-        check_move(step.heading, step.distance, steer_deg, self.max_move_km)
+        """Raise unless a reading and a distance are possible, and possible together."""
+        check_move(step.distance, self.max_move_km)
         if self._last:
             check_earth_jump(self._last[:3], reading, step.distance + self._unread_km, self._sensor_std.noise)
             return
@@ -297,19 +299,9 @@ class Onboard:
 
     def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float, declared: bool) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""
-        options, useful = self.options, measured(self._sensor_std.noise)
-        useful = (useful[0] and not options.magnetic, *useful[1:])
-        if text := stuck([km * use for km, use in zip(self._unchanged, useful, strict=True)], self.max_move_km):
+        options, level = self.options, sum(self._surprises) / max(len(self._surprises), 1)
+        if text := self._lost(level):
             return "lost", text
-        level = sum(self._surprises) / max(len(self._surprises), 1)
-        if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
-            causes = "the sign of I, its zero (from the horizontal), swapped elements, units, sensors and compass"
-            return "lost", f"readings deviate {level**0.5:.0f} times as much as expected: check {causes}"
-        first, north_km = self._northward
-        change = abs(self._last[1] - first) * 100 / max(abs(north_km), 1e-9) if abs(north_km) >= 100 else math.inf
-        slope = min(change, self._estimator.steepest_inclination)
-        if useful[1] and abs(self._last[1]) <= math.pi / 2 and slope < EQUATOR_SLOPE_DEG:
-            return "lost", f"inclination {self._last[1]:g} hardly changes: it looks like radians; degrees are expected"
         if text := out_of_range(self._view, self._last[:3]):
             return "out of range", text
         way_km, error_km = way.displacement.norm().item(), way.covariance[0].trace().sqrt().item()
@@ -327,6 +319,29 @@ class Onboard:
         if 0 < decision.attainable.item() < options.confidence:  # 0 where nothing is known yet
             return "nearest", f"as near as these sensors allow: {near}"
         return wanted
+
+    def _lost(self, level: float) -> str:
+        """Return why readings or moves cannot be those of a vehicle, as text; empty if they can.
+
+        Args:
+            level: mean of the last surprises.
+        """
+        useful = measured(self._sensor_std.noise)
+        useful = (useful[0] and not self.options.magnetic, *useful[1:])
+        if text := stuck([km * use for km, use in zip(self._unchanged, useful, strict=True)], self.max_move_km):
+            return text
+        if len(self._radians) > 1:
+            steered = " and ".join(f"{heading:.0f}" for heading in self._radians)
+            return f"the headings {steered} deg were reported in radians: degrees are expected"
+        if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
+            causes = "the sign of I, its zero (from the horizontal), swapped elements, units, sensors and compass"
+            return f"readings deviate {level**0.5:.0f} times as much as expected: check {causes}"
+        first, north_km = self._northward
+        change = abs(self._last[1] - first) * 100 / max(abs(north_km), 1e-9) if abs(north_km) >= 100 else math.inf
+        slope = min(change, self._estimator.steepest_inclination)
+        if useful[1] and abs(self._last[1]) <= math.pi / 2 and slope < EQUATOR_SLOPE_DEG:
+            return f"inclination {self._last[1]:g} hardly changes: it looks like radians; degrees are expected"
+        return ""
 
     def save(self, path: Path | str) -> None:
         """Write the arguments of :meth:`start` and of all steps since to a file, for :meth:`restore`.

@@ -442,7 +442,6 @@ def test_first_readings_that_are_refused(values: tuple, message: str) -> None:
     [
         ((*HERE, 290.0, 30000.0), "distance 30000 km is longer than the longest move of this vehicle, 50 km"),
         ((*HERE, 290.0, -1.0), "distance must be greater than or equal to 0, got -1"),
-        ((*HERE, math.radians(290.0), 1.0), "looks like radians: the vehicle was to steer 290.0 deg"),
         ((3.5, 73.0, 21000.0, 290.0, 40.0), r"B_H changed from 15000 to 21000 nT over 40 km.*at most 4400 nT"),
         ((40.0, 73.0, 15000.0, 290.0, 20.0), "declination changed from 3.5 to 40 deg over 20 km"),
     ],
@@ -453,6 +452,25 @@ def test_later_readings_that_are_refused(values: tuple, message: str) -> None:
     vehicle.step(*HERE, 290.0)
     with pytest.raises(ValueError, match=message):
         vehicle.step(*values)
+
+
+@pytest.mark.parametrize("unit", [1.0, math.pi / 180], ids=["degrees", "radians"])
+def test_headings_in_radians_are_noticed_by_two_moves_and_not_by_one(unit: float) -> None:
+    """One may be that of a vehicle which did not follow the command, as one that goes on northward."""
+    for steer in range(0, 360, 20):
+        vehicle = Onboard("secant", sensor_std=NOISE)  # its first move is straight on
+        vehicle.start(TARGET)
+        vehicle.step(*HERE, steer)
+        assert vehicle.step(*HERE, unit * steer, 1.0).stop is None
+    vehicle.start(TARGET)
+    stops, place = [vehicle.step(*HERE, 90.0)], torch.zeros(2)
+    while stops[-1].stop is None and len(stops) < 6:
+        distance, heading = stops[-1].distance_km, math.radians(stops[-1].heading_deg)
+        place = place + distance * torch.tensor([math.cos(heading), math.sin(heading)])
+        reading = torch.tensor(HERE) + torch.tensor([[-0.002, 0.012], [0.008, -0.001], [-6.0, 0.5]]) @ place
+        stops.append(vehicle.step(*reading.tolist(), unit * stops[-1].heading_deg, distance))
+    lost = ("lost", True) if unit < 1 else (None, False)
+    assert (stops[-1].stop, "radians: degrees are expected" in stops[-1].reason) == lost, stops
 
 
 def test_step_before_start_and_bad_targets() -> None:
