@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 
 import torch
 from pandas import DataFrame
@@ -12,8 +11,7 @@ from torch import Tensor
 from magrl.field import IGRF
 from magrl.field.elements import NAMES, element_difference, measured_elements
 from magrl.geodesy import geodesic
-from magrl.onboard.readings import check_earth_reading
-from magrl.onboard.start import MODEL_D_NT, MODEL_STD, misfit
+from magrl.onboard.start import deviation, likely_mistake, model_std
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
 MOST_SPIKES = 0.2
@@ -68,15 +66,17 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     rows = readings[~nowhere.numpy()]
     if not len(rows):
         return texts
-    elements, place = _columns(rows, *NAMES), place[~nowhere]
+    place = place[~nowhere]
     if place[:, 0].abs().max() > 90:
         worst = float(place[:, 0].abs().max())
         return [*texts, f"latitude {worst:g} is outside -90 to 90: latitude and longitude are swapped"]
+    elements = _columns(rows, *NAMES)
     expected = elements if date is None else _igrf_elements(place, date)
-    if "D_std" in rows and (rows["D_std"] >= OUTAGE_STD).all():  # D tells where the heading's north is
+    if date is not None:
+        texts += _field_mistakes(rows, expected, place, date)
+    if not _measured(rows):
         rows = rows.assign(heading=rows["heading"] + (expected - elements)[:, 0].numpy())
-        elements = torch.cat((expected[:, :1], elements[:, 1:]), -1)
-    return texts + _field_mistakes(elements, expected, place, date) + _move_mistakes(rows, place[:, :2], expected[:, 0])
+    return texts + _move_mistakes(rows, place[:, :2], expected[:, 0])
 
 
 def _columns(readings: DataFrame, *names: str) -> Tensor:
@@ -102,51 +102,37 @@ def _igrf_elements(place: Tensor, date: str) -> Tensor:
 # Readings
 
 
-def _field_mistakes(elements: Tensor, expected: Tensor, place: Tensor, date: str | None) -> list[str]:
+def _field_mistakes(readings: DataFrame, expected: Tensor, place: Tensor, date: str) -> list[str]:
     """Return which readings do not fit IGRF at their positions, and why."""
-    misfits = _misfits(elements, expected)
-    wrong = [row for row, deviation in enumerate(misfits) if deviation is not None]
-    if date is None or not wrong:
+    elements, std = _columns(readings, *NAMES), model_std(expected)
+    if not _measured(readings):
+        elements[:, 0], std[:, 0] = expected[:, 0], OUTAGE_STD
+    deviations = deviation(elements, expected, std)
+    wrong = torch.tensor([text is not None for text in deviations])
+    if not wrong.any():
         return []
-    texts = [deviation for deviation in misfits if deviation is not None]
-    start = f"{len(wrong)} of {len(misfits)} readings do not fit IGRF, {_rows(torch.tensor(wrong))} ({texts[0][0]})"
-    if len(wrong) <= MOST_SPIKES * len(misfits):
+    detail, rows = next(filter(None, deviations)), _rows(wrong.nonzero())
+    start = f"{int(wrong.sum())} of {len(wrong)} readings do not fit IGRF, {rows} ({detail})"
+    if wrong.double().mean() <= MOST_SPIKES:
         return [f"{start}: spikes, or iron near the vehicle there"]
-    cause, count = Counter(text for _, text in texts).most_common(1)[0]
-    return [f"{start}: {cause if cause and 2 * count > len(wrong) else _other_cause(elements, place, date)}"]
-
-
-def _misfits(elements: Tensor, expected: Tensor) -> list[tuple[str, str | None] | None]:
-    deviations = []
-    for reading, there in zip(elements.tolist(), expected.tolist(), strict=True):
-        std = math.hypot(MODEL_STD[0], MODEL_D_NT / there[2]), *MODEL_STD[1:]
-        deviation = misfit(tuple(reading), tuple(there), std)
-        if deviation and deviation[1] is None:
-            try:
-                check_earth_reading(*reading)
-            except ValueError as error:
-                likely = str(error).rpartition(": ")[2]
-                deviation = deviation[0], likely if "looks like" in likely else None
-        deviations.append(deviation)
-    return deviations
-
-
-def _other_cause(elements: Tensor, place: Tensor, date: str) -> str:
-    """Return the cause of readings that no mistake in D, I, B_H explains: other positions that fit, or none."""
-    latitude, longitude, altitude = place.unbind(-1)
-    places = {
-        "latitude and longitude are swapped": (longitude, latitude, altitude),
-        "longitudes are positive toward the west, and east is expected": (latitude, -longitude, altitude),
-        "latitudes are positive toward the south, and north is expected": (-latitude, longitude, altitude),
-        "altitudes are in meters, and kilometers are expected": (latitude, longitude, altitude / 1000),
+    latitude, longitude, altitude = place[wrong].unbind(-1)
+    others = {
+        "they fit if latitude and longitude are swapped": (longitude.clamp(-90, 90), latitude, altitude),
+        "they fit if longitudes are positive toward the west, and east is expected": (latitude, -longitude, altitude),
+        "they fit if latitudes are positive toward the south, and north is expected": (-latitude, longitude, altitude),
+        "they fit if altitudes are in meters, and kilometers are expected": (latitude, longitude, altitude / 1000),
     }
-    for cause, coordinates in places.items():
-        there = torch.stack(coordinates, -1)
-        if there[:, 0].abs().max() > 90:
-            continue
-        if sum(deviation is None for deviation in _misfits(elements, _igrf_elements(there, date))) > len(place) / 2:
-            return f"they fit if {cause}"
-    return "no calibration, iron near the sensor, or a heading that is wrong"
+    places = {"": (expected[wrong], std[wrong])}
+    for text, coordinates in others.items():
+        there = _igrf_elements(torch.stack(coordinates, -1), date)
+        places[text] = there, torch.maximum(model_std(there), std[wrong])
+    cause = likely_mistake(elements[wrong], places, _columns(readings, "heading")[wrong, 0])
+    return [f"{start}: {cause or 'no calibration, iron near the sensor, or a heading that is wrong'}"]
+
+
+def _measured(readings: DataFrame) -> bool:
+    """Return whether D was measured, which otherwise tells where the north of the headings is."""
+    return "D_std" not in readings or bool((readings["D_std"] < OUTAGE_STD).any())
 
 
 # Moves

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import torch
+from torch import Tensor
 
 from magrl.checks import check_number, check_numbers
 from magrl.field import IGRF, elements_at
-from magrl.field.elements import element_difference
+from magrl.field.elements import FIELD_NT, NAMES, element_difference, elements_jacobian, field_vector
 from magrl.geodesy import move
 from magrl.onboard.readings import DISTURBANCE_NT, check_earth_distance, check_earth_reading
 from magrl.sensor_std import SensorStd
@@ -27,6 +27,8 @@ MOST_SIGMAS = 5.0
 """Deviation of a first reading beyond which it does not fit the known elements, in standard deviations."""
 SLACK_NT = 100.0
 """Deviation of the field vector that always fits; chosen [nT]."""
+IRON_NT = 2000.0
+"""Standard deviation of the iron of a vehicle along each of its axes, before a calibration; chosen [nT]."""
 NEAR_KM = 200.0
 """Largest distance from the start to its assumed place; chosen [km]."""
 
@@ -67,7 +69,7 @@ def known_elements(
         check_number(-360, 360, longitude=here[1])
         declination, inclination, intensity = elements_at(IGRF(date), torch.tensor(here, dtype=torch.float64)).tolist()
         elements = declination, inclination, intensity
-        usual = math.hypot(MODEL_STD[0], MODEL_D_NT / elements[2]), *MODEL_STD[1:]
+        usual = tuple(model_std(torch.tensor(elements, dtype=torch.float64)).tolist())
     check_earth_reading(*elements, what="here")
     if std is not None:
         check_numbers(3, 0, here_std=std)
@@ -155,58 +157,127 @@ def check_start(reading: Elements, elements: Elements, sensor_std: SensorStd, el
         ValueError: the first reading, D 3.4, I -73.1, B_H 14950, does not fit the start, D 3.5, I 73, B_H 15000 (I \
 deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis points up, and down is expected
     """
-    std = [math.hypot(*parts) for parts in zip(sensor_std.noise, sensor_std.bias, elements_std, strict=True)]
-    if deviation := misfit(reading, elements, std):
-        texts: list[Any] = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
-        cause = deviation[1] or "check sensors, calibration, compass and place, or state a larger bias"
-        raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({deviation[0]}): {cause}")
+    read, there = torch.tensor([[reading], [elements]], dtype=torch.float64)
+    parts = torch.tensor([sensor_std.noise, sensor_std.bias, elements_std], dtype=torch.float64)
+    std = parts.norm(dim=0)
+    text = deviation(read, there, std)[0]
+    if text is None:
+        return
+    texts = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
+    cause = likely_mistake(read, {"": (there, std)}, torch.zeros(1).double())
+    cause = cause or "check sensors, calibration, compass and place, or state a larger bias"
+    raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({text}): {cause}")
 
 
-def misfit(reading: Elements, expected: Elements, std: Sequence[float]) -> tuple[str, str | None] | None:
-    """Return how a reading deviates from expected elements, and the mistake that would explain it; None if it fits.
+def model_std(elements: Tensor) -> Tensor:
+    """Return the standard deviations of D [deg], I [deg], B_H [nT] of a model of the core ``(..., 3)``.
 
     Args:
-        reading: D [deg], I [deg], B_H [nT].
-        expected: the elements at its place.
-        std: standard deviations of the difference.
+        elements: ``(..., 3)`` elements of the model.
 
     Example:
-        >>> misfit((3.4, -73.1, 14950.0), (3.5, 73.0, 15000.0), (0.5, 0.1, 50.0))[1]
+        >>> model_std(torch.tensor([3.5, 73.0, 15000.0]))
+        tensor([  0.4450,   0.2000, 133.0000])
+    """
+    std = elements.new_tensor(MODEL_STD).expand_as(elements)
+    return torch.hypot(std, torch.nn.functional.pad(MODEL_D_NT / elements[..., 2:], (0, 2)))
+
+
+def _most(expected: Tensor, std: Tensor) -> Tensor:
+    """Return the largest deviations from expected elements that are likely ``(..., 3)``."""
+    strength = torch.stack((expected[..., 2].clamp_min(SLACK_NT), field_vector(expected).norm(dim=-1)), -1)
+    slack = torch.cat((torch.rad2deg(SLACK_NT / strength), torch.full_like(strength[..., :1], SLACK_NT)), -1)
+    return MOST_SIGMAS * std + slack
+
+
+def deviation(elements: Tensor, expected: Tensor, std: Tensor) -> list[str | None]:
+    """Return how each reading deviates from expected elements, as text; None for one that fits.
+
+    Args:
+        elements: ``(N, 3)`` D [deg], I [deg], B_H [nT].
+        expected: ``(N, 3)`` the elements at their places.
+        std: ``(..., 3)`` standard deviations of the difference.
+
+    Example:
+        >>> deviation(torch.tensor([[3.4, -73.1, 14950.0]]), torch.tensor([[3.5, 73.0, 15000.0]]), torch.zeros(3))
+        ['I deviates by 146.1, where 0.112 is likely']
+    """
+    off, most = element_difference(elements, expected).abs(), _most(expected, std)
+    worst = (off / most).max(-1)
+    rows = zip(worst.values.tolist(), worst.indices.tolist(), off.tolist(), most.tolist(), strict=True)
+    return [
+        f"{NAMES[k]} deviates by {values[k]:.4g}, where {limits[k]:.3g} is likely" if share > 1 else None
+        for share, k, values, limits in rows
+    ]
+
+
+def likely_mistake(elements: Tensor, places: Mapping[str, tuple[Tensor, Tensor]], heading_deg: Tensor) -> str | None:
+    """Return the mistake that explains most of some readings, better than others and than iron; None without one.
+
+    Iron is a constant vector in the vehicle's axes, of a standard deviation of :data:`IRON_NT`. The measure is the
+    likelihood of the readings, for iron the mean over all vectors.
+
+    Args:
+        elements: ``(N, 3)`` D [deg], I [deg], B_H [nT].
+        places: expected elements ``(N, 3)`` and the standard deviations of the difference ``(..., 3)``: at the stated
+            places, with an empty text, and at others by a text that says what is then wrong.
+        heading_deg: ``(N,)`` headings.
+
+    Example:
+        >>> there = torch.tensor([[3.5, 73.0, 15000.0]]).double()
+        >>> read = torch.tensor([[3.4, -73.1, 14950.0]]).double()
+        >>> likely_mistake(read, {"": (there, torch.tensor([0.5, 0.1, 50.0]))}, torch.zeros(1).double())
         'it fits with -I: the vertical axis points up, and down is expected'
     """
-    total = math.hypot(expected[2], expected[2] * math.tan(math.radians(expected[1])))
-    slack = math.degrees(SLACK_NT / max(expected[2], SLACK_NT)), math.degrees(SLACK_NT / total), SLACK_NT
-    most = tuple(MOST_SIGMAS * s + margin for s, margin in zip(std, slack, strict=True))
-
-    def misfit(elements: Sequence[float]) -> list[float]:
-        difference = [value - reference for value, reference in zip(elements, expected, strict=True)]
-        difference[0] = math.remainder(difference[0], 360)
-        return [abs(value) for value in difference]
-
-    def fits(elements: Sequence[float]) -> bool:
-        return all(value <= limit for value, limit in zip(misfit(elements), most, strict=True))
-
-    if fits(reading):
-        return None
-    index, deviation = max(enumerate(misfit(reading)), key=lambda item: item[1] / most[item[0]])
-    causes = [text for text, elements in _mistakes(*reading, declination_there=expected[0]) if fits(elements)]
-    text = f"{('D', 'I', 'B_H')[index]} deviates by {deviation:.4g}, where {most[index]:.3g} is likely"
-    return text, causes[0] if causes else None
+    there, std = places[""]
+    guesses = [(text, read, there, std) for text, read in _mistakes(elements, there, heading_deg).items()]
+    guesses += [(text, elements, *place) for text, place in places.items() if text]
+    costs = {}
+    for text, read, expected, spread in guesses:
+        shares = element_difference(read, expected) / _most(expected, spread)
+        if (shares.abs() <= 1).all(-1).double().mean() > 0.5:
+            costs[text] = _cost(MOST_SIGMAS * shares)
+    best = min(costs, key=lambda text: costs[text], default=None)
+    return best if best and costs[best] < _iron_cost(elements, there, _most(there, std), heading_deg) else None
 
 
-def _mistakes(d: float, i: float, b: float, *, declination_there: float) -> list[tuple[str, Elements]]:
-    """Return mistakes, and what the reading would be without each of them."""
-    degrees_d, degrees_i = math.degrees(d), math.degrees(i)
-    return [
-        ("it fits with -I: the vertical axis points up, and down is expected", (d, -i, b)),
-        ("it fits with -D: D is positive where magnetic north is east of true north", (-d, i, b)),
-        ("it fits with -D and -I: the axes point left and up, and right and down are expected", (-d, -i, b)),
-        ("it fits in radians, and degrees are expected", (degrees_d, degrees_i, b)),
-        ("I fits in radians, and degrees are expected", (d, degrees_i, b)),
-        ("D fits in radians, and degrees are expected", (degrees_d, i, b)),
-        ("D and I are swapped", (i, d, b)),
-        ("it fits with D + 180: the horizontal axes point backward", (d + 180, i, b)),
-        ("it fits with 90 - D: the horizontal axes are swapped", (90 - d, i, b)),
-        ("B_H is the total intensity: the horizontal one is expected", (d, i, b * math.cos(math.radians(i)))),
-        ("D is 0: the heading is from magnetic north, and true north is expected", (d + declination_there, i, b)),
-    ]
+def _cost(deviations: Tensor) -> float:
+    """Return the sum of the squares of deviations ``(N, 3)``, up to a limit for each reading: some may be spikes."""
+    return deviations.square().sum(-1).clamp_max(3 * MOST_SIGMAS**2).sum().item()
+
+
+def _iron_cost(elements: Tensor, expected: Tensor, most: Tensor, heading_deg: Tensor) -> float:
+    """Return -2 times the logarithm of the likelihood of readings with iron, as :func:`_cost` without it."""
+    there, (cos, sin) = field_vector(expected), (f(torch.deg2rad(heading_deg)) for f in (torch.cos, torch.sin))
+    scaled = MOST_SIGMAS * elements_jacobian(there) / most.unsqueeze(-1)
+    off = (scaled @ (field_vector(elements) - there).unsqueeze(-1)).squeeze(-1)
+    none, one = torch.zeros_like(cos), torch.ones_like(cos)
+    axes = torch.stack((cos, -sin, none, sin, cos, none, none, none, one), -1).unflatten(-1, (3, 3))
+    slope, size = IRON_NT * scaled @ axes, off.norm(dim=-1)
+    weight = (size.median() / size).clamp_max(1.0)  # of spikes, less
+    weighted = slope * weight.square().reshape(-1, 1, 1)
+    precision = torch.eye(3).double() + torch.einsum("nki,nkj->ij", weighted, slope)
+    iron = torch.linalg.solve(precision, torch.einsum("nki,nk->i", weighted, off))
+    return _cost(off - slope @ iron) + (iron.square().sum() + torch.logdet(precision)).item()
+
+
+def _mistakes(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> dict[str, Tensor]:
+    """Return what readings would be without each of the mistakes that engineers make."""
+    d, i, b = elements.unbind(-1)
+    wrong = {
+        "it fits with -I: the vertical axis points up, and down is expected": (d, -i, b),
+        "it fits with -D: D is positive where magnetic north is east of true north": (-d, i, b),
+        "it fits with -D and -I: the axes point left and up, and right and down are expected": (-d, -i, b),
+        "it fits in radians, and degrees are expected": (d.rad2deg(), i.rad2deg(), b),
+        "I fits in radians, and degrees are expected": (d, i.rad2deg(), b),
+        "D fits in radians, and degrees are expected": (d.rad2deg(), i, b),
+        "the heading fits in radians, and degrees are expected": (d - heading_deg + heading_deg.rad2deg(), i, b),
+        "D and I are swapped": (i, d, b),
+        "it fits with D + 180: the horizontal axes point backward": (d + 180, i, b),
+        "it fits with 90 - D: the horizontal axes are swapped": (90 - d, i, b),
+        "B_H is the total intensity: the horizontal one is expected": (d, i, b * i.deg2rad().cos()),
+        "D is 0: the heading is from magnetic north, and true north is expected": (d + expected[..., 0], i, b),
+    }
+    units = [(unit, factor) for unit, factor in FIELD_NT.items() if factor > 1]
+    wrong |= {f"B_H looks like {unit}, and nanotesla are expected": (d, i, factor * b) for unit, factor in units}
+    return {text: torch.stack(values, -1) for text, values in wrong.items()}

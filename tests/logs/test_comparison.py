@@ -11,7 +11,7 @@ import torch
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move
-from magrl.logs import difference_from_igrf, mistakes
+from magrl.logs import axes_of_elements, difference_from_igrf, elements_of_axes, mistakes
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
 DATE = "2026-06-30"
@@ -51,6 +51,10 @@ RADIANS = np.pi / 180
         (lambda t: t.assign(I=-t["I"]), ["fits with -I: the vertical axis points up"]),
         (lambda t: t.assign(D=t["D"] * RADIANS), ["D fits in radians"]),
         (lambda t: t.assign(D=t["D"] * RADIANS, I=t["I"] * RADIANS), ["fits in radians"]),
+        (
+            lambda t: t.assign(D=t["D"] + t["heading"] * (RADIANS - 1), heading=t["heading"] * RADIANS),
+            ["the heading fits in radians", "course"],
+        ),
         (lambda t: t.assign(B_H=t["B_H"] / 1000), ["looks like microtesla"]),
         (lambda t: t.assign(B_H=t["B_H"] / 1e5), ["looks like gauss"]),
         (lambda t: t.assign(D=t["D"] * 0), ["D is 0: the heading is from magnetic north"]),
@@ -86,6 +90,23 @@ def test_mistakes_are_named(change, texts: list[str]) -> None:
     assert len(found) == len(texts)
     for text, pattern in zip(found, texts, strict=True):
         assert pandas.Series([text]).str.contains(pattern).all(), text
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_iron_is_taken_for_no_mistake(seed: int) -> None:
+    """Hard iron of about 800 nT and soft iron of 2 % where D is 3 degrees, on few courses: -D would nearly fit."""
+    random, turn = np.random.default_rng(seed), torch.deg2rad(torch.tensor([290.0] * 3 + [335.0] * 3 + [310.0] * 4))
+    place = torch.stack((62.5 + 0.1 * torch.arange(10), 6.0 - 0.3 * torch.arange(10)), -1).double()
+    attitude = torch.nn.functional.pad(torch.rad2deg(turn)[:, None], (2, 0)).double()
+    axes = axes_of_elements(elements_at(IGRF(DATE), place), attitude)
+    axes = axes @ (torch.eye(3) + 0.02 * torch.tensor(random.normal(size=(3, 3)))) + torch.tensor(
+        random.normal(0, 800, 3)
+    )
+    table = pandas.DataFrame(elements_of_axes(axes, attitude, north="true").elements.numpy(), columns=["D", "I", "B_H"])
+    table[["latitude", "longitude"]], table["heading"], table["distance"] = place.numpy(), attitude[:, 2].numpy(), 0.0
+    assert all(
+        text.endswith(("or a heading that is wrong", "iron near the vehicle there")) for text in mistakes(table, DATE)
+    )
 
 
 def test_the_altitude_counts() -> None:

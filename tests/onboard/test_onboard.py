@@ -197,6 +197,8 @@ def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
     vehicle = Onboard("secant", sensor_std=SensorStd(bias=(0.5, 0.0, 0.0)))
     vehicle.start(TARGET, (60.4, 5.3), date="2026-06-30")
     elements = elements_at(IGRF("2026-06-30"), torch.tensor([60.4, 5.3], dtype=torch.float64)).tolist()
+    with pytest.raises(ValueError, match=r"D deviates by 4\.3.*: check sensors, calibration"):
+        vehicle.step(elements[0] - 4.3, elements[1] + 0.6, elements[2] - 500, heading=0.0)  # iron, or nearly -D
     vehicle.step(elements[0] + 0.5, *elements[1:], heading=0.0)
     share = 0.25 / (0.25 + 0.26**2 + (5417 / elements[2]) ** 2)
     assert vehicle._last[0] == pytest.approx(elements[0] + 0.5 - 0.5 * share)
