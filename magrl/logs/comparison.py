@@ -147,16 +147,19 @@ def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> l
         return []
     texts, ratio = [], float((distance[going] / moved[going]).median())
     if abs(ratio - 1) > MOST_DRIFT:
-        unit = next((name for name, size in LENGTHS_KM.items() if abs(ratio / size - 1) < 0.1), None)
-        likely = f"they look like {unit}" if unit else "check the log and its unit"
+        unit = min(LENGTHS_KM, key=lambda name: abs(math.log(ratio / LENGTHS_KM[name])))
+        likely = f"they look like {unit}" if abs(ratio / LENGTHS_KM[unit] - 1) < 0.1 else "check the log and its unit"
         texts.append(f"the positions are {ratio:.3g} times as far apart as the distances of the moves: {likely}")
-    turn = (bearing - torch.deg2rad(heading))[going]
-    drift, east = math.degrees(torch.atan2(turn.sin().mean(), turn.cos().mean()).item()), declination.median().item()
+    turn, east = torch.rad2deg(bearing[going]) - heading[going], declination[1:][going]
+    course = torch.deg2rad(turn)
+    drift = math.degrees(torch.atan2(course.sin().mean(), course.cos().mean()).item())
+    drifts, left = ((angle + 180).remainder(360).sub(180).square().mean().sqrt() for angle in (turn, turn - east))
     text = f"the course between positions is {drift:.0f} deg to the right of the heading"
     if abs(abs(drift) - 180) < LEAST_TURN_DEG:
         texts.append(f"{text}: the heading is reciprocal, or the vehicle goes astern")
-    elif abs(east) > 3 and abs(drift - east) < 0.3 * abs(east):
-        texts.append(f"{text}, as D is {east:.0f} deg: the heading is from magnetic north, and true north is expected")
+    elif drifts > 3 and left < drifts / 3:
+        north = f"as D is {east.median():.0f} deg: the heading is from magnetic north, and true north is expected"
+        texts.append(f"{text}, {north}")
     elif abs(drift) > LEAST_TURN_DEG:
         texts.append(f"{text}: check the compass and its axes")
     return texts

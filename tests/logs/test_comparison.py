@@ -38,6 +38,8 @@ def test_a_log_without_mistake() -> None:
     assert mistakes(log().drop(columns="latitude"), DATE) == []
     compass = log().assign(D=0.0, D_std=OUTAGE_STD, heading=log()["heading"] - log()["D"])
     assert mistakes(compass, DATE) == []
+    drift = np.random.default_rng(0).normal(15, 8, 15)  # of currents, about as D
+    assert mistakes(log().assign(heading=log()["heading"] + drift), DATE) == []
     assert difference_from_igrf(log(), DATE).mean(0).abs().lt(torch.tensor([0.1, 0.05, 40.0])).all()
 
 
@@ -65,6 +67,7 @@ RADIANS = np.pi / 180
             lambda t: t.assign(distance=t["distance"] / 1.852),
             ["1.85 times as far apart .*they look like nautical miles"],
         ),
+        (lambda t: t.assign(distance=t["distance"] / 1.69), ["1.69 times as far apart .*they look like statute miles"]),
         (lambda t: t.assign(distance=t["distance"] * 1000), ["0.001 times as far apart .*they look like meters"]),
         (lambda t: t.assign(distance=t["distance"] * 3), ["0.333 times as far apart .*check the log and its unit"]),
         (
