@@ -55,7 +55,9 @@ def _recording(
     used: Collection[str] = (),
     convert: Callable[[torch.Tensor], torch.Tensor] = lambda attitude: attitude,
 ) -> Recording:
-    """Return the columns of the first sensor of each kind, and of the chosen magnetometer.
+    """Return the columns of the best sensor of each kind, and of the stated magnetometer.
+
+    A sensor is better if it works, if it is calibrated, if the estimator used it, and if it has more samples.
 
     Args:
         kind: name of the format.
@@ -68,32 +70,34 @@ def _recording(
     notes: list[str] = []
     streams: dict[str, tuple[Array, Array]] = {}
     for columns, sensors in tables.items():
-        name = next(iter(sensors))
-        if columns == AXES:
-            name, notes = _magnetometer(sensors, sensor, used)
+        if columns == AXES and sensor is not None:
+            check_choice(sensors, sensor=sensor)
+            name = sensor
+        else:
+            name = min(sensors, key=lambda name: _rank(name, sensors[name], used))
+        if columns == AXES and len(sensors) > 1:
+            others = ", ".join(other for other in sensors if other != name)
+            notes.append(f"the magnetometer is {name}; state sensor for another one: {others}")
         names.append(name)
         time, values = sensors[name][:, 0], sensors[name][:, 1:]
         if columns == _QUATERNION:
             columns, values = ATTITUDE, convert(attitude_of(torch.from_numpy(values.copy()))).numpy()
         streams |= {column: (time, series) for column, series in zip(columns, values.T, strict=True)}
+    notes += [f"{name}: {NOT_CALIBRATED}" for name in names if name.startswith(_RAW_TOPIC)]
     return Recording(streams, f"{kind}: {', '.join(names)}", None, notes)
 
 
-def _magnetometer(fields: Mapping[str, Array], sensor: str | None, used: Collection[str]) -> tuple[str, list[str]]:
-    """Return the name of the stated magnetometer, or of a healthy one, preferably a used one, and notes."""
-    if sensor is not None:
-        check_choice(fields, sensor=sensor)
-    dead = [name for name, rows in fields.items() if not (np.isfinite(rows).all() and np.ptp(rows[:, 1:], 0).any())]
-    name = sensor or min(fields, key=lambda name: (name in dead, name not in used))
-    others = ", ".join(other for other in fields if other != name)
-    notes = [f"the magnetometer is {name}; state sensor for another one: {others}"] if others else []
-    return name, notes + [f"{name}: {NOT_CALIBRATED}"] * name.startswith("sensor_mag")
+def _rank(name: str, rows: Array, used: Collection[str]) -> tuple[bool, bool, bool, int]:
+    """Return the place of a sensor among others of its kind: the least is the best."""
+    works = np.isfinite(rows).all() and np.ptp(rows[:, 1:], 0).any()
+    return not works, name.startswith(_RAW_TOPIC), name not in used, -len(rows)
 
 
 # PX4
 
 _GAUSS = [f"magnetometer_ga[{index}]" for index in range(3)]
-_MAGNETOMETERS = {"vehicle_magnetometer": _GAUSS, "sensor_combined": _GAUSS, "sensor_mag": list(AXES)}
+_RAW_TOPIC = "sensor_mag"
+_MAGNETOMETERS = {"vehicle_magnetometer": _GAUSS, "sensor_combined": _GAUSS, _RAW_TOPIC: list(AXES)}
 """Topics with a magnetometer [gauss], the calibrated one first."""
 
 

@@ -75,6 +75,15 @@ def test_px4_has_the_selected_healthy_magnetometer(tmp_path: Path, second: float
         read_log(path, sensor="mag")
 
 
+@pytest.mark.parametrize("names", [("sensor_mag:1", "vehicle_magnetometer"), ("vehicle_magnetometer", "sensor_mag:1")])
+def test_px4_has_the_calibrated_magnetometer(tmp_path: Path, names: tuple[str, str]) -> None:
+    """Which an older log does not mark as used, and not the device that the estimator used, as it was measured."""
+    factors = {name: 0.5 if "sensor_mag" in name else 1.0 for name in names}
+    log = read_log(written(tmp_path / "log.ulg", ulog(factors, selected=1, older=True)))
+    check(log)
+    assert torch.allclose(log.tensor("x", "y", "z"), AXES, atol=1)
+
+
 def test_px4_without_a_magnetometer_truncated_and_no_log(tmp_path: Path) -> None:
     path = written(tmp_path / "log.ulg", ulog({"vehicle_mag": 1.0}))
     with pytest.raises(ValueError, match=r"none of vehicle_magnetometer, .* is among its topics, sensor_selection, "):

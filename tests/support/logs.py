@@ -39,6 +39,8 @@ def ulog(
     heading: float = math.nan,
     flag: int | None = None,
     selected: int = 0,
+    *,
+    older: bool = False,
 ) -> bytes:
     """A ULog file: https://docs.px4.io/main/en/dev_log/ulog_file_format.html.
 
@@ -47,8 +49,10 @@ def ulog(
         heading: heading of GNSS.
         flag: whether the estimator uses it, if it tells.
         selected: instance of the magnetometer that the estimator uses.
+        older: whether vehicle_magnetometer has no device, and sensor_mag half of the samples.
     """
-    topics = dict.fromkeys(magnetometers, "uint32_t device_id;float[3] magnetometer_ga")
+    device = "" if older else "uint32_t device_id;"
+    topics = dict.fromkeys(magnetometers, f"{device}float[3] magnetometer_ga")
     topics |= {name: "uint32_t device_id;float x;float y;float z" for name in magnetometers if "sensor_mag" in name}
     topics |= {"vehicle_attitude": "float[4] q", "sensor_selection": "uint32_t mag_device_id"}
     topics["vehicle_gps_position"] = "uint64_t time_utc_usec;int32_t lat;int32_t lon;float heading;uint8_t fix_type"
@@ -67,7 +71,9 @@ def ulog(
         rows = {
             name: struct.pack("<I3f", int(name.partition(":")[2] or 0), *(factor * axis for axis in field))
             for name, factor in magnetometers.items()
+            if not (older and row % 2 and "sensor_mag" in name)
         }
+        rows |= {name: content[4:] for name, content in rows.items() if older and "sensor_mag" not in name}
         rows |= {"vehicle_attitude": struct.pack("<4f", *q), "sensor_selection": struct.pack("<I", selected)}
         rows["vehicle_gps_position"] = struct.pack("<QiifB", stamp, *place, heading, fix)
         rows |= {"estimator_status_flags": struct.pack("<B", flag)} if flag is not None else {}
