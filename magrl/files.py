@@ -1,24 +1,30 @@
-"""Safe files: tensors with atomic writes and a checksum, strict JSON, TOML. Reading a file executes no code from it."""
+"""Safe files: tensors with atomic writes and a checksum, strict JSON, TOML, CSV. Reading executes no code of a file."""
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
 import math
 import os
 import re
 import tomllib
 import uuid
+import warnings
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import safetensors.torch
 import torch
 from torch import Tensor
 
 from magrl.checks import check_type, short
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 MAX_FILE_BYTES = 10_000_000
 """Largest TOML or JSON file: a scenario with about fifty thousand tasks."""
@@ -233,6 +239,69 @@ def check_writable(path: Path) -> None:
         raise OSError(f"cannot write {path}: {error.strerror}") from error
     if not existed:
         path.unlink()
+
+
+def read_text(path: Path) -> str:
+    """Return the content of a text file, with newlines alone between its lines.
+
+    Raises:
+        ValueError: for a file that is no text in UTF-8.
+        OSError: for a file that cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "log.csv"
+        >>> _ = path.write_bytes("heading [°]".encode("latin1"))
+        >>> read_text(path)
+        Traceback (most recent call last):
+        ValueError: byte 10 is not UTF-8: save the file as text in UTF-8
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"byte {error.start + 1} is not UTF-8: save the file as text in UTF-8") from error
+
+
+def read_table(text: str, separator: str = ",", **options: Any) -> DataFrame:
+    """Return the rows of a table below its header, of as many cells as this; those that lack at the end are blank.
+
+    Args:
+        text: the table, with a newline between its rows.
+        separator: character between cells.
+        options: those of :func:`pandas.read_csv` for the values.
+
+    Raises:
+        ValueError: for a name that is repeated, no row, a row of more cells, or one that is not closed.
+
+    Example:
+        >>> read_table("time,x,x").columns
+        Traceback (most recent call last):
+        ValueError: the table has 2 columns 'x': keep one of them, or rename it
+    """
+    import pandas  # where it is needed: it takes long to import
+
+    header, _, body = text.lstrip(" \n").partition("\n")
+    try:
+        names = [name.strip() for name in next(csv.reader([header], delimiter=separator, strict=True), [])]
+    except csv.Error as error:
+        raise ValueError(f"the header {short(header)} is not closed, or too long") from error
+    name, count = (Counter(filter(None, names)).most_common(1) or [("", 0)])[0]
+    if count > 1:
+        raise ValueError(f"the table has {count} columns {short(name)}: keep one of them, or rename it")
+    shape: dict[str, Any] = {"header": None, "names": range(len(names) + 1), "index_col": False}
+    shape |= {"sep": separator, "skipinitialspace": True, "low_memory": False}
+    try:
+        with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
+            table = pandas.read_csv(io.StringIO(body), **shape, **options)
+    except (pandas.errors.ParserError, pandas.errors.ParserWarning) as error:
+        place = "".join(re.findall(r"(?<=in line )\d+", str(error))) or "1 or a later one"
+        raise ValueError(f"row {place} has more cells than the header, or a quoted text that is not closed") from error
+    if not len(table):
+        raise ValueError("the table has no row")
+    more = table.pop(len(names)).replace("", None).notna()
+    if more.any():
+        raise ValueError(f"row {int(more.argmax()) + 1} has more cells than the header")
+    return table.set_axis(names, axis=1)
 
 
 def read_document(path: Path) -> Any:

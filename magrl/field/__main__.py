@@ -19,7 +19,7 @@ import argparse
 import contextlib
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from magrl.checks import command, short
 from magrl.field.elements import NAMES, elements_gradient, seven_elements
 from magrl.field.igrf import IGRF, parse_date
+from magrl.files import read_table, read_text
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -92,16 +93,30 @@ def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
         >>> field_of_points(place, parser().parse_args(["points.csv"]))[["D_deg", "B_H_nT"]].round(1).values.tolist()
         [[8.0, 35480.8]]
     """
-    if not len(table):
-        raise ValueError("the table has no row")
-    place = (*_place(table, options), _altitude_km(table, options))
-    field = IGRF(_column(table, _name(table, "date", options.date), "date", _date), options.generation)
+    from pandas import DataFrame
+
+    table = table.reset_index(drop=True)
+    names = _names(table, options)
+    used = table[[name for name in names.values() if name in table.columns]]
+    lacking = (used.isna() | (used == "")).any(axis=1)
+    points = table[~lacking]
+    if not len(points):
+        raise ValueError("no row has a position, an altitude and a date")
+    if lacking.any():
+        count, first = int(lacking.sum()), int(lacking.argmax()) + 1
+        _warn(f"{count} rows, first row {first}, lack a position, an altitude or a date: their field is blank")
+    place = (*_place(points, names), _altitude_km(points, names, options.unit))
+    field = IGRF(_column(points, names["date"], "date", _date), options.generation)
     value, gradient = field.value_and_gradient(*map(torch.from_numpy, place))
     gradient[np.abs(place[0]) == 90, :, 1] = math.nan  # at a pole of the Earth no direction is east
-    columns = _columns(value, gradient)
-    if taken := sorted(columns.keys() & set(table.columns)):
+    columns = DataFrame(_columns(value, gradient), index=points.index)
+    if taken := sorted({*columns} & {*table.columns}):
         raise ValueError(f"the table has columns {', '.join(taken)} already: rename them, or remove them")
-    return table.assign(**columns)
+    return table.join(columns)
+
+
+def _warn(text: str) -> None:
+    print(f"python -m magrl.field: {text}", file=sys.stderr)
 
 
 def _columns(value: torch.Tensor, gradient: torch.Tensor) -> dict[str, NDArray[np.float64]]:
@@ -127,36 +142,39 @@ def _name(table: DataFrame, name: str, given: str | None) -> str:
     return usual[0]
 
 
-def _place(table: DataFrame, options: argparse.Namespace) -> list[NDArray[np.float64]]:
-    """Return latitudes and longitudes [deg] ``(P,)``."""
-    names = {name: _name(table, name, getattr(options, name)) for name in ("latitude", "longitude")}
+def _names(table: DataFrame, options: argparse.Namespace) -> dict[str, str]:
+    """Return the column of each quantity, or its value in all rows."""
+    names = {name: _name(table, name, getattr(options, name)) for name in COLUMNS}
     if names["latitude"].lower() in COLUMNS["longitude"] or names["longitude"].lower() in COLUMNS["latitude"]:
         raise ValueError(f"--latitude {names['latitude']} --longitude {names['longitude']}: they are swapped")
+    given = [name for name in _SIGNS if getattr(options, name) is not None]
+    heights = given or [name for name in _SIGNS if names[name] in table.columns]
+    if len(heights) != 1:
+        which = "both columns altitude and depth" if heights else f"neither altitude nor depth among {_listed(table)}"
+        raise ValueError(f"the table has {which}: choose with --altitude or --depth, such as --altitude 0")
+    return {name: column for name, column in names.items() if name not in _SIGNS or name in heights}
+
+
+def _place(table: DataFrame, names: Mapping[str, str]) -> list[NDArray[np.float64]]:
+    """Return latitudes and longitudes [deg] ``(P,)``."""
     hint = "degrees: are latitude and longitude swapped?"
     place = [
         _numbers(table, names[name], name, -most, most, unit)
         for name, most, unit in (("latitude", 90.0, hint), ("longitude", 360.0, "degrees"))
     ]
     if all((abs(values) <= most).all() for values, most in zip(place, (math.pi / 2, math.pi), strict=True)):
-        warning = "all latitudes are within pi/2 and all longitudes within pi: are they radians? Degrees are expected"
-        print(f"python -m magrl.field: {warning}", file=sys.stderr)
+        _warn("all latitudes are within pi/2 and all longitudes within pi: are they radians? Degrees are expected")
     return place
 
 
-def _altitude_km(table: DataFrame, options: argparse.Namespace) -> NDArray[np.float64]:
+def _altitude_km(table: DataFrame, names: Mapping[str, str], unit: str | None) -> NDArray[np.float64]:
     """Return altitudes above the ellipsoid [km] ``(P,)``."""
-    given = [name for name in _SIGNS if getattr(options, name) is not None]
-    names = given or [name for name in _SIGNS if _name(table, name, None) in table.columns]
-    if len(names) != 1:
-        which = "both columns altitude and depth" if names else f"neither altitude nor depth among {_listed(table)}"
-        raise ValueError(f"the table has {which}: choose with --altitude or --depth, such as --altitude 0")
-    (name,) = names
-    column = _name(table, name, getattr(options, name))
-    suffix = column.lower().rpartition("_")[2]
-    unit = options.unit or (suffix if column in table.columns and suffix in UNITS_KM else "km")
+    name = next(name for name in _SIGNS if name in names)
+    suffix = names[name].lower().rpartition("_")[2]
+    unit = unit or (suffix if names[name] in table.columns and suffix in UNITS_KM else "km")
     low, high = sorted(_SIGNS[name] * limit / UNITS_KM[unit] for limit in IGRF.altitude_range_km)
     hint = ": is it in meters? Then add --unit m" if unit == "km" else ""
-    return _SIGNS[name] * UNITS_KM[unit] * _numbers(table, column, name, low, high, f"{unit}{hint}")
+    return _SIGNS[name] * UNITS_KM[unit] * _numbers(table, names[name], name, low, high, f"{unit}{hint}")
 
 
 _SIGNS = {"altitude": 1.0, "depth": -1.0}
@@ -177,7 +195,7 @@ def _column(table: DataFrame, text: str, name: str, read: Callable[[Any], Any]) 
         for value in dict.fromkeys(values):
             parsed[value] = read(value)
     except ValueError as error:
-        raise ValueError(f"row {values.index(value) + 1}, {text}: {error}") from None
+        raise ValueError(f"row {table.index[values.index(value)] + 1}, {text}: {error}") from None
     return np.array([parsed[value] for value in values])
 
 
@@ -187,7 +205,7 @@ def _numbers(table: DataFrame, text: str, name: str, low: float, high: float, un
     outside = (values < low) | (values > high)
     if outside.any():
         row = int(outside.argmax())
-        raise ValueError(f"row {row + 1}, {text}: {values[row]:g} is not from {low:g} to {high:g} {unit}")
+        raise ValueError(f"row {table.index[row] + 1}, {text}: {values[row]:g} is not from {low:g} to {high:g} {unit}")
     return values
 
 
@@ -221,7 +239,7 @@ def read_points(path: Path) -> DataFrame:
     try:
         if path.suffix == ".parquet":
             return pandas.read_parquet(path)
-        return pandas.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
+        return read_table(read_text(path), dtype=str, keep_default_na=False)
     except ImportError as error:
         raise ValueError(NO_PARQUET) from error
     except (ValueError, OSError) as error:

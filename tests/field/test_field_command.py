@@ -86,9 +86,32 @@ def test_angles_that_may_be_radians_are_named(points, capsys) -> None:
         assert ("are they radians?" in capsys.readouterr().err) is warned
 
 
+def test_a_row_with_a_blank_cell_has_no_field_and_is_named(points, capsys) -> None:
+    """Whichever is blank; the other rows, and what is read of them, do not change."""
+    main([str(points)])
+    whole = pandas.read_csv(points.with_name("points_field.csv"), dtype=str)
+    header, first, *rows = POINTS.splitlines()
+    _, *cells = first.split(",")
+    blank = [",".join(["007", *cells[:place], "", *cells[place + 1 :]]) for place in range(len(cells))]
+    points.write_text("\n".join([header, *blank, "007,-2.0", *rows, first]))
+    main([str(points)])
+    assert "5 rows, first row 1, lack a position, an altitude or a date" in capsys.readouterr().err
+    table = pandas.read_csv(points.with_name("points_field.csv"), dtype=str)
+    assert table.filter(regex="_nT|_deg").iloc[:5].isna().all(axis=None)
+    assert table.iloc[5:].values.tolist() == whole.iloc[[1, 2, 0]].values.tolist()
+    points.write_text("\n".join([header, *blank, rows[0].replace("60.4", "91")]))
+    with pytest.raises(SystemExit):
+        main([str(points)])
+    assert "row 5, latitude: 91 is not from" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("old", "new", "options", "message"),
     [
+        (POINTS.partition("\n")[2], "007,,,,", "", "no row has a position, an altitude and a date"),
+        ("date", "latitude", "", "the table has 2 columns 'latitude': keep one of them, or rename it"),
+        ("007,", "007,7,", "", "row 1 has more cells than the header"),
+        ("007", '"007', "", "a quoted text that is not closed"),
         ("0.5", "5000", "", "row 1, altitude: 5000 is not from -15 to 1000 km: is it in meters? Then add --unit m"),
         ("60.4", "north", "", "row 2, latitude: 'north' is not a finite number"),
         ("60.4", "91", "", "row 2, latitude: 91 is not from -90 to 90 degrees"),
