@@ -15,6 +15,7 @@ import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas
@@ -25,11 +26,12 @@ from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.logs.calibration import Calibration, calibrate
 from magrl.logs.comparison import difference_from_igrf, mistakes
-from magrl.logs.readers import read_log
+from magrl.logs.readers import examine
 from magrl.logs.readings import STD_NAMES, obstacles, readings_of
 from magrl.logs.samples import ATTITUDE, AXES, Log
 from magrl.logs.units import intensity_mistake
 from magrl.logs.vectors import FRAMES, NORTHS
+from magrl.transforms.errors.sensors import OUTAGE_STD
 
 _DIGITS = {"time": 2, "D": 4, "I": 4, "B_H": 2, "heading": 3, "distance": 4, "latitude": 6, "longitude": 6}
 _DIGITS |= {"altitude": 4, "D_std": 4, "I_std": 4, "B_H_std": 2}
@@ -73,16 +75,32 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _main(options: argparse.Namespace) -> None:
-    log = read_log(*options.log, frame=options.frame, sensor=options.sensor)
-    notes = [] if options.calibrate else [f"note: {text}" for text in remarks(log, options)]
-    print("\n".join([*summary(log), *notes]), flush=True)
+    log, wrong = examine(*options.log, frame=options.frame, sensor=options.sensor)
+    mistake = intensity_mistake(_totals(log).median())
+    notes = [text for text in log.notes if text != mistake]
+    notes += [] if options.calibrate else remarks(log, options)
+    print("\n".join([*summary(log), *(f"note: {text}" for text in notes)]), flush=True)
     date = options.date or log.date
-    lines = swing(log, options, date) if options.calibrate else way(log, options, date)
-    print("\n".join(lines))
+    if not options.calibrate:
+        wrong += [mistake] if mistake else []
+        missing = obstacles(log, options.north)
+        if missing and not wrong and not obstacles(log, "true"):  # the north alone is missing, and D may show it
+            missing += mistakes(readings_of(log, north="true", **_parts(options)), date)
+        wrong += missing
+    if wrong:
+        print("\n".join(f"error: {text}" for text in wrong), file=sys.stderr)
+        raise ValueError("no readings: correct what is named above")
+    print("\n".join(swing(log, options, date) if options.calibrate else way(log, options, date)))
+
+
+def _parts(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of readings."""
+    iron = Calibration.load(options.calibration) if options.calibration else None
+    return {"every_km": options.every_km, "every_s": options.every_s, "calibration": iron}
 
 
 def summary(log: Log) -> list[str]:
-    """Return what a log holds: source, columns, duration, rate, field, and its notes."""
+    """Return what a log holds: source, columns, duration, rate, and field."""
     samples = log.samples
     time = samples["time"].to_numpy(float)
     rate = f"{1 / np.median(np.diff(time)):.3g} Hz" if len(time) > 1 else "one sample"
@@ -91,7 +109,6 @@ def summary(log: Log) -> list[str]:
         f"{log.source}: {len(samples)} samples in {time[-1] - time[0]:.4g} s, {rate}, date {log.date or 'unknown'}",
         f"columns: {', '.join(samples)}; north of the heading: {log.north or 'not stated'}",
         f"total intensity as logged: {total.median():.0f} nT, from {total.min():.0f} to {total.max():.0f}",
-        *(f"note: {note}" for note in log.notes if note != intensity_mistake(total.median())),
     ]
 
 
@@ -139,21 +156,9 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
 
 
 def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
-    """Write the readings of a log, and return them beside IGRF, with the likely mistakes.
-
-    Raises:
-        ValueError: if anything prevents readings; all that is wrong is printed before.
-    """
-    iron = Calibration.load(options.calibration) if options.calibration else None
-    settings = {"every_km": options.every_km, "every_s": options.every_s, "calibration": iron}
-    mistake = intensity_mistake(_totals(log).median())
-    wrong = [*filter(None, [mistake]), *obstacles(log, options.north)]
-    if wrong:
-        if not mistake and not obstacles(log, "true"):  # the north alone is missing, and D may show it
-            wrong += mistakes(readings_of(log, north="true", **settings), date)
-        print("\n".join(f"error: {text}" for text in wrong), file=sys.stderr)
-        raise ValueError("no readings: correct what is named above")
-    table = readings_of(log, north=options.north, **settings)
+    """Write the readings of a log, and return them beside IGRF, with the likely mistakes."""
+    parts = _parts(options)
+    table = readings_of(log, north=options.north, **parts)
     lines = [f"first reading: {_elements(table.iloc[0][list(NAMES)])}; {int(table['spikes'].sum())} spikes left out"]
     if "latitude" in table and date:
         mean = difference_from_igrf(table, date).mean(0)
@@ -161,7 +166,7 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     lines += [f"warning: {text}" for text in mistakes(table, date)]
     if len(table) < 2:
         return [*lines, "one reading: no file is written; choose shorter moves by --every-km or --every-s"]
-    return [*lines, *_written(table, log, options, iron)]
+    return [*lines, *_written(table, log, options, parts["calibration"])]
 
 
 def _written(table: DataFrame, log: Log, options: argparse.Namespace, iron: Calibration | None) -> list[str]:
@@ -170,7 +175,7 @@ def _written(table: DataFrame, log: Log, options: argparse.Namespace, iron: Cali
     check_writable(out)
     stamp = pandas.to_datetime(table["time"], unit="s", utc=True).dt.strftime("%Y-%m-%dT%H:%M:%SZ")
     table.round(_DIGITS).assign(**({"time": stamp} if log.date else {})).to_csv(out, index=False)
-    std = np.sqrt(np.square(table[list(STD_NAMES)]).mean())
+    std = np.sqrt(np.square(table[list(STD_NAMES)]).mean()).replace(OUTAGE_STD, 0.0)  # of D that is not measured
     noise, bias = (" ".join(f"{value:.3g}" for value in values) for values in (std, iron.std if iron else np.zeros(3)))
     missing = "" if iron else "; no calibration: give --bias of your sensors"
     if std.isna().any():

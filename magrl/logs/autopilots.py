@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from magrl.checks import check_choice
+from magrl.checks import UsageError
 from magrl.field.elements import FIELD_NT
 from magrl.logs.samples import ATTITUDE, AXES, Array, Recording
 from magrl.logs.units import UNITS, column_of
@@ -70,11 +70,11 @@ def _recording(
     notes: list[str] = []
     streams: dict[str, tuple[Array, Array]] = {}
     for columns, sensors in tables.items():
+        name = min(sensors, key=lambda name: _rank(name, sensors[name], used))
         if columns == AXES and sensor is not None:
-            check_choice(sensors, sensor=sensor)
+            if sensor not in sensors:
+                raise UsageError(f"sensor must be one of {', '.join(map(repr, sensors))}, got {sensor!r}")
             name = sensor
-        else:
-            name = min(sensors, key=lambda name: _rank(name, sensors[name], used))
         if columns == AXES and len(sensors) > 1:
             others = ", ".join(other for other in sensors if other != name)
             notes.append(f"the magnetometer is {name}; state sensor for another one: {others}")
@@ -108,7 +108,7 @@ def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     instances = sorted(log.data_list, key=lambda item: item.multi_id)
     topics = {item.name: item.data for item in reversed(instances)}  # the first instance of each
     fields, used = _px4_fields(instances, topics)
-    tables: _Tables = {AXES: fields}
+    tables: _Tables = {AXES: fields} if fields else {}
     if "vehicle_attitude" in topics:
         tables[_QUATERNION] = _px4_table(topics, "vehicle_attitude", [f"q[{index}]" for index in range(4)])
     position = topics.get("vehicle_gps_position", {})
@@ -145,8 +145,6 @@ def _px4_fields(instances: Sequence[Any], topics: Mapping[str, Any]) -> tuple[di
                 fields |= _px4_table({name: item.data}, name, columns)
                 fields[name][:, 1:] *= FIELD_NT["gauss"]
                 used += [name] if item.data.get("device_id", [0])[-1] == selected else []
-    if not fields:
-        raise ValueError(f"none of {', '.join(_MAGNETOMETERS)} is among its topics, {', '.join(sorted(topics))}")
     return fields, used
 
 
@@ -227,6 +225,10 @@ def _tables(rows: _Rows) -> _Tables:
 # ROS
 
 
+_BAGS = {b"#": ".bag", b"S": ".db3", b"\x89": ".mcap"}
+"""Suffixes of bags, by the first byte."""
+
+
 def read_bag(path: Path, sensor: str | None = None) -> Recording:
     """Read a bag of ROS 1 (.bag) or 2 with rosbags: a topic of each type that is needed.
 
@@ -236,6 +238,9 @@ def read_bag(path: Path, sensor: str | None = None) -> Recording:
     become FRD and NED. The bag does not state the north of the heading, which is that of the Imu.
     """
     highlevel, store = package("rosbags.highlevel", "rosbags"), package("rosbags.typesys", "rosbags")
+    suffix = _BAGS[path.read_bytes()[:1]] if path.is_file() else path.suffix
+    if path.suffix != suffix:
+        raise UsageError(f"such a bag must end in {suffix}: rename it {path.stem}{suffix}")
     rows: _Rows = defaultdict(lambda: defaultdict(list))
     lone = path.suffix == ".bag" or not (path.parent / "metadata.yaml").is_file()
     whole = path if path.is_dir() or lone else path.parent

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import pandas
-from pandas import DataFrame, Series
+import torch
+from pandas import DataFrame
 
-from magrl.checks import check_choice, short
+from magrl.checks import UsageError, check_choice, short
+from magrl.geodesy import wrap_longitude
 from magrl.logs.autopilots import read_ardupilot, read_bag, read_nmea, read_ulg
-from magrl.logs.samples import ATTITUDE, AXES, Array, Log, Recording, samples_of, times_of
-from magrl.logs.units import column_of, intensity_mistake
-from magrl.logs.vectors import FRAMES
+from magrl.logs.samples import ATTITUDE, AXES, Log, Recording, samples_of
+from magrl.logs.tables import read_csv, read_iaga
+from magrl.logs.units import intensity_mistake, out_of_range
+from magrl.logs.vectors import FRAMES, rotation
 
-_NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
+_ENOUGH = 20000  # samples that show the unit of an angle
 
 
 def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) -> Log:
@@ -28,10 +30,11 @@ def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) 
             NMEA 0183, observatories (IAGA-2002); or a folder of ROS 2. Columns of later ones replace those of earlier
             ones; all have one clock.
         frame: axes of CSV files, one of :data:`~magrl.logs.vectors.FRAMES`; the attitude is that of FRD and NED.
-        sensor: magnetometer of those that a log of PX4, ArduPilot or ROS has; by default a healthy one that was used.
+        sensor: magnetometer of those that a log of PX4, ArduPilot or ROS has; by default one that is calibrated, works
+            and was used.
 
     Raises:
-        ValueError: naming the file and what is wrong with it, or its unknown format.
+        ValueError: naming the file and all that is wrong with it, or its unknown format.
         ImportError: for a package that is not installed, naming the extra.
 
     Example:
@@ -41,145 +44,114 @@ def read_log(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) 
         >>> read_log(path).samples.values.tolist()
         [[0.0, 15000.0, 0.0, 48000.0, 350.0]]
     """
+    log, wrong = examine(*paths, frame=frame, sensor=sensor)
+    if wrong:
+        raise ValueError(f"cannot read {', '.join(map(str, paths))}: {'; '.join(wrong)}")
+    return log
+
+
+def examine(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) -> tuple[Log, list[str]]:
+    """Return the samples of a log, and what is wrong with its columns; see :func:`read_log`.
+
+    Raises:
+        ValueError: for files without samples, with all that is wrong.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "log.csv"
+        >>> _ = path.write_text("time_s,mag_x_uT,mag_y_uT,mag_z_uT,pitch" + chr(10) + "0,15,0,48,200")
+        >>> examine(path)[1]
+        ['pitch 200 is not from -90 to 90 deg: check the column and its unit']
+    """
     check_choice(FRAMES, frame=frame)
-    recordings = []
-    for path in map(Path, paths):
-        reader = _reader(path)
-        options = {"frame": frame} if reader is read_csv else {"sensor": sensor}
-        if reader in (read_nmea, read_iaga):
-            options = {}
-        try:
-            recordings.append(reader(path, **options))
-        except ImportError:
-            raise
-        except Exception as error:  # whatever the packages raise for a foreign or damaged file
-            raise ValueError(f"cannot read {path}: {error}") from error
-    samples, notes = samples_of({name: pair for recording in recordings for name, pair in recording.streams.items()})
+    formats = [_format(path) for path in map(Path, paths)]
+    recordings = [_recording(Path(path), form, frame, sensor) for path, form in zip(paths, formats, strict=True)]
+    streams = {name: pair for recording in recordings for name, pair in recording.streams.items()}
+    wrong = [text for recording in recordings for text in recording.wrong]
+    wrong += filter(None, (out_of_range(name, values) for name, (_, values) in streams.items()))
+    times = {text for time, _ in streams.values() if (text := out_of_range("time", time))}
+    try:
+        if times:
+            raise ValueError(*times)
+        samples, notes = samples_of(streams, "; or ".join(dict.fromkeys(form.remedy for form in formats)))
+    except ValueError as error:
+        text = "; ".join([*wrong, *map(str, error.args)])
+        raise ValueError(f"cannot read {', '.join(map(str, paths))}: {text}") from error
     if mistake := intensity_mistake(float(np.sqrt(np.square(samples[list(AXES)]).sum(axis=1)).median())):
         notes.append(mistake)
     norths = [recording.north for recording in recordings if "heading" in recording.streams]
     more = [note for recording in recordings for note in recording.notes]
     source = "; ".join(recording.source for recording in recordings)
-    return Log(samples, source, norths[-1] if norths else None, (*more, *notes))
+    return Log(samples, source, norths[-1] if norths else None, (*more, *notes)), wrong + _radians(samples)
 
 
-def _reader(path: Path) -> Callable[..., Recording]:
-    """Return the reader of a file or a folder."""
-    if path.is_dir():
-        return read_bag
-    if path.exists():
+class _Format(NamedTuple):
+    """How a file begins (a regular expression), its reader, options of this, and how it gets a magnetometer."""
+
+    start: bytes
+    read: Callable[..., Recording]
+    option: str
+    remedy: str
+
+
+def _format(path: Path) -> _Format:
+    """Return the format of a file or a folder."""
+    start = b""
+    if path.is_file():
         with path.open("rb") as file:
             start = file.read(4096)
-        for pattern, reader in _FORMATS:
-            if re.match(pattern, start, re.DOTALL):
-                return reader
+    for form in _FORMATS:
+        if (path.is_dir() and form.read is read_bag) or (path.is_file() and re.match(form.start, start, re.DOTALL)):
+            return form
     raise ValueError(
-        f"a log is a file of CSV, PX4, ArduPilot, MAVLink, ROS, NMEA 0183 or IAGA-2002, or a folder of ROS 2 that "
-        f"exists, got {str(path)!r}"
+        "a log is a file of CSV, PX4, ArduPilot, MAVLink, ROS, NMEA 0183 or IAGA-2002, or a folder of ROS 2 that "
+        f"exists, got {str(path)!r}{f', which begins with {short(start[:20])}' if start else ''}"
     )
 
 
-def read_csv(path: Path, frame: str = "FRD") -> Recording:
-    """Read a CSV file with a header: see :data:`~magrl.logs.units.COLUMNS` for names and units.
+def _recording(path: Path, form: _Format, frame: str, sensor: str | None) -> Recording:
+    """Return the content of a file.
 
-    Three columns without a header are three axes, and their times row numbers. Times are numbers or
-    ISO 8601 texts. Blank cells do not count; other columns are ignored.
+    Raises:
+        ValueError: naming the file and what is wrong with it, whatever the packages raise.
     """
-    lines = path.read_text().rstrip().splitlines() or [""]
-    if re.fullmatch(rf"\s*{_NUMBER}(\s*[,;\s]\s*{_NUMBER}){{2}}\s*", lines[0]):
-        rows = (re.sub(r"[\s,;]+", ",", line.strip()) for line in lines)
-        lines = ["time,x,y,z", *(f"{number},{row}" for number, row in enumerate(rows))]
-    comma = max(",;\t", key=lines[0].count)
-    raw = pandas.read_csv(io.StringIO("\n".join(lines)), sep=comma, skipinitialspace=True)
-    if not len(raw):
-        raise ValueError("the table has no row")
-    cut = lines[-1].count(comma) < lines[0].count(comma)
-    raw = raw[:-1] if cut else raw
-    headers = _headers(raw)
-    time, notes = times_of(raw[headers["time"][0]], headers["time"][1])
-    values = {name: factor * _numbers(raw[header]) for name, (header, factor) in headers.items() if name != "time"}
-    valid = {name: np.isfinite(time) & np.isfinite(series) for name, series in values.items()}
-    notes += ["the last row is not complete, and is left out: the log may be truncated"] if cut else []
-    axes = [valid[name] for name in AXES if name in valid]
-    for name, sign in zip(AXES, FRAMES[frame], strict=True):
-        if name in valid:
-            values[name], valid[name] = sign * values[name], np.all(axes, axis=0)
-    heading = headers.get("heading", ("", 1))[0].lower()
-    north = "true" if "true" in heading else "magnetic" if "mag" in heading else None
-    streams = {name: (time[valid[name]], series[valid[name]]) for name, series in values.items()}
-    return Recording(streams, f"CSV, {len(raw)} rows", north, notes)
+    options = {"frame": frame, "sensor": sensor}
+    try:
+        return form.read(path, **{name: options[name] for name in filter(None, [form.option])})
+    except ImportError:
+        raise
+    except Exception as error:
+        ours = ValueError if form.option != "sensor" else UsageError
+        foreign = f"it is damaged, or of an unknown version ({type(error).__name__}: {short(str(error))})"
+        raise ValueError(f"cannot read {path}: {error if isinstance(error, (ours, OSError)) else foreign}") from error
 
 
-def _headers(raw: DataFrame) -> dict[str, tuple[str, float]]:
-    """Return the header and the unit of each column that is known; raise an error that names all that are wrong."""
-    headers: dict[str, tuple[str, float]] = {}
-    wrong = []
-    for header in raw:
-        try:
-            column = column_of(header)
-        except ValueError as error:
-            wrong.append(str(error))
-            continue
-        if column and column[0] in headers:
-            wrong.append(f"{headers[column[0]][0]!r} and {header!r} are both the {column[0]}: keep one of them")
-        elif column:
-            headers[column[0]] = header, column[1]
-    if "time" not in headers:
-        wrong.append(f"no column is the time, among {', '.join(raw)}: name it time, or time_ms")
-    if wrong:
-        raise ValueError("; ".join(wrong))
-    return headers
+def _radians(samples: DataFrame) -> list[str]:
+    """Return which angles look like radians: as such, they leave much less variance of the field."""
+    some = samples.iloc[:: len(samples) // _ENOUGH + 1].reindex(columns=[*AXES, *ATTITUDE], fill_value=0.0)
+    axes, attitude = torch.tensor(some.to_numpy(float)).unflatten(-1, (2, 3)).unbind(1)
+    seen = slice(0 if "heading" in samples else 2, None)  # without a heading, the vertical component alone
+
+    def variance(names: Sequence[str]) -> float:
+        radians = torch.tensor([name in names for name in ATTITUDE])
+        turn = rotation(torch.where(radians, wrap_longitude(attitude).rad2deg(), attitude))
+        return (turn @ axes.unsqueeze(-1))[:, seen].var(0, correction=0).sum().item()
+
+    best = min((ATTITUDE[:2], ATTITUDE[2:], ATTITUDE), key=variance)
+    if 4 * variance(best) >= variance(()):
+        return []
+    names = [name for name in best if name in samples]
+    return [f"{' and '.join(names)} look like radians: name the columns {', '.join(f'{name}_rad' for name in names)}"]
 
 
-def _numbers(column: Series) -> Array:
-    """Return the numbers of a column, NaN for blank cells."""
-    numbers = pandas.to_numeric(column, errors="coerce")
-    bad = numbers.isna() & column.notna()
-    if bad.any():
-        row = int(bad.idxmax())
-        raise ValueError(f"row {row + 1}, {column.name}: {short(column[row])} is not a number")
-    return numbers.to_numpy(float)
-
-
-def read_iaga(path: Path) -> Recording:
-    """Read the record of an observatory (IAGA-2002) as that of a fixed vehicle with axes north, east, down.
-
-    Rows without X, Y, Z or H, D, Z are left out. The attitude is zero; the header has the position and the altitude.
-    """
-    head, _, body = path.read_text(errors="replace").partition("\nDATE ")
-    station = dict(re.findall(r"^ *(\w[\w ]*?) {2,}(\S.*?) *\|", head, re.MULTILINE))
-    header, _, rows = body.partition("\n")
-    letters = [name[-1] for name in header.strip("| \r").split()[2:]]
-    table = pandas.read_csv(io.StringIO(rows), sep=r"\s+", names=["date", "time", "day", *letters], index_col=False)
-    table[letters] = table[letters].where(table[letters] < _IAGA_MISSING)
-    if {*"HDZ"} <= {*letters}:
-        angle = np.radians(table["D"] / 60)
-        table = table.assign(X=table["H"] * np.cos(angle), Y=table["H"] * np.sin(angle))
-    elif not {*"XYZ"} <= {*letters}:
-        raise ValueError(f"its components are {', '.join(letters)}: a record of X, Y, Z or of H, D, Z is needed")
-    table = table.dropna(subset=[*"XYZ"]).reset_index(drop=True)
-    time, notes = times_of((table["date"] + "T" + table["time"] + "Z").rename("time"))
-    columns = dict(zip(AXES, (table[name] for name in "XYZ"), strict=True)) | dict.fromkeys(ATTITUDE, 0.0)
-    columns |= {name: unit * float(station[key]) for key, (name, unit) in _STATION.items() if key in station}
-    if "variation" in station.get("Data Type", "").lower():
-        notes.append("the data are variations without the baselines of the observatory: they are not the whole field")
-    streams = {name: (time, np.zeros(len(time)) + values) for name, values in columns.items()}
-    return Recording(streams, f"IAGA-2002: {station.get('Station Name', path.stem)}", "true", notes)
-
-
-_IAGA_MISSING = 88888.0  # not recorded; 99999 is missing
-_STATION = {
-    "Geodetic Latitude": ("latitude", 1.0),
-    "Geodetic Longitude": ("longitude", 1.0),
-    "Elevation": ("altitude", 1e-3),
-}
-"""Fields of the header of IAGA-2002: column, and its unit."""
-_FORMATS: Sequence[tuple[bytes, Callable[..., Recording]]] = (
-    (rb"ULog", read_ulg),
-    (rb"\xa3\x95|\0.{7}[\xfd\xfe]|([^\n]*\n)*?FMT, ?\d+,", read_ardupilot),
-    (rb"#ROSBAG|SQLite format 3|\x89MCAP", read_bag),
-    (rb"\s*Format +IAGA-2002", read_iaga),
-    (rb"([^\n]*\n)*?[^\n,]*[$!][A-Z]{2}[A-Z\d]{3},", read_nmea),
-    (rb"[^\0]*\Z", read_csv),
+_FORMATS = (
+    _Format(rb"ULog", read_ulg, "sensor", "log the topic vehicle_magnetometer or sensor_mag"),
+    _Format(rb"\xa3\x95|([^\n]*\n)*?FMT, ?\d+,", read_ardupilot, "sensor", "log MAG, by the compass in LOG_BITMASK"),
+    _Format(rb"\0.{7}[\xfd\xfe]", read_ardupilot, "sensor", "request RAW_IMU, SCALED_IMU2, SCALED_IMU3 or HIGHRES_IMU"),
+    _Format(rb"#ROSBAG|SQLite format 3|\x89MCAP", read_bag, "sensor", "record a topic of sensor_msgs/MagneticField"),
+    _Format(rb"\s*Format +IAGA-2002", read_iaga, "", "take a record of X, Y, Z or of H, D, Z"),
+    _Format(
+        rb"([^\n]*\n)*?[^\n,]*[$!][A-Z]{2}[A-Z\d]{3},", read_nmea, "", "send XDR with MAG_X_NT, MAG_Y_NT and MAG_Z_NT"
+    ),
+    _Format(rb"(?!\s*[<\[{])[^\0]*\Z", read_csv, "frame", "name its columns mag_x_nT, mag_y_nT, mag_z_nT"),
 )
-"""How the content of a file begins (a regular expression), and its reader."""

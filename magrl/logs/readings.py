@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +14,13 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from torch import Tensor
 
-from magrl.checks import check_choice, check_number
+from magrl.checks import check_choice, check_number, short
 from magrl.field.elements import NAMES, elements_jacobian, measured_elements
+from magrl.files import read_table, read_text
 from magrl.geodesy import geodesic
 from magrl.logs.calibration import Calibration
 from magrl.logs.samples import ATTITUDE, AXES, Array, Log, checked_times
+from magrl.logs.units import COLUMNS, column_of, unit_of
 from magrl.logs.vectors import NORTHS, axes_of_elements, rotation
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
@@ -136,7 +139,8 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     Args:
         path: the file.
         names: its columns by ``D``, ``I``, ``B_H``, ``heading``, ``distance``, and optionally ``latitude`` and
-            ``longitude``, and ``altitude`` [km], which the file may lack.
+            ``longitude``, and ``altitude``, which the file may lack, or have as ``alt_m``. A unit that ends a name
+            counts, such as that of ``H_uT`` or ``distance_nmi``; without one, it is nT, deg or km.
         time: its column of the time, numbers or ISO 8601, which it may lack.
 
     Returns:
@@ -153,21 +157,24 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
         ValueError: cannot read nowhere.csv: [Errno 2] No such file or directory: 'nowhere.csv'
     """
     try:
-        raw = pandas.read_csv(path, dtype=str, skipinitialspace=True)
+        raw = read_table(read_text(Path(path)), dtype=str)
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     log = DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
     located = any(names.get(key) in raw for key in ("latitude", "longitude"))
     for key, name in names.items():
-        if (key in ("latitude", "longitude") and not located) or (key == "altitude" and name not in raw):
+        name = _altitude_name(raw) if name == "altitude" else name
+        if name not in raw and (key == "altitude" or (key in ("latitude", "longitude") and not located)):
             continue
         if name not in raw:
-            raise ValueError(f"no column of {path} is {name!r}: name that of {key}, one of {[*raw]}")
-        log[key] = pandas.to_numeric(raw[name], errors="coerce")
+            raise ValueError(f"no column of {path} is {name!r}: name that of {key}, one of {short([*raw], 300)}")
+        kind = "field" if key == "B_H" else COLUMNS[key].kind if key in COLUMNS else "angle"
+        sign = -1 if name.lower().startswith("depth") else 1
+        log[key] = sign * (unit_of(name, kind) or 1.0) * pandas.to_numeric(raw[name], errors="coerce")
         bad = ~np.isfinite(log[key])
         if bad.any():
             row = int(bad.idxmax())
-            raise ValueError(f"row {row + 1} of {path}: {name} is {raw[name][row]!r}, which is not a number")
+            raise ValueError(f"row {row + 1} of {path}: {name} is {short(raw[name][row])}, which is not a number")
     if len(log) < 2:
         raise ValueError(f"{path} must hold at least two rows, got {len(log)}")
     log.attrs = {"notes": [], "date": None}
@@ -177,6 +184,12 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
         log = log[new].reset_index(drop=True)
         log.attrs = {"notes": notes, "date": date}
     return log
+
+
+def _altitude_name(raw: DataFrame) -> str:
+    """Return the column of the altitude: that of this name, or one of its names with a unit."""
+    others = (name for name in raw if unit_of(name, "length") and (column_of(name) or " ")[0] == "altitude")
+    return "altitude" if "altitude" in raw else next(others, "altitude")
 
 
 def joined(table: DataFrame, every_km: float) -> DataFrame:
@@ -228,9 +241,11 @@ def _path(log: Log) -> Array:
 
 def _parts_km(path: Array, every_km: float) -> NDArray[np.int64]:
     """Return the part of each sample ``(N,)``; a part ends where it is ``every_km`` from its first sample."""
-    first = [0]
-    while (away := np.hypot(*(path[first[-1] :] - path[first[-1]]).T) >= every_km).any():
-        first.append(first[-1] + int(away.argmax()))
+    first, start = [0], path[0].tolist()
+    for row, place in enumerate(path.tolist()):
+        if math.dist(place, start) >= every_km:
+            first.append(row)
+            start = place
     if len(first) > 1 and np.hypot(*(path[-1] - path[first[-1]])) < every_km / 2:
         first.pop()
     return np.searchsorted(first, np.arange(len(path)), side="right") - 1

@@ -14,24 +14,25 @@ from numpy.typing import NDArray
 from pandas import DataFrame, Series
 
 from magrl.checks import short
-from magrl.logs.units import COLUMNS
+from magrl.logs.units import COLUMNS, Array
 
 AXES, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "heading")
 _ANGLES = ("roll", "heading", "longitude")  # which jump by 360 degrees
 _EPOCH = 1e8  # seconds: a time beyond is since 1970, one before since the log began
 _GAP, _GAP_SHARE = 10.0, 1e-3  # of the usual step, and of the log
-Array = NDArray[np.float64]
 Streams = Mapping[str, tuple[Array, Array]]
 """Times [s] and values of each column, in the units of :data:`~magrl.logs.units.COLUMNS`."""
 
 
 class Recording(NamedTuple):
-    """Content of one file: columns, format and sensors, the north of its heading where it is stated, and notes."""
+    """Content of one file: columns, format and sensors, the north of its heading where it is stated, notes, and what is
+    wrong with its columns."""
 
     streams: Streams
     source: str
     north: str | None = None
     notes: Sequence[str] = ()
+    wrong: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -146,10 +147,14 @@ def _count(number: int, name: str) -> str:
     return f"{number} {name}{'s' if number > 1 else ''}"
 
 
-def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
+def samples_of(streams: Streams, remedy: str = "name its columns mag_x_nT, ...") -> tuple[DataFrame, list[str]]:
     """Return the samples at the times of the magnetometer, with notes; other columns are interpolated.
 
     Samples before the first and after the last attitude are left out; the first and last position and speed hold there.
+
+    Args:
+        streams: columns.
+        remedy: what to do where there is no magnetometer.
 
     Raises:
         ValueError: for a log without a magnetometer, or times that run backward.
@@ -162,8 +167,7 @@ def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
     """
     if missing := [name for name in AXES if name not in streams or not len(streams[name][0])]:
         raise ValueError(
-            f"no column is the {missing[0]} of the magnetometer, among {', '.join(streams)}: name its columns "
-            "mag_x_nT, mag_y_nT, mag_z_nT"
+            f"no column is the {missing[0]} of the magnetometer, among {', '.join(streams) or 'none'}: {remedy}"
         )
     time = streams["x"][0]
     new, notes = check_times(time)
@@ -197,6 +201,22 @@ def _at(time: Array, name: str, times: Array, values: Array) -> Array:
     return (column + 180) % 360 - 180 if name in ("roll", "longitude") else column % 360 if turning else column
 
 
+def numbers_of(column: Series, wrong: list[str]) -> Array:
+    """Return the numbers of a column, NaN for blank cells, and add the first cell that is no finite number to a list.
+
+    Example:
+        >>> wrong = []
+        >>> numbers_of(Series(["1.5", None, "x"], name="roll"), wrong), wrong
+        (array([1.5, nan, nan]), ["row 3, roll: 'x' is not a number"])
+    """
+    numbers = pandas.to_numeric(column, errors="coerce").to_numpy(float)
+    bad = ~np.isfinite(numbers) & column.notna().to_numpy()
+    if bad.any():
+        row = int(bad.argmax())
+        wrong.append(f"row {row + 1}, {column.name}: {short(column.iloc[row])} is not a number")
+    return numbers
+
+
 def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:
     """Return times of numbers, or of texts in seconds since 1970, and notes.
 
@@ -211,14 +231,19 @@ def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:
         >>> times_of(Series(["2026-06-30T12:00:00"], name="time"))
         (array([1.7828208e+09]), ['the times have no time zone: they are taken as UTC'])
     """
-    numbers = pandas.to_numeric(column, errors="coerce")
-    if numbers.notna().equals(column.notna()):
-        return factor * numbers.to_numpy(float), []
+    wrong: list[str] = []
+    numbers = numbers_of(column, wrong)
+    if not wrong:
+        return factor * numbers, []
+    if np.isfinite(numbers).any():
+        raise ValueError(wrong[0])
     parsed = pandas.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
     bad = parsed.isna() & column.notna()
     if bad.any():
-        row = int(bad.idxmax())
-        raise ValueError(f"row {row + 1}, {column.name}: {short(column[row])} is no time such as 2026-06-30T12:00:00Z")
+        row = int(bad.argmax())
+        raise ValueError(
+            f"row {row + 1}, {column.name}: {short(column.iloc[row])} is no time such as 2026-06-30T12:00:00Z"
+        )
     zoned = column.dropna().str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True)
     notes = [] if zoned.all() else ["the times have no time zone: they are taken as UTC"]
     return (parsed - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float), notes

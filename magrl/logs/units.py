@@ -2,41 +2,81 @@
 
 from __future__ import annotations
 
+import math
 import re
+import unicodedata
 from collections.abc import Mapping
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from magrl.checks import short
+from magrl.field import IGRF
 from magrl.field.elements import FIELD_NT
+
+Array = NDArray[np.float64]
 
 EARTH_NT = 48000.0
 """Total intensity of the Earth's field, within 45 %."""
-SYMBOLS = {"nt": "nanotesla", "mg": "milligauss", "ut": "microtesla", "µt": "microtesla", "g": "gauss"}
+SYMBOLS = {"nt": "nanotesla", "mg": "milligauss", "ut": "microtesla", "μt": "microtesla", "g": "gauss"}
 SYMBOLS |= {"mt": "millitesla", "t": "tesla"}
+_KNOTS = ("kn", "kt", "kts", "knots")
 UNITS: Mapping[str, Mapping[str, float]] = {
     "field": FIELD_NT | {symbol: FIELD_NT[unit] for symbol, unit in SYMBOLS.items()},
     "angle": {"deg": 1.0, "rad": 57.29577951308232},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "utc": 1.0},
-    "speed": {"m_s": 1.0, "mps": 1.0, "km_h": 1 / 3.6, "kmh": 1 / 3.6, "kn": 1852 / 3600, "kt": 1852 / 3600},
-    "length": {"km": 1.0, "m": 1e-3, "nmi": 1.852},
+    "speed": {"m_s": 1.0, "mps": 1.0, "km_h": 1 / 3.6, "kmh": 1 / 3.6, **dict.fromkeys(_KNOTS, 1852 / 3600)},
+    "length": {"km": 1.0, "m": 1e-3, "nmi": 1.852, "ft": 3.048e-4},
 }
-"""Suffixes of a column, in nanotesla, degrees, seconds, meters per second and kilometers."""
-COLUMNS: Mapping[str, tuple[str, str, str]] = {
-    "time": ("time", r"t|time(stamp)?|date_?time|utc", "s"),
-    "x": ("field", r"(mag|magnetometer|b|m)?_?x", "nt"),
-    "y": ("field", r"(mag|magnetometer|b|m)?_?y", "nt"),
-    "z": ("field", r"(mag|magnetometer|b|m)?_?z", "nt"),
-    "roll": ("angle", "roll", "deg"),
-    "pitch": ("angle", "pitch", "deg"),
-    "heading": ("angle", r"(true_|mag(netic)?_)?(heading|hdg|yaw)(_true|_mag(netic)?)?", "deg"),
-    "speed": ("speed", r"speed|stw|sog", ""),
-    "distance": ("length", r"distance", "km"),
-    "latitude": ("angle", r"lat(itude)?", "deg"),
-    "longitude": ("angle", r"lon(gitude)?|lng", "deg"),
-    "altitude": ("length", r"alt(itude)?|depth", "m"),
-}
-"""Columns of the samples of a log: kind of the unit, names (a regular expression), and the unit without a suffix.
+"""Suffixes of a column, in the first unit of each kind: nanotesla, degrees, seconds, meters per second, kilometers."""
 
-A speed has no such unit. A depth is a negative altitude.
-"""
+
+class Column(NamedTuple):
+    """Kind of the unit, names (a regular expression), unit without a suffix, and least and greatest value."""
+
+    kind: str
+    names: str
+    unit: str
+    low: float = -math.inf
+    high: float = math.inf
+
+
+COLUMNS: Mapping[str, Column] = {
+    "time": Column("time", r"t|time(stamp)?|date_?time|utc", "s", -4.1e9, 4.1e9),  # up to the year 2099
+    "x": Column("field", r"(mag|magnetometer|b|m)?_?x", "nt"),
+    "y": Column("field", r"(mag|magnetometer|b|m)?_?y", "nt"),
+    "z": Column("field", r"(mag|magnetometer|b|m)?_?z", "nt"),
+    "roll": Column("angle", "roll", "deg", -360.001, 360.001),  # as of radians, rounded
+    "pitch": Column("angle", "pitch", "deg", -90.001, 90.001),
+    "heading": Column("angle", r"(true_|mag(netic)?_)?(heading|hdg|yaw)(_true|_mag(netic)?)?", "deg"),
+    "speed": Column("speed", r"speed|stw|sog", "", -12000, 12000),
+    "distance": Column("length", r"distance", "km", 0, 40000),
+    "latitude": Column("angle", r"lat(itude)?", "deg", -90, 90),
+    "longitude": Column("angle", r"lon(gitude)?|lng", "deg", -360, 360),
+    "altitude": Column("length", r"alt(itude)?|depth", "m", *IGRF.altitude_range_km),
+}
+"""Columns of the samples of a log. A speed has no unit without a suffix. A depth is a negative altitude."""
+_PATTERNS = {
+    name: re.compile(f"(?P<name>{column.names})(_(?P<unit>{'|'.join(UNITS[column.kind])}))?")
+    for name, column in COLUMNS.items()
+}
+
+
+def unit_of(header: str, kind: str) -> float | None:
+    """Return the unit that ends a header, as a factor to the first one of its kind; None where none does.
+
+    Example:
+        >>> unit_of("alt_km", "length"), unit_of("dip (rad)", "angle"), unit_of("altitude", "length")
+        (1.0, 57.29577951308232, None)
+    """
+    name = _plain(header)
+    return next((size for unit, size in UNITS[kind].items() if name.endswith(f"_{unit}")), None)
+
+
+def _plain(header: str) -> str:
+    """Return a header in lower case, with underscores between words and one of the two characters for micro."""
+    return re.sub(r"[^a-z0-9μ]+", "_", unicodedata.normalize("NFKC", header).lower()).strip("_")
 
 
 def column_of(header: str) -> tuple[str, float] | None:
@@ -52,15 +92,35 @@ def column_of(header: str) -> tuple[str, float] | None:
         >>> column_of("mag_x_uT"), column_of("Heading [rad]"), column_of("battery_V")
         (('x', 1000.0), ('heading', 57.29577951308232), None)
     """
-    name = re.sub(r"[^a-z0-9µ]+", "_", header.lower()).strip("_")
-    for column, (kind, names, usual) in COLUMNS.items():
-        units = "|".join(sorted(UNITS[kind], key=len, reverse=True))
-        if match := re.fullmatch(rf"(?P<name>{names})(_(?P<unit>{units}))?", name):
-            unit = match["unit"] or usual
+    name = _plain(header)
+    for column, pattern in _PATTERNS.items():
+        if match := pattern.fullmatch(name):
+            unit = match["unit"] or COLUMNS[column].unit
             if not unit:
-                raise ValueError(f"column {header!r} has no unit: name it, such as speed_m_s, speed_km_h or speed_kn")
-            return column, UNITS[kind][unit] * (-1 if match["name"] == "depth" else 1)
+                raise ValueError(f"column {short(header)} has no unit: name it speed_m_s, speed_km_h or speed_kn")
+            return column, UNITS[COLUMNS[column].kind][unit] * (-1 if match["name"] == "depth" else 1)
     return None
+
+
+def out_of_range(name: str, values: Array) -> str | None:
+    """Return which value of a column is not possible, as text; None if all are.
+
+    Args:
+        name: one of :data:`COLUMNS`.
+        values: in the units of the samples of a log.
+
+    Example:
+        >>> out_of_range("pitch", np.array([2.0, 200.0]))
+        'pitch 200 is not from -90 to 90 deg: check the column and its unit'
+    """
+    kind, _, _, low, high = COLUMNS[name]
+    wrong = values[(values < low) | (values > high)]
+    if not len(wrong):
+        return None
+    units = UNITS[kind]
+    likely = next((unit for unit, size in units.items() if low <= wrong[0] * size <= high), None)
+    remedy = f"is it in {likely}? Then name its column {name}_{likely}" if likely else "check the column and its unit"
+    return f"{name} {wrong[0]:.10g} is not from {low:.4g} to {high:.4g} {next(iter(units))}: {remedy}"
 
 
 def guess_unit(length: float, total_nt: float) -> str | None:

@@ -99,7 +99,7 @@ def test_notes(tmp_path: Path, rows, note: str) -> None:
     ("rows", "header", "message"),
     [
         ([], HEADER, "the table has no row"),
-        ([], "", "cannot read .*log.csv: No columns to parse"),
+        ([], "", "cannot read .*log.csv: the table has no row"),
         ([ROWS[1], ROWS[0]], HEADER, "time runs backward from row 1 to 2, from 1 to 0: sort the rows"),
         (["7200,1,1,1,0", "3601,1,1,1,0"], HEADER, "an hour back, as at the end of daylight saving time; log UTC"),
         (["0,x,1,1,0"], HEADER, r"row 1, mag_x_nT: 'x' is not a number"),

@@ -73,14 +73,27 @@ def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(tmp_path: Pa
     assert "4 of 4 readings do not fit IGRF" in capsys.readouterr().out
 
 
+def test_the_unit_that_ends_a_name_counts(tmp_path: Path) -> None:
+    """And the altitude is found with its unit."""
+    units = {"dec_rad": 57.29577951308232, "I_deg": 1.0, "H_uT": 1000.0, "distance_nmi": 1.852, "altitude_m": 0.001}
+    log = pd.read_csv(LOG).assign(altitude=10.0)
+    names = dict(zip(["D", "I", "B_H", "distance", "altitude"], units, strict=True))
+    scaled = log.assign(**{name: log[name] / units[other] for name, other in names.items()}).rename(columns=names)
+    log.to_csv(tmp_path / "log.csv", index=False)
+    scaled.to_csv(tmp_path / "other.csv", index=False)
+    options = dict(zip(["declination", "inclination", "horizontal", "distance"], units, strict=False))
+    found = recipe.read_log(recipe.Config(tmp_path / "other.csv", **options))
+    pd.testing.assert_frame_equal(found, recipe.read_log(recipe.Config(tmp_path / "log.csv")))
+
+
 @pytest.mark.parametrize(("km", "warned"), [(450.0, False), (0.45, True)])
 def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) -> None:
     """A log from 450 km fits IGRF there, also the direction of its north; an altitude of 450 m is named."""
     log = pd.read_csv(LOG)[:4]
     elements = elements_at(IGRF("2025-01-01", altitude_km=km), torch.tensor(log[["latitude", "longitude"]].to_numpy()))
     log[["D", "I", "B_H"]] = elements.numpy()
-    log.assign(km=450.0).to_csv(tmp_path / "log.csv", index=False)
-    options = ["--date", "2025-01-01", "--altitude", "km", "--north", "magnetic", "--out", str(tmp_path / "out")]
+    log.assign(altitude_km=450.0).to_csv(tmp_path / "log.csv", index=False)
+    options = ["--date", "2025-01-01", "--north", "magnetic", "--out", str(tmp_path / "out")]
     recipe.main([str(tmp_path / "log.csv"), *NOISE, *options])
     said = capsys.readouterr().out
     assert ("they fit if altitudes are in meters" in said) == warned
