@@ -213,7 +213,7 @@ def numbers_of(column: Series, wrong: list[str]) -> Array:
     bad = ~np.isfinite(numbers) & column.notna().to_numpy()
     if bad.any():
         row = int(bad.argmax())
-        wrong.append(f"row {row + 1}, {column.name}: {short(column.iloc[row])} is not a number")
+        wrong.append(f"row {row + 1}, {column.name}: {short(column.tolist()[row])} is not a number")
     return numbers
 
 

@@ -124,21 +124,21 @@ def test_ardupilot_as_text(tmp_path: Path) -> None:
     assert log.source == "ArduPilot DataFlash, text: GPS, MAG, ATT"
 
 
-def telemetry(path: Path, kind: str, air: float) -> Path:
+def telemetry(path: Path, kind: str, air: float, *, field: bool = True) -> Path:
     """Telemetry of ArduPilot or PX4; positions without a fix do not count."""
     link, parts = MAVLink(None), []
-    for row, (field, angles, q) in enumerate(
+    for row, (axes, angles, q) in enumerate(
         zip(AXES.tolist(), ATTITUDE.tolist(), quaternions(ATTITUDE).tolist(), strict=True)
     ):
         place = [round(x * 1e7) for x in PLACE] if row else [0, 0]
         zeros = (0,) * 6
-        imu = MAVLink_raw_imu_message(0, *zeros, *(round(axis / 100) for axis in field))
+        imu = MAVLink_raw_imu_message(0, *zeros, *(round(axis / 100) for axis in axes))
         attitude = MAVLink_attitude_message(0, *map(math.radians, angles), 0, 0, 0)
         if kind == "PX4":
-            imu = MAVLink_highres_imu_message(0, *zeros, *(axis / 1e5 for axis in field), 0, 0, 0, 0, 0, 1)
+            imu = MAVLink_highres_imu_message(0, *zeros, *(axis / 1e5 for axis in axes), 0, 0, 0, 0, 0, 1)
             attitude = MAVLink_attitude_quaternion_message(0, *q, 0, 0, 0)
         fix = MAVLink_gps_raw_int_message(0, 3 if row else 1, *place, *zeros)
-        messages = imu, attitude, fix, MAVLink_vfr_hud_message(air, 20.0, 0, 0, 0.0, 0.0)
+        messages = *[imu] * field, attitude, fix, MAVLink_vfr_hud_message(air, 20.0, 0, 0, 0.0, 0.0)
         stamp = struct.pack(">Q", int((UTC + row) * 1e6))
         parts += [stamp + message.pack(link) for message in messages]
     return written(path, b"".join(parts))
@@ -158,23 +158,18 @@ def test_telemetry(tmp_path: Path, kind: str, air: float) -> None:
     assert log.source == f"MAVLink telemetry: {', '.join([*names, 'GPS_RAW_INT', f'VFR_HUD.{speed}'])}"
 
 
-@pytest.mark.parametrize(("version", "storage"), [(1, "bag"), (2, "db3"), (2, "mcap")])
-def test_ros(tmp_path: Path, version: int, storage: str) -> None:
-    """Axes and attitude are those of ROS: forward, left, up; east, north, up.
-
-    Recorded .5 s late and in another order, beside an Imu without attitude and a magnetometer of zeros. A file of a
-    folder is read with the metadata of the folder and without.
-    """
+def bag(path: Path, version: int, storage: str = "bag", *left_out: str) -> Path:
+    """A bag of ROS, recorded .5 s late and in another order, with an Imu without attitude and a magnetometer of zeros,
+    without the types that are left out."""
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
     kind = {
         name.rpartition("/")[2]: each for name, each in store.types.items() if not name.startswith("std_msgs/msg/T")
     }
     zeros, unknown, place = np.zeros(9), np.array([-1.0, *[0.0] * 8]), (*PLACE, 0.0)
-    path = tmp_path / ("log.bag" if version == 1 else "log")
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer1(path) if version == 1 else Writer2(path, version=9, storage_plugin=plugin) as writer:
         types = {"/dead": "MagneticField", "/mag": "MagneticField", "/accelerometer": "Imu", "/imu": "Imu"}
-        types |= {"/fix": "NavSatFix"}
+        types = {topic: name for topic, name in (types | {"/fix": "NavSatFix"}).items() if name not in left_out}
         topics = {
             topic: writer.add_connection(topic, f"sensor_msgs/msg/{name}", typestore=store)
             for topic, name in types.items()
@@ -196,9 +191,20 @@ def test_ros(tmp_path: Path, version: int, storage: str) -> None:
                 "/imu": kind["Imu"](header, nothing if row == 6 else still, zeros, none, zeros, none, zeros),
                 "/fix": kind["NavSatFix"](header, kind["NavSatStatus"](status=0, service=1), *place, zeros, 0),
             }
-            for topic, message in messages.items():
+            for topic in topics:
+                message = messages[topic]
                 time = UTC + row + 0.5 + 2 * (topic == "/mag")
                 writer.write(topics[topic], round(time * 1e9), raw(message, message.__msgtype__))
+    return path
+
+
+@pytest.mark.parametrize(("version", "storage"), [(1, "bag"), (2, "db3"), (2, "mcap")])
+def test_ros(tmp_path: Path, version: int, storage: str) -> None:
+    """Axes and attitude are those of ROS: forward, left, up; east, north, up.
+
+    A file of a folder is read with the metadata of the folder and without, by its suffix.
+    """
+    path = bag(tmp_path / ("log.bag" if version == 1 else "log"), version, storage)
     log = read_log(path)
     check(log)
     assert log.north is None
@@ -206,10 +212,25 @@ def test_ros(tmp_path: Path, version: int, storage: str) -> None:
     assert "/mag" in log.source
     with pytest.raises(ValueError, match="no sample has a field"):
         read_log(path, sensor="/dead")
+    file = path if version == 1 else next(path.glob(f"*.{storage}"))
+    check(read_log(file))
     if version == 2:
-        check(read_log(next(path.glob(f"*.{storage}"))))
         (path / "metadata.yaml").unlink()
-        check(read_log(next(path.glob(f"*.{storage}"))))
+        check(read_log(file))
+    with pytest.raises(ValueError, match=rf"such a bag must end in \.{storage}: rename it .*\.{storage}"):
+        read_log(file.rename(tmp_path / "other"))
+
+
+def test_a_log_without_a_magnetometer_tells_how_to_log_one(tmp_path: Path) -> None:
+    silent = b"".join(line for line in nmea().splitlines(keepends=True) if b"XDR" not in line)
+    contents = {"vehicle_magnetometer or sensor_mag": ulog({}), "log MAG, by": dataflash(health=(0, 0))}
+    contents |= {"send XDR with MAG_X_NT": silent, "name its columns mag_x_nT": b"time,heading\n0,5\n"}
+    logs = {text: written(tmp_path / str(len(text)), content) for text, content in contents.items()}
+    logs["request RAW_IMU, SCALED_IMU2"] = telemetry(tmp_path / "log.tlog", "PX4", 9.0, field=False)
+    logs["record a topic of sensor_msgs/MagneticField"] = bag(tmp_path / "log.bag", 1, "bag", "MagneticField")
+    for text, path in logs.items():
+        with pytest.raises(ValueError, match=f"no column is the x of the magnetometer, among .*: .*{text}"):
+            read_log(path)
 
 
 def test_nmea(tmp_path: Path) -> None:
