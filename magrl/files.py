@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 MAX_FILE_BYTES = 10_000_000
 """Largest TOML or JSON file: a scenario with about fifty thousand tasks."""
+MAX_COLUMNS = 10_000
+"""Most columns of a table."""
 
 
 class DamagedFileError(ValueError):
@@ -285,6 +287,8 @@ def read_table(text: str, separator: str = ",", **options: Any) -> DataFrame:
         names = [name.strip() for name in next(csv.reader([header], delimiter=separator, strict=True), [])]
     except csv.Error as error:
         raise ValueError(f"the header {short(header)} is not closed, or too long") from error
+    if len(names) > MAX_COLUMNS:
+        raise ValueError(f"the table has {len(names)} columns, more than {MAX_COLUMNS}")
     name, count = (Counter(filter(None, names)).most_common(1) or [("", 0)])[0]
     if count > 1:
         raise ValueError(f"the table has {count} columns {short(name)}: keep one of them, or rename it")

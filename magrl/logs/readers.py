@@ -61,7 +61,7 @@ def examine(*paths: Path | str, frame: str = "FRD", sensor: str | None = None) -
         >>> path = Path(tempfile.mkdtemp()) / "log.csv"
         >>> _ = path.write_text("time_s,mag_x_uT,mag_y_uT,mag_z_uT,pitch" + chr(10) + "0,15,0,48,200")
         >>> examine(path)[1]
-        ['pitch 200 is not from -90 to 90 deg: check the column and its unit']
+        ['pitch 200 is not from -90 to 90 deg: check it and its unit']
     """
     check_choice(FRAMES, frame=frame)
     formats = [_format(path) for path in map(Path, paths)]
@@ -121,9 +121,9 @@ def _recording(path: Path, form: _Format, frame: str, sensor: str | None) -> Rec
     except ImportError:
         raise
     except Exception as error:
-        ours = ValueError if form.option != "sensor" else UsageError
+        ours = UsageError if form.option == "sensor" else (ValueError, OSError)
         foreign = f"it is damaged, or of an unknown version ({type(error).__name__}: {short(str(error))})"
-        raise ValueError(f"cannot read {path}: {error if isinstance(error, (ours, OSError)) else foreign}") from error
+        raise ValueError(f"cannot read {path}: {error if isinstance(error, ours) else foreign}") from error
 
 
 def _radians(samples: DataFrame) -> list[str]:

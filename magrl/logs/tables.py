@@ -97,7 +97,7 @@ def read_iaga(path: Path) -> Recording:
         angle = np.radians(components["D"] / 60)
         components = components.assign(X=components["H"] * np.cos(angle), Y=components["H"] * np.sin(angle))
     whole = components[[*"XYZ"]].notna().all(axis=1)
-    time, notes = times_of((table["date"] + "T" + table["time"] + "Z")[whole].rename("time"))
+    time, notes = times_of((table["date"].astype(str) + "T" + table["time"].astype(str) + "Z").rename("time"))
     columns = dict(zip(AXES, components.loc[whole, [*"XYZ"]].to_numpy().T, strict=True))
     for key, (name, unit) in _STATION.items():
         if key in station:
@@ -105,7 +105,7 @@ def read_iaga(path: Path) -> Recording:
     if "variation" in station.get("Data Type", "").lower():
         notes.append("the data are variations without the baselines of the observatory: they are not the whole field")
     columns |= dict.fromkeys(ATTITUDE, np.zeros(1))
-    streams = {name: (time, np.zeros(len(time)) + values) for name, values in columns.items()}
+    streams = {name: (time[whole], np.zeros(whole.sum()) + values) for name, values in columns.items()}
     return Recording(streams, f"IAGA-2002: {station.get('Station Name', path.stem)}", "true", notes, wrong)
 
 

@@ -111,16 +111,16 @@ def out_of_range(name: str, values: Array) -> str | None:
 
     Example:
         >>> out_of_range("pitch", np.array([2.0, 200.0]))
-        'pitch 200 is not from -90 to 90 deg: check the column and its unit'
+        'pitch 200 is not from -90 to 90 deg: check it and its unit'
     """
     kind, _, _, low, high = COLUMNS[name]
     wrong = values[(values < low) | (values > high)]
     if not len(wrong):
         return None
     units = UNITS[kind]
-    likely = next((unit for unit, size in units.items() if low <= wrong[0] * size <= high), None)
-    remedy = f"is it in {likely}? Then name its column {name}_{likely}" if likely else "check the column and its unit"
-    return f"{name} {wrong[0]:.10g} is not from {low:.4g} to {high:.4g} {next(iter(units))}: {remedy}"
+    likely = [f", as in {name}_{unit}" for unit, size in units.items() if low <= wrong[0] * size <= high]
+    unit = f"unit{''.join(likely[:1])}"
+    return f"{name} {wrong[0]:.10g} is not from {low:.4g} to {high:.4g} {next(iter(units))}: check it and its {unit}"
 
 
 def guess_unit(length: float, total_nt: float) -> str | None:

@@ -116,7 +116,7 @@ def test_notes(tmp_path: Path, rows, note: str) -> None:
         (
             ["1782813600000,1,1,1,0"],
             HEADER,
-            r"time 1\.78.* is not from .* s: is it in ms\? Then name its column",
+            r"time 1\.78.* is not from .* s: check it and its unit, as in time_ms",
         ),
         (["noon,1,1,1,0"], HEADER, "row 1, time_s: 'noon' is no time such as"),
         (ROWS, HEADER.replace("heading_true_deg", "bx"), "'mag_x_nT' and 'bx' are both the x: keep one of them"),
