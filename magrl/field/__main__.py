@@ -1,7 +1,7 @@
 """Evaluate the field at the points of a table: D, I, B_H, the vector, the total intensity and the gradients.
 
     python -m magrl.field points.csv                                        # writes points_field.csv
-    python -m magrl.field points.csv --altitude height --unit m --date 2026-07-01 --out field.parquet
+    python -m magrl.field points.csv --altitude height --unit m --date 2026-07-01 --out field.csv
 
 The table has a row for each point. Its columns are latitude and longitude [deg], altitude or depth [km], and date (ISO
 text or decimal year), or lat, lon, time, alt, and with a unit altitude_m, alt_km, depth_m. Other names are given by
@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 from magrl.checks import command, short
 from magrl.field.elements import NAMES, elements_gradient, seven_elements
 from magrl.field.igrf import IGRF, parse_date
-from magrl.files import read_table, read_text
+from magrl.files import check_writable, read_table, read_text
 
 if TYPE_CHECKING:
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
 UNITS_KM = {"km": 1.0, "m": 0.001}
 COLUMNS = {
@@ -44,8 +44,6 @@ COLUMNS = {
     "date": ("date", "time", "datetime"),
 }
 """Names by which a column is found, in lower case."""
-SUFFIXES = (".csv", ".parquet")
-NO_PARQUET = "pandas reads and writes Parquet with the package pyarrow: pip install pyarrow, or use .csv"
 _DIGITS = {"deg": 6, "nT": 4, "km": 9}
 
 
@@ -54,10 +52,8 @@ def parser() -> argparse.ArgumentParser:
     arguments = argparse.ArgumentParser(
         prog="python -m magrl.field", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    arguments.add_argument("points", type=Path, help="table of the points: .csv or .parquet")
-    arguments.add_argument(
-        "--out", type=Path, help="result: .csv or .parquet; by default beside the points, with _field"
-    )
+    arguments.add_argument("points", type=Path, help="table of the points: .csv")
+    arguments.add_argument("--out", type=Path, help="result: .csv; by default beside the points, with _field")
     for name, meaning in (("latitude", "geodetic latitude [deg]"), ("longitude", "longitude [deg]")):
         arguments.add_argument(f"--{name}", help=f"column of the {meaning}, or a number; default {_usual(name)}")
     height = arguments.add_mutually_exclusive_group()
@@ -134,7 +130,7 @@ def _columns(value: torch.Tensor, gradient: torch.Tensor) -> dict[str, NDArray[n
 
 def _name(table: DataFrame, name: str, given: str | None) -> str:
     """Return the column of a quantity: the given one, that of its name, or the one that has another usual name."""
-    usual = [column for column in map(str, table.columns) if column.lower() in COLUMNS[name]]
+    usual = [column for column in table.columns if column.lower() in COLUMNS[name]]
     if given is not None or name in usual or not usual:
         return given or name
     if len(usual) > 1:
@@ -225,56 +221,7 @@ def _date(value: Any) -> np.datetime64:
 
 
 def _listed(table: DataFrame) -> str:
-    return ", ".join(map(str, table.columns))
-
-
-def read_points(path: Path) -> DataFrame:
-    """Return a table from a file; columns of a CSV file stay text, so that they are written as they were.
-
-    Raises:
-        ValueError: for a file that is no table.
-    """
-    import pandas
-
-    try:
-        if path.suffix == ".parquet":
-            return pandas.read_parquet(path)
-        return read_table(read_text(path), dtype=str, keep_default_na=False)
-    except ImportError as error:
-        raise ValueError(NO_PARQUET) from error
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path} is not a table: {error}") from error
-
-
-def write_points(path: Path, table: DataFrame) -> None:
-    """Write a table, in the format of the suffix; in Parquet, columns of numbers that were text become numbers."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".csv":
-        return table.to_csv(path, index=False)
-    try:
-        return table.apply(_as_numbers).to_parquet(path, index=False)
-    except ImportError as error:
-        raise ValueError(NO_PARQUET) from error
-
-
-def _as_numbers(column: Series) -> Series:
-    """Return a column of texts as numbers if all of them are, else the column."""
-    import pandas
-
-    try:
-        return pandas.to_numeric(column)
-    except (ValueError, TypeError):
-        return column
-
-
-def check_suffix(path: Path) -> None:
-    """Raise unless a file ends in one of :data:`SUFFIXES`.
-
-    Example:
-        >>> check_suffix(Path("points.csv"))
-    """
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"a table must end in {' or '.join(SUFFIXES)}, got {str(path)!r}")
+    return ", ".join(table.columns)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -283,13 +230,16 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _main(options: argparse.Namespace) -> None:
-    check_suffix(options.points)
-    out = options.out or options.points.with_stem(f"{options.points.stem}_field")
-    check_suffix(out)
-    if out.resolve() == options.points.resolve():
-        raise ValueError(f"--out {out} would replace the points: choose another name")
-    table = field_of_points(read_points(options.points), options)
-    write_points(out, table)
+    out = options.out or options.points.with_name(f"{options.points.stem}_field.csv")
+    if out.suffix != ".csv" or out.resolve() == options.points.resolve():
+        raise ValueError(f"--out must be another file that ends in .csv, got {str(out)!r}")
+    try:
+        points = read_table(read_text(options.points), dtype=str, keep_default_na=False)  # which stay as they were
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{options.points} is not a table: {error}") from error
+    table = field_of_points(points, options)
+    check_writable(out)
+    table.to_csv(out, index=False)
     print(f"The field at {len(table)} points is in {out}")
 
 

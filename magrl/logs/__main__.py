@@ -19,17 +19,16 @@ from typing import Any
 
 import numpy as np
 import pandas
-from pandas import DataFrame, Series
+from pandas import DataFrame
 
 from magrl.checks import command
 from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.logs.calibration import Calibration, calibrate
 from magrl.logs.comparison import difference_from_igrf, mistakes
-from magrl.logs.readers import examine
+from magrl.logs.readers import read_log
 from magrl.logs.readings import STD_NAMES, obstacles, readings_of
-from magrl.logs.samples import ATTITUDE, AXES, Log
-from magrl.logs.units import intensity_mistake
+from magrl.logs.samples import ATTITUDE, AXES, Log, total_intensity
 from magrl.logs.vectors import FRAMES, NORTHS
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
@@ -75,20 +74,16 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _main(options: argparse.Namespace) -> None:
-    log, wrong = examine(*options.log, frame=options.frame, sensor=options.sensor)
-    mistake = intensity_mistake(_totals(log).median())
-    notes = [text for text in log.notes if text != mistake]
-    notes += [] if options.calibrate else remarks(log, options)
+    wrong: list[str] = []
+    log = read_log(*options.log, frame=options.frame, sensor=options.sensor, wrong=wrong)
+    notes = [*log.notes, *([] if options.calibrate else remarks(log, options))]
     print("\n".join([*summary(log), *(f"note: {text}" for text in notes)]), flush=True)
     date = options.date or log.date
-    if not options.calibrate:
-        wrong += [mistake] if mistake else []
-        missing = obstacles(log, options.north)
-        if missing and not wrong and not obstacles(log, "true"):  # the north alone is missing, and D may show it
-            missing += mistakes(readings_of(log, north="true", **_parts(options)), date)
-        wrong += missing
-    if wrong:
-        print("\n".join(f"error: {text}" for text in wrong), file=sys.stderr)
+    missing = [] if options.calibrate else obstacles(log, options.north)
+    if missing and not wrong and not obstacles(log, "true"):  # the north alone is missing, and D may show it
+        missing += mistakes(readings_of(log, north="true", **_parts(options)), date)
+    if wrong or missing:
+        print("\n".join(f"error: {text}" for text in wrong + missing), file=sys.stderr)
         raise ValueError("no readings: correct what is named above")
     print("\n".join(swing(log, options, date) if options.calibrate else way(log, options, date)))
 
@@ -104,7 +99,7 @@ def summary(log: Log) -> list[str]:
     samples = log.samples
     time = samples["time"].to_numpy(float)
     rate = f"{1 / np.median(np.diff(time)):.3g} Hz" if len(time) > 1 else "one sample"
-    total = _totals(log)
+    total = total_intensity(samples)
     return [
         f"{log.source}: {len(samples)} samples in {time[-1] - time[0]:.4g} s, {rate}, date {log.date or 'unknown'}",
         f"columns: {', '.join(samples)}; north of the heading: {log.north or 'not stated'}",
@@ -127,11 +122,6 @@ def remarks(log: Log, options: argparse.Namespace) -> list[str]:
 def _north(log: Log, options: argparse.Namespace) -> str | None:
     """Return the north of the heading; that of a log without a heading is magnetic."""
     return (options.north or log.north) if "heading" in log.samples else "magnetic"
-
-
-def _totals(log: Log) -> Series:
-    """Return the total intensity of each sample [nT]."""
-    return np.sqrt(np.square(log.samples[list(AXES)]).sum(axis=1))
 
 
 def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:

@@ -168,7 +168,7 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
             continue
         if name not in raw:
             raise ValueError(f"no column of {path} is {name!r}: name that of {key}, one of {short([*raw], 300)}")
-        kind = "field" if key == "B_H" else COLUMNS[key].kind if key in COLUMNS else "angle"
+        kind = "field" if key == "B_H" else COLUMNS.get(key, ("angle",))[0]
         sign = -1 if name.lower().startswith("depth") else 1
         log[key] = sign * (unit_of(name, kind) or 1.0) * pandas.to_numeric(raw[name], errors="coerce")
         bad = ~np.isfinite(log[key])

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pandas import DataFrame, Series
 
 from magrl.checks import short
-from magrl.logs.units import COLUMNS, Array
+from magrl.files import numbers_of
+from magrl.logs.units import COLUMNS, Array, out_of_range
 
 AXES, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "heading")
 _ANGLES = ("roll", "heading", "longitude")  # which jump by 360 degrees
@@ -79,6 +80,16 @@ class Log:
         return torch.from_numpy(np.stack(columns, -1))
 
 
+def total_intensity(samples: DataFrame) -> Series:
+    """Return the total intensity of each sample [nT].
+
+    Example:
+        >>> total_intensity(DataFrame({"x": [3.0], "y": [0.0], "z": [4.0]})).tolist()
+        [5.0]
+    """
+    return samples[list(AXES)].pow(2).sum(axis=1).pow(0.5)
+
+
 def date_of(time: float) -> str | None:
     """Return the date of a time in seconds since 1970; None for one since the log began.
 
@@ -86,7 +97,7 @@ def date_of(time: float) -> str | None:
         >>> date_of(1.8e9), date_of(3600.0)
         ('2027-01-15', None)
     """
-    return datetime.datetime.fromtimestamp(time, datetime.UTC).date().isoformat() if time > _EPOCH else None
+    return datetime.datetime.fromtimestamp(time, datetime.UTC).date().isoformat() if _EPOCH < time < 4.1e9 else None
 
 
 def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[str]]:
@@ -103,6 +114,8 @@ def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[s
         >>> check_times(np.array([0.0, 1.0, 1.0, 2.0]))
         (array([ True, True, False, True]), ['1 row with the time of the row before left out'])
     """
+    if unit == "s" and (text := out_of_range("time", time)):
+        raise ValueError(text)
     if not np.isfinite(time).all():
         raise ValueError(f"row {int(np.argmin(np.isfinite(time))) + 1} has no time")
     step = np.diff(time)
@@ -199,22 +212,6 @@ def _at(time: Array, name: str, times: Array, values: Array) -> Array:
     ends = {} if name in ("latitude", "longitude", "altitude", "speed") else {"left": np.nan, "right": np.nan}
     column = np.interp(time, times, np.unwrap(values, period=360) if turning else values, **ends)
     return (column + 180) % 360 - 180 if name in ("roll", "longitude") else column % 360 if turning else column
-
-
-def numbers_of(column: Series, wrong: list[str]) -> Array:
-    """Return the numbers of a column, NaN for blank cells, and add the first cell that is no finite number to a list.
-
-    Example:
-        >>> wrong = []
-        >>> numbers_of(Series(["1.5", None, "x"], name="roll"), wrong), wrong
-        (array([1.5, nan, nan]), ["row 3, roll: 'x' is not a number"])
-    """
-    numbers = pandas.to_numeric(column, errors="coerce").to_numpy(float)
-    bad = ~np.isfinite(numbers) & column.notna().to_numpy()
-    if bad.any():
-        row = int(bad.argmax())
-        wrong.append(f"row {row + 1}, {column.name}: {short(column.tolist()[row])} is not a number")
-    return numbers
 
 
 def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:

@@ -10,8 +10,8 @@ import numpy as np
 from pandas import DataFrame, Series
 
 from magrl.checks import short
-from magrl.files import read_table, read_text
-from magrl.logs.samples import ATTITUDE, AXES, Recording, numbers_of, times_of
+from magrl.files import numbers_of, read_table, read_text
+from magrl.logs.samples import ATTITUDE, AXES, Recording, times_of
 from magrl.logs.units import column_of
 from magrl.logs.vectors import FRAMES
 

@@ -6,7 +6,6 @@ import math
 import re
 import unicodedata
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,34 +31,26 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 """Suffixes of a column, in the first unit of each kind: nanotesla, degrees, seconds, meters per second, kilometers."""
 
 
-class Column(NamedTuple):
-    """Kind of the unit, names (a regular expression), unit without a suffix, and least and greatest value."""
-
-    kind: str
-    names: str
-    unit: str
-    low: float = -math.inf
-    high: float = math.inf
-
-
-COLUMNS: Mapping[str, Column] = {
-    "time": Column("time", r"t|time(stamp)?|date_?time|utc", "s", -4.1e9, 4.1e9),  # up to the year 2099
-    "x": Column("field", r"(mag|magnetometer|b|m)?_?x", "nt"),
-    "y": Column("field", r"(mag|magnetometer|b|m)?_?y", "nt"),
-    "z": Column("field", r"(mag|magnetometer|b|m)?_?z", "nt"),
-    "roll": Column("angle", "roll", "deg", -360.001, 360.001),  # as of radians, rounded
-    "pitch": Column("angle", "pitch", "deg", -90.001, 90.001),
-    "heading": Column("angle", r"(true_|mag(netic)?_)?(heading|hdg|yaw)(_true|_mag(netic)?)?", "deg"),
-    "speed": Column("speed", r"speed|stw|sog", "", -12000, 12000),
-    "distance": Column("length", r"distance", "km", 0, 40000),
-    "latitude": Column("angle", r"lat(itude)?", "deg", -90, 90),
-    "longitude": Column("angle", r"lon(gitude)?|lng", "deg", -360, 360),
-    "altitude": Column("length", r"alt(itude)?|depth", "m", *IGRF.altitude_range_km),
+_ANY = -math.inf, math.inf
+COLUMNS: Mapping[str, tuple[str, str, str, float, float]] = {
+    "time": ("time", r"t|time(stamp)?|date_?time|utc", "s", -4.1e9, 4.1e9),  # up to the year 2099
+    "x": ("field", r"(mag|magnetometer|b|m)?_?x", "nt", *_ANY),
+    "y": ("field", r"(mag|magnetometer|b|m)?_?y", "nt", *_ANY),
+    "z": ("field", r"(mag|magnetometer|b|m)?_?z", "nt", *_ANY),
+    "roll": ("angle", "roll", "deg", -360.001, 360.001),  # as of radians, rounded
+    "pitch": ("angle", "pitch", "deg", -90.001, 90.001),
+    "heading": ("angle", r"(true_|mag(netic)?_)?(heading|hdg|yaw)(_true|_mag(netic)?)?", "deg", *_ANY),
+    "speed": ("speed", r"speed|stw|sog", "", -12000, 12000),
+    "distance": ("length", r"distance", "km", 0, 40000),
+    "latitude": ("angle", r"lat(itude)?", "deg", -90, 90),
+    "longitude": ("angle", r"lon(gitude)?|lng", "deg", -360, 360),
+    "altitude": ("length", r"alt(itude)?|depth", "m", *IGRF.altitude_range_km),
 }
-"""Columns of the samples of a log. A speed has no unit without a suffix. A depth is a negative altitude."""
+"""Columns of the samples of a log: kind of the unit, names (a regular expression), the unit without a suffix, and the
+least and the greatest value. A speed has no such unit. A depth is a negative altitude."""
 _PATTERNS = {
-    name: re.compile(f"(?P<name>{column.names})(_(?P<unit>{'|'.join(UNITS[column.kind])}))?")
-    for name, column in COLUMNS.items()
+    name: re.compile(f"(?P<name>{names})(_(?P<unit>{'|'.join(UNITS[kind])}))?")
+    for name, (kind, names, *_) in COLUMNS.items()
 }
 
 
@@ -93,12 +84,11 @@ def column_of(header: str) -> tuple[str, float] | None:
         (('x', 1000.0), ('heading', 57.29577951308232), None)
     """
     name = _plain(header)
-    for column, pattern in _PATTERNS.items():
-        if match := pattern.fullmatch(name):
-            unit = match["unit"] or COLUMNS[column].unit
-            if not unit:
+    for column, (kind, _, usual, *_) in COLUMNS.items():
+        if match := _PATTERNS[column].fullmatch(name):
+            if not (unit := match["unit"] or usual):
                 raise ValueError(f"column {short(header)} has no unit: name it speed_m_s, speed_km_h or speed_kn")
-            return column, UNITS[COLUMNS[column].kind][unit] * (-1 if match["name"] == "depth" else 1)
+            return column, UNITS[kind][unit] * (-1 if match["name"] == "depth" else 1)
     return None
 
 

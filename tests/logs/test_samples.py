@@ -32,10 +32,10 @@ def written(folder: Path, *rows: str, header: str = HEADER) -> Path:
     [
         ("Time [us],Bx [G],By [G],Bz [G]", "1e6,0.15,0,0.48", "z", 48000.0),
         ("timestamp,mag_x_μT,mag_y_mG,mag_z_gauss", "1,15,10,0.48", "x", 15000.0),
-        ("utc,magx,magy,magz,Yaw (rad)", "1,15,10,0.48,3.14159265358979", "heading", 180.0),
-        ("time,x,y,z,distance_m", "1,1,1,1,500", "distance", 0.0),
-        ("time,x,y,z,depth_m", "1,1,1,1,30", "altitude", -0.03),
-        ("time,x,y,z", "2026-06-30T12:00:00+02:00,1,1,1", "time", 1782813600.0),
+        ("utc,magx,magy,magz,Yaw (rad)", "1,0,0,5e4,3.14159265358979", "heading", 180.0),
+        ("time,x,y,z,distance_m", "1,0,0,5e4,500", "distance", 0.0),
+        ("time,x,y,z,depth_m", "1,0,0,5e4,30", "altitude", -0.03),
+        ("time,x,y,z", "2026-06-30T12:00:00+02:00,0,0,5e4", "time", 1782813600.0),
     ],
 )
 def test_columns_and_units(tmp_path: Path, header: str, row: str, column: str, value: float) -> None:
@@ -67,7 +67,14 @@ def test_the_north_of_a_column(tmp_path: Path, name: str, north: str | None) -> 
 
 def test_blank_cells_are_interpolated(tmp_path: Path) -> None:
     """Headings through north; positions that are slower than the magnetometer; rows without axes are left out."""
-    rows = "0,1,1,1,350,10", "1,1,1,1,,", "1.5,,,,,", "1.7,0,0,0,,", "2,1,1,1,10,12", "3,1,1,1,20,"
+    rows = (
+        "0,0,0,5e4,350,10",
+        "1,0,0,5e4,,",
+        "1.5,,,,,",
+        "1.7,0,0,0,,",
+        "2,0,0,5e4,10,12",
+        "3,0,0,5e4,20,",
+    )
     samples = read_log(written(tmp_path, *rows, header=HEADER + ",lat")).samples
     assert samples["time"].tolist() == [0, 1, 2, 3]
     assert samples["heading"].tolist() == pytest.approx([350, 0, 10, 20])
@@ -81,7 +88,14 @@ def test_a_number_that_is_cut_does_not_count(tmp_path: Path) -> None:
 
 def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
     """A row that repeats a time adds nothing; the distance of a row without axes, or of zeros, belongs to the next."""
-    rows = "0,1,1,1,0,0", "1,1,1,1,0,5", "1,1,1,1,0,5", "2,0,0,0,0,7", "3,,,,0,1", "4,1,1,1,0,2"
+    rows = (
+        "0,0,0,5e4,0,0",
+        "1,0,0,5e4,0,5",
+        "1,0,0,5e4,0,5",
+        "2,0,0,0,0,7",
+        "3,,,,0,1",
+        "4,0,0,5e4,0,2",
+    )
     samples = read_log(written(tmp_path, *rows, header=HEADER + ",distance_km")).samples
     assert samples["distance"].tolist() == [0, 5, 10]
 
@@ -92,13 +106,10 @@ def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
         ([*ROWS, "3,15300"], "the last row is not complete, and is left out: the log"),
         ([*ROWS[:2], *ROWS[1:]], "1 row with the time of the row before left out"),
         (
-            [*ROWS, *(f"{3600 + i},1,1,1,0" for i in range(3, 99))],
+            [*ROWS, *(f"{3600 + i},0,0,5e4,0" for i in range(3, 99))],
             "1 gap, the longest of 3601 s, which is",
         ),
-        (["2026-06-30T12:00:00,1,1,1,0"], "the times have no time zone: they are taken as UTC"),
-        (["0,0.15,0,0.48,0"], "the total intensity is 0.50.*, which looks like gauss: name the columns mag_x_gauss"),
-        (["0,15,0,48,0"], "the total intensity is 50.2.*, which looks like microtesla"),
-        (["0,90,0,-4095,0"], "the total intensity is 4095.*, where about 48000 nT are expected: scale raw counts"),
+        (["2026-06-30T12:00:00,0,0,5e4,0"], "the times have no time zone: they are taken as UTC"),
         ([*ROWS, "3,0,0,0,40"], "1 sample of three zeros left out"),
     ],
 )
@@ -112,13 +123,24 @@ def test_notes(tmp_path: Path, rows, note: str) -> None:
         ([], HEADER, "the table has no row"),
         ([], "", "cannot read .*log.csv: the table has no row"),
         ([ROWS[1], ROWS[0]], HEADER, "time runs backward from row 1 to 2, from 1 to 0: sort the rows"),
-        (["7200,1,1,1,0", "3601,1,1,1,0"], HEADER, "an hour back, as at the end of daylight saving time; log UTC"),
         (
-            ["1782813600000,1,1,1,0"],
+            ["7200,0,0,5e4,0", "3601,0,0,5e4,0"],
+            HEADER,
+            "an hour back, as at the end of daylight saving time; log UTC",
+        ),
+        (
+            ["1782813600000,0,0,5e4,0"],
             HEADER,
             r"time 1\.78.* is not from .* s: check it and its unit, as in time_ms",
         ),
-        (["noon,1,1,1,0"], HEADER, "row 1, time_s: 'noon' is no time such as"),
+        (
+            ["0,0.15,0,0.48,0"],
+            HEADER,
+            r"total intensity is 0\.50.*, which looks like gauss: name the columns mag_x_gauss",
+        ),
+        (["0,15,0,48,0"], HEADER, r"the total intensity is 50\.2.*, which looks like microtesla"),
+        (["0,90,0,-4095,0"], HEADER, "is 4095.*, where about 48000 nT are expected: scale raw counts"),
+        (["noon,0,0,5e4,0"], HEADER, "row 1, time_s: 'noon' is no time such as"),
         (ROWS, HEADER.replace("heading_true_deg", "bx"), "'mag_x_nT' and 'bx' are both the x: keep one of them"),
         (ROWS, "clock,x,bx,y,speed", "are both the x: .*; column 'speed' has .*; no column is the time"),
     ],
