@@ -16,7 +16,7 @@ from torch import Tensor
 
 from magrl.checks import check_choice, check_number, short
 from magrl.field.elements import NAMES, elements_jacobian, measured_elements
-from magrl.files import read_table, read_text
+from magrl.files import numbers_of, read_table, read_text
 from magrl.geodesy import geodesic
 from magrl.logs.calibration import Calibration
 from magrl.logs.samples import ATTITUDE, AXES, Array, Log, checked_times
@@ -160,21 +160,18 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
         raw = read_table(read_text(Path(path)), dtype=str)
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
-    log = DataFrame({"row": np.arange(len(raw)) + 1})  # the header is not counted
+    log, wrong = DataFrame({"row": np.arange(len(raw)) + 1}), list[str]()  # the header is not counted
     located = any(names.get(key) in raw for key in ("latitude", "longitude"))
     for key, name in names.items():
         name = _altitude_name(raw) if name == "altitude" else name
-        if name not in raw and (key == "altitude" or (key in ("latitude", "longitude") and not located)):
-            continue
-        if name not in raw:
-            raise ValueError(f"no column of {path} is {name!r}: name that of {key}, one of {short([*raw], 300)}")
-        kind = "field" if key == "B_H" else COLUMNS.get(key, ("angle",))[0]
-        sign = -1 if name.lower().startswith("depth") else 1
-        log[key] = sign * (unit_of(name, kind) or 1.0) * pandas.to_numeric(raw[name], errors="coerce")
-        bad = ~np.isfinite(log[key])
-        if bad.any():
-            row = int(bad.idxmax())
-            raise ValueError(f"row {row + 1} of {path}: {name} is {short(raw[name][row])}, which is not a number")
+        if name in raw:
+            kind = "field" if key == "B_H" else COLUMNS.get(key, ("angle",))[0]
+            sign = -1 if name.lower().startswith("depth") else 1
+            log[key] = sign * (unit_of(name, kind) or 1.0) * numbers_of(raw[name].fillna(""), wrong)
+        elif key in ("D", "I", "B_H", "heading", "distance") or (located and key != "altitude"):
+            wrong.append(f"no column is {name!r}: name that of {key}, one of {short([*raw], 300)}")
+    if wrong:
+        raise ValueError(f"cannot read {path}: {'; '.join(wrong)}")
     if len(log) < 2:
         raise ValueError(f"{path} must hold at least two rows, got {len(log)}")
     log.attrs = {"notes": [], "date": None}

@@ -136,7 +136,7 @@ def test_notes(tmp_path: Path, rows, note: str) -> None:
         (
             ["0,0.15,0,0.48,0"],
             HEADER,
-            r"total intensity is 0\.50.*, which looks like gauss: name the columns mag_x_gauss",
+            r"intensity is 0\.50.*, which looks like gauss: name the columns mag_x_gauss",
         ),
         (["0,15,0,48,0"], HEADER, r"the total intensity is 50\.2.*, which looks like microtesla"),
         (["0,90,0,-4095,0"], HEADER, "is 4095.*, where about 48000 nT are expected: scale raw counts"),

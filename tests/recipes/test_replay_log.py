@@ -109,7 +109,8 @@ def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) ->
     ("change", "arguments", "message"),
     [
         (("B_H", "H"), (), "is 'B_H': name that of B_H, one of \\['time', 'D', 'I', 'H'"),
-        (("1.310", "x"), (), r"row 2 of .*: D is 'x', which is not a number"),
+        (("1.310", "x"), (), r"cannot read .*: row 2, D: 'x' is not a number"),
+        (("1.310", ""), (), r"cannot read .*: row 2, D: '' is not a number"),
         (("14271.7", "14.27"), (), r"row 2 of .*microtesla"),
         (("14271.7", "19000"), (), r"row 2 of .*B_H changed from 14293.5 to 19000 nT over 20 km"),
         (("290.0,20.0", "290.0,20000.0"), (), r"row 2 of .*distance 20000 km is longer than the longest move"),
