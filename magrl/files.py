@@ -318,7 +318,7 @@ def numbers_of(column: Series, wrong: list[str]) -> NDArray[np.float64]:
     """
     import pandas
 
-    numbers = pandas.to_numeric(column, errors="coerce").to_numpy(float)
+    numbers = np.array(pandas.to_numeric(column, errors="coerce"), dtype=float)
     bad = ~np.isfinite(numbers) & column.notna().to_numpy()
     if bad.any():
         row = int(bad.argmax())

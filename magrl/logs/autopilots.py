@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ MODEL_NORTH = (
 )
 NOT_CALIBRATED = "the magnetometer is as it was measured, without the calibration of the autopilot"
 _Rows = dict[tuple[str, ...], dict[str, list[tuple[float, ...]]]]
-_Tables = dict[tuple[str, ...], Mapping[str, Array]]
+_Tables = dict[tuple[str, ...], dict[str, Array]]
 _QUATERNION, _PLACE = ("w", "x", "y", "z"), ("latitude", "longitude")
 
 
@@ -95,10 +96,17 @@ def _rank(name: str, rows: Array, used: Collection[str]) -> tuple[bool, bool, bo
 
 # PX4
 
-_GAUSS = [f"magnetometer_ga[{index}]" for index in range(3)]
 _RAW_TOPIC = "sensor_mag"
-_MAGNETOMETERS = {"vehicle_magnetometer": _GAUSS, "sensor_combined": _GAUSS, _RAW_TOPIC: list(AXES)}
-"""Topics with a magnetometer [gauss], the calibrated one first."""
+_GAUSS = AXES, [f"magnetometer_ga[{index}]" for index in range(3)], FIELD_NT["gauss"]
+_TOPICS: Sequence[tuple[str, tuple[tuple[str, ...], Sequence[str], float]]] = (
+    ("vehicle_magnetometer", _GAUSS),
+    ("sensor_combined", _GAUSS),
+    (_RAW_TOPIC, (AXES, AXES, FIELD_NT["gauss"])),
+    ("vehicle_attitude", (_QUATERNION, [f"q[{index}]" for index in range(4)], 1.0)),
+    ("vehicle_gps_position", (_PLACE, ("latitude_deg", "longitude_deg"), 1.0)),
+    ("vehicle_gps_position", (_PLACE, ("lat", "lon"), 1e-7)),  # of older logs
+)
+"""Topics: columns, their fields, and their unit."""
 
 
 def read_ulg(path: Path, sensor: str | None = None) -> Recording:
@@ -107,45 +115,26 @@ def read_ulg(path: Path, sensor: str | None = None) -> Recording:
         log = package("pyulog", "pyulog").ULog(file)
     instances = sorted(log.data_list, key=lambda item: item.multi_id)
     topics = {item.name: item.data for item in reversed(instances)}  # the first instance of each
-    fields, used = _px4_fields(instances, topics)
-    tables: _Tables = {AXES: fields} if fields else {}
-    if "vehicle_attitude" in topics:
-        tables[_QUATERNION] = _px4_table(topics, "vehicle_attitude", [f"q[{index}]" for index in range(4)])
+    selected = topics.get("sensor_selection", {}).get("mag_device_id", [None])[-1]
+    tables: _Tables = defaultdict(dict)
+    used: list[str] = []
+    for (topic, (columns, fields, unit)), item in product(_TOPICS, instances):
+        if item.name == topic and {*fields} <= item.data.keys():
+            rows = np.column_stack((item.data["timestamp"] / 1e6, *(unit * item.data[field] for field in fields)))
+            fixed = np.broadcast_to(item.data.get("fix_type", 3), len(rows)) >= 3
+            name = f"{topic}:{item.multi_id}" if item.multi_id else topic
+            tables[columns] |= {name: rows[fixed]} if fixed.any() else {}
+            used += [name] if item.data.get("device_id", [0])[-1] == selected else []
+    recording = _recording("PX4 ULog", {columns: some for columns, some in tables.items() if some}, sensor, used)
     position = topics.get("vehicle_gps_position", {})
     fixed = np.asarray(position.get("fix_type", ())) >= 3
-    offset = 0.0
-    if fixed.any():  # older logs have 1e-7 degrees as integers
-        columns, unit = (("lat", "lon"), 1e-7) if "lat" in position else (("latitude_deg", "longitude_deg"), 1.0)
-        (name, place), *_ = _px4_table(topics, "vehicle_gps_position", columns).items()
-        tables[_PLACE] = {name: place[fixed] * (1, unit, unit)}
-        offset = float(np.median((position["time_utc_usec"] - position["timestamp"].astype(float))[fixed])) / 1e6
+    offset = np.median((position["time_utc_usec"] - position["timestamp"].astype(float))[fixed]) if fixed.any() else 0.0
     flags = topics.get("estimator_status_flags", {})
     gnss = np.mean(flags.get("cs_gnss_yaw", flags.get("cs_gps_yaw", 0))) > 0.5  # the heading of two antennas is used
-    recording = _recording("PX4 ULog", tables, sensor, used)
     notes = [] if gnss else [MODEL_NORTH]
     notes += ["the file is damaged or truncated"] if log.file_corruption or _is_cut(path) else []
-    streams = {column: (time + offset, values) for column, (time, values) in recording.streams.items()}
+    streams = {column: (time + offset / 1e6, values) for column, (time, values) in recording.streams.items()}
     return Recording(streams, recording.source, "true" if gnss else "model", [*notes, *recording.notes])
-
-
-def _px4_table(topics: Mapping[str, Any], name: str, columns: Sequence[str]) -> dict[str, Array]:
-    """Return rows of time [s] and columns of a topic, by its name."""
-    return {name: np.column_stack((topics[name]["timestamp"] / 1e6, *(topics[name][column] for column in columns)))}
-
-
-def _px4_fields(instances: Sequence[Any], topics: Mapping[str, Any]) -> tuple[dict[str, Array], list[str]]:
-    """Return the rows of all magnetometers, and the names of those that the estimator used."""
-    fields: dict[str, Array] = {}
-    used: list[str] = []
-    selected = topics.get("sensor_selection", {}).get("mag_device_id", [None])[-1]
-    for topic, columns in _MAGNETOMETERS.items():
-        for item in instances:
-            if item.name == topic and columns[0] in item.data:
-                name = f"{topic}:{item.multi_id}" if item.multi_id else topic
-                fields |= _px4_table({name: item.data}, name, columns)
-                fields[name][:, 1:] *= FIELD_NT["gauss"]
-                used += [name] if item.data.get("device_id", [0])[-1] == selected else []
-    return fields, used
 
 
 def _is_cut(path: Path) -> bool:
