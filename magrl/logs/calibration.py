@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 from magrl.checks import CheckedModel, check_number, check_tensor
 from magrl.field.elements import elements_jacobian, field_vector
 from magrl.files import DamagedFileError, write_json
-from magrl.logs.units import guess_unit
+from magrl.logs.units import intensity_mistake
 from magrl.logs.vectors import rotation
 from magrl.onboard.start import known_elements
 
@@ -292,12 +292,8 @@ def _check_samples(axes: Tensor, total: float) -> None:
         raise ValueError(f"sample {row + 1} is {axes[row].tolist()}: leave out samples that are not finite")
     lengths = axes.norm(dim=-1)
     length, change = float(lengths.median()), float(lengths.std())
-    unit = guess_unit(length, total)
-    if unit or not 0.25 < length / total < 4:
-        raise ValueError(
-            f"the samples have a length of {length:g}, where {total:.0f} nT are expected: "
-            + (f"they look like {unit}" if unit else "scale raw counts to nanotesla")
-        )
+    if mistake := intensity_mistake(length, total):
+        raise ValueError(mistake)
     if change < 1e-6 * length:
         raise ValueError(f"all samples have the length {length:g}: log the field as measured, not its direction alone")
 

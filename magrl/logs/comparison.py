@@ -11,6 +11,7 @@ from torch import Tensor
 from magrl.field import IGRF
 from magrl.field.elements import NAMES, element_difference, measured_elements
 from magrl.geodesy import geodesic
+from magrl.logs.units import out_of_range
 from magrl.onboard.start import deviation, likely_mistake, model_std
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
@@ -67,9 +68,8 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     if not len(rows):
         return texts
     place = place[~nowhere]
-    if place[:, 0].abs().max() > 90:
-        worst = float(place[:, 0].abs().max())
-        return [*texts, f"latitude {worst:g} is outside -90 to 90: latitude and longitude are swapped"]
+    if text := out_of_range("latitude", place[:, 0].numpy()):
+        return [*texts, text]
     elements = _columns(rows, *NAMES)
     expected = elements if date is None else _igrf_elements(place, date)
     if date is not None:
@@ -116,17 +116,15 @@ def _field_mistakes(readings: DataFrame, expected: Tensor, place: Tensor, date: 
     if wrong.double().mean() <= MOST_SPIKES:
         return [f"{start}: spikes, or iron near the vehicle there"]
     latitude, longitude, altitude = place[wrong].unbind(-1)
-    others = {
+    places = {
         "they fit if latitude and longitude are swapped": (longitude.clamp(-90, 90), latitude, altitude),
         "they fit if longitudes are positive toward the west, and east is expected": (latitude, -longitude, altitude),
         "they fit if latitudes are positive toward the south, and north is expected": (-latitude, longitude, altitude),
         "they fit if altitudes are in meters, and kilometers are expected": (latitude, longitude, altitude / 1000),
     }
-    places = {"": (expected[wrong], std[wrong])}
-    for text, coordinates in others.items():
-        there = _igrf_elements(torch.stack(coordinates, -1), date)
-        places[text] = there, torch.maximum(model_std(there), std[wrong])
-    cause = likely_mistake(elements[wrong], places, _columns(readings, "heading")[wrong, 0])
+    others = {text: _igrf_elements(torch.stack(place, -1), date) for text, place in places.items()}
+    heading = _columns(readings, "heading")[wrong, 0]
+    cause = likely_mistake(elements[wrong], expected[wrong], std[wrong], heading, others)
     return [f"{start}: {cause or 'no calibration, iron near the sensor, or a heading that is wrong'}"]
 
 

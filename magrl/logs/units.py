@@ -113,35 +113,24 @@ def out_of_range(name: str, values: Array) -> str | None:
     return f"{name} {wrong[0]:.10g} is not from {low:.4g} to {high:.4g} {next(iter(units))}: check it and its {unit}"
 
 
-def guess_unit(length: float, total_nt: float) -> str | None:
-    """Return the unit in which a field has a length, if it is not nanotesla; None where none fits within 45 %.
+def intensity_mistake(total: float, expected: float = EARTH_NT) -> str | None:
+    """Return what is wrong with a total intensity, as a sentence with the remedy; None where it is within 45 %, or
+    within a factor of 4 and in no other unit.
 
     Args:
-        length: length of the vector, in an unknown unit.
-        total_nt: known total intensity [nT].
-
-    Example:
-        >>> guess_unit(0.5, 50000.0), guess_unit(45000.0, 50000.0)
-        ('gauss', None)
-    """
-    fitting = [unit for unit, size in FIELD_NT.items() if 0.55 < length * size / total_nt < 1.45]
-    return fitting[0] if fitting and fitting[0] != "nanotesla" else None
-
-
-def intensity_mistake(total: float) -> str | None:
-    """Return what is wrong with a total intensity that is not the Earth's, as a sentence with the remedy.
-
-    Args:
-        total: median total intensity of a log [nT].
+        total: median total intensity of a log, in an unknown unit.
+        expected: total intensity at its place [nT], by default that of the Earth.
 
     Example:
         >>> intensity_mistake(48.0)
         'the total intensity is 48, which looks like microtesla: name the columns mag_x_microtesla, ...'
     """
-    if unit := guess_unit(total, EARTH_NT):
-        return f"the total intensity is {total:g}, which looks like {unit}: name the columns mag_x_{unit}, ..."
-    if 0.25 < total / EARTH_NT < 4:
+    ratio = total / expected
+    unit = next((unit for unit, size in FIELD_NT.items() if 0.55 < ratio * size < 1.45), "")
+    if unit == "nanotesla" or (not unit and 0.25 < ratio < 4):
         return None
+    if unit:
+        return f"the total intensity is {total:g}, which looks like {unit}: name the columns mag_x_{unit}, ..."
     return (
-        f"the total intensity is {total:g}, where about {EARTH_NT:.0f} nT are expected: scale raw counts to nanotesla"
+        f"the total intensity is {total:g}, where about {expected:.0f} nT are expected: scale raw counts to nanotesla"
     )

@@ -29,6 +29,8 @@ SLACK_NT = 100.0
 """Deviation of the field vector that always fits; chosen [nT]."""
 IRON_NT = 2000.0
 """Standard deviation of the iron of a vehicle along each of its axes, before a calibration; chosen [nT]."""
+IRON_COST = 15.0
+"""What iron must explain more, as a sum of squared standard deviations, since it can take any value; chosen."""
 NEAR_KM = 200.0
 """Largest distance from the start to its assumed place; chosen [km]."""
 
@@ -164,7 +166,7 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     if text is None:
         return
     texts = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
-    cause = likely_mistake(read, {"": (there, std)}, torch.zeros(1).double())
+    cause = likely_mistake(read, there, std, torch.zeros(1).double(), {})
     cause = cause or "check sensors, calibration, compass and place, or state a larger bias"
     raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({text}): {cause}")
 
@@ -211,54 +213,55 @@ def deviation(elements: Tensor, expected: Tensor, std: Tensor) -> list[str | Non
     ]
 
 
-def likely_mistake(elements: Tensor, places: Mapping[str, tuple[Tensor, Tensor]], heading_deg: Tensor) -> str | None:
+def likely_mistake(
+    elements: Tensor, expected: Tensor, std: Tensor, heading_deg: Tensor, others: Mapping[str, Tensor]
+) -> str | None:
     """Return the mistake that explains most of some readings, better than others and than iron; None without one.
 
-    Iron is a constant vector in the vehicle's axes, of a standard deviation of :data:`IRON_NT`. The measure is the
-    likelihood of the readings, for iron the mean over all vectors.
+    Iron is a constant vector in the vehicle's axes, whose standard deviation is :data:`IRON_NT`.
 
     Args:
         elements: ``(N, 3)`` D [deg], I [deg], B_H [nT].
-        places: expected elements ``(N, 3)`` and the standard deviations of the difference ``(..., 3)``: at the stated
-            places, with an empty text, and at others by a text that says what is then wrong.
+        expected: ``(N, 3)`` the elements at their places.
+        std: ``(..., 3)`` standard deviations of the difference.
         heading_deg: ``(N,)`` headings.
+        others: elements at other places, by a text that says what is then wrong with the places.
 
     Example:
         >>> there = torch.tensor([[3.5, 73.0, 15000.0]]).double()
         >>> read = torch.tensor([[3.4, -73.1, 14950.0]]).double()
-        >>> likely_mistake(read, {"": (there, torch.tensor([0.5, 0.1, 50.0]))}, torch.zeros(1).double())
+        >>> likely_mistake(read, there, torch.tensor([0.5, 0.1, 50.0]), torch.zeros(1).double(), {})
         'it fits with -I: the vertical axis points up, and down is expected'
     """
-    there, std = places[""]
-    guesses = [(text, read, there, std) for text, read in _mistakes(elements, there, heading_deg).items()]
-    guesses += [(text, elements, *place) for text, place in places.items() if text]
+    guesses = {text: (read, expected) for text, read in _mistakes(elements, expected, heading_deg).items()}
+    guesses |= {text: (elements, there) for text, there in others.items()}
     costs = {}
-    for text, read, expected, spread in guesses:
-        shares = element_difference(read, expected) / _most(expected, spread)
+    for text, (read, there) in guesses.items():
+        shares = element_difference(read, there) / _most(there, std)
         if (shares.abs() <= 1).all(-1).double().mean() > 0.5:
-            costs[text] = _cost(MOST_SIGMAS * shares)
+            costs[text] = _cost(shares)
     best = min(costs, key=lambda text: costs[text], default=None)
-    return best if best and costs[best] < _iron_cost(elements, there, _most(there, std), heading_deg) else None
+    return best if best and costs[best] < _iron_cost(elements, expected, _most(expected, std), heading_deg) else None
 
 
-def _cost(deviations: Tensor) -> float:
-    """Return the sum of the squares of deviations ``(N, 3)``, up to a limit for each reading: some may be spikes."""
-    return deviations.square().sum(-1).clamp_max(3 * MOST_SIGMAS**2).sum().item()
+def _cost(shares: Tensor) -> float:
+    """Return the sum of squared standard deviations, up to a limit for each reading: some may be spikes.
+
+    Args:
+        shares: ``(N, 3)`` deviations over the largest that are likely.
+    """
+    return MOST_SIGMAS**2 * shares.square().sum(-1).clamp_max(3.0).sum().item()
 
 
 def _iron_cost(elements: Tensor, expected: Tensor, most: Tensor, heading_deg: Tensor) -> float:
-    """Return -2 times the logarithm of the likelihood of readings with iron, as :func:`_cost` without it."""
-    there, (cos, sin) = field_vector(expected), (f(torch.deg2rad(heading_deg)) for f in (torch.cos, torch.sin))
-    scaled = MOST_SIGMAS * elements_jacobian(there) / most.unsqueeze(-1)
-    off = (scaled @ (field_vector(elements) - there).unsqueeze(-1)).squeeze(-1)
-    none, one = torch.zeros_like(cos), torch.ones_like(cos)
-    axes = torch.stack((cos, -sin, none, sin, cos, none, none, none, one), -1).unflatten(-1, (3, 3))
-    slope, size = IRON_NT * scaled @ axes, off.norm(dim=-1)
-    weight = (size.median() / size).clamp_max(1.0)  # of spikes, less
-    weighted = slope * weight.square().reshape(-1, 1, 1)
-    precision = torch.eye(3).double() + torch.einsum("nki,nkj->ij", weighted, slope)
-    iron = torch.linalg.solve(precision, torch.einsum("nki,nk->i", weighted, off))
-    return _cost(off - slope @ iron) + (iron.square().sum() + torch.logdet(precision)).item()
+    """Return the cost of readings without the iron that explains them best, and of that iron."""
+    cos, sin = torch.cos(torch.deg2rad(heading_deg)), torch.sin(torch.deg2rad(heading_deg))
+    none, there = torch.zeros_like(cos), field_vector(expected)
+    turn = torch.stack((cos, -sin, none, sin, cos, none, none, none, none + 1), -1).unflatten(-1, (3, 3))
+    off = turn.mT @ (field_vector(elements) - there).unsqueeze(-1)  # in the vehicle's axes
+    iron = off.median(0).values
+    left = (elements_jacobian(there) @ turn @ (off - iron)).squeeze(-1)
+    return _cost(left / most) + (iron / IRON_NT).square().sum().item() + IRON_COST
 
 
 def _mistakes(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> dict[str, Tensor]:

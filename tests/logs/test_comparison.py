@@ -77,7 +77,7 @@ RADIANS = np.pi / 180
         (lambda t: t.rename(columns={"latitude": "longitude", "longitude": "latitude"}), ["swapped", ".*"]),
         (
             lambda t: t.assign(latitude=t["longitude"] * 3),
-            ["latitude 15.* is outside -90 to 90: latitude"],
+            ["latitude -1.* is not from -90 to 90 deg"],
         ),
         (lambda t: t.assign(D=t["D"].where(t.index != 3, 40.0)), ["1 of 15 .*, row 4 .D deviates .*: spikes, or iron"]),
         (lambda t: t.assign(B_H=t["B_H"] + 5000), ["no calibration, iron near the sensor, or a heading that is wrong"]),
