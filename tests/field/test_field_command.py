@@ -110,7 +110,7 @@ def test_a_row_with_a_blank_cell_has_no_field_and_is_named(points, capsys) -> No
     [
         (POINTS.partition("\n")[2], "007,,,,", "", "no row has a position, an altitude and a date"),
         ("date", "latitude", "", "the table has 2 columns 'latitude': keep one of them, or rename it"),
-        ("007,", "007,7,", "", "row 1 has more cells than the header"),
+        ("007,", "007,7,", "", "row 1 or a later one has more cells than the header"),
         ("007", '"007', "", "a quoted text that is not closed"),
         ("0.5", "5000", "", "row 1, altitude: 5000 is not from -15 to 1000 km: is it in meters? Then add --unit m"),
         ("60.4", "north", "", "row 2, latitude: 'north' is not a finite number"),

@@ -183,6 +183,7 @@ def test_each_part_of_a_file(tmp_path: Path) -> None:
         wide = header.startswith(("mag", "heading"))
         assert (" is not from " in message(tmp_path, whole((place, "-1e13")))) != wide
     assert "row 2 has more cells than the header" in message(tmp_path, whole((3, "48000,1")))
+    assert "row 1 or a later one has more cells" in message(tmp_path, (whole()[0], [*whole()[1], "", "1"]))
     text = message(tmp_path, whole(*((place, "x") for place in range(1, 12)))) + "; "
     assert all(f"row 2, {header}: 'x' is not a number; " in text for header in WHOLE.split(",")[1:])
 
