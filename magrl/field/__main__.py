@@ -19,7 +19,7 @@ import argparse
 import contextlib
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,13 +27,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magrl.checks import command, short
+from magrl.checks import command
 from magrl.field.elements import NAMES, elements_gradient, seven_elements
 from magrl.field.igrf import IGRF, parse_date
-from magrl.files import check_writable, read_table, read_text
+from magrl.files import check_writable, numbers_of, read_table, read_text
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
 UNITS_KM = {"km": 1.0, "m": 0.001}
 COLUMNS = {
@@ -91,18 +91,17 @@ def field_of_points(table: DataFrame, options: argparse.Namespace) -> DataFrame:
     """
     from pandas import DataFrame
 
-    table = table.reset_index(drop=True)
     names = _names(table, options)
-    used = table[[name for name in names.values() if name in table.columns]]
-    lacking = (used.isna() | (used == "")).any(axis=1)
-    points = table[~lacking]
+    cells = DataFrame({name: table.get(text, text) for name, text in names.items()}, table.index)
+    lacking = (cells.isna() | (cells == "")).any(axis=1)
+    points = cells[~lacking]
     if not len(points):
         raise ValueError("no row has a position, an altitude and a date")
     if lacking.any():
         count, first = int(lacking.sum()), int(lacking.argmax()) + 1
         _warn(f"{count} rows, first row {first}, lack a position, an altitude or a date: their field is blank")
-    place = (*_place(points, names), _altitude_km(points, names, options.unit))
-    field = IGRF(_column(points, names["date"], "date", _date), options.generation)
+    place = (*_place(points), _altitude_km(points, names, options.unit))
+    field = IGRF(_dates(points["date"]), options.generation)
     value, gradient = field.value_and_gradient(*map(torch.from_numpy, place))
     gradient[np.abs(place[0]) == 90, :, 1] = math.nan  # at a pole of the Earth no direction is east
     columns = DataFrame(_columns(value, gradient), index=points.index)
@@ -143,6 +142,9 @@ def _names(table: DataFrame, options: argparse.Namespace) -> dict[str, str]:
     names = {name: _name(table, name, getattr(options, name)) for name in COLUMNS}
     if names["latitude"].lower() in COLUMNS["longitude"] or names["longitude"].lower() in COLUMNS["latitude"]:
         raise ValueError(f"--latitude {names['latitude']} --longitude {names['longitude']}: they are swapped")
+    for name in ("latitude", "longitude", "date"):
+        if names[name] not in table.columns and not getattr(options, name):
+            raise ValueError(f"no column is {name!r}: choose among {_listed(table)} with --{name}")
     given = [name for name in _SIGNS if getattr(options, name) is not None]
     heights = given or [name for name in _SIGNS if names[name] in table.columns]
     if len(heights) != 1:
@@ -151,73 +153,56 @@ def _names(table: DataFrame, options: argparse.Namespace) -> dict[str, str]:
     return {name: column for name, column in names.items() if name not in _SIGNS or name in heights}
 
 
-def _place(table: DataFrame, names: Mapping[str, str]) -> list[NDArray[np.float64]]:
+def _place(points: DataFrame) -> list[NDArray[np.float64]]:
     """Return latitudes and longitudes [deg] ``(P,)``."""
     hint = "degrees: are latitude and longitude swapped?"
-    place = [
-        _numbers(table, names[name], name, -most, most, unit)
-        for name, most, unit in (("latitude", 90.0, hint), ("longitude", 360.0, "degrees"))
-    ]
+    place = [_numbers(points["latitude"], -90, 90, hint), _numbers(points["longitude"], -360, 360, "degrees")]
     if all((abs(values) <= most).all() for values, most in zip(place, (math.pi / 2, math.pi), strict=True)):
         _warn("all latitudes are within pi/2 and all longitudes within pi: are they radians? Degrees are expected")
     return place
 
 
-def _altitude_km(table: DataFrame, names: Mapping[str, str], unit: str | None) -> NDArray[np.float64]:
+def _altitude_km(points: DataFrame, names: Mapping[str, str], unit: str | None) -> NDArray[np.float64]:
     """Return altitudes above the ellipsoid [km] ``(P,)``."""
     name = next(name for name in _SIGNS if name in names)
     suffix = names[name].lower().rpartition("_")[2]
-    unit = unit or (suffix if names[name] in table.columns and suffix in UNITS_KM else "km")
+    unit = unit or (suffix if suffix in UNITS_KM else "km")
     low, high = sorted(_SIGNS[name] * limit / UNITS_KM[unit] for limit in IGRF.altitude_range_km)
     hint = ": is it in meters? Then add --unit m" if unit == "km" else ""
-    return _SIGNS[name] * UNITS_KM[unit] * _numbers(table, names[name], name, low, high, f"{unit}{hint}")
+    return _SIGNS[name] * UNITS_KM[unit] * _numbers(points[name], low, high, f"{unit}{hint}")
 
 
 _SIGNS = {"altitude": 1.0, "depth": -1.0}
 
 
-def _column(table: DataFrame, text: str, name: str, read: Callable[[Any], Any]) -> NDArray[Any]:
-    """Return the parsed values of a column ``(P,)``; a text that names no column is the value of all rows."""
-    if text not in table.columns:
-        try:
-            return np.full(len(table), read(text))
-        except ValueError:
-            raise ValueError(
-                f"{text!r} is no column of the table and no {name}: choose among {_listed(table)} with --{name}"
-            ) from None
-    values = table[text].tolist()
-    parsed: dict[Any, Any] = {}
-    try:
-        for value in dict.fromkeys(values):
-            parsed[value] = read(value)
-    except ValueError as error:
-        raise ValueError(f"row {table.index[values.index(value)] + 1}, {text}: {error}") from None
-    return np.array([parsed[value] for value in values])
-
-
-def _numbers(table: DataFrame, text: str, name: str, low: float, high: float, unit: str) -> NDArray[np.float64]:
+def _numbers(column: Series, low: float, high: float, unit: str) -> NDArray[np.float64]:
     """Return the numbers of a column ``(P,)``; raise unless all are from ``low`` to ``high``."""
-    values = _column(table, text, name, _number).astype(np.float64)
+    wrong: list[str] = []
+    values = numbers_of(column, wrong)
     outside = (values < low) | (values > high)
     if outside.any():
-        row = int(outside.argmax())
-        raise ValueError(f"row {table.index[row] + 1}, {text}: {values[row]:g} is not from {low:g} to {high:g} {unit}")
+        row, value = column.index[outside.argmax()], values[outside.argmax()]
+        wrong.append(f"row {row + 1}, {column.name}: {value:g} is not from {low:g} to {high:g} {unit}")
+    if wrong:
+        raise ValueError(wrong[0])
     return values
 
 
-def _number(value: Any) -> float:
-    """Return a finite number."""
-    with contextlib.suppress(TypeError, ValueError):
-        if math.isfinite(number := float(value)):
-            return number
-    raise ValueError(f"{short(value)} is not a finite number")
+def _dates(column: Series) -> NDArray[np.datetime64]:
+    """Return the dates of a column ``(P,)``, from texts that are perhaps decimal years."""
+    dates: dict[Any, np.datetime64] = {}
+    for row, cell in column.drop_duplicates().items():
+        try:
+            dates[cell] = np.datetime64(parse_date(_number_or_text(cell)), "us")
+        except ValueError as error:
+            raise ValueError(f"row {row + 1}, date: {error}") from None
+    return column.map(dates).to_numpy("M8[us]")
 
 
-def _date(value: Any) -> np.datetime64:
-    """Return a date, from a text that is perhaps a decimal year."""
-    with contextlib.suppress(TypeError, ValueError):
-        value = float(value)
-    return np.datetime64(parse_date(value), "us")
+def _number_or_text(cell: Any) -> Any:
+    with contextlib.suppress(ValueError):
+        return float(cell)
+    return cell
 
 
 def _listed(table: DataFrame) -> str:
