@@ -138,7 +138,9 @@ def check_number(
 
 def _is_finite(value: object, kind: type = Real) -> bool:
     """Return whether a value is a finite number of a kind, and not a bool."""
-    return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
+    if isinstance(value, bool) or not isinstance(value, kind):
+        return False
+    return abs(value) < 1e308 if isinstance(value, int) else math.isfinite(value)  # type: ignore[arg-type]
 
 
 def check_numbers(count: int, low: float = -math.inf, /, **values: object) -> None:
@@ -160,7 +162,7 @@ def check_numbers(count: int, low: float = -math.inf, /, **values: object) -> No
     for name, value in values.items():
         given = list(value) if isinstance(value, Iterable) else []
         if len(given) != count or not all(map(_is_finite, given)):
-            raise ValueError(f"{name} must be {count} finite numbers, got {value!r}")
+            raise ValueError(f"{name} must be {count} finite numbers, got {short(value)}")
         smallest: dict[str, Any] = {name: min(given)}
         check_number(low, **smallest)
 

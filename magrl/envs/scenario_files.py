@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, Field
 
 from magrl.checks import CheckedModel, check_type, short
 from magrl.envs.scenario import Scenario, numbers_validator
@@ -25,7 +25,13 @@ class TaskEntry(CheckedModel):
 
     start: Annotated[tuple[float, float], numbers_validator("start", 2)]
     target: Annotated[tuple[float, float], numbers_validator("target", 2)]
-    name: Annotated[str, BeforeValidator(_name)]
+    name: Annotated[str | None, BeforeValidator(_name)] = Field(None, validate_default=False)
+
+
+class TaskEntries(CheckedModel):
+    """The tasks in a file."""
+
+    tasks: list[TaskEntry]
 
 
 def load_scenario(path: Path | str, **changes: Any) -> Scenario:
@@ -78,18 +84,8 @@ def _scenario(content: Any, changes: dict[str, Any]) -> Scenario:
 
 def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
     """Return names and ends of a list of tables."""
-    if not isinstance(listed, list):
-        raise ValueError(f"tasks must be a list of tables with start and target, got {short(listed)}")
-    if not listed:
+    entries = TaskEntries(tasks=listed).tasks
+    if not entries:
         return (), None
-    entries = []
-    for number, entry in enumerate(listed, start=1):
-        if not isinstance(entry, dict):
-            raise ValueError(f"tasks, entry {number}, must be a table with start and target, got {short(entry)}")
-        try:
-            values: dict[str, Any] = {"name": f"task {number}"} | entry
-            entries.append(TaskEntry(**values))
-        except ValueError as error:
-            raise ValueError(f"tasks, entry {number}: {error}") from error
     start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
-    return tuple(e.name for e in entries), Tasks(start, target)
+    return tuple(e.name or f"task {number}" for number, e in enumerate(entries, 1)), Tasks(start, target)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +80,6 @@ def test_the_example_file_loads() -> None:
     assert len(scenario.names) == len(scenario.tasks.start) == 3
 
 
-DELETE = object()
-HERE = {"start": [40, -30], "target": [41, -22]}
-
-
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no scenario file at .*nowhere\.toml"):
         load_scenario(tmp_path / "nowhere.toml")
@@ -116,38 +114,50 @@ region = {latitude = [-10, 0], longitude = [160, 170]}
     torch.testing.assert_close(env.field(torch.tensor(-5.0), torch.tensor(165.0)), deep, rtol=0, atol=1e-4)
 
 
-BAD_CONTENT: list[tuple[str, object, str]] = [
-    ("wings", 2, "unknown key 'wings': choose from region, distance_range_km, distance_law, date"),
-    ("region", [1], "a table of latitude and longitude, each [low, high] in degrees, got [1]"),
-    ("region", DELETE, "region is missing: a scenario file must hold region and date"),
-    ("region.latitude", [36, "46"], "region: latitudes must be 2 finite numbers, got (36, '46')"),
-    ("date", 10**400, "000... is not a year between 1 and 9999"),
-    ("tasks", {"start": [1, 2]}, "tasks must be a list of tables with start and target, got {'start': [1, 2]}"),
-    ("tasks", [HERE, {"start": [40, -30]}], "tasks, entry 2: target is missing"),
-    ("tasks", [HERE | {"color": "red"}], "tasks, entry 1: unknown key 'color': choose from start, target, name"),
-    ("tasks", [HERE | {"target": [41, -15]}], "the target of task 0 (the first is task 0), [41.0, -15.0], lies"),
-    ("tasks", [HERE | {"start": [40]}], "tasks, entry 1: start must be 2 finite numbers, got [40]"),
-    ("tasks", [HERE | {"name": ""}], "tasks, entry 1: name must be a text of 1 to 200 printable characters, got ''"),
-]
+DROPPED = object()
 
 
-@pytest.mark.parametrize(("key", "value", "says"), BAD_CONTENT)
-def test_bad_content_is_named_with_file_key_and_value(tmp_path: Path, key: str, value: object, says: str) -> None:
-    path, content = tmp_path / "mine.json", sound()
-    *tables, last = key.split(".")
-    table = content
-    for name in tables:
-        table = table[name]
-    if value is DELETE:
-        del table[last]
-    else:
-        table[last] = value
-    path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"mine\.json: ") as error:
-        load_scenario(path)
-    assert says in str(error.value)
-    assert "\n" not in str(error.value)
-    assert len(str(error.value).removeprefix(str(path))) < 300
+def changed(content: Any, value: object) -> Iterator[tuple[str, Any]]:
+    """The content of a file with one part replaced or dropped, and the name of that part."""
+    for key in [*content] if isinstance(content, dict) else range(len(content)) if isinstance(content, list) else []:
+        parts = [("", value), *changed(content[key], value)]
+        for name, part in parts:
+            other = copy.copy(content)
+            other[key] = part
+            if part is DROPPED:
+                del other[key]
+            yield name or (key if isinstance(key, str) else ""), other
+
+
+OPTIONAL = {"generation", "altitude_km", "margin_deg", "distance_range_km", "objective_floors", "tasks", "name"}
+
+
+@pytest.mark.parametrize(
+    ("value", "taken"),
+    [(DROPPED, OPTIONAL), (None, {"objective_floors"}), ("x", {"name"}), ([], {"tasks"})]
+    + [(value, set()) for value in (True, {"a": 1}, [[1, 2]], math.nan, 10**400)],
+    ids=str,
+)
+def test_bad_content_is_named_with_file_and_key(tmp_path: Path, value: object, taken: set[str]) -> None:
+    """Each part of a file, dropped or of another type; what may be so is taken."""
+    path, found, said = tmp_path / "mine.json", set(), []
+    for key, content in changed(sound(), value):
+        path.write_text(json.dumps(content))
+        try:
+            load_scenario(path)
+            found.add(key)
+        except ValueError as error:
+            file, _, text = str(error).partition(": ")
+            named = key in text or key in ("latitude", "longitude", "start", "target")
+            said.append((file == str(path), named, len(text) < 300, "\n" in text))
+    assert found == taken
+    assert {*said} == {(True, True, True, False)}
+
+
+def test_an_unknown_key_is_named_with_the_choices(tmp_path: Path) -> None:
+    (tmp_path / "mine.json").write_text(json.dumps(sound() | {"wings": 2}))
+    with pytest.raises(ValueError, match="unknown key 'wings': choose from region, distance_range_km, distance_law,"):
+        load_scenario(tmp_path / "mine.json")
 
 
 @pytest.mark.parametrize(
