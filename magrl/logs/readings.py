@@ -20,7 +20,7 @@ from magrl.files import numbers_of, read_table, read_text
 from magrl.geodesy import geodesic
 from magrl.logs.calibration import Calibration
 from magrl.logs.samples import ATTITUDE, AXES, Array, Log, checked_times
-from magrl.logs.units import COLUMNS, column_of, unit_of
+from magrl.logs.units import COLUMNS, UNITS, out_of_range, unit_of
 from magrl.logs.vectors import NORTHS, axes_of_elements, rotation
 from magrl.transforms.errors.sensors import OUTAGE_STD
 
@@ -139,8 +139,8 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     Args:
         path: the file.
         names: its columns by ``D``, ``I``, ``B_H``, ``heading``, ``distance``, and optionally ``latitude`` and
-            ``longitude``, and ``altitude``, which the file may lack, or have as ``alt_m``. A unit that ends a name
-            counts, such as that of ``H_uT`` or ``distance_nmi``; without one, it is nT, deg or km.
+            ``longitude``, and ``altitude``, which the file may lack. A unit that ends a name counts, such as that of
+            ``H_uT``, and a name is also found with one, such as ``altitude_m``; without one, it is nT, deg or km.
         time: its column of the time, numbers or ISO 8601, which it may lack.
 
     Returns:
@@ -163,11 +163,12 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     log, wrong = DataFrame({"row": np.arange(len(raw)) + 1}), list[str]()  # the header is not counted
     located = any(names.get(key) in raw for key in ("latitude", "longitude"))
     for key, name in names.items():
-        name = _altitude_name(raw) if name == "altitude" else name
+        kind = "field" if key == "B_H" else COLUMNS.get(key, ("angle",))[0]
+        others = {f"{name}_{unit}".lower() for unit in UNITS[kind]}
+        name = next((other for other in raw if name not in raw and other.lower() in others), name)
         if name in raw:
-            kind = "field" if key == "B_H" else COLUMNS.get(key, ("angle",))[0]
-            sign = -1 if name.lower().startswith("depth") else 1
-            log[key] = sign * (unit_of(name, kind) or 1.0) * numbers_of(raw[name].fillna(""), wrong)
+            log[key] = (unit_of(name, kind) or 1.0) * numbers_of(raw[name].fillna(""), wrong)
+            wrong += filter(None, [out_of_range(key, log[key].to_numpy())])
         elif key in ("D", "I", "B_H", "heading", "distance") or (located and key != "altitude"):
             wrong.append(f"no column is {name!r}: name that of {key}, one of {short([*raw], 300)}")
     if wrong:
@@ -181,12 +182,6 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
         log = log[new].reset_index(drop=True)
         log.attrs = {"notes": notes, "date": date}
     return log
-
-
-def _altitude_name(raw: DataFrame) -> str:
-    """Return the column of the altitude: that of this name, or one of its names with a unit."""
-    others = (name for name in raw if unit_of(name, "length") and (column_of(name) or " ")[0] == "altitude")
-    return "altitude" if "altitude" in raw else next(others, "altitude")
 
 
 def joined(table: DataFrame, every_km: float) -> DataFrame:

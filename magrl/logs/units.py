@@ -31,14 +31,14 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 """Suffixes of a column, in the first unit of each kind: nanotesla, degrees, seconds, meters per second, kilometers."""
 
 
-_ANY = -math.inf, math.inf
+_ANY, _ROUNDING = (-math.inf, math.inf), 1e-3
 COLUMNS: Mapping[str, tuple[str, str, str, float, float]] = {
     "time": ("time", r"t|time(stamp)?|date_?time|utc", "s", -4.1e9, 4.1e9),  # up to the year 2099
     "x": ("field", r"(mag|magnetometer|b|m)?_?x", "nt", *_ANY),
     "y": ("field", r"(mag|magnetometer|b|m)?_?y", "nt", *_ANY),
     "z": ("field", r"(mag|magnetometer|b|m)?_?z", "nt", *_ANY),
-    "roll": ("angle", "roll", "deg", -360.001, 360.001),  # as of radians, rounded
-    "pitch": ("angle", "pitch", "deg", -90.001, 90.001),
+    "roll": ("angle", "roll", "deg", -360, 360),
+    "pitch": ("angle", "pitch", "deg", -90, 90),
     "heading": ("angle", r"(true_|mag(netic)?_)?(heading|hdg|yaw)(_true|_mag(netic)?)?", "deg", *_ANY),
     "speed": ("speed", r"speed|stw|sog", "", -12000, 12000),
     "distance": ("length", r"distance", "km", 0, 40000),
@@ -101,16 +101,14 @@ def out_of_range(name: str, values: Array) -> str | None:
 
     Example:
         >>> out_of_range("pitch", np.array([2.0, 200.0]))
-        'pitch 200 is not from -90 to 90 deg: check it and its unit'
+        'pitch 200 is not from -90 to 90 deg: check it and its unit, as in pitch_rad'
     """
-    kind, _, _, low, high = COLUMNS[name]
-    wrong = values[(values < low) | (values > high)]
+    kind, _, _, low, high = COLUMNS.get(name, ("angle", "", "", *_ANY))
+    wrong = values[(values < low - _ROUNDING) | (values > high + _ROUNDING)]
     if not len(wrong):
         return None
-    units = UNITS[kind]
-    likely = [f", as in {name}_{unit}" for unit, size in units.items() if low <= wrong[0] * size <= high]
-    unit = f"unit{''.join(likely[:1])}"
-    return f"{name} {wrong[0]:.10g} is not from {low:.4g} to {high:.4g} {next(iter(units))}: check it and its {unit}"
+    unit, other, *_ = UNITS[kind]
+    return f"{name} {wrong[0]:.10g} is not from {low:g} to {high:g} {unit}: check it and its unit, as in {name}_{other}"
 
 
 def intensity_mistake(total: float, expected: float = EARTH_NT) -> str | None:

@@ -81,7 +81,7 @@ def test_the_unit_that_ends_a_name_counts(tmp_path: Path) -> None:
     scaled = log.assign(**{name: log[name] / units[other] for name, other in names.items()}).rename(columns=names)
     log.to_csv(tmp_path / "log.csv", index=False)
     scaled.to_csv(tmp_path / "other.csv", index=False)
-    options = dict(zip(["declination", "inclination", "horizontal", "distance"], units, strict=False))
+    options = dict(zip(["declination", "inclination", "horizontal"], units, strict=False))
     found = recipe.read_log(recipe.Config(tmp_path / "other.csv", **options))
     pd.testing.assert_frame_equal(found, recipe.read_log(recipe.Config(tmp_path / "log.csv")))
 
@@ -119,6 +119,7 @@ def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) ->
         (("", ""), ("--navigator", "dowsing"), "unknown navigator 'dowsing'"),
         (("", ""), ("--target", "-0.2", "1.3", "13000"), "the target: .*radians"),
         (("", ""), ("--target", "-5", "74.5", "14000", "--target-position", "95", "0"), "95"),
+        (("62.06", "162.06"), (), "latitude 162.06.* is not from -90 to 90 deg"),
     ],
 )
 def test_errors_name_what_is_wrong(tmp_path: Path, change, arguments, message: str) -> None:
