@@ -178,10 +178,9 @@ def samples_of(streams: Streams, remedy: str = "name its columns mag_x_nT, ...")
         >>> samples_of({**axes, "heading": (time[:2], np.array([350.0, 370.0]))})[0]["heading"].tolist()
         [350.0, 10.0]
     """
-    if missing := [name for name in AXES if name not in streams or not len(streams[name][0])]:
-        raise ValueError(
-            f"no column is the {missing[0]} of the magnetometer, among {', '.join(streams) or 'none'}: {remedy}"
-        )
+    logged = [name for name, (time, _) in streams.items() if len(time)]
+    if missing := [name for name in AXES if name not in logged]:
+        raise ValueError(f"no {missing[0]} of the magnetometer is among {', '.join(logged) or 'no columns'}: {remedy}")
     time = streams["x"][0]
     new, notes = check_times(time)
     table = {"time": time[new]} | {

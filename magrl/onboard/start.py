@@ -10,7 +10,7 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_numbers
 from magrl.field import IGRF, elements_at
-from magrl.field.elements import FIELD_NT, NAMES, element_difference, elements_jacobian, field_vector
+from magrl.field.elements import FIELD_NT, NAMES, element_difference, field_vector, measured_elements
 from magrl.geodesy import move
 from magrl.onboard.readings import DISTURBANCE_NT, check_earth_distance, check_earth_reading
 from magrl.sensor_std import SensorStd
@@ -233,35 +233,25 @@ def likely_mistake(
         >>> likely_mistake(read, there, torch.tensor([0.5, 0.1, 50.0]), torch.zeros(1).double(), {})
         'it fits with -I: the vertical axis points up, and down is expected'
     """
+    iron, rest = _iron(elements, expected, heading_deg)
     guesses = {text: (read, expected) for text, read in _mistakes(elements, expected, heading_deg).items()}
-    guesses |= {text: (elements, there) for text, there in others.items()}
-    costs = {}
+    guesses |= {text: (elements, there) for text, there in others.items()} | {"": (rest, expected)}
+    costs = {"": math.inf}
     for text, (read, there) in guesses.items():
         shares = element_difference(read, there) / _most(there, std)
-        if (shares.abs() <= 1).all(-1).double().mean() > 0.5:
-            costs[text] = _cost(shares)
-    best = min(costs, key=lambda text: costs[text], default=None)
-    return best if best and costs[best] < _iron_cost(elements, expected, _most(expected, std), heading_deg) else None
+        if (shares.abs() <= 1).all(-1).double().mean() > 0.5:  # others may be spikes, whose squares are limited
+            costs[text] = MOST_SIGMAS**2 * shares.square().sum(-1).clamp_max(3.0).sum().item()
+    costs[""] += IRON_COST + (iron / IRON_NT).square().sum().item()
+    return min(costs, key=lambda text: costs[text]) or None
 
 
-def _cost(shares: Tensor) -> float:
-    """Return the sum of squared standard deviations, up to a limit for each reading: some may be spikes.
-
-    Args:
-        shares: ``(N, 3)`` deviations over the largest that are likely.
-    """
-    return MOST_SIGMAS**2 * shares.square().sum(-1).clamp_max(3.0).sum().item()
-
-
-def _iron_cost(elements: Tensor, expected: Tensor, most: Tensor, heading_deg: Tensor) -> float:
-    """Return the cost of readings without the iron that explains them best, and of that iron."""
+def _iron(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the iron in the vehicle's axes [nT] that explains readings best, and the elements without it."""
     cos, sin = torch.cos(torch.deg2rad(heading_deg)), torch.sin(torch.deg2rad(heading_deg))
-    none, there = torch.zeros_like(cos), field_vector(expected)
+    none, read = torch.zeros_like(cos), field_vector(elements).unsqueeze(-1)
     turn = torch.stack((cos, -sin, none, sin, cos, none, none, none, none + 1), -1).unflatten(-1, (3, 3))
-    off = turn.mT @ (field_vector(elements) - there).unsqueeze(-1)  # in the vehicle's axes
-    iron = off.median(0).values
-    left = (elements_jacobian(there) @ turn @ (off - iron)).squeeze(-1)
-    return _cost(left / most) + (iron / IRON_NT).square().sum().item() + IRON_COST
+    iron = (turn.mT @ (read - field_vector(expected).unsqueeze(-1))).median(0).values
+    return iron, measured_elements((read - turn @ iron).squeeze(-1))
 
 
 def _mistakes(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> dict[str, Tensor]:

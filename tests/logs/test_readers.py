@@ -86,7 +86,7 @@ def test_px4_has_the_calibrated_magnetometer(tmp_path: Path, names: tuple[str, s
 
 def test_px4_without_a_magnetometer_truncated_and_no_log(tmp_path: Path) -> None:
     path = written(tmp_path / "log.ulg", ulog({"vehicle_mag": 1.0}))
-    with pytest.raises(ValueError, match=r"no column is the x .* among roll, .*: log the topic vehicle_magnetometer"):
+    with pytest.raises(ValueError, match=r"no x .* is among roll, .*: log the topic vehicle_magnetometer"):
         read_log(path)
     cut = read_log(written(path, ulog()[:-290]))
     assert len(cut.samples) < 12
@@ -229,7 +229,7 @@ def test_a_log_without_a_magnetometer_tells_how_to_log_one(tmp_path: Path) -> No
     logs["request RAW_IMU, SCALED_IMU2"] = telemetry(tmp_path / "log.tlog", "PX4", 9.0, field=False)
     logs["record a topic of sensor_msgs/MagneticField"] = bag(tmp_path / "log.bag", 1, "bag", "MagneticField")
     for text, path in logs.items():
-        with pytest.raises(ValueError, match=f"no column is the x of the magnetometer, among .*: .*{text}"):
+        with pytest.raises(ValueError, match=f"no x of the magnetometer is among .*: .*{text}"):
             read_log(path)
 
 
