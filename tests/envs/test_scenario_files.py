@@ -136,7 +136,7 @@ OPTIONAL = {"generation", "altitude_km", "margin_deg", "distance_range_km", "obj
     ("value", "taken"),
     [(DROPPED, OPTIONAL), (None, {"objective_floors"}), ("x", {"name"}), ([], {"tasks"})]
     + [(value, set()) for value in (True, {"a": 1}, [[1, 2]], math.nan, 10**400)],
-    ids=str,
+    ids=range(9),
 )
 def test_bad_content_is_named_with_file_and_key(tmp_path: Path, value: object, taken: set[str]) -> None:
     """Each part of a file, dropped or of another type; what may be so is taken."""

@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 import td3_gradient_guided as recipe
 import torch
+from support.logs import dataflash, nmea, ulog
 
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario
 from magrl.files import load_tensors, save_tensors
+from magrl.logs import read_log
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
 
@@ -96,6 +98,19 @@ def test_scenarios(tmp_path: Path, suffix: str) -> None:
     lines = ["\n".join(f"{key} = {json.dumps(value)}" for key, value in table.items()) for table in (content, region)]
     path.write_text("\n[region]\n".join(lines) if suffix == ".toml" else json.dumps(content | {"region": region}))
     fuzz(path, lambda: load_scenario(path), lambda found: isinstance(found, Scenario), 3)
+
+
+CSV = b"time,mag_x_uT,mag_y_uT,mag_z_uT,roll,heading_true_rad,speed_kn,lat,lon,alt_m\n"
+CSV += b"".join(b"%d,15.5,1,48.5,2,3,10,60,5,30\n" % row for row in range(9))
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves a damaged file open
+@pytest.mark.parametrize("content", [CSV, nmea(), ulog(), dataflash()], ids=["CSV", "NMEA", "PX4", "ArduPilot"])
+def test_logs(tmp_path: Path, content: bytes) -> None:
+    """A mutant may be another log, or lack samples."""
+    path = tmp_path / "log"
+    path.write_bytes(content)
+    fuzz(path, lambda: read_log(path), lambda found: len(found.samples) > 0 and bool(found.source), 4)
 
 
 @pytest.mark.parametrize("cells", [(60000, 60000), (0,), ("a",), (), (1,) * 200_000, ((4,),)])
