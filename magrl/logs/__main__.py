@@ -49,9 +49,7 @@ def parser() -> argparse.ArgumentParser:
     )
     arguments.add_argument("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
     arguments.add_argument("--frame", choices=FRAMES, default="FRD", help="axes of a CSV file; default FRD")
-    arguments.add_argument(
-        "--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a healthy one that was used"
-    )
+    arguments.add_argument("--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a calibrated one in use")
     arguments.add_argument("--north", choices=NORTHS, help="north of the heading; default that of the log")
     arguments.add_argument("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
     arguments.add_argument("--every-s", type=float, help="duration of a move [s], in place of a length")

@@ -23,14 +23,12 @@ SYMBOLS |= {"mt": "millitesla", "t": "tesla"}
 _KNOTS = ("kn", "kt", "kts", "knots")
 UNITS: Mapping[str, Mapping[str, float]] = {
     "field": FIELD_NT | {symbol: FIELD_NT[unit] for symbol, unit in SYMBOLS.items()},
-    "angle": {"deg": 1.0, "rad": 57.29577951308232},
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "utc": 1.0},
+    "angle": {"deg": 1.0, "rad": 57.29577951308232, "degrees": 1.0, "radians": 57.29577951308232},
+    "time": {"s": 1.0, "ms": 1e-3, "sec": 1.0, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "utc": 1.0},
     "speed": {"m_s": 1.0, "mps": 1.0, "km_h": 1 / 3.6, "kmh": 1 / 3.6, **dict.fromkeys(_KNOTS, 1852 / 3600)},
     "length": {"km": 1.0, "m": 1e-3, "nmi": 1.852, "ft": 3.048e-4},
 }
 """Suffixes of a column, in the first unit of each kind: nanotesla, degrees, seconds, meters per second, kilometers."""
-
-
 _ANY, _ROUNDING = (-math.inf, math.inf), 1e-3
 COLUMNS: Mapping[str, tuple[str, str, str, float, float]] = {
     "time": ("time", r"t|time(stamp)?|date_?time|utc", "s", -4.1e9, 4.1e9),  # up to the year 2099

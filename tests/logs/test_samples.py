@@ -81,11 +81,6 @@ def test_blank_cells_are_interpolated(tmp_path: Path) -> None:
     assert samples["latitude"].tolist() == pytest.approx([10, 11, 12, 12])
 
 
-def test_a_number_that_is_cut_does_not_count(tmp_path: Path) -> None:
-    samples = read_log(written(tmp_path, *ROWS, "3,15300,1300,4")).samples
-    assert samples["z"].tolist() == [48000, 48100, 48200]
-
-
 def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
     """A row that repeats a time adds nothing; the distance of a row without axes, or of zeros, belongs to the next."""
     rows = (
