@@ -19,7 +19,7 @@ from magrl.field.elements import NAMES, elements_jacobian, measured_elements
 from magrl.files import numbers_of, read_table, read_text
 from magrl.geodesy import geodesic
 from magrl.logs.calibration import Calibration
-from magrl.logs.samples import ATTITUDE, AXES, Array, Log, checked_times
+from magrl.logs.samples import ATTITUDE, AXES, Array, Log, check_times, date_of, times_of
 from magrl.logs.units import COLUMNS, UNITS, out_of_range, unit_of
 from magrl.logs.vectors import NORTHS, axes_of_elements, rotation
 from magrl.transforms.errors.sensors import OUTAGE_STD
@@ -178,9 +178,10 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     log.attrs = {"notes": [], "date": None}
     if time in raw:
         log.insert(1, "time", raw[time])
-        new, notes, date = checked_times(log["time"])
+        times, notes = times_of(raw[time])
+        new, more = check_times(times, "the unit of the times")
         log = log[new].reset_index(drop=True)
-        log.attrs = {"notes": notes, "date": date}
+        log.attrs = {"notes": [*notes, *more], "date": date_of(float(times[0]))}
     return log
 
 

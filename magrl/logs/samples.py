@@ -138,24 +138,6 @@ def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[s
     return new, notes
 
 
-def checked_times(column: Series) -> tuple[NDArray[np.bool_], list[str], str | None]:
-    """Return which rows have a new time, notes, and the date of the first row where it is known.
-
-    Args:
-        column: numbers in any unit, or ISO 8601 texts.
-
-    Raises:
-        ValueError: for times that are neither, missing, or run backward, with the row.
-
-    Example:
-        >>> checked_times(Series(["2026-06-30T12:00:00Z", "2026-06-30T12:10:00Z"], name="time"))[1:]
-        ([], '2026-06-30')
-    """
-    times, notes = times_of(column)
-    new, more = check_times(times, "the unit of the times")
-    return new, [*notes, *more], date_of(float(times[0]))
-
-
 def _count(number: int, name: str) -> str:
     return f"{number} {name}{'s' if number > 1 else ''}"
 
