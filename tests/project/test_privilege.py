@@ -23,7 +23,7 @@ CONDITION = CONDITIONS["low-cost"]
 PRIVATE = {*PRIVILEGED_KEYS, *TRUE_KEYS}
 COMPASS = {"compass_declination", "compass_stream", "true_target_field"}
 TOLD = ["sensor_std", "bias_std", "drift_std"]
-PUBLIC = {*PUBLIC_KEYS, *STD_KEYS, "step_count", "done", "terminated", "truncated"}
+PUBLIC = {*PUBLIC_KEYS, *STD_KEYS, "elapsed_steps", "done", "terminated", "truncated"}
 
 
 def base_env(seed: int = 5) -> GeomagneticNavEnv:
