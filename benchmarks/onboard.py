@@ -7,7 +7,7 @@ import math
 from benchmarks.timing import HEADER, Row, alternate, one_thread
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation.navigators import make_navigator
-from magrl.onboard import Onboard
+from magrl.vehicle.onboard import Onboard
 
 import torch
 from tensordict import TensorDictBase

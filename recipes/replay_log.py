@@ -26,8 +26,8 @@ from magrl.evaluation.tables import markdown_table
 from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
-from magrl.logs import difference_from_igrf, joined, mistakes, read_readings
-from magrl.onboard import Onboard
+from magrl.vehicle.logs import difference_from_igrf, joined, mistakes, read_readings
+from magrl.vehicle.onboard import Onboard
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Way
 from magrl.training import UsageError, command, parse
@@ -99,7 +99,7 @@ class Config:
 
 
 def read_log(config: Config) -> pd.DataFrame:
-    """Return the columns of the log, see :func:`magrl.logs.read_readings`."""
+    """Return the columns of the log, see :func:`magrl.vehicle.logs.read_readings`."""
     keys = (*ELEMENTS, "heading", "distance", *PLACE, "altitude")
     names = {key: getattr(config, OPTIONS.get(key, key)) for key in keys}
     log = read_readings(config.log, names, config.time)

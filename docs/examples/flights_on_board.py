@@ -14,7 +14,7 @@ import math
 import random
 from collections import Counter
 
-from magrl.onboard import Onboard
+from magrl.vehicle.onboard import Onboard
 
 import numpy as np
 import ppigrf

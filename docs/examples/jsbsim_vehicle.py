@@ -1,7 +1,7 @@
 """Fly a Cessna 172 of JSBSim by the magnetic field: the flight model behind MAVLink.
 
     python docs/examples/jsbsim_vehicle.py --flights 20                  # both ends in one process, as fast as it goes
-    python docs/examples/jsbsim_vehicle.py --link udpout:127.0.0.1:14550 --speedup 30     # beside magrl.autopilot
+    python docs/examples/jsbsim_vehicle.py --link udpout:127.0.0.1:14550 --speedup 30     # beside magrl.vehicle.autopilot
 
 The aircraft has the heading and altitude hold of its model c172x. Its magnetometer reads the field of ppigrf, with
 noise of .05 degrees and 5 nT on D, I and B_H of a reading; or, with --tilt, with errors of roll, pitch and heading,
@@ -24,10 +24,10 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
-from magrl.autopilot import Loop, fly
-from magrl.autopilot.mavlink import MavlinkLink
-from magrl.logs import elements_of_axes
-from magrl.onboard import Onboard
+from magrl.vehicle.autopilot import Loop, fly
+from magrl.vehicle.autopilot.mavlink import MavlinkLink
+from magrl.vehicle.logs import elements_of_axes
+from magrl.vehicle.onboard import Onboard
 
 import jsbsim
 import numpy as np
@@ -236,7 +236,7 @@ def serve(options: argparse.Namespace) -> None:
     line = mavutil.mavlink_connection(options.link, source_system=1, source_component=1, dialect="ardupilotmega")
     noise = " ".join(f"{value:.3g}" for value in stated(there, options.tilt))
     place = f"{there[0]:.4f} {there[1]:.4f} --date {DATE:%Y-%m-%d} --altitude {ALTITUDE_KM}"
-    print(f"python -m magrl.autopilot udpin:127.0.0.1:14550 --to {place} --noise {noise}", flush=True)
+    print(f"python -m magrl.vehicle.autopilot udpin:127.0.0.1:14550 --to {place} --noise {noise}", flush=True)
     due, begun = 0.0, time.monotonic()
     while True:
         for message in aircraft.messages():

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import curvature_radii
-from magrl.logs import axes_of_elements
+from magrl.vehicle.logs import axes_of_elements
 
 import numpy as np
 import pandas

@@ -1,7 +1,7 @@
 """Write one step of the pretrained agent as ONNX, and run it without magrl and PyTorch."""
 
 from magrl import load_pretrained
-from magrl.onboard import write_step
+from magrl.vehicle.onboard import write_step
 
 import numpy as np
 import onnxruntime

@@ -2,7 +2,7 @@
 
 import math
 
-from magrl.logs import axes_of_elements, elements_of_axes
+from magrl.vehicle.logs import axes_of_elements, elements_of_axes
 from magrl.sensor_std import SensorStd
 from magrl.tracking import read, start
 from magrl.tracking.belief import IRON

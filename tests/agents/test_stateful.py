@@ -17,7 +17,7 @@ from magrl.agents import ExportedPolicy, export_policy, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluate
 from magrl.evaluation.rollout import evaluation_rollout
-from magrl.onboard import Onboard
+from magrl.vehicle.onboard import Onboard
 from magrl.transforms import SensorNoise, TrackView
 from magrl.transforms.base import StatefulTransform
 

@@ -14,7 +14,7 @@ import torch
 
 from magrl.field import IGRF, elements_at, elements_gradient_at
 from magrl.field.__main__ import main
-from magrl.logs.__main__ import main as log_main
+from magrl.vehicle.logs.__main__ import main as log_main
 
 POINTS = """id,latitude,longitude,altitude,date
 007,-2.0,162.0,0.5,2022-01-01

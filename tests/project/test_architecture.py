@@ -54,7 +54,7 @@ MODULES = [name for name in sources() if name != "magrl"]
 def test_every_package_and_module_has_a_floor() -> None:
     packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
     modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
-    assert len(packages) == 12
+    assert len(packages) == 10
     assert len(modules) <= 7
     assert packages | modules == set(FLOOR)
 
@@ -62,6 +62,11 @@ def test_every_package_and_module_has_a_floor() -> None:
 def test_no_import_upward() -> None:
     pairs = [(module, other) for module in MODULES for other in imported(module)]
     assert [pair for pair in pairs if FLOOR[top(pair[1])] > FLOOR[top(pair[0])]] == []
+
+
+def test_the_core_does_not_know_vehicles() -> None:
+    core = [name for name in MODULES if top(name) != "vehicle"]
+    assert [name for name in core if any(top(other) == "vehicle" for other in imported(name))] == []
 
 
 def test_no_cycle_among_modules() -> None:

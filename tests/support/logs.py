@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from magrl.field import IGRF, elements_at
-from magrl.logs import axes_of_elements
+from magrl.vehicle.logs import axes_of_elements
 
 PLACE, UTC = (47.4, 8.55), 1_782_800_000.0  # June 2026
 ELEMENTS = elements_at(IGRF("2026-06-30"), torch.tensor(PLACE, dtype=torch.float64))

@@ -16,7 +16,7 @@ def load_pretrained(name: str, device: torch.device | str = "cpu") -> FieldPolic
     """Return a trained policy that comes with the library.
 
     It plans for the 120 steps of its training until another number is given: :func:`magrl.evaluate` and
-    :class:`magrl.onboard.Onboard` give theirs, and in a loop of one's own :meth:`FieldPolicy.for_env` does.
+    :class:`magrl.vehicle.onboard.Onboard` give theirs, and in a loop of one's own :meth:`FieldPolicy.for_env` does.
 
     Args:
         name: ``"anywhere"``, which navigates without a map (``recipes/ppo_anywhere.py``).

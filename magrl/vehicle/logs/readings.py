@@ -1,0 +1,298 @@
+"""From samples to readings: means of the vector over the moves of a vehicle, and how accurate they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas
+import torch
+from numpy.typing import NDArray
+from pandas import DataFrame
+from torch import Tensor
+
+from magrl.checks import check_choice, check_number, short
+from magrl.field.elements import NAMES, elements_jacobian, measured_elements
+from magrl.files import numbers_of, read_table, read_text
+from magrl.geodesy import geodesic
+from magrl.vehicle.logs.calibration import Calibration
+from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Log, check_times, date_of, times_of
+from magrl.vehicle.logs.units import COLUMNS, UNITS, out_of_range, unit_of
+from magrl.vehicle.logs.vectors import NORTHS, axes_of_elements, rotation
+from magrl.transforms.errors.sensors import OUTAGE_STD
+
+SPIKE_SIGMAS = 5.0
+_BLOCKS = 10  # of the samples of a reading, whose means are nearly independent
+_PATH, _FIELD, _MEANS = ["path_n", "path_e"], ["b_n", "b_e", "b_d"], ("heading", "latitude", "longitude", "altitude")
+STD_NAMES = ("D_std", "I_std", "B_H_std")
+
+
+def readings_of(
+    log: Log,
+    *,
+    every_km: float = 20.0,
+    every_s: float | None = None,
+    north: str | None = None,
+    calibration: Calibration | None = None,
+) -> DataFrame:
+    """Return one reading for each move: the mean of the samples of that part of the track, at their mean position.
+
+    The parts are as long as the moves, so that every sample counts once. The vector is averaged, without spikes.
+    Positions are by dead reckoning along the heading, from the distances or the speeds of the log, or from its
+    positions where it has neither.
+
+    Args:
+        log: samples. Without a heading, it is that of a compass: the horizontal field, leveled by roll and pitch.
+        every_km: least length of a move.
+        every_s: duration of a move [s], in place of a length.
+        north: north of the heading, one of :data:`~magrl.vehicle.logs.vectors.NORTHS`; default that of the log.
+        calibration: correction of the axes.
+
+    Returns:
+        Columns of ``recipes/replay_log.py``: ``time``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` of the move
+        since the row before, ``latitude`` and ``longitude`` where known; and ``D_std``, ``I_std``, ``B_H_std``, the
+        standard deviations of the means by the scatter of tenths of their samples, NaN where all moves have less than
+        three, ``samples``, and ``spikes``.
+
+    Raises:
+        ValueError: for a log without a motion, an unknown north, or without a heading from that north.
+
+    Example:
+        >>> import pandas
+        >>> time, heading = np.arange(2000.0), np.zeros(2000)
+        >>> axes = {"x": 20000.0 - 0.01 * time, "y": 0 * time, "z": 40000.0 + 0 * time}
+        >>> log = Log(pandas.DataFrame({"time": time, **axes, "heading": heading, "speed": 50 + 0 * time}), "by hand")
+        >>> readings_of(log, every_km=25.0, north="true")[["B_H", "distance"]].round().values.tolist()
+        [[19998.0, 0.0], [19992.0, 25.0], [19987.0, 25.0], [19982.0, 25.0]]
+    """
+    if texts := obstacles(log, north):
+        raise ValueError("; ".join(texts))
+    axes = log.tensor(*AXES) if calibration is None else calibration.apply(log.tensor(*AXES))
+    if "heading" not in log.samples and north in (None, "magnetic"):
+        log = with_compass(log, axes)
+    north = north or log.north or ""
+    check_choice(NORTHS, north=north)
+    check_number(0, above=True, every_km=every_km)
+    check_number(0, above=True, optional=True, every_s=every_s)
+    field = (rotation(log.tensor(*ATTITUDE)) @ axes.unsqueeze(-1)).squeeze(-1).numpy()
+    path, time = _path(log), log.samples["time"].to_numpy(float)
+    part = _parts_km(path, every_km) if every_s is None else _parts_s(time, every_s)
+    samples = pandas.DataFrame(np.column_stack((time, path, field)), columns=["time", *_PATH, *_FIELD])
+    for name in _MEANS:
+        if name in log.samples:
+            samples[name] = log.samples[name] if name == "altitude" else np.unwrap(log.samples[name], period=360)
+    clean = ~_spikes(field, part)
+    groups = samples[clean].groupby(part[clean])
+    table = _readings(groups.mean(), _covariance(field[clean], part[clean]), north)
+    return table.assign(samples=groups.size(), spikes=np.bincount(part[~clean], minlength=len(table)))
+
+
+def obstacles(log: Log, north: str | None = None) -> list[str]:
+    """Return all that a log lacks for :func:`readings_of`, as sentences with the remedy; none where nothing is missing.
+
+    Args:
+        log: samples.
+        north: north of the heading; default that of the log.
+
+    Example:
+        >>> obstacles(Log(DataFrame({"time": [0.0], "x": [0.0], "y": [0.0], "z": [0.0], "speed": [1.0]}), "by hand"))
+        []
+    """
+    texts, columns = [], log.samples.columns
+    if "heading" in columns and not (north or log.north):
+        texts.append(f"the log does not state the north of the heading: give north, one of {', '.join(NORTHS)}")
+    elif "heading" not in columns and north in ("true", "model"):
+        texts.append(
+            f"the log has no heading, only {', '.join(columns)}: log it, or give north magnetic, for a compass"
+        )
+    if not {"distance", "speed"} & {*columns} and not {"latitude", "longitude"} <= {*columns}:
+        texts.append(
+            "the log has neither distances nor speeds nor positions, for the moves between readings: log one of them"
+        )
+    return texts
+
+
+def with_compass(log: Log, axes: Tensor) -> Log:
+    """Return a log with headings from magnetic north, of its own field.
+
+    Args:
+        log: samples without a heading, with roll and pitch, or of a vehicle that is level.
+        axes: ``(N, 3)`` the field, forward, right, down [nT].
+
+    Example:
+        >>> log = Log(DataFrame({"time": [0.0], "x": [0.0], "y": [-20000.0], "z": [40000.0]}), "by hand")
+        >>> with_compass(log, log.tensor("x", "y", "z")).samples["heading"].tolist()  # magnetic north is to the left
+        [90.0]
+    """
+    tilt = torch.nn.functional.pad(log.tensor(*ATTITUDE[:2]), (0, 1))
+    forward, right, _ = (rotation(tilt) @ axes.unsqueeze(-1)).squeeze(-1).unbind(-1)
+    heading = torch.rad2deg(torch.atan2(-right, forward)).remainder(360)
+    return replace(log, samples=log.samples.assign(heading=heading.numpy()), north="magnetic")
+
+
+def read_readings(path: Path | str, names: Mapping[str, str], time: str | None = None) -> DataFrame:
+    """Return the readings of a CSV file with a header, one for each move.
+
+    Args:
+        path: the file.
+        names: its columns by ``D``, ``I``, ``B_H``, ``heading``, ``distance``, and optionally ``latitude`` and
+            ``longitude``, and ``altitude``, which the file may lack. A unit that ends a name counts, such as that of
+            ``H_uT``, and a name is also found with one, such as ``altitude_m``; without one, it is nT, deg or km.
+        time: its column of the time, numbers or ISO 8601, which it may lack.
+
+    Returns:
+        Columns of these names, ``row``, the number of each in the file, and ``time``; without rows that repeat the time
+        of the row before. ``attrs`` has the ``notes`` on the times, and their ``date``.
+
+    Raises:
+        ValueError: for a file that cannot be read, a missing column, a value that is not a number, or times that run
+            backward.
+
+    Example:
+        >>> read_readings("nowhere.csv", {})
+        Traceback (most recent call last):
+        ValueError: cannot read nowhere.csv: [Errno 2] No such file or directory: 'nowhere.csv'
+    """
+    try:
+        raw = read_table(read_text(Path(path)), dtype=str)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    log, wrong = DataFrame({"row": np.arange(len(raw)) + 1}), list[str]()  # the header is not counted
+    located = any(names.get(key) in raw for key in ("latitude", "longitude"))
+    for key, name in names.items():
+        kind = "field" if key == "B_H" else COLUMNS.get(key, ("angle",))[0]
+        others = {f"{name}_{unit}".lower() for unit in UNITS[kind]}
+        name = next((other for other in raw if name not in raw and other.lower() in others), name)
+        if name in raw:
+            log[key] = (unit_of(name, kind) or 1.0) * numbers_of(raw[name].fillna(""), wrong)
+            wrong += filter(None, [out_of_range(key, log[key].to_numpy())])
+        elif key in ("D", "I", "B_H", "heading", "distance") or (located and key != "altitude"):
+            wrong.append(f"no column is {name!r}: name that of {key}, one of {short([*raw], 300)}")
+    if wrong:
+        raise ValueError(f"cannot read {path}: {'; '.join(wrong)}")
+    if len(log) < 2:
+        raise ValueError(f"{path} must hold at least two rows, got {len(log)}")
+    log.attrs = {"notes": [], "date": None}
+    if time in raw:
+        log.insert(1, "time", raw[time])
+        times, notes = times_of(raw[time])
+        new, more = check_times(times, "the unit of the times")
+        log = log[new].reset_index(drop=True)
+        log.attrs = {"notes": [*notes, *more], "date": date_of(float(times[0]))}
+    return log
+
+
+def joined(table: DataFrame, every_km: float) -> DataFrame:
+    """Return the means of the rows of each move in a table that already holds D, I, B_H; see :func:`readings_of`.
+
+    Args:
+        table: columns ``row``, ``D``, ``I``, ``B_H``, ``heading`` and ``distance`` since the row before, and others.
+        every_km: least length of a move; 0 for the rows as they are.
+
+    Returns:
+        The same columns; the others are those of the middle row of each move.
+
+    Raises:
+        ValueError: for moves so long that one reading is left.
+
+    Example:
+        >>> rows = {"row": range(1, 7), "D": 0.0, "I": 0.0, "B_H": range(6)}
+        >>> rows |= {"heading": 90.0, "distance": [0] + [2.0] * 5}
+        >>> joined(DataFrame(rows), 4.0)[["row", "B_H", "distance"]].round(9).values.tolist()
+        [[1.0, 0.5, 0.0], [3.0, 2.5, 4.0], [5.0, 4.5, 4.0]]
+    """
+    check_number(0, every_km=every_km)
+    if not every_km:
+        return table
+    heading = torch.tensor(table["heading"].to_numpy(float))
+    attitude = torch.stack((torch.zeros_like(heading), torch.zeros_like(heading), heading), -1)
+    axes = axes_of_elements(torch.tensor(table[list(NAMES)].to_numpy(float).copy()), attitude).numpy()
+    samples = table.assign(time=np.arange(len(table)), **dict(zip(AXES, axes.T, strict=True)))
+    readings = readings_of(Log(samples, "readings", "true"), every_km=every_km)
+    if len(readings) < 2:
+        raise ValueError(f"every_km {every_km:g} leaves one reading of {len(table)}: choose shorter moves")
+    middle = table.iloc[readings["time"].astype(int)].reset_index(drop=True)
+    return middle.assign(**{name: readings[name] for name in readings if name in table and name != "time"})
+
+
+def _path(log: Log) -> Array:
+    """Return places ``(N, 2)``, northward and eastward of the first one [km]."""
+    samples = log.samples
+    if "distance" in samples or "speed" in samples:
+        step = np.diff(samples["time"], prepend=samples["time"].iloc[0])
+        length = samples["distance"] if "distance" in samples else samples["speed"] * step / 1000
+        heading = np.radians(samples["heading"])
+    else:
+        place = log.tensor("latitude", "longitude")
+        distance, bearing = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))
+        length, heading = (np.concatenate(([0.0], values.numpy())) for values in (distance, bearing))
+    return np.cumsum(np.stack((length * np.cos(heading), length * np.sin(heading)), -1), 0)
+
+
+def _parts_km(path: Array, every_km: float) -> NDArray[np.int64]:
+    """Return the part of each sample ``(N,)``; a part ends where it is ``every_km`` from its first sample."""
+    first, start = [0], path[0].tolist()
+    for row, place in enumerate(path.tolist()):
+        if math.dist(place, start) >= every_km:
+            first.append(row)
+            start = place
+    if len(first) > 1 and np.hypot(*(path[-1] - path[first[-1]])) < every_km / 2:
+        first.pop()
+    return np.searchsorted(first, np.arange(len(path)), side="right") - 1
+
+
+def _parts_s(time: Array, every_s: float) -> NDArray[np.int64]:
+    """Return the part of each sample ``(N,)`` by time, without parts that would be empty."""
+    return np.unique(((time - time[0]) / every_s).astype(int), return_inverse=True)[1]
+
+
+def _spikes(field: Array, part: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which vectors ``(N, 3)`` deviate from the median of their part by more than its scatter explains.
+
+    A part of few samples has none: its scatter is unknown.
+    """
+    groups = pandas.DataFrame(field).groupby(part)
+    deviation = np.abs(field - groups.transform("median").to_numpy())
+    scatter = 1.4826 * pandas.DataFrame(deviation).groupby(part).transform("median").to_numpy()
+    return (deviation > SPIKE_SIGMAS * scatter + 1.0).any(-1) & (np.bincount(part)[part] >= _BLOCKS)
+
+
+def _covariance(field: Array, part: NDArray[np.int64]) -> Array:
+    """Return the covariance ``(3, 3)`` of the mean of a part, as a mean over the parts; NaN if all are too short.
+
+    The means of tenths of a part scatter by errors that last less than a tenth; their linear trend is the field's. With
+    less than two samples in a tenth, the samples themselves are used, which do not show longer errors.
+    """
+    parts = np.split(field, np.flatnonzero(np.diff(part)) + 1)
+    least = 2 * _BLOCKS if max(map(len, parts)) >= 2 * _BLOCKS else 3
+    covariances = []
+    for rows in parts:
+        if len(rows) >= least:
+            blocks = np.stack([block.mean(0) for block in np.array_split(rows, min(_BLOCKS, len(rows)))])
+            line = np.linspace(-1, 1, len(blocks))
+            residual = blocks - blocks.mean(0) - np.outer(line, line @ blocks / (line @ line))
+            covariances.append(residual.T @ residual / (len(blocks) - 2) / len(blocks))
+    return np.mean(covariances, 0) if covariances else np.full((3, 3), np.nan)
+
+
+def _readings(mean: DataFrame, covariance: Array, north: str) -> DataFrame:
+    """Return the columns of readings from the means of parts."""
+    field = torch.tensor(mean[_FIELD].to_numpy(float))
+    jacobian = elements_jacobian(field)
+    std = (jacobian @ torch.from_numpy(covariance) @ jacobian.mT).diagonal(dim1=-2, dim2=-1).sqrt()
+    if north != "true":
+        std[:, 0] = OUTAGE_STD
+    move = np.diff(mean[_PATH].to_numpy(float), axis=0)
+    course = np.degrees(np.arctan2(move[:, 1], move[:, 0])) % 360
+    table = pandas.DataFrame(torch.cat((measured_elements(field), std), -1).numpy(), columns=[*NAMES, *STD_NAMES])
+    table.insert(0, "time", mean["time"])
+    table["heading"] = [mean["heading"].iloc[0] % 360, *course]
+    table["distance"] = [0.0, *np.hypot(*move.T)]
+    if "latitude" in mean:
+        table["latitude"], table["longitude"] = mean["latitude"], (mean["longitude"] + 180) % 360 - 180
+    if "altitude" in mean:
+        table["altitude"] = mean["altitude"]
+    return table

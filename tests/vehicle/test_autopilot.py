@@ -1,0 +1,921 @@
+"""Steering an autopilot: flights of simulated vehicles through the loop and its links, restarts, damaged messages."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import math
+import random
+import runpy
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from support.logs import nmea as log_of_a_ship
+
+from magrl.vehicle.autopilot import Loop, Measurement, fly
+from magrl.vehicle.autopilot.__main__ import main, parser, vehicle
+from magrl.vehicle.autopilot.loop import _SAID, LOG
+from magrl.vehicle.autopilot.mavlink import MavlinkLink, Messages
+from magrl.vehicle.autopilot.nmea import NmeaLink, Sentences
+from magrl.field import IGRF, elements_at
+from magrl.geodesy import geodesic, move
+from magrl.vehicle.logs import axes_of_elements, read_log
+from magrl.vehicle.onboard import Command, Onboard
+
+pytest.importorskip("pymavlink")
+from pymavlink.dialects.v10 import ardupilotmega as mavlink_1
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+FIELD = IGRF("2026-01-01")
+HERE, THERE = (60.0, 5.0), (61.2, 4.0)  # 144 km apart
+SPEED, STEP_S = 60.0, 10.0
+OFFSET = 17.0  # of the autopilot's heading from true north, where the vehicle has a compass [deg]
+EXAMPLE = Path(__file__).parent.parent.parent / "docs" / "examples" / "jsbsim_vehicle.py"
+
+
+@pytest.fixture(autouse=True)
+def _forget() -> None:
+    """Nothing was logged before a test."""
+    _SAID.clear()
+    LOG.handlers.clear()
+
+
+def elements(place: tuple[float, float]) -> list[float]:
+    return elements_at(FIELD, torch.tensor(place, dtype=torch.float64)).tolist()
+
+
+class World:
+    """A vehicle that turns at once and moves at a constant speed, as a link."""
+
+    period_s = 55.0
+
+    def __init__(self, north: str = "true", noise: float = 20.0, speed: float = SPEED, step_s: float = STEP_S) -> None:
+        self.speed, self.step_s = speed, step_s
+        self.place, self.time, self.heading = HERE, 0.0, 320.0
+        self.north, self.rng, self.noise = north, random.Random(0), noise
+        self.said: list[str] = []
+        self.steered = 0
+
+    @property
+    def left_km(self) -> float:
+        place = torch.tensor([*self.place, *THERE], dtype=torch.float64)
+        return geodesic(*place)[0].item()
+
+    def __iter__(self) -> Iterator[Measurement]:
+        while self.time < 20_000:
+            yield from self.messages()
+
+    def messages(self) -> Iterator[Measurement]:
+        """Move on and measure."""
+        self.time += self.step_s
+        length = torch.tensor(self.speed * self.step_s / 1000, dtype=torch.float64)
+        here, course = torch.tensor(self.place, dtype=torch.float64), torch.tensor(math.radians(self.heading))
+        self.place = tuple(value.item() for value in move(*here, course, length))
+        attitude = 1.0 + 0.1 * self.rng.random(), -2.0, self.heading
+        axes = axes_of_elements(torch.tensor(elements(self.place)), torch.tensor(attitude))
+        shown = self.heading - OFFSET * (self.north == "magnetic")
+        field = [self.rng.gauss(value, self.noise) for value in axes.tolist()]
+        yield Measurement(self.time, None, None, None, *attitude[:2], shown % 360, received=self.time)
+        yield Measurement(self.time + 0.01, *field, received=self.time)
+        yield Measurement(self.time + 0.02, speed=self.speed, received=self.time)
+
+    def steer(self, heading_deg: float) -> None:
+        self.steered += 1
+        self.heading = heading_deg + OFFSET * (self.north == "magnetic")
+
+    def report(self, command: Command, text: str) -> None:
+        self.said.append(text or f"{command.heading_deg}")
+
+
+def loop(north: str = "true") -> Loop:
+    board = Onboard("anywhere", north=north, sensor_std=(0.05 * (north == "true"), 0.05, 20.0))
+    board.start([None if north == "magnetic" else elements(THERE)[0], *elements(THERE)[1:]])
+    return Loop(board, read_s=60.0)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> tuple[World, list[Command], Path]:
+    """A flight with true north."""
+    world, folder = World(), tmp_path_factory.mktemp("flight")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("magrl.vehicle.autopilot.flight.clock", lambda: world.time)
+        return world, list(fly(loop(), world, folder)), folder
+
+
+def test_a_vehicle_arrives(flown) -> None:
+    world, commands, folder = flown
+    assert commands[-1].stop == "arrived"
+    assert world.left_km < 25
+    assert world.time * SPEED / 1000 < 3 * 144
+    assert world.said[-1].startswith("within 25 km")
+    assert world.time / 60 < world.steered < world.time / 50 + len(commands)  # with each command, and now and then
+    assert read_log(folder / "messages.csv").north == "true"  # the record is a log
+
+
+def test_a_vehicle_with_a_compass_arrives_by_the_heading_of_its_autopilot(tmp_path) -> None:
+    world = World("magnetic")
+    flight = loop("magnetic")
+    commands = list(fly(flight, world, tmp_path))
+    assert commands[-1].stop
+    assert world.left_km < 25
+    declination = elements(world.place)[0]
+    assert flight.steer_deg == pytest.approx((commands[-1].heading_deg + declination - OFFSET) % 360, abs=0.5)
+
+
+def test_one_step_is_made_at_the_end_of_each_move(monkeypatch, tmp_path) -> None:
+    moves, step = [], Onboard.step
+    monkeypatch.setattr(Onboard, "step", lambda self, *a, **k: moves.append(a[4]) or step(self, *a, **k))
+    commands = list(fly(loop(), World(), tmp_path))
+    assert len(moves) == len(commands)
+    for made, command in zip(moves[1:], commands, strict=False):
+        if command.distance_km > 5:
+            assert made == pytest.approx(command.distance_km, abs=SPEED * STEP_S / 1000)
+
+
+class Played(World):
+    """Messages of a record."""
+
+    def __init__(self, lines: list[str]) -> None:
+        super().__init__()
+        self.lines = lines
+
+    def __iter__(self) -> Iterator[Measurement]:
+        for line in self.lines:
+            yield Measurement(*(float(cell) if cell else None for cell in line.strip().split(",")))
+
+
+def record(folder: Path) -> list[str]:
+    """The lines of a record, the header first."""
+    return (folder / "messages.csv").read_text().splitlines(keepends=True)
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_a_killed_flight_continues_with_the_same_commands(flown, number, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("magrl.vehicle.autopilot.flight.STATE_LINES", 10 + 90 * number)
+    lines, repeated = record(flown[2]), []
+    cut, other = sorted(random.Random(number).sample(range(2, len(lines)), 2))
+    before = [*fly(loop(), Played(lines[1:cut]), tmp_path)]
+    with (tmp_path / "messages.csv").open("a") as file:
+        file.write(lines[cut][: number % 7])  # the last line is torn
+    flight, take = loop(), Loop.take
+    monkeypatch.setattr(Loop, "take", lambda self, *a: repeated.append(a) or take(self, *a))
+    after = [*fly(flight, Played([]), tmp_path)]
+    assert after == before[-1:]
+    assert len(repeated) <= 10 + 90 * number  # of a state beside the messages
+    if number % 2:
+        (tmp_path / "flight.json").write_text(number // 2 * "{")  # damaged: all messages are repeated
+    after = [*fly(loop(), Played(lines[cut:other]), tmp_path), *[*fly(loop(), Played(lines[other:]), tmp_path)][1:]]
+    assert before + after[len(before[-1:]) :] == flown[1] or not before
+    assert record(tmp_path) == lines
+
+
+@pytest.mark.parametrize("damage", ["\n", "{line},5.0\n", "\0\0\0\n", ",1.0,,,,,,,\n"])
+def test_what_comes_before_a_damaged_line_is_used(flown, damage, tmp_path, caplog) -> None:
+    lines, cut = record(flown[2]), 150
+    before = [*fly(loop(), Played(lines[1:cut]), tmp_path)]
+    bad = damage.format(line=lines[cut].strip()).encode()
+    (tmp_path / "messages.csv").write_bytes("".join(lines[:cut]).encode() + bad + "".join(lines[cut + 5 :]).encode())
+    flight = loop()
+    assert [*fly(flight, Played([]), tmp_path)] == before[-1:]
+    assert caplog.text.count("is no message") == caplog.text.count(f"line {cut + 1} of {tmp_path}/messages.csv") == 1
+    assert flight.now == pytest.approx(float(lines[cut - 1].split(",")[0]), abs=0.05)
+    _SAID.clear()
+    again = [*fly(loop(), Played(lines[cut : cut + 100]), tmp_path)]
+    assert [*fly(loop(), Played([]), tmp_path)] == again[-1:] == flown[1][len(before) - 2 + len(again) :][:1]
+    assert caplog.text.count("is no message") == 1  # it is said once
+
+
+CHANGES: list[tuple[str, dict[str, Any]]] = [
+    ("here", {"here": (60.0, 5.0), "date": "2026-01-01"}),
+    ("near", {"near": (60.0, 5.0), "date": "2026-01-01"}),
+    ("confidence", {"confidence": 0.9}),
+    ("north", {"north": "magnetic"}),
+    ("weights", {"navigator": "kalman"}),
+    ("read_s", {"read_s": 10.0}),
+]
+
+
+@pytest.mark.parametrize(("name", "change"), CHANGES)
+def test_a_flight_with_other_options_is_refused(name, change, tmp_path) -> None:
+    def made(read_s: float = 30.0, **rest: Any) -> Loop:
+        start = {key: rest.pop(key) for key in ("here", "near", "date") if key in rest}
+        board = Onboard(rest.pop("navigator", "secant"), **rest)
+        board.start((-11.6, 75.4, 13240.0), **start)
+        return Loop(board, read_s=read_s)
+
+    assert [*fly(made(), Played([]), tmp_path)] == []
+    assert [*fly(made(), Played([]), tmp_path)] == []
+    with pytest.raises(ValueError, match=rf"is of a flight with.* {name} ") as error:
+        [*fly(made(**change), Played([]), tmp_path)]
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_has_one_process(tmp_path) -> None:
+    first = fly(loop(), World(), tmp_path)
+    next(first)
+    with pytest.raises(ValueError, match="another process"):
+        next(fly(loop(), World(), tmp_path))
+    first.close()
+    assert next(fly(loop(), World(), tmp_path))
+
+
+def full(*_: Any) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+class Full:
+    """A file on a disk that is full now and then, where a part of what is written fits."""
+
+    left = 800
+
+    def __init__(self, file: Any, rng: random.Random) -> None:
+        self.file, self.rng = file, rng
+        self.close = file.close
+
+    def write(self, content: bytes) -> int:
+        self.left -= 1
+        if self.left > 0 and self.rng.random() < 0.7:
+            full()
+        return self.file.write(content[: self.rng.randrange(200)])
+
+
+def test_errors_of_the_system_do_not_end_the_steering(flown, tmp_path, caplog, monkeypatch) -> None:
+    rng, lines, opened = random.Random(0), record(flown[2]), Path.open
+
+    class Broken(Played):
+        def steer(self, *_: Any) -> None:
+            self.steered += 1
+            if rng.random() < 0.5:
+                raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+        report = steer
+
+    def write(path: Path, content: bytes) -> None:
+        full() if rng.random() < 0.5 else path.write_bytes(content)
+
+    def disk(path: Path, mode: str, **options: Any) -> Any:
+        return Full(opened(path, mode, **options), rng) if mode == "ab" else opened(path, mode, **options)
+
+    [*fly(loop(), Played([]), tmp_path)]
+    monkeypatch.setattr("magrl.vehicle.autopilot.flight.STATE_LINES", 5)
+    monkeypatch.setattr("magrl.vehicle.autopilot.flight.write_atomically", write)
+    monkeypatch.setattr(Path, "open", disk)
+    link = Broken(lines[1:])
+    assert [*fly(loop(), link, tmp_path)] == flown[1]
+    assert link.steered >= 2 * len(flown[1]) - 1
+    assert record(tmp_path) == lines
+    for text in ("the heading is not sent", "the command is not reported", "messages wait", "the state of the flight"):
+        assert len([line for line in caplog.messages if text in line]) == 1  # not each time
+    assert [*fly(loop(), Played([]), tmp_path)] == flown[1][-1:]
+
+
+def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
+    class Late(World):
+        def messages(self) -> Iterator[Measurement]:
+            messages = [*super().messages()]
+            order = messages + messages[:2] if self.rng.random() < 0.5 else messages[::-1]
+            old = Measurement(self.time - 3 * STEP_S, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0, self.time)
+            yield from (*order, old)
+
+    world = Late(noise=0.0)
+    assert [*fly(loop(), world, tmp_path)][-1].stop == "arrived"
+    assert world.left_km < 25
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_no_clock_moves_the_vehicle(number, caplog) -> None:
+    """Times that are wrong once or from then on, and silence, against the time of receipt."""
+    rng, flight, now, shift = random.Random(number), loop(), 0.0, 0.0
+    jumps = (2**32 / 1e3, 30 * 86400.0, 3600.0, 61.0, -1000.0, -2.6e6, math.nan, 1e18)
+    for _ in range(3000):
+        now += 600.0 if number % 2 and rng.random() < 0.002 else 1.0
+        shift += rng.choice(jumps[:-2]) if rng.random() < 0.01 else 0.0
+        once = rng.choice([*jumps, -now - shift]) if rng.random() < 0.05 else 0.0
+        flight.take(Measurement(now + shift + once, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, SPEED, received=now))
+    assert flight._place == (pytest.approx(SPEED * now / 1000, abs=2.0), 0.0)
+    assert "not believed" in caplog.text
+    assert "does not count" in caplog.text
+    assert ("no message for" in caplog.text) == bool(number % 2)
+    place = flight._place[0]
+    flight.take(Measurement(now + 9000.0, speed=SPEED, received=now + 9000.0))
+    assert flight._place[0] - place == pytest.approx(SPEED * 3.6, abs=2.0)  # of an hour at most
+
+
+# Readings
+
+
+def readings(change: Callable[[int, Measurement], Measurement | None], steps: int = 60) -> Loop:
+    """A loop after messages that a function changes; None leaves one out."""
+    flight, world = loop(), World()
+    for number in range(steps):
+        for message in world.messages():
+            changed = change(number, message)
+            if changed:
+                flight.take(changed)
+        if flight.steer_deg is not None:
+            world.steer(flight.steer_deg)
+    return flight
+
+
+def stuck(number: int, message: Measurement) -> Measurement:
+    return message if message.x is None or number < 9 else message._replace(x=5000.0, y=14000.0, z=49000.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (stuck, "the magnetometer is stuck"),
+        (lambda n, m: m if m.x is None or n < 9 else None, "no sample of the field"),
+        (lambda n, m: m if m.x is None or n < 9 else m._replace(x=-m.x), "changed from"),
+        (lambda n, m: m._replace(heading=None) if n else m, "no sample of the field with an attitude"),
+    ],
+)
+def test_a_bad_reading_is_named_and_the_vehicle_goes_on(change, text) -> None:
+    flight = readings(change, 100)
+    assert text in flight.note
+    first = "attitude" in text
+    assert (flight.command is None) == first  # nothing is commanded before the first reading
+    if not first:
+        assert flight.vehicle._steps[-1].inclination is None
+
+
+def test_an_impossible_message_does_not_count() -> None:
+    bad = [{"x": math.nan}, {"heading": math.inf}, {"pitch": 91.0}, {"speed": -1.0}, {"speed": 1e4}]
+    assert not any(Measurement(0.0, **values).possible for values in bad)
+    spiked = readings(lambda n, m: m._replace(pitch=400.0) if n % 2 and m.pitch else m)
+    assert spiked.vehicle._steps[0].inclination == pytest.approx(elements(HERE)[1], abs=0.1)
+
+
+@pytest.mark.parametrize("good", [True, False])
+def test_a_long_way_is_reported_in_parts_and_once(good) -> None:
+    flight = readings(lambda _, m: m, 10)
+    before = len(flight.vehicle._steps)
+    messages = (m._replace(time=m.time + gap, received=gap) for gap in (2000.0, 2100.0) for m in World().messages())
+    while len(flight.vehicle._steps) == before:  # it was not heard of for half an hour
+        message = next(messages)
+        flight.take(message if good or message.x is None else message._replace(x=-message.x))
+    distances = [step.distance for step in flight.vehicle._steps][before:]
+    assert distances[:2] == [50.0, 50.0]
+    assert sum(distances) == pytest.approx(math.dist(flight._origin, (0.0, 0.0)), abs=5.0)
+
+
+def test_a_refused_reading_does_not_turn_the_vehicle() -> None:
+    flight, world, shown = loop("magnetic"), World("magnetic"), 0.0
+    while len(flight.vehicle._steps) < 2:
+        for message in world.messages():
+            wrong = flight.command and message.x is not None
+            flight.take(message._replace(x=message.y, y=message.z) if wrong else message)
+        if flight.steer_deg is not None:
+            world.steer(flight.steer_deg)
+            shown = flight._offset if len(flight.vehicle._steps) < 2 else shown
+    assert "not possible" in flight.note or "changed from" in flight.note
+    assert flight._offset == shown != 0.0
+
+
+def test_a_vehicle_that_does_not_get_ahead_reads_again() -> None:
+    flight, world = readings(lambda _, m: m, 8), World()
+    world.time = 80.0
+    assert flight.command.distance_km > 10
+    while len(flight.vehicle._steps) < 2:
+        world.heading += 30.0  # it circles
+        for message in world.messages():
+            flight.take(message)
+        assert world.time < 1000
+
+
+def test_a_loop_is_refused_without_a_start_and_after_the_end(flown) -> None:
+    with pytest.raises(ValueError, match="call start"):
+        Loop(Onboard("secant"))
+    flight = loop()
+    flight.command = flown[1][-1]
+    with pytest.raises(RuntimeError, match="has stopped: within 25 km"):
+        flight.take(Measurement(0.0))
+
+
+# Links
+
+
+class Line:
+    """A connection of pymavlink: what it receives, and what was sent."""
+
+    def __init__(self, messages: list[Any]) -> None:
+        self.messages, self.sent = iter(messages), []
+        self.mav = mavlink.MAVLink(self)
+
+    def write(self, content: bytes) -> None:
+        self.sent += mavlink.MAVLink(None).parse_buffer(content)
+
+    def recv_match(self, **_: Any) -> Any:
+        return next(self.messages, None)
+
+
+def packed(*messages: Any, system: int = 1, component: int = 1) -> list[Any]:
+    source = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    return [mavlink.MAVLink(None).parse_buffer(message.pack(source))[0] for message in messages]
+
+
+def heartbeat(kind: int = 1, autopilot: int = 3) -> Any:
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3)
+
+
+def received(link: MavlinkLink, count: int = 0) -> list[Measurement | None]:
+    """What comes before the silence after some messages."""
+    return [*islice(link, count + 1)][:count]
+
+
+def test_mavlink_is_read_in_our_units_from_one_vehicle() -> None:
+    attitude = mavlink.MAVLink_attitude_quaternion_message(5000, math.sqrt(0.5), 0, 0, math.sqrt(0.5), 0, 0, 0)
+    imu = mavlink.MAVLink_highres_imu_message(5_100_000, *[0] * 6, 0.15, -0.02, 0.5, *[0] * 4, 0x1C0)
+    coarse = mavlink.MAVLink_scaled_imu_message(5200, *[0] * 6, 150, 0, 500)
+    line = Line([*packed(heartbeat(), attitude, imu, coarse, mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0))])
+    line.messages = iter([*line.messages, *packed(attitude, system=9)])
+    beat, turned, field, ignored, speed, silence = received(MavlinkLink(line), 6)
+    assert turned == pytest.approx(Measurement(5.0, roll=0.0, pitch=0.0, heading=90.0), abs=1e-4)
+    assert field[:4] == pytest.approx((5.1, 15000.0, -2000.0, 50000.0), abs=1e-2)
+    assert [beat, ignored, silence] == [None] * 3
+    assert speed == Measurement(5.0, speed=50.0)
+    asked = [message.param1 for message in line.sent if message.get_type() == "COMMAND_LONG"]
+    assert {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_VFR_HUD} <= set(asked)
+
+
+def test_a_coarse_magnetometer_is_taken_after_some_messages_and_another_clock_is_set_aside() -> None:
+    messages = Messages("groundspeed")
+    speed = mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0)
+    assert messages.measurement(speed) is None  # its time is not known before the first attitude
+    messages.measurement(mavlink.MAVLink_attitude_message(2**32 - 1, *[0.0] * 6))  # a clock that ran out
+    messages.measurement(mavlink.MAVLink_attitude_message(3000, *[0.0] * 6))
+    raw = [mavlink.MAVLink_raw_imu_message(10**15 + n, *[0] * 6, 150, 0, 500, id=n % 2) for n in range(64)]
+    found = [messages.measurement(message) for message in raw]
+    assert found[:30] == [None] * 30
+    assert found[30:] == [Measurement(3.0, 15000.0, 0.0, 50000.0), None] * 17  # of one of two
+    assert messages.measurement(speed) == Measurement(3.0, speed=40.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [(1, "COMMAND_INT"), (2, "SET_POSITION_TARGET_LOCAL_NED"), (10, "SET_POSITION_TARGET_LOCAL_NED")],
+)
+def test_mavlink_steers(kind, name) -> None:
+    line = Line(packed(heartbeat(kind)))
+    link = MavlinkLink(line, cruise_m_s=5.0)
+    received(link)
+    link.steer(120.0)
+    sent = line.sent[-1]
+    assert sent.get_type() == name
+    assert (sent.target_system, sent.target_component) == (1, 1)
+    if kind == 1:
+        assert (sent.command, sent.param1, sent.param2) == (mavlink.MAV_CMD_GUIDED_CHANGE_HEADING, 1, 120)
+    else:
+        assert (sent.vx, sent.vy, sent.yaw) == pytest.approx((-2.5, 4.3301, 2.0944), abs=1e-3)
+        ignored = mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+        assert sent.type_mask & ignored == ignored
+        assert not sent.type_mask & mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
+        yaw_ignored = bool(sent.type_mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE)
+        assert yaw_ignored == (kind == 10)  # a Rover would drive to the south backward
+        assert link._messages.speed == "groundspeed"
+
+
+def test_a_refused_heading_and_lost_requests_are_noticed(caplog) -> None:
+    answer = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_GUIDED_CHANGE_HEADING, 4)
+    line = Line(packed(*[heartbeat()] * 11, answer, answer))
+    received(MavlinkLink(line), 13)
+    assert caplog.text.count("is it in GUIDED") == 1
+    asked = [m.param1 for m in line.sent if m.get_type() == "COMMAND_LONG"]
+    assert asked.count(mavlink.MAVLINK_MSG_ID_VFR_HUD) == 2
+
+
+def test_reports_are_whole(flown) -> None:
+    line, texts = Line([]), []
+    link, order = MavlinkLink(line), flown[1][-1]
+    link.report(order, "")
+    values = {message.name: message.value for message in line.sent}
+    assert values["mg_north"] == pytest.approx(order.way_km[0], rel=1e-5)
+    for length in (1, 36, 37, 91, 200):  # the last part of a text is not full
+        line.sent.clear()
+        link.report(order, "x" * length)
+        parts = [message for message in line.sent if message.get_type() == "STATUSTEXT"]
+        assert "".join(part.text for part in parts) == "magrl arrived: " + "x" * length
+        assert [part.chunk_seq for part in parts] == [*range(len(parts))]
+        assert all(len(part.text) == 50 for part in parts[:-1])
+        assert len(parts[-1].text) < 50
+        texts.append({part.id for part in parts})
+    assert len(set().union(*texts)) == len(texts)
+    line.sent.clear()
+    line.mav = mavlink_1.MAVLink(line)
+    link.report(None, "x" * 60)
+    assert "".join(part.text for part in line.sent) == "magrl: " + "x" * 60
+    ship = NmeaLink("loop://,4800")
+    ship.report(None, "The sign of D ± the compass, not checked: " + 40 * "x")
+    told = [ship.port.readline().decode().split("*")[0].split(",", 4) for _ in range(2)]
+    assert [part[1:3] for part in told] == [["02", "01"], ["02", "02"]]
+    assert "".join(part[4] for part in told) == "The sign of D ; the compass; not checked: " + 40 * "x"
+
+
+FOREIGN = [(6, 8, 255, 1), (18, 8, 1, 191), (26, 8, 7, 154), (27, 8, 9, 156), (5, 3, 3, 1), (1, 12, 4, 1), (2, 3, 5, 1)]
+"""Ground station, onboard computer, gimbal, ADS-B, antenna tracker, a fixed wing of PX4, a copter without a speed."""
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_only_an_autopilot_that_can_be_steered_is_steered(number, caplog) -> None:
+    def beat(kind: int, autopilot: int, system: int, component: int) -> Any:
+        return packed(heartbeat(kind, autopilot), system=system, component=component)[0]
+
+    others = [beat(*source) for source in random.Random(number).sample(FOREIGN, len(FOREIGN))]
+    mine, attitude = beat(1, 3, 7, 1), mavlink.MAVLink_attitude_message(1000, *[0.0] * 6)
+    foreign, own = packed(attitude, system=1), packed(attitude, system=7)
+    line = Line([*others, mine, *foreign, *own, beat(1, 3, 8, 1), *others])
+    link = MavlinkLink(line)
+    link.steer(10.0)  # nobody is there yet
+    assert [item is not None for item in received(link, 18)].index(True) == 9
+    link.steer(120.0)
+    assert (line.sent[-1].target_system, line.sent[-1].target_component) == (7, 1)
+    assert line.sent[-1].get_srcSystem() == 7
+    assert {message.target_system for message in line.sent if message.get_type() == "COMMAND_LONG"} == {7}
+    assert "is not steered: PX4 accepts no heading" in caplog.text
+    line.messages = iter([mine, beat(1, 3, 8, 2), *others])
+    link = MavlinkLink(line, autopilot=(8, 2))
+    received(link, 9)
+    link.steer(120.0)
+    assert (line.sent[-1].target_system, line.sent[-1].target_component) == (8, 2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "autopilot", "options", "text"),
+    [
+        (1, 12, {}, "PX4 accepts no heading"),
+        (22, 12, {"cruise_m_s": 20.0}, "PX4 accepts no heading"),
+        (10, 3, {}, "state cruise_m_s"),
+    ],
+)
+def test_an_autopilot_that_cannot_be_steered_as_stated_is_named(kind, autopilot, options, text, caplog) -> None:
+    received(MavlinkLink(Line(packed(heartbeat(kind, autopilot))), **options))
+    assert text in caplog.text
+
+
+def test_a_link_that_fails_goes_on(monkeypatch, caplog) -> None:
+    monkeypatch.setattr("time.sleep", lambda _: None)
+
+    class Torn(Line):
+        def recv_match(self, **options: Any) -> Any:
+            message = super().recv_match(**options)
+            if isinstance(message, OSError):
+                raise message
+            return message
+
+    attitude = packed(mavlink.MAVLink_attitude_message(1000, *[0.0] * 6))
+    link = MavlinkLink(Torn([OSError("unplugged"), *packed(heartbeat()), OSError("unplugged"), *attitude]))
+    assert [item and item.heading for item in islice(link, 4)] == [None, None, None, 0.0]
+    ship = NmeaLink("loop://,4800")
+    items = iter(ship)
+    ship.port.close()  # as if it was unplugged
+    with pytest.raises(OSError, match="not open"):
+        ship.steer(1.0)
+    assert next(items) is None
+    ship.port.write(sentence("HEHDT,290.0,T"))
+    assert next(items).heading == 290.0
+    assert "nothing is received: unplugged" in caplog.text
+
+
+def sentence(content: str) -> bytes:
+    checksum = 0
+    for byte in content.encode():
+        checksum ^= byte
+    return f"${content}*{checksum:02X}\r\n".encode()
+
+
+def nmea(world: World) -> Iterator[bytes]:
+    """The sentences of a ship's instruments."""
+    for message in world.messages():
+        if message.heading is not None:
+            yield sentence(f"HEHDT,{message.heading:.1f},T")
+        if message.x is not None:
+            axes = ",".join(f"G,{message[1 + n]:.1f},,MAG_{axis}_NT" for n, axis in enumerate("XYZ"))
+            yield sentence(f"IIXDR,{axes},A,{1.0:.1f},D,ROLL,A,-2.0,D,PTCH")
+        if message.speed is not None:
+            yield sentence(f"VWVHW,,T,,M,{message.speed * 3600 / 1852:.2f},N,,K")
+
+
+def test_nmea_over_udp_steers_a_ship() -> None:
+    world, found = World(), []
+    link = NmeaLink("udp:0")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ship:
+        ship.settimeout(10)
+        for line in (*nmea(world), b"$HEHDT,nonsense*00"):
+            ship.sendto(line, ("127.0.0.1", link.port.port))
+        for item in link:
+            found.append(item)
+            if item is None or len(found) == 3:
+                break
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:  # it does not get the answers
+            other.sendto(sentence("GPGSV,1,1,00"), ("127.0.0.1", link.port.port))
+            next(iter(link))
+        link.steer(120.0)
+        assert ship.recv(99) == sentence("ECHSC,120.0,T,,M")
+        assert ship.recv(99).startswith(b"$ECAPB,A,A,0.00,R,N,V,V,120.0,T,MAGRL,120.0,T,120.0,T*")
+        link.report(Command(1.0, 0.0, 0.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.5), "")
+        assert ship.recv(99) == sentence("PMGRL,WAY,90.0,-12.0,5.0,0.50,")
+    link.port.close()
+    heading, field, speed = found
+    assert heading.heading == pytest.approx(320.0)
+    assert (field.roll, field.pitch) == (1.0, -2.0)
+    assert math.hypot(field.x, field.y, field.z) == pytest.approx(50_900, abs=700)
+    assert speed.speed == pytest.approx(SPEED, abs=0.01)
+
+
+def read(*contents: str, **options: Any) -> list[dict[str, float]]:
+    """What sentences say, that comes one a second."""
+    kind = Sentences(**options)
+    found = [item for n, content in enumerate(contents) for item in kind.measurements(sentence(content), float(n))]
+    return [{k: v for k, v in item._asdict().items() if v is not None and k != "time"} for item in found]
+
+
+SPEEDS = ["VWVHW,,T,,M,10.0,N,18.52,K", "VWVHW,,T,,M,,N,18.52,K", "VWVBW,10.0,0.0,A,9.0,0.0,V,,V,,V"]
+SPEEDS += ["GPVTG,,T,,M,10.0,N,18.52,K,A", "GPVTG,,T,,M,,N,18.52,K,A", "VWVBW,9.0,0.0,V,10.0,0.0,A,,V,,V"]
+
+
+def test_sentences_of_another_north_or_speed_do_not_count() -> None:
+    for line in SPEEDS:
+        water = SPEEDS.index(line) < 3
+        assert read(line, speed="water" if water else "ground") == [{"speed": pytest.approx(10 * 1852 / 3600)}]
+        assert read(line, speed="ground" if water else "water") == []
+    assert [read("HCHDM,350.0,M", north=north) for north in ("true", "magnetic")] == [[], [{"heading": 350.0}]]
+
+
+@pytest.mark.parametrize("line", ["HETHS,290.0,V", "HETHS,290.0,S", "HETHS,290.0,M", "HEHDT,720.0,T", "HEHDT,-1.0,T"])
+def test_a_heading_that_is_not_valid_does_not_count(line) -> None:
+    assert read(line, "HEHDT,290.0,T") == [{"heading": 290.0}]
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_an_unknown_transducer_changes_nothing(number, tmp_path) -> None:
+    """Names of columns of a log, with and without units, of any kind."""
+    rng, axes = random.Random(number), "G,1.0,,MAG_X_NT,G,2.0,,MAG_Y_NT,G,3.0,,MAG_Z_NT"
+    names = [
+        "SPEED",
+        "SOG",
+        "STW",
+        "YAW",
+        "HEADING",
+        "HEADING_TRUE",
+        "X",
+        "Y",
+        "Z",
+        "B_X",
+        "ACC_X",
+        "X_G",
+        "MAGNET",
+        "T",
+    ]
+    names += [
+        "TIME",
+        "DISTANCE",
+        "DEPTH",
+        "LAT",
+        "LON",
+        "ALT",
+        "MAG_HEADING",
+        "SPEED_KN",
+        "",
+        "PTCH",
+        "ROLL",
+        "PITCH",
+        "é",
+    ]
+    lines = []
+    for _ in range(100):
+        kinds = [(rng.choice("ACDFGHNPRTUV"), rng.choice(["", "N", "C", "R", "M", "X"]), name) for name in names]
+        group = ",".join(
+            f"{kind},{rng.choice(['5.0', '', '-1e9'])},{unit},{name}" for kind, unit, name in rng.sample(kinds, 6)
+        )
+        lines.append(rng.choice(["YX", "II", "SD"]) + f"XDR,{group}")
+    assert read(*lines, f"IIXDR,{axes}", "YXXDR,A,1.0,D,ROLL,A,2.0,D,PTCH") == [
+        {"x": 1.0, "y": 2.0, "z": 3.0},
+        {"roll": 1.0, "pitch": 2.0},
+    ]
+    paths = tmp_path / "a.log", tmp_path / "b.log"
+    for path, extra in zip(paths, ((), lines), strict=True):
+        path.write_bytes(log_of_a_ship(*extra))
+    logs = [read_log(path) for path in paths]
+    assert logs[0].samples.equals(logs[1].samples)
+    assert logs[0].north == logs[1].north
+
+
+@pytest.mark.parametrize(("north", "one", "other"), [("true", "HEHDT", "GPHDT"), ("magnetic", "HCHDM", "HCHDG")])
+def test_of_two_sources_the_first_or_the_named_one_counts(north, one, other, caplog) -> None:
+    lines = [f"{one},290.0,T", f"{other},20.0,,,,", f"{one},291.0,T", f"{other},300.0,,,,", "VWVHW,,T,,M,10.0,N,,K"]
+    found = read(*lines, "IIVBW,19.0,0.0,A,,,V,,V,,V", north=north)
+    assert [item["heading"] for item in found if "heading" in item] == [290.0, 291.0]
+    assert len(found) == 3
+    assert caplog.messages == [
+        f"heading of {other} does not count: it is 20.0, that of {one} was 290.0",
+        "speed of IIVBW does not count: it is 9.8, that of VWVHW was 5.1",
+    ]
+    assert read(*lines, north=north, sources=[other]) == [{"heading": 20.0}, {"heading": 300.0}]
+    caplog.clear()
+    _SAID.clear()
+    read(lines[0], *20 * ["GPGSA"], lines[3], north=north)
+    assert len(caplog.messages) == 1  # it agrees, but the first one is silent
+
+
+def test_a_serial_port_is_read_and_written() -> None:
+    link = NmeaLink("loop://,4800", level=True, north="magnetic")
+    link.port.write(sentence("HCHDM,350.0,M"))
+    assert next(iter(link)).heading == 350.0
+    link.steer(20.0)
+    assert link.port.readline() == sentence("ECHSC,,T,20.0,M")
+    link.port.close()
+
+
+@pytest.mark.parametrize("kind", ["mavlink", "nmea"])
+def test_mutated_messages_do_no_harm(kind) -> None:
+    """2000 messages of which a bit, a byte or a field is changed: no error, and no heading out of range."""
+    rng, world, flight = random.Random(0), World(speed=300.0, step_s=3.0), loop()
+    source, buffer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
+    buffer.robust_parsing = True
+    messages, sentences, commands, count = Messages(), Sentences(), [], 0
+
+    def take(content: bytes) -> None:
+        if kind == "nmea":
+            found = [*sentences.measurements(content, world.time)]
+        else:
+            parsed = buffer.parse_buffer(content) or ()
+            found = [messages.measurement(message) for message in parsed if message.get_type() in messages.names]
+        for item in filter(None, found):
+            ended = flight.command and flight.command.stop
+            commands.extend([] if ended else [flight.take(item)])
+
+    while count < 2000:
+        for content in [*nmea(world)] if kind == "nmea" else [m.pack(source) for m in encoded(world, rng)]:
+            for _ in range(2):
+                count += 1
+                damaged = bytearray(content)
+                damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+                whole = kind == "nmea" and rng.random() < 0.5  # with a checksum that fits
+                take(sentence(damaged[1:-5].decode("latin1")) if whole else bytes(damaged))
+            take(content)
+        if flight.steer_deg is not None:
+            world.steer(flight.steer_deg)
+    sent = [command for command in commands if command]
+    assert len(sent) > 3
+    assert all(0 <= command.heading_deg <= 360 and 0 <= command.distance_km <= 50 for command in sent)
+
+
+def encoded(world: World, rng: random.Random) -> Iterator[Any]:
+    """Messages of MAVLink, some of which have numbers that cannot be true."""
+    for message in world.messages():
+        ms = int(1000 * message.time)
+        wrong = rng.choice([math.nan, math.inf, -1e30, 1e30, 0.0])
+        if message.heading is not None:
+            angles = [math.radians(value) for value in message[4:7]]
+            yield mavlink.MAVLink_attitude_message(ms, wrong, *angles[1:], 0, 0, 0)
+            yield mavlink.MAVLink_attitude_message(ms, *angles, 0, 0, 0)
+        if message.x is not None:
+            axes = [value / 1e5 for value in message[1:4]]
+            if rng.random() < 0.2:
+                yield mavlink.MAVLink_highres_imu_message(1000 * ms, *[0] * 6, wrong, *axes[1:], *[0] * 4, 0)
+            yield mavlink.MAVLink_highres_imu_message(1000 * ms, *[0] * 6, *axes, *[0] * 4, 0)
+        if message.speed is not None:
+            yield mavlink.MAVLink_vfr_hud_message(wrong, wrong, 0, 0, 0, 0)
+            yield mavlink.MAVLink_vfr_hud_message(message.speed, 0, 0, 0, 0, 0)
+
+
+# The command
+
+
+def test_the_command_looks_up_its_destination_and_names_what_is_missing(capsys) -> None:
+    words = ["--to", *map(str, THERE), "--noise", "0.05", "0.05", "5"]
+    here = ["--here", *map(str, HERE), "--date", "2026-01-01", "--navigator", "secant", "--bias", "0", "0", "0"]
+    board = vehicle(parser().parse_args(["udp:0", *words, *here]))
+    assert board.target == pytest.approx(elements(THERE), rel=1e-6)
+    assert board._here[1][1:] == (0.2, 133.0)  # a place is known as well as a model of the core
+    with pytest.raises(SystemExit):
+        main(["udp:0", "--nmea", *words])
+    assert "--to and --here need --date" in capsys.readouterr().err
+
+
+def test_the_command_flies_on(flown, monkeypatch, capsys, tmp_path) -> None:
+    target = map(repr, loop().vehicle.target)
+    monkeypatch.setattr("magrl.vehicle.autopilot.__main__.link", lambda _: World())
+    noise = ["--noise", "0.05", "0.05", "20", "--read-s", "60"]
+    command = ["udp:0", "--target", *target, *noise, "--out", str(tmp_path)]
+    main(command)
+    shown = capsys.readouterr().out
+    lines = shown.splitlines()
+    assert len(lines) == 1 + len(flown[1])
+    assert lines[1].endswith("; the sign of D and the compass were not checked: give here or near in start")
+    assert "stop: arrived, within 25 km" in shown
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.stdout, "write", full)
+        main([*command[:-1], str(tmp_path / "full")])  # nothing can be printed
+    assert record(tmp_path / "full") == record(tmp_path)
+    main(command)
+    again = capsys.readouterr().out.splitlines()
+    assert again[0].startswith(f"continues the flight in {tmp_path}")
+    assert again[2:] == [lines[-1].replace(f"{len(flown[1]) - 1}:", "0:", 1)]
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["udp:99999", "--nmea"], "cannot open udp:99999: "),
+        (["/dev/none,4800", "--nmea"], "cannot open /dev/none,4800: "),
+        (["udpin:0.0.0.0:99999"], "cannot open udpin:0.0.0.0:99999: "),
+        (["/dev/none,fast"], "'fast'"),
+        (
+            ["udp:0", "--nmea", "--steering", "velocity", "--cruise", "5"],
+            "--steering, --cruise has no effect with --nmea",
+        ),
+        (["udpin:0.0.0.0:0", "--level", "--sources", "HEHDT"], "--level, --sources has no effect without --nmea"),
+        (["udp:0", "--nmea", "--date", "2026-01-01"], "--date and --altitude need them"),
+        (["udp:0", "--nmea", "--altitude", "1"], "--date and --altitude need them"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves a socket open
+def test_a_wrong_command_is_refused_in_one_line(words, text, capsys, tmp_path) -> None:
+    with pytest.raises(SystemExit) as status:
+        main(
+            [*words, "--target", "-11.6", "75.4", "13240", "--noise", "0.05", "0.05", "5", "--out", str(tmp_path / "x")]
+        )
+    gc.collect()
+    shown = capsys.readouterr().err
+    assert status.value.code == 2
+    assert text in shown
+    assert shown.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.slow
+def test_a_cessna_of_jsbsim_arrives_in_spite_of_faults(tmp_path) -> None:
+    """200 km in wind; the flight is interrupted, the magnetometer sticks for a while, and messages come twice."""
+    pytest.importorskip("jsbsim")
+    example = runpy.run_path(str(EXAMPLE))
+    rng = random.Random(5)
+    here, there, heading, wind = example["task"](rng, 200.0, 12.0)
+    aircraft = example["Cessna"](here, heading, wind, rng)
+    line = example["Loopback"](aircraft)
+    receive = line.recv_match
+
+    def faulty(**_: Any) -> Any:
+        aircraft.stuck = 1500 < aircraft.time < 1800
+        message = receive()
+        if rng.random() < 0.1 and line._queue:  # out of order, and twice
+            line._queue.append(line._queue.popleft())
+            line._queue.append(line._queue[-1])
+        return message
+
+    line.recv_match = faulty
+    commands: list[Command] = []
+    for limit in (8, 200):
+        board = Onboard("anywhere", sensor_std=example["NOISE"])
+        board.start(example["elements"](there))
+        again = []
+        for command in fly(Loop(board), MavlinkLink(line), tmp_path):
+            again.append(command)
+            if len(again) == limit:
+                break
+        assert again[: len(commands[-1:])] == commands[-1:]
+        commands = commands[:-1] + again
+        line._queue.extendleft([heartbeat()])
+    assert commands[-1].stop == "arrived"
+    assert example["EARTH"].Inverse(*aircraft.place, *there)["s12"] < 25_000
+
+
+@pytest.mark.slow
+def test_two_processes_fly_over_udp(tmp_path) -> None:
+    pytest.importorskip("jsbsim")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    aircraft = [
+        sys.executable,
+        str(EXAMPLE),
+        "--link",
+        f"udpout:127.0.0.1:{port}",
+        "--speedup",
+        "60",
+        "--distance",
+        "40",
+    ]
+    with subprocess.Popen(aircraft, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            words = next(line for line in process.stdout if "magrl.vehicle.autopilot" in line).split()
+            command = [
+                sys.executable,
+                *words[1:3],
+                f"udpin:127.0.0.1:{port}",
+                *words[4:],
+                "--out",
+                str(tmp_path / "out"),
+            ]
+            shown = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
+        finally:
+            process.kill()
+    assert "stop: arrived" in shown

@@ -1,0 +1,149 @@
+"""The command, and the story of docs/logs.md from a raw log to a replay: its commands run as they are written."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from support.logs import ELEMENTS, ulog
+
+from magrl.vehicle.logs import Calibration
+from magrl.vehicle.logs.__main__ import main
+
+ROOT = Path(__file__).parent.parent.parent
+PAGE = (ROOT / "docs" / "logs.md").read_text()
+COMMANDS = re.findall(r"```sh\n(.*?)```", PAGE[PAGE.index("## From a raw log to a replay") :], re.DOTALL)[0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Folder with the logs of the example."""
+    made = tmp_path_factory.mktemp("raw")
+    runpy.run_path(str(ROOT / "docs" / "examples" / "make_raw_log.py"))["write"](made / "raw")
+    return made
+
+
+def test_the_story_of_the_page(folder: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(folder)
+    first, *commands = COMMANDS.splitlines()
+    assert first == ".venv/bin/python docs/examples/make_raw_log.py raw"
+    for line in commands:
+        _, *words = shlex.split(line, comments=True)
+        name = words.pop(0)
+        name, run = (words.pop(0), runpy.run_module) if name == "-m" else (str(ROOT / name), runpy.run_path)
+        monkeypatch.setattr(sys, "argv", [name, *words])
+        monkeypatch.delitem(sys.modules, f"{name}.__main__", raising=False)
+        run(name, run_name="__main__")
+    said = capsys.readouterr().out
+    assert "15 readings, moves of 19.8 km" in said
+    assert "warning" not in said
+    replay = commands[-1].removeprefix(".venv/bin/")
+    assert f"replay: {replay}" in said, "the page has the command that is printed"
+    table = pd.read_csv(folder / "runs" / "replay_log" / "log.csv")
+    assert table["miss_km"].iloc[-1] < 30
+
+
+def test_a_log_of_px4_agrees_with_igrf(tmp_path: Path, capsys) -> None:
+    (tmp_path / "log.ulg").write_bytes(ulog({"vehicle_magnetometer:0": 1.0, "sensor_mag:0": 0.5}))
+    main([str(tmp_path / "log.ulg"), "--sensor", "vehicle_magnetometer"])
+    said = capsys.readouterr().out
+    assert "first reading: D {:.2f} deg, I {:.2f} deg, B_H {:.0f} nT".format(*ELEMENTS) in said
+    assert "state sensor for another one: sensor_mag" in said
+    assert "warning" not in said
+
+
+def test_a_calibration_is_needed_and_is_used(folder: Path, capsys) -> None:
+    way = str(folder / "raw" / "way.csv")
+    main([way, "--out", str(folder / "raw.csv")])
+    said = capsys.readouterr().out
+    assert re.search(r"warning: 15 of 15 readings do not fit IGRF.*: no calibration, iron near the sensor, or a", said)
+    swing, quay = str(folder / "raw" / "swing.csv"), folder / "new" / "quay.json"
+    main([swing, "--calibrate", str(quay), "--here", "62.47", "6.15", "--date", "2026-07-01"])
+    assert Calibration.load(quay).date == "2026-07-01"
+    main([way, "--calibration", str(quay), "--every-s", "1800", "--out", str(folder / "half.csv")])
+    said = capsys.readouterr().out
+    assert "warning" not in said
+    main([way, "--north", "magnetic", "--out", str(folder / "compass.csv")])
+    assert "--north magnetic --noise 0 0.00" in capsys.readouterr().out
+    table = pd.read_csv(folder / "half.csv")
+    assert len(table) == 30
+    assert np.allclose(table["distance"][1:5], 10, atol=0.1)
+
+
+def test_a_compass_calibrates_by_the_length_alone(folder: Path, capsys) -> None:
+    """A heading that the magnetometer made would hide its iron."""
+    swing = str(folder / "raw" / "swing.csv")
+    with pytest.raises(SystemExit, match="2"):
+        main([swing, "--calibrate", str(folder / "no.json"), "--north", "model"])
+    assert "too few directions for a fit without attitude" in capsys.readouterr().err
+
+
+def test_a_short_log_is_compared_and_its_noise_is_to_be_stated(folder: Path, capsys) -> None:
+    rows = (folder / "raw" / "way.csv").read_text().splitlines()[:200]
+    (folder / "short.csv").write_text("\n".join(rows))
+    main([str(folder / "short.csv")])
+    assert "one reading: no file is written" in capsys.readouterr().out
+    main([str(folder / "short.csv"), "--every-s", "2"])
+    assert "--noise D I B_H --bias 0 0 0; too few samples for --noise" in capsys.readouterr().out
+
+
+MOTION = "neither distances nor speeds nor positions"
+MICROTESLA = "total intensity is .*, which looks like microtesla: name the columns"
+NORTH = "does not state the north of the heading: give north"
+
+
+@pytest.mark.parametrize(
+    ("change", "errors"),
+    [
+        (lambda t: t[["time", "mag_x", "mag_y", "mag_z", "heading"]], [MICROTESLA, NORTH, MOTION]),
+        (lambda t: t.drop(columns=["roll_deg", "pitch_deg"]), [MICROTESLA, NORTH]),
+        (
+            lambda t: t.assign(**{f"{x}_deg": np.radians(t[f"{x}_deg"]) for x in ("roll", "pitch")}, speed=20.0),
+            ["column 'speed' has no unit|are both the speed", "roll and pitch look like radians", MICROTESLA, NORTH],
+        ),
+        (
+            lambda t: t.assign(mag_x=1000 * t["mag_x"], mag_y=1000 * t["mag_y"], mag_z=-1000 * t["mag_z"]),
+            [NORTH, "15 of 15 readings do not fit IGRF.*fits with .*-I: the axes point .*up"],
+        ),
+    ],
+)
+def test_all_that_is_wrong_is_said_in_one_run(folder: Path, capsys, change, errors: list[str]) -> None:
+    table = pd.read_csv(folder / "raw" / "way.csv")
+    path, names = folder / "wrong.csv", {f"mag_{axis}_uT": f"mag_{axis}" for axis in "xyz"}
+    change(table.rename(columns=names | {"heading_true_deg": "heading"})).to_csv(path, index=False)
+    with pytest.raises(SystemExit, match="2"):
+        main([str(path)])
+    out, err = capsys.readouterr()
+    lines = re.findall(r"^error: (.*)", err, re.MULTILINE)
+    assert len(lines) == len(errors)
+    assert all(map(re.search, errors, lines))
+    assert err.splitlines()[-1] == "python -m magrl.vehicle.logs: no readings: correct what is named above"
+    assert ("note: no roll and pitch: the vehicle is taken as level" in out) == (MICROTESLA in errors[:1])
+    assert "note: no calibration: " in out
+    assert "microtesla" not in out
+    assert not path.with_name("wrong_readings.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("way.csv", ["--calibration", "none.json"], "none.json is not a calibration"),
+        ("swing.txt", [], "a log is a file of CSV"),
+        (
+            "swing.csv",
+            ["--calibrate", "quay.json", "--here", "1"],
+            "here must be D, I and B_H, or latitude",
+        ),
+    ],
+)
+def test_errors_of_the_command(folder: Path, monkeypatch, capsys, name: str, options, message: str) -> None:
+    monkeypatch.chdir(folder / "raw")
+    with pytest.raises(SystemExit, match="2"):
+        main([name, *options])
+    assert message in capsys.readouterr().err

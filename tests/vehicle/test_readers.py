@@ -1,0 +1,329 @@
+"""Logs of autopilots, written by the tests: the same axes, attitude and position come out of each format."""
+
+from __future__ import annotations
+
+import math
+import struct
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+import torch
+from pymavlink.DFReader import DFReader_binary
+from pymavlink.dialects.v20.ardupilotmega import (
+    MAVLink,
+    MAVLink_attitude_message,
+    MAVLink_attitude_quaternion_message,
+    MAVLink_gps_raw_int_message,
+    MAVLink_highres_imu_message,
+    MAVLink_raw_imu_message,
+    MAVLink_vfr_hud_message,
+)
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+from support.logs import ATTITUDE, AXES, ELEMENTS, PLACE, UTC, dataflash, nmea, quaternions, ulog
+
+from magrl.vehicle.logs import Log, axes_of_elements, elements_of_axes, from_enu, read_log
+
+
+def check(log: Log, *, date: str | None = "2026-06-30") -> None:
+    """The elements of a log are those that were written, at their place and date."""
+    found = elements_of_axes(log.tensor("x", "y", "z"), log.tensor("roll", "pitch", "heading"), north="true").elements
+    assert len(found) == 12
+    assert (found - ELEMENTS).abs().amax(0).lt(torch.tensor([0.1, 0.05, 20.0])).all()
+    assert log.date == date
+    assert log.tensor("latitude", "longitude")[0].tolist() == pytest.approx(PLACE, abs=1e-6)
+
+
+def written(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def test_px4(tmp_path: Path) -> None:
+    path = written(tmp_path / "log.ulg", ulog())
+    log = read_log(path)
+    check(log)
+    assert "the file is damaged or truncated" not in log.notes
+    assert log.source == "PX4 ULog: vehicle_magnetometer, vehicle_attitude, vehicle_gps_position"
+    assert [note for note in log.notes if "D is that of the model" in note]
+    notes = read_log(written(path, ulog({"sensor_mag": 1.0}))).notes
+    assert any("without the calibration of the autopilot" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("heading", "flag", "north"),
+    [(math.nan, None, "model"), (0.5, None, "model"), (0.5, 0, "model"), (0.5, 1, "true"), (math.nan, 1, "true")],
+)
+def test_px4_has_true_north_if_the_estimator_uses_gnss(tmp_path: Path, heading: float, flag, north: str) -> None:
+    assert read_log(written(tmp_path / "log.ulg", ulog(heading=heading, flag=flag))).north == north
+
+
+@pytest.mark.parametrize(("second", "selected"), [(0.0, 0), (0.5, 0), (0.5, 1), (0.0, 1)])
+def test_px4_has_the_selected_healthy_magnetometer(tmp_path: Path, second: float, selected: int) -> None:
+    names = {"vehicle_magnetometer:0": 1.0, "vehicle_magnetometer:1": second, "sensor_mag:0": 0.25}
+    path = written(tmp_path / "log.ulg", ulog(names, selected=selected))
+    factor = second if second and selected else 1.0
+    assert torch.allclose(read_log(path).tensor("x", "y", "z"), factor * AXES, atol=1)
+    assert torch.allclose(read_log(path, sensor="sensor_mag").tensor("x", "y", "z"), 0.25 * AXES, atol=1)
+    with pytest.raises(ValueError, match=r"sensor must be one of 'vehicle_magnetometer', .*, got 'mag'"):
+        read_log(path, sensor="mag")
+
+
+@pytest.mark.parametrize("names", [("sensor_mag:1", "vehicle_magnetometer"), ("vehicle_magnetometer", "sensor_mag:1")])
+def test_px4_has_the_calibrated_magnetometer(tmp_path: Path, names: tuple[str, str]) -> None:
+    """Which an older log does not mark as used, and not the device that the estimator used, as it was measured."""
+    factors = {name: 0.5 if "sensor_mag" in name else 1.0 for name in names}
+    log = read_log(written(tmp_path / "log.ulg", ulog(factors, selected=1, older=True)))
+    check(log)
+    assert torch.allclose(log.tensor("x", "y", "z"), AXES, atol=1)
+
+
+def test_px4_truncated_and_no_log(tmp_path: Path) -> None:
+    path = tmp_path / "log.ulg"
+    cut = read_log(written(path, ulog()[:-290]))
+    assert len(cut.samples) < 12
+    assert "the file is damaged or truncated" in cut.notes
+    with pytest.raises(ValueError, match=r"cannot read .*log.ulg"):
+        read_log(written(path, b"ULog" * 9))
+
+
+def test_ardupilot(tmp_path: Path) -> None:
+    path = written(tmp_path / "log.BIN", dataflash())
+    log = read_log(path)
+    check(log)
+    assert log.north == "model"
+    assert "D is that of the model" in log.notes[0]
+    assert len(read_log(written(path, dataflash()[:-400])).samples) < 12
+
+
+@pytest.mark.parametrize("options", [{"use": (0.0, 1.0)}, {"health": (0, 1)}, {"sensor": "MAG:1"}])
+def test_ardupilot_has_the_magnetometer_that_is_used_and_healthy(tmp_path: Path, options) -> None:
+    sensor = options.pop("sensor", None)
+    log = read_log(written(tmp_path / "log.bin", dataflash(**options)), sensor=sensor)
+    assert torch.allclose(log.tensor("x", "y", "z"), 0.5 * AXES, atol=1)
+
+
+def test_ardupilot_as_text(tmp_path: Path) -> None:
+    """The same messages as lines, after a line of another program."""
+    path, text = written(tmp_path / "log.bin", dataflash()), "ArduCopter V4.5.7\n"
+    with closing(DFReader_binary(str(path))) as reader:
+        while message := reader.recv_msg():
+            values = (str(getattr(message, name)) for name in message.get_fieldnames())
+            text += ", ".join([message.get_type(), *values]) + "\n"
+    log, same = read_log(written(tmp_path / "log.log", text.encode())), read_log(path)
+    check(log)
+    pandas.testing.assert_frame_equal(log.samples, same.samples)
+    assert log.source == "ArduPilot DataFlash, text: GPS, MAG, ATT"
+
+
+def telemetry(path: Path, kind: str, air: float, *, field: bool = True) -> Path:
+    """Telemetry of ArduPilot or PX4; positions without a fix do not count."""
+    link, parts = MAVLink(None), []
+    for row, (axes, angles, q) in enumerate(
+        zip(AXES.tolist(), ATTITUDE.tolist(), quaternions(ATTITUDE).tolist(), strict=True)
+    ):
+        place = [round(x * 1e7) for x in PLACE] if row else [0, 0]
+        zeros = (0,) * 6
+        imu = MAVLink_raw_imu_message(0, *zeros, *(round(axis / 100) for axis in axes))
+        attitude = MAVLink_attitude_message(0, *map(math.radians, angles), 0, 0, 0)
+        if kind == "PX4":
+            imu = MAVLink_highres_imu_message(0, *zeros, *(axis / 1e5 for axis in axes), 0, 0, 0, 0, 0, 1)
+            attitude = MAVLink_attitude_quaternion_message(0, *q, 0, 0, 0)
+        fix = MAVLink_gps_raw_int_message(0, 3 if row else 1, *place, *zeros)
+        messages = *[imu] * field, attitude, fix, MAVLink_vfr_hud_message(air, 20.0, 0, 0, 0.0, 0.0)
+        stamp = struct.pack(">Q", int((UTC + row) * 1e6))
+        parts += [stamp + message.pack(link) for message in messages]
+    return written(path, b"".join(parts))
+
+
+@pytest.mark.parametrize(("kind", "air"), [("ArduPilot", 25.0), ("PX4", math.nan), ("PX4", 0.0)])
+def test_telemetry(tmp_path: Path, kind: str, air: float) -> None:
+    """Milligauss or gauss, radians or quaternions; airspeed, or groundspeed without an airspeed sensor."""
+    log = read_log(telemetry(tmp_path / "log.tlog", kind, air))
+    found = elements_of_axes(log.tensor("x", "y", "z"), log.tensor("roll", "pitch", "heading"), north="true").elements
+    limits = torch.tensor([0.3, 0.2, 100.0]) if kind == "ArduPilot" else torch.tensor([0.001, 0.001, 1.0])
+    assert (found - ELEMENTS).abs().amax(0).lt(limits).all(), "whole milligauss, or float32"
+    assert log.tensor("latitude", "longitude")[0].tolist() == pytest.approx(PLACE, abs=1e-6)
+    assert log.samples["speed"].tolist() == [air if air > 0 else 20.0] * 12
+    speed = "airspeed" if air > 0 else "groundspeed"
+    names = {"ArduPilot": ["RAW_IMU", "ATTITUDE"], "PX4": ["HIGHRES_IMU:1", "ATTITUDE_QUATERNION"]}[kind]
+    assert log.source == f"MAVLink telemetry: {', '.join([*names, 'GPS_RAW_INT', f'VFR_HUD.{speed}'])}"
+
+
+def bag(path: Path, version: int, storage: str = "bag", *left_out: str) -> Path:
+    """A bag of ROS, recorded .5 s late and in another order, with an Imu without attitude and a magnetometer of zeros,
+    without the types that are left out."""
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    kind = {
+        name.rpartition("/")[2]: each for name, each in store.types.items() if not name.startswith("std_msgs/msg/T")
+    }
+    zeros, unknown, place = np.zeros(9), np.array([-1.0, *[0.0] * 8]), (*PLACE, 0.0)
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Writer1(path) if version == 1 else Writer2(path, version=9, storage_plugin=plugin) as writer:
+        types = {"/dead": "MagneticField", "/mag": "MagneticField", "/accelerometer": "Imu", "/imu": "Imu"}
+        types = {topic: name for topic, name in (types | {"/fix": "NavSatFix"}).items() if name not in left_out}
+        topics = {
+            topic: writer.add_connection(topic, f"sensor_msgs/msg/{name}", typestore=store)
+            for topic, name in types.items()
+        }
+        raw = store.serialize_ros1 if version == 1 else store.serialize_cdr
+        for row, q in enumerate(quaternions(from_enu(ATTITUDE)).tolist()):
+            stamp = kind["Time"](sec=int(UTC) + row, nanosec=0)
+            header = kind["Header"](**({"seq": 0} if version == 1 else {}), stamp=stamp, frame_id="")
+            none, turn = kind["Vector3"](x=0.0, y=0.0, z=0.0), dict(zip("wxyz", q, strict=True))
+            still, north, nothing = (
+                kind["Quaternion"](**values)
+                for values in (turn, turn | {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}, dict.fromkeys("wxyz", 0.0))
+            )
+            x, y, z = (AXES[row] / 1e9).tolist()
+            messages = {
+                "/dead": kind["MagneticField"](header, none, zeros),
+                "/mag": kind["MagneticField"](header, kind["Vector3"](x=x, y=-y, z=-z), zeros),
+                "/accelerometer": kind["Imu"](header, north, unknown, none, zeros, none, zeros),
+                "/imu": kind["Imu"](header, nothing if row == 6 else still, zeros, none, zeros, none, zeros),
+                "/fix": kind["NavSatFix"](header, kind["NavSatStatus"](status=0, service=1), *place, zeros, 0),
+            }
+            for topic in topics:
+                message = messages[topic]
+                time = UTC + row + 0.5 + 2 * (topic == "/mag")
+                writer.write(topics[topic], round(time * 1e9), raw(message, message.__msgtype__))
+    return path
+
+
+@pytest.mark.parametrize(("version", "storage"), [(1, "bag"), (2, "db3"), (2, "mcap")])
+def test_ros(tmp_path: Path, version: int, storage: str) -> None:
+    """Axes and attitude are those of ROS: forward, left, up; east, north, up.
+
+    A file of a folder is read with the metadata of the folder and without, by its suffix.
+    """
+    path = bag(tmp_path / ("log.bag" if version == 1 else "log"), version, storage)
+    log = read_log(path)
+    check(log)
+    assert log.north is None
+    assert log.source.startswith("ROS bag: ")
+    assert "/mag" in log.source
+    with pytest.raises(ValueError, match="no sample has a field"):
+        read_log(path, sensor="/dead")
+    file = path if version == 1 else next(path.glob(f"*.{storage}"))
+    check(read_log(file))
+    if version == 2:
+        (path / "metadata.yaml").unlink()
+        check(read_log(file))
+    with pytest.raises(ValueError, match=rf"such a bag must end in \.{storage}: rename it .*\.{storage}"):
+        read_log(file.rename(tmp_path / "other"))
+
+
+def test_a_log_without_a_magnetometer_tells_how_to_log_one(tmp_path: Path) -> None:
+    silent = b"".join(line for line in nmea().splitlines(keepends=True) if b"XDR" not in line)
+    contents = {"vehicle_magnetometer or sensor_mag": ulog({}), "log MAG, by": dataflash(health=(0, 0))}
+    contents |= {"send XDR with MAG_X_NT": silent, "name its columns mag_x_nT": b"time,heading\n0,5\n"}
+    logs = {text: written(tmp_path / str(len(text)), content) for text, content in contents.items()}
+    logs["request RAW_IMU, SCALED_IMU2"] = telemetry(tmp_path / "log.tlog", "PX4", 9.0, field=False)
+    logs["record a topic of sensor_msgs/MagneticField"] = bag(tmp_path / "log.bag", 1, "bag", "MagneticField")
+    for text, path in logs.items():
+        with pytest.raises(ValueError, match=f"no x of the magnetometer is among .*: .*{text}"):
+            read_log(path)
+
+
+def test_nmea(tmp_path: Path) -> None:
+    """A heading from true north is preferred to that of the compass, a speed through the water to that over ground."""
+    path = written(tmp_path / "log.txt", nmea())
+    log = read_log(path)
+    check(log)
+    assert log.north == "true"
+    assert log.samples["speed"].tolist() == pytest.approx([5 * 1852 / 3600] * 12)
+    path = written(path, nmea("VWVHW,,T,,M,4.0,N,7.4,K", "GPZDA,082710.00,01,07,2026,00,00"))
+    assert read_log(path).samples["speed"].tolist() == pytest.approx([4 * 1852 / 3600] * 12)
+    with pytest.raises(ValueError, match=r"no sentence with a time \(TAG, RMC, ZDA\)"):
+        read_log(written(path, b"$GPGLL,4717.1,N,00833.9,E,092321.00,A,A*60\r\n"))
+    tagged = read_log(written(path, nmea(tag=True)))
+    check(tagged)
+    assert tagged.samples["time"].tolist() == pytest.approx(UTC + np.arange(12))
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "GPZDA,095559,,,,00",
+        "GPRMC,061312.00,V,0000.0,N,00000.0,E,,,060180,,,N",
+        "GPGGA,061312,0000.0,N,00000.0,E,0,00,,,,,,,",
+        "GPGLL,0000.0,N,00000.0,E,061312.00,V,N",
+        "HETHS,90.0,V",
+    ],
+)
+def test_sentences_that_say_nothing(tmp_path: Path, sentence: str) -> None:
+    log, same = (read_log(written(tmp_path / "log.log", nmea(*extra))) for extra in ((sentence,), ()))
+    assert log.samples.equals(same.samples)
+    damaged = f"${sentence}\r\n".encode()  # without a checksum
+    assert read_log(written(tmp_path / "log.log", nmea() + damaged)).samples.equals(same.samples)
+
+
+def test_the_deviation_of_a_compass_counts(tmp_path: Path) -> None:
+    content = nmea("HCHDG,180.0,5.0,W,10.0,W")
+    lines = [line for line in content.splitlines(keepends=True) if b"HDT" not in line and b"E,3.0,E" not in line]
+    log = read_log(written(tmp_path / "log.nmea", b"".join([lines[0], lines[-1], *lines[1:], lines[-1]])))
+    assert log.samples["heading"].tolist() == pytest.approx([175.0] * len(log.samples))
+
+
+def iaga(names: str, rows: list[tuple[float, ...]], kind: str = "definitive") -> bytes:
+    """A record of an observatory: https://www.ngdc.noaa.gov/IAGA/vdat/IAGA2002/iaga2002format.html."""
+    head = {"Format": "IAGA-2002", "Station Name": "Zurich", "IAGA CODE": "ZUR", "Geodetic Latitude": PLACE[0]}
+    head |= {"Geodetic Longitude": PLACE[1] - 360, "Elevation": 600, "Reported": names, "Data Type": kind}
+    lines = [f" {name:<23}{value:<45}|" for name, value in head.items()]
+    lines += [f" # {'a comment with $GPRMC, in it':<66}|", f"{'DATE       TIME         DOY':<30}"]
+    lines[-1] += "".join(f" ZUR{name}     " for name in names) + "  |"
+    for minute, values in enumerate(rows):
+        time = f"2026-06-30 12:{minute:02}:00.000 181   "
+        lines.append(time + "".join(f" {value:9.2f}" for value in values))
+    return "\r\n".join([*lines, ""]).encode()
+
+
+@pytest.mark.parametrize("names", ["XYZF", "HDZF", "DHZF"])
+def test_observatory(tmp_path: Path, names: str) -> None:
+    """A fixed vehicle with axes north, east, down; D is in minutes of arc; rows with a missing value do not count."""
+    (d, _, h), (x, y, z) = ELEMENTS.tolist(), axes_of_elements(ELEMENTS, torch.zeros(3).double()).tolist()
+    values = {"X": x, "Y": y, "Z": z, "H": h, "D": 60 * d, "F": 99999.0}
+    whole = tuple(values[name] for name in names)
+    rows = [whole, (*whole[:2], 99999.0, 0.0), (88888.0, *whole[1:]), (*whole[:3], 48000.0)]
+    path = written(tmp_path / "zur.min", iaga(names, rows))
+    log = read_log(path)
+    assert log.tensor("roll", "pitch", "heading").abs().max() == 0
+    found = elements_of_axes(log.tensor("x", "y", "z"), torch.zeros(2, 3).double(), north="true").elements
+    assert torch.allclose(found, ELEMENTS.expand(2, 3), atol=0.01)
+    assert log.tensor("latitude", "longitude", "altitude")[0].tolist() == pytest.approx([*PLACE, 0.6])
+    assert np.diff(log.samples["time"]).tolist() == [180.0]
+    assert (log.date, log.north, log.source, log.notes) == ("2026-06-30", "true", "IAGA-2002: Zurich", ())
+    assert "without the baselines" in read_log(written(path, iaga(names, rows, "variation"))).notes[0]
+    with pytest.raises(ValueError, match="its components are H, E, Z, F: a record of X, Y, Z or of H, D, Z is needed"):
+        read_log(written(path, iaga("HEZF", rows)))
+
+
+@pytest.mark.parametrize("separator", [",", " ", "\t", "; "])
+def test_three_columns_are_axes(tmp_path: Path, separator: str) -> None:
+    rows = "\n".join(separator.join(f"{value:.3f}" for value in axes) for axes in AXES.tolist())
+    log = read_log(written(tmp_path / "log.txt", rows.encode()))
+    assert torch.allclose(log.tensor("time", "x", "y", "z")[:, 1:], AXES, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("module", "start"),
+    [
+        ("pyulog", b"ULog"),
+        ("pymavlink", b"\xa3\x95"),
+        ("pymavlink", bytes(8) + b"\xfd"),
+        ("rosbags", b"#ROSBAG"),
+        ("rosbags", b"\x89MCAP"),
+        ("pynmeagps", b"junk$GPRMC,"),
+    ],
+)
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch, module: str, start: bytes) -> None:
+    for name in [module, *(each for each in sys.modules if each.startswith(f"{module}."))]:
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=rf"needs the package {module}: pip install 'magrl\[logs\]'"):
+        read_log(written(tmp_path / "log", start))

@@ -1,0 +1,255 @@
+"""CSV files with the columns that engineers write: units, times, blank cells, and errors that name the row."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from pandas import DataFrame
+
+from magrl.vehicle.logs import axes_of_elements, read_log
+from magrl.vehicle.logs.samples import check_times
+from magrl.vehicle.logs.units import COLUMNS, UNITS, column_of, unit_of
+
+HEADER = "time_s,mag_x_nT,mag_y_nT,mag_z_nT,heading_true_deg"
+ROWS = ("0,15000,1000,48000,350", "1,15100,1100,48100,10", "2,15200,1200,48200,30")
+
+
+def written(folder: Path, *rows: str, header: str = HEADER) -> Path:
+    path = folder / "log.csv"
+    path.write_text("\n".join([header, *rows]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "column", "value"),
+    [
+        ("Time [us],Bx [G],By [G],Bz [G]", "1e6,0.15,0,0.48", "z", 48000.0),
+        ("timestamp,mag_x_μT,mag_y_mG,mag_z_gauss", "1,15,10,0.48", "x", 15000.0),
+        ("utc,magx,magy,magz,Yaw (rad)", "1,0,0,5e4,3.14159265358979", "heading", 180.0),
+        ("time,x,y,z,distance_m", "1,0,0,5e4,500", "distance", 0.0),
+        ("time,x,y,z,depth_m", "1,0,0,5e4,30", "altitude", -0.03),
+        ("time,x,y,z", "2026-06-30T12:00:00+02:00,0,0,5e4", "time", 1782813600.0),
+    ],
+)
+def test_columns_and_units(tmp_path: Path, header: str, row: str, column: str, value: float) -> None:
+    assert read_log(written(tmp_path, row, header=header)).samples[column].iloc[0] == pytest.approx(value)
+
+
+def test_each_unit_of_each_column() -> None:
+    headers = ("{}_{}".format, "{} [{}]".format, lambda column, unit: f"{column} ({unit})".title())
+    for column, (kind, *_) in COLUMNS.items():
+        for unit, size in UNITS[kind].items():
+            assert {column_of(header(column, unit)) for header in headers} == {(column, size)}
+            assert {unit_of(header("any", unit), kind) for header in headers} == {size}
+
+
+def test_other_axes(tmp_path: Path) -> None:
+    assert read_log(written(tmp_path, *ROWS), frame="FLU").samples.loc[0, ["x", "y", "z"]].tolist() == [
+        15000,
+        -1000,
+        -48000,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "north"), [("heading_true_deg", "true"), ("mag_heading", "magnetic"), ("heading", None)]
+)
+def test_the_north_of_a_column(tmp_path: Path, name: str, north: str | None) -> None:
+    assert read_log(written(tmp_path, *ROWS, header=HEADER.replace("heading_true_deg", name))).north == north
+
+
+def test_blank_cells_are_interpolated(tmp_path: Path) -> None:
+    """Headings through north; positions that are slower than the magnetometer; rows without axes are left out."""
+    rows = (
+        "0,0,0,5e4,350,10",
+        "1,0,0,5e4,,",
+        "1.5,,,,,",
+        "1.7,0,0,0,,",
+        "2,0,0,5e4,10,12",
+        "3,0,0,5e4,20,",
+    )
+    samples = read_log(written(tmp_path, *rows, header=HEADER + ",lat")).samples
+    assert samples["time"].tolist() == [0, 1, 2, 3]
+    assert samples["heading"].tolist() == pytest.approx([350, 0, 10, 20])
+    assert samples["latitude"].tolist() == pytest.approx([10, 11, 12, 12])
+
+
+def test_rows_that_are_left_out_keep_the_way(tmp_path: Path) -> None:
+    """A row that repeats a time adds nothing; the distance of a row without axes, or of zeros, belongs to the next."""
+    rows = (
+        "0,0,0,5e4,0,0",
+        "1,0,0,5e4,0,5",
+        "1,0,0,5e4,0,5",
+        "2,0,0,0,0,7",
+        "3,,,,0,1",
+        "4,0,0,5e4,0,2",
+    )
+    samples = read_log(written(tmp_path, *rows, header=HEADER + ",distance_km")).samples
+    assert samples["distance"].tolist() == [0, 5, 10]
+
+
+@pytest.mark.parametrize(
+    ("rows", "note"),
+    [
+        ([*ROWS, "3,15300"], "the last row is not complete, and is left out: the log"),
+        ([*ROWS[:2], *ROWS[1:]], "1 row with the time of the row before left out"),
+        (
+            [*ROWS, *(f"{3600 + i},0,0,5e4,0" for i in range(3, 99))],
+            "1 gap, the longest of 3601 s, which is",
+        ),
+        (["2026-06-30T12:00:00,0,0,5e4,0"], "the times have no time zone: they are taken as UTC"),
+        ([*ROWS, "3,0,0,0,40"], "1 sample of three zeros left out"),
+    ],
+)
+def test_notes(tmp_path: Path, rows, note: str) -> None:
+    assert any(re.match(note, text) for text in read_log(written(tmp_path, *rows)).notes)
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "message"),
+    [
+        ([], HEADER, "the table has no row"),
+        ([], "", "cannot read .*log.csv: the table has no row"),
+        ([ROWS[1], ROWS[0]], HEADER, "time runs backward from row 1 to 2, from 1 to 0: sort the rows"),
+        (
+            ["7200,0,0,5e4,0", "3601,0,0,5e4,0"],
+            HEADER,
+            "an hour back, as at the end of daylight saving time; log UTC",
+        ),
+        (
+            ["1782813600000,0,0,5e4,0"],
+            HEADER,
+            r"time 1\.78.* is not from .* s: check it and its unit, as in time_ms",
+        ),
+        (
+            ["0,0.15,0,0.48,0"],
+            HEADER,
+            r"intensity is 0\.50.*, which looks like gauss: name the columns mag_x_gauss",
+        ),
+        (["0,15,0,48,0"], HEADER, r"the total intensity is 50\.2.*, which looks like microtesla"),
+        (["0,90,0,-4095,0"], HEADER, "is 4095.*, where about 48000 nT are expected: scale raw counts"),
+        (["noon,0,0,5e4,0"], HEADER, "row 1, time_s: 'noon' is no time such as"),
+        (ROWS, HEADER.replace("heading_true_deg", "bx"), "'mag_x_nT' and 'bx' are both the x: keep one of them"),
+        (ROWS, "clock,x,bx,y,speed", "are both the x: .*; column 'speed' has .*; no column is the time"),
+    ],
+)
+def test_files_that_are_refused(tmp_path: Path, rows, header: str, message: str) -> None:
+    path = written(tmp_path, *rows, header=header)
+    with pytest.raises(ValueError, match=message):
+        read_log(path)
+
+
+WHOLE = HEADER + ",roll_deg,pitch_deg,speed_m_s,distance_km,lat_deg,lon_deg,alt_m"
+
+
+def whole(*changes: tuple[int, str]) -> tuple[list[str], ...]:
+    """Header and rows of a log with all columns, with other cells in the second row."""
+    rows = [f"{row},15000,1000,48000,350,1,2,5,0.1,60,5,10".split(",") for row in range(3)]
+    for column, cell in changes:
+        rows[1][column] = cell
+    return WHOLE.split(","), *rows
+
+
+def message(folder: Path, table: Iterable[list[str]]) -> str:
+    """What is wrong with a log; empty if nothing."""
+    try:
+        read_log(written(folder, *map(",".join, table), header=""))
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def test_each_part_of_a_file(tmp_path: Path) -> None:
+    """Dropped, doubled, retyped, beyond its range, of a longer row; and all that is retyped in one run."""
+    assert message(tmp_path, whole()) == ""
+    for place, header in enumerate(WHOLE.split(",")):
+        needed = header.startswith(("time", "mag"))
+        assert ("no " in message(tmp_path, [row[:place] + row[place + 1 :] for row in whole()])) == needed
+        assert f"2 columns '{header}'" in message(tmp_path, [[*row, row[place]] for row in whole()])
+        assert f"row 2, {header}: 'x' is not a number" in message(tmp_path, whole((place, "x")))
+        assert f"row 2, {header}: inf is not a number" in message(tmp_path, whole((place, "inf")))
+        wide = header.startswith(("mag", "heading"))
+        assert (" is not from " in message(tmp_path, whole((place, "-1e13")))) != wide
+    assert "row 2 has more cells than the header" in message(tmp_path, whole((3, "48000,1")))
+    assert "row 1 or a later one has more cells" in message(tmp_path, (whole()[0], [*whole()[1], "", "1"]))
+    text = message(tmp_path, whole(*((place, "x") for place in range(1, 12)))) + "; "
+    assert all(f"row 2, {header}: 'x' is not a number; " in text for header in WHOLE.split(",")[1:])
+
+
+def test_a_file_that_is_cut_anywhere(tmp_path: Path) -> None:
+    """It is refused, or says so, or lacks whole rows."""
+    path = written(tmp_path, *map(",".join, whole()), header="")
+    content = path.read_text().lstrip()
+    for length in range(0, len(content) - len("0.1,60,5,10"), 3):
+        path.write_text(content[:length])
+        with suppress(ValueError):
+            log = read_log(path)
+            assert log.samples["z"].eq(48000).all()
+            assert len(log.samples) < 3
+
+
+@pytest.mark.parametrize("names", [("roll", "pitch"), ("heading",), ("roll", "pitch", "heading")])
+@pytest.mark.parametrize("logged", [("roll", "pitch", "heading"), ("roll", "pitch")])
+def test_angles_in_radians_are_named(tmp_path: Path, names: tuple[str, ...], logged: tuple[str, ...]) -> None:
+    """On a swing with waves of 3 degrees, by the variance of the field; in degrees, nothing is named."""
+    time = np.arange(300.0)
+    angles = {"roll": 3 * np.sin(time), "pitch": 3 * np.sin(time / 1.7), "heading": 2.4 * time % 360 - 180}
+    attitude = torch.tensor(np.stack([*angles.values()], -1))
+    axes = axes_of_elements(torch.tensor([3.0, 73.0, 15000.0]).double(), attitude) + torch.tensor(
+        [500.0, -300.0, 200.0]
+    )
+    table = DataFrame({"time": time} | dict(zip("xyz", axes.numpy().T, strict=True)) | {k: angles[k] for k in logged})
+    assert message(tmp_path, [[*table], *table.astype(str).to_numpy().tolist()]) == ""
+    table = table.assign(**{name: np.radians(table[name]) for name in names if name in logged})
+    wrong = " and ".join(name for name in names if name in logged)
+    text = message(tmp_path, [[*table], *table.astype(str).to_numpy().tolist()])
+    assert f": {wrong} look like radians: name the columns" in text or not wrong
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "1" + " " * 10**5 + "x\n1,2",
+        " Format    IAGA-2002 |\n a" + " " * 10**5 + "\nDATE       TIME         DOY     X Y Z\n",
+        ",".join(["time"] * 50000) + "\n1",
+        " Format    IAGA-2002 |\n" + " a  b" * 10**5 + "\nDATE       TIME         DOY     X Y Z\n",
+    ],
+    ids=range(4),
+)
+def test_the_time_of_a_reader_grows_with_the_length_of_a_line(tmp_path: Path, content: str) -> None:
+    """With its square, each took minutes."""
+    (tmp_path / "log").write_text(content)
+    with pytest.raises(ValueError, match="cannot read") as error:
+        read_log(tmp_path / "log")
+    assert len(str(error.value)) < 600
+
+
+def test_two_files_of_one_vehicle(tmp_path: Path) -> None:
+    """The magnetometer in one, the gyrocompass in the other, which decides the heading and its north."""
+    path = written(tmp_path, *ROWS).rename(tmp_path / "mag.csv")
+    gyro = written(tmp_path, "0,100", "2,200", header="time,heading_mag")
+    log = read_log(path, gyro)
+    assert log.samples["heading"].tolist() == pytest.approx([100, 150, 200])
+    assert (log.north, log.source) == ("magnetic", "CSV, 3 rows; CSV, 2 rows")
+    with pytest.raises(ValueError, match="no x of the magnetometer is among heading"):
+        read_log(gyro)
+
+
+@pytest.mark.parametrize("name", ["log.xlsx", "none.csv", "log.jsonl"])
+def test_files_that_are_not_logs(tmp_path: Path, name: str) -> None:
+    (tmp_path / "log.xlsx").write_bytes(b"PK\3\4\0")
+    (tmp_path / "log.jsonl").write_text('{"time": 0, "x": 1}\n')
+    with pytest.raises(ValueError, match=rf"a log is a file of CSV, .* that exists, got '.*{name}'"):
+        read_log(tmp_path / name)
+
+
+def test_times_that_are_not_there() -> None:
+    with pytest.raises(ValueError, match="row 2 has no time"):
+        check_times(np.array([0.0, math.nan]))
