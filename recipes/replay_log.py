@@ -26,12 +26,12 @@ from magrl.evaluation.tables import markdown_table
 from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
-from magrl.vehicle.logs import difference_from_igrf, joined, mistakes, read_readings
-from magrl.vehicle.onboard import Onboard
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Way
 from magrl.training import UsageError, command, parse
 from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.vehicle.logs import difference_from_igrf, joined, mistakes, read_readings
+from magrl.vehicle.onboard import Onboard
 
 import numpy as np
 import pandas as pd

@@ -17,12 +17,12 @@ from magrl.evaluation.tables import markdown_table
 from magrl.field import IGRF
 from magrl.field.elements import measured_elements
 from magrl.geodesy import geodesic
-from magrl.vehicle.logs import read_readings
-from magrl.vehicle.onboard.start import MODEL_STD
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Belief, before, destination, known, moved, posterior, read
 from magrl.tracking.destination import log_density
 from magrl.training import command
+from magrl.vehicle.logs import read_readings
+from magrl.vehicle.onboard.start import MODEL_STD
 
 import torch
 import tyro

@@ -17,9 +17,9 @@ from magrl.agents import ExportedPolicy, export_policy, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluate
 from magrl.evaluation.rollout import evaluation_rollout
-from magrl.vehicle.onboard import Onboard
 from magrl.transforms import SensorNoise, TrackView
 from magrl.transforms.base import StatefulTransform
+from magrl.vehicle.onboard import Onboard
 
 NOISE = (0.05, 0.05, 5.0)
 

@@ -13,9 +13,9 @@ from support.logs import nmea, ulog
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario
 from magrl.files import load_tensors, save_tensors
-from magrl.vehicle.logs import read_log
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
+from magrl.vehicle.logs import read_log
 
 MUTANTS = 200
 

@@ -19,13 +19,13 @@ import pytest
 import torch
 from support.logs import nmea as log_of_a_ship
 
+from magrl.field import IGRF, elements_at
+from magrl.geodesy import geodesic, move
 from magrl.vehicle.autopilot import Loop, Measurement, fly
 from magrl.vehicle.autopilot.__main__ import main, parser, vehicle
 from magrl.vehicle.autopilot.loop import _SAID, LOG
 from magrl.vehicle.autopilot.mavlink import MavlinkLink, Messages
 from magrl.vehicle.autopilot.nmea import NmeaLink, Sentences
-from magrl.field import IGRF, elements_at
-from magrl.geodesy import geodesic, move
 from magrl.vehicle.logs import axes_of_elements, read_log
 from magrl.vehicle.onboard import Command, Onboard
 

@@ -11,8 +11,8 @@ import torch
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move
-from magrl.vehicle.logs import axes_of_elements, difference_from_igrf, elements_of_axes, mistakes
 from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.vehicle.logs import axes_of_elements, difference_from_igrf, elements_of_axes, mistakes
 
 DATE = "2026-06-30"
 

@@ -29,10 +29,10 @@ from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move
 from magrl.navigators import Geodesic, Secant
 from magrl.navigators.base import displacement_to
-from magrl.vehicle.onboard import Onboard, VehicleStep, check_earth_jump, check_earth_reading, first_state, write_step
-from magrl.vehicle.onboard.step import ONNX_INPUTS
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms import Conditions, MagneticNorth, SensorErrors, with_conditions, with_sensor_noise
+from magrl.vehicle.onboard import Onboard, VehicleStep, check_earth_jump, check_earth_reading, first_state, write_step
+from magrl.vehicle.onboard.step import ONNX_INPUTS
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
 NOISE = (0.02, 0.02, 2.0)

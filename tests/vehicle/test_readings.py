@@ -7,8 +7,8 @@ import pandas
 import pytest
 import torch
 
-from magrl.vehicle.logs import Calibration, Log, axes_of_elements, readings_of
 from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.vehicle.logs import Calibration, Log, axes_of_elements, readings_of
 
 
 def sailed(count: int = 6000, noise: np.ndarray | None = None, **columns) -> Log:

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from magrl.vehicle.logs import attitude_of, axes_of_elements, elements_of_axes, from_enu, rotation
 from magrl.transforms import VectorErrors
 from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.vehicle.logs import attitude_of, axes_of_elements, elements_of_axes, from_enu, rotation
 
 
 def cases(count: int = 500) -> tuple[Tensor, Tensor]:

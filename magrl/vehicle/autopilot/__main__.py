@@ -20,16 +20,16 @@ from pathlib import Path
 import torch
 
 from magrl.agents import load_policy
+from magrl.checks import command
+from magrl.field import IGRF, elements_at
+from magrl.sensor_std import SensorStd
 from magrl.vehicle.autopilot.flight import Link, fly
 from magrl.vehicle.autopilot.loop import LOG, Loop
 from magrl.vehicle.autopilot.mavlink import SENSORS, STEERING, MavlinkLink
 from magrl.vehicle.autopilot.nmea import NmeaLink
-from magrl.checks import command
-from magrl.field import IGRF, elements_at
 from magrl.vehicle.logs import Calibration
 from magrl.vehicle.onboard import Command, Onboard
 from magrl.vehicle.onboard.start import known_elements
-from magrl.sensor_std import SensorStd
 
 _MAVLINK = ("speed", "sensor", "steering", "cruise_m_s", "autopilot")
 _NMEA = ("speed", "level", "sources")
@@ -38,7 +38,9 @@ _NMEA = ("speed", "level", "sources")
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     arguments = argparse.ArgumentParser(
-        prog="python -m magrl.vehicle.autopilot", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m magrl.vehicle.autopilot",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = arguments.add_argument
     add("address", help="MAVLink: an address of pymavlink; NMEA: udp:PORT; or a serial port and its rate, PORT,RATE")

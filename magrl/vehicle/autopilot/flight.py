@@ -10,11 +10,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Protocol
 
-from magrl.vehicle.autopilot.loop import LOG, NO_STATE, Loop, Measurement, clock, tolerated
 from magrl.checks import short
 from magrl.files import write_atomically
-from magrl.vehicle.onboard import Command
 from magrl.training.checkpoints import locked
+from magrl.vehicle.autopilot.loop import LOG, NO_STATE, Loop, Measurement, clock, tolerated
+from magrl.vehicle.onboard import Command
 
 HEADER = "time_s,mag_x_nT,mag_y_nT,mag_z_nT,roll_deg,pitch_deg,heading_{north}_deg,speed_m_s,received_s\n"
 """Columns of the recorded messages, which :func:`magrl.vehicle.logs.read_log` reads."""

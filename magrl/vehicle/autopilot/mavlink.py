@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from magrl.vehicle.autopilot.loop import LOG, Measurement, patient, tolerated
 from magrl.checks import check_choice
 from magrl.field.elements import FIELD_NT
+from magrl.vehicle.autopilot.loop import LOG, Measurement, patient, tolerated
 from magrl.vehicle.logs import attitude_of
 from magrl.vehicle.logs.autopilots import package
 from magrl.vehicle.logs.samples import ATTITUDE

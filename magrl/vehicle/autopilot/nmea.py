@@ -8,8 +8,8 @@ import socket
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from magrl.vehicle.autopilot.loop import LOG, Measurement, clock, patient
 from magrl.checks import check_choice
+from magrl.vehicle.autopilot.loop import LOG, Measurement, clock, patient
 from magrl.vehicle.logs.autopilots import INVALID, nmea_values, package
 from magrl.vehicle.logs.samples import AXES
 from magrl.vehicle.onboard import Command

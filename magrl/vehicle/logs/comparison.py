@@ -11,9 +11,9 @@ from torch import Tensor
 from magrl.field import IGRF
 from magrl.field.elements import NAMES, element_difference, measured_elements
 from magrl.geodesy import geodesic
+from magrl.transforms.errors.sensors import OUTAGE_STD
 from magrl.vehicle.logs.units import out_of_range
 from magrl.vehicle.onboard.start import deviation, likely_mistake, model_std
-from magrl.transforms.errors.sensors import OUTAGE_STD
 
 MOST_SPIKES = 0.2
 """Share of readings up to which those that do not fit are spikes, and not a mistake in all; chosen."""

@@ -18,11 +18,11 @@ from magrl.checks import check_choice, check_number, short
 from magrl.field.elements import NAMES, elements_jacobian, measured_elements
 from magrl.files import numbers_of, read_table, read_text
 from magrl.geodesy import geodesic
+from magrl.transforms.errors.sensors import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Log, check_times, date_of, times_of
 from magrl.vehicle.logs.units import COLUMNS, UNITS, out_of_range, unit_of
 from magrl.vehicle.logs.vectors import NORTHS, axes_of_elements, rotation
-from magrl.transforms.errors.sensors import OUTAGE_STD
 
 SPIKE_SIGMAS = 5.0
 _BLOCKS = 10  # of the samples of a reading, whose means are nearly independent

@@ -9,12 +9,12 @@ from torch import Tensor
 from torchrl.envs import Compose
 
 from magrl import tracking
-from magrl.vehicle.onboard.limits import view_of
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import RANGE_KM, ArrivalDecision, Belief, DestinationPosterior
 from magrl.transforms import TrackField, TrackView
 from magrl.transforms.errors.known_start import START_KEYS
 from magrl.transforms.track import POSTERIOR_KEYS, belief_of
+from magrl.vehicle.onboard.limits import view_of
 
 
 class Estimator:

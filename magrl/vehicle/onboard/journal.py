@@ -16,9 +16,9 @@ from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
 from magrl.files import write_atomically
-from magrl.vehicle.onboard.limits import Reading
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.vehicle.onboard.limits import Reading
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""

@@ -12,9 +12,9 @@ from magrl.checks import check_number, check_numbers
 from magrl.field import IGRF, elements_at
 from magrl.field.elements import FIELD_NT, NAMES, element_difference, field_vector, measured_elements
 from magrl.geodesy import move
-from magrl.vehicle.onboard.readings import DISTURBANCE_NT, check_earth_distance, check_earth_reading
 from magrl.sensor_std import SensorStd
 from magrl.transforms import calibration
+from magrl.vehicle.onboard.readings import DISTURBANCE_NT, check_earth_distance, check_earth_reading
 
 MODEL_STD = (0.26, 0.20, 133.0)
 """Standard deviations of D [deg], I [deg], B_H [nT] of a model of the core, which omits crust and currents.

@@ -23,17 +23,22 @@ from magrl.checks import check_type
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.field.elements import NAMES
 from magrl.navigators import Secant
-from magrl.vehicle.onboard.command import Command
-from magrl.vehicle.onboard.estimator import Estimator
-from magrl.vehicle.onboard.journal import Journal, Options, Step
-from magrl.vehicle.onboard.limits import check_move, measured, move_limits, out_of_range, stuck, unchanged_km, view_of
-from magrl.vehicle.onboard.readings import EQUATOR_SLOPE_DEG, check_earth_distance, check_earth_jump, check_earth_reading
-from magrl.vehicle.onboard.start import Elements, calibrated, check_start, known_elements, nearby_elements
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import ArrivalDecision, Way
 from magrl.transforms import TrackView
 from magrl.transforms.errors.known_start import START_KEYS
 from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.vehicle.onboard.command import Command
+from magrl.vehicle.onboard.estimator import Estimator
+from magrl.vehicle.onboard.journal import Journal, Options, Step
+from magrl.vehicle.onboard.limits import check_move, measured, move_limits, out_of_range, stuck, unchanged_km, view_of
+from magrl.vehicle.onboard.readings import (
+    EQUATOR_SLOPE_DEG,
+    check_earth_distance,
+    check_earth_jump,
+    check_earth_reading,
+)
+from magrl.vehicle.onboard.start import Elements, calibrated, check_start, known_elements, nearby_elements
 
 NAMED = ("anywhere", "secant", "kalman")
 """Navigators by name; any other is given as a module."""
