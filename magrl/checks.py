@@ -262,6 +262,17 @@ def short(value: object, length: int = 80) -> str:
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
+def printable(text: object) -> str:
+    r"""Return a text in one line, with escapes in place of control characters, which could rewrite what a user sees.
+
+    Example:
+        >>> printable("a\x1b[2J\nb")
+        'a\\x1b[2J b'
+    """
+    line = " ".join(str(text).split())
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line)
+
+
 class UsageError(ValueError):
     """A command that cannot run as given; its message is shown without a traceback.
 
@@ -297,5 +308,5 @@ def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> Non
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered is written at exit
         raise SystemExit(141) from None
     except usage as error:
-        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{name}: {printable(error)}", file=sys.stderr)
         raise SystemExit(2) from None

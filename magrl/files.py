@@ -218,7 +218,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
         {'steps': 9, 'spl': None}
     """
     check_type(Path, path=path)
-    path.write_text(json.dumps(json_ready(content), indent=2, allow_nan=False) + "\n")
+    write_atomically(path, f"{json.dumps(json_ready(content), indent=2, allow_nan=False)}\n".encode())
 
 
 def check_writable(path: Path) -> None:
