@@ -16,7 +16,7 @@ from pathlib import Path
 
 from magrl.benchmark.submission import BUILT_IN, run, verify
 from magrl.benchmark.tracks import TRACKS
-from magrl.checks import command
+from magrl.checks import command, printable
 
 
 def parser() -> argparse.ArgumentParser:
@@ -49,7 +49,7 @@ def _main(options: argparse.Namespace) -> None:
         print(means.round(1).to_string(), f"The submission is in {options.out}", sep="\n")
         return
     notes, wrong = verify(options.folder, options.tasks, options.seed)
-    print(*notes, *(f"CONTRADICTION: {text}" for text in wrong), sep="\n")
+    print(*map(printable, (*notes, *(f"CONTRADICTION: {text}" for text in wrong))), sep="\n")
     print("verdict: not verified" if wrong else "verdict: verified")
     if wrong:
         raise SystemExit(1)

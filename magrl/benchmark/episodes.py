@@ -6,12 +6,14 @@ import gzip
 import io
 import zlib
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 
 import pandas
 import torch
 from torch import Tensor
 
+from magrl.checks import short
 from magrl.files import write_atomically
 
 COLUMNS = {
@@ -29,8 +31,10 @@ COLUMNS = {
     "final_distance_km": float,
 }
 """Columns and their types. ``run`` counts the trainings of a navigator; ``seed`` is that of the errors."""
-MAX_BYTES = 500_000_000
-"""Largest table that is read, uncompressed: about five million episodes."""
+MAX_ROWS = 1_000_000
+"""Most episodes that are read where a caller knows no number."""
+MAX_ROW = 500
+"""Longest row of a table [bytes], about four times a usual one."""
 
 
 def episode_table(measures: Mapping[str, Tensor], region: Tensor, **labels: str | int) -> pandas.DataFrame:
@@ -76,8 +80,12 @@ def write_episodes(path: Path | str, tables: Sequence[pandas.DataFrame]) -> None
     write_atomically(Path(path), gzip.compress(text.encode(), mtime=0))
 
 
-def read_episodes(path: Path | str) -> pandas.DataFrame:
-    """Read a file of :func:`write_episodes`.
+def read_episodes(path: Path | str, rows: int = MAX_ROWS) -> pandas.DataFrame:
+    """Read a file of :func:`write_episodes`: its header first, and never more than ``rows`` short rows.
+
+    Args:
+        path: path of the file.
+        rows: most episodes that it may hold.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -92,12 +100,21 @@ def read_episodes(path: Path | str) -> pandas.DataFrame:
     """
     try:
         with gzip.open(path) as file:
-            body = file.read(MAX_BYTES + 1)
-        if len(body) > MAX_BYTES:
-            raise ValueError(f"it holds more than {MAX_BYTES} bytes")
-        table = pandas.read_csv(io.BytesIO(body), dtype=COLUMNS, keep_default_na=False)
-        if list(table) != list(COLUMNS):
-            raise ValueError(f"its columns are {list(table)}, not {list(COLUMNS)}")
-    except (ValueError, EOFError, zlib.error, gzip.BadGzipFile) as error:
+            lines = _lines(file, rows)
+        table = pandas.read_csv(io.BytesIO(b"".join(lines)), dtype=COLUMNS, keep_default_na=False, index_col=False)
+    except (ValueError, OverflowError, EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise ValueError(f"{path} is not a table of episodes: {error}") from error
     return table
+
+
+def _lines(file: gzip.GzipFile, rows: int) -> list[bytes]:
+    """Return the header and the rows of a table; raise for another header, too many rows, or one that is too long."""
+    header = file.readline(MAX_ROW)
+    if header.split() != [",".join(COLUMNS).encode()]:
+        raise ValueError(f"its header is {short(header)}, not {','.join(COLUMNS)}")
+    lines = list(islice(iter(lambda: file.readline(MAX_ROW + 1), b""), rows + 1))
+    if max(map(len, lines), default=0) > MAX_ROW:
+        raise ValueError(f"a row has more than {MAX_ROW} bytes")
+    if len(lines) > rows:
+        raise ValueError(f"it holds more than {rows} rows")
+    return [header, *lines]

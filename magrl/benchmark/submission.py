@@ -7,7 +7,6 @@ the submitter.
 from __future__ import annotations
 
 import hashlib
-import math
 import platform
 import secrets
 import shutil
@@ -19,14 +18,16 @@ from typing import Any, Literal
 import pandas
 import torch
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 import magrl
 from magrl.agents import FieldPolicy, load_policy
-from magrl.agents.exported import TrainedPolicy
+from magrl.agents.exported import ExportedPolicy, TrainedPolicy
+from magrl.agents.program import TensorProgram
+from magrl.benchmark.comparison import TOO_GOOD, compared, different, impossible
 from magrl.benchmark.episodes import episode_table, read_episodes, write_episodes
 from magrl.benchmark.tracks import TRACKS, Track
-from magrl.checks import CheckedModel, check_choice, check_number
+from magrl.checks import CheckedModel, check_choice, check_number, short
 from magrl.envs import Tasks
 from magrl.evaluation import episode_measures
 from magrl.evaluation.navigators import PRETRAINED
@@ -38,15 +39,14 @@ BUILT_IN = (*PRETRAINED, *(name for name, kind in NAVIGATORS.items() if "mode" n
 """Navigators that need no file. Random numbers of metaheuristics depend on the batch, so that no part is repeated."""
 RECORD, EPISODES, POLICY = "run.json", "episodes.csv.gz", "policy.safetensors"
 PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "safetensors")
-TOLERANCE = {"spl": 1e-3, "final_distance_km": 0.1}
-"""Largest difference of a repeated episode. Other sizes of the batch change SPL by 1e-7 and distances by 0.1 m."""
-MOST_DIFFERENT = {True: 0.02, False: 0.5}
-"""Largest share of repeated episodes that may end differently, on the same platform and on another one. With other
-instructions of the processor, 11 of 150 episodes of ``anywhere`` did on alone-v1, and 48 of 200 on vehicles-v1."""
-STANDARD_ERRORS = 4.0
-"""By how many standard errors a claimed SPL may exceed the one that is flown."""
-MARGIN = 0.005
-"""What it may exceed it by beyond that: a few tasks, all flown alike, have no standard error."""
+SHIFTS_DEG = tuple(
+    (size * north, size * east) for size in (1e-4, 3e-4) for north, east in ((1, 0), (-1, 0), (0, 1), (0, -1))
+)
+"""How far starts are moved [deg], 11 m and 33 m, where an episode ends differently: does rounding decide its end?"""
+MOST_UNEXPLAINED = 0.02
+"""Largest share of the episodes that end differently for which these starts need not show it. With AVX2 in place of
+the default instructions of the processor, 14 of 192 episodes of ``anywhere`` end differently on alone-v1 and 78 of 256
+on vehicles-v1; a start 14 m to the northeast shows it for 84 of the 92, these starts for the others."""
 
 
 class Submission(CheckedModel):
@@ -90,7 +90,7 @@ def run(policy: str, track: str, out: Path, tasks: int | None = None) -> pandas.
     Raises:
         ValueError: for a policy that is refused, an unknown track, or a number of tasks that it does not have.
         FileNotFoundError: for a missing policy.
-        FileExistsError: for a folder that holds files.
+        FileExistsError: for a folder that holds other files than those of an interrupted run.
 
     Example:
         >>> import tempfile
@@ -103,12 +103,12 @@ def run(policy: str, track: str, out: Path, tasks: int | None = None) -> pandas.
     check_number(1, chosen.tasks, whole=True, tasks=count)
     navigator = _policy(policy, chosen)
     out.mkdir(parents=True, exist_ok=True)
-    if any(out.iterdir()):
+    if {path.name for path in out.iterdir()} - {EPISODES, POLICY}:  # which an interrupted run leaves, without a record
         raise FileExistsError(f"{out} holds files: choose a new folder")
     if isinstance(navigator, TrainedPolicy):
         shutil.copyfile(policy, out / POLICY)
     name = POLICY if isinstance(navigator, TrainedPolicy) else navigator
-    episodes = _flown(navigator, chosen, torch.arange(count)).assign(track=track, navigator=Path(policy).name)
+    episodes = _flown(navigator, chosen, torch.arange(count)).assign(track=track, navigator=name)
     write_episodes(out / EPISODES, [episodes])
     record = Submission(
         magrl=magrl.__version__,
@@ -127,8 +127,10 @@ def run(policy: str, track: str, out: Path, tasks: int | None = None) -> pandas.
 def verify(folder: Path, tasks: int = 32, seed: int | None = None) -> tuple[list[str], list[str]]:
     """Compare a submission with flights of its policy.
 
-    Some of its tasks, drawn at random, are flown again and must end alike. New tasks, which the submitter has not seen,
-    must not be flown worse than claimed.
+    Each row must agree with the track and with itself. Some of the tasks, drawn at random, are flown again and must end
+    alike, unless they end differently from starts moved by :data:`SHIFTS_DEG` as well: then rounding decides. Claimed
+    means must not be better than those of repeated tasks, nor than those of new tasks, which the submitter has not
+    seen. All limits come from the track and from what is flown here.
 
     Args:
         folder: folder of :func:`run`.
@@ -154,35 +156,53 @@ def verify(folder: Path, tasks: int = 32, seed: int | None = None) -> tuple[list
     record = Submission(**read_document(folder / RECORD))
     check_choice(TRACKS, track=record.track)
     check_choice((POLICY, *BUILT_IN), policy=record.policy)
-    track, claimed = TRACKS[record.track], read_episodes(folder / EPISODES)
+    track = TRACKS[record.track]
+    claimed = read_episodes(folder / EPISODES, len(track.errors) * min(record.tasks, track.tasks))
     navigator = _policy(str(folder / POLICY) if record.policy == POLICY else record.policy, track)
-    wrong = list(_contradictions(folder, record, track, claimed))
     notes = [f"{record.track}, {record.policy}: {record.tasks} of {track.tasks} tasks, seed of this check {seed}"]
-    if wrong:
+    if wrong := list(_contradictions(folder, record, track, claimed)):
         return notes, wrong
     draw = torch.randperm(record.tasks, generator=torch.Generator().manual_seed(seed))[:tasks].sort().values
     again = _flown(navigator, track, draw)
-    seen = claimed[claimed["task"].isin(draw.tolist())].reset_index(drop=True)
-    different, same = _different(seen, again), record.platform == _platform()
-    where = "the same platform" if same else f"another platform, {record.platform}"
-    notes.append(f"repeated, flown on {where}: {len(again) - different} of {len(again)} episodes end alike")
-    if different > MOST_DIFFERENT[same] * len(again):
-        wrong.append(f"{different} of {len(again)} repeated episodes end differently")
     new = _flown(navigator, track, torch.arange(tasks), track.scenario.random_tasks(tasks, seed), seed)
-    for what, claim, flown in (("repeated tasks", seen, again), ("new tasks", claimed, new)):
-        for level in track.errors:
-            pair = [100 * table.loc[table["level"] == level, "spl"] for table in (claim, flown)]
-            text, exceeds = _compared(*pair, paired=claim is seen)
-            (wrong if exceeds else notes).append(f"{what}, {level}: {text}")
+    apart = different(claimed, again)
+    forged = _not_rounded(navigator, track, again, apart)
+    notes.append(f"{len(again) - len(apart)} of {len(again)} repeated episodes end alike")
+    notes.append(f"rounding decides how {len(apart) - len(forged)} of the others end")
+    if len(forged) > MOST_UNEXPLAINED * len(apart):
+        wrong.append(f"rounding does not explain {len(forged)} of the others: level and task {short(forged.tolist())}")
+    means = compared("repeated tasks", claimed[claimed["task"].isin(draw.tolist())], again, track, apart)
+    means += compared("all tasks", claimed, again, track) + compared("new tasks", claimed, new, track)
+    for text in means:
+        (wrong if TOO_GOOD in text else notes).append(text)
     return notes, wrong
 
 
-def _compared(claim: pandas.Series, flown: pandas.Series, *, paired: bool) -> tuple[str, bool]:
-    """Return both means and the standard error of their difference in a text, and whether the claim is too high."""
-    parts = [claim - flown] if paired else [claim, flown]
-    error = math.sqrt(sum(values.var(ddof=0) / len(values) for values in parts))
-    text = f"SPL {claim.mean():.1f} % claimed, {flown.mean():.1f} % flown, standard error {error:.1f}"
-    return text, not claim.mean() - flown.mean() <= STANDARD_ERRORS * error + 100 * MARGIN
+def _not_rounded(
+    navigator: TrainedPolicy | str, track: Track, again: pandas.DataFrame, apart: pandas.MultiIndex
+) -> pandas.MultiIndex:
+    """Return which of some episodes end in the same way from all starts nearby: rounding does not decide how."""
+    assert track.scenario.tasks is not None
+    start, *ends = track.scenario.tasks
+    for shift in SHIFTS_DEG:
+        if len(apart):
+            vehicle = torch.tensor(sorted(set(apart.get_level_values("task"))))
+            moved = _flown(navigator, track, vehicle, Tasks(start + torch.tensor(shift), *ends))
+            apart = apart.difference(different(moved, again))
+    return apart
+
+
+class _OneByOne(nn.Module):
+    """A program that computes one vehicle at a time: no action depends on the rest of a batch, nor does memory."""
+
+    def __init__(self, program: TensorProgram) -> None:
+        super().__init__()
+        self.program = program
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the outputs ``(N, ...)`` for inputs ``(N, ...)``."""
+        rows = [self.program(*row) for row in zip(*(value.split(1) for value in inputs), strict=True)]
+        return tuple(torch.cat(values) for values in zip(*rows, strict=True))
 
 
 def _policy(text: str, track: Track) -> TrainedPolicy | str:
@@ -193,6 +213,8 @@ def _policy(text: str, track: Track) -> TrainedPolicy | str:
             raise ValueError(f"refused {text!r}: submit a file of magrl.save_policy (.safetensors), or one of {names}")
         return text
     policy = load_policy(text)
+    if isinstance(policy, ExportedPolicy):
+        policy.program = _OneByOne(policy.program)  # type: ignore[assignment]
     reads = {*policy.in_keys, *(STD_KEYS if isinstance(policy, FieldPolicy) and policy.state_keys else ())}
     if hidden := sorted(reads - set(track.keys)):
         raise ValueError(f"refused {text!r}: it reads {', '.join(hidden)}, which this track does not give")
@@ -202,7 +224,10 @@ def _policy(text: str, track: Track) -> TrainedPolicy | str:
 def _flown(
     policy: TrainedPolicy | str, track: Track, vehicle: Tensor, tasks: Tasks | None = None, seed: int | None = None
 ) -> pandas.DataFrame:
-    """Return an episode of each level and vehicle, whose number is that of its task; with a seed, of other tasks."""
+    """Return an episode of each level and vehicle, whose number is that of its task; of other tasks, if they are given.
+
+    With a seed, the errors are others, too.
+    """
     tables = []
     for level, errors in track.errors.items():
         changes = {} if seed is None else {"seed": seed}
@@ -226,16 +251,8 @@ def _contradictions(folder: Path, record: Submission, track: Track, claimed: pan
     rows = [(record.track, level, task) for level in track.errors for task in range(min(record.tasks, track.tasks))]
     if record.tasks > track.tasks or list(map(tuple, claimed[["track", "level", "task"]].values)) != rows:
         yield f"the episodes are not one of each level and each of {record.tasks} tasks, in their order"
-
-
-def _different(claimed: pandas.DataFrame, again: pandas.DataFrame) -> int:
-    """Return the number of episodes that end differently."""
-    alike = pandas.Series(True, again.index)
-    for name in ("region", "seed", "success", "steps", "false_arrival"):
-        alike &= claimed[name] == again[name]
-    for name, most in TOLERANCE.items():
-        alike &= (claimed[name] - again[name]).abs() <= most
-    return int((~alike).sum())
+    else:
+        yield from impossible(claimed, track, record.policy)
 
 
 def _platform() -> dict[str, str]:

@@ -8,8 +8,10 @@ from pathlib import Path
 import pandas
 import pytest
 import torch
+from tensordict import TensorDict
 
-from magrl.agents import kalman, save_policy
+from magrl.agents import ExportedPolicy, kalman, save_policy
+from magrl.agents.program import TensorProgram
 from magrl.benchmark import TRACKS, Track, read_episodes, submission, write_episodes
 from magrl.benchmark.__main__ import main
 from magrl.evaluation import episode_measures
@@ -21,6 +23,7 @@ SMALL = Track(regions=3, tasks=12, within_km=25, max_steps=20, levels=((0.05, 0.
 @pytest.fixture(autouse=True)
 def small_track(monkeypatch) -> None:
     monkeypatch.setitem(TRACKS, NAME, SMALL)
+    monkeypatch.setattr(submission, "SHIFTS_DEG", [(0.0, 1e-4)])
 
 
 @pytest.fixture(scope="module")
@@ -74,44 +77,110 @@ def test_what_was_flown_is_verified(policy: Path, tmp_path: Path, capsys) -> Non
     episodes = read_episodes(folder / "episodes.csv.gz")
     assert episodes["task"].tolist() == 2 * [*range(8)]
     assert episodes["region"].tolist() == 2 * SMALL.scenario.tasks.region[:8].tolist()
-    assert set(episodes["navigator"]) == {"mine.safetensors"}
+    assert set(episodes["navigator"]) == {"policy.safetensors"}
     assert status(folder, "--tasks", "4") == 0
-    assert "flown on the same platform: 8 of 8 episodes end alike" in capsys.readouterr().out
-    assert status(fly("geodesic", tmp_path / "named"), "--tasks", "2") == 0
-    change(folder, platform={"cpu": "another"})
-    assert status(folder, "--tasks", "4") == 0
-    assert "another platform, {'cpu': 'another'}" in capsys.readouterr().out
+    assert "8 of 8 repeated episodes end alike" in capsys.readouterr().out
+    assert status(fly("geodesic", tmp_path / "named", "--tasks", "2"), "--tasks", "2") == 0
 
 
 def test_what_was_changed_is_not_verified(policy: Path, tmp_path: Path, capsys) -> None:
-    folder = fly(policy, tmp_path / "mine")
-    claim(folder, spl=1.0, success=True, steps=0)
+    folder = fly(policy, tmp_path / "mine", "--tasks", "3")
+    claim(folder, track="\x1b[2J", level="\x1b[2Jverdict: verified")
     assert status(folder) == 1
     assert "episodes.csv.gz is not the file of the record" in capsys.readouterr().out
-    change(folder)
+    change(folder, magrl="\x1b[2J\nverdict: verified\n", declared={"max_steps": 500})
     assert status(folder) == 1
     out = capsys.readouterr().out
-    assert "24 of 24 repeated episodes end differently" in out
-    assert "CONTRADICTION: new tasks, 0.5, 0.1, 20: SPL 100.0 % claimed" in out
-    assert out.endswith("verdict: not verified\n")
-    claim(folder, task=0)
-    change(folder)
-    assert status(folder) == 1
-    assert "the episodes are not one of each level" in capsys.readouterr().out
+    assert "the episodes are not one of each level" in out
+    assert "than in the \\x1b[2J verdict: verified of the record" in out
+    assert "\x1b" not in out
+    assert out.endswith("\nverdict: not verified\n")
     (folder / "policy.safetensors").write_bytes(b"")
     assert status(folder) == 2
     save_policy(folder / "policy.safetensors", kalman())
     assert status(folder) == 1
     assert "policy.safetensors is not the file of the record" in capsys.readouterr().out
-    change(folder, declared={"max_steps": 500}, tasks=10**15)
+    change(folder, tasks=10**15)
     assert status(folder) == 1
-    assert "small-v1 is another track in magrl" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def rows() -> pandas.DataFrame:
+    """What one navigator flies."""
+    flown = submission._flown("geodesic", SMALL, torch.arange(12))
+    return flown.assign(track=NAME, navigator="geodesic")
+
+
+@pytest.fixture
+def folder(rows: pandas.DataFrame, tmp_path: Path, monkeypatch) -> Path:
+    """A submission; later flights repeat its rows, whatever their tasks."""
+    monkeypatch.setattr(submission, "_flown", lambda _0, _1, vehicle, *_: rows[rows["task"].isin(vehicle.tolist())])
+    return fly("geodesic", tmp_path / "geodesic")
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "text"),
+    [
+        ("spl", 250.0, "not all rows have spl in (0, 1] with success, 0 without: level 0.5, 0.1, 20, task 7"),
+        ("navigator", "MyNet-v9 (PPO)", "not all rows have navigator geodesic: level 0.5, 0.1, 20, task 7"),
+        ("spl", 0.9, "rounding does not explain 1 of the others: level and task [('0.5, 0.1, 20', 7)]"),
+        ("steps", 19, "rounding does not explain 1 of the others: level and task [('0.5, 0.1, 20', 7)]"),
+    ],
+)
+def test_one_number_that_was_changed_is_found(
+    column: str, value: object, text: str, folder: Path, rows, capsys
+) -> None:
+    """Whatever the record says of the platform: what may differ is decided by the flights of the verifier."""
+    assert status(folder) == 0
+    values = rows[column].astype(object)
+    values[19] = value
+    claim(folder, **{column: values})
+    change(folder, platform={"cpu": "another"})
+    assert status(folder) == 1
+    assert f"CONTRADICTION: {text}" in capsys.readouterr().out
+
+
+def test_an_end_that_rounding_decides_may_differ(folder: Path, rows, monkeypatch, capsys) -> None:
+    """Task 7 takes 20 steps in the flights of the verifier, and the starts east of it show that it may take fewer."""
+    flown = rows.assign(steps=rows["steps"].where(rows["task"] != 7, 20))
+
+    def fly_again(_policy, _track, vehicle, tasks=None, seed=None) -> pandas.DataFrame:
+        east = seed is None and tasks is not None and (tasks.start > SMALL.scenario.tasks.start)[:, 1].all()
+        return (rows.assign(steps=18) if east else flown)[rows["task"].isin(vehicle.tolist())]
+
+    monkeypatch.setattr(submission, "_flown", fly_again)
+    assert status(folder) == 0
+    assert "23 of 24 repeated episodes end alike\nrounding decides how 1 of the others" in capsys.readouterr().out
+
+
+def test_an_interrupted_run_is_flown_again(folder: Path, policy: Path, monkeypatch, capsys) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        fly(policy, folder)
+    assert "holds files: choose a new folder" in capsys.readouterr().err
+
+    def full(_source, _to) -> None:
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr("magrl.files.os.replace", full)
+        with pytest.raises(SystemExit, match="2"):
+            fly(policy, folder.parent / "mine")
+    fly(policy, folder.parent / "mine")
+
+
+def test_no_action_of_a_program_depends_on_the_rest_of_the_batch(tmp_path: Path) -> None:
+    """Here it adds the mean over the batch to the move of each vehicle."""
+    steps = [["mean.dim", [{"value": 0}, [0], True], {}], ["add.Tensor", [{"value": 0}, {"value": 1}], {}]]
+    save_policy(tmp_path / "mean.safetensors", ExportedPolicy(["move"], TensorProgram(1, steps, [], [2])))
+    mine, moves = submission._policy(str(tmp_path / "mean.safetensors"), SMALL), torch.rand(5, 2)
+    assert mine(TensorDict(move=moves, batch_size=[5]))["action"].tolist() == (2 * moves).tolist()
 
 
 def test_another_policy_than_that_which_flew_is_found(tmp_path: Path) -> None:
-    folder = fly("secant", tmp_path / "secant")
+    folder = fly("secant", tmp_path / "secant", "--tasks", "3")
+    claim(folder, navigator="geodesic")
     change(folder, policy="geodesic")
-    assert status(folder, "--tasks", "6") == 1
+    assert status(folder, "--tasks", "2") == 1
 
 
 @pytest.mark.parametrize("name", ["mine.py", "policy.pt", "pso", "module:Class", "anywhere=runs/mine"])
@@ -138,16 +207,3 @@ def test_a_policy_with_a_filter_does_not_fly_raw_sequences(policy: Path, tmp_pat
         ValueError, match="it reads bias_std, drift_std, iron_std, sensor_std, which this track does not"
     ):
         submission.run(str(policy), "sequences-v1", tmp_path / "out")
-
-
-def test_a_claim_is_compared_by_its_standard_error() -> None:
-    """By hand: of 0 and 100 % in turn, the mean of 16 has the standard error 12.5, and that of a pair 17.7."""
-    flown = pandas.Series(8 * [0.0, 100.0])
-    assert submission._compared(flown + 70, flown, paired=False) == (
-        "SPL 120.0 % claimed, 50.0 % flown, standard error 17.7",
-        False,
-    )
-    assert submission._compared(flown + 72, flown, paired=False)[1]
-    assert submission._compared(flown + 1, flown, paired=True)[1]
-    assert not submission._compared(flown + 0.4, flown, paired=True)[1]
-    assert submission._compared(flown * float("nan"), flown, paired=True)[1]
