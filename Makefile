@@ -71,9 +71,8 @@ RUNS_figure-learning-success := $(GUIDED) $(PLAIN)
 RUNS_figure-learning-spl := $(GUIDED) $(PLAIN)
 RUNS_figure-noise := $(NOISY)
 RUNS_figure-paper-run := $(WHOLE)
-RUNS_figure-sequences := $(MEMORY)
 TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' recipes/tables/tables.toml)
-FIGURES ?= section-4 noise conditions globe two-elements prices reliability $(shell sed -n 's/^\[curves\.\([a-z-]*\)\]$$/\1/p' recipes/tables/figures.toml)
+FIGURES ?= place-error section-4 noise conditions globe two-elements prices reliability $(shell sed -n 's/^\[curves\.\([a-z-]*\)\]$$/\1/p' recipes/tables/figures.toml)
 
 tables: $(TABLES:%=table-%)  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
 	$(RECIPE)/tables/publish.py README.md $(wildcard docs/*.md)
@@ -102,8 +101,8 @@ $(eval $(call training,td3_gradient_guided-fast-noise-0.05-0.05-5,td3_gradient_g
 $(eval $(call training,td3-fast,td3_gradient_guided.py --preset td3-fast))
 $(eval $(call training,td3_gradient_guided-paper,td3_gradient_guided.py --preset paper --precision bfloat16))
 $(eval $(call training,td3-paper,td3_gradient_guided.py --preset td3-paper --precision bfloat16))
-$(eval $(call training,ppo_recurrent,ppo_recurrent.py))
-$(eval $(call training,ppo_recurrent-short,ppo_recurrent.py --total-frames 1998848))
+$(eval $(call training,ppo_recurrent,../docs/examples/ppo_recurrent.py))
+$(eval $(call training,ppo_recurrent-short,../docs/examples/ppo_recurrent.py --total-frames 1998848))
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## /  \1\t/p' $(MAKEFILE_LIST) | expand -t 14

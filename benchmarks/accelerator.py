@@ -13,8 +13,9 @@ from collections.abc import Callable, Sequence
 
 from benchmarks.update import CONFIG
 from magrl import tracking
-from magrl.agents import SoftUpdate, TD3Loss, kalman, make_actor, make_critic
+from magrl.agents import SoftUpdate, TD3Loss, make_actor, make_critic
 from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation.navigators import make_navigator
 from magrl.sensor_std import SensorStd
 
 import torch
@@ -49,7 +50,7 @@ def parts(vehicles: int, device: torch.device) -> dict[str, Callable[[], object]
     """Return the parts of a step by name."""
     env = GeomagneticNavEnv(num_envs=vehicles, seed=0, device=device)
     state = env.rand_action(env.reset())
-    policy = kalman().for_env(env)
+    policy = make_navigator("kalman", env)
     std = torch.tensor([0.05, 0.05, 5.0], device=device).expand(vehicles, 3)
     errors, course = SensorStd(std, *[torch.zeros_like(std)] * 3), state["heading"].squeeze(-1)
     belief = tracking.start(state["field"], errors, course)

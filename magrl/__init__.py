@@ -1,8 +1,7 @@
 """Navigation by the Earth's magnetic field: a TorchRL environment, transforms and what trains on them.
 
-Importing the package registers ``magrl/GeomagneticNavigation-v0`` and ``magrl/GeomagneticNavigationAnywhere-v0`` with
-Gymnasium. The names in ``magrl.__all__``, those of ``__init__.pyi``, are loaded when first used, so that the import
-does not load torch.
+Importing the package registers the named tasks of :mod:`magrl.envs.gymnasium` with Gymnasium. The names in
+``magrl.__all__``, those of ``__init__.pyi``, are loaded when first used, so that the import does not load torch.
 """
 
 import multiprocessing as _multiprocessing
@@ -29,10 +28,12 @@ def __getattr__(name: str) -> object:
     return getattr(gymnasium, name)
 
 
-for _name, _kind in (("GeomagneticNavigation", "GeomagneticNav"), ("GeomagneticNavigationAnywhere", "Anywhere")):
-    if f"magrl/{_name}-v0" not in _gymnasium.registry:
+for _ending, _threshold in {"": 16.8, "Anywhere": 16.0, "Readings": 16.0, "Storm": 12.7}.items():
+    if f"magrl/GeomagneticNavigation{_ending}-v0" not in _gymnasium.registry:
         _gymnasium.register(
-            f"magrl/{_name}-v0",
-            entry_point=f"magrl:{_kind}GymEnv",
-            vector_entry_point=f"magrl:{_kind}VectorEnv",
+            f"magrl/GeomagneticNavigation{_ending}-v0",
+            entry_point="magrl:GeomagneticNavGymEnv",
+            vector_entry_point="magrl:GeomagneticNavVectorEnv",
+            reward_threshold=_threshold,
+            kwargs={"task": _ending.lower() or "box"},
         )

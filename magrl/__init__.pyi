@@ -3,7 +3,6 @@
 from .agents import FieldPolicy as FieldPolicy
 from .agents import export_policy as export_policy
 from .agents import load_policy as load_policy
-from .agents import load_pretrained as load_pretrained
 from .agents import save_policy as save_policy
 from .envs import GeomagneticNavEnv as GeomagneticNavEnv
 from .envs import Region as Region
@@ -21,6 +20,8 @@ from .evaluation import summarize as summarize
 from .field import IGRF as IGRF
 from .field import RegionalField as RegionalField
 from .field import SphericalHarmonicField as SphericalHarmonicField
+from .navigators import Anywhere as Anywhere
+from .navigators import Kalman as Kalman
 from .transforms import AlignmentReward as AlignmentReward
 from .transforms import AngleVector as AngleVector
 from .transforms import FieldGradient as FieldGradient

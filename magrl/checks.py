@@ -11,12 +11,14 @@ import os
 import sys
 from collections.abc import Callable, Collection, Iterable
 from numbers import Integral, Real
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
-from tensordict import TensorDictBase
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
 
 
 def check_finite(data: TensorDictBase | Iterable[tuple[str, Tensor]], what: str) -> None:
@@ -35,7 +37,7 @@ def check_finite(data: TensorDictBase | Iterable[tuple[str, Tensor]], what: str)
             ...
         FloatingPointError: update 7: loss is not finite in rows [1]
     """
-    items = data.items(True, True) if isinstance(data, TensorDictBase) else data
+    items = data.items(True, True) if hasattr(data, "items") else data
     for key, value in items:
         # A sum is finite unless an entry is not, or it overflows: one kernel in nearly all cases.
         if value.is_floating_point() and not torch.isfinite(value.detach().sum()):

@@ -260,6 +260,17 @@ def move(latitude: Tensor, longitude: Tensor, heading: Tensor, distance_km: Tens
     return end[0], end[1]
 
 
+def move_place(place: Tensor, heading: Tensor, distance_km: Tensor) -> Tensor:
+    """Return the ends ``(..., 2)`` latitude, longitude [deg] of moves from places ``(..., 2)``; see :func:`move`.
+
+    Example:
+        >>> move_place(torch.tensor([0.0, 0.0]), torch.tensor(0.0), torch.tensor(110.574)).round(decimals=3)
+        tensor([1., 0.])
+    """
+    latitude, longitude = place.unbind(-1)
+    return torch.stack(move(latitude, longitude, heading, distance_km), -1)
+
+
 def geodesic(latitude1: Tensor, longitude1: Tensor, latitude2: Tensor, longitude2: Tensor) -> tuple[Tensor, Tensor]:
     """Return length and initial bearing of the geodesic from one point to another.
 

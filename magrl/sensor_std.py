@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_numbers
 
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+
 STD_KEYS = ("sensor_std", "bias_std", "drift_std", "iron_std")
 """Keys of the fields of :class:`SensorStd` in a TensorDict, each ``(..., 3)``."""
+OUTAGE_STD = 1e4
+"""Standard deviation of a repeated reading, in the unit of each element: a filter ignores it."""
 _NONE = (0.0, 0.0, 0.0)
 
 

@@ -6,8 +6,8 @@
     python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --errors 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --errors ship                    # errors of a real vehicle
     python recipes/evaluate.py kalman --errors 0.05 0.05 5 --north magnetic     # without a true-north reference
-    python recipes/evaluate.py secant kalman --arrival distance --arrival-radius-km 25 --max-steps 80 --altitude-km -3
-    python recipes/evaluate.py policy:SAC=sac.safetensors secant                # a policy of another algorithm
+    python recipes/evaluate.py secant kalman --arrival distance --radius-km 25 --max-steps 80 --altitude-km -3
+    python recipes/evaluate.py sac.onnx secant                                  # a policy of another algorithm
 
 Trained agents are named by their run folders. By default, scenario, arrival threshold, start heading and sensor noise
 are those of the training. If the runs differ in one of these, give its option. A warning below the table names agents
@@ -34,7 +34,7 @@ from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
 from magrl.evaluation import Flight, episode_measures, export, summarize
 from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import check_distinct, check_map_date, label
+from magrl.evaluation.navigators import check_distinct, label
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.runs import NO_NOISE, Noise, agreed, trained_runs, unfinished
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
@@ -70,9 +70,9 @@ class Config(ScenarioOptions):
     """Settings of an evaluation."""
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
-    """Navigators: anywhere, kalman, secant, mean_jacobian, map_matching, parallel, geodesic, ga, pso,
-    afsa; trained agents by run folder: gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN; policies of
-    any algorithm by file: policy=FILE or policy:LABEL=FILE."""
+    """Navigators: anywhere, kalman, dead_reckoning, secant, mean_jacobian, parallel, geodesic, ga, pso, afsa; trained
+    agents by run folder: gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN; policies of any algorithm by file:
+    FILE, or policy:LABEL=FILE with a label."""
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
     tasks_seed: int | None = None
@@ -94,8 +94,11 @@ class Config(ScenarioOptions):
     known_start: Noise | None = None
     """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
     calibrated, with the errors of a real vehicle; by default the start is unknown."""
-    map_date: str | None = None
-    """Date of the IGRF map of map_matching, such as 2015-01-01; by default its map is the true field."""
+    model: str | None = None
+    """Model of the Earth that vehicles carry, as of the date of the scenario: IGRF-14, IGRF-13, IGRF-2005, ...; none by
+    default."""
+    start_km: float | None = None
+    """Error of the start as vehicles know it, with a model [km]; by default they do not know their start."""
     kilometers: bool = False
     """Distances in the first columns of the tables; always on with another --arrival than objective."""
     confidence: float = 0.0
@@ -169,15 +172,16 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         if config.export:
             export.check_suffix(config.export)
         check_distinct(config.navigators, config.mode)
-        check_map_date(config.navigators, config.map_date)
         config, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        options = {key: getattr(config, key) for key in ("errors", "north", "known_start", "confidence", "seed")}
+        told = ("errors", "north", "known_start", "model", "start_km", "confidence", "seed")
+        options = {key: getattr(config, key) for key in told}
         flights = [Flight(scenario, **options), Flight(example, **options)]
         config = replace(config, north="magnetic" if flights[0].sensor_std.magnetic else "true")  # also by a preset
-        options = {"mode": config.mode, "map_date": config.map_date}
-        navigators = [tuple(flight.navigator(text, **options) for flight in flights) for text in config.navigators]
+        navigators = [
+            tuple(flight.navigator(text, mode=config.mode) for flight in flights) for text in config.navigators
+        ]
         if config.export:
             check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")
@@ -229,9 +233,9 @@ def settings(config: Config, env: GeomagneticNavEnv) -> dict[str, Any]:
         "tasks_seed": (config.tasks_seed or 0) if isinstance(config.tasks, int) else None,
         "scenario": config.scenario and config.scenario.name,
         "arrival": env.arrival.rule,
-        "arrival_radius_km": env.arrival.radius_km,
+        "radius_km": env.arrival.radius_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        **{key: getattr(config, key) for key in ("tasks", "north", "known_start", "map_date", "mode", "seed")},
+        **{key: getattr(config, key) for key in ("tasks", "north", "known_start", "model", "start_km", "mode", "seed")},
         "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
         **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
         **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
@@ -240,8 +244,7 @@ def settings(config: Config, env: GeomagneticNavEnv) -> dict[str, Any]:
 
 def write(config: Config, env: GeomagneticNavEnv, results: Results) -> None:
     """Write the files of the results, and the runs as a table in wandb."""
-    for name in ("episodes", "runs", "paths"):
-        rows = getattr(results, name)
+    for name, rows in (("episodes", results.episodes), ("runs", results.runs), ("paths", results.paths)):
         with (config.out / f"{name}.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]))
             writer.writeheader()
@@ -251,9 +254,10 @@ def write(config: Config, env: GeomagneticNavEnv, results: Results) -> None:
     text, noisy = "{:g} deg, {:g} deg, {:g} nT".format, not isinstance(config.errors, str) and any(config.errors or ())
     lines = {
         "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
-        "Date of the map of map matching": config.map_date,
         "North": config.north != "true" and config.north,
         "Conditions": isinstance(config.errors, str) and config.errors,
+        "Model of the Earth": config.model or "",
+        "Error of the known start": "" if config.start_km is None else f"{config.start_km:g} km",
         "Known start, standard deviations of D, I, B_H": config.known_start and text(*config.known_start),
         "Standard deviations of the noise on D, I and B_H": noisy and text(*config.errors),
     }

@@ -7,7 +7,8 @@
     python recipes/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors 0 0.05 5 --north magnetic  # with a compass, without D
 
 The agent measures declination D, inclination I and horizontal intensity B_H, and knows their values at the destination.
-It never observes a position: coordinates serve the simulation, the score and the picture only.
+With --model and --start-km, it carries a model of the Earth and knows its start and destination; else it never observes
+a position: coordinates serve the simulation, the score and the picture only.
 Writes flight.png and flight.json.
 """
 
@@ -22,16 +23,16 @@ from typing import Any, Literal
 
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
-from magrl.evaluation import Flight, episode_measures, export, places, with_declaration
+from magrl.evaluation import Flight, episode_measures, export, places
 from magrl.evaluation.maps import trajectories_figure, write_gif
 from magrl.evaluation.navigators import needs
 from magrl.field import IGRF
 from magrl.files import check_writable, write_json
 from magrl.geodesy import geodesic
-from magrl.sensor_std import STD_KEYS
-from magrl.tracking import Way
+from magrl.tracking import Rules, Way
 from magrl.training import UsageError, command, parse
 from magrl.transforms import TrackField, conditions_named
+from magrl.transforms.track import known_keys
 
 import torch
 import tyro
@@ -70,6 +71,10 @@ class Config:
     known_start: tuple[float, float, float] | None = None
     """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
     calibrated, with the errors of a real vehicle; by default the start is unknown."""
+    model: str | None = None
+    """Model of the Earth that the vehicle carries, as of the date: IGRF-14, IGRF-13, IGRF-2005; none by default."""
+    start_km: float | None = None
+    """Error of the start as the vehicle knows it, with a model [km]; by default it does not know its start."""
     date: str = "2025-01-01"
     """Date of the field, 1900 to 2030 (IGRF-14)."""
     zeta: float | None = None
@@ -99,10 +104,10 @@ class Watched(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Show the distance flown, and the estimated remaining way with its standard deviation."""
-        way, covariance = tensordict["way"][0].double(), tensordict["way_covariance"][0].double()
-        left = way.norm()
-        direction = way / left.clamp_min(1e-6)
-        error = (direction @ covariance @ direction).clamp_min(0).sqrt()
+        way = Way(**tensordict["track", "way"][0].double())
+        left = way.displacement.norm()
+        direction = way.displacement / left.clamp_min(1e-6)
+        error = (direction @ way.covariance @ direction).clamp_min(0).sqrt()
         self.bar.set_postfix_str(f"estimated {left:.0f} ± {error:.0f} km to go", refresh=False)
         self.bar.update(min(tensordict["move"][0, 0].item(), self.bar.total - self.bar.n))
         return self.navigator(tensordict)
@@ -114,12 +119,9 @@ def ends(config: Config, field: IGRF) -> tuple[Tensor, Tensor, float]:
     Raises:
         ValueError: for a place that cannot be read or found, or ends between which no flight is possible.
     """
-    start, elements = places.parse_coordinates(config.start), places.parse_elements(config.destination)
-    target = (
-        places.parse_coordinates(config.destination)
-        if elements is None
-        else places.find_elements(field, elements, start)
-    )
+    read = places.parse_coordinates
+    start, elements = read(config.start), places.parse_elements(config.destination)
+    target = read(config.destination) if elements is None else places.find_elements(field, elements, start)
     distance_km = geodesic(*start, *target)[0].item()
     if math.isnan(distance_km):
         raise ValueError(f"{config.destination!r} is the antipode of the start, {config.start!r}: choose another one")
@@ -156,13 +158,15 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
         start, target, distance_km = ends(config, field)
         region = places.region_around(start, target, field, 50.0 + drift_km)
         tasks = Tasks(start[None], target[None])
-        scenario = Scenario(region=region, margin_deg=0, field=field, tasks=tasks)
+        scenario = Scenario(region=region, margin_deg=0, field=field, tasks=tasks, date=config.date)
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,
                 errors=config.errors,
                 north=config.north,
                 known_start=config.known_start,
+                model=config.model,
+                start_km=config.start_km,
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,
                 zeta=0.01 * min(1, ARRIVAL_KM / distance_km) ** 2 if config.zeta is None else config.zeta,
                 start_heading="random",
@@ -177,10 +181,8 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
 
 
 def with_estimates(flight: Flight) -> TransformedEnv:
-    """Return the environment of a flight; without a declaration, add estimates of the way."""
-    if flight.base.arrival.declared:
-        return with_declaration(flight.env)
-    track = TrackField(std_keys=STD_KEYS if flight.env is not flight.base else (), range_km=1000.0)
+    """Return the environment of a flight with estimates of the way."""
+    track = TrackField(Rules(**flight.base.limits | flight.rules), known_keys(flight.env.observation_spec))
     return TransformedEnv(flight.env, track, auto_unwrap=True)
 
 
@@ -250,7 +252,7 @@ def fly(config: Config) -> dict[str, Any]:
         **{key: first[key].tolist() for key in ("start_position", "target_position")},
         "target_field": first.get("true_target_field", first["target_field"]).tolist(),
         **measures["with_signal"],
-        "without_signal": measures["without_signal"] | {"ellipse": Way(last["way"], last["way_covariance"]).ellipse()},
+        "without_signal": measures["without_signal"] | {"ellipse": Way(**last["track", "way"]).ellipse()},
     }
     write_json(config.out / "flight.json", result)
     draw(config, steps, measures, base)

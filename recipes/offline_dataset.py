@@ -28,14 +28,14 @@ from magrl import paper
 from magrl.benchmark.tracks import LEVELS
 from magrl.checks import CheckedModel
 from magrl.envs import PUBLIC_KEYS, earth_scenario, planet_scenario
-from magrl.envs.gymnasium import ANYWHERE_ID, AnywhereVectorEnv
+from magrl.envs.gymnasium import ANYWHERE_ID, GeomagneticNavVectorEnv
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.runs import Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.config import Count, Rising, Seed
-from magrl.transforms import SensorNoise
+from magrl.transforms import SensorErrors
 
 import numpy as np
 import torch
@@ -77,19 +77,20 @@ def command_line(config: Config) -> str:
     return " ".join((f"python recipes/{RECIPE}", *words))
 
 
-def make_envs(config: Config, noise: Noise) -> tuple[AnywhereVectorEnv, str]:
+def make_envs(config: Config, noise: Noise) -> tuple[GeomagneticNavVectorEnv, str]:
     """Return one vehicle for each episode, and the call that makes them."""
     region: dict[str, Any] = {"distance_range_km": config.distance_range_km, "max_latitude": 70.0}
     region |= {"start_heading": "random", "max_steps": config.max_steps}
     scenario = SCENARIOS[config.field](config.regions, config.seed, **region)
-    options: dict[str, Any] = {"observation": "dict", "scale_actions": False, "seed": config.seed}
-    envs = AnywhereVectorEnv(config.episodes, scenario=scenario, transforms=[SensorNoise(noise)], **options)
+    options: dict[str, Any] = {"observation": "dict", "reward": "spl", "scale_actions": False, "seed": config.seed}
+    errors = [SensorErrors(noise)]
+    envs = GeomagneticNavVectorEnv(config.episodes, task="anywhere", scenario=scenario, transforms=errors, **options)
     parts = f"scenario=magrl.envs.{config.field}_scenario({config.regions}, {config.seed}, **{region})"
-    parts += f", transforms=[magrl.transforms.SensorNoise({noise})], **{options}"
+    parts += f", transforms=[magrl.transforms.SensorErrors({noise})], **{options}"
     return envs, f"gymnasium.make_vec({ANYWHERE_ID!r}, num_envs={config.episodes}, {parts})"
 
 
-def fly(policy: str, envs: AnywhereVectorEnv, noise: Noise, seed: int) -> TensorDictBase:
+def fly(policy: str, envs: GeomagneticNavVectorEnv, noise: Noise, seed: int) -> TensorDictBase:
     """Return the first episode of each vehicle."""
     env = envs.torchrl_env
     torch.manual_seed(seed)  # of random actions

@@ -15,31 +15,29 @@ arrival has an SPL of 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
-from magrl import paper
-from magrl.agents import FieldPolicy, PolicyConfig, optimize
+from magrl import Anywhere, paper
+from magrl.agents import make_correcting_actor, optimize
 from magrl.agents.networks import make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
-from magrl.evaluation import with_declaration
-from magrl.sensor_std import STD_KEYS
-from magrl.tracking import RANGE_KM
+from magrl.tracking import OBSERVATION_SIZE, RANGE_KM, Rules, correction_network
 from magrl.training import Run, command, parse_config
 from magrl.training.collectors import make_collector
 from magrl.training.config import Count, Discount, NonNegative, PlanetConfig, Positive, Rising
 from magrl.transforms import (
     DeclareArrival,
     HighestSPL,
-    RandomSensorNoise,
+    MinMaxNorm,
     RandomStepPrice,
-    SensorNoise,
+    SensorErrors,
     SPLReward,
-    TrackView,
+    TrackField,
     TrueWay,
     sensor_levels,
 )
+from magrl.transforms.track import known_keys
 
 import torch
 from tensordict import TensorDictBase
@@ -80,8 +78,8 @@ class Config(PlanetConfig):
     batch_size: Count = 16_384
 
     arrival: Literal["objective", "declared"] = "objective"
-    """Rule of arrival: by the objective, or declared by the vehicle within ``arrival_km``."""
-    arrival_km: Positive = 25.0
+    """Rule of arrival: by the objective, or declared by the vehicle within ``radius_km``."""
+    radius_km: Positive = 25.0
     """Distance from the destination within which a declaration is correct [km]."""
     range_km: Positive = RANGE_KM
     """Prior standard deviation of the way to the destination along each axis [km]."""
@@ -100,39 +98,33 @@ PRESETS = {"far": FAR, "fast": FAST}
 
 def errors(config: Config, seed: int) -> list[Transform]:
     """Return the drift and the noise of the sensors: that of the settings, or levels drawn for each episode."""
-    levels = partial(sensor_levels, exponent=config.noise_exponent)
-    noise = SensorNoise(config.noise, seed=seed) if any(config.noise) else RandomSensorNoise(levels, seed=seed)
-    return [*config.motion(seed), noise]
+    levels = None if any(config.noise) else partial(sensor_levels, exponent=config.noise_exponent)
+    return [*config.motion(seed), SensorErrors(config.noise, levels=levels, seed=seed)]
 
 
-def make_view(base: GeomagneticNavEnv, range_km: float) -> TrackView:
-    """Return what the agent observes in training: the estimates of its own track, a plan, and the price of a step."""
-    limits = {name: getattr(base, name) for name in ("zeta", "max_steps", "max_move_km", "max_turn_rad")}
-    return TrackView(**limits, range_km=range_km, step_price=None)
+def rules_of(base: GeomagneticNavEnv, config: Config) -> Rules:
+    """Return what the agent knows before it starts."""
+    return Rules(**base.limits, range_km=config.range_km)
 
 
-def declaration(base: GeomagneticNavEnv, range_km: float) -> list[Transform]:
-    """Return what declares the arrival by the estimates of the agent's view, where it must be declared."""
-    if not base.arrival.declared:
-        return []
-    return [DeclareArrival(base.arrival.radius_km, max_steps=base.max_steps, range_km=range_km, std_keys=STD_KEYS)]
-
-
-def make_env(base: GeomagneticNavEnv, view: TrackView, config: Config) -> TransformedEnv:
-    """Add sensors, step price, the agent's view, and the privileged inputs of critic and reward, for training only."""
-    price = RandomStepPrice(config.price_range, seed=base.seed)
+def make_env(base: GeomagneticNavEnv, config: Config) -> TransformedEnv:
+    """Add sensors, step price, the agent's track, and the privileged inputs of critic and reward, for training only."""
+    env = TransformedEnv(base, Compose(*errors(config, base.seed), RandomStepPrice(config.price_range, seed=base.seed)))
+    rules, known = rules_of(base, config), known_keys(env.observation_spec)
+    declaration = [] if rules.signaled else [DeclareArrival(rules, known)]
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
     highest = HighestSPL({"move": "true_move"} if config.drift else None)
     privileged = [TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
-    observed = [*errors(config, base.seed), price, *view.observation_transforms(), *declaration(base, view.range_km)]
-    return TransformedEnv(base, Compose(*observed, view.action_transform(), *privileged))
+    for transform in (TrackField(rules, known), *declaration, MinMaxNorm(in_keys_inv=["action"]), *privileged):
+        env.append_transform(transform)
+    return env
 
 
 def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config, **options: Any) -> TransformedEnv:
     """Return an environment of random tasks of a scenario, drawn once, with the noise of the sensors."""
     tasks = scenario.random_tasks(num_tasks, seed)
     base = GeomagneticNavEnv(scenario.with_tasks(tasks), num_envs=num_tasks, seed=seed, **options)
-    return with_declaration(TransformedEnv(base, Compose(*errors(config, seed))))
+    return TransformedEnv(base, Compose(*errors(config, seed)))
 
 
 class Spread(nn.Module):
@@ -177,7 +169,7 @@ def train(config: Config) -> dict[str, float]:
     with Run(config, recipe=RECIPE, name=f"ppo_anywhere-{config.preset}", losses=LOSSES) as run:
         # Environments
         options = {"zeta": config.zeta, "max_steps": config.max_steps, "start_heading": "random"}
-        options |= {"device": config.device, "arrival": config.arrival, "arrival_radius_km": config.arrival_km}
+        options |= {"device": config.device, "arrival": config.arrival, "radius_km": config.radius_km}
         options |= config.limits
         planets = planet_scenario(config.num_regions, seed=config.seed, **config.regions)
         base = GeomagneticNavEnv(planets, num_envs=config.num_envs, seed=config.seed, **options)
@@ -185,15 +177,14 @@ def train(config: Config) -> dict[str, float]:
         validation = evaluation_env(others, config.eval_tasks_small, paper.VALIDATION_SEED, config, **options)
         earth = earth_scenario(128, seed=paper.TEST_SEED, **config.regions)
         test = evaluation_env(earth, config.eval_tasks, paper.TEST_SEED, config, **options)
-        view = make_view(base, config.range_km)
-        env = make_env(base, view, config)
+        env, rules = make_env(base, config), rules_of(base, config)
 
         # Networks: the critic also reads the true way and the SPL that can still be reached, the actor never does
-        network = PolicyConfig(replace(view, step_price=TrackView.step_price), config.num_cells)
-        actor = network.make_actor(env.device)
+        network = correction_network(config.num_cells, env.device)
+        actor = make_correcting_actor(network, rules)
         spread = Spread(config.exploration).to(env.device)
         stochastic_actor = make_stochastic_actor(actor, spread)
-        value = make_mlp(view.size + 3, 1, config.critic_cells, layer_norm=True, device=env.device)
+        value = make_mlp(OBSERVATION_SIZE + 3, 1, config.critic_cells, layer_norm=True, device=env.device)
         critic = ValueOperator(value, in_keys=list(OBSERVED))
 
         # Advantages and loss with a clipped probability ratio
@@ -214,7 +205,7 @@ def train(config: Config) -> dict[str, float]:
         frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
         collector = make_collector(env, stochastic_actor, **frames)
         run.start(
-            policy=FieldPolicy(network, actor).to(env.device),
+            policy=Anywhere(rules, network),
             validation=validation,
             env=base,
             collector=collector,

@@ -9,7 +9,7 @@ Each row of the log holds a reading of D [deg], I [deg], B_H [nT], and the headi
 since the row before; in the first row, the length is 0. The destination is that of the last row, unless --target gives
 its elements. With --north magnetic, D only converts the headings: the navigator gets I, B_H and headings from
 magnetic north, whatever the north of the log is. Where the log has positions, the estimates are compared with them; the
-navigator does not read them.
+navigator does not read them, but for the first one with --start-km.
 Writes log.csv, log.md and log.png.
 """
 
@@ -26,10 +26,9 @@ from magrl.evaluation.tables import markdown_table
 from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.geodesy import check_positions, geodesic
-from magrl.sensor_std import SensorStd
+from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import Way
 from magrl.training import UsageError, command, parse
-from magrl.transforms.errors.sensors import OUTAGE_STD
 from magrl.vehicle.logs import difference_from_igrf, joined, mistakes, read_readings
 from magrl.vehicle.onboard import Onboard
 
@@ -59,23 +58,27 @@ class Config:
     log: tyro.conf.Positional[Path]
     """Log of the vehicle: a CSV file with a header."""
     navigator: str = "anywhere"
-    """Navigator: anywhere (the pretrained agent), secant, kalman, or a policy file (.safetensors)."""
+    """Navigator: anywhere (the pretrained agent), secant, kalman, or a policy file (.safetensors, .onnx)."""
     target: tuple[float, float, float] | None = None
     """Elements at the destination, D [deg], I [deg], B_H [nT]; by default those of the last row."""
     target_position: tuple[float, float] | None = None
-    """Latitude, longitude of the destination [deg], for comparison only; without --target those of the last row."""
+    """Latitude, longitude of the destination [deg], for comparison and --start-km; without --target the last ones."""
     north: Literal["true", "magnetic"] = "true"
     """North of the vehicle: true (D is measured), or magnetic (it has a compass, and D tells nothing)."""
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Standard deviations of constant and slow errors of D [deg], I [deg], B_H [nT]."""
-    arrival_km: float = 25.0
+    radius_km: float = 25.0
     """Arrival radius around the destination [km]."""
     every_km: float = 0.0
     """Minimum length of a move [km]; readings of shorter moves are averaged."""
     date: str | None = None
-    """Date of the IGRF that readings are compared with; by default from the column of the time, if it has dates."""
+    """Date of the log, for IGRF; by default from the column of the time, if it has dates."""
+    start_km: float | None = None
+    """Accuracy of the first position [km]: the navigator then knows this one, and that of the destination."""
+    model: str = "IGRF-14"
+    """Model of the Earth that it then carries."""
     time: str = "time"
     """Column of the time, numbers or ISO 8601; optional."""
     declination: str = "D"
@@ -107,6 +110,28 @@ def read_log(config: Config) -> pd.DataFrame:
     return log
 
 
+def started(config: Config, log: pd.DataFrame, date: str | None) -> Onboard:
+    """Return the navigator at its start, with what it knows.
+
+    Raises:
+        ValueError: for a known start without positions or without a date.
+    """
+    own = Path(config.navigator).suffix == ".onnx"
+    navigator = load_policy(config.navigator) if own else config.navigator
+    options = {"north": config.north, "max_steps": len(log) + 1, "radius_km": config.radius_km}
+    board = Onboard(navigator, sensor_std=SensorStd(config.noise, config.bias), **options)
+    target, told = config.target or log[ELEMENTS].iloc[-1].tolist(), {}
+    if config.start_km is not None:
+        if "latitude" not in log or date is None:
+            raise ValueError(f"start_km {config.start_km:g} needs positions in the log and a date: give --date")
+        first, *_, last = log[[*PLACE]].to_numpy(dtype=float).tolist()
+        target = config.target or config.target_position or last
+        told = {"start": first, "start_km": config.start_km, "date": date, "model": config.model}
+        told["altitude_km"] = log["altitude"][0] if "altitude" in log else 0.0
+    board.start(target, **told)
+    return board
+
+
 def replay(config: Config, log: pd.DataFrame, date: str | None = None) -> pd.DataFrame:
     """Return what the navigator would have commanded and estimated after each row, beside the row itself, and the
     direction of its north from true north, ``north_deg``.
@@ -114,12 +139,7 @@ def replay(config: Config, log: pd.DataFrame, date: str | None = None) -> pd.Dat
     Raises:
         UsageError: for a row that no vehicle can have recorded, with its number.
     """
-    navigator = load_policy(config.navigator) if config.navigator.endswith(".safetensors") else config.navigator
-    sensor_std = SensorStd(config.noise, config.bias)
-    magnetic = config.north == "magnetic"
-    options = {"north": config.north, "max_steps": len(log) + 1, "arrival_km": config.arrival_km}
-    board = Onboard(navigator, sensor_std=sensor_std, **options)
-    board.start(log[ELEMENTS].iloc[-1].tolist() if config.target is None else config.target)
+    board, magnetic = started(config, log, date), config.north == "magnetic"
     commands, north = [], log["D"].shift(1, fill_value=log["D"][0]) * magnetic  # of headings, from that of the log
     for (_, row), east in zip(log.iterrows(), north, strict=True):
         heading = math.remainder(row["heading"] - east, 360)

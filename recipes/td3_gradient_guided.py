@@ -29,7 +29,7 @@ from magrl.transforms import (
     FieldGradient,
     GradientHeading,
     ObservationView,
-    SensorNoise,
+    SensorErrors,
 )
 
 import torch
@@ -149,7 +149,7 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
         GradientHeading(),
         AlignmentReward(out_keys=keys, weight=config.alignment_weight, offset=config.alignment_offset),
     ]
-    sensors = [SensorNoise(config.noise, seed=base.seed)] if any(config.noise) else []
+    sensors = [SensorErrors(config.noise, seed=base.seed)] if any(config.noise) else []
     scaling = [*view.observation_transforms(), view.action_transform()]
     sums = [RewardSum(), EpisodeSum([*REWARD_TERMS, *(keys[1:] if config.guided else ())])]
     rewards = [*sums, DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]

@@ -1,7 +1,7 @@
 """Fly a Cessna 172 of JSBSim by the magnetic field: the flight model behind MAVLink.
 
     python docs/examples/jsbsim_vehicle.py --flights 20                  # both ends in one process, as fast as it goes
-    python docs/examples/jsbsim_vehicle.py --link udpout:127.0.0.1:14550 --speedup 30     # beside magrl.vehicle.autopilot
+    python docs/examples/jsbsim_vehicle.py --link udpout:127.0.0.1:14550 --speedup 30  # beside magrl.vehicle.autopilot
 
 The aircraft has the heading and altitude hold of its model c172x. Its magnetometer reads the field of ppigrf, with
 noise of .05 degrees and 5 nT on D, I and B_H of a reading; or, with --tilt, with errors of roll, pitch and heading,
@@ -21,18 +21,16 @@ import statistics
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from magrl.vehicle.autopilot import Loop, fly
 from magrl.vehicle.autopilot.mavlink import MavlinkLink
-from magrl.vehicle.logs import elements_of_axes
 from magrl.vehicle.onboard import Onboard
 
 import jsbsim
 import numpy as np
 import ppigrf
-import torch
 from geographiclib.geodesic import Geodesic
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -63,19 +61,6 @@ def elements_of(field: np.ndarray) -> tuple[float, float, float]:
     north, east, down = field
     level = math.hypot(north, east)
     return math.degrees(math.atan2(east, north)), math.degrees(math.atan2(down, level)), level
-
-
-def quaternion(roll: float, pitch: float, heading: float) -> list[float]:
-    """Return w, x, y, z of angles [rad]."""
-    (cr, cp, ch), (sr, sp, sh) = (
-        [wave(angle / 2) for angle in (roll, pitch, heading)] for wave in (math.cos, math.sin)
-    )
-    return [
-        cr * cp * ch + sr * sp * sh,
-        sr * cp * ch - cr * sp * sh,
-        cr * sp * ch + sr * cp * sh,
-        cr * cp * sh - sr * sp * ch,
-    ]
 
 
 class Cessna:
@@ -138,8 +123,8 @@ class Cessna:
             self._errors = [self._rng.gauss(0, math.sqrt(1.5)) for _ in range(3)]  # a reading averages two
         true = [self._model[f"attitude/{name}-rad"] for name in ("phi", "theta", "psi")]
         ms = int(1000 * self.time)
-        shown = quaternion(*(t + math.radians(self._tilt_deg * e) for t, e in zip(true, self._errors, strict=True)))
-        yield mavlink.MAVLink_attitude_quaternion_message(ms, *shown, 0, 0, 0)
+        shown = (t + math.radians(self._tilt_deg * e) for t, e in zip(true, self._errors, strict=True))
+        yield mavlink.MAVLink_attitude_message(ms, *shown, 0, 0, 0)
         if not self.stuck:
             self._axes = self._rotation(true).T @ self._noisy(self._field)
             self._axes += [self._rng.gauss(0, AXIS_NT) for _ in range(3)]
@@ -157,7 +142,7 @@ class Cessna:
         return level * np.array([math.cos(east), math.sin(east), math.tan(down)])
 
     @staticmethod
-    def _rotation(attitude: list[float]) -> np.ndarray:
+    def _rotation(attitude: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return the rotation from the axes of the aircraft to north, east, down."""
         (sr, sp, sh), (cr, cp, ch) = np.sin(attitude), np.cos(attitude)
         roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
@@ -203,8 +188,8 @@ def stated(place: Place, tilt_deg: float) -> tuple[float, ...]:
     """Return the standard deviations of a reading near a place: D [deg], I [deg], B_H [nT]."""
     if not tilt_deg:
         return NOISE
-    field, level = torch.from_numpy(vector(place)), torch.zeros(3, dtype=torch.float64)
-    return tuple(elements_of_axes(field, level, north="true", attitude_std_deg=[tilt_deg] * 3).std.tolist())
+    field, tilts = vector(place), np.random.default_rng(0).normal(0, math.radians(tilt_deg), (4000, 3))
+    return tuple(np.std([elements_of(Cessna._rotation(tilt) @ field) for tilt in tilts], 0).tolist())
 
 
 def flight(number: int, options: argparse.Namespace) -> tuple[str, float, float]:
@@ -236,7 +221,7 @@ def serve(options: argparse.Namespace) -> None:
     line = mavutil.mavlink_connection(options.link, source_system=1, source_component=1, dialect="ardupilotmega")
     noise = " ".join(f"{value:.3g}" for value in stated(there, options.tilt))
     place = f"{there[0]:.4f} {there[1]:.4f} --date {DATE:%Y-%m-%d} --altitude {ALTITUDE_KM}"
-    print(f"python -m magrl.vehicle.autopilot udpin:127.0.0.1:14550 --to {place} --noise {noise}", flush=True)
+    print(f"python -m magrl.vehicle.autopilot udpin:127.0.0.1:14550 --target {place} --noise {noise}", flush=True)
     due, begun = 0.0, time.monotonic()
     while True:
         for message in aircraft.messages():

@@ -1,7 +1,8 @@
-"""stable-baselines3 on the navigation environment: SAC or TD3, with many vehicles in one batch.
+"""stable-baselines3 on the navigation environment: PPO, SAC or TD3, with many vehicles in one batch.
 
     pip install -c constraints.txt -e '.[recipes,sb3]'
-    python docs/examples/sb3.py --algorithm sac
+    python docs/examples/sb3.py                       # PPO, 330 000 steps
+    python docs/examples/sb3.py --algorithm sac --num-envs 64 --total-timesteps 51200
 
 Prints success rate, SPL (success weighted by path length) and steps on 100 test tasks. Takes one to two minutes.
 """
@@ -18,10 +19,9 @@ from magrl.envs.sb3 import BatchedVecEnv
 import gymnasium
 import numpy as np
 import tyro
-from gymnasium.wrappers.vector import TransformReward
-from stable_baselines3 import SAC, TD3
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecMonitor
 
 
@@ -29,16 +29,16 @@ from stable_baselines3.common.vec_env import VecMonitor
 class Config:
     """Settings of a training."""
 
-    algorithm: Literal["sac", "td3"] = "sac"
+    algorithm: Literal["ppo", "sac", "td3"] = "ppo"
     """Algorithm of stable-baselines3."""
-    num_envs: int = 64
+    num_envs: int = 256
     """Number of vehicles."""
-    total_timesteps: int = 51_200
+    total_timesteps: int = 327_680
     """Steps of all vehicles together."""
     learning_starts: int = 1_024
-    """Steps with random actions before the policy acts."""
+    """Steps with random actions before the policy acts, of SAC and TD3."""
     gradient_steps: int = 8
-    """Gradient steps after each step of all vehicles."""
+    """Gradient steps after each step of all vehicles, of SAC and TD3."""
     learning_rate: float = 1e-3
     """Learning rate of Adam."""
     eval_tasks: int = 100
@@ -47,13 +47,15 @@ class Config:
     """Random seed of weights, exploration and tasks."""
 
 
-def make_model(config: Config) -> OffPolicyAlgorithm:
-    """Return an agent with the networks, the discount and the reward scale of the recipes' preset `fast`."""
-    envs = gymnasium.make_vec(ENV_ID, num_envs=config.num_envs, autoreset_mode="SameStep")
-    envs = TransformReward(envs, lambda reward: 0.05 * reward)
-    settings: dict[str, Any] = {
+def make_model(config: Config) -> BaseAlgorithm:
+    """Return an agent, whose networks and discount are those of the recipes' preset `fast` for SAC and TD3."""
+    envs = VecMonitor(BatchedVecEnv(gymnasium.make_vec(ENV_ID, num_envs=config.num_envs, autoreset_mode="SameStep")))
+    settings: dict[str, Any] = {"learning_rate": config.learning_rate, "seed": config.seed, "device": "cpu"}
+    if config.algorithm == "ppo":
+        network = {"net_arch": [64, 64], "log_std_init": -0.5}
+        return PPO("MlpPolicy", envs, n_steps=32, batch_size=2048, n_epochs=5, policy_kwargs=network, **settings)
+    settings |= {
         "learning_starts": config.learning_starts,
-        "learning_rate": config.learning_rate,
         "train_freq": 1,
         "gradient_steps": config.gradient_steps,
         "batch_size": 256,
@@ -61,16 +63,13 @@ def make_model(config: Config) -> OffPolicyAlgorithm:
         "gamma": 0.9,
         "tau": 0.01,
         "policy_kwargs": {"net_arch": [128, 128, 128]},
-        "seed": config.seed,
-        "device": "cpu",
     }
     if config.algorithm == "td3":
         settings["action_noise"] = NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))
-    algorithm = {"sac": SAC, "td3": TD3}[config.algorithm]
-    return algorithm("MlpPolicy", VecMonitor(BatchedVecEnv(envs)), **settings)
+    return {"sac": SAC, "td3": TD3}[config.algorithm]("MlpPolicy", envs, **settings)
 
 
-def evaluate(model: OffPolicyAlgorithm, num_tasks: int) -> dict[str, float]:
+def evaluate(model: BaseAlgorithm, num_tasks: int) -> dict[str, float]:
     """Evaluate an agent on frozen test tasks, all in one batch; return the means of their measures."""
     scenario = Scenario()
     scenario = scenario.with_tasks(scenario.random_tasks(num_tasks, paper.TEST_SEED))

@@ -18,7 +18,7 @@ belief = None
 for heading in torch.arange(0, 361, 36).double():
     attitude = torch.tensor([0.0, 0.0, heading]).double().expand(1000, 3)
     axes = axes_of_elements(here.expand(1000, 3), attitude) + iron
-    reading = elements_of_axes(axes, attitude, north="true").elements + noise * torch.randn(1000, 3)
+    reading = elements_of_axes(axes, attitude) + noise * torch.randn(1000, 3)
     course = torch.deg2rad(heading).expand(1000)
     belief = start(reading, errors, course) if belief is None else read(belief, reading, noise, course)
 print("errors [nT]", (belief.mean[:, IRON] - iron).square().mean(0).sqrt())

@@ -10,9 +10,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP, TanhModule, ValueOperator
 
 from magrl.checks import check_number, check_type
-from magrl.geodesy import steer
-from magrl.tracking import corrected
-from magrl.transforms import TrackView
+from magrl.tracking import Rules, corrected, moving
 
 Device = torch.device | str | None
 MOST_LAYERS = 64
@@ -117,58 +115,41 @@ class CorrectedMove(nn.Module):
     """The action of a plan and its correction, scaled to [-1, 1]; see :func:`magrl.tracking.corrected`.
 
     Args:
-        max_move_km: longest move [km].
-        max_turn_rad: largest turn [rad].
+        rules: limits of the move.
 
     Example:
-        >>> CorrectedMove(50.0, 1.5)(torch.tensor([25.0, 0.0]), torch.zeros(1))
+        >>> CorrectedMove(Rules(max_turn_rad=1.5))(torch.tensor([25.0, 0.0]), torch.zeros(1), torch.zeros(2))
         tensor([0., 0.])
     """
 
-    def __init__(self, max_move_km: float, max_turn_rad: float) -> None:
+    def __init__(self, rules: Rules) -> None:
         super().__init__()
-        self.limits = float(max_move_km), float(max_turn_rad)
+        self.rules = rules
 
-    def forward(self, planned: Tensor, heading: Tensor, correction: Tensor | None = None) -> Tensor:
+    def forward(self, planned: Tensor, heading: Tensor, correction: Tensor) -> Tensor:
         """Return the scaled action ``(..., 2)`` of a displacement northward and eastward [km] at a heading
         ``(..., 1)`` [rad], and its correction."""
-        move = planned if correction is None else corrected(planned, correction)
-        north, east = move.unbind(-1)
-        bearing, distance = torch.atan2(east, north), torch.hypot(north, east)
-        distance, turn = steer(heading.squeeze(-1), bearing, distance, *self.limits)
-        return torch.stack((2 * distance / self.limits[0] - 1, turn / self.limits[1]), -1)
+        distance, turn = moving(self.rules, corrected(planned, correction), heading.squeeze(-1)).unbind(-1)
+        return torch.stack((2 * distance / self.rules.max_move_km - 1, turn / self.rules.max_turn_rad), -1)
 
 
-def make_correcting_actor(
-    view: TrackView, num_cells: Sequence[int] | None, *, device: Device = None
-) -> TensorDictSequential:
-    """Return an actor that corrects a plan: ``observation`` and ``planned_move`` to ``correction`` and ``action``.
-
-    Its correction starts at zero, so that the untrained actor flies as planned.
+def make_correcting_actor(network: nn.Module, rules: Rules) -> TensorDictSequential:
+    """Return an actor that corrects the plan of a :class:`~magrl.transforms.TrackField`: to ``correction`` and
+    ``action``, scaled to [-1, 1].
 
     Args:
-        view: what it observes.
-        num_cells: width of each hidden layer; None for an actor without a network, which flies as planned.
-        device: device of the parameters.
-
-    Raises:
-        ValueError: for a size that is not a whole number from 1 to 65536.
+        network: from ``observation`` to a correction (:func:`magrl.tracking.correction_network`).
+        rules: limits of the move.
 
     Example:
-        >>> from magrl.transforms import TrackView
-        >>> view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=1.5)
-        >>> make_correcting_actor(view, (32, 32)).out_keys
+        >>> from magrl.tracking import correction_network
+        >>> make_correcting_actor(correction_network((32, 32)), Rules()).out_keys
         ['correction', 'action']
     """
-    move, keys = CorrectedMove(view.max_move_km, view.max_turn_rad), ["planned_move", "heading"]
-    if num_cells is None:
-        return TensorDictSequential(TensorDictModule(move, keys, ["action"]))
-    network = make_mlp(view.size, 2, num_cells, layer_norm=True, device=device)
-    for parameter in network[-1].parameters():
-        nn.init.zeros_(parameter)
+    keys = [("track", "plan"), "heading", "correction"]
     return TensorDictSequential(
         TensorDictModule(network, ["observation"], ["correction"]),
-        TensorDictModule(move, [*keys, "correction"], ["action"]),
+        TensorDictModule(CorrectedMove(rules), keys, ["action"]),
     )
 
 

@@ -7,30 +7,30 @@ transforms and is used like every other navigator.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import Compose, EnvBase
 
-from magrl.agents.exported import ExportedPolicy, TrainedPolicy, rebuild
-from magrl.agents.networks import Device, make_actor, make_correcting_actor
-from magrl.agents.pipeline import export_policy
-from magrl.checks import check_finite, check_type, short
-from magrl.files import load_tensors, save_tensors
-from magrl.sensor_std import STD_KEYS
-from magrl.transforms import ObservationView, TrackView
-from magrl.transforms.errors.known_start import START_KEYS
-from magrl.transforms.track import TRACK_KEYS
+from magrl.agents.networks import Device, make_actor
+from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with_description
+from magrl.agents.trained import TrainedPolicy
+from magrl.checks import check_finite, check_type
+from magrl.files import save_tensors, write_atomically
+from magrl.navigators import Anywhere
+from magrl.tracking.network import FILE_FORMAT, policy_content, save_pilot
+from magrl.transforms import ObservationView, ReadingView
 
-POLICY_FORMAT = 3
-VIEWS: dict[str, type[ObservationView] | type[TrackView]] = {"region": ObservationView, "track": TrackView}
+View = ObservationView | ReadingView
+VIEWS: dict[str, type[View]] = {"region": ObservationView, "readings": ReadingView}
 """What policies observe, by the kind that their files name."""
-LIMITS = ("max_move_km", "max_turn_rad")
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class PolicyConfig:
     """All that is needed to rebuild a policy, except its weights.
 
     Args:
-        view: what the policy observes, and its scaling: values scaled to a region, or estimates of its own track.
-        num_cells: width of each hidden layer; None for a plan without a network, of a :class:`TrackView`.
+        view: what the policy observes, and its scaling: values scaled to a region, or plain readings.
+        num_cells: width of each hidden layer; None for a network of another kind.
         layer_norm: whether hidden layers are normalized.
 
     Raises:
@@ -53,18 +53,17 @@ class PolicyConfig:
         True
     """
 
-    view: ObservationView | TrackView
+    view: View
     num_cells: tuple[int, ...] | None
     layer_norm: bool = True
 
     def __post_init__(self) -> None:
-        check_type((ObservationView, TrackView), view=self.view)
-        self.make_actor("meta")  # checks the sizes
+        check_type(tuple(VIEWS.values()), view=self.view)
+        if self.num_cells is not None:
+            self.make_actor("meta")  # checks the sizes
 
     def make_actor(self, device: Device = None) -> TensorDictSequential:
         """Return an actor of this shape, with new weights."""
-        if isinstance(self.view, TrackView):
-            return make_correcting_actor(self.view, self.num_cells, device=device)
         if self.num_cells is None:
             raise ValueError(
                 f"num_cells must be the widths of the hidden layers with {type(self.view).__name__}, got None"
@@ -74,12 +73,6 @@ class PolicyConfig:
 
 class FieldPolicy(TrainedPolicy):
     """A trained agent as a navigator of the plain environment, in physical units.
-
-    A policy that reads its own track (:class:`~magrl.transforms.TrackView`) keeps its own state for each vehicle from
-    the start of an episode (``elapsed_steps`` 0) on. Another call in the same step begins with the same state as the
-    first, so that calling it twice on one state changes nothing. Such a policy reads the accuracy of the readings
-    (:data:`magrl.sensor_std.STD_KEYS`); without these keys it is perfect. Where the environment has a
-    :class:`~magrl.transforms.TrackField`, it reads that belief and computes none of its own.
 
     Args:
         config: what the policy observes, and the shape of its network.
@@ -102,74 +95,20 @@ class FieldPolicy(TrainedPolicy):
         self.config, self.view = config, config.view
         self.in_keys = list(config.view.in_keys)
         self.observe = Compose(*config.view.observation_transforms())
-        if isinstance(config.view, TrackView):
-            self.observe_tracked = Compose(*config.view.observation_transforms(tracked=True))
-        self.act = config.view.action_transform()
         self.actor = config.make_actor().float() if actor is None else actor  # environments write float32
-        self.state_keys = config.view.state_keys
-
-    def adapted(self, **changes: Any) -> FieldPolicy:
-        """Return the policy with other options of its view, such as ``search`` or ``step_price``; it shares weights.
-
-        Args:
-            changes: options of the view.
-
-        Raises:
-            TypeError: for an option that the view does not have.
-            ValueError: for another longest move or largest turn, where the policy does not correct a plan.
-
-        Example:
-            >>> from magrl.agents import load_pretrained
-            >>> load_pretrained("anywhere").adapted(step_price=1.0).config.view.step_price
-            1.0
-        """
-        config = replace(self.config, view=replace(self.config.view, **changes))
-        limits = [(name, getattr(self.view, name), getattr(config.view, name)) for name in LIMITS]
-        if changed := [f"{name} is {old:g}, not {new:g}" for name, old, new in limits if new != old]:
-            if not isinstance(self.view, TrackView):
-                raise ValueError(f"the actions of this policy are scaled to the limits of its training: {changed[0]}")
-            actor = config.make_actor()
-            actor.load_state_dict(self.actor.state_dict(), assign=True)
-            return FieldPolicy(config, actor)
-        return FieldPolicy(config, self.actor)
-
-    def for_env(self, env: EnvBase) -> FieldPolicy:
-        """Return the policy on the device of an environment, for its limits: those of a plan are adapted.
-
-        Example:
-            >>> from magrl import GeomagneticNavEnv, load_pretrained
-            >>> load_pretrained("anywhere").for_env(GeomagneticNavEnv(max_steps=80, seed=0)).view.max_steps
-            80
-        """
-        policy, base = self, getattr(env, "base_env", env)
-        if isinstance(self.view, TrackView):
-            limits = {name: min(getattr(self.view, name), getattr(base, name)) for name in LIMITS}
-            limits |= {"zeta": base.zeta, "max_steps": base.max_steps}
-            limits["radius_km"] = base.arrival.radius_km if base.arrival.rule == "distance" else None
-            searches = self.view.search and not base.arrival.declared
-            policy = self.adapted(**limits, search=searches).to(base.device)
-        policy.check_fits(base)
-        return policy
+        if isinstance(self.actor, OnnxNetwork):
+            self.declares = self.actor.declares
+            self.in_keys = list(dict.fromkeys([*self.in_keys, *self.actor.in_keys[1:]]))
+        self.act = config.view.action_transform(declared=self.declares)
 
     def check_fits(self, env: EnvBase) -> None:
-        """Raise unless an environment has the field of the policy, allows its moves and turns, and is as it plans.
+        """Raise unless an environment has the field of the policy, and allows its moves and turns.
 
         Raises:
             ValueError: naming the element and both ranges, or both limits.
-
-        Example:
-            >>> from magrl import GeomagneticNavEnv, load_pretrained
-            >>> load_pretrained("anywhere").check_fits(GeomagneticNavEnv(seed=0))
-            Traceback (most recent call last):
-            ValueError: the policy plans for max_steps 120, the environment has 50: fly policy.for_env(env)
         """
         super().check_fits(env)
         view, base = self.view, getattr(env, "base_env", env)
-        for name in ("zeta", "max_steps") if isinstance(view, TrackView) else ():
-            planned, limit = getattr(view, name), getattr(base, name)
-            if planned != limit:
-                difference = f"{name} {planned:g}, the environment has {limit:g}"
-                raise ValueError(f"the policy plans for {difference}: fly policy.for_env(env)")
         (move, turn), (longest, largest) = (
             (round(part.max_move_km, 3), round(math.degrees(part.max_turn_rad), 3)) for part in (view, base)
         )
@@ -182,65 +121,62 @@ class FieldPolicy(TrainedPolicy):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""
-        seen = tensordict.select(*self.in_keys)
-        if not self.state_keys:
-            action = self.actor(self.observe(seen))["action"]
-            return tensordict.set("action", self.act.denormalize("action", action))
-        before, starts = self._state_before(seen)
-        observed = self._track(
-            seen.update(tensordict.select(*STD_KEYS, *START_KEYS, *TRACK_KEYS, strict=False)), before, starts
-        )
-        action = self.actor(observed)["action"]
-        self._keep_state(seen, before, starts, observed.select(*self.state_keys).detach())
+        action = self.actor(self.observe(tensordict.select(*self.in_keys)))["action"]
         return tensordict.set("action", self.act.denormalize("action", action))
 
-    def _track(self, seen: TensorDictBase, state: TensorDictBase | None, starts: Tensor) -> TensorDictBase:
-        """Return the observation after the last move."""
-        tracked = all(key in seen.keys() for key in TRACK_KEYS)  # noqa: SIM118 - a TensorDict is no mapping
-        observe = self.observe_tracked if tracked else self.observe
-        for key in STD_KEYS:
-            seen[key] = seen.get(key, torch.zeros_like(seen["field"]))
-        if state is None or starts.all():
-            return observe(seen)
-        observed = observe(state.copy().set("next", seen.copy()))["next"]
-        return torch.where(starts.squeeze(-1), observe(seen), observed) if starts.any() else observed
 
-
-def kalman(**options: Any) -> FieldPolicy:
-    """Return dual control by the belief of the field: the policy that flies as planned, without a network.
+def export_policy(
+    actor: nn.Module | Path | str, view: View, memory: Mapping[str, Sequence[int]] | None = None
+) -> FieldPolicy:
+    """Return a network of any algorithm or library as a policy, run by onnxruntime (extra ``onnx``).
 
     Args:
-        options: options of :class:`~magrl.transforms.TrackView` other than its defaults: moves up to 50 km, turns up to
-            90 degrees, 50 steps, and the arrival threshold 0.01.
+        actor: network from an observation ``(N, K)`` of the view to the action in [-1, 1], ``(N, 2)``, or ``(N, 3)``
+            with the declaration of the arrival: a module of PyTorch or TensorDict
+            (:func:`magrl.agents.onnx_policy.exported`), or the path of an ONNX file
+            (:class:`magrl.agents.onnx_policy.OnnxNetwork`).
+        view: what it observes, and its scaling and limits.
+        memory: shapes of the memory of a recurrent module without the batch, by name, such as ``{"hidden": (128,)}``.
 
-    Source:
-        A. A. Feldbaum, Dual control theory, Automation and Remote Control 21 (1960): an action both steers and probes.
+    Raises:
+        ImportError: without the extra ``onnx``.
+        ValueError: for a network that cannot be exported, or takes or returns something else.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> bool(env.rollout(50, kalman(), break_when_any_done=False)["next", "success"].any(1).all())
-        True
+        >>> network = nn.Sequential(nn.Linear(13, 2), nn.Tanh())
+        >>> env.rollout(3, export_policy(network, env.observation_view()))["action"].shape
+        torch.Size([2, 3, 2])
     """
-    usual: dict[str, Any] = {"zeta": 0.01, "max_steps": 50, "max_move_km": 50.0, "max_turn_rad": math.pi / 2}
-    return FieldPolicy(PolicyConfig(TrackView(**usual | options), num_cells=None))
+    check_type((nn.Module, Path, str), actor=actor)
+    check_type(tuple(VIEWS.values()), view=view)
+    if isinstance(actor, nn.Module):
+        network = exported(actor, view.size, memory or {})
+    else:
+        with _reading(actor):
+            network = OnnxNetwork(Path(actor).read_bytes(), view.size)
+    return FieldPolicy(PolicyConfig(view, None), network)
 
 
-def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | None = None) -> None:
+def save_policy(
+    path: Path | str,
+    policy: nn.Module | Path | str,
+    view: View | None = None,
+    memory: Mapping[str, Sequence[int]] | None = None,
+) -> None:
     """Write a policy as numbers, text and tensors, for :func:`load_policy`.
 
-    A policy of another class is exported first, with the transforms that it needs, and compared with its export in
-    flight (:func:`export_policy`).
-
     Args:
-        path: path of the file; an existing file is replaced.
-        policy: policy of any algorithm; a stochastic one is saved with its deterministic sample.
-        env: environment of the training, with its transforms; not needed for a :class:`FieldPolicy` or an
-            :class:`ExportedPolicy`.
+        path: path of the file: ``.onnx`` for a network of any algorithm or library; an existing file is replaced.
+        policy: :class:`FieldPolicy`, :class:`~magrl.Anywhere`, or a network, as :func:`export_policy` takes it.
+        view: what such a network observes.
+        memory: its memory.
 
     Raises:
-        TypeError: for a policy that is no TensorDict module, or of another class without an environment.
-        ValueError: for a policy that cannot be exported, with the reason.
+        TypeError: for a network without what it observes.
+        ImportError: for a network without the extra ``onnx``.
+        ValueError: for a network that cannot be exported, or a path of another kind of file.
         OSError: if the file cannot be written.
 
     Example:
@@ -250,24 +186,28 @@ def save_policy(path: Path | str, policy: TensorDictModuleBase, env: EnvBase | N
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save_policy(Path(folder) / "policy.safetensors", policy)
     """
-    check_type(TensorDictModuleBase, policy=policy)
-    if not isinstance(policy, (FieldPolicy, ExportedPolicy)):
-        if env is None:
-            raise TypeError(
-                f"a {type(policy).__name__} is saved with the transforms of its environment: "
-                "save_policy(path, policy, env)"
-            )
-        policy = export_policy(policy, env)
-    if isinstance(policy, ExportedPolicy):
-        save_tensors({"format": POLICY_FORMAT, "exported": policy.content()}, Path(path))
+    if isinstance(policy, Anywhere):
+        assert isinstance(policy.network, nn.Sequential)
+        save_pilot(path, policy.rules, policy.network)
+        return
+    if not isinstance(policy, FieldPolicy):
+        if view is None:
+            raise TypeError(f"{policy!r:.80} is saved with what it observes: save_policy('policy.onnx', network, view)")
+        policy = export_policy(policy, view, memory)
+    network, config = isinstance(policy.actor, OnnxNetwork), asdict(policy.config)
+    if network != (Path(path).suffix == ".onnx"):
+        kind = "an exported network ends with .onnx, that of another policy does not"
+        raise ValueError(f"the file of {kind}, got {str(path)!r}")
+    config["kind"] = next(name for name, kind in VIEWS.items() if isinstance(policy.view, kind))
+    if network:
+        described = {"kind": config["kind"], "view": config["view"]}
+        write_atomically(Path(path), with_description(policy.actor.content, described))
         return
     weights = {key: value for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
-    kind = next(name for name, view in VIEWS.items() if isinstance(policy.config.view, view))
-    config = asdict(policy.config) | {"kind": kind}
-    save_tensors({"format": POLICY_FORMAT, "config": config, "weights": weights}, Path(path))
+    save_tensors({"format": FILE_FORMAT, "config": config, "weights": weights}, Path(path))
 
 
-def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy | ExportedPolicy:
+def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy | Anywhere:
     """Read a policy that :func:`save_policy` wrote. Reading a file runs no code from it.
 
     Args:
@@ -276,31 +216,49 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
 
     Raises:
         FileNotFoundError: if there is no such file.
+        ImportError: for a file ``.onnx`` without the extra ``onnx``.
         ValueError: for a file that is not a policy, of another format, or with weights of other shapes.
 
     Example:
-        >>> from magrl.agents import pretrained
-        >>> load_policy(Path(pretrained.__file__).parent / "anywhere.safetensors").config.num_cells
-        (128, 128, 128)
+        >>> load_policy("policy.safetensors")
+        Traceback (most recent call last):
+        FileNotFoundError: there is no policy file at policy.safetensors
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no policy file at {path}")
-    content = load_tensors(path)
-    version = content.pop("format", None) if isinstance(content, dict) else None
-    if version != POLICY_FORMAT:
-        raise ValueError(
-            f"{path} is a policy of format {short(version)}; this version reads format {POLICY_FORMAT}: train it again"
-        )
+    if Path(path).suffix == ".onnx" and Path(path).is_file():
+        return _load_onnx(path).to(device).eval()
+    content = policy_content(path)
+    if "rules" in content:
+        return Anywhere(source=path).to(device).eval()
+    with _reading(path):
+        return _rebuild(**content).to(device).eval()
+
+
+def _config(kind: str, view: Any, num_cells: Any = None, **shape: Any) -> PolicyConfig:
+    ranges: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in view.items()}
+    return PolicyConfig(VIEWS[kind](**ranges), num_cells, **shape)
+
+
+def _load_onnx(path: Path | str) -> FieldPolicy:
+    """Return the policy of an ONNX file."""
+    content = Path(path).read_bytes()
+    with _reading(path):
+        config = _config(**description_of(content))
+        return FieldPolicy(config, OnnxNetwork(content, config.view.size))
+
+
+@contextmanager
+def _reading(path: Path | str) -> Iterator[None]:
+    """Name the file in the error of foreign content, whatever it raises."""
     try:
-        policy = rebuild(**content) if "exported" in content else _rebuild(**content)
-        return policy.to(device).eval()
-    except Exception as error:  # whatever foreign content raises
+        yield
+    except (FileNotFoundError, ImportError):
+        raise
+    except Exception as error:
         raise ValueError(f"{path} does not hold a valid policy: {' '.join(str(error).split())}") from error
 
 
 def _rebuild(config: Any, weights: Any) -> FieldPolicy:
-    view = VIEWS[config.pop("kind")](**config.pop("view"))
-    rebuilt = PolicyConfig(view, **config)
+    rebuilt = _config(**config)
     # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
     rebuilt.make_actor("meta").load_state_dict(weights, assign=True)
     check_finite(weights.items(), "weights")

@@ -1,7 +1,7 @@
 """Fly a track of the benchmark and write a submission, or verify one.
 
-    python -m magrl.benchmark run kalman --track earth-v1 --out kalman --tasks 20    # a trial of 20 tasks
-    python -m magrl.benchmark run mine.safetensors --track alone-v1 --out mine
+    python -m magrl.benchmark run kalman --track earth-v2 --out kalman --tasks 20    # a trial of 20 tasks
+    python -m magrl.benchmark run mine.onnx --track alone-v2 --out mine
     python -m magrl.benchmark verify mine --tasks 64 --seed 5
 
 A policy is a file of magrl.save_policy, or the name of a navigator of the library. `verify` runs no code of the
@@ -26,7 +26,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = arguments.add_subparsers(dest="command", required=True)
     flown = commands.add_parser("run", help="fly a track and write a submission")
-    flown.add_argument("policy", help=f"policy file (.safetensors), or one of {', '.join(BUILT_IN)}")
+    flown.add_argument("policy", help=f"policy file (.safetensors, .onnx), or one of {', '.join(BUILT_IN)}")
     flown.add_argument("--track", required=True, choices=TRACKS, help="track and its version")
     flown.add_argument("--out", type=Path, required=True, help="folder of the submission, new or empty")
     flown.add_argument("--tasks", type=int, help="number of tasks, for a trial; default all")

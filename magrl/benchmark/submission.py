@@ -10,7 +10,7 @@ import hashlib
 import platform
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -18,26 +18,28 @@ from typing import Any, Literal
 import pandas
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 import magrl
 from magrl.agents import FieldPolicy, load_policy
-from magrl.agents.exported import ExportedPolicy, TrainedPolicy
-from magrl.agents.program import TensorProgram
+from magrl.agents.onnx_policy import OnnxNetwork
 from magrl.benchmark.comparison import TOO_GOOD, compared, different, impossible
 from magrl.benchmark.episodes import episode_table, read_episodes, write_episodes
 from magrl.benchmark.tracks import TRACKS, Track
 from magrl.checks import CheckedModel, check_choice, check_number, short
 from magrl.envs import Tasks
 from magrl.evaluation import episode_measures
-from magrl.evaluation.navigators import PRETRAINED
+from magrl.evaluation.navigators import SUFFIXES
 from magrl.files import read_document, write_json
-from magrl.navigators import NAVIGATORS
+from magrl.navigators import NAVIGATORS, Anywhere
 from magrl.sensor_std import STD_KEYS
 
-BUILT_IN = (*PRETRAINED, *(name for name, kind in NAVIGATORS.items() if "mode" not in kind.options))
+BUILT_IN = tuple(name for name, kind in NAVIGATORS.items() if "mode" not in kind.options)
 """Navigators that need no file. Random numbers of metaheuristics depend on the batch, so that no part is repeated."""
-RECORD, EPISODES, POLICY = "run.json", "episodes.csv.gz", "policy.safetensors"
+RECORD, EPISODES = "run.json", "episodes.csv.gz"
+POLICIES = tuple(f"policy{suffix}" for suffix in SUFFIXES)
+"""Names of the file of a policy."""
 PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "safetensors")
 SHIFTS_DEG = tuple(
     (size * north, size * east) for size in (1e-4, 3e-4) for north, east in ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -45,7 +47,7 @@ SHIFTS_DEG = tuple(
 """How far starts are moved [deg], 11 m and 33 m, where an episode ends differently: does rounding decide its end?"""
 MOST_UNEXPLAINED = 0.02
 """Largest share of the episodes that end differently for which these starts need not show it. With AVX2 in place of
-the default instructions of the processor, 14 of 192 episodes of ``anywhere`` end differently on alone-v1 and 78 of 256
+the default instructions of the processor, 14 of 192 episodes of ``anywhere`` end differently on alone-v2 and 78 of 256
 on vehicles-v1; a start 14 m to the northeast shows it for 84 of the 92, these starts for the others."""
 
 
@@ -79,7 +81,7 @@ def run(policy: str, track: str, out: Path, tasks: int | None = None) -> pandas.
     """Fly a track and write the folder of a submission.
 
     Args:
-        policy: policy file, ``.safetensors``, or one of :data:`BUILT_IN`.
+        policy: policy file, ``.safetensors`` or ``.onnx``, or one of :data:`BUILT_IN`.
         track: one of :data:`~magrl.benchmark.TRACKS`.
         out: folder, new or empty.
         tasks: number of tasks for a trial; by default all.
@@ -94,7 +96,7 @@ def run(policy: str, track: str, out: Path, tasks: int | None = None) -> pandas.
 
     Example:
         >>> import tempfile
-        >>> len(run("geodesic", "earth-v1", Path(tempfile.mkdtemp()), tasks=2))
+        >>> len(run("geodesic", "earth-v2", Path(tempfile.mkdtemp()), tasks=2))
         6
     """
     check_choice(TRACKS, track=track)
@@ -103,11 +105,14 @@ def run(policy: str, track: str, out: Path, tasks: int | None = None) -> pandas.
     check_number(1, chosen.tasks, whole=True, tasks=count)
     navigator = _policy(policy, chosen)
     out.mkdir(parents=True, exist_ok=True)
-    if {path.name for path in out.iterdir()} - {EPISODES, POLICY}:  # which an interrupted run leaves, without a record
+    if {path.name for path in out.iterdir()} - {
+        EPISODES,
+        *POLICIES,
+    }:  # which an interrupted run leaves
         raise FileExistsError(f"{out} holds files: choose a new folder")
-    if isinstance(navigator, TrainedPolicy):
-        shutil.copyfile(policy, out / POLICY)
-    name = POLICY if isinstance(navigator, TrainedPolicy) else navigator
+    name = navigator if isinstance(navigator, str) else f"policy{Path(policy).suffix}"
+    if name in POLICIES:
+        shutil.copyfile(policy, out / name)
     episodes = _flown(navigator, chosen, torch.arange(count)).assign(track=track, navigator=name)
     write_episodes(out / EPISODES, [episodes])
     record = Submission(
@@ -115,7 +120,7 @@ def run(policy: str, track: str, out: Path, tasks: int | None = None) -> pandas.
         track=track,
         declared=chosen.record(),
         policy=name,
-        policy_sha256=_sha256(out / POLICY) if name == POLICY else None,
+        policy_sha256=_sha256(out / name) if name in POLICIES else None,
         tasks=count,
         episodes_sha256=_sha256(out / EPISODES),
         platform=_platform(),
@@ -147,7 +152,7 @@ def verify(folder: Path, tasks: int = 32, seed: int | None = None) -> tuple[list
     Example:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
-        >>> _ = run("geodesic", "earth-v1", folder, tasks=4)
+        >>> _ = run("geodesic", "earth-v2", folder, tasks=4)
         >>> verify(folder, tasks=2, seed=0)[1]
         []
     """
@@ -155,10 +160,10 @@ def verify(folder: Path, tasks: int = 32, seed: int | None = None) -> tuple[list
     seed = secrets.randbelow(2**31) if seed is None else seed
     record = Submission(**read_document(folder / RECORD))
     check_choice(TRACKS, track=record.track)
-    check_choice((POLICY, *BUILT_IN), policy=record.policy)
+    check_choice((*POLICIES, *BUILT_IN), policy=record.policy)
     track = TRACKS[record.track]
     claimed = read_episodes(folder / EPISODES, len(track.errors) * min(record.tasks, track.tasks))
-    navigator = _policy(str(folder / POLICY) if record.policy == POLICY else record.policy, track)
+    navigator = _policy(str(folder / record.policy) if record.policy in POLICIES else record.policy, track)
     notes = [f"{record.track}, {record.policy}: {record.tasks} of {track.tasks} tasks, seed of this check {seed}"]
     if wrong := list(_contradictions(folder, record, track, claimed)):
         return notes, wrong
@@ -179,7 +184,7 @@ def verify(folder: Path, tasks: int = 32, seed: int | None = None) -> tuple[list
 
 
 def _not_rounded(
-    navigator: TrainedPolicy | str, track: Track, again: pandas.DataFrame, apart: pandas.MultiIndex
+    navigator: TensorDictModuleBase | str, track: Track, again: pandas.DataFrame, apart: pandas.MultiIndex
 ) -> pandas.MultiIndex:
     """Return which of some episodes end in the same way from all starts nearby: rounding does not decide how."""
     assert track.scenario.tasks is not None
@@ -192,37 +197,42 @@ def _not_rounded(
     return apart
 
 
-class _OneByOne(nn.Module):
-    """A program that computes one vehicle at a time: no action depends on the rest of a batch, nor does memory."""
+class _OneByOne(OnnxNetwork):
+    """A network that acts for one vehicle at a time: no action depends on the rest of a batch, nor does memory."""
 
-    def __init__(self, program: TensorProgram) -> None:
-        super().__init__()
-        self.program = program
+    def run(self, observation: Tensor, memory: Mapping[str, Tensor]) -> list[Tensor]:
+        """Return the action and the next memory for observations ``(N, K)``."""
+        run, sizes = super().run, self.shapes.items()
+        parts = {key: memory[key].expand(len(observation), *shape).split(1) for key, shape in sizes}
+        rows = enumerate(observation.split(1))
+        found = [run(seen, {key: part[row] for key, part in parts.items()}) for row, seen in rows]
+        return [torch.cat(values) for values in zip(*found, strict=True)]
 
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the outputs ``(N, ...)`` for inputs ``(N, ...)``."""
-        rows = [self.program(*row) for row in zip(*(value.split(1) for value in inputs), strict=True)]
-        return tuple(torch.cat(values) for values in zip(*rows, strict=True))
 
-
-def _policy(text: str, track: Track) -> TrainedPolicy | str:
+def _policy(text: str, track: Track) -> TensorDictModuleBase | str:
     """Return the policy of a file, or the name of a navigator of the library; raise for any other."""
-    if not text.endswith(".safetensors"):
+    if Path(text).suffix not in SUFFIXES:
         if text not in BUILT_IN:
             names = ", ".join(BUILT_IN)
-            raise ValueError(f"refused {text!r}: submit a file of magrl.save_policy (.safetensors), or one of {names}")
+            raise ValueError(
+                f"refused {text!r}: submit a file of magrl.save_policy (.safetensors, .onnx), or one of {names}"
+            )
         return text
     policy = load_policy(text)
-    if isinstance(policy, ExportedPolicy):
-        policy.program = _OneByOne(policy.program)  # type: ignore[assignment]
-    reads = {*policy.in_keys, *(STD_KEYS if isinstance(policy, FieldPolicy) and policy.state_keys else ())}
+    if isinstance(policy, FieldPolicy) and isinstance(policy.actor, OnnxNetwork):
+        policy.actor = _OneByOne(policy.actor.content, policy.actor.size)
+    reads = {*policy.in_keys, *(STD_KEYS if isinstance(policy, Anywhere) else ())}
     if hidden := sorted(reads - set(track.keys)):
         raise ValueError(f"refused {text!r}: it reads {', '.join(hidden)}, which this track does not give")
     return policy
 
 
 def _flown(
-    policy: TrainedPolicy | str, track: Track, vehicle: Tensor, tasks: Tasks | None = None, seed: int | None = None
+    policy: TensorDictModuleBase | str,
+    track: Track,
+    vehicle: Tensor,
+    tasks: Tasks | None = None,
+    seed: int | None = None,
 ) -> pandas.DataFrame:
     """Return an episode of each level and vehicle, whose number is that of its task; of other tasks, if they are given.
 
@@ -244,8 +254,8 @@ def _contradictions(folder: Path, record: Submission, track: Track, claimed: pan
     """Yield what is wrong with a submission before anything is flown."""
     if record.declared != track.record():
         yield f"{record.track} is another track in magrl {magrl.__version__} than in the {record.magrl} of the record"
-    if record.policy == POLICY and _sha256(folder / POLICY) != record.policy_sha256:
-        yield f"{POLICY} is not the file of the record"
+    if record.policy in POLICIES and _sha256(folder / record.policy) != record.policy_sha256:
+        yield f"{record.policy} is not the file of the record"
     if _sha256(folder / EPISODES) != record.episodes_sha256:
         yield f"{EPISODES} is not the file of the record"
     rows = [(record.track, level, task) for level in track.errors for task in range(min(record.tasks, track.tasks))]

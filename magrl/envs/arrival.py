@@ -6,7 +6,29 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from magrl.checks import check_number
 from magrl.geodesy import geodesic
+
+MAX_OBJECTIVE = 3
+"""Largest objective F at the start: each of the three elements adds at most 1 (Eq. 2-6)."""
+
+
+def check_zeta(zeta: float) -> float:
+    """Return an arrival threshold on the objective; raise unless it lies between 0 and the largest F at the start.
+
+    Raises:
+        ValueError: with the value and the reason.
+
+    Example:
+        >>> check_zeta(5)
+        Traceback (most recent call last):
+        ValueError: zeta must be below 3, got 5: the objective F is at most 3 at the start, so every vehicle has arrived
+    """
+    check_number(0, above=True, zeta=zeta)
+    if zeta >= MAX_OBJECTIVE:
+        reason = f"the objective F is at most {MAX_OBJECTIVE} at the start, so every vehicle has arrived"
+        raise ValueError(f"zeta must be below {MAX_OBJECTIVE}, got {zeta!r}: {reason}")
+    return zeta
 
 
 class Arrival(NamedTuple):

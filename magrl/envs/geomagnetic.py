@@ -72,7 +72,7 @@ class GeomagneticNavEnv(EnvBase):
         seed: seed of tasks and start headings; random if None.
         device: device of the batch.
         **changes: fields of :class:`Scenario` that replace those of the scenario, such as ``max_steps``,
-            ``max_move_km``, ``max_turn_deg``, ``zeta``, ``arrival``, ``arrival_radius_km`` or ``start_heading``.
+            ``max_move_km``, ``max_turn_deg``, ``zeta``, ``arrival``, ``radius_km`` or ``start_heading``.
 
     Raises:
         TypeError: for an unknown option, with the list of options.
@@ -145,7 +145,7 @@ class GeomagneticNavEnv(EnvBase):
         self.scenario = scenario
         self.max_steps, self.max_move_km = scenario.max_steps, float(scenario.max_move_km)
         self.max_turn_rad = math.radians(scenario.max_turn_deg)
-        self.arrival = Arrival(scenario.arrival, float(scenario.zeta), float(scenario.arrival_radius_km))
+        self.arrival = Arrival(scenario.arrival, float(scenario.zeta), float(scenario.radius_km))
         self.zeta, self.start_heading = self.arrival.zeta, scenario.start_heading
         high = self.max_move_km, self.max_turn_rad, *([1.0] if self.arrival.declared else [])
         self.register_buffer("action_high", torch.tensor(high, dtype=torch.float64, device=self.device))
@@ -158,6 +158,13 @@ class GeomagneticNavEnv(EnvBase):
         if isinstance(field, torch.nn.Module):  # a copy, which shares its buffers until one of them is moved
             field = copy.deepcopy(field, {id(values): values for values in field.buffers()}).to(self.device)
         self.field = field
+
+    @property
+    def limits(self) -> dict[str, Any]:
+        """What a vehicle knows of the environment before it starts, as :class:`magrl.tracking.Rules` name it."""
+        names = ("max_move_km", "max_turn_rad", "max_steps", "zeta")
+        rule = {"arrival": self.arrival.rule, "radius_km": self.arrival.radius_km}
+        return {name: getattr(self, name) for name in names} | rule
 
     def observation_view(self, **observed: bool) -> ObservationView:
         """Return what an agent observes of this environment, scaled to the range of the field over the region.

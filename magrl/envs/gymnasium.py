@@ -1,17 +1,17 @@
 """The environment for Gymnasium: one vehicle as an ``Env``, a batch of them as a ``VectorEnv``.
 
-``import magrl`` registers ``magrl/GeomagneticNavigation-v0`` and, without a map, ``GeomagneticNavigationAnywhere-v0``.
-The classes run :func:`navigation_env` and :func:`anywhere_env`, the TorchRL environment behind the transforms of the
-recipes, and only convert tensors to arrays: the same seed and the same actions give the same bits.
+``import magrl`` registers the named tasks: ``magrl/GeomagneticNavigation-v0``, which is *Box*, and with the endings
+``Anywhere-v0``, ``Readings-v0`` and ``Storm-v0``. The classes run :data:`magrl.envs.named.NAMED_ENVS`, the TorchRL
+environments behind the transforms of the recipes, and only convert tensors to arrays: the same seed and the same
+actions give the same bits.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -26,15 +26,17 @@ from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import CatTensors, TransformedEnv
 
+from magrl.checks import check_choice
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.envs.measures import path_measures
-from magrl.envs.navigation import anywhere_env, navigation_env
+from magrl.envs.named import NAMED_ENVS
+from magrl.transforms.goals import goal_reward
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v0"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 VectorStep = tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
-_NAMED: dict[str, tuple[str, ...]] = {"flat": ("observation",), "track": ("observation",), "dict": PUBLIC_KEYS}
+_NAMED: dict[str, tuple[str, ...]] = {"dict": PUBLIC_KEYS, "goal": ("observation", "achieved_goal", "desired_goal")}
 # A forked process lacks the threads of its parent, and would wait for them.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
@@ -69,6 +71,21 @@ def _array(tensor: Tensor) -> NDArray[Any]:
     return np.array(tensor.detach().cpu().numpy())
 
 
+def goal_rewards(achieved_goal: Any, desired_goal: Any, info: Any = None) -> NDArray[Any]:  # noqa: ARG001
+    """Return the rewards of ``observation="goal"``, 1 at an arrival and 0 elsewhere: ``compute_reward``, ``(...)``.
+
+    Args:
+        achieved_goal: ``(..., 6)`` what was achieved by a step.
+        desired_goal: ``(..., 6)`` the goal, or another one in hindsight.
+        info: ignored.
+
+    Example:
+        >>> goal_rewards(np.zeros((2, 6)), np.zeros((2, 6)))
+        array([1., 1.])
+    """
+    return _array(goal_reward(*(torch.as_tensor(goal) for goal in (achieved_goal, desired_goal))))
+
+
 def _keep_spec(env: Any, spec: EnvSpec) -> None:
     """Keep Gymnasium's ``spec`` of an environment, with its step limit."""
     env.limited_spec = replace(spec, max_episode_steps=env.torchrl_env.base_env.max_steps)
@@ -94,10 +111,11 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         render_mode: None, or ``"rgb_array"``: an image of each vehicle.
         autoreset_mode: mode, or its value: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
         max_episode_steps: Gymnasium's name of ``max_steps``.
-        **options: of :func:`navigation_env`.
+        task: name of the task in :data:`magrl.envs.named.NAMED_ENVS`, which an id sets.
+        **options: of the function there, all of which take those of :func:`magrl.envs.navigation.navigation_env`.
 
     Raises:
-        TypeError, ValueError: for a bad option, as :func:`navigation_env`.
+        TypeError, ValueError: for a bad option, as that function.
 
     Example:
         >>> envs = gymnasium.make_vec(ENV_ID, num_envs=4, vectorization_mode="vector_entry_point")
@@ -107,10 +125,8 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         ((4, 13), (4,))
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 as Gymnasium declares it
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}
     spec = _SPEC
-    make_env: ClassVar[Callable[..., TransformedEnv]] = staticmethod(navigation_env)
-    """Function that makes the environment."""
 
     def __init__(
         self,
@@ -119,6 +135,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
+        task: str = "box",
         **options: Any,
     ) -> None:
         if max_episode_steps is not None:
@@ -126,10 +143,13 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)  # where TorchRL's GymWrapper reads it
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
-        observation = options.get("observation", "flat")
-        self._flat = observation in ("flat", "track")
-        self.torchrl_env = self.make_env(num_envs, render_mode=render_mode, **options)
-        self._keys = _NAMED[observation] if isinstance(observation, str) else tuple(observation)
+        check_choice(NAMED_ENVS, task=task)
+        self.torchrl_env = NAMED_ENVS[task](num_envs, render_mode=render_mode, **options)
+        observation = options.get("observation", "flat")  # or another array, by default of the task
+        keys = _NAMED.get(observation, ("observation",)) if isinstance(observation, str) else observation
+        self._keys, self._flat = tuple(keys), isinstance(observation, str) and observation not in _NAMED
+        if observation == "goal":  # stable-baselines3 takes whatever has such a method for an environment of goals
+            self.compute_reward = goal_rewards
         self.single_observation_space = _observation_space(self.torchrl_env, self._keys, flat=self._flat)
         self.single_action_space = _box(self.torchrl_env.action_spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -226,10 +246,10 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Args:
         render_mode: None, or ``"rgb_array"``: the track over the field's contours, ``(700, 700, 3)`` uint8.
-        **options: of :func:`navigation_env`, which holds those of :class:`magrl.envs.GeomagneticNavEnv`.
+        **options: of :class:`GeomagneticNavVectorEnv`: those of the task, with ``task``.
 
     Raises:
-        TypeError, ValueError: for a bad option, as :func:`navigation_env`.
+        TypeError, ValueError: for a bad option, as there.
 
     Example:
         >>> env = gymnasium.make(ENV_ID, zeta=0.001)
@@ -239,14 +259,14 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         ((13,), Box(-1.0, 1.0, (2,), float32))
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 as Gymnasium declares it
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}
     spec = _SPEC
-    vector_class: ClassVar[type[GeomagneticNavVectorEnv]] = GeomagneticNavVectorEnv
-    """Batch of which this is the only vehicle."""
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
-        self._envs = self.vector_class(1, render_mode=render_mode, autoreset_mode="Disabled", **options)
+        self._envs = GeomagneticNavVectorEnv(1, render_mode=render_mode, autoreset_mode="Disabled", **options)
         self.torchrl_env, self.render_mode = self._envs.torchrl_env, render_mode
+        if options.get("observation") == "goal":
+            self.compute_reward = goal_rewards
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
 
@@ -277,43 +297,6 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Return the running episode over the field's contours, or None without a ``render_mode``."""
         images = self._envs.render()
         return images[0] if images else None
-
-
-class AnywhereVectorEnv(GeomagneticNavVectorEnv):
-    """A batch of vehicles without a map: ``gymnasium.make_vec("magrl/GeomagneticNavigationAnywhere-v0", num_envs=N)``.
-
-    Args:
-        num_envs: vehicles in the batch.
-        **options: of :func:`anywhere_env`: ``scenario`` of any number of regions, ``observation="track"`` or
-            ``"dict"`` for raw readings, ``transforms``, and so on.
-
-    Raises:
-        TypeError, ValueError: for a bad option, as :func:`anywhere_env`.
-
-    Example:
-        >>> AnywhereVectorEnv(num_envs=4).reset(seed=0)[0].shape
-        (4, 19)
-    """
-
-    make_env = staticmethod(anywhere_env)
-
-
-class AnywhereGymEnv(GeomagneticNavGymEnv):
-    """One vehicle without a map: ``gymnasium.make("magrl/GeomagneticNavigationAnywhere-v0", **options)``.
-
-    Args:
-        **options: of :func:`anywhere_env`.
-
-    Raises:
-        TypeError, ValueError: for a bad option, as :func:`anywhere_env`.
-
-    Example:
-        >>> readings, _ = AnywhereGymEnv(observation=("field", "target_field", "move", "heading")).reset(seed=0)
-        >>> readings["field"].shape
-        (3,)
-    """
-
-    vector_class = AnywhereVectorEnv
 
 
 def _measures(end: TensorDictBase, length_km: Tensor) -> dict[str, NDArray[Any]]:

@@ -13,25 +13,28 @@ from magrl.checks import check_choice, check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.envs.random_regions import planet_scenario
 from magrl.envs.scenario import Scenario
-from magrl.tracking import STEP_PRICE
+from magrl.tracking import STEP_PRICE, Rules
 from magrl.transforms import (
     AlignmentReward,
-    DeclareArrival,
     FieldGradient,
+    GoalObservation,
+    GoalReward,
     GradientHeading,
     HighestSPL,
-    ObservationView,
-    RandomSensorNoise,
+    MinMaxNorm,
+    ProgressReward,
     RandomStepPrice,
-    SensorNoise,
+    ReadingObservation,
+    SensorErrors,
     SPLReward,
-    TrackView,
+    TrackField,
     TrueWay,
+    sensor_levels,
 )
-from magrl.transforms.errors.base import ReadingErrors
+from magrl.transforms.track import known_keys
 
-OBSERVATIONS = ("flat", "track", "dict")
-REWARDS = ("guided", "base", "spl")
+OBSERVATIONS = ("flat", "track", "readings", "goal", "dict")
+REWARDS = ("progress", "paper", "base", "spl", "goal")
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
 
@@ -40,7 +43,7 @@ def navigation_env(
     num_envs: int = 1,
     *,
     observation: str | Sequence[str] = "flat",
-    reward: str = "guided",
+    reward: str | None = None,
     transforms: Sequence[Transform] = (),
     scale_actions: bool = True,
     alignment_weight: float = 3.0,
@@ -53,49 +56,57 @@ def navigation_env(
         num_envs: vehicles in the batch.
         observation: ``"flat"`` adds ``observation``, ``(N, 13)``, scaled to the region: the input of the recipes'
             networks. ``"track"`` adds ``observation``, ``(N, 19)``, the estimates of the own track
-            (:class:`~magrl.transforms.TrackView`), in any number of regions. ``"dict"`` leaves the public keys in
-            physical units, and so does a list of keys, which the Gymnasium interface observes.
+            (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 20)``, readings without estimates
+            (:class:`~magrl.transforms.ReadingObservation`), in any number of regions. ``"goal"`` adds ``observation``,
+            ``achieved_goal`` and ``desired_goal`` (:class:`~magrl.transforms.GoalObservation`). ``"dict"`` leaves the
+            public keys in physical units, and so does a list of keys, which the Gymnasium interface observes. The view
+            of ``"flat"`` and ``"goal"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
         transforms: added after the guidance: errors of sensors, estimates, rewards. They are cloned.
-        reward: ``"guided"`` adds the alignment term to the paper's base reward, by the true field and heading; over
-            several regions by the pair of elements that crosses best. ``"base"`` is that reward alone. ``"spl"`` is
-            :class:`~magrl.transforms.SPLReward`, in which each step costs 0.5 % of SPL.
+        reward: ``"progress"``, the default, is :class:`~magrl.transforms.ProgressReward`: kilometers nearer to the
+            destination over 50, plus 10 at the arrival, minus 0.1 a step. ``"paper"`` is the paper's: decrease of the
+            objective, 200 at the arrival, and alignment with the theoretical heading by the true field, over several
+            regions by the pair of elements that crosses best. It has a trap: to stand still and turn to that heading
+            earns 117 in 50 steps. ``"base"`` is that without the alignment. ``"spl"`` is
+            :class:`~magrl.transforms.SPLReward`, in which each step costs 0.5 % of SPL. ``"goal"``, that of goals
+            alone, is 1 at the arrival and 0 elsewhere (:func:`~magrl.transforms.goals.goal_reward`).
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
-        alignment_weight: zeta_3 of Eq. 3-6 [1/rad], of the guided reward.
+        alignment_weight: zeta_3 of Eq. 3-6 [1/rad], of the paper's reward.
         alignment_offset: heading deviation at which the alignment term turns into a penalty [rad].
         **options: of :class:`magrl.envs.GeomagneticNavEnv`.
 
     Raises:
         TypeError: for an unknown option, ``scale_actions`` that is not a bool, or an object among the transforms
             that is not a transform.
-        ValueError: for any option out of its range, naming it and its value, or ``"flat"`` over several regions.
+        ValueError: for any option out of its range, naming it and its value, ``"flat"`` or ``"goal"`` over several
+            regions, or goals with another reward or rule of arrival.
 
     Example:
         >>> navigation_env(4, seed=0).reset()["observation"].shape
         torch.Size([4, 13])
     """
+    check_type(Sequence, observation=observation)
     if isinstance(observation, str):
         check_choice(OBSERVATIONS, observation=observation)
+    reward = reward or ("goal" if observation == "goal" else "progress")
     check_choice(REWARDS, reward=reward)
     check_type(bool, scale_actions=scale_actions)
     check_type(Transform, **{f"transforms[{number}]": transform for number, transform in enumerate(transforms)})
     base = GeomagneticNavEnv(num_envs=num_envs, **options)
-    view, added = _view(base, observation), [transform.clone() for transform in _parts(transforms)]
     steps: list[Transform] = []
-    if reward == "guided":  # before errors of the sensors
+    if reward == "progress":
+        steps += [TrueWay(), ProgressReward()]
+    elif reward == "paper":  # before errors of the sensors
         alignment = AlignmentReward(weight=alignment_weight, offset=alignment_offset)
         heading = GradientHeading() if len(base.region) == 1 else GradientHeading(pair="auto")
         steps += [FieldGradient(base.field), heading, alignment]
     elif reward == "spl":
         steps += [TrueWay(), HighestSPL(), RandomStepPrice((STEP_PRICE, STEP_PRICE)), SPLReward()]
-    steps += added
-    if observation == "track" and not any(isinstance(transform, ReadingErrors) for transform in added):
-        steps.append(SensorNoise((0.0, 0.0, 0.0)))  # the view reads standard deviations
-    if observation in ("flat", "track"):
-        steps += view.observation_transforms()
+    env = TransformedEnv(base, Compose(*steps, *(transform.clone() for transform in _parts(transforms))))
+    for transform in _observation(env, observation, reward):
+        env.append_transform(transform)
     if scale_actions:
-        declared = base.arrival.declared and not any(isinstance(transform, DeclareArrival) for transform in added)
-        steps.append(view.action_transform(declared=declared))
-    return TransformedEnv(base, Compose(*steps))
+        env.append_transform(MinMaxNorm(in_keys_inv=["action"]))
+    return env
 
 
 def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **options: Any) -> TransformedEnv:
@@ -105,8 +116,9 @@ def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **optio
         num_envs: vehicles in the batch.
         scenario: scenario of any number of regions; by default :data:`PLANET_REGIONS` of random planets, with
             destinations 300 to 500 km away.
-        **options: of :func:`navigation_env`, with other defaults: ``observation="track"``, ``reward="spl"``,
-            ``start_heading="random"`` unless the scenario states one, and ``transforms=[RandomSensorNoise()]``.
+        **options: of :func:`navigation_env`, with other defaults: ``observation="track"``, ``start_heading="random"``
+            unless the scenario states one, and errors of its sensors of random size
+            (:func:`magrl.transforms.sensor_levels`).
 
     Raises:
         TypeError, ValueError: as :func:`navigation_env`.
@@ -117,8 +129,8 @@ def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **optio
     """
     scenario = _planets() if scenario is None else scenario
     heading = scenario.given("start_heading") or "random"
-    defaults: dict[str, Any] = {"observation": "track", "reward": "spl", "start_heading": heading}
-    defaults["transforms"] = [RandomSensorNoise()]
+    defaults: dict[str, Any] = {"observation": "track", "start_heading": heading}
+    defaults["transforms"] = [SensorErrors(levels=sensor_levels)]
     return navigation_env(num_envs, scenario=scenario, **defaults | options)
 
 
@@ -127,15 +139,23 @@ def _planets() -> Scenario:
     return planet_scenario(PLANET_REGIONS, seed=0, max_latitude=70.0, distance_range_km=(300.0, 500.0))
 
 
-def _view(base: GeomagneticNavEnv, observation: str | Sequence[str]) -> ObservationView | TrackView:
-    """Return what is observed, and how actions are scaled."""
-    if observation == "flat":
+def _observation(env: TransformedEnv, observation: str | Sequence[str], reward: str) -> list[Transform]:
+    """Return the transforms of an observation; raise where it does not fit."""
+    base, rule = env.base_env, env.base_env.arrival.rule
+    if "goal" in (observation, reward) and (observation, reward, rule) != ("goal", "goal", "objective"):
+        given = f"observation={observation!r}, reward={reward!r} and arrival={rule!r}"
+        raise ValueError(f"goals need observation='goal', reward='goal' and arrival='objective', got {given}")
+    if observation in ("flat", "goal"):
         if len(base.region) > 1:
-            message = f"observation='flat' is scaled to one region, the scenario has {len(base.region)}"
+            message = f"observation={observation!r} is scaled to one region, the scenario has {len(base.region)}"
             raise ValueError(f"{message}: take observation='track', or 'dict' for raw readings")
-        return base.observation_view()
-    limits = {name: getattr(base, name) for name in ("zeta", "max_steps", "max_move_km", "max_turn_rad")}
-    return TrackView(**limits, search=base.arrival.rule == "objective")
+        env.view = view = base.observation_view()
+        if observation == "flat":
+            return view.observation_transforms()
+        return [GoalObservation(view, base.zeta, base.objective_floors[0].tolist()), GoalReward()]
+    if observation == "track":
+        return [TrackField(Rules(**base.limits), known_keys(env.observation_spec))]
+    return [ReadingObservation()] if observation == "readings" else []
 
 
 def _parts(transforms: Iterable[Transform]) -> Iterator[Transform]:

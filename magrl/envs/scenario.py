@@ -14,7 +14,7 @@ from torch import Tensor
 
 from magrl import guidance, paper
 from magrl.checks import CheckedModel, check_number, check_numbers, short
-from magrl.envs.measures import check_zeta
+from magrl.envs.arrival import check_zeta
 from magrl.envs.regions import PAPER_REGION, Region, Regions, check_expansions
 from magrl.envs.specs import field_bounds
 from magrl.envs.tasks import Tasks, check_distance_range, check_tasks, task_set
@@ -138,7 +138,7 @@ class Scenario(CheckedModel):
     """Frozen tasks to fly in place of random ones; by default in region 0."""
     names: Annotated[tuple[str, ...], BeforeValidator(_tuple)] = ()
     """Names of the frozen tasks, or none."""
-    max_steps: Annotated[int, Field(ge=1)] = 50
+    max_steps: Annotated[int, Field(ge=1, le=10**9)] = 50
     """Moves after which an episode is truncated."""
     max_move_km: Annotated[float, Field(gt=0, le=1000)] = 50.0
     """Longest move [km]."""
@@ -147,10 +147,10 @@ class Scenario(CheckedModel):
     zeta: Annotated[float, AfterValidator(check_zeta)] = 0.01
     """Arrival threshold on the objective, below 3, its largest value at the start."""
     arrival: Literal["objective", "distance", "declared"] = "objective"
-    """Rule of arrival: the paper's, F below ``zeta``; a distance to the destination below ``arrival_radius_km``; or
+    """Rule of arrival: the paper's, F below ``zeta``; a distance to the destination below ``radius_km``; or
     ``"declared"``: the action has a third number, in [-1, 1], and above 0 the vehicle declares that it has arrived with
     this move, which ends the episode."""
-    arrival_radius_km: Annotated[float, Field(gt=0)] = 25.0
+    radius_km: Annotated[float, Field(gt=0)] = 25.0
     """Distance from the destination of an arrival by distance, or of a correct declaration [km]."""
     start_heading: Literal["north", "random"] = "north"
     """Heading at the start of an episode; ``"random"`` is uniform."""

@@ -5,4 +5,3 @@ from magrl.evaluation.flight import evaluate as evaluate
 from magrl.evaluation.metrics import episode_measures as episode_measures
 from magrl.evaluation.metrics import summarize as summarize
 from magrl.evaluation.rollout import evaluation_rollout as evaluation_rollout
-from magrl.evaluation.scenarios import with_declaration as with_declaration

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -11,18 +11,16 @@ from typing import Any, ClassVar, TypeAlias
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
-from magrl.agents.exported import TrainedPolicy
 from magrl.checks import check_choice
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
 from magrl.evaluation.metrics import episode_measures
-from magrl.evaluation.navigators import make_navigator
+from magrl.evaluation.navigators import fitted, make_navigator
 from magrl.evaluation.rollout import evaluation_rollout, next_rollout, restart
-from magrl.evaluation.scenarios import with_declaration
-from magrl.navigators import Navigator
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.transforms import Conditions, conditions_named, with_conditions, with_sensor_noise
+from magrl.tracking import EarthModel, earth_model
+from magrl.transforms import Conditions, KnownPlace, conditions_named, with_conditions
 from magrl.transforms.errors.conditions import MAGNETIC
 
 Errors: TypeAlias = Conditions | Sequence[float] | str | Path
@@ -41,6 +39,12 @@ class Flight:
             their compass (:class:`magrl.transforms.MagneticNorth`), whatever ``errors`` say of a north reference.
         known_start: standard deviations of the elements at a known start, where the vehicles calibrate their sensors
             (:class:`magrl.transforms.KnownStart`). With the errors of a real vehicle.
+        model: model of the Earth that the vehicles carry, as of the date of the scenario
+            (:func:`magrl.tracking.earth_model`): ``"IGRF-14"``, ``"IGRF-13"``, ``"IGRF-2005"``; None without one, as in
+            the paper.
+        start_km: root mean square error of the place where they start [km]; None where they do not know it.
+        target_km: the same of the destination, where they know the start.
+        rules: further values of :class:`magrl.tracking.Rules`, such as ``crust_nt``.
         confidence: minimum probability at which navigators declare an arrival, with arrival ``"declared"``.
         num_envs: number of vehicles; by default one for each task of the scenario, and one without tasks.
         seed: random seed of the errors, random start headings and metaheuristics.
@@ -71,34 +75,46 @@ class Flight:
         errors: Errors = PERFECT.noise,
         north: str = "true",
         known_start: Sequence[float] | None = None,
+        model: EarthModel | str | None = None,
+        start_km: float | None = None,
+        target_km: float = 0.0,
+        rules: Mapping[str, Any] | None = None,
         confidence: float = 0.0,
         num_envs: int | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
         **options: Any,
     ) -> None:
-        self.confidence, self.seed = confidence, seed
+        self.seed = seed
+        self.rules: dict[str, Any] = {"confidence": confidence, **(rules or {})}
         tasks = 1 if scenario.tasks is None else len(scenario.tasks.start)
         options |= {"num_envs": tasks if num_envs is None else num_envs, "seed": seed, "device": device}
         errors = conditions_named(str(errors)) if isinstance(errors, str | Path) else errors
         check_choice(NORTHS, north=north)
-        if north == MAGNETIC:
-            conditions = errors if isinstance(errors, Conditions) else Conditions("noise", sensors={"noise": errors})
-            errors = replace(conditions, north=MAGNETIC)
-        if isinstance(errors, Conditions):
-            drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
-            self.base = self.env_class(scenario, **drift | options)
-            self.env = with_conditions(self.base, errors, seed, known_start)
-            self.sensor_std = errors.std_at(known_start)
-        else:
+        if not isinstance(errors, Conditions):
             if known_start is not None:
                 raise ValueError(f"known_start {known_start} needs conditions: white noise has nothing to calibrate")
-            self.base = self.env_class(scenario, **options)
-            self.env = with_sensor_noise(self.base, errors, seed)
-            self.sensor_std = SensorStd.of(errors)
+            noise = SensorStd.of(errors).noise
+            errors = Conditions("noise", sensors={"noise": noise} if any(noise) else {})
+        if north == MAGNETIC:
+            errors = replace(errors, north=MAGNETIC)
+        drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
+        self.base = self.env_class(scenario, **drift | options)
+        self.env = with_conditions(self.base, errors, seed, known_start)
+        self.sensor_std = errors.std_at(known_start)
+        if model is not None:
+            self.rules["model"] = earth_model(model, scenario.date, scenario.altitude_km)
+        if start_km is not None:
+            names = ("start_km", "target_km", "drift", "wander_km")
+            told = dict(zip(names, (start_km, target_km, *errors.motion_std), strict=True))
+            self.rules |= told if model is not None else {}
+            self.env = TransformedEnv(self.env, KnownPlace(start_km, target_km, seed=seed), auto_unwrap=True)
 
     def navigator(self, policy: TensorDictModuleBase | str, **options: Any) -> TensorDictModuleBase:
         """Return a policy that flies within the limits of the environment, with the accuracy of its sensors.
+
+        With arrival ``"declared"``, navigators and trained agents declare from a track of their own readings; another
+        policy writes the third action itself.
 
         Args:
             policy: policy or navigator of the plain environment, or the text that names one, as
@@ -109,17 +125,8 @@ class Flight:
             ValueError: for an unknown name, or a policy of another field or of longer moves.
         """
         if isinstance(policy, str):
-            return make_navigator(policy, self.base, sensor_std=self.sensor_std, **{"seed": self.seed} | options)
-        return policy.for_env(self.base) if isinstance(policy, TrainedPolicy) else policy
-
-    def environment(self, navigator: TensorDictModuleBase) -> EnvBase:
-        """Return the environment in which a navigator of :meth:`navigator` flies.
-
-        With arrival ``"declared"``, navigators and trained agents declare from their own estimate
-        (:func:`magrl.evaluation.scenarios.with_declaration`); another policy writes the third action itself.
-        """
-        declares = isinstance(navigator, TrainedPolicy | Navigator)
-        return with_declaration(self.env, self.confidence, navigator) if declares else self.env
+            policy = make_navigator(policy, self.base, sensor_std=self.sensor_std, **{"seed": self.seed} | options)
+        return fitted(policy, self.base, **self.rules)
 
     def fly(self, policy: TensorDictModuleBase | str) -> TensorDict:
         """Return a rollout of the first episode of each vehicle, as :func:`evaluation_rollout` does.
@@ -131,8 +138,7 @@ class Flight:
             TypeError: for a policy that is not callable.
             ValueError: as :meth:`navigator`.
         """
-        navigator = self.navigator(policy)
-        return evaluation_rollout(self.environment(navigator), navigator)
+        return evaluation_rollout(self.env, self.navigator(policy))
 
 
 def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, **options: Any) -> TensorDict:
@@ -140,7 +146,7 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
 
     Args:
         policy: policy or navigator of the plain environment, or the text that names one, as
-            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.safetensors"``. A
+            :func:`magrl.evaluation.navigators.make_navigator` takes it: ``"secant"``, ``"policy=sac.onnx"``. A
             trained policy is flown within the limits of the environment (:meth:`magrl.FieldPolicy.for_env`).
         tasks: scenario with tasks; or tasks, or the name of a frozen set such as ``"test-1000"``, in the paper's
             region.
@@ -165,7 +171,7 @@ def evaluate(policy: TensorDictModuleBase | str, tasks: Scenario | Tasks | str, 
     scenario = _with_tasks(tasks)
     flight = Flight(scenario, **options)
     navigator = flight.navigator(policy)
-    env, count = flight.environment(navigator), len(scenario.tasks.start)  # type: ignore[union-attr]
+    env, count = flight.env, len(scenario.tasks.start)  # type: ignore[union-attr]
     restart(env)
     episodes = [_next_episodes(env, navigator) for _ in range(math.ceil(count / env.num_envs))]
     return torch.cat(episodes)[:count]  # a last batch that is not full has flown the first tasks again

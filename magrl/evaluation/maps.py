@@ -30,10 +30,13 @@ from magrl.evaluation.metrics import episode_measures
 from magrl.evaluation.replay import PIECES, episode_tracks
 from magrl.field import FieldModel
 from magrl.geodesy import geodesic, move, polar
+from magrl.tracking import Way
 
 LAND, ESTIMATE = "#8c6d46", "#56B4E9"
 """Colors of coastlines, and of estimates of the destination."""
 FRAME_MS, LAST_FRAME_MS, GIF_COLORS = 150, 1280, 256
+WAY = ("track", "way")
+"""Key of the estimated way of a :class:`~magrl.transforms.TrackField`."""
 _DRAWN = PIECES // 2  # a frame at every second piece of a move
 _FARTHEST = 1.3  # distance of an estimate, over that of the task, up to which the map of an animation holds it
 
@@ -110,9 +113,8 @@ def trajectories_figure(
 ) -> Figure:
     """Return maps of the first episodes of one or several navigators, beside each other.
 
-    A map has the tracks, the shortest paths, contours of the field and coastlines; for an episode with the key ``way``
-    ``(..., 2)`` [km] northward and eastward (:class:`~magrl.transforms.TrackField`) also where its destination was
-    estimated.
+    A map has the tracks, the shortest paths, contours of the field and coastlines; for an episode with a track
+    (:class:`~magrl.transforms.TrackField`) also where its destination was estimated.
 
     Args:
         rollouts: ``(M, T)`` from the environment, or several of them by title.
@@ -144,7 +146,7 @@ def trajectories_figure(
         for track in tracks:
             axes.plot(track[::PIECES, 1], track[::PIECES, 0], "-", color=PATH, lw=1.5, marker=".", ms=4)
         axes.lines[-1].set_label("track")
-        if "way" in shown["next"].keys():  # noqa: SIM118 - a TensorDict is no mapping
+        if shown.get(WAY, None) is not None:
             guesses = region.unwrapped(estimates(shown["next"].reshape(-1), 5000.0))
             axes.plot(guesses[:, 1], guesses[:, 0], ".", color=ESTIMATE, ms=4, label="destination, estimated")
         _write_names(axes, names, region.unwrapped(shown["target_position"][:, 0]))
@@ -203,7 +205,7 @@ def estimates(states: TensorDictBase, farthest_km: float) -> Tensor:
     """Return where a vehicle estimated its destination to be.
 
     Args:
-        states: ``(T,)`` of one vehicle, with ``position`` and ``way``.
+        states: ``(T,)`` of one vehicle, with ``position`` and a track.
         farthest_km: distance from the vehicle beyond which an estimate is left out [km].
 
     Returns:
@@ -211,12 +213,13 @@ def estimates(states: TensorDictBase, farthest_km: float) -> Tensor:
 
     Example:
         >>> from tensordict import TensorDict
-        >>> ways = torch.tensor([[111.2, 0.0], [9000.0, 0.0]])
-        >>> states = TensorDict(position=torch.zeros(2, 2), way=ways, batch_size=[2])
+        >>> states = TensorDict(position=torch.zeros(2, 2), batch_size=[2])
+        >>> states["track", "way", "displacement"] = torch.tensor([[111.2, 0.0], [9000.0, 0.0]])
         >>> estimates(states, 5000.0).round(decimals=1)
         tensor([[1., 0.]], dtype=torch.float64)
     """
-    return _ends(states["position"], states["way"])[states["way"].norm(dim=-1) < farthest_km]
+    way = states[WAY]["displacement"]
+    return _ends(states["position"], way)[way.norm(dim=-1) < farthest_km]
 
 
 def _ends(position: Tensor, way: Tensor) -> Tensor:
@@ -267,9 +270,9 @@ def write_gif(
 
     Args:
         path: path of the image; an existing file is replaced.
-        rollout: ``(M, T)`` from the environment; of one vehicle with the keys ``way`` ``(..., 2)`` [km] northward and
-            eastward and ``way_covariance`` ``(..., 2, 2)`` [km^2] (:class:`~magrl.transforms.TrackField`), the
-            ellipse of two standard deviations around the estimated destination is drawn.
+        rollout: ``(M, T)`` from the environment; of one vehicle with a track
+            (:class:`~magrl.transforms.TrackField`), the ellipse of two standard deviations around the estimated
+            destination is drawn.
         field: any model of :mod:`magrl.field`.
         region: region of the episodes.
         title: title of the map.
@@ -300,7 +303,7 @@ def _frames(
 ) -> Iterator[Image.Image]:
     """Yield the frames; a vehicle that has arrived takes the color of destinations."""
     success, states = episode_measures(rollout)["success"].tolist(), rollout[0]
-    estimated = len(rollout) == 1 and "way_covariance" in rollout.keys()  # noqa: SIM118 - a TensorDict is no mapping
+    estimated = len(rollout) == 1 and rollout.get(WAY, None) is not None
     distance = geodesic(*states["start_position"][0], *states["target_position"][0])[0].item()
     figure = Figure(layout="constrained")
     canvas, axes = FigureCanvasAgg(figure), figure.add_subplot(title=title)
@@ -327,7 +330,7 @@ def _frames(
 
 def _estimate(state: TensorDictBase, region: Region) -> np.ndarray:
     """Return the estimated destination and, after a gap, its ellipse, with gaps at the edge of the map: ``(P, 2)``."""
-    position, way, covariance = (state[key].double() for key in ("position", "way", "way_covariance"))
+    position, (way, covariance) = state["position"].double(), (state[WAY][key].double() for key in Way._fields)
     line = region.unwrapped(torch.cat((_ends(position, way[None]), way_ellipse(position, way, covariance)))).numpy()
     jumps = np.flatnonzero(np.abs(np.diff(line[:, 1])) > 180)
     return np.insert(line, [1, *jumps[jumps > 0] + 1], np.nan, axis=0)

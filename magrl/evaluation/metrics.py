@@ -15,7 +15,8 @@ from torchrl.envs import EnvBase
 
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.measures import distance_to_arrival, path_measures, spl
+from magrl.envs.measures import path_measures, spl
+from magrl.evaluation.arrival_distance import distance_to_arrival
 from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
 from magrl.geodesy import geodesic, wrap_angle
 
@@ -55,8 +56,8 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
         angle at way-points (180 is straight, NaN without way-points); ``heading_mae_deg`` and ``heading_rmse_deg``,
         deviations from the bearing to the destination over the moves of nonzero length (NaN without any); with ``env``
         also ``spl_to_arrival``, the SPL whose shortest path leads to the nearest place where a vehicle has arrived
-        (:func:`magrl.envs.measures.distance_to_arrival`) instead of to the destination. Where vehicles declare their
-        arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success.
+        (:func:`magrl.evaluation.arrival_distance.distance_to_arrival`) instead of to the destination. Where vehicles
+        declare their arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success.
 
     Raises:
         TypeError: for an ``env`` that is no environment.

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 
-from magrl.agents import kalman, load_policy
-from magrl.agents.pretrained import load_pretrained
+from magrl.agents import load_policy
+from magrl.agents.trained import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.field import Date
-from magrl.navigators import NAVIGATORS, Navigator
+from magrl.navigators import NAVIGATORS, Anywhere, Declaring, Kalman, Navigator
+from magrl.navigators.kalman import LIMITS
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.transforms import TrackView
+from magrl.tracking.network import policy_content
 
 
 class TrainedAgent(NamedTuple):
@@ -31,22 +31,18 @@ class TrainedAgent(NamedTuple):
 
 
 OWN = "policy"
-"""Name of policies of any algorithm, given by a file or a folder with ``policy.safetensors``, and a label."""
-PRETRAINED = ("anywhere", "kalman")
-"""Names of the agents in the library; ``kalman`` has no network."""
-SPECTRUM = "the field's spectrum"
-"""What agents without a map need: their belief has the spectrum of the Earth's field as its prior."""
-UNTRAINED = "nothing"
-"""What a navigator without training was trained on."""
+"""Name of policies of any algorithm, given by a file or the folder of a run, and a label."""
+SUFFIXES = (".safetensors", ".onnx")
+"""Ends of the files of policies."""
 TRAINED = {
     "gg_td3": TrainedAgent("Gradient-Guided TD3", "Gradient-Guided TD3"),
     "gg_td3_noise": TrainedAgent("Gradient-Guided TD3, trained with noise", "Gradient-Guided TD3, trained with noise"),
     "td3": TrainedAgent("TD3", "TD3"),
-    "anywhere": TrainedAgent("anywhere", "anywhere (PPO)", "random planets", SPECTRUM),
     OWN: TrainedAgent("own policy", "own policy", "tasks of its own"),
-    "kalman": TrainedAgent("Kalman", "Kalman (dual control)", UNTRAINED, SPECTRUM),
 }
-"""Trained agents, which take a run folder; ``anywhere`` without one is the pretrained policy."""
+"""Agents of one region, which take a run folder, and policies of other algorithms."""
+WITH_RUN = (*TRAINED, Anywhere.name)
+"""Names that take a run folder or a file."""
 
 KINDS: dict[str, TrainedAgent | type[Navigator]] = {**TRAINED, **NAVIGATORS}
 NAVIGATOR_NAMES = {name: kind.label for name, kind in KINDS.items()}
@@ -72,13 +68,17 @@ class NavigatorText(NamedTuple):
 
 
 def parse_navigator(text: str) -> NavigatorText:
-    """Return the parts of a text that names a navigator; empty where it has none.
+    """Return the parts of a text that names a navigator; empty where it has none. A file of a policy may stand alone.
 
     Example:
-        >>> parse_navigator("policy:SAC=sac.safetensors")
-        NavigatorText(name='policy', option='SAC', source='sac.safetensors')
+        >>> parse_navigator("policy:SAC=sac.onnx")
+        NavigatorText(name='policy', option='SAC', source='sac.onnx')
+        >>> parse_navigator("runs/sac.onnx")
+        NavigatorText(name='policy', option='sac', source='runs/sac.onnx')
     """
     check_type(str, text=text)
+    if "=" not in text and Path(text).suffix in SUFFIXES:
+        return NavigatorText(OWN, Path(text).stem, text)
     named, _, source = text.partition("=")
     name, _, option = named.partition(":")
     return NavigatorText(name, option, source)
@@ -91,20 +91,18 @@ def make_navigator(
     sensor_std: SensorStd | Sequence[float] = PERFECT,
     mode: str = "look-ahead",
     seed: int = 0,
-    map_date: Date | None = None,
     **options: Any,
 ) -> TensorDictModuleBase:
     """Return the navigator that a text such as ``secant``, ``pso:flown`` or ``gg_td3=RUN`` names.
 
     Args:
         text: name; after ``=`` the run folder of a trained agent, or the file of a policy; after ``:`` the mode of a
-            metaheuristic, or the label of a policy, as in ``policy:SAC=sac.safetensors``.
+            metaheuristic, or the label of a policy, as in ``policy:SAC=sac.onnx``; or that file alone.
         env: environment that it navigates in.
         sensor_std: accuracy of the sensors, for navigators that weigh their readings; three numbers are white noise of
             D [deg], I [deg], B_H [nT]. Agents read it from the TensorDict.
         mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
-        map_date: date of the map of ``map_matching``, from IGRF; None for the environment's own field.
         options: further options of the class of a navigator without training, such as ``caution`` of ``kalman``, or of
             the view of an agent without a map, such as ``step_price``.
 
@@ -123,29 +121,60 @@ def make_navigator(
     if name in TRAINED and (not option or name == OWN):
         return _load(text, env, options)
     kind = NAVIGATORS.get(name)
-    if kind is None or source or (option and "mode" not in kind.options):
-        trained = [f"{agent}=RUN" for agent in TRAINED if agent not in (OWN, "kalman")]
-        names = [*PRETRAINED, *trained, "policy:NAME=FILE", *NAVIGATORS]
+    if kind is None or (source and kind is not Anywhere) or (option and "mode" not in kind.options):
+        trained = [f"{agent}=RUN" for agent in WITH_RUN if agent != OWN]
+        names = [*trained, "policy:NAME=FILE", *NAVIGATORS]
         raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(names)}")
-    shared = {"mode": option or mode, "seed": seed, "map_date": map_date}
+    shared = {"mode": option or mode, "seed": seed}
     options = {key: value for key, value in shared.items() if key in kind.options} | options
+    options |= {"source": policy_file(source)} if source else {}
     return kind.for_env(env, sensor_std=sensor_std, **options).to(env.device)
+
+
+def policy_file(source: str) -> Path:
+    """Return the file of a policy, given that or a run folder."""
+    path = Path(source)
+    if path.is_dir():
+        path /= "policy.onnx" if (path / "policy.onnx").is_file() else "policy.safetensors"
+    return path
 
 
 def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> TensorDictModuleBase:
     """Return a trained agent; raise unless it fits the environment."""
     name, _, source = parse_navigator(text)
-    if not source and name not in PRETRAINED:
+    if not source:
         file = " or the file of a policy" if name == OWN else ""
         raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
-    path = Path(source) if name == OWN and not Path(source).is_dir() else Path(source) / "policy.safetensors"
-    policy: Any = load_policy(path, env.device) if source else kalman() if name == "kalman" else load_pretrained(name)
-    if options and not isinstance(policy.view, TrackView):
+    path = policy_file(source)
+    if path.suffix != ".onnx" and "rules" in policy_content(path):
+        return Anywhere.for_env(env, source=path, **options).to(env.device)
+    if options:
         raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
     try:
-        return (policy.adapted(**options) if options else policy).for_env(env)
+        return load_policy(path, env.device).for_env(env)
     except ValueError as error:
         raise ValueError(f"{text}: {error}") from error
+
+
+def fitted(policy: TensorDictModuleBase, env: GeomagneticNavEnv, **rules: Any) -> TensorDictModuleBase:
+    """Return a policy within the limits of an environment, which declares its arrival where it must.
+
+    Args:
+        policy: navigator, trained policy, or another policy of the plain environment, which is returned as it is.
+        env: environment without errors.
+        rules: values of :class:`magrl.tracking.Rules` for its declarations, such as ``confidence``.
+
+    Raises:
+        ValueError: for a policy of another field or of longer moves.
+    """
+    if isinstance(policy, Kalman):
+        shorter = {key: min(env.limits[key], getattr(policy.rules, key)) for key in LIMITS}
+        return policy.adapted(**env.limits | rules | shorter)
+    if isinstance(policy, TrainedPolicy):
+        policy = policy.for_env(env)
+    if not env.arrival.declared or getattr(policy, "declares", False):
+        return policy
+    return Declaring(policy, **env.limits | rules) if isinstance(policy, TrainedPolicy | Navigator) else policy
 
 
 def _kind(name: str) -> TrainedAgent | type[Navigator]:
@@ -186,7 +215,7 @@ def trained_on(name: str) -> str:
         >>> trained_on("td3"), trained_on("anywhere"), trained_on("kalman"), trained_on("policy:SAC")
         ('the region', 'random planets', 'nothing', 'tasks of its own')
     """
-    return getattr(_kind(parse_navigator(name).name), "trained_on", UNTRAINED)
+    return _kind(parse_navigator(name).name).trained_on
 
 
 def label(name: str, default_mode: str = "look-ahead") -> str:
@@ -235,28 +264,6 @@ def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> No
         key = Path(source).resolve() if source else (name, option or default_mode)
         if key in seen:
             raise ValueError(f"{text} is given twice: the same episodes again are no spread over runs")
-        if source and name in PRETRAINED and name in texts:
+        if source and name == Anywhere.name and name in texts:
             raise ValueError(f"{text} has the name of the pretrained {name}: write policy:LABEL={source}")
         seen.add(key)
-
-
-def check_map_date(texts: Sequence[str], map_date: Date | None) -> None:
-    """Raise if the date of a map is given without the navigator that has a map.
-
-    Args:
-        texts: navigators, as :func:`make_navigator` takes them.
-        map_date: date of the map, or None.
-
-    Raises:
-        ValueError: with the date.
-
-    Example:
-        >>> check_map_date(["secant", "map_matching"], "2015-01-01")
-        >>> check_map_date(["secant"], "2015-01-01")
-        Traceback (most recent call last):
-        ValueError: --map-date 2015-01-01 is the date of the map of map_matching: add that navigator, or omit the date
-    """
-    if map_date is not None and "map_matching" not in texts:
-        raise ValueError(
-            f"--map-date {map_date} is the date of the map of map_matching: add that navigator, or omit the date"
-        )

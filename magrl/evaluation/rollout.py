@@ -10,12 +10,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from magrl.agents.exported import TrainedPolicy
+from magrl.agents.trained import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.transforms.track import BELIEF_KEYS, POSTERIOR_KEYS
 
-LARGE_KEYS = [key for name in (*BELIEF_KEYS, *POSTERIOR_KEYS) for key in (name, ("next", name))]
+LARGE_KEYS = [(*root, "track", name) for root in ((), ("next",)) for name in ("state", "posterior")]
 """Keys that rollouts leave out."""
 
 
@@ -32,7 +31,7 @@ def evaluation_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict
 
     Returns:
         ``(num_envs, T)``, as :func:`magrl.evaluation.episode_measures` takes it, until the last episode is done.
-        What follows the end of an episode does not count. The belief and the posterior of
+        What follows the end of an episode does not count. The state and the posterior of a
         :class:`~magrl.transforms.TrackField`, some ten kilobytes for each step, are left out.
 
     Raises:
@@ -101,8 +100,8 @@ def with_true_field(rollout: TensorDictBase) -> TensorDictBase:
 
     Example:
         >>> from torchrl.envs import TransformedEnv
-        >>> from magrl.transforms import SensorNoise
-        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), SensorNoise((0.05, 0.05, 5.0)))
+        >>> from magrl.transforms import SensorErrors
+        >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), SensorErrors((0.05, 0.05, 5.0)))
         >>> rollout = env.rollout(2)
         >>> bool((with_true_field(rollout)["next", "field"] == rollout["next", "true_field"]).all())
         True

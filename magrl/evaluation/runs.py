@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from magrl.evaluation.navigators import OWN, TRAINED, parse_navigator
+from magrl.evaluation.navigators import OWN, WITH_RUN, parse_navigator
 from magrl.files import read_document
 
 Noise = tuple[float, float, float]
@@ -82,9 +82,9 @@ def trained_runs(texts: Sequence[str]) -> list[TrainedRun]:
     """
     runs = []
     for name, _, folder in map(parse_navigator, texts):
-        if name in TRAINED and (Path(folder) / "config.json").is_file():
+        if name in WITH_RUN and (Path(folder) / "config.json").is_file():
             run = read_run(Path(folder))
-            if name != OWN and run.kind in TRAINED and run.kind != name.removesuffix("_noise"):
+            if name != OWN and run.kind in WITH_RUN and run.kind != name.removesuffix("_noise"):
                 raise ValueError(f"{folder} was trained as {run.kind}, not {name}: write {run.kind}={folder}")
             runs.append(run)
     return runs
@@ -97,7 +97,7 @@ def unfinished(texts: Sequence[str]) -> list[str]:
         >>> unfinished(["secant", "td3=runs/nowhere"])
         ['runs/nowhere is not a finished training: it holds no eval.json']
     """
-    folders = (Path(source) for name, _, source in map(parse_navigator, texts) if name in TRAINED and source)
+    folders = (Path(source) for name, _, source in map(parse_navigator, texts) if name in WITH_RUN and source)
     open_runs = (folder for folder in folders if not folder.is_file() and not (folder / "eval.json").is_file())
     return [f"{folder} is not a finished training: it holds no eval.json" for folder in open_runs]
 

@@ -6,14 +6,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from torchrl.envs import Compose, EnvBase, TransformedEnv
-
 from magrl import paper
 from magrl.checks import check_number
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, load_scenario, named_tasks
+from magrl.envs import Scenario, Tasks, load_scenario, named_tasks
 from magrl.envs.tasks import RANDOM_SETS
-from magrl.sensor_std import STD_KEYS
-from magrl.transforms import DeclareArrival, TrackField, TrackView
 
 TaskSet = Literal["test-1000", "paper-100", "figure-4-1"]
 FIRST_TASKS_SEED = 2 * paper.FIRST_RESERVED_SEED
@@ -34,9 +30,9 @@ class ScenarioOptions:
     start_heading: Literal["north", "random"] | None = None
     """Heading at the start of an episode; by default that of the runs, or north."""
     arrival: Literal["objective", "distance", "declared"] | None = None
-    """Rule of arrival: F below --zeta, the distance below --arrival-radius-km, or a declaration by the navigator's own
+    """Rule of arrival: F below --zeta, the distance below --radius-km, or a declaration by the navigator's own
     estimate; objective by default."""
-    arrival_radius_km: float | None = None
+    radius_km: float | None = None
     """Arrival radius around the destination, for --arrival distance and declared [km]; 25 by default."""
     max_steps: int | None = None
     """Maximum number of moves in an episode; 50 by default."""
@@ -115,33 +111,3 @@ def task_names(scenario: Scenario, first: int = 0) -> tuple[str, ...]:
     """
     assert scenario.tasks is not None
     return scenario.names or tuple(f"task {number}" for number in range(first, first + len(scenario.tasks.start)))
-
-
-def with_declaration(env: EnvBase, confidence: float = 0.0, navigator: object = None) -> EnvBase:
-    """Return an environment in which navigators of two numbers declare their arrival, where it must be declared.
-
-    They declare by the belief of their own track (:class:`~magrl.transforms.DeclareArrival`). Where readings come with
-    standard deviations, that of the noise is scaled by what the readings show (:class:`~magrl.transforms.TrackField`).
-
-    Args:
-        env: navigation environment with all errors of the sensors.
-        confidence: minimum probability of a correct declaration at which they declare.
-        navigator: navigator; one with its own declaration (``declares``) needs no other.
-
-    Example:
-        >>> env = with_declaration(GeomagneticNavEnv(num_envs=2, arrival="declared", seed=0))
-        >>> env.action_spec.shape
-        torch.Size([2, 2])
-    """
-    base: GeomagneticNavEnv = getattr(env, "base_env", env)
-    if not base.arrival.declared or getattr(navigator, "declares", False):
-        return env
-    std_keys = STD_KEYS if STD_KEYS[0] in env.observation_spec.keys() else ()  # noqa: SIM118 - a Composite is no mapping
-    view = getattr(navigator, "view", None)
-    world: dict[str, Any] = (
-        {"range_km": view.range_km, "crust_nt": view.crust_nt} if isinstance(view, TrackView) else {}
-    )
-    track = TrackField(std_keys=std_keys, estimate_noise=bool(std_keys), **world)
-    options: dict[str, Any] = {"max_steps": base.max_steps, "confidence": confidence, "std_keys": std_keys}
-    declare = DeclareArrival(base.arrival.radius_km, **options, **world)
-    return TransformedEnv(env, Compose(track, declare), auto_unwrap=True)

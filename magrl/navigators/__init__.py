@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from magrl.navigators.base import Navigator as Navigator
+from magrl.navigators.dead_reckoning import DeadReckoning as DeadReckoning
 from magrl.navigators.geodesic import Geodesic as Geodesic
-from magrl.navigators.map_matching import MapMatching as MapMatching
+from magrl.navigators.kalman import Anywhere as Anywhere
+from magrl.navigators.kalman import Declaring as Declaring
+from magrl.navigators.kalman import Kalman as Kalman
 from magrl.navigators.mean_jacobian import MeanJacobian as MeanJacobian
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
 from magrl.navigators.parallel import ParallelApproach as ParallelApproach
@@ -12,6 +15,8 @@ from magrl.navigators.quasi_newton import QuasiNewton as QuasiNewton
 from magrl.navigators.secant import Secant as Secant
 
 _CLASSES: tuple[type[Navigator], ...] = (
+    Kalman,
+    Anywhere,
     GeneticAlgorithm,
     ParticleSwarm,
     ArtificialFishSwarm,
@@ -19,7 +24,7 @@ _CLASSES: tuple[type[Navigator], ...] = (
     ParallelApproach,
     MeanJacobian,
     Geodesic,
-    MapMatching,
+    DeadReckoning,
 )
 NAVIGATORS = {navigator.name: navigator for navigator in _CLASSES}
 """Classes by the names that commands take. Figures color them in this order: add a new one at the end."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -103,8 +103,14 @@ class Navigator(TensorDictModuleBase):
     """Whether the navigator reads privileged keys, or the field where the vehicle has not been."""
     needs: str = "nothing"
     """What it needs beside its readings and the standard deviations of the sensors, such as ``"the position"``."""
+    trained_on: str = "nothing"
+    """What it was trained on."""
+    optional_keys: ClassVar[tuple[str, ...]] = STD_KEYS
+    """Keys that :meth:`decide` reads where an environment has them."""
+    action_size = 2
+    """Numbers of the action: 3 with a declaration of the arrival."""
     options: tuple[str, ...] = ()
-    """Further options of :meth:`for_env` that a command has: ``mode``, ``seed``, ``map_date``."""
+    """Further options of :meth:`for_env` that a command has: ``mode``, ``seed``."""
 
     def __init__(self, max_move_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
         super().__init__()
@@ -140,13 +146,14 @@ class Navigator(TensorDictModuleBase):
         """Return the memory of vehicles at the start of an episode: tensors ``(N, ...)``; none by default."""
         return {}
 
-    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return distance [km] and turn [rad], each ``(P,)``, of vehicles in a new state, and update their memory."""
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor] | Tensor:
+        """Return distance [km] and turn [rad], each ``(P,)``, of vehicles in a new state, and update their memory; or
+        the whole action ``(P, A)``."""
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]."""
-        seen = tensordict.select(*self.in_keys).update(tensordict.select(*STD_KEYS, strict=False))
+        """Write ``action`` ``(N, 2)``: distance [km] and turn [rad]; with a declaration, ``(N, 3)``."""
+        seen = tensordict.select(*self.in_keys).update(tensordict.select(*self.optional_keys, strict=False))
         self.memory = memory = self._recall(seen)
         step = seen["elapsed_steps"].squeeze(-1)
         if "done" in self.in_keys:  # a rollout steps all vehicles until the last one is done
@@ -155,20 +162,26 @@ class Navigator(TensorDictModuleBase):
         rows = ((step != memory["decided_at"]) & ~memory["over"]).nonzero().squeeze(-1)
         if len(rows):
             part = memory[rows]
-            part["action"] = torch.stack(self.decide(seen[rows], part), -1).to(part["action"].dtype)
+            chosen = self.decide(seen[rows], part)
+            action = chosen if isinstance(chosen, Tensor) else torch.stack(chosen, -1)
+            part["action"] = action.to(part["action"].dtype)
             part["decided_at"] = step[rows]
             memory[rows] = part
-        return tensordict.set("action", memory["action"].clone())
+        for key in self.out_keys:
+            tensordict.set(key, memory[key].clone())
+        return tensordict
 
     def _recall(self, seen: TensorDictBase) -> TensorDictBase:
         """Return the memory of the batch, reset where an episode starts."""
-        step = seen["elapsed_steps"].squeeze(-1)
-        common = {"action": seen["heading"].new_zeros(len(step), 2), "decided_at": torch.full_like(step, -1)}
-        common |= {"field_readings": torch.zeros_like(step), "over": torch.zeros_like(step, dtype=torch.bool)}
+        step, memory = seen["elapsed_steps"].squeeze(-1), self.memory
+        known = memory is not None and memory.shape == step.shape and memory.device == step.device
+        if memory is not None and known and not (step == 0).any():
+            return memory
+        common = {"action": seen["heading"].new_zeros(len(step), self.action_size)}
+        common |= {"decided_at": torch.full_like(step, -1), "field_readings": torch.zeros_like(step)}
+        common |= {"over": torch.zeros_like(step, dtype=torch.bool)}
         first = TensorDict(self.first_memory(seen) | common, batch_size=step.shape, device=step.device)
-        if self.memory is None or self.memory.shape != first.shape or self.memory.device != first.device:
-            return first
-        return torch.where(step == 0, first, self.memory)
+        return torch.where(step == 0, first, memory) if memory is not None and known else first
 
     @property
     def field_readings(self) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_tensor
 from magrl.tracking import Way
-from magrl.tracking.destination import inverse2
+from magrl.tracking.local import inverse2
 
 CURVATURE = (1.5e-6, 1.8e-6, 1.2e-3)
 """Standard deviation of the change of a gradient along the way: D, I [deg], B_H [nT], per km^2, typical of the Earth's

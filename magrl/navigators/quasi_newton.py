@@ -19,7 +19,6 @@ from magrl.navigators.base import Navigator, element_indices
 from magrl.navigators.filter import CURVATURE, PERIODS, FieldTrack, GradientPrior
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import Way
-from magrl.transforms.track import displacement_of
 
 RANGE_KM = 1000.0
 """Prior standard deviation of the way to the destination along each axis [km]."""
@@ -166,7 +165,8 @@ def displacement(seen: TensorDictBase) -> Tensor:
         >>> displacement(TensorDict({"move": [[30.0, 0.0]], "heading": [[0.0]]}, 1))
         tensor([[30.,  0.]], dtype=torch.float64)
     """
-    return displacement_of(seen["move"].double(), seen["heading"].double())
+    heading = seen["heading"].double()
+    return seen["move"][..., :1].double() * torch.cat((torch.cos(heading), torch.sin(heading)), -1)
 
 
 def search_options(env: GeomagneticNavEnv) -> dict[str, Any]:

@@ -1,10 +1,13 @@
 """What a vehicle knows of the field around it: one normal distribution, and how moves and readings change it.
 
 The state has the local coefficients of the field's potential to degree 3 (:mod:`~magrl.tracking.harmonics`, the first
-three are the field itself), the offset of the latitude from a reference that is dead-reckoned (true north turns along
-the way, by tan(latitude) / R for each kilometer eastward), and the errors of the readings of D, I, B_H: constant ones,
-slow ones, which vary along the way as a first-order Gauss-Markov process, and a field that turns with the vehicle,
-such as that of hard iron. Both steps are those of a Kalman filter:
+three are the field itself), a magnetic anomaly, the error of the estimated place, the drift of dead reckoning, and the
+errors of the readings: constant ones of D, I, B_H, and a field that turns with the vehicle, such as that of hard iron.
+The anomaly is the field of the crust and of magnetic weather, three components that vary along the way as a first-order
+Gauss-Markov process. Where the place is not known, its error northward is that of the latitude, which is dead-reckoned
+(true north turns along the way, by tan(latitude) / R for each kilometer eastward). Where it is known, and with it a
+model of the Earth, the coefficients stay those at the true place, and a move changes them as the model does, but for
+their difference from it (:class:`Motion`). Both steps are those of a Kalman filter:
 
 - A move along a great circle is linear in the coefficients, c' = Turn(gamma) exp(X) c, where X = n (d_x + T_N / M) + e
   (d_y + T_E / N) has the generators of translations, with the degrees above 3 as their regression, and of the turns of
@@ -30,42 +33,74 @@ from torch.nn.functional import pad
 
 from magrl.checks import check_tensor
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
-from magrl.geodesy import curvature_radii
+from magrl.geodesy import move_place
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking.harmonics import RADIUS, UNIT_KM, arc, generators, size, turning
-from magrl.tracking.prior import ANGLES, DEGREE, closure, expected
+from magrl.tracking.earth import EarthModel
+from magrl.tracking.harmonics import UNIT_KM, arc, generators, turning
+from magrl.tracking.local import COEFFICIENTS, carry, closed_derivatives, inverse3, radii, slopes
+from magrl.tracking.prior import ANGLES, DEGREE, closure, expected, lasting_covariances, latitude_cells
 
-COEFFICIENTS = size(DEGREE)
-"""Number of coefficients of a belief; the latitude's offset [rad] has this index in the state."""
-CONSTANT = slice(COEFFICIENTS + 1, COEFFICIENTS + 4)
+PLACE = slice(COEFFICIENTS, COEFFICIENTS + 2)
+"""True minus estimated place, northward and eastward [km] in the state."""
+DRIFT = slice(COEFFICIENTS + 2, COEFFICIENTS + 4)
+"""Constant drift of dead reckoning, northward and eastward [share of the way] in the state."""
+CONSTANT = slice(COEFFICIENTS + 4, COEFFICIENTS + 7)
 """Constant errors of D, I [deg], B_H [nT] in the state."""
-SLOW = slice(COEFFICIENTS + 4, COEFFICIENTS + 7)
-"""Slow errors of D, I [deg], B_H [nT] in the state."""
-IRON = slice(COEFFICIENTS + 7, COEFFICIENTS + 10)
+ANOMALY = slice(COEFFICIENTS + 7, COEFFICIENTS + 10)
+"""Anomaly of the field: north, east, down [nT] in the state."""
+IRON = slice(COEFFICIENTS + 10, COEFFICIENTS + 13)
 """Errors that turn with the vehicle, such as hard iron: forward, to the right and downward [nT] in the state."""
-STATES = COEFFICIENTS + 10
+STATES = COEFFICIENTS + 13
 """Number of states."""
-LASTING_KM = 30.0
-"""Correlation length of slow errors [km]: for a ship, an hour of magnetic weather; chosen on random planets, under the
-conditions of four vehicles."""
+ANOMALY_KM = 125.0
+"""Correlation length of the anomaly [km]. WMMHR, degrees 14 to 133 at the ground, has .9 at 50 km, .62 at 100 km and
+.28 at 150 km; for a ship, it is four hours of magnetic weather."""
 MODEL_NT = 2.0
 """Standard deviation of the field by what the model leaves out, in each axis [nT]: .1 to .8 after six moves of 50 km on
 random planets, and more after many."""
 
 
+class Motion(NamedTuple):
+    """How dead reckoning and the field go on from place to place.
+
+    Args:
+        model: model of the Earth; None without one.
+        drift: constant drift of dead reckoning, standard deviation along each axis as a share of the way.
+        wander_km: random part of it, standard deviation along each axis after a way of 1 km [km].
+    """
+
+    model: EarthModel | None = None
+    drift: float = 0.0
+    wander_km: float = 0.0
+
+
+STILL = Motion()
+
+
 class Belief(NamedTuple):
-    """Mean ``(..., S)`` and covariance ``(..., S, S)`` of the state, and the reference latitude ``(...)`` [deg]: NaN in
-    the axes of magnetic north.
+    """Mean ``(..., S)`` and covariance ``(..., S, S)`` of the state, and the estimated place ``(..., 2)``, latitude and
+    longitude [deg]. Latitude is NaN in the axes of magnetic north; longitude is NaN where the place is not known, and
+    latitude then the reference of the error northward.
 
     Example:
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
         >>> belief.mean.shape, round(float(belief.latitude))
-        (torch.Size([25]), 40)
+        (torch.Size([28]), 40)
     """
 
     mean: Tensor
     covariance: Tensor
-    latitude: Tensor
+    place: Tensor
+
+    @property
+    def latitude(self) -> Tensor:
+        """Latitude ``(...)`` [deg]."""
+        return self.place[..., 0]
+
+    @property
+    def located(self) -> Tensor:
+        """Whether the place is known ``(...)``."""
+        return ~self.place[..., 1].isnan()
 
     @property
     def field(self) -> Tensor:
@@ -90,7 +125,7 @@ class Innovation(NamedTuple):
     has a residual of 0, rows of 0 and a variance of 1.
 
     Example:
-        >>> Innovation(torch.zeros(3), torch.zeros(3, 25), torch.eye(3)).square()
+        >>> Innovation(torch.zeros(3), torch.zeros(3, 28), torch.eye(3)).square()
         tensor(0.)
     """
 
@@ -114,73 +149,90 @@ def start(reading: Tensor, errors: SensorStd, heading: Tensor | None = None, cru
 
     Example:
         >>> start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.zeros(3))).covariance.shape
-        torch.Size([25, 25])
+        torch.Size([28, 28])
     """
-    return read(before(reading, errors), reading, torch.as_tensor(errors.noise), heading, crust_nt)
+    return read(before(reading, errors, crust_nt), reading, torch.as_tensor(errors.noise), heading)
 
 
-def before(near: Tensor, errors: SensorStd) -> Belief:
+def before(near: Tensor, errors: SensorStd, crust_nt: float = 0.0, model: EarthModel | None = None) -> Belief:
     """Return the belief before any reading, where the elements are about ``near``; other arguments as :func:`start`.
 
     Where the constant error of D has no limit (infinite), the vehicle has no true north, and D does not count.
 
     Where the start's true elements are known: ``read(known(before(elements, errors), elements, std), reading, ...)``.
 
+    Args:
+        near: ``(..., 3)``: D [deg], I [deg], B_H [nT].
+        errors: accuracy of the readings, tensors ``(..., 3)``.
+        crust_nt: standard deviation of the crust's field in each axis [nT].
+        model: model of the Earth, whose places are the prior; the spectrum of random planets without one.
+
     Example:
         >>> before(torch.tensor([3.0, 65.0, 18000.0]), PERFECT).mean.shape
-        torch.Size([25])
+        torch.Size([28])
     """
     check_tensor(3, near=near)
     near, magnetic = near.double(), torch.as_tensor(errors.bias)[..., 0].isinf().expand(near.shape[:-1])
-    mean, covariance = expected(field_vector(near))
+    mean, covariance = expected(field_vector(near), latitude_cells() if model is None else model.cells())
     if torch.compiler.is_compiling() or torch.compiler.is_exporting() or magnetic.any():  # its table is large
         north = torch.where(magnetic.unsqueeze(-1), near * near.new_tensor((0.0, 1.0, 1.0)), near)
-        unknown = expected(field_vector(north), ANGLES)
+        cells = latitude_cells(ANGLES) if model is None else model.cells(magnetic=True)
+        unknown = expected(field_vector(north), cells)
         mean, covariance = (
             torch.where(magnetic.reshape(*magnetic.shape, *[1] * n), new, old)
             for n, new, old in zip((1, 2), (unknown[0], _without(unknown[1], 1)), (mean, covariance), strict=True)
         )
-    constant, slow, iron = (kind.expand(*near.shape, 3) for kind in lasting_covariances(mean[..., :3], errors))
-    count = STATES - COEFFICIENTS - 1
-    variances = sum(
-        pad(kind, (part.start, STATES - part.stop) * 2)
-        for kind, part in zip((constant, slow, iron), (CONSTANT, SLOW, IRON), strict=True)
-    )
-    latitude = torch.rad2deg(mean[..., -1]).masked_fill(magnetic, math.nan)
-    return Belief(pad(mean[..., :-1], (0, count + 1)), pad(covariance, (0, count, 0, count)) + variances, latitude)
+    latitude = torch.rad2deg(mean[..., -1:]).masked_fill(magnetic.unsqueeze(-1), math.nan)
+    scale = torch.ones_like(mean)
+    scale[..., -1] = torch.where(magnetic, 1.0, radii(latitude[..., 0])[0])  # radians of latitude to kilometers
+    covariance = covariance * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    place = torch.cat((latitude, torch.full_like(latitude, math.nan)), -1)
+    return _with_errors(mean[..., :-1], covariance, place, errors, crust_nt)
 
 
-def lasting_covariances(field: Tensor, errors: SensorStd) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the covariances ``(..., 3, 3)`` of constant and slow errors of D, I [deg], B_H [nT], and of iron along
-    the vehicle's axes [nT^2].
-
-    The stated drift contains the effect of the iron on the elements, as a mean over the headings. Slow errors of the
-    field vector, such as magnetic weather, have a part along magnetic north, which changes B_H by that and I by -sin(I)
-    of it over the total intensity, and a downward part, which changes I by cos(I) of it over the same. Where both have
-    the same size, the correlation of I and B_H is -sin(I).
+def at_place(place: Tensor, place_km: float, errors: SensorStd, motion: Motion, crust_nt: float = 0.0) -> Belief:
+    """Return the belief before any reading at a place that is known, by a model of the Earth.
 
     Args:
-        field: ``(..., 3)`` north, east, down [nT].
+        place: ``(..., 2)`` latitude, longitude [deg].
+        place_km: its root mean square error [km].
         errors: accuracy of the readings, tensors ``(..., 3)``.
-
-    Example:
-        >>> errors = SensorStd(bias=torch.tensor([0.5, 0.0, 0.0]), drift=torch.tensor([0.3, 0.0, 0.0]))
-        >>> lasting_covariances(torch.tensor([20000.0, 0.0, 30000.0]), errors)[0].diagonal()
-        tensor([0.1600, 0.0000, 0.0000], dtype=torch.float64)
+        motion: with a model.
+        crust_nt: standard deviation of the crust's field in each axis [nT].
     """
-    bias, drift, iron = (torch.as_tensor(std).to(field.device, torch.float64).square() for std in errors[1:])
-    bias = torch.where(bias < math.inf, bias, 0.0)  # that of D, which is then no reading
-    level = iron[..., :2].mean(-1)
-    axes = torch.stack((level, level, iron[..., 2]), -1)
-    spread = elements_jacobian(field.double()).square() @ axes.unsqueeze(-1)
-    slow = torch.diag_embed((drift - spread.squeeze(-1)).clamp_min(0))
-    sin = field[..., 2].double() / field.double().norm(dim=-1)
-    shared = -sin * (slow[..., 1, 1] * slow[..., 2, 2]).sqrt()
-    slow[..., 1, 2], slow[..., 2, 1] = shared, shared
-    return torch.diag_embed((bias - drift).clamp_min(0)), slow, torch.diag_embed(iron)
+    assert motion.model is not None
+    place = place.double()
+    mean = motion.model.coefficients(place)
+    jacobian = slopes(mean, place)
+    lever = torch.cat((jacobian, torch.eye(2).to(jacobian).expand(*jacobian.shape[:-2], 2, 2)), -2)
+    covariance = lever @ lever.mT * (place_km**2 / 2)
+    covariance = covariance + pad(motion.model.error.to(mean), (0, 2, 0, 2))
+    drift = torch.eye(2).to(mean) * motion.drift**2
+    joint = pad(covariance, (0, 2, 0, 2)) + pad(drift, (DRIFT.start, 0, DRIFT.start, 0))
+    return _with_errors(mean, joint, place, errors, crust_nt)
 
 
-def moved(belief: Belief, distance: Tensor, course: Tensor, errors: SensorStd = PERFECT) -> Belief:
+def _with_errors(mean: Tensor, covariance: Tensor, place: Tensor, errors: SensorStd, crust_nt: float) -> Belief:
+    """Return a belief whose first states have a mean and a covariance, and the others those of the sensors."""
+    constant, anomaly, iron = (
+        kind.expand(*mean.shape[:-1], 3, 3) for kind in lasting_covariances(mean[..., :3], errors, crust_nt)
+    )
+    variances = sum(
+        pad(kind, (part.start, STATES - part.stop) * 2)
+        for kind, part in zip((constant, anomaly, iron), (CONSTANT, ANOMALY, IRON), strict=True)
+    )
+    rest = STATES - covariance.shape[-1]
+    return Belief(pad(mean, (0, STATES - mean.shape[-1])), pad(covariance, (0, rest, 0, rest)) + variances, place)
+
+
+def moved(
+    belief: Belief,
+    distance: Tensor,
+    course: Tensor,
+    errors: SensorStd = PERFECT,
+    motion: Motion = STILL,
+    crust_nt: float = 0.0,
+) -> Belief:
     """Return the belief after a move, before the reading at its end.
 
     Args:
@@ -188,6 +240,8 @@ def moved(belief: Belief, distance: Tensor, course: Tensor, errors: SensorStd = 
         distance: ``(...)`` [km], to about 200; divide longer moves.
         course: ``(...)`` at the start of the move [rad, clockwise from north].
         errors: accuracy of the readings, tensors ``(..., 3)``.
+        motion: errors of dead reckoning, and the model of the Earth, where the place is known.
+        crust_nt: standard deviation of the crust's field in each axis [nT].
 
     Example:
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
@@ -203,21 +257,70 @@ def moved(belief: Belief, distance: Tensor, course: Tensor, errors: SensorStd = 
     meridian, vertical = radii(middle)
     angles = north / meridian, east / vertical
     turn = arc(sin, cos, *angles)
-    matrix = turning(turn.cos_turn, turn.sin_turn, DEGREE) @ _carry(north / UNIT_KM, east / UNIT_KM, *angles)
+    matrix = turning(turn.cos_turn, turn.sin_turn, DEGREE) @ carry(north / UNIT_KM, east / UNIT_KM, *angles)
     column = matrix @ belief.mean[..., :COEFFICIENTS, None]
-    column = turn.slope[..., None, None] * (generators(DEGREE).turn[2].to(column) @ column)
+    column = (turn.slope / meridian)[..., None, None] * (generators(DEGREE).turn[2].to(column) @ column)
     rise = turn.sin * cos - turn.cos * sin  # sine of the change of the latitude
     after = belief.latitude + torch.rad2deg(rise * (1 + rise * rise / 6))
-    kept, ones = torch.exp(-distance / LASTING_KM).unsqueeze(-1), torch.ones_like(belief.mean)
-    parts = 0 * ones[..., :COEFFICIENTS], turn.rate.unsqueeze(-1), ones[..., CONSTANT], kept * ones[..., SLOW]
-    rest = belief.mean.shape[-1] - COEFFICIENTS
-    step = torch.diag_embed(torch.cat((*parts, ones[..., IRON]), -1))
+    kept, ones = torch.exp(-distance / ANOMALY_KM).unsqueeze(-1), torch.ones_like(belief.mean)
+    parts = 0 * ones[..., :COEFFICIENTS], turn.rate.unsqueeze(-1), ones[..., COEFFICIENTS + 1 : ANOMALY.start]
+    step = torch.diag_embed(torch.cat((*parts, kept * ones[..., ANOMALY], ones[..., IRON]), -1))
+    rest = STATES - COEFFICIENTS
     step = step + pad(torch.cat((matrix, column), -1), (0, rest - 1, 0, rest))
-    noise = pad(closure().drift.to(step), (0, rest, 0, rest)) * (distance / UNIT_KM).square()[..., None, None]
-    fresh = (1 - kept.square()).unsqueeze(-1) * lasting_covariances(belief.field, errors)[1]
-    noise = noise + pad(fresh, (SLOW.start, STATES - SLOW.stop) * 2)
+    spread = pad(closure().drift.to(step), (0, rest, 0, rest)) * (distance / UNIT_KM).square()[..., None, None]
+    fresh = (1 - kept.square()).unsqueeze(-1) * lasting_covariances(belief.field, errors, crust_nt)[1]
+    fresh = pad(fresh, (ANOMALY.start, STATES - ANOMALY.stop) * 2)
     mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
-    return _to_magnetic_north(Belief(mean, step @ belief.covariance @ step.mT + noise, after))
+    place = torch.stack((after, belief.place[..., 1]), -1)
+    if motion.model is not None:
+        return _moved_by_model(belief, Belief(mean, fresh, place), matrix, spread, distance, course, motion)
+    return _to_magnetic_north(Belief(mean, step @ belief.covariance @ step.mT + spread + fresh, place))
+
+
+def _moved_by_model(
+    belief: Belief, after: Belief, matrix: Tensor, spread: Tensor, distance: Tensor, course: Tensor, motion: Motion
+) -> Belief:
+    """Return the belief after a move where the place is known: coefficients change as those of the model do at the
+    estimated place, and their difference from the model as any field does.
+
+    With the model's coefficients m and their slopes J before the move, m' and J' after it, the turn and translation M,
+    and the errors d of the place, c' = m' + M (c - m - J d) + J' d'.
+    """
+    model = motion.model
+    assert model is not None
+    here, start = slice(None, COEFFICIENTS), belief.place
+    end = move_place(start, course, distance)
+    (old, slope), (new, slope_end) = (
+        (c, slopes(c, place)) for place in (start, end) for c in (model.coefficients(place),)
+    )
+    turn = distance * torch.tan(torch.deg2rad(end[..., 0])) / radii(end[..., 0])[1]  # of north, eastward of the place
+    none, sin, cos = torch.zeros_like(turn), torch.sin(course), torch.cos(course)
+    carried = torch.stack((none + 1, none, turn * sin, 1 - turn * cos), -1).unflatten(-1, (2, 2))
+    ones = torch.ones_like(belief.mean)
+    step = torch.diag_embed(torch.cat((0 * ones[..., : PLACE.stop], ones[..., PLACE.stop :]), -1))
+    kept = torch.exp(-distance / ANOMALY_KM)[..., None, None]
+    step[..., ANOMALY, ANOMALY] = step[..., ANOMALY, ANOMALY] * kept
+    step[..., here, here] = matrix
+    step[..., here, PLACE], step[..., PLACE, PLACE] = slope_end @ carried - matrix @ slope, carried
+    far = distance[..., None, None]
+    step[..., here, DRIFT], step[..., PLACE, DRIFT] = slope_end * far, torch.eye(2).to(step) * far
+    mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
+    mean[..., here] = mean[..., here] + new - (matrix @ old.unsqueeze(-1)).squeeze(-1)
+    lever = torch.cat((slope_end, torch.eye(2).to(slope_end).expand(*slope_end.shape[:-2], 2, 2)), -2)
+    wander = pad(lever @ lever.mT, (0, STATES - PLACE.stop) * 2) * (motion.wander_km**2 * far)
+    covariance = step @ belief.covariance @ step.mT + spread * model.share + after.covariance + wander
+    return settled(Belief(mean, covariance, end))
+
+
+def settled(belief: Belief) -> Belief:
+    """Return a belief whose expected error of the place is taken into the place, where that is known."""
+    north, east = belief.mean[..., PLACE].where(belief.located.unsqueeze(-1), 0.0).unbind(-1)
+    known = belief.located.unsqueeze(-1)
+    place = torch.where(known, belief.place, 0.0)
+    moved_place = move_place(place, torch.atan2(east, north), torch.hypot(north, east))
+    mean = belief.mean.clone()
+    mean[..., PLACE] = torch.where(known, 0.0, mean[..., PLACE])
+    return Belief(mean, belief.covariance, torch.where(known, moved_place, belief.place))
 
 
 def _to_magnetic_north(belief: Belief) -> Belief:
@@ -235,19 +338,7 @@ def _to_magnetic_north(belief: Belief) -> Belief:
     step = pad(slope, (0, rest, 0, rest))
     step = step + torch.diag_embed(pad(torch.zeros_like(mean), (0, rest), value=1.0))
     mean = torch.cat((mean, belief.mean[..., COEFFICIENTS:]), -1)
-    return Belief(mean, step @ belief.covariance @ step.mT, belief.latitude)
-
-
-def radii(latitude: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the radii of curvature [km] along the meridian and across it; that of the sphere where a latitude is NaN.
-
-    Example:
-        >>> radii(torch.tensor(math.nan))[0]
-        tensor(6371.2002)
-    """
-    known, middle = ~latitude.isnan(), RADIUS * UNIT_KM
-    meridian, vertical = (torch.where(known, radius, middle) for radius in curvature_radii(latitude))
-    return meridian, vertical
+    return Belief(mean, step @ belief.covariance @ step.mT, belief.place)
 
 
 def innovation(
@@ -255,7 +346,6 @@ def innovation(
     reading: Tensor,
     sensor_std: Tensor,
     heading: Tensor | None = None,
-    crust_nt: float = 0.0,
     errors: bool = True,
 ) -> Innovation:
     """Return a reading minus what the belief predicts; arguments as those of :func:`read`.
@@ -265,7 +355,6 @@ def innovation(
         reading: ``(..., 3)``.
         sensor_std: ``(..., 3)``.
         heading: ``(...)`` [rad].
-        crust_nt: standard deviation of the crust's field [nT].
         errors: whether the reading has the errors of the state; the true elements of a known place have not.
 
     Example:
@@ -279,18 +368,19 @@ def innovation(
     present = (sensor_std < math.inf) & (reading == reading) & belief.measured
     vector = field_vector(torch.where(present, reading, _elements(belief.field)))
     jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(vector), 0.0)
-    rows = pad(jacobian, (0, COEFFICIENTS - 2))
+    rows = pad(jacobian, (0, COEFFICIENTS - 3))
     if errors:
         own, course = (
             torch.diag_embed(present.double()),
             torch.zeros_like(reading[..., 0]) if heading is None else heading,
         )
         turn = turning(torch.cos(course.double()), torch.sin(course.double()), 1)  # forward, right, down
-        rows = torch.cat((rows, own, own, jacobian @ turn), -1)
+        place = torch.zeros_like(rows[..., :4])
+        rows = torch.cat((rows[..., :COEFFICIENTS], place, own, jacobian, jacobian @ turn), -1)
     rows = pad(rows, (0, belief.mean.shape[-1] - rows.shape[-1]))
     residual = (jacobian @ vector.unsqueeze(-1) - rows @ belief.mean.unsqueeze(-1)).squeeze(-1)
     variance = torch.where(present, sensor_std, 1.0).square()
-    noise = torch.diag_embed(variance) + (MODEL_NT**2 + crust_nt**2) * jacobian @ jacobian.mT
+    noise = torch.diag_embed(variance) + MODEL_NT**2 * jacobian @ jacobian.mT
     return Innovation(residual, rows, rows @ belief.covariance @ rows.mT + noise)
 
 
@@ -300,18 +390,16 @@ def updated(belief: Belief, new: Innovation) -> Belief:
     Example:
         >>> belief = before(torch.tensor([3.0, 65.0, 18000.0]), PERFECT)
         >>> updated(belief, innovation(belief, torch.tensor([4.0, 65.0, 18000.0]), torch.ones(3))).mean.shape
-        torch.Size([25])
+        torch.Size([28])
     """
     cross = belief.covariance @ new.rows.mT
     gain = cross @ inverse3(new.covariance)
     mean = belief.mean + (gain @ new.residual.unsqueeze(-1)).squeeze(-1)
     covariance = belief.covariance - gain @ cross.mT
-    return Belief(mean, (covariance + covariance.mT) / 2, belief.latitude)  # else, what is not symmetric grows
+    return settled(Belief(mean, (covariance + covariance.mT) / 2, belief.place))  # else, what is not symmetric grows
 
 
-def read(
-    belief: Belief, reading: Tensor, sensor_std: Tensor, heading: Tensor | None = None, crust_nt: float = 0.0
-) -> Belief:
+def read(belief: Belief, reading: Tensor, sensor_std: Tensor, heading: Tensor | None = None) -> Belief:
     """Return the belief after a reading.
 
     Args:
@@ -319,14 +407,13 @@ def read(
         reading: ``(..., 3)``: D [deg], I [deg], B_H [nT]; NaN for an element that is missing.
         sensor_std: ``(..., 3)`` standard deviation of the errors that are new in it; infinite for a missing element.
         heading: ``(...)`` [rad, clockwise from true north] of the vehicle, where the state has iron.
-        crust_nt: standard deviation of the crust's field in each axis [nT], new in each reading.
 
     Example:
         >>> belief = before(torch.tensor([3.0, 65.0, 18000.0]), PERFECT)
         >>> read(belief, torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0])).field.round()
         tensor([17975.,   942., 38601.], dtype=torch.float64)
     """
-    return updated(belief, innovation(belief, reading, sensor_std, heading, crust_nt))
+    return updated(belief, innovation(belief, reading, sensor_std, heading))
 
 
 def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: float = 0.0) -> Belief:
@@ -345,7 +432,9 @@ def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: float = 0.0) 
         >>> belief.mean[CONSTANT].round(decimals=1)  # the compass is off by 0.8 degrees
         tensor([0.8000, -0.0000, 0.2000], dtype=torch.float64)
     """
-    return updated(belief, innovation(belief, elements, std, None, crust_nt, errors=False))
+    new = innovation(belief, elements, std, errors=False)
+    crust = crust_nt**2 * new.rows[..., :3] @ new.rows[..., :3].mT
+    return updated(belief, new._replace(covariance=new.covariance + crust))
 
 
 class LocalElements(NamedTuple):
@@ -383,7 +472,12 @@ def elements(belief: Belief) -> LocalElements:
     east = derivative[1, :3] / UNIT_KM + turn[1, :3] / vertical + sin / (cos * vertical) * turn[2, :3]
     field = torch.eye(3, COEFFICIENTS).to(mean).expand_as(north)
     rows = elements_jacobian(belief.field).unsqueeze(-3) @ torch.stack((field, north, east), -3)  # (..., 3, E, K)
-    column = elements_jacobian(belief.field) @ turn[2, :3, :3] @ belief.field.unsqueeze(-1) / (cos.square() * vertical)
+    column = (
+        elements_jacobian(belief.field)
+        @ turn[2, :3, :3]
+        @ belief.field.unsqueeze(-1)
+        / (cos.square() * vertical * meridian)
+    )
     column = torch.stack((0 * column, 0 * column, column), -3)
     rows = torch.cat((rows, column), -1).transpose(-3, -2)  # (..., E, 3, K + 1): value, northward, eastward
     state = COEFFICIENTS + 1
@@ -402,31 +496,3 @@ def _without(covariance: Tensor, index: int) -> Tensor:
 def _elements(field: Tensor) -> Tensor:
     """Return D, I, B_H of a field; the angles by way of single precision, as ONNX Runtime has no other arc tangent."""
     return measured_elements(field.float()).to(field)
-
-
-def closed_derivatives() -> Tensor:
-    """Return the derivatives ``(2, K, K)`` northward and eastward, with degree 4 as its regression."""
-    derivative = generators(DEGREE + 1).derivative[:2, :COEFFICIENTS]
-    return derivative @ closure().extend[: size(DEGREE + 1)]
-
-
-def _carry(north: Tensor, east: Tensor, *angles: Tensor) -> Tensor:
-    """Return exp(X) ``(..., K, K)`` of a move [unit] that turns the vertical by angles northward and eastward [rad], to
-    the fourth order."""
-    steps = torch.cat((closed_derivatives(), generators(DEGREE).turn[:2])).to(north)
-    matrix = torch.tensordot(torch.stack((north, east, *angles), -1), steps, 1)
-    one = torch.eye(matrix.shape[-1]).to(matrix)
-    square = matrix @ matrix
-    return one + matrix + square @ (one / 2 + matrix / 6 + square / 24)
-
-
-def inverse3(matrix: Tensor) -> Tensor:
-    """Return the inverses of symmetric matrices ``(..., 3, 3)``, in closed form.
-
-    Example:
-        >>> inverse3(torch.diag(torch.tensor([1.0, 2.0, 4.0]))).diagonal()
-        tensor([1.0000, 0.5000, 0.2500])
-    """
-    x, y, z = matrix.unbind(-2)
-    adjugate = torch.stack([torch.linalg.cross(*rows) for rows in ((y, z), (z, x), (x, y))], -1)
-    return adjugate / (x.unsqueeze(-2) @ adjugate[..., :1]).squeeze(-1).unsqueeze(-1)

@@ -11,14 +11,11 @@ from torch import Tensor
 from magrl.checks import check_number, check_tensor
 from magrl.geodesy import wrap_angle
 from magrl.sensor_std import SensorStd
-from magrl.tracking.destination import Destination, DestinationPosterior, unit_points
+from magrl.tracking.destination import Destination, unit_points
 from magrl.tracking.forecast import covariance_after
+from magrl.tracking.way import DestinationPosterior
 
 # Chosen on random planets.
-TRIP_KM = 800.0
-"""Path before the decision [km]: another kilometer has to make a right declaration about 1/800 more likely."""
-STEP_KM = 0.5
-"""Path that a reading costs [km]."""
 STOPS = (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 0.8)
 """Distances from the estimated place to which a vehicle may come to read, as shares of the radius."""
 SHORT = 0.25
@@ -27,6 +24,25 @@ TURN_DEG = 90.0
 """Turn before each further reading there, so that errors which turn with the vehicle, such as iron, average out."""
 READINGS = (1, 2, 4, 8, 16, 32)
 """Numbers of further readings there that are compared with declaring now."""
+_NONE = 0.01  # readings, for a forecast without one
+
+
+class Trip(NamedTuple):
+    """What a decision knows of the path, its steps and their price.
+
+    Attributes:
+        path: ``(...)`` flown [km].
+        home: ``(..., 2)`` displacement from the start, northward and eastward [km].
+        steps_left: ``(...)`` number of steps that are left after this one.
+        price: ``(...)`` price of a step [% of SPL].
+        max_move_km: longest move.
+    """
+
+    path: Tensor
+    home: Tensor
+    steps_left: Tensor
+    price: Tensor | float
+    max_move_km: float
 
 
 class ArrivalDecision(NamedTuple):
@@ -51,45 +67,61 @@ class ArrivalDecision(NamedTuple):
 
 
 def arrival_decision(
-    goal: Destination, posterior: DestinationPosterior, errors: SensorStd, steps_left: Tensor, radius_km: float
+    goal: Destination, posterior: DestinationPosterior, errors: SensorStd, trip: Trip, radius_km: float
 ) -> ArrivalDecision:
     """Return whether to declare that the destination is within a radius, or where to stop and read on.
 
-    It compares the probability of being right now with that after a way toward the estimated place, to one of
-    :data:`STOPS` before it, and 1 to 32 readings there, times the share of the path that remains useful: a path of
-    :data:`TRIP_KM` over itself, the way and :data:`STEP_KM` for each reading. Readings do not reduce the errors that
-    are constant. Without steps left, going on is worth nothing.
+    It compares what is expected of a declaration now and later, as SPL less the price of the steps, both over the SPL
+    of an arrival now. Later is after a way toward the estimated place, to one of :data:`STOPS` before it, and 1 to 32
+    readings there. Readings do not reduce the errors that are constant. Without steps left, going on is worth nothing.
+
+    The posterior has tails that a normal forecast of it has not. Within the radius, forecasts are reduced by half of
+    what the same forecast without any reading is above the probability now; the other half is what readings resolve.
 
     Args:
         goal: the destination as seen from the belief.
         posterior: its posterior.
         errors: accuracy of the readings, tensors ``(..., 3)``.
-        steps_left: ``(...)`` number of steps that are left after this one.
+        trip: path, steps and their price.
         radius_km: distance from the destination within which a declaration is right [km].
 
     Example:
         >>> from magrl.tracking import destination, posterior, start
         >>> here, errors = torch.tensor([8.0, -16.0, 35000.0]), SensorStd(torch.tensor([0.02, 0.02, 2.0]))
         >>> goal = destination(start(here, errors), here, range_km=300.0)
-        >>> decision = arrival_decision(goal, posterior(goal), errors, torch.tensor(9), radius_km=25.0)
-        >>> decision.probability > 0.8
+        >>> trip = Trip(torch.tensor(400.0), torch.tensor([400.0, 0.0]), torch.tensor(9), 0.5, 50.0)
+        >>> arrival_decision(goal, posterior(goal), errors, trip, radius_km=25.0).probability > 0.8
         tensor(True)
     """
     check_number(0, above=True, radius_km=radius_km)
     probability, way = posterior.within(radius_km), posterior.aim(radius_km).to(goal.field)
-    readings = torch.tensor(READINGS).to(way)
+    counts = torch.tensor((_NONE, *READINGS)).to(way)
+    readings = counts[1:]
     distance, stops = way.norm(dim=-1, keepdim=True), radius_km * torch.tensor(STOPS).to(way)
-    place = way.unsqueeze(-2).expand(*way.shape[:-1], len(READINGS), 2)
-    covariance = covariance_after(goal, way, place, errors, readings)
+    place = way.unsqueeze(-2).expand(*way.shape[:-1], len(counts), 2)
+    covariance = covariance_after(goal, way, place, errors, counts).float()
     apart = way.unsqueeze(-2) * (stops / distance.clamp_min(1e-6)).unsqueeze(-1)
-    later = _within(covariance.float(), apart.float(), radius_km).to(way)  # (..., K, J)
-    possible = (readings <= steps_left.unsqueeze(-1)).unsqueeze(-1) & (stops <= distance).unsqueeze(-2)
+    now = _within(covariance[..., :1, :, :], way.unsqueeze(-2).float(), radius_km).to(way)[..., 0, 0]
+    later = _within(covariance[..., 1:, :, :], apart.float(), radius_km).to(way)  # (..., K, J)
+    tails = (1 + (probability / now.clamp_min(1e-6)).clamp_max(1)) / 2
+    later = later * torch.where(distance[..., 0] < radius_km, tails, 1.0)[..., None, None]
+    possible = (readings <= trip.steps_left.unsqueeze(-1)).unsqueeze(-1) & (stops <= distance).unsqueeze(-2)
     later = later.where(possible, 0.0)
-    cost = (distance - stops).unsqueeze(-2) + STEP_KM * readings.unsqueeze(-1)
-    worth, best = (later * (TRIP_KM / (TRIP_KM + cost))).flatten(-2).max(-1)
+    worth, best = (later * _efficiency(trip, way, distance - stops, readings)).flatten(-2).max(-1)
     attainable = torch.maximum(probability, later.flatten(-2).amax(-1))
     stop_km = stops[best % len(STOPS)].clamp_min(SHORT * radius_km)
     return ArrivalDecision(probability, worth, attainable, way, stop_km)
+
+
+def _efficiency(trip: Trip, way: Tensor, further: Tensor, readings: Tensor) -> Tensor:
+    """Return the SPL of an arrival after a further way ``(..., J)`` [km] and readings ``(K,)``, less the price of the
+    steps, over the SPL of an arrival now: ``(..., K, J)``."""
+    straight = (trip.home.to(way) + way).norm(dim=-1).clamp_min(1.0)
+    path = torch.maximum(trip.path.to(way), straight)
+    share = path.unsqueeze(-1) / torch.maximum(trip.path.unsqueeze(-1).to(way) + further, straight.unsqueeze(-1))
+    steps = readings.unsqueeze(-1) + (further / trip.max_move_km).unsqueeze(-2)
+    price = torch.as_tensor(trip.price).to(way) / 100 * (path / straight)
+    return share.unsqueeze(-2) - price[..., None, None] * steps
 
 
 def approach(

@@ -20,149 +20,43 @@ from torch import Tensor
 
 from magrl.checks import check_number, check_tensor
 from magrl.field.elements import field_vector
-from magrl.tracking.belief import COEFFICIENTS, MODEL_NT, Belief, radii
-from magrl.tracking.harmonics import RADIUS, UNIT_KM, Arc, arc, constant, field_rows, powers, turning
-from magrl.tracking.prior import DEGREE, HIGHEST, closure
+from magrl.geodesy import geodesic
+from magrl.sensor_std import PERFECT, SensorStd
+from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief
+from magrl.tracking.harmonics import UNIT_KM, constant, powers, turning
+from magrl.tracking.local import COEFFICIENTS, inverse3, levers, monomial_rows, unturned
+from magrl.tracking.prior import DEGREE, HIGHEST, closure, lasting_covariances
+from magrl.tracking.way import DestinationPosterior, Way
 
 RANGE_KM = 400.0
 """Default of the prior standard deviation of the way along each axis [km]."""
-_AT_ONCE = 13  # moves whose distances to all points are held at once
-_CANDIDATES = 16  # points among which that with most mass around it is chosen
 _NEAR_KM, _FAR_KM = 4.0, 2000.0  # distances between which the points around the vehicle thin out; none is farther
+_ELSEWHERE_LOG = -39.0  # its log density: e^-7, over the volume of all fields on the Earth [nT^3]
+_SLACK_NT = 100.0  # deviation of the field at the mode within which a destination is in reach
 _SPREAD = 1.5  # standard deviations of the points around the mode, over those of the mode
 _LEAST_NT = 1.0  # horizontal field whose direction is north
 _LEAST_KM = 0.1  # standard deviation of the points around the mode
 _LEAST_WEIGHT = 1e-12  # below, products of weights would be denormal numbers, which are slow
-_TERMS = 5  # degree of the polynomials for the field there: 1.6 nT of error at 1000 km, 0.1 at 700
 _STEPS = 5  # of the search for the mode
+_CRUST = 0.1  # correlation length of the crust's field [unit]
 _DIFFERENCE_KM = 1.0  # of the derivatives of the predicted field there
-
-
-class Way(NamedTuple):
-    """Displacement ``(..., 2)`` northward and eastward [km] and its covariance ``(..., 2, 2)`` [km^2].
-
-    Example:
-        >>> Way(torch.zeros(2), torch.eye(2)).displacement
-        tensor([0., 0.])
-    """
-
-    displacement: Tensor
-    covariance: Tensor
-
-    def axes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the standard deviations [km] along the long axis of the ellipse and across it, and the direction of
-        the long axis [deg, clockwise from north, 0 to 180], each ``(...)``.
-
-        Where two elements do not determine a place, the way is known across a line, and not along it.
-
-        Example:
-            >>> Way(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).axes()
-            (tensor(30.), tensor(10.), tensor(90.))
-        """
-        (nn, ne), (_, ee) = (row.unbind(-1) for row in self.covariance.unbind(-2))
-        middle, half = (nn + ee) / 2, torch.hypot((nn - ee) / 2, ne)
-        bearing = torch.rad2deg(torch.atan2(2 * ne, nn - ee)) / 2
-        return (middle + half).sqrt(), (middle - half).clamp_min(0).sqrt(), bearing.remainder(180)
-
-    def ellipse(self) -> str:
-        """Return the axes of one way as text.
-
-        Example:
-            >>> Way(torch.zeros(2), torch.tensor([[100.0, 0.0], [0.0, 900.0]])).ellipse()
-            '± 10 km across, ± 30 km along 090°'
-        """
-        along, across, bearing = (axis.item() for axis in self.axes())
-        return f"± {across:.0f} km across, ± {along:.0f} km along {bearing:03.0f}°"
-
-
-class DestinationPosterior(NamedTuple):
-    """Displacements ``(..., M, 2)`` northward and eastward [km] and their probabilities ``(..., M)``.
-
-    Example:
-        >>> posterior = DestinationPosterior(torch.tensor([[0.0, 10.0], [0.0, 30.0]]), torch.tensor([0.25, 0.75]))
-        >>> posterior.way().displacement, posterior.within(25.0)
-        (tensor([ 0., 25.]), tensor(0.2500))
-    """
-
-    points: Tensor
-    weights: Tensor
-
-    def way(self) -> Way:
-        """Return the mean and the covariance."""
-        mean = (self.points * self.weights.unsqueeze(-1)).sum(-2)
-        apart = self.points - mean.unsqueeze(-2)
-        return Way(mean, (apart * self.weights.unsqueeze(-1)).mT @ apart)
-
-    def aim(self, radius_km: float) -> Tensor:
-        """Return the displacement to aim at ``(..., 2)`` [km]: the mean, or, where that is within a radius of the
-        vehicle, the point that holds most probability within the radius.
-
-        Between two maxima the mean may be where the vehicle is, and no move makes progress.
-
-        Example:
-            >>> points = torch.tensor([[0.0, 40.0], [0.0, -40.0], [0.0, -42.0]])
-            >>> DestinationPosterior(points, torch.tensor([0.5, 0.25, 0.25])).aim(25.0)
-            tensor([ 0., 40.])
-        """
-        mean = (self.points * self.weights.unsqueeze(-1)).sum(-2)
-        likely = self.weights.topk(min(_CANDIDATES, self.weights.shape[-1]), -1).indices
-        centers = self.points.gather(-2, likely.unsqueeze(-1).expand(*likely.shape, 2))
-        mass = ((self._squares(centers) <= radius_km**2).to(self.weights) @ self.weights.unsqueeze(-1)).squeeze(-1)
-        best = mass.argmax(-1, keepdim=True).unsqueeze(-1)
-        center = centers.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
-        return torch.where(mean.norm(dim=-1, keepdim=True) > radius_km, mean, center)
-
-    def mean_distance(self, moves: Tensor) -> Tensor:
-        """Return the mean distances ``(..., K)`` [km] of the place after moves ``(..., K, 2)`` [km], as float32.
-
-        Example:
-            >>> posterior = DestinationPosterior(torch.tensor([[30.0, 0.0], [0.0, 40.0]]), torch.tensor([0.5, 0.5]))
-            >>> posterior.mean_distance(torch.tensor([[0.0, 0.0], [30.0, 0.0]])).round()
-            tensor([35., 25.])
-        """
-        weights = self.weights.float().unsqueeze(-1)
-        parts = [(self._squares(some).sqrt_() @ weights).squeeze(-1) for some in moves.split(_AT_ONCE, -2)]
-        return torch.cat(parts, -1)
-
-    def _squares(self, moves: Tensor) -> Tensor:
-        """Return the squared distances ``(..., K, M)`` of the points after moves, as one matrix product [km^2]."""
-        points, moves = self.points.float(), moves.float()
-        # 0.01 km^2 is for the rounding
-        left = torch.cat((moves, moves.square().sum(-1, keepdim=True) + 0.01, torch.ones_like(moves[..., :1])), -1)
-        right = torch.cat((-2 * points, torch.ones_like(points[..., :1]), points.square().sum(-1, keepdim=True)), -1)
-        return left @ right.mT
-
-    def within(self, radius_km: float) -> Tensor:
-        """Return the probability ``(...)`` that the place is within a radius [km] of the vehicle."""
-        check_number(0, above=True, radius_km=radius_km)
-        return (self.weights * (self.points.norm(dim=-1) <= radius_km)).sum(-1)
-
-    def radius(self, probability: float) -> Tensor:
-        """Return the least radius ``(...)`` [km] around the vehicle that holds the place with a probability.
-
-        Example:
-            >>> points = torch.tensor([[0.0, 30.0], [0.0, 10.0]])
-            >>> DestinationPosterior(points, torch.tensor([0.25, 0.75])).radius(0.7)
-            tensor(10.)
-        """
-        check_number(0, 1, probability=probability)
-        distance, order = self.points.norm(dim=-1).sort(-1)
-        held = self.weights.gather(-1, order).cumsum(-1)
-        first = (held < probability).sum(-1, keepdim=True).clamp_max(held.shape[-1] - 1)
-        return distance.gather(-1, first).squeeze(-1)
 
 
 class Destination(NamedTuple):
     """A destination as seen from a belief, in units of 1000 km and nT.
 
     Attributes:
-        belief: what is known of the field.
+        belief: what is known of the field; where the crust has one, the share of the anomaly that the destination has,
+            too, is part of the field.
         field: ``(..., 3)`` at the destination, in the axes there.
         range: prior standard deviation of the displacement along each axis.
         noise: variance of the field in each axis that the belief does not know.
+        crust: standard deviation of the crust's field in each axis.
+        share: ``(..., 3, 3)`` of the anomaly that is crust; None without a crust.
+        between: displacement between the places of vehicle and destination, where both are known.
 
     Example:
-        >>> Destination._fields
+        >>> Destination._fields[:4]
         ('belief', 'field', 'range', 'noise')
     """
 
@@ -170,9 +64,28 @@ class Destination(NamedTuple):
     field: Tensor
     range: float
     noise: float
+    crust: float = 0.0
+    share: Tensor | None = None
+    between: Way | None = None
+
+    def noise_at(self, square: Tensor) -> Tensor:
+        """Return the variance of the field in each axis that the belief does not know, at squared distances [unit^2].
+
+        The crust's field there differs from that here by ``2 (1 - rho)`` of its variance, with the correlation ``rho =
+        exp(-d^2 / (2 * (100 km)^2))`` of WMMHR.
+        """
+        return self.noise + 2 * self.crust**2 * (1 - torch.exp(-square / (2 * _CRUST**2)))
 
 
-def destination(belief: Belief, elements: Tensor, range_km: float, crust_nt: float = 0.0) -> Destination:
+def destination(
+    belief: Belief,
+    elements: Tensor,
+    range_km: float,
+    crust_nt: float = 0.0,
+    errors: SensorStd = PERFECT,
+    place: Tensor | None = None,
+    place_km: float = 0.0,
+) -> Destination:
     """Return the destination where the field has given elements.
 
     Args:
@@ -180,9 +93,12 @@ def destination(belief: Belief, elements: Tensor, range_km: float, crust_nt: flo
         elements: ``(..., 3)``: D [deg], I [deg], B_H [nT] at the destination.
         range_km: prior standard deviation of the way along each axis [km].
         crust_nt: standard deviation of the crust's field in each axis [nT].
+        errors: accuracy of the readings, tensors ``(..., 3)``.
+        place: ``(..., 2)`` latitude, longitude [deg] of the destination, where that is known and the vehicle knows its
+            own; the elements then do not count, as they would add the error of the model from which they are.
+        place_km: its root mean square error [km].
 
     Example:
-        >>> from magrl.sensor_std import SensorStd
         >>> from magrl.tracking.belief import start
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd())
         >>> destination(belief, torch.tensor([3.0, 66.0, 17500.0]), 300.0).noise
@@ -190,7 +106,19 @@ def destination(belief: Belief, elements: Tensor, range_km: float, crust_nt: flo
     """
     check_tensor(3, elements=elements)
     check_number(0, above=True, range_km=range_km)
-    return Destination(belief, field_vector(elements.double()), range_km / UNIT_KM, MODEL_NT**2 + crust_nt**2)
+    share, between = None, None
+    if place is not None:
+        distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
+        apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
+        between = Way(apart, belief.covariance[..., PLACE, PLACE] + torch.eye(2).to(apart) * (place_km**2 / 2))
+    elif crust_nt > 0:
+        share = crust_nt**2 * inverse3(lasting_covariances(belief.field, errors, crust_nt)[1])
+        step = torch.diag_embed(torch.ones_like(belief.mean))
+        step[..., :3, ANOMALY] = share
+        mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
+        belief = Belief(mean, step @ belief.covariance @ step.mT, belief.place)
+    field = field_vector(elements.double())
+    return Destination(belief, field, range_km / UNIT_KM, MODEL_NT**2, crust_nt, share, between)
 
 
 def log_density(goal: Destination, points: Tensor) -> Tensor:
@@ -267,6 +195,8 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
         >>> posterior(there).way().displacement.round(decimals=-1)
         tensor([ 30., -10.])
     """
+    if goal.between is not None:
+        return _normal(goal.between, count)
     way = mode(goal)
     distance = way.displacement.norm(dim=-1, keepdim=True)
     ahead = torch.tensor([1.0, 0.0]).to(distance)
@@ -276,30 +206,32 @@ def posterior(goal: Destination, count: int = 256) -> DestinationPosterior:
     parts = (near, _moments(goal.belief, near)), (around, _moments_around(goal.belief, heading, count))
     logarithms = [_log_density(goal, *part) for part in parts]
     far = points.norm(dim=-1) > _FAR_KM  # where the polynomials do not hold
-    weights = torch.softmax((torch.cat(logarithms, -1) - density.log()).masked_fill(far, -torch.inf), -1)
-    return DestinationPosterior(points, weights.where(weights > _LEAST_WEIGHT, 0.0))
+    mass = (torch.cat(logarithms, -1) - density.log()).masked_fill(far, -torch.inf)
+    weights = torch.softmax(mass, -1)
+    volume = math.log(2 * math.pi * (goal.range * UNIT_KM) ** 2) + 1.5 * math.log(2 * math.pi)  # of prior and field
+    reached = torch.sigmoid(torch.logsumexp(mass, -1) - volume - _ELSEWHERE_LOG)
+    place = (way.displacement / UNIT_KM).unsqueeze(-2)
+    miss = _covariance(goal, place, _moments(goal.belief, place))[0].squeeze(-1).norm(dim=-1)
+    reached = torch.where(miss < _SLACK_NT, 1.0, reached)  # crust and sensors deviate by so much, too
+    return DestinationPosterior(points, weights.where(weights > _LEAST_WEIGHT, 0.0), reached)
 
 
-def inverse2(matrix: Tensor) -> Tensor:
-    """Return the inverses of symmetric matrices ``(..., 2, 2)``.
-
-    Example:
-        >>> inverse2(torch.diag(torch.tensor([2.0, 4.0]))).diagonal()
-        tensor([0.5000, 0.2500])
-    """
-    nn, ne, ee = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-    return (torch.stack((ee, -ne, -ne, nn), -1) / (nn * ee - ne * ne).unsqueeze(-1)).unflatten(-1, (2, 2))
-
-
-def _levers(points: Tensor) -> Tensor:
-    """Return the field at displacements [unit] as rows ``(..., M, 3, K)`` on the coefficients."""
-    rows = _rows(_TERMS).to(points)  # (J, 3, K)
-    return (powers(points, _TERMS) @ rows.flatten(1)).unflatten(-1, (3, COEFFICIENTS))
+def _normal(way: Way, count: int) -> DestinationPosterior:
+    """Return points of a normal distribution, of equal weights."""
+    points = unit_points(4 * count)[0].to(way.displacement)
+    first = way.covariance[..., 0, 0].clamp_min(_LEAST_KM**2).sqrt()
+    below = way.covariance[..., 0, 1] / first
+    second = (way.covariance[..., 1, 1] - below * below).clamp_min(_LEAST_KM**2).sqrt()
+    x, y = points.unbind(-1)
+    apart = torch.stack((first.unsqueeze(-1) * x, below.unsqueeze(-1) * x + second.unsqueeze(-1) * y), -1)
+    apart = apart - apart.mean(-2, keepdim=True)
+    places = (way.displacement.unsqueeze(-2) + apart).float()
+    return DestinationPosterior(places, torch.full_like(places[..., 0], 1 / count), torch.ones_like(places[..., 0, 0]))
 
 
 def _with_latitude(levers: Tensor, field: Tensor, slope: Tensor) -> Tensor:
     """Return rows with the effect of the latitude's offset, which turns a field ``(..., M, 3)`` by ``slope`` for each
-    radian."""
+    kilometer."""
     x, y, _ = field.unbind(-1)
     return torch.cat((levers, torch.stack((-slope * y, slope * x, torch.zeros_like(x)), -1).unsqueeze(-1)), -1)
 
@@ -320,7 +252,7 @@ _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric ma
 
 def _moments(belief: Belief, points: Tensor) -> _Moments:
     """Return the moments at displacements ``(..., M, 2)`` [unit], in their dtype."""
-    lever, state = _levers(points), _state(belief).to(points)
+    lever, state = levers(points), _state(belief).to(points)
     spread = (lever.flatten(-3, -2) @ state).unflatten(-2, (-1, 3))  # (..., M, 3, K + 2)
     mean, cross = spread[..., -2:].permute(*range(points.ndim - 2), -1, -2, -3).unbind(-3)
     product = spread[..., :-2] @ lever.mT
@@ -347,17 +279,11 @@ def _state(belief: Belief) -> Tensor:
 
 
 @constant
-def _rows(terms: int) -> Tensor:
-    """Return the field at a displacement ``(J, 3, K)`` for each of its monomials."""
-    return field_rows(HIGHEST, terms) @ closure().extend
-
-
-@constant
 def _around(count: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return the field at the points around the vehicle: its rows ``(K, 3 M)``, and for its covariance those of the
     upper triangle of the coefficients' covariance ``(K (K + 1) / 2, 6 M)``, and where these are in it, flattened."""
     points = unit_points(count)[1] / UNIT_KM
-    lever = torch.tensordot(powers(points, HIGHEST), _rows(HIGHEST), 1)  # (M, 3, K)
+    lever = torch.tensordot(powers(points, HIGHEST), monomial_rows(HIGHEST), 1)  # (M, 3, K)
     first, second = torch.triu_indices(COEFFICIENTS, COEFFICIENTS)
     rows = []
     for i, j in _ENTRIES:
@@ -379,8 +305,8 @@ def _covariance(goal: Destination, points: Tensor, moments: _Moments) -> tuple[T
     """Return the destination's field minus the predicted one ``(..., 3, M)`` in the axes of the moments, and the six
     entries of its covariance ``(..., M)``.
 
-    To the moments it adds the latitude's offset, which turns the field by ``slope`` for each radian, the field that is
-    left out, and what the belief does not know.
+    To the moments it adds the latitude's offset, which turns the field by ``slope`` for each kilometer, the field that
+    is left out, and what the belief does not know.
     """
     target, slope = _carried(goal, points, moments.heading)
     (x, y, _), (cx, cy, cz) = moments.mean.unbind(-2), moments.cross.unbind(-2)
@@ -390,7 +316,7 @@ def _covariance(goal: Destination, points: Tensor, moments: _Moments) -> tuple[T
     )
     x, y = -slope * y, slope * x  # derivatives of the field with respect to the latitude
     residual = target - moments.mean - torch.stack((x * offset, y * offset, torch.zeros_like(x)), -2)
-    apart = points.square().sum(-1) ** DEGREE * closure().left_out_nt ** 2 + goal.noise
+    apart = points.square().sum(-1) ** DEGREE * closure().left_out_nt ** 2 + goal.noise_at(points.square().sum(-1))
     xx, xy, xz, yy, yz, zz = moments.entries
     xx, xz = xx + 2 * x * cx + x * x * variance + apart, xz + x * cz
     xy, yy, yz = xy + x * cy + y * cx + x * y * variance, yy + 2 * y * cy + y * y * variance + apart, yz + y * cz
@@ -420,26 +346,14 @@ def _without_declination(
 def _carried(goal: Destination, points: Tensor, heading: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return the destination's field in the axes that are carried from the vehicle ``(..., 3, M)``, turned so that
     the heading is their first, and the derivative of the angle of the meridians with respect to the latitude
-    ``(..., M)``.
+    ``(..., M)`` [rad/km].
     """
-    (along, across, slope, *_), n, e = _meridians(goal.belief, points)
-    north, east = points.unbind(-1)
-    x, y, z = (part.unsqueeze(-1) for part in goal.field.to(points).unbind(-1))
-    x, y = x * along + y * across, y * along - x * across
-    tilt_n, tilt_e = n - north / RADIUS, e - east / RADIUS  # of the vertical, more than on the sphere
-    x, y, z = x - tilt_n * z, y - tilt_e * z, z + tilt_n * x + tilt_e * y
+    field = goal.field.to(points).unsqueeze(-2)
+    (x, y, z), slope = unturned(field, goal.belief.latitude, points)
     if heading is not None:
         cos, sin = heading.unsqueeze(-2).unbind(-1)
         x, y = x * cos + y * sin, y * cos - x * sin
     return torch.stack((x, y, z), -2), slope
-
-
-def _meridians(belief: Belief, points: Tensor) -> tuple[Arc, Tensor, Tensor]:
-    """Return the great circles to displacements ``(..., M, 2)`` [unit], and their angles northward and eastward."""
-    radius = (radius.to(points).unsqueeze(-1) / UNIT_KM for radius in radii(belief.latitude))
-    n, e = (part / length for part, length in zip(points.unbind(-1), radius, strict=True))
-    latitude = torch.deg2rad(belief.latitude).to(points).unsqueeze(-1)
-    return arc(torch.sin(latitude), torch.cos(latitude), n, e), n, e
 
 
 def _inverse(entries: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:

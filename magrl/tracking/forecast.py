@@ -9,22 +9,12 @@ from torch import Tensor
 
 from magrl.field.elements import elements_jacobian
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import COEFFICIENTS, LASTING_KM, lasting_covariances
-from magrl.tracking.destination import (
-    _DIFFERENCE_KM,
-    _ENTRIES,
-    _TERMS,
-    Destination,
-    _carried,
-    _inverse,
-    _levers,
-    _meridians,
-    _rows,
-    _with_latitude,
-    inverse2,
-)
+from magrl.tracking.belief import ANOMALY_KM, DRIFT, PLACE
+from magrl.tracking.destination import _DIFFERENCE_KM, _ENTRIES, Destination, _carried, _inverse, _with_latitude
 from magrl.tracking.harmonics import UNIT_KM, powers, turning
-from magrl.tracking.prior import DEGREE, closure
+from magrl.tracking.local import COEFFICIENTS, TERMS, inverse2, inverse3, levers, monomial_rows, slopes, unturned
+from magrl.tracking.prior import DEGREE, closure, lasting_covariances
+from magrl.tracking.way import Way
 
 
 def covariance_after(
@@ -51,11 +41,13 @@ def covariance_after(
         >>> covariance_after(goal, torch.tensor([90.0, 0.0]), moves, errors).shape
         torch.Size([2, 2, 2])
     """
+    if goal.between is not None:
+        return _between_after(goal, goal.between, moves.to(goal.field) / UNIT_KM, errors, readings)
     belief, place, moves = goal.belief, place.to(goal.field) / UNIT_KM, moves.to(goal.field) / UNIT_KM
     eye, apart = torch.eye(3).to(place), _DIFFERENCE_KM / UNIT_KM
     corners = place.unsqueeze(-2) + torch.cat((torch.zeros(1, 2), torch.eye(2))).to(place) * apart
     target, slope = _carried(goal, corners)
-    at_place = _with_latitude(_levers(corners), target.mT, slope)  # (..., 3, 3, K + 1)
+    at_place = _with_latitude(levers(corners), target.mT, slope)  # (..., 3, 3, K + 1)
     residual = target.mT - (at_place @ belief.mean[..., None, : COEFFICIENTS + 1, None]).squeeze(-1)
     at_place, residual = _comparable(goal, at_place, residual)
     value, derivatives = at_place[..., 0, :, :], (at_place[..., 1:, :, :] - at_place[..., :1, :, :]) / apart
@@ -69,7 +61,8 @@ def covariance_after(
     total = _entries_first(reading @ spread.unflatten(-1, (-1, 3)).movedim(-2, -3) + noise)
     gain = _product(shared, _inverse_entries(total))
     now = value @ covariance[..., :state, :state] @ value.mT
-    left = (place.unsqueeze(-2) - moves).square().sum(-1) ** DEGREE * closure().left_out_nt ** 2 + goal.noise
+    square = (place.unsqueeze(-2) - moves).square().sum(-1)
+    left = square**DEGREE * closure().left_out_nt ** 2 + goal.noise_at(square)
     after = _entries_first(now.unsqueeze(-3) + left[..., None, None] * eye) - _product(gain[:3], shared[:3])
     weight = _inverse_entries(after)
     slopes = slopes.movedim(-1, 0).float().unsqueeze(-1)  # (6, ..., 1)
@@ -77,6 +70,21 @@ def covariance_after(
     blocks = squares[:3, :3], squares[:3, 3:], squares[3:, 3:]
     (nn, ne, ee), ridge = ((weight * block).sum((0, 1)) for block in blocks), goal.range**-2
     return inverse2(torch.stack((nn + ridge, ne, ne, ee + ridge), -1).unflatten(-1, (2, 2)).to(place)) * UNIT_KM**2
+
+
+def _between_after(
+    goal: Destination, between: Way, moves: Tensor, errors: SensorStd, readings: Tensor | float
+) -> Tensor:
+    """Return :func:`covariance_after` where the displacement is that between two known places: that of the place."""
+    reading, noise = _readings(goal, moves, errors, readings)
+    covariance = goal.belief.covariance.unsqueeze(-3)
+    far = moves.norm(dim=-1)[..., None, None] * UNIT_KM
+    cross = covariance[..., PLACE, :] + far * covariance[..., DRIFT, :]  # of the place after the move, (..., M, 2, S)
+    now = cross[..., PLACE] + far * cross[..., DRIFT]
+    target = between.covariance - goal.belief.covariance[..., PLACE, PLACE]
+    shared = cross @ reading.mT
+    total = reading @ covariance @ reading.mT + noise
+    return now - shared @ inverse3(total) @ shared.mT + target.unsqueeze(-3)
 
 
 def _comparable(goal: Destination, rows: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,23 +108,31 @@ def _readings(goal: Destination, moves: Tensor, errors: SensorStd, readings: Ten
     noise = torch.as_tensor(errors.noise).to(moves)
     present = (noise < math.inf) & belief.measured
     jacobian = torch.where(present.unsqueeze(-1), elements_jacobian(belief.field), 0.0).unsqueeze(-3).to(moves)
-    terms, monomials = _rows(_TERMS).to(moves), powers(moves, _TERMS)
+    terms, monomials = monomial_rows(TERMS).to(moves), powers(moves, TERMS)
     field = monomials @ (terms @ mean).squeeze(-1)  # (..., M, 3)
-    levers = (monomials @ (jacobian @ terms).flatten(-2)).unflatten(-1, (3, COEFFICIENTS))  # on the elements
-    x, y, slope = field[..., 0], field[..., 1], _meridians(belief, moves)[0].slope.unsqueeze(-1)
+    rows = (monomials @ (jacobian @ terms).flatten(-2)).unflatten(-1, (3, COEFFICIENTS))  # on the elements
+    x, y, slope = (
+        field[..., 0],
+        field[..., 1],
+        unturned(torch.zeros(3).to(moves), belief.latitude, moves)[1].unsqueeze(-1),
+    )
     turned = (torch.stack((-y, x), -1) @ jacobian[..., 0, :, :2].mT) * slope  # by the offset of the latitude
-    rows = torch.cat((levers, turned.unsqueeze(-1)), -1)
-    distance, count = moves.norm(dim=-1), torch.as_tensor(readings).to(rows)
-    kept = torch.exp(-distance * (UNIT_KM / LASTING_KM)).unsqueeze(-1)
+    distance, count = moves.norm(dim=-1), torch.as_tensor(readings).to(moves)
+    slope = slopes(belief.mean[..., :COEFFICIENTS], belief.place)[..., :3, :].to(moves).unsqueeze(-3)
+    drift = (jacobian @ slope) * (distance * UNIT_KM)[..., None, None]
+    kept = torch.exp(-distance * (UNIT_KM / ANOMALY_KM))[..., None, None]
+    anomaly = kept * jacobian
+    if goal.share is not None:  # is part of the field
+        anomaly = anomaly - rows[..., :3] @ goal.share.to(moves).unsqueeze(-3)
     own = torch.diag_embed(present.to(rows)).unsqueeze(-3).expand(*rows.shape[:-1], 3)
     ahead = moves / (distance * count).clamp_min(1e-9).unsqueeze(-1)  # readings turn with the vehicle between them
     iron = jacobian @ turning(ahead[..., 0], ahead[..., 1], 1)
-    white = torch.where(present, noise, 1.0).square().unsqueeze(-2)
-    white = white / count.unsqueeze(-1)
-    slow = lasting_covariances(belief.field, errors)[1].to(moves).unsqueeze(-3)
-    fresh = (1 - kept.square()).unsqueeze(-1) * (own @ slow @ own)  # a missing element has none
+    white = torch.where(present, noise, 1.0).square().unsqueeze(-2) / count.unsqueeze(-1)
+    new = lasting_covariances(belief.field, errors, goal.crust)[1].to(moves).unsqueeze(-3)
+    fresh = (1 - kept.square()) * (jacobian @ new @ jacobian.mT)  # a missing element has none
     noise = torch.diag_embed(white) + fresh + goal.noise * jacobian @ jacobian.mT
-    return torch.cat((rows, own, kept.unsqueeze(-1) * own, iron), -1), noise
+    place = torch.stack((turned, torch.zeros_like(turned)), -1)
+    return torch.cat((rows, place, drift, own, anomaly, iron), -1), noise
 
 
 def _entries_first(matrix: Tensor) -> Tensor:

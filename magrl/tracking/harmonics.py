@@ -29,6 +29,7 @@ from typing import NamedTuple, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
 from magrl.geodesy import REFERENCE_RADIUS_KM
 
@@ -55,7 +56,8 @@ def constant(function: Callable[P, T]) -> Callable[P, T]:
     @torch.compiler.assume_constant_result
     @wraps(function)
     def value(*args: P.args, **options: P.kwargs) -> T:
-        return cached(*args, **options)
+        with _disable_current_modes():  # a number and not a part of the graph, where a trace asks first
+            return cached(*args, **options)
 
     return value
 

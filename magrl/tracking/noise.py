@@ -24,6 +24,12 @@ LARGEST_RATIO = 64.0
 """Largest ratio of the variances: with the dead band, the standard deviation is scaled by at most 6.5."""
 
 
+SPIKES = 0.015
+"""Share of elements of readings that are spikes, in advance."""
+SPIKE_FACTOR = 10.0
+"""Noise of a spike over the stated one."""
+
+
 class NoiseEstimate(NamedTuple):
     """Logarithm ``(..., 3)`` of the variance of the noise over the stated one, and the effective number ``(..., 3)`` of
     readings from which it is known.
@@ -77,3 +83,29 @@ def noise_estimate(before: NoiseEstimate, new: Innovation, sensor_std: Tensor) -
     limit = math.log(LARGEST_RATIO)
     log_ratio = before.log_ratio + score / (SHEET_READINGS + readings)
     return NoiseEstimate(log_ratio.clamp(-limit, limit), readings)
+
+
+def spike_factor(new: Innovation, sensor_std: Tensor) -> Tensor:
+    """Return by which factor ``(..., 3)`` of the noise an element of a reading counts, 1 to :data:`SPIKE_FACTOR`.
+
+    A reading is normal, or with the probability :data:`SPIKES` a spike; its precision is the mean of both given its
+    innovation, as of a likelihood with tails.
+
+    Args:
+        new: innovation of the reading with its noise.
+        sensor_std: ``(..., 3)`` that noise.
+
+    Example:
+        >>> std = torch.tensor([0.1, 0.1, 10.0])
+        >>> new = Innovation(torch.tensor([0.1, 0.3, 100.0]), torch.zeros(3, 28), torch.diag(std.square()))
+        >>> spike_factor(new, std).round(decimals=1)
+        tensor([ 1.0000,  1.1000, 10.0000])
+    """
+    total = new.covariance.diagonal(dim1=-2, dim2=-1)
+    noise = sensor_std.to(total).square()
+    noise = torch.where(noise < math.inf, noise, 0.0)
+    wide = total + (SPIKE_FACTOR**2 - 1) * noise
+    square = new.residual.square()
+    odds = math.log(SPIKES / (1 - SPIKES)) + (torch.log(total / wide) + square / total - square / wide) / 2
+    spike = torch.sigmoid(odds) * (noise > 0)
+    return (1 - spike + spike / SPIKE_FACTOR**2).rsqrt()

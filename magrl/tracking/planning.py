@@ -9,8 +9,9 @@ from torch import Tensor
 
 from magrl.checks import check_tensor
 from magrl.sensor_std import SensorStd
-from magrl.tracking.destination import Destination, DestinationPosterior
+from magrl.tracking.destination import Destination
 from magrl.tracking.forecast import covariance_after
+from magrl.tracking.way import DestinationPosterior
 
 CAUTION = 0.3
 """Weight of the uncertainty of the way after a reading; this and :data:`LENGTHS` are from scans on random planets

@@ -17,7 +17,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from magrl.field.elements import elements_jacobian
 from magrl.field.planets import gauss_moments
+from magrl.sensor_std import SensorStd
 from magrl.tracking.harmonics import RADIUS, constant, field_rows, generators, orders, size, turning
 
 DEGREE = 3
@@ -28,6 +30,8 @@ CELLS = 36
 """Number of cells of latitude. Their 5 degrees are less than what a first reading leaves of it (about 10)."""
 HIGHEST = 8
 """Highest degree that is expected from those of a belief; with 6, half as much more is left out at 1200 km."""
+LEAST_COS = 0.2
+"""Least cosine of the inclination in the downward part of an anomaly, which follows from the error of I."""
 _FOLLOWED = 10  # highest degree of the coefficients whose effect is counted as left out
 
 
@@ -119,12 +123,12 @@ def closure() -> Closure:
     return Closure(extend, drift, left_out)
 
 
-class LatitudeCells(NamedTuple):
-    """The prior in cells of latitude, given the field at the vehicle: constants for :func:`expected`.
+class Cells(NamedTuple):
+    """Places that a vehicle may be at, with the coefficients of the field there.
 
     Attributes:
-        latitude: ``(C,)`` middle of each cell [rad].
-        log_weight: ``(C,)`` logarithm of the share of the sphere, over the root of the determinant of the covariance.
+        latitude: ``(C,)`` [rad].
+        log_weight: ``(C,)`` logarithm of the probability, plus half of that of the determinant of ``precision``.
         mean: ``(C, K)`` of the coefficients.
         field_covariance: ``(C, 3, 3)`` of the field.
         precision: ``(C, 3, 3)`` inverse of that.
@@ -145,8 +149,24 @@ class LatitudeCells(NamedTuple):
     covariance: Tensor
 
 
+def cells(latitude: Tensor, weight: Tensor, mean: Tensor, joint: Tensor) -> Cells:
+    """Return cells of places.
+
+    Args:
+        latitude: ``(C,)`` [rad].
+        weight: ``(C,)`` probabilities, unnormalized.
+        mean: ``(C, K)`` of the coefficients.
+        joint: ``(C, K + 1, K + 1)`` covariance of the coefficients and the latitude [rad].
+    """
+    field = joint[:, :3, :3].clone()
+    precision = torch.linalg.inv(field).contiguous()
+    gain = joint[:, 3:, :3] @ precision
+    rest = joint[:, 3:, 3:] - gain @ joint[:, :3, 3:]
+    return Cells(latitude, torch.log(weight) + torch.logdet(precision) / 2, mean, field, precision, gain, rest)
+
+
 @constant
-def latitude_cells(angles: int = 1) -> LatitudeCells:
+def latitude_cells(angles: int = 1) -> Cells:
     """Return the prior in each cell of latitude.
 
     Args:
@@ -167,48 +187,94 @@ def latitude_cells(angles: int = 1) -> LatitudeCells:
     joint = local_covariance(variance, DEGREE) + axial_part
     joint = torch.nn.functional.pad(joint, (0, 1, 0, 1))
     joint[:, -1, -1] = (math.pi / CELLS) ** 2 / 12
-    field = joint[:, :3, :3].clone()
     around = 2 * math.pi * torch.arange(angles, dtype=torch.float64) / angles
     turn = turning(torch.cos(around), torch.sin(around), DEGREE)
     mean = (turn @ (axial * unit)[:, None, :, None]).squeeze(-1).flatten(0, 1)
     turn = torch.nn.functional.pad(turn, (0, 1, 0, 1))
     turn[:, -1, -1] = 1.0
     joint, latitude = (turn @ joint.unsqueeze(1) @ turn.mT).flatten(0, 1), latitude.repeat_interleave(angles)
-    field = joint[:, :3, :3].clone()
-    precision = torch.linalg.inv(field).contiguous()
-    gain = joint[:, 3:, :3] @ precision
-    rest = joint[:, 3:, 3:] - gain @ joint[:, :3, 3:]
-    log_weight = torch.log(torch.cos(latitude)) + torch.logdet(precision) / 2
-    return LatitudeCells(latitude, log_weight, mean, field, precision, gain, rest)
+    return cells(latitude, torch.cos(latitude), mean, joint)
 
 
-def expected(field: Tensor, angles: int = 1) -> tuple[Tensor, Tensor]:
+MOST_CELLS = 512
+"""Number of cells that are weighed by their whole likelihood: those nearest to the first reading."""
+
+
+def expected(field: Tensor, where: Cells) -> tuple[Tensor, Tensor]:
     """Return the prior around a first reading, whose own information is still to be added.
 
-    The cells of latitude, weighted by the likelihood of the field, are joined to one normal distribution with their
-    moments given that field. The field itself keeps the covariance that it has before the reading.
+    The cells, weighted by the likelihood of the field, are joined to one normal distribution with their moments given
+    that field. The field itself keeps the covariance that it has before the reading.
 
     Args:
         field: ``(..., 3)`` north, east, down [nT].
-        angles: as of :func:`latitude_cells`.
+        where: cells.
 
     Returns:
         Mean ``(..., K + 1)`` of the coefficients and the latitude [rad], and covariance ``(..., K + 1, K + 1)``.
 
     Example:
-        >>> mean, _ = expected(torch.tensor([15000.0, 0.0, 45000.0], dtype=torch.float64))
+        >>> mean, _ = expected(torch.tensor([15000.0, 0.0, 45000.0], dtype=torch.float64), latitude_cells())
         >>> round(math.degrees(mean[-1]))  # latitude
         47
     """
-    cells = LatitudeCells(*(x.to(field) for x in latitude_cells(angles)))
-    apart = field.unsqueeze(-2) - cells.mean[:, :3]  # (..., C, 3)
-    square = (apart.unsqueeze(-2) @ cells.precision @ apart.unsqueeze(-1)).squeeze((-2, -1))
-    weight = torch.softmax(cells.log_weight - square / 2, -1)
-    prior = torch.cat((cells.mean[:, 3:], cells.latitude.unsqueeze(-1)), -1)
-    means = prior + (cells.gain @ apart.unsqueeze(-1)).squeeze(-1)  # (..., C, K - 2), given the field
+    where = Cells(*(x.to(field) for x in where))
+    if len(where.mean) <= MOST_CELLS:
+        return _joined(field, where)
+    flat = field.reshape(-1, 3)
+    apart = flat.unsqueeze(1) - where.mean[:, :3]
+    square = ((apart.unsqueeze(-2) @ where.precision).squeeze(-2) * apart).sum(-1)
+    chosen = (where.log_weight - square / 2).topk(MOST_CELLS, -1).indices
+    parts = [_joined(point, Cells(*(x[rows] for x in where))) for point, rows in zip(flat, chosen, strict=True)]
+    mean, covariance = (torch.stack(part) for part in zip(*parts, strict=True))
+    return mean.reshape(*field.shape[:-1], -1), covariance.reshape(*field.shape[:-1], *covariance.shape[1:])
+
+
+def _joined(field: Tensor, where: Cells) -> tuple[Tensor, Tensor]:
+    """Return :func:`expected` of all cells."""
+    apart = field.unsqueeze(-2) - where.mean[:, :3]  # (..., C, 3)
+    square = (apart.unsqueeze(-2) @ where.precision @ apart.unsqueeze(-1)).squeeze((-2, -1))
+    weight = torch.softmax(where.log_weight - square / 2, -1)
+    prior = torch.cat((where.mean[:, 3:], where.latitude.unsqueeze(-1)), -1)
+    means = prior + (where.gain @ apart.unsqueeze(-1)).squeeze(-1)  # (..., C, K - 2), given the field
     mean = (weight.unsqueeze(-2) @ means).squeeze(-2)
     spread = (means - mean.unsqueeze(-2)) * weight.sqrt().unsqueeze(-1)
-    given, gain, wide = (torch.tensordot(weight, x, 1) for x in (cells.covariance, cells.gain, cells.field_covariance))
+    given, gain, wide = (torch.tensordot(weight, x, 1) for x in (where.covariance, where.gain, where.field_covariance))
     lever = torch.cat((torch.eye(3).to(field).expand(*gain.shape[:-2], 3, 3), gain), -2)
     rest = torch.nn.functional.pad(given + spread.mT @ spread, (3, 0, 3, 0))
     return torch.cat((field, mean), -1), lever @ wide @ lever.mT + rest
+
+
+def lasting_covariances(field: Tensor, errors: SensorStd, crust_nt: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the covariances ``(..., 3, 3)`` of constant errors of D, I [deg], B_H [nT], of the anomaly [nT^2], and of
+    iron along the vehicle's axes [nT^2].
+
+    The stated drift contains the effect of the iron on the elements, as a mean over the headings. What is left is the
+    effect of the anomaly, which has independent parts along magnetic north (that is the error of B_H), across it (B_H
+    times the error of D), and downward (what is left of the error of I), and the field of the crust in each axis.
+
+    Args:
+        field: ``(..., 3)`` north, east, down [nT].
+        errors: accuracy of the readings, tensors ``(..., 3)``.
+        crust_nt: standard deviation of the crust's field in each axis [nT].
+
+    Example:
+        >>> errors = SensorStd(bias=torch.tensor([0.5, 0.0, 0.0]), drift=torch.tensor([0.3, 0.0, 0.0]))
+        >>> lasting_covariances(torch.tensor([20000.0, 0.0, 30000.0]), errors)[0].diagonal()
+        tensor([0.1600, 0.0000, 0.0000], dtype=torch.float64)
+    """
+    bias, drift, iron = (torch.as_tensor(std).to(field.device, torch.float64).square() for std in errors[1:])
+    field = field.double()
+    bias = torch.where(bias < math.inf, bias, 0.0)  # that of D, which is then no reading
+    level = iron[..., :2].mean(-1)
+    axes = torch.stack((level, level, iron[..., 2]), -1)
+    spread = (elements_jacobian(field).square() @ axes.unsqueeze(-1)).squeeze(-1)
+    d, i, along = (drift - spread).clamp_min(0).unbind(-1)
+    x, y, z = field.unbind(-1)
+    square, total = x * x + y * y, field.square().sum(-1)
+    across, tilt = torch.deg2rad(d.sqrt()).square() * square, torch.deg2rad(i.sqrt()).square() * total
+    down = (tilt - z * z / total * along).clamp_min(0) / (square / total).clamp_min(LEAST_COS**2)
+    cos, sin, none = x / square.sqrt(), y / square.sqrt(), torch.zeros_like(along)
+    turn = torch.stack((cos, -sin, none, sin, cos, none, none, none, none + 1), -1).unflatten(-1, (3, 3))
+    anomaly = turn @ torch.diag_embed(torch.stack((along, across, down), -1) + crust_nt**2) @ turn.mT
+    return torch.diag_embed((bias - drift).clamp_min(0)), anomaly, torch.diag_embed(iron)

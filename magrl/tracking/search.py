@@ -9,7 +9,7 @@ from torch import Tensor
 
 from magrl import guidance
 from magrl.checks import check_number, check_tensor
-from magrl.tracking.destination import Way
+from magrl.tracking.way import Way
 
 VISITED = 24
 """Number of past places that a search remembers."""

@@ -17,7 +17,6 @@ from types import FrameType
 from typing import Any, Self
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
@@ -33,6 +32,7 @@ from magrl.evaluation.flight import Flight
 from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
 from magrl.files import write_json
+from magrl.navigators import Anywhere
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder, locked
 from magrl.training.config import CHANGEABLE, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
@@ -175,7 +175,7 @@ class Run:
     def start(
         self,
         *,
-        policy: TensorDictModuleBase,
+        policy: FieldPolicy | Anywhere,
         validation: EnvBase,
         env: GeomagneticNavEnv,
         collector: BaseCollector,
@@ -184,7 +184,7 @@ class Run:
         """Take the parts of the training, and restore them from the newest checkpoint of a run that is resumed.
 
         Args:
-            policy: agent for evaluations: a navigator, or any module that acts in ``validation`` and can be exported.
+            policy: agent for evaluations, which is saved.
             validation: environment of the validation tasks.
             env: environment inside the collector; with several collectors, each has its own.
             collector: source of batches.
@@ -241,7 +241,7 @@ class Run:
         bar = {"total": getattr(self.config, f"total_{counted}"), "initial": getattr(self.statistics, counted)}
         with tqdm(**bar, unit=counted[:-1], desc=self.name, mininterval=0.5, unit_scale=True) as progress:
             for batch in self.collector:
-                check_finite(batch, f"after {self.statistics.frames} frames")
+                check_finite(batch.exclude("track", ("next", "track")), f"after {self.statistics.frames} frames")
                 self.statistics.add(batch.reshape(-1))
                 yield batch
                 self._check_weights()
@@ -296,7 +296,7 @@ class Run:
 
         seconds = self.log.seconds
         self._network.load_state_dict(self.best.weights or self._network.state_dict())
-        save_policy(self.folder / "policy.safetensors", self.policy, self.validation)
+        save_policy(self.folder / "policy.safetensors", self.policy)
         if self.log.rows:
             self.log.figure("training", figures.training_figure(self.log.rows))
         if not self.complete:

@@ -18,7 +18,7 @@ from magrl.field import FieldBank
 from magrl.field.elements import element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import wrap_angle
-from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward, expect_keys
+from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward
 
 
 class FieldGradient(ObservationTransform):
@@ -49,7 +49,8 @@ class FieldGradient(ObservationTransform):
 
     default_in_keys = ("position",)
     default_out_keys = ("field_gradient",)
-    in_counts, in_sizes = (1, 2), (2, 1)
+    optional_in_keys = ("region",)
+    in_sizes = {"position": (2,), "region": (1,)}
 
     def __init__(
         self,
@@ -59,7 +60,8 @@ class FieldGradient(ObservationTransform):
     ) -> None:
         indexed = getattr(field, "indexed", False)
         super().__init__(["position", "region"] if indexed and in_keys is None else in_keys, out_keys)
-        expect_keys(self, 1 + indexed, 1)
+        if ("region" in self.in_names) != indexed:
+            raise ValueError(f"in_keys must have a region for a bank of fields, and for nothing else, got {in_keys}")
         self.elements = hasattr(field, "value_and_gradient")
         if not self.elements and not callable(field):
             raise ValueError(
@@ -205,7 +207,9 @@ class AlignmentReward(StepReward):
     """
 
     default_in_keys = ("heading", "gradient_heading", "gradient_heading_valid")
-    in_counts, out_counts, out_sizes = (2, 3), (1, 2), ((), (1,))
+    optional_in_keys = ("gradient_heading_valid",)
+    optional_out_keys = ("reward_alignment",)
+    out_sizes = {"reward_alignment": (1,)}
 
     def __init__(
         self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, weight: float = 3.0, offset: float = math.pi / 4

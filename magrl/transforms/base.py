@@ -17,24 +17,23 @@ from magrl.checks import check_choice
 T = TypeVar("T")
 Keys = Sequence[NestedKey]
 GivenKeys: TypeAlias = NestedKey | Keys | Mapping[str, NestedKey] | None
-"""Keys as a user gives them: in order, or replacements of default keys by name; None for the default keys."""
+"""Keys as a user gives them: at most four in order, or a mapping of names to keys; None for the default keys."""
 
 
 class ObservationTransform(Transform):
     """Base class of transforms that write observations: they also run at reset, and on plain TensorDicts.
 
-    A subclass computes the values at ``out_keys`` from those at ``in_keys`` in :meth:`_compute`, and names its default
-    keys in class attributes.
+    A subclass computes the values at ``out_keys`` from those at ``in_keys`` in :meth:`_compute`. It names its keys in
+    class attributes; without names, each key is its own name.
 
     Args:
-        in_keys: keys that are read, by default :attr:`default_in_keys`; or a mapping of names of default keys to the
-            keys in their place, as more than four of them must be given.
-        out_keys: keys that are written, by default :attr:`default_out_keys`; or a mapping.
-        optional: further keys that are read, in the order of :attr:`optional_in_keys`.
+        in_keys: keys that are read: a mapping of names to keys, where a default name that is left out stands for
+            itself; or up to four keys in the order of the names, of which the optional ones may be left out.
+        out_keys: keys that are written, in the same way.
         **inverse: ``in_keys_inv`` and ``out_keys_inv`` of an invertible transform.
 
     Raises:
-        ValueError: for another number of keys than a class with default keys takes.
+        ValueError: for a name that the class does not have, or another number of keys.
 
     Example:
         >>> import torch
@@ -48,31 +47,32 @@ class ObservationTransform(Transform):
     """
 
     default_in_keys: ClassVar[Keys] = ()
+    """Names of the keys that are read by default."""
     default_out_keys: ClassVar[Keys] = ()
+    """Names of the keys that are written by default."""
     optional_in_keys: ClassVar[Keys] = ()
-    """Names of keys that are read only where they are given."""
-    in_counts: ClassVar[Sequence[int]] = ()
-    """Numbers of ``in_keys`` that are allowed; by default that of the default ones, with optional ones or without."""
-    out_counts: ClassVar[Sequence[int]] = ()
-    """Numbers of ``out_keys`` that are allowed; by default that of :attr:`default_out_keys`."""
-    in_sizes: Sequence[int | None] = ()
-    """Last dimensions of the values at ``in_keys``; None for any."""
-    out_sizes: Sequence[tuple[int, ...]] = ()
-    """Last dimensions of the values at ``out_keys``, unbounded ones; () for a reward."""
+    """Names of keys that may be left out; those that are not default ones are read only where they are given."""
+    optional_out_keys: ClassVar[Keys] = ()
+    """The same of keys that are written."""
+    in_sizes: Mapping[NestedKey, tuple[int, ...]] = {}
+    """Last dimensions of the values by name; others may have any."""
+    out_sizes: Mapping[NestedKey, tuple[int, ...]] = {}
+    """Last dimensions of unbounded values that are written, by name."""
 
-    def __init__(
-        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, optional: Keys = (), **inverse: Any
-    ) -> None:
-        ins, outs = self.default_in_keys, self.default_out_keys
-        keys = [*_chosen(in_keys, ins), *several_keys(optional)]
-        super().__init__(in_keys=keys, out_keys=_chosen(out_keys, outs), **inverse)
-        if ins:
-            counts = self.in_counts or (len(ins), len(ins) + len(self.optional_in_keys))
-            expect_keys(self, counts, self.out_counts or len(outs))
+    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, **inverse: Any) -> None:
+        self.in_names, ins = _chosen(in_keys, self.default_in_keys, self.optional_in_keys)
+        self.out_names, outs = _chosen(out_keys, self.default_out_keys, self.optional_out_keys)
+        super().__init__(in_keys=ins, out_keys=outs, **inverse)
 
     def _named(self, values: Sequence[T]) -> dict[NestedKey, T]:
-        """Return values of ``in_keys`` by the names of the default and optional keys."""
-        return dict(zip((*self.default_in_keys, *self.optional_in_keys), values, strict=False))
+        """Return values of ``in_keys`` by name."""
+        return dict(zip(self.in_names, values, strict=True))
+
+    def _write_named(self, tensordict: TensorDictBase, **values: Tensor) -> None:
+        """Write values by the names of ``out_keys``."""
+        keys = dict(zip(self.out_names, self.out_keys, strict=True))
+        for name, value in values.items():
+            tensordict.set(keys[name], value)
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:
         """Return the values at ``out_keys``, given those at ``in_keys``."""
@@ -101,7 +101,8 @@ class ObservationTransform(Transform):
         missing = [key for key, value in zip(keys, values, strict=True) if value is None]
         if not missing:
             if checked:
-                self._check_shapes(value.shape for value in values)
+                for name, key, value in zip(self.in_names, keys, values, strict=True):
+                    self._check_shape(name, key, value.shape)
             return values
         if self.missing_tolerance:
             return None
@@ -135,20 +136,21 @@ class ObservationTransform(Transform):
             KeyError: for a key that is missing.
             ValueError: for a value of another shape.
         """
-        self._check_shapes(self._leaf(observation_spec, key).shape for key in self.in_keys)
-        if self.out_sizes:
-            like = self._leaf(observation_spec, self.in_keys[0])
-            for key, last in zip(self.out_keys, self.out_sizes, strict=False):
-                if last:
-                    self._add(observation_spec, like, key, *last)
+        for name, key in self._named(self.in_keys).items():
+            if name in self.in_sizes:
+                self._check_shape(name, key, self._leaf(observation_spec, key).shape)
+        for name, key in zip(self.out_names, self.out_keys, strict=True):
+            if name in self.out_sizes:
+                self._add(observation_spec, self._leaf(observation_spec, self.in_keys[0]), key, *self.out_sizes[name])
         return observation_spec
 
-    def _check_shapes(self, shapes: Iterable[torch.Size]) -> None:
-        """Raise unless the last dimensions of the values at ``in_keys`` are :attr:`in_sizes`."""
-        for key, size, shape in zip(self.in_keys, self.in_sizes, shapes, strict=False):
-            if size is not None and shape[-1:] != (size,):
-                hint = f": UnsqueezeTransform(-1, [{key!r}], [...]) of torchrl adds the dimension" if size == 1 else ""
-                raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {size}), got {tuple(shape)}{hint}")
+    def _check_shape(self, name: NestedKey, key: NestedKey, shape: torch.Size) -> None:
+        """Raise unless the last dimensions of a value that is read are those of :attr:`in_sizes`."""
+        size = self.in_sizes.get(name, ())
+        if size and shape[-len(size) :] != size:
+            hint = f": UnsqueezeTransform(-1, [{key!r}], [...]) of torchrl adds the dimension" * (size == (1,))
+            wanted = ", ".join(map(str, size))
+            raise ValueError(f"{type(self).__name__} reads {key!r} as (..., {wanted}), got {tuple(shape)}{hint}")
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
         """Load buffers that are not set yet, too."""
@@ -348,42 +350,23 @@ def several_keys(keys: Keys) -> list[NestedKey]:
     return [unravel_key(key) for key in keys]
 
 
-def _chosen(keys: GivenKeys, default: Keys) -> list[NestedKey]:
-    """Return the keys that a user gives, or the default ones; a tuple is one nested key where one key is usual.
+def _chosen(given: GivenKeys, default: Keys, optional: Keys) -> tuple[list[NestedKey], list[NestedKey]]:
+    """Return names and keys, of those that a user gives; a tuple is one nested key where one key is usual.
 
     Raises:
-        ValueError: for a name that is not among the default keys, or more than 4 keys without names.
+        ValueError: for a name that is not among the default and the optional ones, or another number of keys.
     """
-    if isinstance(keys, Mapping):
-        for name in keys:
-            check_choice(default, key=name)
-        return [unravel_key(keys.get(key, key)) for key in default]
-    if keys is None:
-        return list(default)
-    if len(default) and len(keys) > 4 and not isinstance(keys, str):
-        raise ValueError(f"more than 4 keys need names: give a mapping of {tuple(default)}, got {keys!r}")
-    return several_keys(cast(Keys, keys)) if len(default) > 1 else key_list(keys)
-
-
-def expect_keys(transform: Transform, num_in: int | Sequence[int], num_out: int | Sequence[int]) -> None:
-    """Raise unless a transform has the given numbers of keys.
-
-    Raises:
-        ValueError: with its keys.
-
-    Example:
-        >>> from torchrl.envs import CatTensors
-        >>> joined = CatTensors(["field", "move"], "observation")
-        >>> expect_keys(joined, (2, 3), 1)
-        >>> expect_keys(joined, 3, 1)
-        Traceback (most recent call last):
-            ...
-        ValueError: CatTensors takes 3 in_keys and 1 out_keys, got ['field', 'move'] and ['observation']
-    """
-    counts = [(count,) if isinstance(count, int) else sorted(set(count)) for count in (num_in, num_out)]
-    if len(transform.in_keys) not in counts[0] or len(transform.out_keys) not in counts[1]:
-        ins, outs = (" or ".join(map(str, count)) for count in counts)
-        raise ValueError(
-            f"{type(transform).__name__} takes {ins} in_keys and {outs} out_keys, "
-            f"got {transform.in_keys} and {transform.out_keys}"
-        )
+    names = list(dict.fromkeys((*default, *optional)))
+    if given is None:
+        return list(default), list(default)
+    if isinstance(given, Mapping):
+        for name in given:
+            check_choice(names, key=name)
+        chosen = [name for name in names if name in default or name in given]
+        return chosen, [unravel_key(given.get(name, name)) for name in chosen]
+    keys = several_keys(cast(Keys, given)) if len(default) > 1 else key_list(given)
+    if default and not len(set(default) - set(optional)) <= len(keys) <= min(len(names), 4):
+        rest = f" ({', '.join(map(str, optional))} may be left out)" * bool(optional)
+        order = ", ".join(map(str, names))
+        raise ValueError(f"give up to 4 keys in the order {order}{rest}, or a mapping of names to keys, got {keys}")
+    return (names if default else keys)[: len(keys)], keys

@@ -53,6 +53,60 @@ class TrueWay(ObservationTransform):
         return observation_spec
 
 
+class ProgressReward(StepReward):
+    """Write the reward for getting nearer to the destination, for the arrival, and minus the price of a step.
+
+    The first term is ``gamma * phi(after) - phi(before)`` with ``gamma`` 1 and the potential ``phi`` of minus the
+    distance, which leaves the optimal policy without discount unchanged: a detour and its way back add up to 0. With
+    the default numbers, an episode of up to 90 steps earns less than any arrival at the same destination if it ends
+    without one. In place of the reward of the environment. Privileged.
+
+    Args:
+        in_keys: true way ``(..., 2)`` [km], and the flag success ``(..., 1)``.
+        out_keys: one reward ``(..., 1)``.
+        unit_km: distance of a reward of 1 [km].
+        arrival: reward for the arrival.
+        price: price of a step.
+
+    Raises:
+        ValueError: for a unit that is not above 0, a negative reward or price, or another number of keys.
+
+    Source:
+        A. Y. Ng, D. Harada and S. Russell, Policy invariance under reward transformations, ICML (1999).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> after = TensorDict(true_way=torch.tensor([30.0, 40.0]), success=torch.tensor([True]))
+        >>> ProgressReward()(TensorDict(true_way=torch.tensor([60.0, 80.0]), next=after))["next", "reward"]
+        tensor([10.9000])
+    """
+
+    default_in_keys = ("true_way", "success")
+
+    def __init__(
+        self,
+        in_keys: GivenKeys = None,
+        out_keys: GivenKeys = None,
+        *,
+        unit_km: float = 50.0,
+        arrival: float = 10.0,
+        price: float = 0.1,
+    ) -> None:
+        super().__init__(in_keys, out_keys)
+        check_number(0, above=True, unit_km=unit_km)
+        check_number(0, arrival=arrival, price=price)
+        self.unit_km, self.arrival, self.price = float(unit_km), float(arrival), float(price)
+
+    @property
+    def state_keys(self) -> list[NestedKey]:
+        """Keys that a step reads from the TensorDict before it: the true way."""
+        return self.in_keys[:1]
+
+    def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
+        nearer_km = state[0].norm(dim=-1, keepdim=True) - values[0].norm(dim=-1, keepdim=True)
+        tensordict.set(self.out_keys[0], nearer_km / self.unit_km + self.arrival * values[1].to(nearer_km) - self.price)
+
+
 class HighestSPL(StatefulTransform):
     """Write the highest SPL (success weighted by path length) that an episode can still reach. Privileged.
 
@@ -77,7 +131,7 @@ class HighestSPL(StatefulTransform):
 
     default_in_keys = ("true_way", "move", "start_position", "target_position", "success", "done")
     default_out_keys = ("highest_spl",)
-    out_sizes = ((1,),)
+    out_sizes = {"highest_spl": (1,)}
 
     @property
     def state_keys(self) -> list[NestedKey]:
@@ -193,7 +247,7 @@ class EpisodeSum(StatefulTransform):
 
     def __init__(self, in_keys: Sequence[str]) -> None:
         super().__init__(in_keys, [f"episode_{key}" for key in in_keys])
-        self.out_sizes = ((1,),) * len(in_keys)
+        self.out_sizes = dict.fromkeys(self.out_keys, (1,))
 
     @property
     def state_keys(self) -> list[NestedKey]:

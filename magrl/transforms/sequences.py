@@ -49,8 +49,8 @@ class ReadingObservation(StatefulTransform):
 
     default_in_keys = ("field", "target_field", "move", "heading")
     default_out_keys = ("observation",)
-    in_counts = (3, 4)
-    out_sizes = ((20,),)
+    optional_in_keys = ("heading",)
+    out_sizes = {"observation": (20,)}
 
     @property
     def state_keys(self) -> list[NestedKey]:

@@ -3,7 +3,8 @@
     python recipes/tables/figures.py section-4 learning-spl       # from runs of evaluations and trainings
     python recipes/tables/figures.py conditions globe --out runs  # from new flights; five minutes and one minute
 
-From new flights: conditions (the cost of each error alone), globe (a map of the Earth), noise (SPL over the noise, in
+From new flights: place-error (dead reckoning against the belief of the place), conditions (the cost of each error
+alone), globe (a map of the Earth), noise (SPL over the noise, in
 the paper's box), prices (SPL over steps), reliability (of stated probabilities). From runs: section-4 (field contours
 4-1, trajectories 4-4, convergence 4-5, box plots 4-6), and the learning curves of figures.toml.
 """
@@ -17,21 +18,27 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from magrl.envs import PAPER_REGION, Scenario, named_tasks
+from magrl.envs import PAPER_REGION, Region, Scenario, named_tasks
 from magrl.envs.rendering import draw_tracks
+from magrl.evaluation import Flight, evaluation_rollout
 from magrl.evaluation import figures as plots
 from magrl.evaluation.navigators import label
 from magrl.evaluation.runs import NO_NOISE
+from magrl.field import IGRF
 from magrl.files import check_writable
+from magrl.tracking import Rules
 from magrl.training import UsageError, command
-from magrl.transforms import Conditions, load_conditions
+from magrl.transforms import Conditions, TrackField, load_conditions
+from magrl.transforms.track import known_keys
 
+import torch
 import tyro
 from matplotlib.figure import Figure
+from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent))
-from flights import Flights, matching, reliability
+from flights import Flights, matching, place_errors, reliability
 from globe import earth_tasks, globe_map, measured, two_elements_map
 from grid import RUNS, declared
 
@@ -41,10 +48,8 @@ Figures = Mapping[str, Figure]
 """Figures by file, from the folder of the documentation."""
 SHOWN = ("gg_td3", "td3", "ga", "pso", "afsa", "secant", "parallel")
 """Navigators in the figures of Section 4."""
-PILOTS = ("anywhere", "kalman", "secant", "map_matching", "parallel")
-LOOKS = dict(
-    zip(PILOTS, zip(("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000"), "osv^x", strict=True), strict=True)
-)
+PILOTS = ("anywhere", "kalman", "secant", "parallel")
+LOOKS = dict(zip(PILOTS, zip(("#0072B2", "#D55E00", "#009E73", "#000000"), "osvx", strict=True), strict=True))
 """Color and marker of navigators in panels."""
 
 
@@ -182,7 +187,33 @@ def reliability_diagram(tasks: int = 2000) -> Figures:
     return {"figures/reliability": figure}
 
 
+def place_error(tasks: int = 64) -> Figures:
+    """Return the median error of the place over 3000 km: of dead reckoning, and of a belief with IGRF-13 beside it.
+
+    Bands hold the middle half of the flights. Vehicles follow their dead reckoning; the start is known to 5 km.
+    """
+    figure, told = Figure(figsize=(9, 3.2), layout="constrained"), {"model": "IGRF-13", "start_km": 5.0}
+    box = {"region": Region((-40, 60), (-50, 50)), "margin_deg": 10, "distance_range_km": (2950.0, 3050.0)}
+    sea = Scenario(**box, field=IGRF("2025-01-01"), date="2025-01-01", start_heading="random", max_steps=80)
+    sea = sea.with_tasks(sea.random_tasks(tasks, 5))
+    for axes, name in zip(figure.subplots(1, 3, sharex=True), ("ship", "underwater", "low-cost"), strict=True):
+        flight = Flight(sea, errors=name, arrival="declared", **told)
+        track = TrackField(Rules(**flight.base.limits | flight.rules), known_keys(flight.env.observation_spec))
+        flown = evaluation_rollout(TransformedEnv(flight.env, track), flight.navigator("dead_reckoning"))["next"]
+        for (given, error), color in zip(place_errors(flown).items(), ("#000000", "#0072B2"), strict=True):
+            low, middle, high = error.nanquantile(torch.tensor([0.25, 0.5, 0.75]).double(), 0)
+            path = flown["move"][..., 0].cumsum(1).nanmean(0)
+            axes.plot(path, middle, color=color, label=given)
+            axes.fill_between(path, low, high, color=color, alpha=0.2, lw=0)
+        axes.set(title=name, xlabel="distance flown [km]", xlim=(0, 2900), ylim=(0, None))
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("error of the place [km]")
+    figure.axes[0].legend()
+    return {"figures/place-error": figure}
+
+
 FIGURES: Mapping[str, Callable[..., Figures]] = {
+    "place-error": place_error,
     "section-4": section_4,
     "noise": noise,
     "conditions": conditions,

@@ -13,7 +13,7 @@ from magrl.evaluation import Flight, episode_measures, summarize
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.runs import Noise
 from magrl.evaluation.tables import about, mean_of_runs
-from magrl.geodesy import geodesic
+from magrl.geodesy import geodesic, move_place
 from magrl.transforms import Conditions
 
 import torch
@@ -26,8 +26,8 @@ Spec = str | Mapping[str, Any]
 """Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
 MEASURES = ("success_rate", "spl")
 """Measures in a cell of a table."""
-OWN_OPTIONS = ("north", "known_start", "confidence")
-"""Options of all flights that a navigator may have by itself."""
+OWN_OPTIONS = ("north", "known_start", "confidence", "model", "start_km", "rules")
+"""Options of flights that a navigator may have by itself."""
 
 
 class Table(NamedTuple):
@@ -47,10 +47,9 @@ class Flights(Track):
 
     def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
         """Return an episode of each task."""
-        given = {key: getattr(self, key) for key in OWN_OPTIONS}
         own = navigator if isinstance(navigator, Mapping) else {"name": navigator}
-        options = {key: own.get(key, value) for key, value in given.items()}
-        return flown(self.flight(errors, **options), {key: value for key, value in own.items() if key not in given})
+        options = {key: own[key] for key in OWN_OPTIONS if key in own}
+        return flown(self.flight(errors, **options), {key: own[key] for key in own if key not in options})
 
     def episodes(self, navigator: Spec, errors: Errors) -> list[Measures]:
         """Return the measures of an episode of each task, once for each run that the pattern of a navigator names."""
@@ -104,6 +103,30 @@ def reliability(flight: TensorDictBase, region: Tensor, radius_km: float) -> lis
     return [(100 * stated[one].mean().item(), *clustered(100 * right[one].double(), region[one])) for one in chosen]
 
 
+def place_errors(steps: TensorDictBase) -> dict[str, Tensor]:
+    """Return the errors of the place ``(N, T)`` [km] after each step of flights, NaN after their end.
+
+    Args:
+        steps: ``(N, T)`` after each step, with a track between known places.
+    """
+    true, target = (steps[key].double() for key in ("position", "target_place"))
+    over = first_episode_mask(steps["done"]).squeeze(-1).logical_not()
+
+    def apart(place: Tensor) -> Tensor:
+        distance, bearing = geodesic(*place.unbind(-1), *target.unbind(-1))
+        return distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
+
+    reckoned = [steps["start_place"][:, 0].double()]
+    for number in range(steps.shape[1]):  # the heading is that of the move before
+        move = steps["move"][:, number, 0].double()
+        reckoned.append(move_place(reckoned[-1], steps["heading"][:, number, 0].double(), move))
+    errors = {
+        "compass and log": geodesic(*torch.stack(reckoned[1:], 1).unbind(-1), *true.unbind(-1))[0],
+        "and IGRF-13": (steps["track", "way", "displacement"].double() - apart(true)).norm(dim=-1),
+    }
+    return {name: error.masked_fill(over, torch.nan) for name, error in errors.items()}
+
+
 def matching(pattern: str) -> list[str]:
     """Return the paths that a pattern names, in natural order.
 
@@ -135,9 +158,12 @@ def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
 def names(navigator: Spec) -> list[str]:
     """Return the label of a navigator, with its options, what it was trained on, and what it is given.
 
-    A start that is known exactly has no numbers.
+    A start that is known exactly has no numbers. What a vehicle knows of the Earth and its start is what it is given.
     """
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
-    text, *known = about(options.pop("name").partition("=")[0])
+    text, trained, given = about(options.pop("name").partition("=")[0])
+    model, start_km, _ = (options.pop(key, None) for key in ("model", "start_km", "rules"))
+    told = [*([model] if model else []), *([f"start ± {start_km:g} km"] if start_km is not None else [])]
     shown = {key: "" if value == [0.0, 0.0, 0.0] else value for key, value in options.items()}
-    return [", ".join([text, *(f"{key.replace('_', ' ')} {value}".strip() for key, value in shown.items())]), *known]
+    label = ", ".join([text, *(f"{key.replace('_', ' ')} {value}".strip() for key, value in shown.items())])
+    return [label, trained, " and ".join(told) or given]

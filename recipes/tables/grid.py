@@ -1,7 +1,7 @@
 """Make the tables that recipes/tables/tables.toml declares: navigators by errors, tasks and runs.
 
     python recipes/tables/grid.py earth conditions --out docs/results        # writes earth.md, earth.csv.gz, ...
-    python recipes/tables/grid.py earth --navigators policy:MINE=mine.safetensors  # the same table of other navigators
+    python recipes/tables/grid.py earth --navigators mine.onnx  # the same table of other navigators
     python recipes/tables/grid.py earth --tasks 200                          # faster
 
 Without --out, tables are printed. Navigators are given the accuracy of their sensors. Tables of trained agents read
@@ -54,16 +54,23 @@ def flights(
     """
     made, rows, spl, tables = Flights.of(**options), [], {}, []
     region = made.scenario.tasks.region
+    labels = [names(navigator)[0] for navigator in navigators]
+
+    def title(navigator: Spec) -> str:
+        """Return the label of a navigator, with what it is given where others have the same."""
+        label, _, given = names(navigator)
+        return f"{label} ({given})" if labels.count(label) > 1 else label
+
     for navigator in tqdm(navigators, unit="row"):
-        about = names(navigator)
+        name = title(navigator)
         episodes = {level: made.episodes(navigator, errors) for level, errors in made.errors.items()}
-        spl[about[0]] = [runs[0]["spl"] for runs in episodes.values()]
-        rows.append([*about, *(cell(runs, measures) for runs in episodes.values())])
+        spl[name] = [runs[0]["spl"] for runs in episodes.values()]
+        rows.append([*names(navigator), *(cell(runs, measures) for runs in episodes.values())])
         for level, runs in episodes.items():
-            labels = {"navigator": about[0], "level": level, "seed": made.seed}
-            tables += [episode_table(run, region, run=number, **labels) for number, run in enumerate(runs)]
-    first = names(navigators[0])[0]
-    for other in [names(navigator)[0] for navigator in against if names(navigator)[0] in spl]:
+            about = {"navigator": name, "level": level, "seed": made.seed}
+            tables += [episode_table(run, region, run=number, **about) for number, run in enumerate(runs)]
+    first = title(navigators[0])
+    for other in [name for name in map(title, against) if name in spl]:
         differences = (paired_difference(*pair, region) for pair in zip(spl[first], spl[other], strict=True))
         rows.append([f"{first} − {other}, SPL", "—", "—", *differences])
     return Table(markdown_table([*ABOUT, *made.errors], rows), tables)

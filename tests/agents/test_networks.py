@@ -5,14 +5,10 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
 
-from magrl.agents import FieldPolicy, PolicyConfig, kalman, make_actor
+from magrl.agents import make_actor
 from magrl.agents.networks import CorrectedMove, make_mlp
-from magrl.envs import GeomagneticNavEnv
-from magrl.transforms import SensorErrors, TrackView
-
-STD, BIAS, NONE = (0.05, 0.05, 5.0), (0.1, 0.1, 10.0), (0.0, 0.0, 0.0)
+from magrl.tracking import Rules
 
 
 def test_new_actor_is_not_saturated() -> None:
@@ -23,28 +19,14 @@ def test_new_actor_is_not_saturated() -> None:
     assert actions.std(0).min() > 0.01
 
 
-@pytest.mark.parametrize(("std", "bias", "price"), [(STD, NONE, 0.5), (STD, BIAS, 4.0), (NONE, NONE, 0.5)])
-def test_an_untrained_correction_is_the_move_of_kalman(std: tuple, bias: tuple, price: float) -> None:
-    """With noise, constant errors, and without."""
-    view = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2, step_price=price)
-    base = GeomagneticNavEnv(num_envs=200, seed=0, start_heading="random")
-    env = TransformedEnv(base, SensorErrors(std, bias=bias, seed=0))
-    planner = kalman(step_price=price)
-    agent, state = FieldPolicy(PolicyConfig(view, (8,))), env.reset()
-    for _ in range(4):
-        state = planner(agent(state).rename_key_("action", "planned"))
-        torch.testing.assert_close(state["planned"], state["action"])
-        state = env.step_mdp(env.step(state))
-
-
 def test_a_correction_scales_and_turns_the_plan() -> None:
     """Up to the longest move; where the turn is too large, the vehicle turns where it is."""
-    corrected = CorrectedMove(50.0, math.pi / 2)
+    corrected = CorrectedMove(Rules())
     planned = torch.tensor([[20.0, 0.0], [20.0, 0.0], [0.0, 40.0], [-10.0, 0.0]])
     change = torch.tensor([[0.0, 1.0], [2 * math.log(2.0), 0.0], [2.0, -math.pi], [0.0, -0.1]])
     expected = torch.tensor([[-0.2, 1 / math.pi], [0.6, 0.0], [1.0, 0.0], [-1.0, 1.0]])
     torch.testing.assert_close(corrected(planned, torch.zeros(4, 1), change), expected)
-    turned = corrected(planned[:1], torch.tensor([[0.3]]))  # at a heading, without a correction
+    turned = corrected(planned[:1], torch.tensor([[0.3]]), torch.zeros(1, 2))  # at a heading, without a correction
     torch.testing.assert_close(turned, torch.tensor([[-0.2, -0.6 / math.pi]]))
 
 

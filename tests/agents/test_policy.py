@@ -6,11 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import step_mdp
 
-from magrl.agents import FieldPolicy, PolicyConfig, load_policy, load_pretrained, save_policy
+from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.files import load_tensors, save_tensors
 from magrl.transforms import ObservationView
@@ -48,38 +46,6 @@ def test_a_policy_is_of_its_region(env, policy) -> None:
         policy.check_fits(GeomagneticNavEnv(azores, seed=0))
 
 
-def test_a_second_call_on_a_state_changes_nothing(env) -> None:
-    """Also where episodes start at different steps."""
-    policy = load_pretrained("anywhere")
-
-    def flown(calls: int) -> list[list[Tensor]]:
-        env.set_seed(3)
-        state, actions = env.reset(), []
-        for step in range(5):
-            actions.append([policy(state.clone())["action"] for _ in range(calls)])
-            state = step_mdp(env.step(state.set("action", actions[-1][0])))
-            begin = torch.tensor([[True], [False], [False], [False], [False]])
-            state = env.reset(state.set("_reset", begin)) if step == 1 else state
-        return actions
-
-    for (once,), (first, second) in zip(flown(1), flown(2), strict=True):
-        assert torch.equal(first, once)
-        assert torch.equal(second, once)
-    policy.state, late = None, env.rollout(3)[:, -1]  # without the start of the episode
-    assert torch.equal(*(policy(late.clone())["action"] for _ in range(2)))
-
-
-def test_adapted_limits_are_those_of_the_moves() -> None:
-    """The corrections of a plan do not depend on them; other actions are scaled to those of the training."""
-    policy, env = load_pretrained("anywhere"), GeomagneticNavEnv(num_envs=50, seed=0, start_heading="random")
-    action = env.rollout(2, policy.adapted(max_move_km=10.0, max_turn_rad=0.5))["action"]
-    assert 5 < action[..., 0].max() <= 10 + 1e-4
-    assert 0.45 < action[..., 1].abs().max() <= 0.5 + 1e-4
-    region = FieldPolicy(PolicyConfig(env.observation_view(), CELLS))
-    with pytest.raises(ValueError, match="limits of its training: max_move_km is 50, not 10"):
-        region.adapted(max_move_km=10.0)
-
-
 # Files
 
 
@@ -102,10 +68,10 @@ def config(**change) -> Callable:
     [
         (
             lambda c: c | {"format": [1] * 10**5},
-            r"a policy of format \[1, 1, .{70}\.\.\.; this version reads format 3: train it again",
+            r"a policy of format \[1, 1, .{70}\.\.\.; this version reads format 4: train it again",
         ),
         (lambda c: c | {"extra": 1}, "unexpected keyword argument 'extra'"),
-        (lambda c: c | {"config": {"num_cells": (16,)}}, "kind"),
+        (lambda c: c | {"config": {"num_cells": (16,)}}, "view"),
         (config(num_cells=(8, 8)), "size mismatch for .*weight"),
         (config(view={}), "does not hold a valid policy"),
         (lambda c: c | {"weights": {k: v * math.nan for k, v in c["weights"].items()}}, "is not finite"),

@@ -125,7 +125,7 @@ def forged(rows: pandas.DataFrame, column: str, unit: float) -> pandas.DataFrame
     ],
 )
 def test_power_to_find_a_column_that_is_forged_by_a_point(column: str, unit: float, tasks: int, power: float) -> None:
-    """Of draws of 256 tasks, how many hold an episode that was changed: of secant on earth-v1, at the highest noise."""
+    """Of draws of 256 tasks, how many hold an episode that was changed: of secant on earth-v2, at the highest noise."""
     rows = read_episodes(Path(magrl.__file__).parent.parent / "docs/results/earth.csv.gz")
     rows = rows[(rows["navigator"] == "secant (quasi-Newton)") & (rows["level"] == "0.5, 0.1, 20")][:tasks]
     apart = different(forged(rows, column, unit), rows).get_level_values("task")

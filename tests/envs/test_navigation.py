@@ -1,24 +1,57 @@
 """The navigation environment behind the transforms of the recipes."""
 
+from collections.abc import Callable
+
 import torch
-from torchrl.envs import CatTensors, Compose
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs import CatTensors, Compose, TransformedEnv
 
 from magrl.envs.navigation import navigation_env
-from magrl.transforms import NorthReferenceError, SensorNoise
+from magrl.evaluation import evaluation_rollout
+from magrl.evaluation.metrics import first_episode_mask
+from magrl.navigators import Geodesic
+from magrl.transforms import NorthReferenceError, SensorErrors
 
 
 def test_rewards() -> None:
-    guided, base = (navigation_env(3, reward=reward, seed=1).reset() for reward in ("guided", "base"))
-    assert "gradient_heading" in guided
-    assert "gradient_heading" not in base
-    assert torch.equal(guided["observation"], base["observation"])
+    states = [navigation_env(3, seed=1).reset()]
+    states += [navigation_env(3, reward=reward, seed=1).reset() for reward in ("paper", "base", "spl")]
+    assert ["gradient_heading" in state for state in states] == [False, True, False, False]
+    assert ["true_way" in state for state in states] == [True, False, False, True]
+    assert all(torch.equal(states[0]["observation"], state["observation"]) for state in states)
+
+
+def returns(env: TransformedEnv, policy: Callable[[TensorDict], TensorDict]) -> tuple[Tensor, Tensor]:
+    """Return of the first episode of each vehicle, and whether it has arrived, ``(N,)``."""
+    rollout = evaluation_rollout(env, policy)["next"]
+    counted = first_episode_mask(rollout["done"])
+    return (rollout["reward"].squeeze(-1) * counted).sum(1), (rollout["success"].squeeze(-1) & counted).any(1)
+
+
+def test_no_episode_without_an_arrival_earns_as_much_as_the_worst_arrival() -> None:
+    """Standing still, turning on the spot, and every constant action, beside arrivals after 25 random moves."""
+    grid = torch.cartesian_prod(torch.linspace(-1, 1, 9), torch.linspace(-1, 1, 17))
+    constant = navigation_env(4 * len(grid), seed=0)
+    earned, lucky = returns(constant, lambda state: state.set("action", grid.repeat(4, 1)))
+    env = navigation_env(200, seed=1, scale_actions=False)
+    home = Geodesic.for_env(env.base_env)
+
+    def astray(state: TensorDict) -> TensorDict:
+        return env.rand_action(state) if state["elapsed_steps"].max() < 25 else home(state)
+
+    worst, arrived = returns(env, astray)
+    assert arrived.sum() > 100
+    assert (~lucky).sum() > 600
+    assert earned[~lucky].max() < worst[arrived].min()
+    torch.testing.assert_close(earned[grid[:, 0].repeat(4) == -1], torch.full((68,), -5.0))  # who stands still
 
 
 def test_guidance_is_by_the_truth_and_a_compose_is_the_list_of_its_parts() -> None:
     """Whatever the errors of the readings are."""
-    errors = [SensorNoise((0.2, 0.2, 20.0), seed=0), NorthReferenceError(2.0, fixed=True, seed=0)]
+    errors = [SensorErrors((0.2, 0.2, 20.0), seed=0), NorthReferenceError(2.0, fixed=True, seed=0)]
     clean, listed, composed = (
-        navigation_env(20, transforms=transforms, seed=0, scale_actions=False)
+        navigation_env(20, transforms=transforms, reward="paper", seed=0, scale_actions=False)
         for transforms in ((), errors, [Compose(*errors)])
     )
     action = torch.tensor([[30.0, 0.0]]).expand(20, 2)

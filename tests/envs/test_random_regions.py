@@ -171,20 +171,18 @@ def bank_of(*boxes: Region) -> dict[str, Any]:
 
 
 TINY = Region((20, 21), (0, 1))
-BAD: list[tuple[Callable[[], object], type[Exception], str]] = [
-    (lambda: planet_scenario(0, 0), ValueError, "count must be a whole number from 1 on, got 0"),
-    (lambda: earth_scenario(2, 0, "2055-01-01"), ValueError, "2055-01-01T00:00:00 is outside IGRF-14"),
-    (lambda: planet_scenario(2, 0, degree=5), ValueError, "misses the field by"),
-    (lambda: planet_scenario(2, 0, distance_range_km=(4e3, 5e3)), ValueError, "(4000.0, 5000.0): no two points of"),
-    (lambda: Scenario(**bank_of(Region((-5, 5), (0, 10)), TINY)), ValueError, "no two points of Region(latitude=(20.0"),
-    (lambda: Scenario(region=planets().region), ValueError, "region holds 6 boxes, and field 1 expansions"),
-    (lambda: Scenario(field=planets().field), ValueError, "region holds 1 boxes, and field 6 expansions"),
-    (lambda: planets().with_tasks(Tasks(*planets().random_tasks(9, seed=0)[:2])), ValueError, "lies outside Region("),
-    (lambda: make(2, max_move_km=900.0), ValueError, "the field is not defined on all of Region("),
+BAD: list[tuple[Callable[[], object], str]] = [
+    (lambda: planet_scenario(2, 0, degree=5), "misses the field by"),
+    (lambda: planet_scenario(2, 0, distance_range_km=(4e3, 5e3)), "(4000.0, 5000.0): no two points of"),
+    (lambda: Scenario(**bank_of(Region((-5, 5), (0, 10)), TINY)), "no two points of Region(latitude=(20.0"),
+    (lambda: Scenario(region=planets().region), "region holds 6 boxes, and field 1 expansions"),
+    (lambda: Scenario(field=planets().field), "region holds 1 boxes, and field 6 expansions"),
+    (lambda: planets().with_tasks(Tasks(*planets().random_tasks(9, seed=0)[:2])), "lies outside Region("),
+    (lambda: make(2, max_move_km=900.0), "the field is not defined on all of Region("),
 ]
 
 
-@pytest.mark.parametrize(("call", "kind", "says"), BAD, ids=[says for *_, says in BAD])
-def test_bad_input(call: Callable[[], object], kind: type[Exception], says: str) -> None:
-    with pytest.raises(kind, match=re.escape(says)):
+@pytest.mark.parametrize(("call", "says"), BAD, ids=[says for _, says in BAD])
+def test_what_regions_and_field_do_not_hold_is_refused(call: Callable[[], object], says: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(says)):
         call()

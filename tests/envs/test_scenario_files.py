@@ -27,6 +27,14 @@ altitude_km = 10.0
 margin_deg = 4
 distance_range_km = [200, 400]
 objective_floors = [0.1, 0.3, 100]
+distance_law = "log"
+max_steps = 80
+max_move_km = 20
+max_turn_deg = 45
+zeta = 0.02
+arrival = "distance"
+radius_km = 30
+start_heading = "random"
 
 [region]
 latitude = [36, 46]
@@ -91,27 +99,14 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 def test_a_scenario_holds_the_options_of_its_episodes(tmp_path) -> None:
-    path = tmp_path / "long.toml"
-    path.write_text(
-        """date = 2022-01-01
-altitude_km = -3
-max_steps = 80
-max_move_km = 20
-max_turn_deg = 45
-zeta = 0.02
-arrival = "distance"
-arrival_radius_km = 30
-start_heading = "random"
-region = {latitude = [-10, 0], longitude = [160, 170]}
-"""
-    )
-    env = GeomagneticNavEnv(load_scenario(path), num_envs=3, seed=0)
+    (tmp_path / "deep.toml").write_text(TOML.replace("altitude_km = 10.0", "altitude_km = -3"))
+    env = GeomagneticNavEnv(load_scenario(tmp_path / "deep.toml"), num_envs=3, seed=0)
     assert (env.max_steps, env.max_move_km, env.zeta, env.start_heading) == (80, 20.0, 0.02, "random")
     assert (env.max_turn_rad, env.arrival.rule, env.arrival.radius_km) == (math.pi / 4, "distance", 30.0)
     assert env.action_spec.space.high[0].tolist() == pytest.approx([20.0, math.pi / 4])
     assert env.reset()["heading"].abs().min() > 0
-    deep = IGRF("2022-01-01")(torch.tensor(-5.0), torch.tensor(165.0), -3.0)
-    torch.testing.assert_close(env.field(torch.tensor(-5.0), torch.tensor(165.0)), deep, rtol=0, atol=1e-4)
+    deep = IGRF("2026-07-01", 14)(torch.tensor(40.0), torch.tensor(-27.0), -3.0)
+    torch.testing.assert_close(env.field(torch.tensor(40.0), torch.tensor(-27.0)), deep, rtol=0, atol=1e-4)
 
 
 DROPPED = object()
@@ -129,7 +124,7 @@ def changed(content: Any, value: object) -> Iterator[tuple[str, Any]]:
             yield name or (key if isinstance(key, str) else ""), other
 
 
-OPTIONAL = {"generation", "altitude_km", "margin_deg", "distance_range_km", "objective_floors", "tasks", "name"}
+OPTIONAL = {*tomllib.loads(TOML).keys(), "name"} - {"region", "date"}
 
 
 @pytest.mark.parametrize(
@@ -166,19 +161,12 @@ def test_an_unknown_key_is_named_with_the_choices(tmp_path: Path) -> None:
         ("a.yaml", b"", "the file must end in .toml or .json, got '.yaml'"),
         ("a.toml", b"[region", "the file is not valid TOML"),
         ("a.toml", b".".join([b'"a#"'] * 2000) + b"=1", "not valid TOML: a key has more than 16 parts"),
-        ("a.toml", b"[" + b" . ".join([b"a"] * 2000) + b"]", "a key has more than 16 parts"),
-        ("a.toml", b'a = ["""b"""", {' + b".".join([b"'a'"] * 2000) + b" = 1}]", "a key has more than 16 parts"),
         ("a.json", b'{"region": 1, "region": 2}', "the key 'region' is repeated"),
         ("a.json", b"[" * 100_000, "JSON"),
-        (
-            "a.json",
-            json.dumps({str(key): 0 for key in range(10**5)})[:-1].encode() + b', "99999": 1}',
-            "'99999' is repeated",
-        ),
         ("a.json", b" " * (MAX_FILE_BYTES + 1), f"the file holds more than {MAX_FILE_BYTES} bytes"),
         ("a.json", b"[]", "a scenario file must hold a table, got []"),
     ],
-    ids=range(10),
+    ids=range(7),
 )
 def test_unreadable_files(tmp_path: Path, name: str, content: bytes, says: str) -> None:
     (tmp_path / name).write_bytes(content)

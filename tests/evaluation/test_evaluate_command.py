@@ -110,8 +110,8 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
         tmp_path / "run", GeomagneticNavEnv(own), scenario="scenario.toml", zeta=0.02, start_heading="random"
     )
     (run / "scenario.toml").write_text(OWN)
-    names = (f"gg_td3={run}", "secant", "map_matching")
-    evaluate.evaluate(evaluate.Config(names, map_date="2020-01-01", **config, **options))
+    names = (f"gg_td3={run}", "secant")
+    evaluate.evaluate(evaluate.Config(names, **config, **options))
     settings = json.loads((out / "settings.json").read_text())
     assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 2}).items()
     arrived = [row for row in rows(out / "episodes.csv") if row["success"] == "True"]
@@ -119,7 +119,6 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     text = (out / "table.md").read_text()
     assert "paper" not in text
     assert "Arrival: distance, within 25 km." in text
-    assert "Date of the map of map matching: 2020-01-01." in text
     flown = [feature["properties"] for feature in json.loads(tracks.read_text())["features"]]
     assert [(x["navigator"], x["name"]) for x in flown[1:3]] == [("gg_td3", "task 2"), ("secant", "far off")]
     for message, change in (
@@ -136,7 +135,6 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     [
         ((), {}, "at least one navigator"),
         (("dowsing",), {}, "unknown navigator 'dowsing'"),
-        (("secant",), {"map_date": "2020-01-01"}, "add that navigator, or omit the date"),
         (("secant",), {"zeta": 3.0}, "zeta must be below 3, got 3.0"),
         (("secant",), {"errors": (0.05, -1.0, 5.0)}, "noise must be a finite number from 0 on, got -1.0"),
         (("secant",), {"errors": "yacht"}, r"or a file that ends in \.toml or \.json, got 'yacht'"),

@@ -36,7 +36,7 @@ def flight() -> tuple[TensorDictBase, GeomagneticNavEnv]:
     tasks = Tasks(place(-17, 179.999)[None], place(-14, -172)[None])
     scenario = Scenario(region=Region((-25, -5), (170, 195)), tasks=tasks, objective_floors=None)
     base = GeomagneticNavEnv(scenario, seed=0, max_steps=3)
-    return TransformedEnv(base, TrackField(range_km=1000.0)).rollout(3, Geodesic()), base
+    return TransformedEnv(base, TrackField()).rollout(3, Geodesic()), base
 
 
 def test_coastlines() -> None:
@@ -108,8 +108,8 @@ def test_gif_of_several_vehicles_shows_them_moving(env: GeomagneticNavEnv, tmp_p
 def test_gif_of_one_vehicle_holds_the_estimates_and_ends_with_the_last(flight, monkeypatch) -> None:
     rollout, env = flight
     rollout, drawn = rollout.clone(), []
-    rollout["way"][0] = torch.tensor([[100.0, 100.0], [500.0, 0.0], [9000.0, 0.0]])
-    rollout["next", "way"][0, -1] = torch.tensor([-300.0, 0.0])
+    rollout["track", "way", "displacement"][0] = torch.tensor([[100.0, 100.0], [500.0, 0.0], [9000.0, 0.0]])
+    rollout["next", "track", "way", "displacement"][0, -1] = torch.tensor([-300.0, 0.0])
     keep = maps._draw_legend
     monkeypatch.setattr(maps, "_draw_legend", lambda figure: (drawn.append(figure.axes[0]), keep(figure)))
     assert len(list(maps._frames(rollout, env.field, env.region[0], "", 200))) == 7
@@ -123,7 +123,7 @@ def test_gif_of_one_vehicle_holds_the_estimates_and_ends_with_the_last(flight, m
 
 def test_an_ellipse_has_a_gap_at_the_edge_of_the_map(flight) -> None:
     state = flight[0]["next"][0, -1].clone()
-    state["way_covariance"] = 4e6 * torch.eye(2)
+    state["track", "way", "covariance"] = 4e6 * torch.eye(2)
     line = maps._estimate(state, Region((-25, -5), (-180, 180)))
     assert np.isnan(line).all(1).sum() > 1
     assert np.nanmax(np.abs(np.diff(line[2:, 1]))) < 180

@@ -11,7 +11,9 @@ from torch import Tensor
 from torchrl.envs import RewardSum, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks, planet_scenario
-from magrl.envs.measures import check_zeta, distance_to_arrival, path_efficiency, path_measures, spl
+from magrl.envs.arrival import check_zeta
+from magrl.envs.measures import path_efficiency, path_measures, spl
+from magrl.evaluation.arrival_distance import distance_to_arrival
 from magrl.evaluation.intervals import wilson_interval
 from magrl.evaluation.metrics import episode_measures, first_episode_mask, moved, summarize
 from magrl.evaluation.rollout import evaluation_rollout
@@ -206,7 +208,7 @@ def nearest_on_grids(env: GeomagneticNavEnv, state: TensorDict, task: int, half_
     return nearest
 
 
-def arrival_km(env: GeomagneticNavEnv, state: TensorDict) -> Tensor:
+def nearest_km(env: GeomagneticNavEnv, state: TensorDict) -> Tensor:
     keys = ("start_position", "target_position", "objective_weights")
     return distance_to_arrival(*(state[key] for key in keys), env.field, env.zeta, env.edge, state["region"][:, 0])
 
@@ -216,7 +218,7 @@ def test_distance_to_arrival_is_that_of_a_search_on_grids(zeta: float, half_km: 
     env = GeomagneticNavEnv(num_envs=4, seed=2, zeta=zeta)
     state = env.reset()
     expected = [nearest_on_grids(env, state, task, half_km) for task in range(4)]
-    assert arrival_km(env, state).tolist() == pytest.approx(expected, abs=0.02)
+    assert nearest_km(env, state).tolist() == pytest.approx(expected, abs=0.02)
 
 
 def test_places_outside_the_region_are_no_arrival() -> None:
@@ -224,16 +226,16 @@ def test_places_outside_the_region_are_no_arrival() -> None:
     tasks = Tasks(torch.tensor([[-3.0, 165.0]]).double(), torch.tensor([[-6.0, 165.0]]).double())
     env = GeomagneticNavEnv(Scenario(tasks=tasks), seed=0)
     state = env.reset()
-    free_km = arrival_km(env, state).item()
+    free_km = nearest_km(env, state).item()
     env.edge = Regions.of(Region((-12.0, -6.0), (158.0, 172.0)))
     meridian_km, _ = geodesic(*tasks.start.T, *tasks.target.T)
-    assert arrival_km(env, state).item() == pytest.approx(meridian_km.item(), abs=0.01)
+    assert nearest_km(env, state).item() == pytest.approx(meridian_km.item(), abs=0.01)
     assert free_km < meridian_km.item() - 10
 
 
 def test_spl_to_arrival_is_weighted_by_the_nearer_distance() -> None:
     env = GeomagneticNavEnv(num_envs=8, seed=0)
-    near_km = arrival_km(env, env.reset())
+    near_km = nearest_km(env, env.reset())
     env.set_seed(0)
     transformed = TransformedEnv(env, RewardSum())
     rollout = evaluation_rollout(transformed, Secant(probe_km=10))
@@ -269,11 +271,11 @@ def test_an_episode_without_a_way_is_measured_without_nan() -> None:
     here = torch.tensor([[-5.0, 165.0]] * 2).double()
     env = GeomagneticNavEnv(num_envs=2, seed=0)
     state = env.reset().update({"start_position": here, "target_position": here})
-    assert arrival_km(env, state).tolist() == [0, 0]
+    assert nearest_km(env, state).tolist() == [0, 0]
     beside = state.update({"start_position": here + 0.001})
-    assert arrival_km(env, beside).tolist() == [0, 0]
-    assert spl(torch.tensor([True, True]), arrival_km(env, state), torch.tensor([0.0, 5.0])).tolist() == [1, 0]
-    near = GeomagneticNavEnv(num_envs=1, seed=0, arrival="distance", arrival_radius_km=25)
+    assert nearest_km(env, beside).tolist() == [0, 0]
+    assert spl(torch.tensor([True, True]), nearest_km(env, state), torch.tensor([0.0, 5.0])).tolist() == [1, 0]
+    near = GeomagneticNavEnv(num_envs=1, seed=0, arrival="distance", radius_km=25)
     flight = episode([(0.5, 0.0)], point(20.0, 0.0), True, 1)
     assert episode_measures(flight, near)["spl_to_arrival"].item() == 0  # already arrived, and moved
 

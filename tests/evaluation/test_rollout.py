@@ -6,15 +6,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from magrl.agents import FieldPolicy, PolicyConfig, load_pretrained
+from magrl import Anywhere
+from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
-from magrl.evaluation import episode_measures, evaluate, evaluation_rollout, summarize, with_declaration
+from magrl.evaluation import episode_measures, evaluate, evaluation_rollout, summarize
+from magrl.evaluation.navigators import fitted
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import Secant
-from magrl.transforms import with_sensor_noise
+from magrl.transforms import SensorErrors
 
 
 def test_every_task_is_flown_once_however_many_vehicles_fly() -> None:
@@ -45,7 +48,7 @@ def test_batches_have_errors_of_their_own_that_repeat() -> None:
 
 
 def test_navigators_declare_their_arrival_where_it_must_be_declared() -> None:
-    episodes = evaluate("secant", "paper-100", arrival="declared", arrival_radius_km=40.0)
+    episodes = evaluate("secant", "paper-100", arrival="declared", radius_km=40.0)
     assert summarize(episodes)["success_rate"] > 80
 
 
@@ -91,16 +94,14 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
 def test_a_pretrained_policy_flies_as_by_its_name(options: dict) -> None:
     """Within the limits of the environment, which it gets from `evaluate`, or from a loop of one's own."""
     scenario = first_tasks(choose_tasks(None, "paper-100"), 3)
-    policy, options = load_pretrained("anywhere"), {"max_steps": 12, **options}
+    policy, options = Anywhere(), {"max_steps": 12, **options}
     flights = (evaluate(agent, scenario, errors=(0.05, 0.05, 5.0), **options) for agent in ("anywhere", policy))
     named, given = flights
     assert all(torch.equal(named[key], given[key]) for key in named.keys())  # noqa: SIM118
     base = GeomagneticNavEnv(scenario, num_envs=3, seed=0, **options)
-    env = with_declaration(with_sensor_noise(base, (0.05, 0.05, 5.0), 0))
-    with pytest.raises(ValueError, match=r"the policy plans for .*: fly policy\.for_env\(env\)"):
-        evaluation_rollout(env, policy)
+    env = TransformedEnv(base, SensorErrors((0.05, 0.05, 5.0)))
     with torch.no_grad():
-        own = env.rollout(12, policy.for_env(env), break_when_any_done=False, break_when_all_done=True)
+        own = env.rollout(12, fitted(policy, base), break_when_any_done=False, break_when_all_done=True)
     assert torch.equal(episode_measures(own, env)["length_km"], named["length_km"])
 
 

@@ -113,7 +113,6 @@ def test_positions_off_the_earth_raise(latitude, longitude, altitude_km, message
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"altitude_km": math.inf}, "altitude_km must be a finite number, got inf"),
         ({"altitude_km": -101.0}, "altitude_km -101.0 is not a finite number from -100 km on"),
         ({"gauss": torch.zeros(2, 2)}, "gauss must be a tensor of complex numbers"),
         ({"gauss": torch.zeros(2, 3, dtype=torch.complex64)}, r"gauss must have the shape .*, got \(2, 3\)"),

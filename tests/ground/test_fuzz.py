@@ -9,12 +9,14 @@ import pytest
 import td3_gradient_guided as recipe
 import torch
 from support.logs import nmea, ulog
+from support.networks import network_file
 
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario
 from magrl.files import load_tensors, save_tensors
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
+from magrl.transforms import ReadingView
 from magrl.vehicle.logs import read_log
 
 MUTANTS = 200
@@ -68,6 +70,14 @@ def test_policies(tmp_path: Path) -> None:
         return found.config == policy.config and all(torch.equal(weights[k], other[k]) for k in weights)
 
     fuzz(path, lambda: load_policy(path), same, 0)
+
+
+def test_networks(tmp_path: Path) -> None:
+    """A mutant may be another network, but then it is a valid one."""
+    view = ReadingView(max_move_km=50.0, max_turn_rad=1.5)
+    path = tmp_path / "policy.onnx"
+    save_policy(path, network_file(tmp_path, view.size, memory=True), view)
+    fuzz(path, lambda: load_policy(path), lambda found: isinstance(found, FieldPolicy), 5)
 
 
 def test_checkpoints(tmp_path: Path) -> None:

@@ -260,19 +260,6 @@ def test_nan_is_masked_in_its_own_vehicle(place):
     assert heading[1] == 0
 
 
-def test_bad_arguments_raise():
-    with pytest.raises(TypeError, match="arrived must be a tensor of bools"):
-        destination_reward(torch.zeros(2), 1.0)
-    with pytest.raises(ValueError, match="max_steps must be a whole number from 1 on, got 0"):
-        late_decay(torch.zeros(1), torch.ones(1), 0)
-    with pytest.raises(ValueError, match="limit must be a finite number above 0, got 0"):
-        proximity_reward(torch.zeros(1), torch.zeros(1), 1.0, 0)
-    with pytest.raises(ValueError, match=r"min_crossing must be a finite number from 0 up to 1\.5708, got -1"):
-        parallel_approach(torch.zeros(2), torch.zeros(2), torch.eye(2), -1)
-    with pytest.raises(ValueError, match=r"at least two elements \(\.\.\., E, 2\), got \(1, 2\)"):
-        best_pair(torch.zeros(1, 2))
-
-
 def test_approach_depends_on_the_difference_alone() -> None:
     here, there, gradient = (
         torch.tensor([3.0, -20.0]),

@@ -182,17 +182,10 @@ def test_bad_options_are_refused_with_their_value() -> None:
         (GeneticAlgorithm, {"mode": "dreamt"}, "dreamt"),
         (GeneticAlgorithm, {"mode": "look-ahead"}, "look-ahead"),
         (GeneticAlgorithm, {"population_size": 1}, "population_size.*1"),
-        (GeneticAlgorithm, {"population_size": 2.5}, "2.5"),
-        (GeneticAlgorithm, {"generations": 0}, "generations.*0"),
         (GeneticAlgorithm, {"spread": 1.5}, "spread.*1.5"),
         (GeneticAlgorithm, {"elites": 8, "population_size": 8}, "elites.*8"),
-        (GeneticAlgorithm, {"mutation_rate": -0.5}, "-0.5"),
-        (GeneticAlgorithm, {"crossover_rate": math.nan}, "nan"),
         (GeneticAlgorithm, {"objective_floors": (1.0, 0.0, 1.0)}, r"objective_floors.*0\.0"),
         (ParticleSwarm, {"inertia": 3.0}, "inertia.*3.0"),
-        (ParticleSwarm, {"max_velocity": 0.0}, r"max_velocity.*0\.0"),
-        (ArtificialFishSwarm, {"visual": -1.0}, "visual.*-1.0"),
-        (ArtificialFishSwarm, {"tries": 0}, "tries.*0"),
         (ArtificialFishSwarm, {"max_turn_rad": 9.0}, "9.0"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -7,17 +7,17 @@ from collections.abc import Callable
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
 
-from magrl.agents import kalman
 from magrl.envs import PRIVILEGED_KEYS, GeomagneticNavEnv, Region, Scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
 from magrl.geodesy import steer
-from magrl.navigators import NAVIGATORS, MeanJacobian, Navigator, ParallelApproach, Secant
+from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant
 from magrl.navigators.base import displacement_to
 from magrl.navigators.secant import probe_length
-from magrl.transforms import Conditions, with_conditions, with_sensor_noise
+from magrl.transforms import Conditions, SensorErrors, with_conditions
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +50,13 @@ def noisy(navigator, noise: tuple[float, float, float]) -> Callable:
     return act
 
 
-def scrambled(state: TensorDict) -> TensorDict:
+PLACES = {"dead_reckoning": {"start_position", "target_position"}}
+"""Privileged keys of the places that a navigator knows."""
+
+
+def scrambled(state: TensorDict, keys: set[str]) -> TensorDict:
     state = state.clone()
-    for key in {*PRIVILEGED_KEYS} - {"region"}:
+    for key in keys - {"region"}:
         value = state[key]
         state[key] = torch.full_like(value, math.nan) if value.is_floating_point() else ~value
     return state
@@ -63,12 +67,12 @@ def test_kalman_arrives_without_a_map(noise: tuple[float, ...], spl: float) -> N
     """From any heading, by the standard deviations that come with the readings."""
     scenario = Scenario(tasks=task_set(60, seed=93))
     base = GeomagneticNavEnv(scenario, num_envs=60, seed=0, start_heading="random")
-    summary = flown(with_sensor_noise(base, noise), kalman())
+    summary = flown(TransformedEnv(base, SensorErrors(noise)), Kalman())
     assert summary["success_rate"] == 100
     assert summary["spl"] > spl
 
 
-@pytest.mark.parametrize("name", ["secant", "mean_jacobian", "map_matching"])
+@pytest.mark.parametrize("name", ["secant", "mean_jacobian"])
 def test_a_navigator_that_is_told_of_its_arrival_searches(name: str) -> None:
     """Under constant errors the destination is not where the readings fit."""
     biased, rates = Conditions("biased", sensors={"bias": (0.15, 0.05, 20.0)}), []
@@ -125,7 +129,7 @@ def test_two_probing_legs_give_the_jacobian(turn: float) -> None:
         seen = {"field": reading, "target_field": start + 1, "heading": torch.tensor([turn * (step == 2)])}
         seen |= {"move": torch.tensor([10.0 * (step > 0), 0.0]), "elapsed_steps": torch.tensor([step])}
         navigator(TensorDict(seen).unsqueeze(0))
-        found.append(navigator.memory["mean"][0, :, 1:])
+        found.append(navigator.memory["mean"][0, :, 1:].clone())
     size = torch.tensor([0.004, 0.015, 4.0], dtype=torch.float64)
     assert (found[0] == 0).all()
     across_only = torch.stack((truth[:, 0], torch.zeros(3, dtype=torch.float64)), -1)
@@ -209,14 +213,15 @@ def test_every_navigator_stays_in_bounds_and_reads_what_it_declares(name: str) -
     env = GeomagneticNavEnv(num_envs=6, seed=4, max_move_km=8.0, max_turn_deg=math.degrees(0.7), start_heading="random")
     options = {"mode": "flown"} if "mode" in NAVIGATORS[name].options else {}
     navigator, blind, other = (NAVIGATORS[name].for_env(env, **options) for _ in range(3))
-    assert navigator.oracle or not set(navigator.in_keys) & set(PRIVILEGED_KEYS)
+    private = set(PRIVILEGED_KEYS) - PLACES.get(name, set())
+    assert navigator.oracle or not set(navigator.in_keys) & private
     state, longest = env.reset(), torch.zeros(())
     for _ in range(12):
         action = navigator(state.clone())["action"]
         if "seed" not in navigator.options:  # whose second call takes other random numbers
             assert torch.equal(navigator(state.clone())["action"], action)
         if not navigator.oracle:
-            assert torch.equal(blind(scrambled(state))["action"], action)
+            assert torch.equal(blind(scrambled(state, private))["action"], action)
         assert ((action[:, 0] >= 0) & (action[:, 0] <= 8)).all()
         assert (action[:, 1].abs() <= 0.7 + 1e-6).all()
         longest = torch.maximum(longest, action[:, 0].max())
@@ -279,15 +284,11 @@ def test_secant_stands_a_field_without_change() -> None:
 
 def test_bad_options_are_refused_with_their_value() -> None:
     for options, message in (
-        ({"max_move_km": -3.0}, "-3.0"),
         ({"max_turn_rad": 4.5}, "4.5"),
         ({"probe_km": 60.0}, "60.0"),
-        ({"probe_km": 0.0}, r"0\.0"),
         ({"elements": ("D",)}, "'D'"),
         ({"elements": ("D", "D")}, "'D', 'D'"),
         ({"elements": ("D", "X")}, "'X'"),
-        ({"sensor_std": (0.05, 0.05)}, r"sensor_std.*\(0.05, 0.05\)"),
-        ({"sensor_std": (0.05, -0.05, 5.0)}, r"sensor_std.*-0\.05"),
     ):
         with pytest.raises(ValueError, match=message):
             Secant(**options)
@@ -313,7 +314,7 @@ def test_maps_and_pairs_are_checked(env) -> None:
             kind(len)
 
 
-@pytest.mark.parametrize("name", ["secant", "mean_jacobian", "map_matching"])
+@pytest.mark.parametrize("name", ["secant", "mean_jacobian"])
 def test_a_reading_that_is_nan_is_not_flown(env, name: str) -> None:
     """A NaN action, which the environment refuses, and not a move by a guess; other vehicles go on."""
     env.set_seed(0)

@@ -46,7 +46,7 @@ BUDGET = {
     "= 400_000, 500": "= 256, 4",
     "num_envs=512, ": "num_envs=8, ",
     '"batch_size": 2048': '"batch_size": 256',
-    '"sac.safetensors"), "test-1000"': '"sac.safetensors"), "figure-4-1"',
+    '"sac.onnx", "test-1000"': '"sac.onnx", "figure-4-1"',
     "= 100_000, 1024, 1000": "= 128, 4, 2",
     "earth_scenario(64, ": "earth_scenario(2, max_steps=5, ",
     "earth_scenario(128, ": "earth_scenario(2, max_steps=5, ",
@@ -144,7 +144,7 @@ def test_scripts_options_and_targets_exist(page: Path) -> None:
                 assert re.search(rf"{flag}(?![\w-])", help_text(script)), f"{script} has no {flag}"
             assert rest[0] == "-m" or (ROOT / script).is_file(), script
     recipes = [str(path.relative_to(ROOT)) for path in ROOT.glob("recipes/*.py")]
-    modules = ("autopilot", "benchmark", "field", "logs")
+    modules = ("benchmark", "field", "vehicle.autopilot", "vehicle.logs")
     known = "".join(map(help_text, [*recipes, *(f"-m magrl.{name}" for name in modules)]))
     for flag in re.findall(r"`(--[\w-]+)", TEXTS[page]):
         assert re.search(rf"{flag}(?![\w-])", known), f"no script has {flag}"

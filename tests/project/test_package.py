@@ -111,8 +111,8 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     }
     data |= {
         "field/weather.npz",
-        "agents/pretrained/anywhere.safetensors",
-        "agents/pretrained/anywhere.md",
+        "navigators/pretrained/anywhere.safetensors",
+        "navigators/pretrained/anywhere.md",
     }
     assert {path for path in held if path.parts[0] == "magrl"} == library | {Path("magrl") / name for name in data}
     others = {path.parts[0] for path in held} - {"magrl"}

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 
 from magrl.benchmark import read_episodes, tracks
 from magrl.benchmark.episodes import COLUMNS
+from magrl.benchmark.tracks import LEVELS
 from magrl.envs import Scenario, Tasks
 from magrl.field import IGRF
 from magrl.training import UsageError
@@ -40,7 +41,7 @@ def test_tables_and_errors_declare_options_that_exist() -> None:
             options.pop("against", None)
             options.pop("measures", None)
             made = flights.Flights.of(**options)
-            assert len(made.errors) == len(made.conditions or made.levels)
+            assert len(made.errors) == (len(made.conditions) + len(made.levels) or len(LEVELS))
     for error in grid.declared(figures.FILE)["errors"].values():
         for size in error["sizes"]:
             assert not figures.one_error(error["lines"], size).perfect
@@ -101,11 +102,11 @@ def few_regions(monkeypatch) -> None:
 
 
 def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> None:
-    oracle, old = "geodesic", {"name": "map_matching", "map_date": "2015-01-01"}
+    oracle, old = "geodesic", {"name": "kalman", "step_price": 30.0}
     table = rows(grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], tasks=8).text)
     assert table[0] == ["navigator", "trained on", "given", "0, 0, 0", "0.5, 0.1, 20"]
     assert table[2][3] == "100.0 / 100.0"
-    assert table[3][0] == "map matching (Kalman filter), map date 2015-01-01"
+    assert table[3][0] == "Kalman (dual control), step price 30.0"
     assert table[4][0] == f"{table[2][0]} − {table[3][0]}, SPL"
     assert table[4][3].strip("*").startswith("+")
     assert rows(grid.flights([oracle], tasks=2, max_steps=1).text)[2][3] == "0.0 / 0.0"
@@ -257,7 +258,7 @@ def test_each_error_and_each_level_has_a_line_for_each_navigator(monkeypatch) ->
     monkeypatch.setattr(flights.Flights, "summaries", lambda *_: [measured])
     *panels, last = figures.conditions(2)["figures/conditions"].axes
     sizes = [len(error["sizes"]) + 1 for error in grid.declared(figures.FILE)["errors"].values()]
-    assert [[len(line.get_xdata()) for line in axes.lines] for axes in panels] == [[size] * 5 for size in sizes]
+    assert [[len(line.get_xdata()) for line in axes.lines] for axes in panels] == [[size] * 4 for size in sizes]
     assert [text.get_text() for text in last.get_legend().texts][:2] == ["anywhere", "Kalman"]
     assert [len(axes.lines) for axes in figures.prices(2)["figures/prices"].axes] == [2, 2, 2]
     assert len(figures.noise(2)["figures/noise"].axes[0].lines) == len(grid.declared()["noise"]["navigators"])

@@ -12,20 +12,18 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from magrl import paper
-from magrl.agents import PolicyConfig
+from magrl.agents import make_correcting_actor
 from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
 from magrl.field import igrf_coefficients
 from magrl.geodesy import geodesic
+from magrl.tracking import correction_network
 from magrl.training import parse_config
-from magrl.transforms import RandomSensorNoise, TrackView
-
-VIEW = TrackView(zeta=0.01, max_steps=50, max_move_km=50.0, max_turn_rad=math.pi / 2, step_price=None)
 
 
 def training_env(noise: tuple[float, float, float] = (0.0, 0.0, 0.0), **rules):
     scenario = planet_scenario(8, seed=3, **recipe.FAST.regions)
     base = GeomagneticNavEnv(scenario, num_envs=6, start_heading="random", seed=5, **rules)
-    return recipe.make_env(base, VIEW, recipe.Config(noise=noise))
+    return recipe.make_env(base, recipe.Config(noise=noise))
 
 
 def test_specs_of_the_training_environment() -> None:
@@ -33,7 +31,7 @@ def test_specs_of_the_training_environment() -> None:
         env = training_env(noise)
         check_env_specs(env, break_when_any_done="both")
         assert env.observation_spec["observation"].shape == (6, 19)
-        assert (type(env.transform[0]) is RandomSensorNoise) == (not any(noise))
+        assert (env.transform[0].levels is None) == any(noise)
         assert env.transform[0].seed == 5
 
 
@@ -43,15 +41,15 @@ def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
     assert 0.4 < td["true_way_scaled"].norm(dim=-1).mean() < 3.0
     torch.testing.assert_close(td["episode_reward"], td["reward"].cumsum(1))
     assert "episode_reward_proximity" not in td.keys()  # noqa: SIM118
-    assert PolicyConfig(VIEW, (8,)).make_actor().in_keys == ["observation", "planned_move", "heading"]
     assert recipe.OBSERVED == ("observation", "true_way_scaled", "highest_spl")
 
 
 def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None:
-    env = training_env(arrival="declared", arrival_radius_km=25.0, max_steps=40)
+    env = training_env(arrival="declared", radius_km=25.0, max_steps=40)
     check_env_specs(env)
     assert env.action_spec.shape == (6, 2)
-    actor = PolicyConfig(recipe.make_view(env.base_env, 300.0), (8,)).make_actor()
+    actor = make_correcting_actor(correction_network((8,)), recipe.rules_of(env.base_env, recipe.FAST))
+    assert actor.in_keys == ["observation", ("track", "plan"), "heading"]
     td = env.rollout(40, actor, break_when_any_done=False)["next"]
     first = td["done"].cumsum(1) - td["done"].long() == 0
     assert ((td["declared"] & first).sum(1) == 1).all()
@@ -64,11 +62,11 @@ def test_the_vehicle_is_that_of_the_settings() -> None:
     config = recipe.FAST.replace(max_move_km=10.0, max_turn_deg=20.0, drift=0.2)
     planets = planet_scenario(4, seed=3, **config.regions)
     base = GeomagneticNavEnv(planets, num_envs=6, seed=5, **config.limits)
-    view = recipe.make_view(base, 300.0)
-    assert (view.max_move_km, math.degrees(view.max_turn_rad)) == (10.0, pytest.approx(20.0))
-    td = recipe.make_env(base, view, config).rollout(5)["next"]
+    rules = recipe.rules_of(base, config)
+    assert (rules.max_move_km, math.degrees(rules.max_turn_rad)) == (10.0, pytest.approx(20.0))
+    td = recipe.make_env(base, config).rollout(5)["next"]
     move, true_move = td["move"], td["true_move"]
-    assert (move[..., 1].abs() <= view.max_turn_rad + 1e-6).all()
+    assert (move[..., 1].abs() <= rules.max_turn_rad + 1e-6).all()
     drift = (true_move - move)[..., 0].abs() / move[..., 0]
     assert 0.05 < drift.max() < 0.2 + 1e-5
     path_km = true_move[..., 0].cumsum(1)

@@ -44,6 +44,20 @@ def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
     pd.testing.assert_frame_equal(table[columns], other[columns])
 
 
+def test_the_first_position_may_be_known(tmp_path: Path) -> None:
+    """The way to the last position, or to another one, is then known from the first row on."""
+    log, date = pd.read_csv(LOG), ["--date", "2025-01-01"]
+    for options in ([], ["--target-position", "62.5", "1.0"]):
+        recipe.main([str(LOG), *NOISE, *date, "--start-km", "0.5", *options, "--out", str(tmp_path / "out")])
+        assert pd.read_csv(tmp_path / "out" / "log.csv")["miss_km"].max() < 3
+    log.drop(columns=["latitude", "longitude"]).to_csv(tmp_path / "blind.csv", index=False)
+    for path, more in ((LOG, []), (tmp_path / "blind.csv", date)):
+        with pytest.raises(UsageError, match=r"start_km 0\.5 needs positions in the log and a date"):
+            recipe.main([str(path), "--start-km", "0.5", *more, "--out", str(tmp_path / "out")])
+    with pytest.raises(UsageError, match="model 'WMM' must be IGRF-13, IGRF-14"):
+        recipe.main([str(LOG), "--start-km", "0.5", *date, "--model", "WMM", "--out", str(tmp_path / "out")])
+
+
 def test_readings_of_short_moves_are_averaged(tmp_path: Path) -> None:
     """Each reading is at the mean of the places of its rows; the last move may have half the length."""
     path = tmp_path / "log.csv"

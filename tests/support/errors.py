@@ -12,7 +12,7 @@ from torchrl.envs.utils import step_mdp
 
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.field import FieldModel
-from magrl.transforms import MagneticWeather, MotionError, NorthReferenceError, SensorErrors, VectorErrors
+from magrl.transforms import MagneticWeather, MotionError, NorthReferenceError, SensorErrors, Spikes, VectorErrors
 
 STD = (0.05, 0.05, 5.0)
 
@@ -49,7 +49,8 @@ def motion_error(**options: object) -> MotionError:
 
 def every_error(seed: int = 0) -> Compose:
     weather = MagneticWeather(speed_km_h=24.0, span_h=100.0, seed=seed)
-    return Compose(motion_error(seed=seed), weather, sensor_errors(seed=seed), north_error(seed=seed))
+    spikes = Spikes((1.0, 1.0, 100.0), rate=0.1, seed=seed)
+    return Compose(motion_error(seed=seed), weather, sensor_errors(seed=seed), spikes, north_error(seed=seed))
 
 
 def all_errors(num_envs: int = 2, seed: int = 0) -> TransformedEnv:

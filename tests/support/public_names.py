@@ -14,8 +14,8 @@ PACKAGES = (
     "navigators",
     "navigators.metaheuristics",
     "agents",
-    "onboard",
-    "logs",
+    "vehicle.onboard",
+    "vehicle.logs",
     "evaluation",
     "training",
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -15,3 +17,9 @@ def f64(*values: object) -> Tensor:
 
 def randn(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=F64)
+
+
+def unknown(latitude: Tensor | float) -> Tensor:
+    """A place of which only the latitude is known."""
+    latitude = torch.as_tensor(latitude, dtype=F64)
+    return torch.stack((latitude, torch.full_like(latitude, math.nan)), -1)

@@ -6,12 +6,13 @@ import math
 
 import pytest
 import torch
-from support.tracks import F64, STD, f64, randn
+from support.tracks import F64, STD, f64, randn, unknown
 
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Belief, covariance_after, destination, elements, innovation, moved, posterior, start
-from magrl.tracking.belief import COEFFICIENTS, STATES
+from magrl.tracking.belief import STATES
 from magrl.tracking.harmonics import turning
+from magrl.tracking.local import COEFFICIENTS
 from magrl.tracking.prior import CELLS, expected, latitude_cells
 
 COMPASS = SensorStd(f64(*STD), f64(math.inf, 0.0, 0.0), f64(0.0, 0.0, 0.0), f64(0.0, 0.0, 0.0))
@@ -22,7 +23,8 @@ def test_the_prior_does_not_depend_on_the_direction_of_true_north() -> None:
     """Turning the field by the angle between two cells permutes them, and turns what is expected."""
     field, angle = f64(15000.0, 3000.0, 45000.0), math.pi / 2
     turn = turning(f64(math.cos(angle))[0], f64(math.sin(angle))[0], 3)
-    (mean, covariance), (other, spread) = expected(field, 12), expected(turn[:3, :3] @ field, 12)
+    cells = latitude_cells(12)
+    (mean, covariance), (other, spread) = expected(field, cells), expected(turn[:3, :3] @ field, cells)
     torch.testing.assert_close(other[:-1], turn @ mean[:-1])
     torch.testing.assert_close(spread[:-1, :-1], turn @ covariance[:-1, :-1] @ turn.mT, rtol=1e-6, atol=1e-3)
     assert latitude_cells(12).mean.shape == (12 * CELLS, COEFFICIENTS)
@@ -50,10 +52,10 @@ def test_a_move_turns_the_axes_to_magnetic_north_at_its_end(course: float) -> No
     spread = 1e-2 * torch.diag(torch.cat((f64(20.0, 0.0, 20.0), 100 + 0 * mean[3:COEFFICIENTS])))
     covariance = torch.zeros(STATES, STATES, dtype=F64)
     covariance[:COEFFICIENTS, :COEFFICIENTS] = spread @ spread
-    unknown, way = f64(math.nan)[0], (f64(60.0), f64(course))
-    belief = moved(Belief(mean.expand(1, -1), covariance.expand(1, -1, -1), unknown.expand(1)), *way)
+    nowhere, way = f64(math.nan)[0], (f64(60.0), f64(course))
+    belief = moved(Belief(mean.expand(1, -1), covariance.expand(1, -1, -1), unknown(nowhere.expand(1))), *way)
     samples = mean + torch.nn.functional.pad(randn(4000, COEFFICIENTS, seed=1) @ spread, (0, STATES - COEFFICIENTS))
-    sure = Belief(samples, torch.zeros(4000, STATES, STATES, dtype=F64), unknown.expand(4000))
+    sure = Belief(samples, torch.zeros(4000, STATES, STATES, dtype=F64), unknown(nowhere.expand(4000)))
     after = moved(sure, way[0].expand(4000), way[1].expand(4000))
     assert after.mean[:, 1].abs().max() < 1e-6
     fresh = after.covariance[0]  # that of the degrees that are left out

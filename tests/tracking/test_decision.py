@@ -11,7 +11,7 @@ from torch import Tensor
 
 from magrl import tracking
 from magrl.sensor_std import SensorStd
-from magrl.tracking import ArrivalDecision, approach, arrival_decision, decision
+from magrl.tracking import ArrivalDecision, Trip, approach, arrival_decision, decision
 from magrl.tracking.belief import STATES
 
 RADIUS_KM, UNITS = 25.0, f64(1.0, 1.0, 100.0)
@@ -26,10 +26,11 @@ def decide(north_km: float, noise: float, bias: float, left: int = 50) -> tuple[
     cross = belief.covariance @ rows.mT
     exact = rows @ cross + 1e-9 * torch.diag((rows @ cross).diagonal())
     mean = belief.mean.index_add(0, torch.tensor([3]), f64(6000.0))  # D changes by 1 degree over 100 km eastward
-    belief = tracking.Belief(mean, belief.covariance - cross @ torch.linalg.solve(exact, cross.mT), belief.latitude)
+    belief = tracking.Belief(mean, belief.covariance - cross @ torch.linalg.solve(exact, cross.mT), belief.place)
     target = tracking.elements(tracking.moved(belief, f64(north_km)[0], f64(0.0)[0])).value
     goal = tracking.destination(belief, target, 300.0)
-    decided = arrival_decision(goal, tracking.posterior(goal, 512), errors, torch.tensor(left), RADIUS_KM)
+    trip = Trip(f64(400.0)[0], f64(400.0, 0.0), torch.tensor(left), 0.5, 50.0)
+    decided = arrival_decision(goal, tracking.posterior(goal, 512), errors, trip, RADIUS_KM)
     return decided, tracking.elements(belief).gradient
 
 

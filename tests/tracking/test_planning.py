@@ -11,10 +11,11 @@ from torch import Tensor
 from torch.autograd.functional import jacobian
 
 from magrl import tracking
+from magrl.field.elements import elements_jacobian
 from magrl.geodesy import geodesic, move
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Belief, Destination, DestinationPosterior, covariance_after, planning
-from magrl.tracking.belief import CONSTANT, MODEL_NT, SLOW
+from magrl.tracking.belief import ANOMALY, CONSTANT
 from magrl.tracking.prior import DEGREE, closure
 
 RANGE_KM, KM = 300.0, f64(40.0)[0]
@@ -24,15 +25,24 @@ WHITE = SensorStd(NOISE)
 SHIP = SensorStd(NOISE, f64(3.0, 0.5, 150.0), f64(2.9, 0.4, 140.0), f64(100.0, 100.0, 100.0))
 
 
-def flown(reading: Tensor, errors: SensorStd, legs: int, crust_nt: float = 0.0) -> Destination:
-    """A belief after some legs of 40 km, and a destination 150 km away from the expected one."""
+def track(reading: Tensor, errors: SensorStd, legs: int, crust_nt: float = 0.0) -> Belief:
+    """A belief after some legs of 40 km."""
     belief = tracking.start(reading, errors, f64(0.3)[0], crust_nt)
     for leg in range(legs):
         course = f64(0.3 + 1.2 * leg)[0]
-        belief = tracking.moved(belief, KM, course, errors)
-        belief = tracking.read(belief, tracking.elements(belief).value + 0.5 * NOISE, errors.noise, course, crust_nt)
+        belief = tracking.moved(belief, KM, course, errors, crust_nt=crust_nt)
+        belief = tracking.read(belief, tracking.elements(belief).value + 0.5 * NOISE, errors.noise, course)
+    return belief
+
+
+def goal_of(belief: Belief, errors: SensorStd, crust_nt: float = 0.0) -> Destination:
+    """A destination 150 km away from the expected one."""
     target = tracking.elements(tracking.moved(belief, f64(150.0)[0], f64(-0.7)[0])).value
-    return tracking.destination(belief, target + f64(0.1, 0.1, 20.0), RANGE_KM, crust_nt)
+    return tracking.destination(belief, target + f64(0.1, 0.1, 20.0), RANGE_KM, crust_nt, errors)
+
+
+def flown(reading: Tensor, errors: SensorStd, legs: int) -> Destination:
+    return goal_of(track(reading, errors, legs), errors)
 
 
 def polar(way: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,19 +63,25 @@ def prediction(belief: Belief, way: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     return one @ belief.covariance @ one.mT, slopes(belief.mean), six @ belief.covariance @ six.mT
 
 
-def flown_covariance(goal: Destination, way: Tensor, leg: Tensor, errors: SensorStd, readings: int = 1) -> Tensor:
+def flown_covariance(
+    belief: Belief, goal: Destination, way: Tensor, leg: Tensor, errors: SensorStd, readings: int = 1
+) -> Tensor:
     """The covariance of a way by the belief after a leg and the expected readings at its end."""
-    origin = goal.belief.latitude, torch.zeros((), dtype=F64)
+    origin = belief.latitude, torch.zeros((), dtype=F64)
     km, course = polar(leg)
-    after = tracking.moved(goal.belief, km, course, errors)
+    after = tracking.moved(belief, km, course, errors, crust_nt=goal.crust)
     for _ in range(readings):
-        reading = tracking.elements(after).value + after.mean[CONSTANT] + after.mean[SLOW]
-        after = tracking.read(after, reading, errors.noise, course, (goal.noise - MODEL_NT**2) ** 0.5)
+        anomaly = elements_jacobian(after.field) @ after.mean[ANOMALY]
+        after = tracking.read(
+            after, tracking.elements(after).value + after.mean[CONSTANT] + anomaly, errors.noise, course
+        )
+    after = tracking.destination(after, f64(0.0, 60.0, 20000.0), RANGE_KM, goal.crust, errors).belief
     distance, bearing = geodesic(*move(*origin, course, km), *move(*origin, *polar(way)[::-1]))
     covariance, _, later = prediction(after, distance * torch.stack((bearing.cos(), bearing.sin())))
     _, slopes, now = prediction(goal.belief, way)
-    left_out = closure().left_out_nt * ((way - leg).norm() / 1000) ** DEGREE
-    precision = torch.linalg.inv(covariance + (left_out**2 + goal.noise) * torch.eye(3, dtype=F64))
+    square = (way - leg).square().sum() / 1000**2
+    left_out = closure().left_out_nt ** 2 * square**DEGREE + goal.noise_at(square)
+    precision = torch.linalg.inv(covariance + left_out * torch.eye(3, dtype=F64))
     squares = (slopes[:, None] * slopes + now - later).unflatten(0, (2, 3)).unflatten(-1, (2, 3)).transpose(1, 2)
     return torch.linalg.inv((precision * squares).sum((-2, -1)) + torch.eye(2, dtype=F64) / RANGE_KM**2)
 
@@ -81,20 +97,22 @@ def test_the_forecast_is_the_covariance_after_the_leg_is_flown(
     errors: SensorStd, crust_nt: float, reading: Tensor, legs: int, missing: int | None
 ) -> None:
     """By :func:`~magrl.tracking.moved`, :func:`~magrl.tracking.read` and differences of what is predicted."""
-    goal, moves = flown(reading, errors, legs, crust_nt), f64((30.0, 0.0), (-10.0, 40.0))
+    belief, moves = track(reading, errors, legs, crust_nt), f64((30.0, 0.0), (-10.0, 40.0))
+    goal = goal_of(belief, errors, crust_nt)
     way = tracking.mode(goal).displacement
     if missing is not None:
         errors = errors._replace(noise=NOISE.index_fill(0, torch.tensor([missing]), math.inf))
     for found, leg in zip(covariance_after(goal, way, moves, errors), moves, strict=True):
-        assert differs(found, flown_covariance(goal, way, leg, errors)) < 0.015
+        assert differs(found, flown_covariance(belief, goal, way, leg, errors)) < 0.015
 
 
 def test_the_forecast_averages_the_noise_of_many_readings() -> None:
     errors, leg = SensorStd(4 * NOISE), f64(20.0, -30.0)
-    goal = flown(HERE, errors, 2)
+    belief = track(HERE, errors, 2)
+    goal = goal_of(belief, errors)
     way = tracking.mode(goal).displacement
     one, six = covariance_after(goal, way, leg.expand(2, 2), errors, torch.tensor([1, 6]))
-    assert differs(six, flown_covariance(goal, way, leg, errors, readings=6)) < 0.02
+    assert differs(six, flown_covariance(belief, goal, way, leg, errors, readings=6)) < 0.02
     assert six.trace() < 0.8 * one.trace()
 
 

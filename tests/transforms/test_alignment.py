@@ -143,9 +143,8 @@ def test_without_next_the_error_says_what_is_needed() -> None:
     ("make", "message"),
     [
         (lambda: FieldGradient("IGRF"), "value_and_gradient.*str"),
+        (lambda: FieldGradient(field(), ["position", "region"]), "region for a bank of fields"),
         (lambda: GradientHeading(pair=("D", "Z")), "'Z'.*D, I, B_H"),
-        (lambda: GradientHeading(min_crossing_deg=90.0), "min_crossing_deg.*90.0"),
-        (lambda: AlignmentReward(["x"]), r"2 or 3 in_keys and 1 or 2 out_keys, got \['x'\]"),
     ],
 )
 def test_bad_options(make, message: str) -> None:

@@ -24,17 +24,18 @@ from magrl.transforms import (
     AngleVector,
     DistanceCost,
     FieldGradient,
+    GoalObservation,
+    GoalReward,
     GradientHeading,
     HighestSPL,
     MinMaxNorm,
-    RandomSensorNoise,
+    ProgressReward,
     RandomStepPrice,
-    ReadingObservation,
     SensorErrors,
-    SensorNoise,
     SPLReward,
     TargetDifference,
     TrueWay,
+    sensor_levels,
 )
 from magrl.transforms.base import key_list, several_keys
 
@@ -54,7 +55,7 @@ def guided() -> Transform:
         GradientHeading(pair="auto"),
         AlignmentReward(out_keys=["reward", "reward_alignment"]),
         DistanceCost(0.01),
-        RandomSensorNoise(),
+        SensorErrors(levels=sensor_levels),
         TargetDifference(),
         AngleVector(["heading"], ["course"]),
         MinMaxNorm(["move"], ["m"], ["action"]),
@@ -83,9 +84,11 @@ ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     "guided": (nav, guided),
     "rewarded": (
         nav,
-        lambda: Compose(ReadingObservation(), RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward()),
+        lambda: Compose(RandomStepPrice((0.1, 1.0)), TrueWay(), HighestSPL(), SPLReward()),
     ),
     "every error": (nav, every_error),
+    "progress": (nav, lambda: Compose(TrueWay(), ProgressReward())),
+    "goal": (nav, lambda: Compose(GoalObservation(nav().observation_view(), 0.01, (0.05, 0.4, 15.0)), GoalReward())),
     "plane": (partial(PlaneEnv, (3,), torch.float64), of_a_plane),
     "scaled pendulum": (PendulumEnv, pendulum),
 }
@@ -249,7 +252,9 @@ def test_a_reader_before_its_writer_is_refused() -> None:
             _ = TransformedEnv(nav(), Compose(reader, FieldGradient(field()), GradientHeading())).specs
 
 
-@pytest.mark.parametrize("transform", [AngleVector(["th"], ["v"]), SensorNoise((0.1,), in_keys=["th"], out_keys=["v"])])
+@pytest.mark.parametrize(
+    "transform", [AngleVector(["th"], ["v"]), SensorErrors((0.1,), in_keys=["th"], out_keys=["v"])]
+)
 def test_a_value_without_its_last_dimension_is_refused(transform: Transform) -> None:
     message = rf"{type(transform).__name__} reads 'th' as \(..., 1\), got \(\): UnsqueezeTransform\(-1, \['th'\]"
     with pytest.raises(ValueError, match=message):
@@ -266,6 +271,20 @@ def test_keys() -> None:
     for keys in ("x", 5, [5]):
         with pytest.raises(TypeError, match="keys must be a sequence of names"):
             several_keys(keys)
+
+
+def test_keys_have_names() -> None:
+    """By name in any order, the default ones in part, and optional ones only where they are given."""
+    reward = AlignmentReward({"gradient_heading": "reference"}, {"reward_alignment": "term"})
+    assert reward.in_keys == ["heading", "reference", "gradient_heading_valid"]
+    assert reward.out_keys == ["reward", "term"]
+    assert AlignmentReward().out_keys == ["reward"]
+    assert AlignmentReward(["a", "b"]).in_names == ["heading", "gradient_heading"]
+    highest = HighestSPL({"done": "over", "success": "there"})
+    assert highest.in_keys == ["true_way", "move", "start_position", "target_position", "there", "over"]
+    for given in (highest.in_keys, {"way": "true_way"}):
+        with pytest.raises(ValueError, match=r"key must be one of|give up to 4 keys in the order .*, or a mapping"):
+            HighestSPL(given)
 
 
 def test_all_errors_are_deterministic_in_a_chain() -> None:

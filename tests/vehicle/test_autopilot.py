@@ -8,7 +8,6 @@ import math
 import random
 import runpy
 import socket
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -17,7 +16,6 @@ from typing import Any
 
 import pytest
 import torch
-from support.logs import nmea as log_of_a_ship
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move
@@ -30,7 +28,6 @@ from magrl.vehicle.logs import axes_of_elements, read_log
 from magrl.vehicle.onboard import Command, Onboard
 
 pytest.importorskip("pymavlink")
-from pymavlink.dialects.v10 import ardupilotmega as mavlink_1
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 FIELD = IGRF("2026-01-01")
@@ -60,7 +57,7 @@ class World:
         self.speed, self.step_s = speed, step_s
         self.place, self.time, self.heading = HERE, 0.0, 320.0
         self.north, self.rng, self.noise = north, random.Random(0), noise
-        self.said: list[str] = []
+        self.said: list[Command] = []
         self.steered = 0
 
     @property
@@ -90,8 +87,8 @@ class World:
         self.steered += 1
         self.heading = heading_deg + OFFSET * (self.north == "magnetic")
 
-    def report(self, command: Command, text: str) -> None:
-        self.said.append(text or f"{command.heading_deg}")
+    def report(self, command: Command) -> None:
+        self.said.append(command)
 
 
 def loop(north: str = "true") -> Loop:
@@ -114,7 +111,7 @@ def test_a_vehicle_arrives(flown) -> None:
     assert commands[-1].stop == "arrived"
     assert world.left_km < 25
     assert world.time * SPEED / 1000 < 3 * 144
-    assert world.said[-1].startswith("within 25 km")
+    assert world.said[-1].stop == "arrived"
     assert world.time / 60 < world.steered < world.time / 50 + len(commands)  # with each command, and now and then
     assert read_log(folder / "messages.csv").north == "true"  # the record is a log
 
@@ -156,65 +153,44 @@ def record(folder: Path) -> list[str]:
     return (folder / "messages.csv").read_text().splitlines(keepends=True)
 
 
-@pytest.mark.parametrize("number", range(4))
-def test_a_killed_flight_continues_with_the_same_commands(flown, number, tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize("number", range(3))
+def test_a_killed_flight_continues_with_the_same_commands(flown, number, tmp_path, monkeypatch, caplog) -> None:
+    """After a torn or a damaged line, with a state, with a damaged one, or without."""
     monkeypatch.setattr("magrl.vehicle.autopilot.flight.STATE_LINES", 10 + 90 * number)
     lines, repeated = record(flown[2]), []
     cut, other = sorted(random.Random(number).sample(range(2, len(lines)), 2))
     before = [*fly(loop(), Played(lines[1:cut]), tmp_path)]
+    torn = (lines[cut][:7], "\0\0\0\n", f"{lines[cut].strip()},5.0\n")[number]
     with (tmp_path / "messages.csv").open("a") as file:
-        file.write(lines[cut][: number % 7])  # the last line is torn
+        file.write(torn)
+    if number == 1:
+        (tmp_path / "flight.json").write_text("{")  # damaged: all messages are repeated
     flight, take = loop(), Loop.take
     monkeypatch.setattr(Loop, "take", lambda self, *a: repeated.append(a) or take(self, *a))
-    after = [*fly(flight, Played([]), tmp_path)]
-    assert after == before[-1:]
-    assert len(repeated) <= 10 + 90 * number  # of a state beside the messages
-    if number % 2:
-        (tmp_path / "flight.json").write_text(number // 2 * "{")  # damaged: all messages are repeated
+    assert [*fly(flight, Played([]), tmp_path)] == before[-1:]
+    assert number == 1 or len(repeated) <= 10 + 90 * number  # of a state beside the messages
     after = [*fly(loop(), Played(lines[cut:other]), tmp_path), *[*fly(loop(), Played(lines[other:]), tmp_path)][1:]]
     assert before + after[len(before[-1:]) :] == flown[1] or not before
-    assert record(tmp_path) == lines
+    assert ("is no message" in caplog.text) == (number > 0)
 
 
-@pytest.mark.parametrize("damage", ["\n", "{line},5.0\n", "\0\0\0\n", ",1.0,,,,,,,\n"])
-def test_what_comes_before_a_damaged_line_is_used(flown, damage, tmp_path, caplog) -> None:
-    lines, cut = record(flown[2]), 150
-    before = [*fly(loop(), Played(lines[1:cut]), tmp_path)]
-    bad = damage.format(line=lines[cut].strip()).encode()
-    (tmp_path / "messages.csv").write_bytes("".join(lines[:cut]).encode() + bad + "".join(lines[cut + 5 :]).encode())
-    flight = loop()
-    assert [*fly(flight, Played([]), tmp_path)] == before[-1:]
-    assert caplog.text.count("is no message") == caplog.text.count(f"line {cut + 1} of {tmp_path}/messages.csv") == 1
-    assert flight.now == pytest.approx(float(lines[cut - 1].split(",")[0]), abs=0.05)
-    _SAID.clear()
-    again = [*fly(loop(), Played(lines[cut : cut + 100]), tmp_path)]
-    assert [*fly(loop(), Played([]), tmp_path)] == again[-1:] == flown[1][len(before) - 2 + len(again) :][:1]
-    assert caplog.text.count("is no message") == 1  # it is said once
-
-
-CHANGES: list[tuple[str, dict[str, Any]]] = [
-    ("here", {"here": (60.0, 5.0), "date": "2026-01-01"}),
-    ("near", {"near": (60.0, 5.0), "date": "2026-01-01"}),
-    ("confidence", {"confidence": 0.9}),
-    ("north", {"north": "magnetic"}),
-    ("weights", {"navigator": "kalman"}),
-    ("read_s", {"read_s": 10.0}),
-]
-
-
-@pytest.mark.parametrize(("name", "change"), CHANGES)
-def test_a_flight_with_other_options_is_refused(name, change, tmp_path) -> None:
+def test_a_flight_with_other_options_is_refused(tmp_path) -> None:
     def made(read_s: float = 30.0, **rest: Any) -> Loop:
-        start = {key: rest.pop(key) for key in ("here", "near", "date") if key in rest}
+        start = {key: rest.pop(key) for key in ("start", "date") if key in rest}
         board = Onboard(rest.pop("navigator", "secant"), **rest)
         board.start((-11.6, 75.4, 13240.0), **start)
         return Loop(board, read_s=read_s)
 
-    assert [*fly(made(), Played([]), tmp_path)] == []
-    assert [*fly(made(), Played([]), tmp_path)] == []
-    with pytest.raises(ValueError, match=rf"is of a flight with.* {name} ") as error:
-        [*fly(made(**change), Played([]), tmp_path)]
-    assert "\n" not in str(error.value)
+    for _ in range(2):
+        assert [*fly(made(), Played([]), tmp_path)] == []
+    changes: dict[str, dict[str, Any]] = {
+        "start": {"start": (60.0, 5.0), "date": "2026-01-01"},
+        "read_s": {"read_s": 10.0},
+    }
+    changes |= {"confidence": {"confidence": 0.9}, "north": {"north": "magnetic"}, "navigator": {"navigator": "kalman"}}
+    for name, change in changes.items():
+        with pytest.raises(ValueError, match=rf"is of a flight with.* {name} "):
+            [*fly(made(**change), Played([]), tmp_path)]
 
 
 def test_a_folder_has_one_process(tmp_path) -> None:
@@ -230,50 +206,34 @@ def full(*_: Any) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-class Full:
-    """A file on a disk that is full now and then, where a part of what is written fits."""
-
-    left = 800
-
-    def __init__(self, file: Any, rng: random.Random) -> None:
-        self.file, self.rng = file, rng
-        self.close = file.close
-
-    def write(self, content: bytes) -> int:
-        self.left -= 1
-        if self.left > 0 and self.rng.random() < 0.7:
-            full()
-        return self.file.write(content[: self.rng.randrange(200)])
-
-
 def test_errors_of_the_system_do_not_end_the_steering(flown, tmp_path, caplog, monkeypatch) -> None:
+    """The line fails and the disk is full now and then: the commands are the same, and all messages are written."""
     rng, lines, opened = random.Random(0), record(flown[2]), Path.open
 
     class Broken(Played):
         def steer(self, *_: Any) -> None:
             self.steered += 1
-            if rng.random() < 0.5:
-                raise OSError(errno.ENETUNREACH, "Network is unreachable")
+            full() if rng.random() < 0.5 else None
 
         report = steer
 
-    def write(path: Path, content: bytes) -> None:
-        full() if rng.random() < 0.5 else path.write_bytes(content)
+    class Disk:
+        def __init__(self, file: Any) -> None:
+            self.file, self.close, self.left = file, file.close, 800
 
-    def disk(path: Path, mode: str, **options: Any) -> Any:
-        return Full(opened(path, mode, **options), rng) if mode == "ab" else opened(path, mode, **options)
+        def write(self, content: bytes) -> int:
+            self.left -= 1
+            full() if self.left > 0 and rng.random() < 0.7 else None
+            return self.file.write(content[: rng.randrange(200)])
 
     [*fly(loop(), Played([]), tmp_path)]
-    monkeypatch.setattr("magrl.vehicle.autopilot.flight.STATE_LINES", 5)
-    monkeypatch.setattr("magrl.vehicle.autopilot.flight.write_atomically", write)
-    monkeypatch.setattr(Path, "open", disk)
+    monkeypatch.setattr(Path, "open", lambda *a, **k: Disk(opened(*a, **k)) if a[1:] == ("ab",) else opened(*a, **k))
     link = Broken(lines[1:])
     assert [*fly(loop(), link, tmp_path)] == flown[1]
     assert link.steered >= 2 * len(flown[1]) - 1
     assert record(tmp_path) == lines
-    for text in ("the heading is not sent", "the command is not reported", "messages wait", "the state of the flight"):
+    for text in ("the heading is not sent", "the command is not reported", "messages wait"):
         assert len([line for line in caplog.messages if text in line]) == 1  # not each time
-    assert [*fly(loop(), Played([]), tmp_path)] == flown[1][-1:]
 
 
 def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
@@ -289,7 +249,7 @@ def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
     assert world.left_km < 25
 
 
-@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("number", range(2))
 def test_no_clock_moves_the_vehicle(number, caplog) -> None:
     """Times that are wrong once or from then on, and silence, against the time of receipt."""
     rng, flight, now, shift = random.Random(number), loop(), 0.0, 0.0
@@ -346,13 +306,6 @@ def test_a_bad_reading_is_named_and_the_vehicle_goes_on(change, text) -> None:
         assert flight.vehicle._steps[-1].inclination is None
 
 
-def test_an_impossible_message_does_not_count() -> None:
-    bad = [{"x": math.nan}, {"heading": math.inf}, {"pitch": 91.0}, {"speed": -1.0}, {"speed": 1e4}]
-    assert not any(Measurement(0.0, **values).possible for values in bad)
-    spiked = readings(lambda n, m: m._replace(pitch=400.0) if n % 2 and m.pitch else m)
-    assert spiked.vehicle._steps[0].inclination == pytest.approx(elements(HERE)[1], abs=0.1)
-
-
 @pytest.mark.parametrize("good", [True, False])
 def test_a_long_way_is_reported_in_parts_and_once(good) -> None:
     flight = readings(lambda _, m: m, 10)
@@ -377,17 +330,6 @@ def test_a_refused_reading_does_not_turn_the_vehicle() -> None:
             shown = flight._offset if len(flight.vehicle._steps) < 2 else shown
     assert "not possible" in flight.note or "changed from" in flight.note
     assert flight._offset == shown != 0.0
-
-
-def test_a_vehicle_that_does_not_get_ahead_reads_again() -> None:
-    flight, world = readings(lambda _, m: m, 8), World()
-    world.time = 80.0
-    assert flight.command.distance_km > 10
-    while len(flight.vehicle._steps) < 2:
-        world.heading += 30.0  # it circles
-        for message in world.messages():
-            flight.take(message)
-        assert world.time < 1000
 
 
 def test_a_loop_is_refused_without_a_start_and_after_the_end(flown) -> None:
@@ -431,7 +373,7 @@ def received(link: MavlinkLink, count: int = 0) -> list[Measurement | None]:
 
 
 def test_mavlink_is_read_in_our_units_from_one_vehicle() -> None:
-    attitude = mavlink.MAVLink_attitude_quaternion_message(5000, math.sqrt(0.5), 0, 0, math.sqrt(0.5), 0, 0, 0)
+    attitude = mavlink.MAVLink_attitude_message(5000, 0.0, 0.0, math.pi / 2, 0, 0, 0)
     imu = mavlink.MAVLink_highres_imu_message(5_100_000, *[0] * 6, 0.15, -0.02, 0.5, *[0] * 4, 0x1C0)
     coarse = mavlink.MAVLink_scaled_imu_message(5200, *[0] * 6, 150, 0, 500)
     line = Line([*packed(heartbeat(), attitude, imu, coarse, mavlink.MAVLink_vfr_hud_message(50, 40, 0, 0, 0, 0))])
@@ -491,38 +433,11 @@ def test_a_refused_heading_and_lost_requests_are_noticed(caplog) -> None:
     assert asked.count(mavlink.MAVLINK_MSG_ID_VFR_HUD) == 2
 
 
-def test_reports_are_whole(flown) -> None:
-    line, texts = Line([]), []
-    link, order = MavlinkLink(line), flown[1][-1]
-    link.report(order, "")
-    values = {message.name: message.value for message in line.sent}
-    assert values["mg_north"] == pytest.approx(order.way_km[0], rel=1e-5)
-    for length in (1, 36, 37, 91, 200):  # the last part of a text is not full
-        line.sent.clear()
-        link.report(order, "x" * length)
-        parts = [message for message in line.sent if message.get_type() == "STATUSTEXT"]
-        assert "".join(part.text for part in parts) == "magrl arrived: " + "x" * length
-        assert [part.chunk_seq for part in parts] == [*range(len(parts))]
-        assert all(len(part.text) == 50 for part in parts[:-1])
-        assert len(parts[-1].text) < 50
-        texts.append({part.id for part in parts})
-    assert len(set().union(*texts)) == len(texts)
-    line.sent.clear()
-    line.mav = mavlink_1.MAVLink(line)
-    link.report(None, "x" * 60)
-    assert "".join(part.text for part in line.sent) == "magrl: " + "x" * 60
-    ship = NmeaLink("loop://,4800")
-    ship.report(None, "The sign of D ± the compass, not checked: " + 40 * "x")
-    told = [ship.port.readline().decode().split("*")[0].split(",", 4) for _ in range(2)]
-    assert [part[1:3] for part in told] == [["02", "01"], ["02", "02"]]
-    assert "".join(part[4] for part in told) == "The sign of D ; the compass; not checked: " + 40 * "x"
-
-
 FOREIGN = [(6, 8, 255, 1), (18, 8, 1, 191), (26, 8, 7, 154), (27, 8, 9, 156), (5, 3, 3, 1), (1, 12, 4, 1), (2, 3, 5, 1)]
 """Ground station, onboard computer, gimbal, ADS-B, antenna tracker, a fixed wing of PX4, a copter without a speed."""
 
 
-@pytest.mark.parametrize("number", range(5))
+@pytest.mark.parametrize("number", range(2))
 def test_only_an_autopilot_that_can_be_steered_is_steered(number, caplog) -> None:
     def beat(kind: int, autopilot: int, system: int, component: int) -> Any:
         return packed(heartbeat(kind, autopilot), system=system, component=component)[0]
@@ -546,19 +461,6 @@ def test_only_an_autopilot_that_can_be_steered_is_steered(number, caplog) -> Non
     assert (line.sent[-1].target_system, line.sent[-1].target_component) == (8, 2)
 
 
-@pytest.mark.parametrize(
-    ("kind", "autopilot", "options", "text"),
-    [
-        (1, 12, {}, "PX4 accepts no heading"),
-        (22, 12, {"cruise_m_s": 20.0}, "PX4 accepts no heading"),
-        (10, 3, {}, "state cruise_m_s"),
-    ],
-)
-def test_an_autopilot_that_cannot_be_steered_as_stated_is_named(kind, autopilot, options, text, caplog) -> None:
-    received(MavlinkLink(Line(packed(heartbeat(kind, autopilot))), **options))
-    assert text in caplog.text
-
-
 def test_a_link_that_fails_goes_on(monkeypatch, caplog) -> None:
     monkeypatch.setattr("time.sleep", lambda _: None)
 
@@ -572,14 +474,6 @@ def test_a_link_that_fails_goes_on(monkeypatch, caplog) -> None:
     attitude = packed(mavlink.MAVLink_attitude_message(1000, *[0.0] * 6))
     link = MavlinkLink(Torn([OSError("unplugged"), *packed(heartbeat()), OSError("unplugged"), *attitude]))
     assert [item and item.heading for item in islice(link, 4)] == [None, None, None, 0.0]
-    ship = NmeaLink("loop://,4800")
-    items = iter(ship)
-    ship.port.close()  # as if it was unplugged
-    with pytest.raises(OSError, match="not open"):
-        ship.steer(1.0)
-    assert next(items) is None
-    ship.port.write(sentence("HEHDT,290.0,T"))
-    assert next(items).heading == 290.0
     assert "nothing is received: unplugged" in caplog.text
 
 
@@ -619,7 +513,7 @@ def test_nmea_over_udp_steers_a_ship() -> None:
         link.steer(120.0)
         assert ship.recv(99) == sentence("ECHSC,120.0,T,,M")
         assert ship.recv(99).startswith(b"$ECAPB,A,A,0.00,R,N,V,V,120.0,T,MAGRL,120.0,T,120.0,T*")
-        link.report(Command(1.0, 0.0, 0.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.5), "")
+        link.report(Command(1.0, 0.0, 0.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.5))
         assert ship.recv(99) == sentence("PMGRL,WAY,90.0,-12.0,5.0,0.50,")
     link.port.close()
     heading, field, speed = found
@@ -651,77 +545,6 @@ def test_sentences_of_another_north_or_speed_do_not_count() -> None:
 @pytest.mark.parametrize("line", ["HETHS,290.0,V", "HETHS,290.0,S", "HETHS,290.0,M", "HEHDT,720.0,T", "HEHDT,-1.0,T"])
 def test_a_heading_that_is_not_valid_does_not_count(line) -> None:
     assert read(line, "HEHDT,290.0,T") == [{"heading": 290.0}]
-
-
-@pytest.mark.parametrize("number", range(5))
-def test_an_unknown_transducer_changes_nothing(number, tmp_path) -> None:
-    """Names of columns of a log, with and without units, of any kind."""
-    rng, axes = random.Random(number), "G,1.0,,MAG_X_NT,G,2.0,,MAG_Y_NT,G,3.0,,MAG_Z_NT"
-    names = [
-        "SPEED",
-        "SOG",
-        "STW",
-        "YAW",
-        "HEADING",
-        "HEADING_TRUE",
-        "X",
-        "Y",
-        "Z",
-        "B_X",
-        "ACC_X",
-        "X_G",
-        "MAGNET",
-        "T",
-    ]
-    names += [
-        "TIME",
-        "DISTANCE",
-        "DEPTH",
-        "LAT",
-        "LON",
-        "ALT",
-        "MAG_HEADING",
-        "SPEED_KN",
-        "",
-        "PTCH",
-        "ROLL",
-        "PITCH",
-        "é",
-    ]
-    lines = []
-    for _ in range(100):
-        kinds = [(rng.choice("ACDFGHNPRTUV"), rng.choice(["", "N", "C", "R", "M", "X"]), name) for name in names]
-        group = ",".join(
-            f"{kind},{rng.choice(['5.0', '', '-1e9'])},{unit},{name}" for kind, unit, name in rng.sample(kinds, 6)
-        )
-        lines.append(rng.choice(["YX", "II", "SD"]) + f"XDR,{group}")
-    assert read(*lines, f"IIXDR,{axes}", "YXXDR,A,1.0,D,ROLL,A,2.0,D,PTCH") == [
-        {"x": 1.0, "y": 2.0, "z": 3.0},
-        {"roll": 1.0, "pitch": 2.0},
-    ]
-    paths = tmp_path / "a.log", tmp_path / "b.log"
-    for path, extra in zip(paths, ((), lines), strict=True):
-        path.write_bytes(log_of_a_ship(*extra))
-    logs = [read_log(path) for path in paths]
-    assert logs[0].samples.equals(logs[1].samples)
-    assert logs[0].north == logs[1].north
-
-
-@pytest.mark.parametrize(("north", "one", "other"), [("true", "HEHDT", "GPHDT"), ("magnetic", "HCHDM", "HCHDG")])
-def test_of_two_sources_the_first_or_the_named_one_counts(north, one, other, caplog) -> None:
-    lines = [f"{one},290.0,T", f"{other},20.0,,,,", f"{one},291.0,T", f"{other},300.0,,,,", "VWVHW,,T,,M,10.0,N,,K"]
-    found = read(*lines, "IIVBW,19.0,0.0,A,,,V,,V,,V", north=north)
-    assert [item["heading"] for item in found if "heading" in item] == [290.0, 291.0]
-    assert len(found) == 3
-    assert caplog.messages == [
-        f"heading of {other} does not count: it is 20.0, that of {one} was 290.0",
-        "speed of IIVBW does not count: it is 9.8, that of VWVHW was 5.1",
-    ]
-    assert read(*lines, north=north, sources=[other]) == [{"heading": 20.0}, {"heading": 300.0}]
-    caplog.clear()
-    _SAID.clear()
-    read(lines[0], *20 * ["GPGSA"], lines[3], north=north)
-    assert len(caplog.messages) == 1  # it agrees, but the first one is silent
 
 
 def test_a_serial_port_is_read_and_written() -> None:
@@ -789,15 +612,27 @@ def encoded(world: World, rng: random.Random) -> Iterator[Any]:
 # The command
 
 
-def test_the_command_looks_up_its_destination_and_names_what_is_missing(capsys) -> None:
-    words = ["--to", *map(str, THERE), "--noise", "0.05", "0.05", "5"]
-    here = ["--here", *map(str, HERE), "--date", "2026-01-01", "--navigator", "secant", "--bias", "0", "0", "0"]
-    board = vehicle(parser().parse_args(["udp:0", *words, *here]))
+WORDS = ["--target", *map(str, THERE), "--noise", "0.05", "0.05", "5"]
+
+
+def test_the_command_looks_up_its_destination() -> None:
+    here = ["--start", *map(str, HERE), "--date", "2026-01-01", "--navigator", "secant", "--bias", "0", "0", "0"]
+    board = vehicle(parser().parse_args(["udp:0", *WORDS, *here]))
     assert board.target == pytest.approx(elements(THERE), rel=1e-6)
-    assert board._here[1][1:] == (0.2, 133.0)  # a place is known as well as a model of the core
-    with pytest.raises(SystemExit):
-        main(["udp:0", "--nmea", *words])
-    assert "--to and --here need --date" in capsys.readouterr().err
+    assert board._known[1][1:] == pytest.approx((0.2, 133.0), rel=1e-4)  # as a model of the core
+
+
+@pytest.mark.parametrize("address", ["udp:99999", "/dev/none,4800", "udpin:0.0.0.0:99999", "/dev/none,fast", ""])
+@pytest.mark.parametrize("extra", [[], ["--nmea"], ["--nmea", "--cruise", "5"], ["--level"], ["--altitude", "1"]])
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves a socket open
+def test_a_wrong_command_is_refused_in_one_line(address, extra, capsys, tmp_path) -> None:
+    target = ["--target", "-11.6", "75.4", "13240"]
+    with pytest.raises(SystemExit) as status:
+        main([address, *extra, *target, *WORDS[3:], "--navigator", "secant", "--out", str(tmp_path / "x")])
+    gc.collect()
+    assert status.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "x").exists()
 
 
 def test_the_command_flies_on(flown, monkeypatch, capsys, tmp_path) -> None:
@@ -809,7 +644,7 @@ def test_the_command_flies_on(flown, monkeypatch, capsys, tmp_path) -> None:
     shown = capsys.readouterr().out
     lines = shown.splitlines()
     assert len(lines) == 1 + len(flown[1])
-    assert lines[1].endswith("; the sign of D and the compass were not checked: give here or near in start")
+    assert lines[1].endswith("; the sign of D and the compass were not checked: give the start")
     assert "stop: arrived, within 25 km" in shown
     with monkeypatch.context() as patch:
         patch.setattr(sys.stdout, "write", full)
@@ -821,101 +656,21 @@ def test_the_command_flies_on(flown, monkeypatch, capsys, tmp_path) -> None:
     assert again[2:] == [lines[-1].replace(f"{len(flown[1]) - 1}:", "0:", 1)]
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["udp:99999", "--nmea"], "cannot open udp:99999: "),
-        (["/dev/none,4800", "--nmea"], "cannot open /dev/none,4800: "),
-        (["udpin:0.0.0.0:99999"], "cannot open udpin:0.0.0.0:99999: "),
-        (["/dev/none,fast"], "'fast'"),
-        (
-            ["udp:0", "--nmea", "--steering", "velocity", "--cruise", "5"],
-            "--steering, --cruise has no effect with --nmea",
-        ),
-        (["udpin:0.0.0.0:0", "--level", "--sources", "HEHDT"], "--level, --sources has no effect without --nmea"),
-        (["udp:0", "--nmea", "--date", "2026-01-01"], "--date and --altitude need them"),
-        (["udp:0", "--nmea", "--altitude", "1"], "--date and --altitude need them"),
-    ],
-)
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves a socket open
-def test_a_wrong_command_is_refused_in_one_line(words, text, capsys, tmp_path) -> None:
-    with pytest.raises(SystemExit) as status:
-        main(
-            [*words, "--target", "-11.6", "75.4", "13240", "--noise", "0.05", "0.05", "5", "--out", str(tmp_path / "x")]
-        )
-    gc.collect()
-    shown = capsys.readouterr().err
-    assert status.value.code == 2
-    assert text in shown
-    assert shown.count("\n") == 1
-    assert not (tmp_path / "x").exists()
-
-
 @pytest.mark.slow
-def test_a_cessna_of_jsbsim_arrives_in_spite_of_faults(tmp_path) -> None:
-    """200 km in wind; the flight is interrupted, the magnetometer sticks for a while, and messages come twice."""
+def test_a_cessna_of_jsbsim_arrives_after_an_interruption(tmp_path) -> None:
+    """200 km in wind; its magnetometer sticks for a while."""
     pytest.importorskip("jsbsim")
-    example = runpy.run_path(str(EXAMPLE))
-    rng = random.Random(5)
+    example, rng = runpy.run_path(str(EXAMPLE)), random.Random(5)
     here, there, heading, wind = example["task"](rng, 200.0, 12.0)
     aircraft = example["Cessna"](here, heading, wind, rng)
-    line = example["Loopback"](aircraft)
-    receive = line.recv_match
-
-    def faulty(**_: Any) -> Any:
-        aircraft.stuck = 1500 < aircraft.time < 1800
-        message = receive()
-        if rng.random() < 0.1 and line._queue:  # out of order, and twice
-            line._queue.append(line._queue.popleft())
-            line._queue.append(line._queue[-1])
-        return message
-
-    line.recv_match = faulty
-    commands: list[Command] = []
+    line, commands = example["Loopback"](aircraft), []
     for limit in (8, 200):
         board = Onboard("anywhere", sensor_std=example["NOISE"])
         board.start(example["elements"](there))
-        again = []
-        for command in fly(Loop(board), MavlinkLink(line), tmp_path):
-            again.append(command)
-            if len(again) == limit:
-                break
-        assert again[: len(commands[-1:])] == commands[-1:]
-        commands = commands[:-1] + again
+        for command in islice(fly(Loop(board), MavlinkLink(line), tmp_path), limit):
+            aircraft.stuck = 1500 < aircraft.time < 1800
+            commands.append(command)
         line._queue.extendleft([heartbeat()])
+    assert commands[7] == commands[8]  # the last one before the interruption is yielded again
     assert commands[-1].stop == "arrived"
     assert example["EARTH"].Inverse(*aircraft.place, *there)["s12"] < 25_000
-
-
-@pytest.mark.slow
-def test_two_processes_fly_over_udp(tmp_path) -> None:
-    pytest.importorskip("jsbsim")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    aircraft = [
-        sys.executable,
-        str(EXAMPLE),
-        "--link",
-        f"udpout:127.0.0.1:{port}",
-        "--speedup",
-        "60",
-        "--distance",
-        "40",
-    ]
-    with subprocess.Popen(aircraft, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            words = next(line for line in process.stdout if "magrl.vehicle.autopilot" in line).split()
-            command = [
-                sys.executable,
-                *words[1:3],
-                f"udpin:127.0.0.1:{port}",
-                *words[4:],
-                "--out",
-                str(tmp_path / "out"),
-            ]
-            shown = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
-        finally:
-            process.kill()
-    assert "stop: arrived" in shown

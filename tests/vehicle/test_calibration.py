@@ -32,7 +32,7 @@ def swing(seed: int = 0, tilt: float = 20.0, headings: float = 1080.0) -> tuple[
 
 def left(calibration: Calibration, level: Tensor) -> Tensor:
     """Mean square errors of D, I, B_H after a calibration."""
-    found = elements_of_axes(calibration.apply(level), LEVEL, north="true").elements
+    found = elements_of_axes(calibration.apply(level), LEVEL)
     return (found - FIELD).square().mean(0)
 
 
@@ -92,7 +92,7 @@ def test_half_of_the_directions_without_attitude(side: int) -> None:
         directions = normal / normal.norm(dim=-1, keepdim=True)
         half = directions[side * directions[:, 2] > 0.2][:600]
         swung = calibrate(0.83 * 48680 * half + iron + 800 * normal[-600:], elements, alignment_deg=0.01)
-        inclination = elements_of_axes(swung.apply(0.83 * level + iron), LEVEL, north="true").elements[:, 1]
+        inclination = elements_of_axes(swung.apply(0.83 * level + iron), LEVEL)[:, 1]
         squares.append((inclination - 66).square().mean() / swung.std[1] ** 2)
         assert swung.offset_nt[2] == pytest.approx(1800, abs=4000)
         assert swung.std[1] < 1.5
@@ -134,11 +134,9 @@ def test_samples_that_are_refused(change, options, message: str) -> None:
         calibrate(change(axes), BERGEN, attitude_deg=attitude, **options)
 
 
-@pytest.mark.parametrize(
-    ("tilt", "message"), [(0.0, "1 % of its strength, where 5 % are needed"), (20.0, "leave D .*: the field was along")]
-)
+@pytest.mark.parametrize(("tilt", "message"), [(0.0, "1 % of its strength, where 5 % are needed"), (20.0, "leave D ")])
 def test_a_swing_without_attitude_needs_roll_and_pitch(tilt: float, message: str) -> None:
-    with pytest.raises(ValueError, match=rf"too few directions.*{message}.*; swing the vehicle: slowly through all"):
+    with pytest.raises(ValueError, match=rf"too few directions.*{message}.*swing the vehicle: slowly through all"):
         calibrate(swing(1, tilt)[0], BERGEN, alignment_deg=5.0)
 
 

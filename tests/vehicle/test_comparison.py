@@ -11,7 +11,7 @@ import torch
 
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import move
-from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs import axes_of_elements, difference_from_igrf, elements_of_axes, mistakes
 
 DATE = "2026-06-30"
@@ -105,7 +105,7 @@ def test_iron_is_taken_for_no_mistake(seed: int) -> None:
     axes = axes @ (torch.eye(3) + 0.02 * torch.tensor(random.normal(size=(3, 3)))) + torch.tensor(
         random.normal(0, 800, 3)
     )
-    table = pandas.DataFrame(elements_of_axes(axes, attitude, north="true").elements.numpy(), columns=["D", "I", "B_H"])
+    table = pandas.DataFrame(elements_of_axes(axes, attitude).numpy(), columns=["D", "I", "B_H"])
     table[["latitude", "longitude"]], table["heading"], table["distance"] = place.numpy(), attitude[:, 2].numpy(), 0.0
     assert all(
         text.endswith(("or a heading that is wrong", "iron near the vehicle there")) for text in mistakes(table, DATE)

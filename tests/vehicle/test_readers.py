@@ -16,7 +16,6 @@ from pymavlink.DFReader import DFReader_binary
 from pymavlink.dialects.v20.ardupilotmega import (
     MAVLink,
     MAVLink_attitude_message,
-    MAVLink_attitude_quaternion_message,
     MAVLink_gps_raw_int_message,
     MAVLink_highres_imu_message,
     MAVLink_raw_imu_message,
@@ -28,12 +27,12 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from support.logs import ATTITUDE, AXES, ELEMENTS, PLACE, UTC, dataflash, nmea, quaternions, ulog
 
-from magrl.vehicle.logs import Log, axes_of_elements, elements_of_axes, from_enu, read_log
+from magrl.vehicle.logs import Log, elements_of_axes, from_enu, read_log
 
 
 def check(log: Log, *, date: str | None = "2026-06-30") -> None:
     """The elements of a log are those that were written, at their place and date."""
-    found = elements_of_axes(log.tensor("x", "y", "z"), log.tensor("roll", "pitch", "heading"), north="true").elements
+    found = elements_of_axes(log.tensor("x", "y", "z"), log.tensor("roll", "pitch", "heading"))
     assert len(found) == 12
     assert (found - ELEMENTS).abs().amax(0).lt(torch.tensor([0.1, 0.05, 20.0])).all()
     assert log.date == date
@@ -75,20 +74,10 @@ def test_px4_has_the_selected_healthy_magnetometer(tmp_path: Path, second: float
         read_log(path, sensor="mag")
 
 
-@pytest.mark.parametrize("names", [("sensor_mag:1", "vehicle_magnetometer"), ("vehicle_magnetometer", "sensor_mag:1")])
-def test_px4_has_the_calibrated_magnetometer(tmp_path: Path, names: tuple[str, str]) -> None:
-    """Which an older log does not mark as used, and not the device that the estimator used, as it was measured."""
-    factors = {name: 0.5 if "sensor_mag" in name else 1.0 for name in names}
-    log = read_log(written(tmp_path / "log.ulg", ulog(factors, selected=1, older=True)))
-    check(log)
-    assert torch.allclose(log.tensor("x", "y", "z"), AXES, atol=1)
-
-
 def test_px4_truncated_and_no_log(tmp_path: Path) -> None:
     path = tmp_path / "log.ulg"
     cut = read_log(written(path, ulog()[:-290]))
     assert len(cut.samples) < 12
-    assert "the file is damaged or truncated" in cut.notes
     with pytest.raises(ValueError, match=r"cannot read .*log.ulg"):
         read_log(written(path, b"ULog" * 9))
 
@@ -125,16 +114,13 @@ def test_ardupilot_as_text(tmp_path: Path) -> None:
 def telemetry(path: Path, kind: str, air: float, *, field: bool = True) -> Path:
     """Telemetry of ArduPilot or PX4; positions without a fix do not count."""
     link, parts = MAVLink(None), []
-    for row, (axes, angles, q) in enumerate(
-        zip(AXES.tolist(), ATTITUDE.tolist(), quaternions(ATTITUDE).tolist(), strict=True)
-    ):
+    for row, (axes, angles) in enumerate(zip(AXES.tolist(), ATTITUDE.tolist(), strict=True)):
         place = [round(x * 1e7) for x in PLACE] if row else [0, 0]
         zeros = (0,) * 6
         imu = MAVLink_raw_imu_message(0, *zeros, *(round(axis / 100) for axis in axes))
         attitude = MAVLink_attitude_message(0, *map(math.radians, angles), 0, 0, 0)
         if kind == "PX4":
             imu = MAVLink_highres_imu_message(0, *zeros, *(axis / 1e5 for axis in axes), 0, 0, 0, 0, 0, 1)
-            attitude = MAVLink_attitude_quaternion_message(0, *q, 0, 0, 0)
         fix = MAVLink_gps_raw_int_message(0, 3 if row else 1, *place, *zeros)
         messages = *[imu] * field, attitude, fix, MAVLink_vfr_hud_message(air, 20.0, 0, 0, 0.0, 0.0)
         stamp = struct.pack(">Q", int((UTC + row) * 1e6))
@@ -144,15 +130,15 @@ def telemetry(path: Path, kind: str, air: float, *, field: bool = True) -> Path:
 
 @pytest.mark.parametrize(("kind", "air"), [("ArduPilot", 25.0), ("PX4", math.nan), ("PX4", 0.0)])
 def test_telemetry(tmp_path: Path, kind: str, air: float) -> None:
-    """Milligauss or gauss, radians or quaternions; airspeed, or groundspeed without an airspeed sensor."""
+    """Milligauss or gauss; airspeed, or groundspeed without an airspeed sensor."""
     log = read_log(telemetry(tmp_path / "log.tlog", kind, air))
-    found = elements_of_axes(log.tensor("x", "y", "z"), log.tensor("roll", "pitch", "heading"), north="true").elements
+    found = elements_of_axes(log.tensor("x", "y", "z"), log.tensor("roll", "pitch", "heading"))
     limits = torch.tensor([0.3, 0.2, 100.0]) if kind == "ArduPilot" else torch.tensor([0.001, 0.001, 1.0])
     assert (found - ELEMENTS).abs().amax(0).lt(limits).all(), "whole milligauss, or float32"
     assert log.tensor("latitude", "longitude")[0].tolist() == pytest.approx(PLACE, abs=1e-6)
     assert log.samples["speed"].tolist() == [air if air > 0 else 20.0] * 12
     speed = "airspeed" if air > 0 else "groundspeed"
-    names = {"ArduPilot": ["RAW_IMU", "ATTITUDE"], "PX4": ["HIGHRES_IMU:1", "ATTITUDE_QUATERNION"]}[kind]
+    names = {"ArduPilot": ["RAW_IMU", "ATTITUDE"], "PX4": ["HIGHRES_IMU:1", "ATTITUDE"]}[kind]
     assert log.source == f"MAVLink telemetry: {', '.join([*names, 'GPS_RAW_INT', f'VFR_HUD.{speed}'])}"
 
 
@@ -215,8 +201,6 @@ def test_ros(tmp_path: Path, version: int, storage: str) -> None:
     if version == 2:
         (path / "metadata.yaml").unlink()
         check(read_log(file))
-    with pytest.raises(ValueError, match=rf"such a bag must end in \.{storage}: rename it .*\.{storage}"):
-        read_log(file.rename(tmp_path / "other"))
 
 
 def test_a_log_without_a_magnetometer_tells_how_to_log_one(tmp_path: Path) -> None:
@@ -271,59 +255,10 @@ def test_the_deviation_of_a_compass_counts(tmp_path: Path) -> None:
     assert log.samples["heading"].tolist() == pytest.approx([175.0] * len(log.samples))
 
 
-def iaga(names: str, rows: list[tuple[float, ...]], kind: str = "definitive") -> bytes:
-    """A record of an observatory: https://www.ngdc.noaa.gov/IAGA/vdat/IAGA2002/iaga2002format.html."""
-    head = {"Format": "IAGA-2002", "Station Name": "Zurich", "IAGA CODE": "ZUR", "Geodetic Latitude": PLACE[0]}
-    head |= {"Geodetic Longitude": PLACE[1] - 360, "Elevation": 600, "Reported": names, "Data Type": kind}
-    lines = [f" {name:<23}{value:<45}|" for name, value in head.items()]
-    lines += [f" # {'a comment with $GPRMC, in it':<66}|", f"{'DATE       TIME         DOY':<30}"]
-    lines[-1] += "".join(f" ZUR{name}     " for name in names) + "  |"
-    for minute, values in enumerate(rows):
-        time = f"2026-06-30 12:{minute:02}:00.000 181   "
-        lines.append(time + "".join(f" {value:9.2f}" for value in values))
-    return "\r\n".join([*lines, ""]).encode()
-
-
-@pytest.mark.parametrize("names", ["XYZF", "HDZF", "DHZF"])
-def test_observatory(tmp_path: Path, names: str) -> None:
-    """A fixed vehicle with axes north, east, down; D is in minutes of arc; rows with a missing value do not count."""
-    (d, _, h), (x, y, z) = ELEMENTS.tolist(), axes_of_elements(ELEMENTS, torch.zeros(3).double()).tolist()
-    values = {"X": x, "Y": y, "Z": z, "H": h, "D": 60 * d, "F": 99999.0}
-    whole = tuple(values[name] for name in names)
-    rows = [whole, (*whole[:2], 99999.0, 0.0), (88888.0, *whole[1:]), (*whole[:3], 48000.0)]
-    path = written(tmp_path / "zur.min", iaga(names, rows))
-    log = read_log(path)
-    assert log.tensor("roll", "pitch", "heading").abs().max() == 0
-    found = elements_of_axes(log.tensor("x", "y", "z"), torch.zeros(2, 3).double(), north="true").elements
-    assert torch.allclose(found, ELEMENTS.expand(2, 3), atol=0.01)
-    assert log.tensor("latitude", "longitude", "altitude")[0].tolist() == pytest.approx([*PLACE, 0.6])
-    assert np.diff(log.samples["time"]).tolist() == [180.0]
-    assert (log.date, log.north, log.source, log.notes) == ("2026-06-30", "true", "IAGA-2002: Zurich", ())
-    assert "without the baselines" in read_log(written(path, iaga(names, rows, "variation"))).notes[0]
-    with pytest.raises(ValueError, match="its components are H, E, Z, F: a record of X, Y, Z or of H, D, Z is needed"):
-        read_log(written(path, iaga("HEZF", rows)))
-
-
-@pytest.mark.parametrize("separator", [",", " ", "\t", "; "])
-def test_three_columns_are_axes(tmp_path: Path, separator: str) -> None:
-    rows = "\n".join(separator.join(f"{value:.3f}" for value in axes) for axes in AXES.tolist())
-    log = read_log(written(tmp_path / "log.txt", rows.encode()))
-    assert torch.allclose(log.tensor("time", "x", "y", "z")[:, 1:], AXES, atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("module", "start"),
-    [
-        ("pyulog", b"ULog"),
-        ("pymavlink", b"\xa3\x95"),
-        ("pymavlink", bytes(8) + b"\xfd"),
-        ("rosbags", b"#ROSBAG"),
-        ("rosbags", b"\x89MCAP"),
-        ("pynmeagps", b"junk$GPRMC,"),
-    ],
-)
-def test_a_missing_package_is_named(tmp_path: Path, monkeypatch, module: str, start: bytes) -> None:
-    for name in [module, *(each for each in sys.modules if each.startswith(f"{module}."))]:
-        monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ImportError, match=rf"needs the package {module}: pip install 'magrl\[logs\]'"):
-        read_log(written(tmp_path / "log", start))
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch) -> None:
+    starts = {"pyulog": b"ULog", "rosbags": b"#ROSBAG", "pynmeagps": b"junk$GPRMC,"}
+    for module, start in starts.items():
+        for name in [module, *(each for each in sys.modules if each.startswith(f"{module}."))]:
+            monkeypatch.setitem(sys.modules, name, None)
+        with pytest.raises(ImportError, match=rf"needs the package {module}: pip install 'magrl\[logs\]'"):
+            read_log(written(tmp_path / "log", start))

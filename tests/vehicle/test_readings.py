@@ -7,7 +7,7 @@ import pandas
 import pytest
 import torch
 
-from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs import Calibration, Log, axes_of_elements, readings_of
 
 
@@ -32,11 +32,8 @@ def test_a_reading_is_that_at_its_place() -> None:
     assert table["samples"].sum() == 6000
 
 
-@pytest.mark.parametrize("options", [{"every_s": 1200.0}, {"every_km": 20.0}])
-def test_the_last_part_is_not_short(options) -> None:
-    """By time the last one may be; by distance it is joined to the one before."""
-    found = readings_of(sailed(6600 - 60 * ("every_km" in options)), **options)
-    assert len(found) == (6 if "every_s" in options else 5)
+def test_a_short_last_part_is_joined_to_the_one_before() -> None:
+    assert len(readings_of(sailed(6540), every_km=20.0)) == 5
 
 
 @pytest.mark.parametrize("motion", ["distance", "speed", "positions"])
@@ -86,14 +83,14 @@ def test_the_standard_deviation_of_correlated_noise() -> None:
 def test_the_standard_deviation_of_few_samples(count: int) -> None:
     """That of white noise, 30 / sqrt(n), and unknown below three samples."""
     noise = np.random.default_rng(count).normal(0, 30, (200 * count, 3))
-    std = readings_of(sailed(200 * count, noise), every_s=float(count))["B_H_std"]
+    std = readings_of(sailed(200 * count, noise), every_km=count / 60 - 1e-6)["B_H_std"]
     assert np.sqrt((std**2).mean()) == pytest.approx(30 / np.sqrt(count), rel=0.2)
-    assert readings_of(sailed(200, noise[:200]), every_s=2.0)["B_H_std"].isna().all()
+    assert readings_of(sailed(200, noise[:200]), every_km=2 / 60 - 1e-6)["B_H_std"].isna().all()
 
 
 def test_a_magnetic_heading_and_a_calibration() -> None:
     one, options = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), {"noise_nt": 0.0, "samples": 9, "outliers": 0.0}
-    options |= {"method": "vector", "std": (0.1, 0.1, 9.0), "seen": ((0.0, 1.0),) * 3, "here": (0.0, 0.0)}
+    options |= {"method": "vector", "std": (0.1, 0.1, 9.0), "here": (0.0, 0.0)}
     iron = Calibration(matrix=one, offset_nt=(300.0, 0.0, 0.0), **options)
     corrected = readings_of(sailed(noise=np.array([[300.0, 0.0, 0.0]])), calibration=iron)
     assert corrected["D"].tolist() == pytest.approx([10] * 5, abs=1e-6)
@@ -112,29 +109,18 @@ def test_a_log_without_a_heading_has_that_of_its_compass() -> None:
     assert alone["I"].tolist() == pytest.approx(whole["I"].tolist())
 
 
-@pytest.mark.parametrize(
-    ("change", "options", "message"),
-    [
-        (lambda log: Log(log.samples, "by hand"), {}, "does not state the north of the heading: give north"),
-        (
-            lambda log: Log(log.samples.drop(columns="heading"), ""),
-            {"north": "true"},
-            "the log has no heading, only time, x",
-        ),
-        (
-            lambda log: Log(log.samples.drop(columns="speed"), "", "true"),
-            {},
-            "neither distances nor speeds nor positions",
-        ),
-        (
-            lambda log: Log(log.samples.drop(columns="speed"), "by hand"),
-            {},
-            "does not state the north .*; the log has neither",
-        ),
-        (lambda log: log, {"every_km": 0.0}, "every_km must be a finite number above 0"),
-        (lambda log: log, {"north": "grid"}, "north must be one of 'true', 'magnetic', 'model', got 'grid'"),
-    ],
-)
-def test_logs_that_are_refused(change, options, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        readings_of(change(sailed(100)), **options)
+def test_a_log_that_lacks_something_is_refused() -> None:
+    """Each column and the north, as far as they are needed, and a wrong option."""
+    log = sailed(100)
+    for column, message in (
+        ("heading", "the log has no heading"),
+        ("speed", "neither distances nor speeds"),
+        ("x", "no x"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            readings_of(Log(log.samples.drop(columns=column), "by hand", "true"), north="true")
+    with pytest.raises(ValueError, match=r"does not state the north .*; the log has neither"):
+        readings_of(Log(log.samples.drop(columns="speed"), "by hand"))
+    for options in ({"every_km": 0.0}, {"north": "grid"}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            readings_of(log, **options)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -192,6 +192,8 @@ class ReadingErrors(EpisodeErrors):
         in_keys: of the transform.
         out_keys: of the transform.
         seed: seed of the errors.
+        stated: accuracy that the vehicle is told, in place of that of the errors:
+            :data:`magrl.sensor_std.PERFECT` for errors that no data sheet states.
 
     :meth:`_disturb` returns the numbers of the next step, so that a drift keeps its value. :meth:`accuracy` knows no
     time: of an error that grows, it is the mean over an episode.
@@ -202,11 +204,12 @@ class ReadingErrors(EpisodeErrors):
         >>> from torchrl.envs import TransformedEnv
         >>> class TemperatureError(ReadingErrors):
         ...     channel = 8  # a number that no other error has
+        ...     default_in_keys, in_sizes = ("field",), {"field": (3,)}
         ...     numbers_key, stream_key = "temperature_error", "temperature_stream"  # privileged keys of its state
         ...     size = draws = 1  # numbers of an episode, and random numbers at its start
         ...     def __init__(self, std_nt, **options):
-        ...         super().__init__(["field"], ["field"], **options)
-        ...         self.std_nt, self.in_sizes = std_nt, (3,)
+        ...         super().__init__(**options)
+        ...         self.std_nt = std_nt
         ...         self._set_accuracy()
         ...     def _constants(self, stream):  # the errors of new episodes
         ...         return self.std_nt * stream_normal(stream, self.draws)
@@ -224,14 +227,16 @@ class ReadingErrors(EpisodeErrors):
 
     default_out_keys: ClassVar[Keys] = ("field",)
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
-    reading: ClassVar[int] = 0
-    """Index of the reading among ``in_keys`` and ``out_keys``."""
     _accuracy: Tensor
+
+    def __init__(self, *keys: GivenKeys, stated: SensorStd | None = None, **options: Any) -> None:
+        super().__init__(*keys, **options)
+        self.stated = stated
 
     def _set_accuracy(self) -> None:
         """Compute the standard deviations that the vehicle knows, when all sizes are set."""
-        count = self.in_sizes[self.reading]
-        field = torch.tensor(TYPICAL_FIELD if count == 3 else (0.0,) * (count or 0), dtype=torch.float64)
+        (count,) = self.in_sizes["field"]
+        field = torch.tensor(TYPICAL_FIELD if count == 3 else (0.0,) * count, dtype=torch.float64)
         accuracy = torch.stack(self.accuracy(field)).to(torch.get_default_dtype())
         self.register_buffer("_accuracy", accuracy, persistent=False)
 
@@ -241,8 +246,9 @@ class ReadingErrors(EpisodeErrors):
         """Write a reading, its true value and its accuracy, if that is not always the same."""
         if tensordict.get(self.true_keys[0], None) is None:
             tensordict.set(self.true_keys[0], value)
-        tensordict.set(self.out_keys[self.reading], _folded(reading) if reading.shape[-1] == 3 else reading)
+        self._write_named(tensordict, field=_folded(reading) if reading.shape[-1] == 3 else reading)
         accuracy = SensorStd(*self._accuracy.to(reading.dtype)) if accuracy is None else accuracy
+        accuracy = accuracy if self.stated is None else SensorStd(*reading.new_tensor(self.stated))
         for key, std in zip(STD_KEYS, accuracy, strict=True):
             before = tensordict.get(key, None)
             tensordict.set(key, std.expand_as(reading).clone() if before is None else torch.hypot(before, std))
@@ -250,10 +256,10 @@ class ReadingErrors(EpisodeErrors):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the true value, the accuracy, the errors and the state of the numbers; the reading is unbounded."""
         observation_spec = super().transform_observation_spec(observation_spec)
-        leaf = observation_spec[self.in_keys[self.reading]]
+        leaf = observation_spec[self._named(self.in_keys)["field"]]
         if self.true_keys[0] not in observation_spec.keys(True, True):
             observation_spec[self.true_keys[0]] = leaf.clone()
-        for key in (self.out_keys[self.reading], *STD_KEYS):
+        for key in (self.out_keys[self.out_names.index("field")], *STD_KEYS):
             self._add(observation_spec, leaf, key, *leaf.shape[-1:])
         return observation_spec
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from magrl.checks import check_choice, check_numbers, check_type
+from magrl.checks import check_choice, check_number, check_numbers, check_type
 from magrl.files import read_document
 from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
@@ -26,6 +26,10 @@ from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
 
 MAGNETIC = "magnetic"
 """North of a vehicle without a true-north reference."""
+
+
+MOVE_KM = 50.0
+"""Move that the noise of a log belongs to [km]."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ class Conditions:
 
     def __post_init__(self) -> None:
         check_type(str, name=self.name)
+        check_number(0, above=True, speed_km_h=self.speed_km_h)
         self.transforms()  # an error before they are used
 
     @property
@@ -117,6 +122,24 @@ class Conditions:
         field = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
         variances = sum(torch.stack(error.accuracy(field)).square() for error in self.transforms())
         return _rounded(SensorStd(*torch.as_tensor(variances).sqrt()))
+
+    @cached_property
+    def motion_std(self) -> tuple[float, float]:
+        """Errors of dead reckoning along each axis, as a vehicle knows them: its constant drift [share of the way], and
+        the random part after 1 km [km].
+
+        Log, current and the constant error of true north drift; eddies and the noise of the log are random.
+
+        Example:
+            >>> [round(number, 3) for number in CONDITIONS["ship"].motion_std]
+            [0.027, 0.0]
+        """
+        motion = {"log_scale": 0.0, "log_noise": 0.0, "current_km_h": 0.0, "eddies_km_h": 0.0, "eddy_km": 200.0}
+        log, noise, current, eddies, length = (({**motion, **(self.motion or {})})[key] for key in motion)
+        north = self.std.bias[0] if math.isfinite(self.std.bias[0]) else 0.0
+        shares = log, current / self.speed_km_h, math.radians(north)
+        random = (eddies / self.speed_km_h) ** 2 / 2 * length / math.pi + noise**2 / 2 * MOVE_KM
+        return math.hypot(*shares) / math.sqrt(2), math.sqrt(random)
 
     def std_at(self, known_start: Sequence[float] | None) -> SensorStd:
         """Return the standard deviations with which a vehicle navigates, given what it knows at its start.

@@ -81,8 +81,8 @@ class KnownStart(StatefulTransform):
 
     default_in_keys = ("field", "true_field", "sensor_std", "bias_std")
     default_out_keys = ("field", "bias_std", *START_KEYS)
-    in_sizes = (3, 3, 3, 3)
-    out_sizes = ((3,),) * 6
+    in_sizes = dict.fromkeys(default_in_keys, (3,))
+    out_sizes = dict.fromkeys(default_out_keys, (3,))
     _std: Tensor
 
     def __init__(
@@ -100,8 +100,10 @@ class KnownStart(StatefulTransform):
         drift, known_std = self._std.to(reading.dtype)
         known = torch.where(bias < math.inf, known, reading)  # what is not measured is not told, either
         error, left = calibration(reading, known, SensorStd(noise, bias, drift), known_std)
-        self._advance(tensordict, values, [left.bias, error, known, known_std.expand_as(known).clone(), bias])
+        given = {"start_error": error, "start_field": known, "start_std": known_std.expand_as(known).clone()}
+        first = element_difference(reading, error)
+        self._write_named(tensordict, field=first, bias_std=left.bias, start_bias_std=bias, **given)
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        for key, value in zip(self.out_keys, (element_difference(values[0], state[1]), *state), strict=True):
-            tensordict.set(key, value)
+        before = dict(zip(self.out_names[1:], state, strict=True))
+        self._write_named(tensordict, field=element_difference(values[0], before["start_error"]), **before)

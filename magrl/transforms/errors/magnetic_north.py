@@ -12,6 +12,7 @@ from torchrl.data import Composite
 
 from magrl.geodesy import wrap_angle
 from magrl.sensor_std import SensorStd
+from magrl.transforms.base import GivenKeys
 from magrl.transforms.errors.base import Episode, ReadingErrors
 
 
@@ -49,12 +50,12 @@ class MagneticNorth(ReadingErrors):
     default_in_keys = ("heading", "field", "target_field")
     default_out_keys = default_in_keys
     numbers_key, stream_key = "compass_declination", "compass_stream"
-    reading = 1
-    in_sizes = (1, 3, 3)
+    in_sizes = {"heading": (1,), "field": (3,), "target_field": (3,)}
     size = 1
 
-    def __init__(self, in_keys: tuple[NestedKey, ...] = default_in_keys) -> None:
-        super().__init__(in_keys, in_keys)
+    def __init__(self, in_keys: GivenKeys = None) -> None:
+        super().__init__(in_keys)
+        self.out_keys: list[NestedKey] = list(self.in_keys)
         self.in_keys_inv, self.out_keys_inv = [self.in_keys[0], self.in_keys[2]], list(self.true_keys[1:])
         self._set_accuracy()
 

@@ -69,7 +69,7 @@ class MotionError(EpisodeErrors):
     default_out_keys = ("true_move", "true_course")
     true_keys = (*default_out_keys, DISPLACEMENT)
     numbers_key, stream_key = "motion_error", "motion_stream"
-    in_sizes = (2, 1, 2)
+    in_sizes = {"move": (2,), "heading": (1,), "position": (2,)}
     size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2
 
     def __init__(
@@ -92,8 +92,7 @@ class MotionError(EpisodeErrors):
         check_number(0, log_noise=log_noise, heading_noise_deg=heading_noise_deg)
         check_number(0, current_km_h=current_km_h, eddies_km_h=eddies_km_h)
         check_number(0, above=True, eddy_km=eddy_km)
-        if current_km_h or eddies_km_h:
-            check_number(0, above=True, speed_km_h=speed_km_h)
+        check_number(0, above=True, optional=not (current_km_h or eddies_km_h), speed_km_h=speed_km_h)
         self.log, self.compass, self.fixed = (log_scale, log_noise), (compass_deg, heading_noise_deg), fixed
         self.current_km_h, self.eddies_km_h, self.speed_km_h = current_km_h, eddies_km_h, float(speed_km_h or 1.0)
         shortest, _ = self._stretch

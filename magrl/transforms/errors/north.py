@@ -17,7 +17,7 @@ from magrl.checks import check_choice, check_number
 from magrl.counters import stream_normal
 from magrl.geodesy import wrap_angle, wrap_longitude
 from magrl.sensor_std import SensorStd
-from magrl.transforms.base import Keys
+from magrl.transforms.base import GivenKeys
 from magrl.transforms.errors.base import Episode, ReadingErrors, gauss_markov
 
 SCHULER_HOURS = 1.407
@@ -87,10 +87,9 @@ class NorthReferenceError(ReadingErrors):
     true_keys = ("true_field", "true_heading")
     default_in_keys = ("heading", "field", "move")
     default_out_keys = ("heading", "field")
-    in_counts = (3, 4)
+    optional_in_keys = ("position",)
     numbers_key, stream_key = "north_error", "north_stream"
-    reading = 1
-    in_sizes = (1, 3, None, 2)
+    in_sizes = {"heading": (1,), "field": (3,), "position": (2,)}
     size, draws, step_draws = 3, 1, 2
 
     def __init__(
@@ -101,15 +100,15 @@ class NorthReferenceError(ReadingErrors):
         *,
         drift_length_km: float | None = None,
         fixed: bool = False,
-        in_keys: Keys = default_in_keys,
+        in_keys: GivenKeys = None,
         **options: Any,
     ) -> None:
-        super().__init__(in_keys, in_keys[:2], **options)
+        super().__init__(in_keys, **options)
+        self.out_keys: list[NestedKey] = self.in_keys[:2]
         self.in_keys_inv, self.out_keys_inv = self.in_keys[:1], [self.true_keys[1]]
         check_number(-math.inf if fixed else 0, constant_deg=constant_deg)
         check_number(0, drift_deg=drift_deg, random_deg=random_deg)
-        if drift_deg:
-            check_number(0, above=True, drift_length_km=drift_length_km)
+        check_number(0, above=True, optional=not drift_deg, drift_length_km=drift_length_km)
         self.sizes, self.drift_length_km = (constant_deg, drift_deg, random_deg), float(drift_length_km or 1)
         self.fixed = fixed
         self._set_accuracy()

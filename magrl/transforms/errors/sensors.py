@@ -1,9 +1,9 @@
-"""Errors of sensors beyond white noise: bias, scale, drift, outages, rounding, and those of a vector magnetometer."""
+"""Errors of sensors: noise, bias, scale, drift, outages, rounding, and those of a vector magnetometer."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,14 +11,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number, check_type
-from magrl.counters import normal_of, stream_normal, stream_uniform
-from magrl.sensor_std import SensorStd
-from magrl.transforms.base import expect_keys
+from magrl.counters import normal_of, stream_uniform
+from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, gauss_markov
+from magrl.transforms.errors.levels import LEVEL_DRAWS
 from magrl.transforms.errors.vector import VectorErrors
 
-OUTAGE_STD = 1e4
-"""Standard deviation of a repeated reading, in the unit of each element: a filter ignores it."""
+DRIFT_KM = 200.0
+"""Correlation length of a drift [km]; chosen."""
 
 
 class SensorErrors(ReadingErrors):
@@ -30,29 +30,34 @@ class SensorErrors(ReadingErrors):
     in the unit of each element; those that are not given are 0.
 
     ``sensor_std`` becomes that of the errors which are new at each reading (noise and rounding), during an outage
-    :data:`OUTAGE_STD`; ``bias_std`` that of the constant and the slow ones. Both are roots of sums of variances, at
-    :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
+    :data:`~magrl.sensor_std.OUTAGE_STD`; ``bias_std`` that of the constant and the slow ones. Both are roots of sums
+    of variances, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
     Args:
         noise: white noise.
         bias: constant error.
         scale: error of the scale, as a share of the value, where the elements are D, I, B_H.
         drift: slow drift.
-        drift_length: its correlation length [unit of the distance of a move, or steps]; with ``drift`` alone.
+        drift_length: its correlation length [unit of the distance of a move, or steps].
         resolution: the reading is rounded to multiples of this; 0 for no rounding.
         outage_rate: probability that a reading is missing; never the first of an episode.
         vector: errors of a vector magnetometer, where the elements are D, I, B_H.
         fixed: whether bias and scale are the errors themselves, in every episode.
+        levels: function of uniform numbers ``(..., 12)`` in [0, 1), which returns further standard deviations
+            ``(..., 2 E)`` for each vehicle and episode, such as :func:`~magrl.transforms.sensor_levels`: of white
+            noise, then of a bias, whose variance is shared between a constant error and a drift at random.
         in_keys: a value ``(..., E)``; optionally the last move ``(..., K)``, whose first number is its distance,
             without which the drift is by steps; and optionally the heading ``(..., 1)`` [rad], in whose axes ``vector``
             acts.
         out_keys: the reading ``(..., E)``, in place by default.
         **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
-            episode are bias, scale error, drift, last reading, and those of ``vector``.
+            episode are bias, scale error, drift, last reading, drawn standard deviations of noise, bias and drift, and
+            those of ``vector``.
 
     Raises:
-        ValueError: for sizes that are negative or of another number than ``noise``, a rate outside [0, 1), a drift
-            without its length, ``scale`` or ``vector`` with other than three elements, or ``vector`` without a heading.
+        ValueError: for sizes that are negative or of another number than ``noise``, a rate outside [0, 1), a length
+            that is not above 0, ``scale`` or ``vector`` with other than three elements, or ``vector`` and no heading.
+        TypeError: for ``levels`` that cannot be called.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -65,7 +70,7 @@ class SensorErrors(ReadingErrors):
 
     channel = 2
     default_in_keys = ("field", "move", "heading")
-    in_counts = (1, 2, 3)
+    optional_in_keys = ("move", "heading")
     numbers_key, stream_key = "sensor_error", "sensor_stream"
     _sizes: Tensor
 
@@ -76,11 +81,12 @@ class SensorErrors(ReadingErrors):
         bias: Sequence[float] | None = None,
         scale: Sequence[float] | None = None,
         drift: Sequence[float] | None = None,
-        drift_length: float | None = None,
+        drift_length: float = DRIFT_KM,
         resolution: Sequence[float] | None = None,
         outage_rate: float = 0.0,
         vector: VectorErrors | None = None,
         fixed: bool = False,
+        levels: Callable[[Tensor], Tensor] | None = None,
         **options: Any,
     ) -> None:
         super().__init__(**options)
@@ -95,26 +101,40 @@ class SensorErrors(ReadingErrors):
         check_number(0, 1, outage_rate=outage_rate)
         if outage_rate == 1:
             raise ValueError("outage_rate must be below 1, got 1: no reading would be new")
-        if drift is not None and any(drift):
-            check_number(0, above=True, drift_length=drift_length)
+        check_number(0, above=True, drift_length=drift_length)
+        if levels is not None and not callable(levels):
+            raise TypeError(f"levels must be a function of uniform numbers, got {levels!r}")
         if vector is not None:
             check_type(VectorErrors, vector=vector)
-            expect_keys(self, 3, 1)
+            if "heading" not in self.in_names:
+                raise ValueError(f"vector acts in the axes of a heading: in_keys must name one, got {self.in_keys}")
         if self.count != 3 and (vector is not None or any(scale or ())):
             raise ValueError(f"scale and vector act on D, I and B_H, got {self.count} elements in noise")
-        self.drift_length, self.outage_rate, self.vector = float(drift_length or 1), float(outage_rate), vector
-        self.fixed, self.in_sizes = fixed, (self.count, None, 1)
-        self.size = 4 * self.count + (vector.size if vector else 0)
-        self.draws = 2 * self.count + (vector.draws if vector else 0)
+        self.drift_length, self.outage_rate, self.vector = float(drift_length), float(outage_rate), vector
+        self.fixed, self.levels, self.in_sizes = fixed, levels, {"field": (self.count,), "heading": (1,)}
+        self.level_draws = LEVEL_DRAWS + 1 + self.count if levels else 0
+        self.size = 7 * self.count + (vector.size if vector else 0)
+        self.draws = self.level_draws + 2 * self.count + (vector.draws if vector else 0)
         self.step_draws = 2 * self.count + 1
         self._set_accuracy()
 
     def _constants(self, stream: Tensor) -> Tensor:
         """Return the errors of an episode ``(..., size)``, without drift and last reading."""
-        normal, vector = stream_normal(stream, self.draws).tensor_split([2 * self.count], -1)
-        drawn = torch.ones_like(normal) if self.fixed else normal
-        constants = drawn * self._sizes[1:3].flatten(), torch.zeros_like(drawn)
-        return torch.cat((*constants, self.vector.constants(vector) if self.vector else vector), -1)
+        ends = [self.level_draws, self.level_draws + 2 * self.count]
+        level, constant, vector = stream_uniform(stream, self.draws).tensor_split(ends, -1)
+        drawn = torch.ones_like(constant) if self.fixed else normal_of(constant)
+        bias, scale = (drawn * self._sizes[1:3].flatten()).split(self.count, -1)
+        further, *levels = self._drawn_levels(level)
+        constants = self.vector.constants(normal_of(vector)) if self.vector else vector
+        return torch.cat((bias + further, scale, torch.zeros_like(drawn), *levels, constants), -1)
+
+    def _drawn_levels(self, uniform: Tensor) -> tuple[Tensor, ...]:
+        """Return a constant error, and the standard deviations of noise, bias and drift, of an episode ``(..., E)``."""
+        if self.levels is None:
+            return (uniform.new_zeros(*uniform.shape[:-1], self.count),) * 4
+        level, share, normal = uniform.split((LEVEL_DRAWS, 1, self.count), -1)
+        noise_std, bias_std = self.levels(level).split(self.count, -1)
+        return bias_std * share.sqrt() * normal_of(normal), noise_std, bias_std, bias_std * (1 - share).sqrt()
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         (value, *others), count, dtype = values, self.count, values[0].dtype
@@ -122,7 +142,8 @@ class SensorErrors(ReadingErrors):
         noise_std, _, _, drift_std, resolution = self._sizes.to(dtype)
         uniform = stream_uniform(stream, self.step_draws)
         noise, walk = normal_of(uniform[..., :-1]).to(dtype).split(count, -1)
-        bias, scale, drift, last, vector = errors.tensor_split([count, 2 * count, 3 * count, 4 * count], -1)
+        bias, scale, drift, last, *levels, vector = errors.tensor_split([count * k for k in range(1, 8)], -1)
+        noise_std, drift_std = torch.hypot(noise_std, levels[0]), torch.hypot(drift_std, levels[2])
         distance = math.inf if first else others[0][..., :1] if others else 1.0
         drift = gauss_markov(drift, drift_std, distance, self.drift_length, walk)
         reading = self.vector.disturb(value, others[1], vector) if self.vector else value
@@ -130,12 +151,14 @@ class SensorErrors(ReadingErrors):
         reading = torch.where(resolution > 0, torch.round(reading / resolution) * resolution, reading)
         missing = (uniform[..., -1:] < self.outage_rate) & (not first)
         reading = torch.where(missing, last, reading)
-        stated, *slower = self._accuracy.to(dtype)
-        self._measure(tensordict, value, reading, SensorStd(torch.where(missing, OUTAGE_STD, stated), *slower))
-        return torch.cat((bias, scale, drift, reading, vector), -1)
+        *stated, iron = self._accuracy.to(dtype)
+        noise, slow, drifting = map(torch.hypot, stated, levels)
+        std = SensorStd(torch.where(missing, OUTAGE_STD, noise), slow, drifting, iron)
+        self._measure(tensordict, value, reading, std)
+        return torch.cat((bias, scale, drift, reading, *levels, vector), -1)
 
     def accuracy(self, field: Tensor) -> SensorStd:
-        """Return the standard deviations that the errors add to a reading, each ``(..., E)``.
+        """Return the standard deviations that the errors add to a reading, without ``levels``, each ``(..., E)``.
 
         Example:
             >>> SensorErrors((1.0, 1.0), bias=(2.0, 0.0)).accuracy(torch.zeros(2))

@@ -73,7 +73,7 @@ class MagneticWeather(ReadingErrors):
     channel = 7
     default_in_keys = ("field", "move")
     numbers_key, stream_key = "weather_clock", "weather_stream"
-    in_sizes = (3, None)
+    in_sizes = {"field": (3,)}
     size, numbers_dtype = 2, torch.float64
     variation: Tensor
 
@@ -91,6 +91,7 @@ class MagneticWeather(ReadingErrors):
         check_type(WeatherRecord, record=self.record)
         check_number(0, above=True, speed_km_h=speed_km_h)
         check_number(0, reading_s=reading_s)
+        check_number(0, optional=True, span_h=span_h)
         self.speed_km_h, self.reading_s, self.span_h = float(speed_km_h), float(reading_s), span_h
         self._starts_by_span: dict[float, Tensor] = {}
         self.register_buffer("variation", self.record.variation, persistent=False)

@@ -25,7 +25,7 @@ STATE_LINES = 2000
 class Link(Protocol):
     """Connection to an autopilot.
 
-    Iterating yields a :class:`~magrl.vehicle.autopilot.Measurement` for each message, and None now and then where none comes.
+    Iterating yields a :class:`~magrl.vehicle.autopilot.Measurement` for each message, now and then None.
     """
 
     period_s: float
@@ -37,8 +37,8 @@ class Link(Protocol):
     def steer(self, heading_deg: float) -> None:
         """Send a heading to steer, in the reference of the autopilot."""
 
-    def report(self, command: Command | None, text: str) -> None:
-        """Send the estimated way, if there is a command, and a text for the operator, empty for none."""
+    def report(self, command: Command) -> None:
+        """Send the estimated way."""
 
 
 def fly(loop: Loop, link: Link, folder: Path | str) -> Iterator[Command]:
@@ -87,7 +87,7 @@ def _steered(loop: Loop, link: Link, record: _Record) -> Iterator[Command]:
             record.write(loop.heard)
         if command:
             with tolerated("the command is not reported"):
-                link.report(command, command.reason or loop.note)
+                link.report(command)
             yield command
             if command.stop:
                 return

@@ -291,9 +291,7 @@ class Loop:
 
         Returns None where the first reading is refused.
         """
-        heading = heading % 360
-        heading -= 360 * (heading < 7)  # a small one could be taken for radians
-        longest = self.vehicle.max_move_km
+        longest, heading = self.vehicle.options.max_move_km, heading % 360
         while distance > LONGER * longest:
             self.vehicle.step(None, None, None, heading, longest)  # the reading at the end decides
             distance -= longest

@@ -6,18 +6,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import torch
-
 from magrl.checks import check_choice
 from magrl.field.elements import FIELD_NT
 from magrl.vehicle.autopilot.loop import LOG, Measurement, patient, tolerated
-from magrl.vehicle.logs import attitude_of
 from magrl.vehicle.logs.autopilots import package
-from magrl.vehicle.logs.samples import ATTITUDE
 from magrl.vehicle.onboard import Command
 
-STEERING = ("heading", "velocity")
-"""Ways to steer: MAV_CMD_GUIDED_CHANGE_HEADING, and SET_POSITION_TARGET_LOCAL_NED with velocity and yaw."""
 RATE_HZ = 10.0
 """Rate of the messages that are asked for."""
 CENTRIPETAL_M_S2 = 3.6
@@ -26,7 +20,6 @@ SENSORS: Mapping[str, float] = {"HIGHRES_IMU": FIELD_NT["gauss"]} | dict.fromkey
     ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3"), FIELD_NT["milligauss"]
 )
 """Messages with a magnetometer, and their unit [nT]. Those of integers have steps of 100 nT."""
-_ATTITUDE = "ATTITUDE", "ATTITUDE_QUATERNION"
 _WAIT = 30  # coarser messages, before one of them is taken in place of HIGHRES_IMU
 _CLOCKS_S = 60.0  # a message whose clock differs by more has another one
 _VELOCITY_AND_YAW = 0b100111000111  # type_mask: position, acceleration and yaw rate are ignored
@@ -37,9 +30,7 @@ _WINGS = (_FIXED_WING, *range(19, 26))  # and vehicles that start and land verti
 _BEATS = 10  # heartbeats, of about 1 Hz, after which the messages are asked for again
 _OTHERS = (5, 6)  # MAV_TYPE_ANTENNA_TRACKER, MAV_TYPE_GCS
 _CHANGE_HEADING = 43002  # MAV_CMD_GUIDED_CHANGE_HEADING
-_SEVERITY = 5  # MAV_SEVERITY_NOTICE
 _DIALECT = "pymavlink.dialects.v20.ardupilotmega"
-_TEXT = 50  # characters of a STATUSTEXT
 
 
 class Messages:
@@ -47,7 +38,6 @@ class Messages:
 
     Args:
         speed: ``"airspeed"`` or ``"groundspeed"`` of VFR_HUD.
-        sensor: one of :data:`SENSORS`; by default HIGHRES_IMU, or one of the others after 30 of these.
 
     Example:
         >>> from pymavlink.dialects.v20 import common
@@ -55,28 +45,22 @@ class Messages:
         -28.64788975654116
     """
 
-    def __init__(self, speed: str = "airspeed", sensor: str | None = None) -> None:
+    def __init__(self, speed: str = "airspeed") -> None:
         check_choice(("airspeed", "groundspeed"), speed=speed)
-        check_choice((None, *SENSORS), sensor=sensor)
-        self.names = (*_ATTITUDE, "VFR_HUD", *([sensor] if sensor else SENSORS))
-        self.speed, self._wanted = speed, sensor or "HIGHRES_IMU"
-        self._wait = math.inf if sensor else _WAIT
+        self.names, self.speed, self._wait = ("ATTITUDE", "VFR_HUD", *SENSORS), speed, _WAIT
         self._sensor: tuple[str, int] | None = None  # name and number of the chosen one
         self._now: float | None = None
 
     def measurement(self, message: Any) -> Measurement | None:
         """Return the content of a message; None for one that does not count, and before the first attitude."""
         name = message.get_type()
-        if self._now is None and name not in _ATTITUDE:
+        if self._now is None and name != "ATTITUDE":
             return None
         time = self._time(message)
-        if name in _ATTITUDE:
+        if name == "ATTITUDE":
             self._now = time
-            if name == "ATTITUDE":
-                angles = [math.degrees(angle) for angle in (message.roll, message.pitch, message.yaw)]
-            else:  # NaN for a quaternion of zeros
-                angles = attitude_of(torch.tensor([message.q1, message.q2, message.q3, message.q4])).tolist()
-            return Measurement(time, **dict(zip(ATTITUDE, angles, strict=True)))
+            roll, pitch, heading = (math.degrees(angle) for angle in (message.roll, message.pitch, message.yaw))
+            return Measurement(time, roll=roll, pitch=pitch, heading=heading)
         if name == "VFR_HUD":
             return Measurement(time, speed=getattr(message, self.speed))
         if name not in SENSORS or not self._chosen(name, getattr(message, "id", 0)):
@@ -88,12 +72,12 @@ class Messages:
         """Return the time of a message, or that of the last attitude where it has none, or that of another clock."""
         now = self._now or 0.0
         own = getattr(message, "time_usec", 1e3 * getattr(message, "time_boot_ms", 1e3 * now)) / 1e6
-        return own if message.get_type() in _ATTITUDE or abs(own - now) <= _CLOCKS_S else now
+        return own if message.get_type() == "ATTITUDE" or abs(own - now) <= _CLOCKS_S else now
 
     def _chosen(self, name: str, number: int) -> bool:
         """Return whether a message is that of the magnetometer; the first one that may be is chosen."""
         self._wait -= 1
-        if self._sensor is None and (name == self._wanted or self._wait < 0):
+        if self._sensor is None and (name == "HIGHRES_IMU" or self._wait < 0):
             self._sensor = name, number
         return self._sensor == (name, number)
 
@@ -101,30 +85,24 @@ class Messages:
 class MavlinkLink:
     """Connection to an autopilot that speaks MAVLink.
 
-    The messages ATTITUDE_QUATERNION, VFR_HUD and HIGHRES_IMU (or another one of :data:`SENSORS`) are asked for and
-    read. A heading goes out as MAV_CMD_GUIDED_CHANGE_HEADING (``steering="heading"``; ArduPlane in GUIDED), or as
-    velocity and yaw in SET_POSITION_TARGET_LOCAL_NED (``"velocity"``; ArduPilot's Copter and Rover in GUIDED, and
-    multicopters of PX4 in OFFBOARD). The operator arms the vehicle and chooses the mode. The estimates go out as
-    NAMED_VALUE_FLOAT (``mg_north``, ``mg_east``, ``mg_error`` [km], ``mg_conf``), texts as STATUSTEXT.
+    The messages ATTITUDE, VFR_HUD and HIGHRES_IMU (or another one of :data:`SENSORS`) are asked for and read. A heading
+    goes out as MAV_CMD_GUIDED_CHANGE_HEADING to a fixed wing (ArduPlane in GUIDED), as velocity and yaw in
+    SET_POSITION_TARGET_LOCAL_NED to others (ArduPilot's Copter and Rover in GUIDED, multicopters of PX4 in OFFBOARD).
+    The operator arms the vehicle and chooses the mode. The estimates go out as NAMED_VALUE_FLOAT (``mg_north``,
+    ``mg_east``, ``mg_error`` [km], ``mg_conf``).
 
     Args:
         connection: what ``pymavlink.mavutil.mavlink_connection`` returns; or its address, such as
             ``"udpin:0.0.0.0:14550"`` or ``"/dev/ttyUSB0,57600"``.
-        steering: one of :data:`STEERING`; by default by the type of the vehicle.
-        cruise_m_s: speed to command with ``"velocity"`` [m/s].
-        speed: ``"airspeed"`` or ``"groundspeed"`` of VFR_HUD, with which the moves are integrated; by default the
-            airspeed of a fixed wing, the ground speed of others.
-        sensor: message of the magnetometer, one of :data:`SENSORS`.
+        cruise_m_s: speed to command to others than fixed wings [m/s].
         autopilot: numbers of the system and the component to steer; by default the first autopilot that can be steered.
 
     Raises:
         ImportError: without pymavlink.
-        ValueError: for an unknown option, ``"velocity"`` without a speed, or ``"heading"`` with one.
 
     Example:
-        >>> MavlinkLink(None, steering="velocity")
-        Traceback (most recent call last):
-        ValueError: steering by velocity, and it alone, needs cruise_m_s, the speed to command
+        >>> MavlinkLink(None, cruise_m_s=5.0).period_s
+        0.4
     """
 
     period_s = 0.4  # PX4 leaves OFFBOARD below 2 Hz
@@ -133,21 +111,15 @@ class MavlinkLink:
         self,
         connection: Any,
         *,
-        steering: str | None = None,
         cruise_m_s: float | None = None,
-        speed: str | None = None,
-        sensor: str | None = None,
         autopilot: Sequence[int] | None = None,
     ) -> None:
-        check_choice((None, *STEERING), steering=steering)
-        if steering and (steering == "velocity") != (cruise_m_s is not None):
-            raise ValueError("steering by velocity, and it alone, needs cruise_m_s, the speed to command")
-        self._messages, self._speed = Messages(speed or "airspeed", sensor), speed
+        self._messages = Messages()
         self._connection = _connected(connection) if isinstance(connection, str) else connection
-        self._steering, self._cruise = steering, cruise_m_s
+        self._wings, self._cruise = True, cruise_m_s
         self._wanted = autopilot and tuple(autopilot)
         self._vehicle: tuple[int, int] | None = None  # system and component of the autopilot
-        self._mask, self._beats, self._texts = _VELOCITY_AND_YAW, 0, 0
+        self._mask, self._beats = _VELOCITY_AND_YAW, 0
 
     def __iter__(self) -> Iterator[Measurement | None]:
         """Iterate over the messages of the autopilot."""
@@ -191,13 +163,13 @@ class MavlinkLink:
 
     def _obstacle(self, kind: int, autopilot: int) -> str:
         """Choose how to steer a type of vehicle, or return why it cannot be steered."""
-        steering = self._steering or ("heading" if kind == _FIXED_WING else "velocity")
         if autopilot == 12 and kind in _WINGS:  # MAV_AUTOPILOT_PX4
             return "PX4 accepts no heading by MAVLink on a fixed wing: steer it by another program"
-        if steering == "velocity" and self._cruise is None:
+        self._wings = kind == _FIXED_WING
+        if not self._wings and self._cruise is None:
             return "this vehicle is steered by velocity: state cruise_m_s, the speed to command"
-        self._steering, self._mask = steering, _VELOCITY if kind in _ROVERS else _VELOCITY_AND_YAW
-        self._messages.speed = self._speed or ("airspeed" if kind == _FIXED_WING else "groundspeed")
+        self._mask = _VELOCITY if kind in _ROVERS else _VELOCITY_AND_YAW
+        self._messages.speed = "airspeed" if self._wings else "groundspeed"
         return ""
 
     def steer(self, heading_deg: float) -> None:
@@ -205,7 +177,7 @@ class MavlinkLink:
         if self._vehicle is None:
             return
         mav = self._connection.mav
-        if self._steering == "heading":  # MAV_FRAME_GLOBAL, MAV_CMD_GUIDED_CHANGE_HEADING, HEADING_TYPE_HEADING
+        if self._wings:  # MAV_FRAME_GLOBAL, MAV_CMD_GUIDED_CHANGE_HEADING, HEADING_TYPE_HEADING
             heading = round(heading_deg, 2) % 360
             mav.command_int_send(*self._vehicle, 0, _CHANGE_HEADING, 0, 0, 1, heading, CENTRIPETAL_M_S2, 0, 0, 0, 0)
             return
@@ -215,20 +187,11 @@ class MavlinkLink:
         rest, yaw = (0.0, 0.0, 0.0), math.remainder(yaw, 2 * math.pi)
         mav.set_position_target_local_ned_send(0, *self._vehicle, 1, self._mask, *rest, *velocity, *rest, yaw, 0.0)
 
-    def report(self, command: Command | None, text: str) -> None:
-        """Send the estimated way and a text."""
-        mav = self._connection.mav
-        if command:
-            values = (*command.way_km, command.error_km, command.confidence)
-            for name, value in zip((b"mg_north", b"mg_east", b"mg_error", b"mg_conf"), values, strict=True):
-                mav.named_value_float_send(0, name, value)
-        start = f"magrl {command.stop}" if command and command.stop else "magrl"
-        content = f"{start}: {text}".encode("ascii", "replace")
-        self._texts = self._texts % 65535 + 1  # the number of the text, of which each part but the last is full
-        numbered = isinstance(mav, package(_DIALECT, "pymavlink").MAVLink)  # MAVLink 1 has no numbers
-        for part in range(len(content) // _TEXT + 1 if text else 0):
-            numbers = (self._texts, part) if numbered else ()
-            mav.statustext_send(_SEVERITY, content[part * _TEXT : (part + 1) * _TEXT], *numbers)
+    def report(self, command: Command) -> None:
+        """Send the estimated way."""
+        values = (*command.way_km, command.error_km, command.confidence)
+        for name, value in zip((b"mg_north", b"mg_east", b"mg_error", b"mg_conf"), values, strict=True):
+            self._connection.mav.named_value_float_send(0, name, value)
 
 
 def _connected(address: str) -> Any:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
-import re
 import socket
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from magrl.checks import check_choice
-from magrl.vehicle.autopilot.loop import LOG, Measurement, clock, patient
+from magrl.vehicle.autopilot.loop import Measurement, clock, patient
 from magrl.vehicle.logs.autopilots import INVALID, nmea_values, package
 from magrl.vehicle.logs.samples import AXES
 from magrl.vehicle.onboard import Command
 
 _TALKER = "EC"  # an electronic chart system
-_SILENCE_S, _SILENT_S, _TEXT = 1.0, 10.0, 50
-_AGREE = {"heading": 10.0, "roll": 5.0, "pitch": 5.0, "speed": 2.0} | dict.fromkeys(AXES, 1000.0)
-"""Difference of two sources that is reported [deg, m/s, nT]; chosen."""
+_SILENCE_S = 1.0
+_QUANTITIES = ("heading", "roll", "pitch", "speed", *AXES)
 
 
 class Sentences:
@@ -28,7 +25,7 @@ class Sentences:
         speed: ``"water"`` (VHW) or ``"ground"`` (VTG).
         level: whether roll and pitch are 0, as of a magnetometer in gimbals; otherwise they must come by XDR.
         sources: talkers and sentences that count, such as ``"HEHDT"``; by default all. Of each value, the first source
-            counts, and another one that differs is logged.
+            counts.
 
     Raises:
         ImportError: without pynmeagps.
@@ -45,9 +42,9 @@ class Sentences:
         check_choice(("true", "magnetic"), north=north)
         check_choice(("water", "ground"), speed=speed)
         self._reader = package("pynmeagps", "pynmeagps").NMEAReader
-        self._names = {name: name for name in _AGREE} | {f"heading_{north}": "heading", f"speed_{speed}": "speed"}
+        self._names = {name: name for name in _QUANTITIES} | {f"heading_{north}": "heading", f"speed_{speed}": "speed"}
         self._sources, self._tilt = sources, {"roll": 0.0, "pitch": 0.0} if level else {}
-        self._last: dict[str, tuple[str, float, float]] = {}  # source, value and time of the quantities
+        self._chosen: dict[str, str] = {}  # source of the quantities
 
     def measurements(self, line: bytes, time: float) -> Iterator[Measurement]:
         """Yield the content of a sentence that came at a time [s]; nothing for a damaged one, or another kind."""
@@ -61,20 +58,10 @@ class Sentences:
         source = f"{message.talker}{message.msgID}"
         if self._sources and source not in self._sources:
             return
-        values = {name: value for name, value in found.items() if self._counts(name, source, value, time)}
+        values = {name: value for name, value in found.items() if self._chosen.setdefault(name, source) == source}
         axes = [name for name in AXES if name in values]
         if values and len(axes) in (0, len(AXES)):
             yield Measurement(time, **(self._tilt | values if axes else values))
-
-    def _counts(self, name: str, source: str, value: float, time: float) -> bool:
-        """Return whether the source of a value is the one that counts."""
-        chosen, last, when = self._last.setdefault(name, (source, value, time))
-        apart = math.remainder(value - last, 360) if name == "heading" else value - last
-        if source == chosen:
-            self._last[name] = source, value, time
-        elif abs(apart) > _AGREE[name] or time - when > _SILENT_S:
-            LOG.warning(f"{name} of {source} does not count: it is %.1f, that of {chosen} was %.1f", value, last)
-        return source == chosen
 
 
 class NmeaLink:
@@ -109,7 +96,7 @@ class NmeaLink:
 
     def __iter__(self) -> Iterator[Measurement | None]:
         """Iterate over the sentences."""
-        for content in patient(self._receive):
+        for content in patient(lambda: self.port.readline()):
             now = clock()
             found = [each for line in (content or b"").splitlines() for each in self._sentences.measurements(line, now)]
             if found and isinstance(self.port, _Udp):
@@ -117,15 +104,6 @@ class NmeaLink:
             yield from found
             if not found:
                 yield None
-
-    def _receive(self) -> bytes:
-        """Return the sentences that come next, if any."""
-        try:
-            return self.port.readline()
-        except OSError:
-            self.port.close()
-            self.port.open()  # a serial port may have been unplugged
-            raise
 
     def steer(self, heading_deg: float) -> None:
         """Send a heading."""
@@ -135,15 +113,11 @@ class NmeaLink:
         course = f"{shown},{self._north}"
         self._send(f"{_TALKER}APB,A,A,0.00,R,N,V,V,{course},MAGRL,{course},{course}")
 
-    def report(self, command: Command | None, text: str) -> None:
-        """Send the estimated way and a text."""
-        if command:
-            north, east = command.way_km
-            way = f"{north:.1f},{east:.1f},{command.error_km:.1f},{command.confidence:.2f},{command.stop or ''}"
-            self._send(f"PMGRL,WAY,{way}")
-        parts = re.findall(f".{{1,{_TEXT}}}", re.sub(r"[^ -~]|[,*$!~^\\]", ";", text))
-        for number, part in enumerate(parts, 1):
-            self._send(f"{_TALKER}TXT,{len(parts):02},{number:02},00,{part}")
+    def report(self, command: Command) -> None:
+        """Send the estimated way."""
+        north, east = command.way_km
+        way = f"{north:.1f},{east:.1f},{command.error_km:.1f},{command.confidence:.2f},{command.stop or ''}"
+        self._send(f"PMGRL,WAY,{way}")
 
     def _send(self, content: str) -> None:
         """Send a sentence with its checksum."""
@@ -155,14 +129,10 @@ class _Udp:
     """Sentences as datagrams, with the interface of pyserial; answers go to a receiver."""
 
     def __init__(self, port: int) -> None:
-        self.port = port
         self.sender: Any = None
         self.receiver: Any = None
-        self.open()
-
-    def open(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("", self.port))
+        self._socket.bind(("", port))
         self._socket.settimeout(_SILENCE_S)
         self.port = self._socket.getsockname()[1]
 

@@ -1,18 +1,17 @@
 """Read the log of a vehicle: what it holds, beside IGRF, and readings of D, I, B_H for a replay.
 
-    python -m magrl.vehicle.logs swing.csv --calibrate quay.json --here 60.4 5.3 --date 2026-06-30    # a swing at the quay
-    python -m magrl.vehicle.logs way.csv --calibration quay.json --every-km 20                       # writes way_readings.csv
-    python recipes/replay_log.py way_readings.csv                                            # what would be commanded
+    python -m magrl.vehicle.logs swing.csv --calibrate quay.json --here 60.4 5.3 --date 2026-06-30    # a swing
+    python -m magrl.vehicle.logs way.csv --calibration quay.json --every-km 20          # writes way_readings.csv
+    python recipes/replay_log.py way_readings.csv                                       # what would be commanded
 
 Logs are CSV files (columns such as time_s, mag_x_nT, mag_y_uT, roll_deg, heading_true_deg, speed_kn, lat, lon) and
-those of autopilots, ships and observatories (docs/logs.md). The axes are forward, right, down, the angles roll,
+those of autopilots and ships (docs/logs.md). The axes are forward, right, down, the angles roll,
 pitch, heading.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,13 @@ from pandas import DataFrame
 from magrl.checks import command
 from magrl.field.elements import NAMES
 from magrl.files import check_writable
-from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration, calibrate
 from magrl.vehicle.logs.comparison import difference_from_igrf, mistakes
 from magrl.vehicle.logs.readers import read_log
 from magrl.vehicle.logs.readings import STD_NAMES, obstacles, readings_of
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Log, total_intensity
-from magrl.vehicle.logs.vectors import FRAMES, NORTHS
+from magrl.vehicle.logs.vectors import NORTHS
 
 _DIGITS = {"time": 2, "D": 4, "I": 4, "B_H": 2, "heading": 3, "distance": 4, "latitude": 6, "longitude": 6}
 _DIGITS |= {"altitude": 4, "D_std": 4, "I_std": 4, "B_H_std": 2}
@@ -47,22 +46,17 @@ def parser() -> argparse.ArgumentParser:
     arguments = argparse.ArgumentParser(
         prog="python -m magrl.vehicle.logs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    arguments.add_argument("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
-    arguments.add_argument("--frame", choices=FRAMES, default="FRD", help="axes of a CSV file; default FRD")
-    arguments.add_argument("--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a calibrated one in use")
-    arguments.add_argument("--north", choices=NORTHS, help="north of the heading; default that of the log")
-    arguments.add_argument("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
-    arguments.add_argument("--every-s", type=float, help="duration of a move [s], in place of a length")
-    arguments.add_argument("--calibration", type=Path, help="file of a calibration, which corrects the axes")
-    arguments.add_argument("--calibrate", type=Path, help="calibration to write (.json), of the swing in this log")
-    arguments.add_argument(
-        "--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H"
-    )
-    arguments.add_argument(
-        "--alignment-deg", type=float, default=0.5, help="misalignment of the axes [deg]; default 0.5"
-    )
-    arguments.add_argument("--date", help="date for IGRF, such as 2026-06-30; default that of the log")
-    arguments.add_argument("--out", type=Path, help="readings (.csv); default beside the first file, with _readings")
+    add = arguments.add_argument
+    add("log", type=Path, nargs="+", help="log of the vehicle: one file, or several with one clock")
+    add("--sensor", help="magnetometer of PX4, ArduPilot or ROS; default a calibrated one in use")
+    add("--north", choices=NORTHS, help="north of the heading; default that of the log")
+    add("--every-km", type=float, default=20.0, help="least length of a move [km]; default 20")
+    add("--calibration", type=Path, help="file of a calibration, which corrects the axes")
+    add("--calibrate", type=Path, help="calibration to write (.json), of the swing in this log")
+    add("--here", type=float, nargs="+", help="place of the swing: latitude, longitude, or D, I, B_H")
+    add("--alignment-deg", type=float, default=0.5, help="misalignment of the axes [deg]; default 0.5")
+    add("--date", help="date for IGRF, such as 2026-06-30; default that of the log")
+    add("--out", type=Path, help="readings (.csv); default beside the first file, with _readings")
     return arguments
 
 
@@ -72,24 +66,21 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _main(options: argparse.Namespace) -> None:
-    wrong: list[str] = []
-    log = read_log(*options.log, frame=options.frame, sensor=options.sensor, wrong=wrong)
+    log = read_log(*options.log, sensor=options.sensor)
+    date, missing = options.date or log.date, [] if options.calibrate else obstacles(log, options.north)
     notes = [*log.notes, *([] if options.calibrate else remarks(log, options))]
     print("\n".join([*summary(log), *(f"note: {text}" for text in notes)]), flush=True)
-    date = options.date or log.date
-    missing = [] if options.calibrate else obstacles(log, options.north)
-    if missing and not wrong and not obstacles(log, "true"):  # the north alone is missing, and D may show it
+    if missing and not obstacles(log, "true"):  # the north alone is missing, and D may show it
         missing += mistakes(readings_of(log, north="true", **_parts(options)), date)
-    if wrong or missing:
-        print("\n".join(f"error: {text}" for text in wrong + missing), file=sys.stderr)
-        raise ValueError("no readings: correct what is named above")
+    if missing:
+        raise ValueError("; ".join(missing))
     print("\n".join(swing(log, options, date) if options.calibrate else way(log, options, date)))
 
 
 def _parts(options: argparse.Namespace) -> dict[str, Any]:
     """Return the options of readings."""
     iron = Calibration.load(options.calibration) if options.calibration else None
-    return {"every_km": options.every_km, "every_s": options.every_s, "calibration": iron}
+    return {"every_km": options.every_km, "calibration": iron}
 
 
 def summary(log: Log) -> list[str]:
@@ -153,7 +144,7 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
         lines.append(f"minus IGRF of {date}, mean of {len(table)}: {_elements(mean)}")
     lines += [f"warning: {text}" for text in mistakes(table, date)]
     if len(table) < 2:
-        return [*lines, "one reading: no file is written; choose shorter moves by --every-km or --every-s"]
+        return [*lines, "one reading: no file is written; choose shorter moves by --every-km"]
     return [*lines, *_written(table, log, options, parts["calibration"])]
 
 

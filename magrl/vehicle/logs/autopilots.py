@@ -20,7 +20,7 @@ from magrl.checks import UsageError
 from magrl.field.elements import FIELD_NT
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Recording
 from magrl.vehicle.logs.units import UNITS, column_of
-from magrl.vehicle.logs.vectors import FRAMES, attitude_of, from_enu
+from magrl.vehicle.logs.vectors import attitude_of, from_enu
 
 MODEL_NORTH = (
     "the heading is that of a compass plus the declination of a model, so D is that of the model and is not used "
@@ -110,7 +110,7 @@ _TOPICS: Sequence[tuple[str, tuple[tuple[str, ...], Sequence[str], float]]] = (
 
 
 def read_ulg(path: Path, sensor: str | None = None) -> Recording:
-    """Read a log of PX4 (ULog) with pyulog: see :func:`~magrl.vehicle.logs.read_log`. Times are UTC where GNSS gives it."""
+    """Read a log of PX4 (ULog) with pyulog. Times are UTC where GNSS gives it."""
     with path.open("rb") as file:
         log = package("pyulog", "pyulog").ULog(file)
     instances = sorted(log.data_list, key=lambda item: item.multi_id)
@@ -132,17 +132,9 @@ def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     flags = topics.get("estimator_status_flags", {})
     gnss = np.mean(flags.get("cs_gnss_yaw", flags.get("cs_gps_yaw", 0))) > 0.5  # the heading of two antennas is used
     notes = [] if gnss else [MODEL_NORTH]
-    notes += ["the file is damaged or truncated"] if log.file_corruption or _is_cut(path) else []
+    notes += ["the file is damaged or truncated"] if log.file_corruption else []
     streams = {column: (time + offset / 1e6, values) for column, (time, values) in recording.streams.items()}
     return Recording(streams, recording.source, "true" if gnss else "model", [*notes, *recording.notes])
-
-
-def _is_cut(path: Path) -> bool:
-    """Return whether a ULog file ends before its last message does."""
-    content, position = path.read_bytes(), 16
-    while position + 3 <= len(content):
-        position += 3 + int.from_bytes(content[position : position + 2], "little")
-    return position != len(content)
 
 
 # ArduPilot and MAVLink
@@ -152,7 +144,6 @@ _MESSAGES: dict[str, tuple[tuple[str, ...], Sequence[str], float]] = {
     "ATT": (ATTITUDE, ("Roll", "Pitch", "Yaw"), 1.0),
     "ATTITUDE": (ATTITUDE, ("roll", "pitch", "yaw"), UNITS["angle"]["rad"]),
     "GPS": (_PLACE, ("Lat", "Lng"), 1.0),
-    "ATTITUDE_QUATERNION": (_QUATERNION, ("q1", "q2", "q3", "q4"), 1.0),
     "GPS_RAW_INT": (_PLACE, ("lat", "lon"), 1e-7),
     "VFR_HUD": (_SPEEDS, _SPEEDS, 1.0),
     "HIGHRES_IMU": (AXES, ("xmag", "ymag", "zmag"), FIELD_NT["gauss"]),
@@ -191,15 +182,13 @@ def read_ardupilot(path: Path, sensor: str | None = None) -> Recording:
                 values = (unit * getattr(message, field) for field in fields)
                 rows[columns][f"{name}:{number}" if number else name].append((message._timestamp, *values))
     used = [name for name, parameter in _USE.items() if log.params.get(parameter, 1)]
-    recording = _recording(kind, _one_speed_and_attitude(_tables(rows)), sensor, used)
+    recording = _recording(kind, _with_one_speed(_tables(rows)), sensor, used)
     return recording._replace(north="model", notes=[MODEL_NORTH, *recording.notes])
 
 
-def _one_speed_and_attitude(tables: _Tables) -> _Tables:
-    """Return tables with one speed, through the air where it is measured, and one attitude."""
+def _with_one_speed(tables: _Tables) -> _Tables:
+    """Return tables with one speed, through the air where it is measured."""
     speeds = tables.pop(_SPEEDS, {})
-    if ATTITUDE in tables:
-        tables.pop(_QUATERNION, None)
     for name, rows in speeds.items():
         column = 1 if np.median(rows[:, 1]) > 0 else 2  # zero or NaN without an airspeed sensor
         tables[("speed",)] = {f"{name}.{_SPEEDS[column - 1]}": rows[np.isfinite(rows[:, column])][:, [0, column]]}
@@ -214,10 +203,6 @@ def _tables(rows: _Rows) -> _Tables:
 # ROS
 
 
-_BAGS = {b"#": ".bag", b"S": ".db3", b"\x89": ".mcap"}
-"""Suffixes of bags, by the first byte."""
-
-
 def read_bag(path: Path, sensor: str | None = None) -> Recording:
     """Read a bag of ROS 1 (.bag) or 2 with rosbags: a topic of each type that is needed.
 
@@ -227,9 +212,6 @@ def read_bag(path: Path, sensor: str | None = None) -> Recording:
     become FRD and NED. The bag does not state the north of the heading, which is that of the Imu.
     """
     highlevel, store = package("rosbags.highlevel", "rosbags"), package("rosbags.typesys", "rosbags")
-    suffix = _BAGS[path.read_bytes()[:1]] if path.is_file() else path.suffix
-    if path.suffix != suffix:
-        raise UsageError(f"such a bag must end in {suffix}: rename it {path.stem}{suffix}")
     rows: _Rows = defaultdict(lambda: defaultdict(list))
     lone = path.suffix == ".bag" or not (path.parent / "metadata.yaml").is_file()
     whole = path if path.is_dir() or lone else path.parent
@@ -245,8 +227,8 @@ def read_bag(path: Path, sensor: str | None = None) -> Recording:
 
 
 def _ros_field(message: Any) -> Sequence[float]:
-    axes = zip(FRAMES["FLU"], (getattr(message.magnetic_field, name) for name in AXES), strict=True)
-    return [FIELD_NT["tesla"] * sign * value for sign, value in axes]
+    axes = message.magnetic_field  # forward, left, up
+    return [FIELD_NT["tesla"] * value for value in (axes.x, -axes.y, -axes.z)]
 
 
 def _ros_attitude(message: Any) -> Sequence[float]:

@@ -19,13 +19,15 @@ from magrl.field.elements import elements_jacobian, field_vector
 from magrl.files import DamagedFileError, write_json
 from magrl.vehicle.logs.units import intensity_mistake
 from magrl.vehicle.logs.vectors import rotation
-from magrl.vehicle.onboard.start import known_elements
+from magrl.vehicle.onboard.known import known_elements
 
 GAIN_STD, SOFT_IRON_STD, HARD_IRON_STD = 0.3, 0.05, 1.0
 """Standard deviations before the swing, as shares of the field: of the gain that the axes have in common, of each entry
 of soft iron, and of hard iron; chosen."""
 MOST_STD = (10.0, 4.0, 1000.0)
 """Standard deviations of D [deg], I [deg], B_H [nT] beyond which a calibration is refused; chosen."""
+TILT_DEG = 5.0
+"""Roll and pitch up to which the standard deviations hold [deg]."""
 LEAST_SAMPLES = 100
 LEAST_SPREAD = 0.05
 LEAST_CHANGE = 0.01
@@ -41,7 +43,6 @@ _SWING = (
 _AXES = ("forward", "right", "down")
 _SIGNS = list(product((1.0, -1.0), repeat=3))
 _LISTS = Strict(False)  # of JSON
-Share = Annotated[tuple[float, float], _LISTS]
 Row = Annotated[tuple[float, float, float], _LISTS]
 
 
@@ -56,7 +57,6 @@ class Calibration(CheckedModel):
         noise_nt: root mean square of the residuals of a sample [nT].
         samples: number of samples.
         outliers: share of them that were left out.
-        seen: least and greatest share of the field along each axis, from -1 to 1.
         date: date of the swing.
         here: latitude and longitude of the swing [deg], or D, I, B_H.
 
@@ -66,8 +66,7 @@ class Calibration(CheckedModel):
     Example:
         >>> one = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         >>> options = {"std": (0.1, 0.1, 9.0), "noise_nt": 30.0, "samples": 600, "outliers": 0.0, "here": (60.4, 5.3)}
-        >>> options |= {"method": "vector", "seen": ((-1.0, 1.0),) * 3}
-        >>> iron = Calibration(matrix=one, offset_nt=(500.0, 0.0, 0.0), **options)
+        >>> iron = Calibration(matrix=one, offset_nt=(500.0, 0.0, 0.0), method="vector", **options)
         >>> iron.apply(torch.tensor([15500.0, 0.0, 45000.0]))
         tensor([15000., 0., 45000.])
     """
@@ -79,7 +78,6 @@ class Calibration(CheckedModel):
     noise_nt: float
     samples: int
     outliers: float
-    seen: Annotated[tuple[Share, Share, Share], _LISTS]
     here: Annotated[tuple[float, ...], _LISTS]
     date: str | None = None
 
@@ -113,7 +111,6 @@ def calibrate(
     here_std: Sequence[float] | None = None,
     attitude_deg: Tensor | None = None,
     alignment_deg: float = 0.5,
-    tilt_deg: float = 5.0,
 ) -> Calibration:
     """Fit a calibration to the samples of a swing at one place.
 
@@ -121,7 +118,7 @@ def calibrate(
     are fitted by an ellipsoid, which does not show a misalignment of the axes. The fit is least squares without
     outliers. Its prior is :data:`GAIN_STD`, :data:`SOFT_IRON_STD`, :data:`HARD_IRON_STD` and ``alignment_deg``, which
     remain where the swing shows nothing. The standard deviations allow for errors that last a hundredth of the swing,
-    hold for a field such as that of the swing, and include those of the known elements.
+    hold for a field such as that of the swing and tilts of :data:`TILT_DEG`, and include those of the known elements.
 
     Args:
         axes_nt: ``(N, 3)`` forward, right, down [nT].
@@ -131,7 +128,6 @@ def calibrate(
         here_std: standard deviations of the elements.
         attitude_deg: ``(N, 3)`` roll, pitch, heading from true north [deg].
         alignment_deg: standard deviation of the misalignment of the axes before the swing [deg].
-        tilt_deg: roll and pitch up to which the standard deviations hold [deg].
 
     Raises:
         ValueError: for samples that are too few, in another unit, along other axes, with too many outliers, or from too
@@ -149,7 +145,7 @@ def calibrate(
         ([500, 0, -200], 'ellipsoid')
     """
     elements, elements_std = known_elements(here, here_std, date)
-    check_number(0, above=True, alignment_deg=alignment_deg, tilt_deg=tilt_deg)
+    check_number(0, above=True, alignment_deg=alignment_deg)
     axes, reference = axes_nt.double(), field_vector(torch.tensor(elements, dtype=torch.float64))
     scale, std = float(reference.norm()), torch.tensor(elements_std, dtype=torch.float64)
     _check_samples(axes, scale)
@@ -158,13 +154,11 @@ def calibrate(
     mix, offset, covariance, noise, inliers = _fit(shares, level, math.radians(alignment_deg), 1 / scale)
     matrix, outliers = torch.linalg.inv(mix), 1 - float(inliers.double().mean())
     _check_fit(scale * noise, outliers, scale)
-    corrected = ((shares - offset) @ matrix.mT)[inliers]
-    seen = torch.stack((corrected.amin(0), corrected.amax(0)), -1)
     if attitude_deg is None:  # the known intensity is a scale: of B_H alone
         std = torch.stack((*torch.zeros(2), torch.hypot(std[2], torch.deg2rad(std[1]) * reference[2])))
-    std = torch.hypot(_remaining_std(mix, covariance, reference, tilt_deg), std)
-    _check_std(std, seen)
-    rows = {"matrix": matrix, "offset_nt": scale * offset, "std": std, "seen": seen}
+    std = torch.hypot(_remaining_std(mix, covariance, reference), std)
+    _check_std(std)
+    rows = {"matrix": matrix, "offset_nt": scale * offset, "std": std}
     return Calibration(
         **{name: row.tolist() for name, row in rows.items()},
         method="ellipsoid" if attitude_deg is None else "vector",
@@ -269,9 +263,9 @@ def _prior(alignment: float) -> Tensor:
     return precision
 
 
-def _remaining_std(mix: Tensor, covariance: Tensor, reference: Tensor, tilt_deg: float) -> Tensor:
+def _remaining_std(mix: Tensor, covariance: Tensor, reference: Tensor) -> Tensor:
     """Return the remaining standard deviations of D, I, B_H ``(3,)``, averaged over headings, roll and pitch."""
-    tilts = (0.0, 0.0), (tilt_deg, 0.0), (-tilt_deg, 0.0), (0.0, tilt_deg), (0.0, -tilt_deg)
+    tilts = (0.0, 0.0), (TILT_DEG, 0.0), (-TILT_DEG, 0.0), (0.0, TILT_DEG), (0.0, -TILT_DEG)
     attitude = torch.tensor([(*tilt, 30.0 * turn) for tilt in tilts for turn in range(12)], dtype=torch.float64)
     turn, scale = rotation(attitude), reference.norm()
     moved = torch.linalg.solve(mix, _design(turn.mT @ reference / scale))
@@ -341,12 +335,8 @@ def _check_directions(shares: Tensor) -> None:
         )
 
 
-def _check_std(std: Tensor, seen: Tensor) -> None:
+def _check_std(std: Tensor) -> None:
     """Raise if a calibration leaves more than :data:`MOST_STD`."""
-    if bool((std <= torch.tensor(MOST_STD)).all()):
-        return
-    left = "D {:.2g} deg, I {:.2g} deg, B_H {:.3g} nT".format(*std.tolist())
-    shares = ", ".join(
-        f"{name} {low:.2f} to {high:.2f}" for name, (low, high) in zip(_AXES, seen.tolist(), strict=True)
-    )
-    raise ValueError(f"too few directions, which leave {left}: the field was along {shares} of its strength; {_SWING}")
+    if (std > torch.tensor(MOST_STD)).any():
+        left = "D {:.2g} deg, I {:.2g} deg, B_H {:.3g} nT".format(*std.tolist())
+        raise ValueError(f"too few directions, which leave {left}: {_SWING}")

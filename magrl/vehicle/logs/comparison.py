@@ -11,9 +11,9 @@ from torch import Tensor
 from magrl.field import IGRF
 from magrl.field.elements import NAMES, element_difference, measured_elements
 from magrl.geodesy import geodesic
-from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.units import out_of_range
-from magrl.vehicle.onboard.start import deviation, likely_mistake, model_std
+from magrl.vehicle.onboard.known import deviation, likely_mistake, model_std
 
 MOST_SPIKES = 0.2
 """Share of readings up to which those that do not fit are spikes, and not a mistake in all; chosen."""
@@ -44,11 +44,11 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     """Return the likely mistakes in a log with positions, as sentences; none where it fits.
 
     Readings are compared with IGRF, within the accuracy of a model of the core
-    (:data:`~magrl.vehicle.onboard.start.MODEL_STD`), and moves with the positions.
+    (:data:`~magrl.vehicle.onboard.known.MODEL_STD`), and moves with the positions.
 
     Args:
-        readings: columns of :func:`~magrl.vehicle.logs.readings_of` or ``recipes/replay_log.py``. Where D is not measured
-            (``D_std``), it converts the headings.
+        readings: columns of :func:`~magrl.vehicle.logs.readings_of`. Where D is not measured (``D_std``), it converts
+            the headings.
         date: date for IGRF; without it, moves alone are compared.
 
     Example:

@@ -18,7 +18,7 @@ from magrl.checks import check_choice, check_number, short
 from magrl.field.elements import NAMES, elements_jacobian, measured_elements
 from magrl.files import numbers_of, read_table, read_text
 from magrl.geodesy import geodesic
-from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Log, check_times, date_of, times_of
 from magrl.vehicle.logs.units import COLUMNS, UNITS, out_of_range, unit_of
@@ -34,7 +34,6 @@ def readings_of(
     log: Log,
     *,
     every_km: float = 20.0,
-    every_s: float | None = None,
     north: str | None = None,
     calibration: Calibration | None = None,
 ) -> DataFrame:
@@ -47,7 +46,6 @@ def readings_of(
     Args:
         log: samples. Without a heading, it is that of a compass: the horizontal field, leveled by roll and pitch.
         every_km: least length of a move.
-        every_s: duration of a move [s], in place of a length.
         north: north of the heading, one of :data:`~magrl.vehicle.logs.vectors.NORTHS`; default that of the log.
         calibration: correction of the axes.
 
@@ -76,10 +74,9 @@ def readings_of(
     north = north or log.north or ""
     check_choice(NORTHS, north=north)
     check_number(0, above=True, every_km=every_km)
-    check_number(0, above=True, optional=True, every_s=every_s)
     field = (rotation(log.tensor(*ATTITUDE)) @ axes.unsqueeze(-1)).squeeze(-1).numpy()
     path, time = _path(log), log.samples["time"].to_numpy(float)
-    part = _parts_km(path, every_km) if every_s is None else _parts_s(time, every_s)
+    part = _parts(path, every_km)
     samples = pandas.DataFrame(np.column_stack((time, path, field)), columns=["time", *_PATH, *_FIELD])
     for name in _MEANS:
         if name in log.samples:
@@ -232,7 +229,7 @@ def _path(log: Log) -> Array:
     return np.cumsum(np.stack((length * np.cos(heading), length * np.sin(heading)), -1), 0)
 
 
-def _parts_km(path: Array, every_km: float) -> NDArray[np.int64]:
+def _parts(path: Array, every_km: float) -> NDArray[np.int64]:
     """Return the part of each sample ``(N,)``; a part ends where it is ``every_km`` from its first sample."""
     first, start = [0], path[0].tolist()
     for row, place in enumerate(path.tolist()):
@@ -242,11 +239,6 @@ def _parts_km(path: Array, every_km: float) -> NDArray[np.int64]:
     if len(first) > 1 and np.hypot(*(path[-1] - path[first[-1]])) < every_km / 2:
         first.pop()
     return np.searchsorted(first, np.arange(len(path)), side="right") - 1
-
-
-def _parts_s(time: Array, every_s: float) -> NDArray[np.int64]:
-    """Return the part of each sample ``(N,)`` by time, without parts that would be empty."""
-    return np.unique(((time - time[0]) / every_s).astype(int), return_inverse=True)[1]
 
 
 def _spikes(field: Array, part: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -121,9 +121,8 @@ def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[s
     step = np.diff(time)
     if (step < 0).any():
         row = int(np.argmax(step < 0))
-        hour = ": an hour back, as at the end of daylight saving time; log UTC" if abs(step[row] + 3600) < 60 else ""
         raise ValueError(
-            f"time runs backward from row {row + 1} to {row + 2}, from {time[row]:.10g} to {time[row + 1]:.10g}{hour}: "
+            f"time runs backward from row {row + 1} to {row + 2}, from {time[row]:.10g} to {time[row + 1]:.10g}: "
             "sort the rows, or split the log where its clock was set"
         )
     new = np.concatenate(([True], step > 0))
@@ -133,8 +132,7 @@ def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[s
     step = step[step > 0]
     least = max(_GAP * np.median(step), _GAP_SHARE * step.sum()) if len(step) else 0.0
     if count := int((step > least).sum()):
-        hour = ", which is daylight saving time if the log has local time" if (abs(step - 3600) < 60).any() else ""
-        notes.append(f"{_count(count, 'gap')}, the longest of {step.max():g} {unit}{hour}")
+        notes.append(f"{_count(count, 'gap')}, the longest of {step.max():g} {unit}")
     return new, notes
 
 

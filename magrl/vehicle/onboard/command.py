@@ -1,4 +1,4 @@
-"""The command of a step, as plain numbers."""
+"""The command of a step on board."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ class Command:
         heading_deg: heading after that turn, 0 to 360: what to steer.
         way_km: mean of the way to the destination, northward and eastward.
         way_covariance_km2: its covariance, by rows.
-        confidence: estimated probability that the destination is within ``arrival_km``.
+        confidence: estimated probability that the destination is within ``radius_km`` of the options.
         stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
             the distance is then 0.
         reason: why to stop, as text; in the first command, what was not checked.
-        radius_km: radius that holds the destination with the ``confidence`` of the options.
+        error_radius_km: radius that holds the destination with the ``confidence`` of the options.
+        place: estimated latitude and longitude [deg], where the vehicle knows its start; else None.
+        place_covariance_km2: covariance of the place, northward and eastward.
+        drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the way].
 
     Example:
         >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
@@ -39,7 +42,10 @@ class Command:
     confidence: float
     stop: str | None = None
     reason: str = ""
-    radius_km: float = math.inf
+    error_radius_km: float = math.inf
+    place: tuple[float, float] | None = None
+    place_covariance_km2: tuple[tuple[float, float], tuple[float, float]] | None = None
+    drift: tuple[float, float] | None = None
 
     @property
     def error_km(self) -> float:

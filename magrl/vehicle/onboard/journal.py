@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
-from magrl.files import write_atomically
-from magrl.sensor_std import PERFECT, SensorStd
-from magrl.transforms.errors.sensors import OUTAGE_STD
-from magrl.vehicle.onboard.limits import Reading
+from magrl.sensor_std import OUTAGE_STD, PERFECT, SensorStd
+from magrl.tracking import Rules
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
+_LAX = Field(strict=False)  # a tuple may be given as a list
+Triple = Annotated[tuple[float, float, float], _LAX]
 
 
 def _plain(value: Any) -> Any:
@@ -29,10 +28,18 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-_PLAIN, _LAX = BeforeValidator(_plain), Field(strict=False)  # a tuple may be given as a list
-Number = Annotated[float, _PLAIN]
-Numbers = Annotated[tuple[Number, ...], _PLAIN, _LAX]
-Triple = Annotated[tuple[Number, Number, Number], _PLAIN, _LAX]
+class Inputs(CheckedModel):
+    """Take numbers of Python, NumPy and torch.
+
+    Example:
+        >>> Inputs()
+        Inputs()
+    """
+
+    @model_validator(mode="before")
+    @classmethod
+    def _plain_values(cls, values: Any) -> Any:
+        return {name: _plain(value) for name, value in values.items()} if isinstance(values, dict) else values
 
 
 def _accuracy(value: Any) -> SensorStd:
@@ -41,7 +48,6 @@ def _accuracy(value: Any) -> SensorStd:
     Raises:
         ValueError: for a standard deviation that is out of its range, or one of B_H that looks like microtesla.
     """
-    value = _plain(value)
     whole = isinstance(value, SensorStd) or (isinstance(value, list) and isinstance(value[0], list))
     sensor_std = SensorStd.of(SensorStd(*map(_plain, value)) if whole else value)
     for name, std in sensor_std._asdict().items():
@@ -55,22 +61,18 @@ def _accuracy(value: Any) -> SensorStd:
     return sensor_std
 
 
-class Options(CheckedModel):
-    """Hold the options of :class:`~magrl.vehicle.onboard.Onboard`.
+class Options(Inputs, Rules):
+    """Hold the options of :class:`~magrl.vehicle.onboard.Onboard`: all :class:`~magrl.tracking.Rules`, and the sensors.
 
     Args:
+        arrival: always declared: nothing tells a vehicle that it has arrived.
+        model: given to :meth:`~magrl.vehicle.onboard.Onboard.start`, as are ``start_km`` and ``target_km``.
         north: ``"true"``: headings are from true north, and D is measured; or ``"magnetic"``: they are from magnetic
             north, those of a compass, and D is not measured.
         sensor_std: accuracy of the sensors, a :class:`~magrl.sensor_std.SensorStd`; three numbers are white noise of
-            D [deg], I [deg], B_H [nT]. A noise that is not 0 is corrected by what the readings show
-            (:class:`~magrl.transforms.TrackField`). The drift is what a known start does not show, and what readings
-            average in part.
-        max_move_km: longest move; 50 km, or for a trained policy that of its training.
-        max_turn_deg: largest turn to either side; 90°, or for a trained policy that of its training.
-        max_steps: steps of a way, the last of which stops.
-        arrival_km: distance from the destination that counts as arrived.
-        confidence: least estimated probability of arrival at which the command is to stop as arrived.
-        navigator: class of the navigator; the vehicle writes it.
+            D [deg], I [deg], B_H [nT]. A noise that is not 0 is corrected by what the readings show. The drift is what
+            a known start does not show, and what readings average in part.
+        navigator: name of the navigator; the vehicle writes it.
         weights: digest of its weights; the vehicle writes it.
 
     Example:
@@ -80,13 +82,12 @@ class Options(CheckedModel):
 looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
     """
 
+    arrival: Literal["declared"] = "declared"
+    model: None = None
+    start_km: None = None
+    target_km: None = None
     north: Literal["true", "magnetic"] = "true"
     sensor_std: Annotated[SensorStd, BeforeValidator(_accuracy)] = PERFECT
-    max_move_km: Number | None = Field(None, gt=0, le=1000)
-    max_turn_deg: Number | None = Field(None, gt=0, le=180)
-    max_steps: Annotated[int, _PLAIN] = Field(120, ge=1)
-    arrival_km: Number = Field(25.0, gt=0)
-    confidence: Number = Field(0.8, ge=0, le=1)
     navigator: str = ""
     weights: str = ""
 
@@ -103,7 +104,7 @@ looks like microtesla, and nanotesla are expected; give 0 for a perfect sensor
         return self.sensor_std._replace(bias=(math.inf, *self.sensor_std.bias[1:]))
 
 
-class Step(CheckedModel):
+class Step(Inputs):
     """Hold the arguments of :meth:`~magrl.vehicle.onboard.Onboard.step`.
 
     Example:
@@ -112,60 +113,14 @@ class Step(CheckedModel):
         ValueError: heading must be a finite number, got nan
     """
 
-    declination: Number | None
-    inclination: Number | None
-    horizontal_intensity: Number | None
-    heading: Number = Field(ge=-360, le=360)
-    distance: Number = Field(0.0, ge=0)
-    time: Number | None = None
-
-    @property
-    def reading(self) -> Reading:
-        """D [deg], I [deg], B_H [nT]; None for an element that is missing."""
-        return self.declination, self.inclination, self.horizontal_intensity
-
-    def in_radians(self, before: Sequence[float], steer_deg: float) -> tuple[float, ...]:
-        """Return the commanded headings that were reported in radians, by the moves before and by this one in a row.
-
-        A heading may equal the commanded one in radians by chance; two that differ do not.
-
-        Args:
-            before: those before this move.
-            steer_deg: commanded heading of this move.
-
-        Example:
-            >>> step = Step(declination=3, inclination=73, horizontal_intensity=15000, heading=1.9199)
-            >>> step.in_radians((60.0,), 110.0), step.in_radians((60.0,), 120.0)
-            ((60.0, 110.0), ())
-        """
-
-        def apart(heading_deg: float) -> float:
-            return abs(math.remainder(heading_deg - steer_deg, 360))
-
-        if abs(self.heading) > 2 * math.pi or apart(math.degrees(self.heading)) > 0.5:
-            return ()
-        known = min(map(apart, (self.heading, *before))) < 10  # the move shows nothing new
-        return tuple(before) if known else (*before, steer_deg)
-
-    def repeats(self, before: Step) -> bool:
-        """Return whether this repeats the message of the step before, by its time.
-
-        Raises:
-            ValueError: for an earlier time, or another message of the same time.
-
-        Example:
-            >>> step = Step(declination=3, inclination=73, horizontal_intensity=15000, heading=0, time=5)
-            >>> step.repeats(step)
-            True
-        """
-        if self.time is None or before.time is None or self.time > before.time:
-            return False
-        if self != before:
-            raise ValueError(f"time must be later than {before.time!r}, that of the last step, got {self.time!r}")
-        return True
+    declination: float | None
+    inclination: float | None
+    horizontal_intensity: float | None
+    heading: float = Field(ge=-360, le=360)
+    distance: float = Field(0.0, ge=0)
 
 
-class Journal(CheckedModel):
+class Journal(Inputs):
     """Hold all inputs of a vehicle since its start, which determine its state with any navigator.
 
     Example:
@@ -174,13 +129,16 @@ class Journal(CheckedModel):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[10] = 10
+    format: Literal[12] = 12
     options: Annotated[Options, _LAX]
-    target: Triple
-    here: Numbers | None = None
-    here_std: Numbers | None = None
-    near: Annotated[tuple[Number, Number], _PLAIN, _LAX] | None = None
+    target: Annotated[tuple[float, ...], _LAX]
+    start: Annotated[tuple[float, ...], _LAX] | None = None
+    start_std: Triple | None = None
     date: str | None = None
+    altitude_km: float = 0.0
+    model: str | None = None
+    start_km: float = Field(0.1, ge=0)
+    target_km: float = Field(0.1, ge=0)
     steps: Annotated[tuple[Annotated[Step, _LAX], ...], _LAX] = ()
 
     def content(self) -> bytes:
@@ -188,17 +146,9 @@ class Journal(CheckedModel):
         body = self.model_dump_json().encode()
         return body + b"\n" + hashlib.sha256(body).hexdigest().encode()
 
-    def write(self, path: Path) -> None:
-        """Write a file atomically.
-
-        Raises:
-            OSError: if it cannot be written; an existing one stays unchanged.
-        """
-        write_atomically(path, self.content())
-
     @classmethod
     def read(cls, path: Path) -> Journal:
-        """Read a file of :meth:`write`.
+        """Read a file with this content.
 
         Raises:
             ValueError: for anything else, naming what is wrong.

@@ -1,96 +1,193 @@
-"""Limits of a policy and of a vehicle: the longest move, the largest turn, the range of the field, and sensors."""
+"""Limits of the Earth's field, of a vehicle and of its sensors, for checks of plain numbers.
+
+The limits of the field are those of IGRF-14 at sea level, 1900 to 2030, on a grid of 1 by 2 degrees: a total intensity
+of 21 900 to 69 400 nT, a horizontal intensity up to 41 900 nT, and a change of the vector of up to 16 nT/km between
+75° S and 75° N and 63 nT/km up to 88°, where north turns along the way; B_H and B_Z alone change by up to 16.4 nT/km
+anywhere. Where the inclination is within 1.6 degrees, the horizontal intensity is at least 24 100 nT and the gradient
+of the inclination at least 1.5 degrees per 100 km. The checks leave room for the crust, magnetic storms, altitude and
+errors of sensors.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Real
+from typing import Any
 
-from tensordict.nn import TensorDictModuleBase
-
-from magrl.field.elements import NAMES, UNITS
+from magrl.checks import check_number, check_numbers
+from magrl.field.elements import FIELD_NT, NAMES, UNITS
 from magrl.tracking.planning import MISSING_KM, SLOPES
-from magrl.transforms import ObservationView, TrackView
 
+TOTAL_NT = (20000.0, 76000.0)
+"""Least and greatest total intensity: 10 % beyond those of IGRF [nT]."""
+MOST_HORIZONTAL_NT = 44000.0
+"""Greatest horizontal intensity: 2000 nT beyond that of IGRF [nT]."""
+EQUATOR_NT = 22000.0
+"""Least horizontal intensity where the inclination is within pi/2 degrees: 10 % below that of IGRF [nT]."""
+EQUATOR_SLOPE_DEG = 0.5
+"""Least gradient of the inclination where it is within pi/2 degrees: a third of that of IGRF [deg per 100 km]."""
+SLOPE_NT_KM = 60.0
+"""Greatest change of the field vector along a way, up to 88 degrees of latitude [nT/km]."""
+MERIDIAN_SLOPE_NT_KM = 16.4
+"""Greatest change of B_H and B_Z, which do not depend on where north is, along a way [nT/km]."""
+DISTURBANCE_NT = 2000.0
+"""Change of the field vector between two readings by the crust and a severe magnetic storm; chosen [nT]."""
+_SLACK_DEG = 1.0  # of an inclination
+_SIGMAS = 8.0  # of the noise of a difference
 LEAST_NT = 2000.0
 """Least B_H for an agent without a map: below, it fails more often (docs/earth.md, the whole globe) [nT]."""
-
 STUCK_KM = (100.0, 400.0)
 """Path without a change of any element, and of one element, after which a sensor counts as stuck, but at least 2 and 8
 of the longest moves [km]. Coarse readings of one element can stay equal that long; chosen."""
 LONGER = 1.1
 """A move may be as many times as long as the longest one that is commanded."""
 
-View = ObservationView | TrackView | None
-Path = tuple[float, float, float]
-Reading = tuple[float | None, float | None, float | None]
+Triple = tuple[float, float, float]
+Incomplete = tuple[float | None, float | None, float | None]
 
 
-def view_of(policy: TensorDictModuleBase) -> View:
-    """Return what a trained policy observes; None for a navigator, or a policy of no region.
+def check_earth_reading(
+    declination: float, inclination: float, horizontal_intensity: float, what: str = "the reading"
+) -> None:
+    """Raise unless three elements are possible on the Earth.
 
-    Example:
-        >>> from magrl.agents import load_pretrained
-        >>> view_of(load_pretrained("anywhere")).max_steps
-        120
-    """
-    view = getattr(getattr(policy, "config", policy), "view", None)
-    return view if isinstance(view, (ObservationView, TrackView)) else None
-
-
-def move_limits(
-    policy: TensorDictModuleBase | None, max_move_km: float | None = None, max_turn_deg: float | None = None
-) -> tuple[float, float]:
-    """Return the longest move [km] and the largest turn [deg] of a vehicle that follows a policy.
+    An inclination in radians is a small one in degrees. On the Earth, an inclination of at most pi/2 degrees comes with
+    a strong horizontal field, so that most readings in radians are recognized, but not all: at 0.5 and 30000 nT both
+    units are possible.
 
     Args:
-        policy: policy or navigator; None for one that is made for the vehicle.
-        max_move_km: longest move of the vehicle; by default that of the policy, or 50 km.
-        max_turn_deg: its largest turn to either side; by default that of the policy, or 90 degrees.
+        declination: D [deg], -180 to 180.
+        inclination: I [deg], -90 to 90.
+        horizontal_intensity: B_H [nT].
+        what: context, at the start of the message.
 
     Raises:
-        ValueError: for a vehicle that cannot do what the policy commands.
+        ValueError: naming the value, what is possible, and the unit that it probably has.
 
     Example:
-        >>> move_limits(None, max_move_km=20.0)
-        (20.0, 90.0)
+        >>> check_earth_reading(3.5, 73.0, 15000.0)
+        >>> check_earth_reading(3.5, 73.0, 15.0)
+        Traceback (most recent call last):
+        ValueError: the reading: horizontal_intensity 15 at an inclination of 73 deg is not possible on the Earth, \
+where it is 5513 to 23485 nT there: it looks like microtesla, and nanotesla are expected
     """
-    source = policy if policy is None else view_of(policy) or policy
-    move, turn = getattr(source, "max_move_km", 0.0), math.degrees(getattr(source, "max_turn_rad", 0.0))
-    limits = []
-    for name, value, commanded, usual in (
-        ("max_move_km", max_move_km, move, 50.0),
-        ("max_turn_deg", max_turn_deg, turn, 90.0),
+    for name, value, least, most in (
+        ("declination [deg]", declination, -180.0, 180.0),
+        ("inclination [deg]", inclination, -90.0, 90.0),
+        ("horizontal_intensity [nT]", horizontal_intensity, 0.0, math.inf),
     ):
-        if value is not None and value < commanded * (1 - 1e-6):
-            raise ValueError(f"{name} must be at least {commanded:g}, which the policy commands, got {value!r}")
-        limits.append(float(commanded or usual) if value is None else value)
-    return limits[0], limits[1]
+        given: dict[str, Any] = {f"{what}: {name}": value}
+        if isinstance(value, Real) and name == "declination [deg]" and 180 < value <= 360:
+            raise ValueError(f"{what}: {name} must be from -180 up to 180, got {value:g}: give {value - 360:g}")
+        check_number(least, most, **given)
+    low, high = _horizontal_limits(abs(inclination))
+    if low <= horizontal_intensity <= high:
+        return
+    units = [unit for unit, factor in FIELD_NT.items() if low <= factor * horizontal_intensity <= high]
+    in_radians = abs(inclination) <= math.pi / 2 and abs(declination) <= math.pi
+    least, most = _horizontal_limits(math.degrees(abs(inclination))) if in_radians else (math.inf, 0.0)
+    guess = f": it looks like {units[0]}, and nanotesla are expected" if units else ""
+    if least <= horizontal_intensity <= most:
+        guess = ": the inclination looks like radians, and degrees are expected"
+    raise ValueError(
+        f"{what}: horizontal_intensity {horizontal_intensity:g} at an inclination of {inclination:g} deg is not "
+        f"possible on the Earth, where it is {low:.0f} to {high:.0f} nT there{guess}"
+    )
 
 
-def out_of_range(view: View, elements: Sequence[float]) -> str:
-    """Return which element is beyond the range that a policy was trained or tested in, as text; empty if none is.
+def _horizontal_limits(inclination: float) -> tuple[float, float]:
+    """Return the least and the greatest horizontal intensity [nT] at the size of an inclination [deg]."""
+    steep, flat = min(inclination + _SLACK_DEG, 90.0), max(inclination - _SLACK_DEG, 0.0)
+    low = EQUATOR_NT if inclination <= math.pi / 2 else TOTAL_NT[0] * math.cos(math.radians(steep))
+    return low, min(MOST_HORIZONTAL_NT, TOTAL_NT[1] * math.cos(math.radians(flat)))
 
-    For a policy of a region, its :attr:`~magrl.transforms.ObservationView.field_limits`; for one that reads its own
-    track, B_H of at least :data:`LEAST_NT`.
+
+def check_earth_distance(reading: Sequence[float], target: Sequence[float], most_km: float) -> None:
+    """Raise if places with such elements are farther apart on the Earth than the longest way.
 
     Args:
-        view: from :func:`view_of`.
-        elements: D [deg], I [deg], B_H [nT].
+        reading: D [deg], I [deg], B_H [nT] at the start.
+        target: the same at the destination.
+        most_km: longest way [km].
+
+    Raises:
+        ValueError: with the least distance.
 
     Example:
-        >>> from magrl.agents import load_pretrained
-        >>> out_of_range(view_of(load_pretrained("anywhere")), (0.0, 88.0, 1500.0))
-        'B_H 1500 nT is out of the range of the policy, 2000 to inf nT'
+        >>> check_earth_distance((-7.7, -7.7, 40000.0), (3.3, 74.9, 13581.0), 2500.0)
+        Traceback (most recent call last):
+        ValueError: the reading at the start is at least 3639 km from the target, and the longest way is 2500 km: \
+check the target, and the axes, the units and the calibration of the sensors
     """
-    low: Sequence[float] = (-180.0, -90.0, 0.0)
-    high: Sequence[float] = (180.0, 90.0, math.inf)
-    if isinstance(view, TrackView):
-        low = (-180.0, -90.0, LEAST_NT)
-    elif view is not None:
-        low, high = view.field_limits
-    for name, unit, value, least, most in zip(NAMES, UNITS, elements, low, high, strict=True):
+    here, there = ((b, b * math.tan(math.radians(i))) for _, i, b in (reading, target))  # B_H and B_Z
+    least_km = (math.dist(here, there) - DISTURBANCE_NT) / MERIDIAN_SLOPE_NT_KM
+    if least_km > most_km:
+        raise ValueError(
+            f"the reading at the start is at least {least_km:.0f} km from the target, and the longest way is "
+            f"{most_km:.0f} km: check the target, and the axes, the units and the calibration of the sensors"
+        )
+
+
+def check_earth_jump(
+    before: Sequence[float], after: Sequence[float], distance_km: float, noise: Sequence[float] = (0.0, 0.0, 0.0)
+) -> None:
+    """Raise unless a move can explain the change between two readings, up to 88 degrees of latitude.
+
+    The change of each element is a change of the field vector of at least so many nanotesla. A move changes the vector
+    by at most :data:`SLOPE_NT_KM`, anything else by :data:`DISTURBANCE_NT`.
+
+    Args:
+        before: D [deg], I [deg], B_H [nT] before the move.
+        after: the same after it.
+        distance_km: length of the move [km].
+        noise: standard deviations of the noise of a reading, in the same units.
+
+    Raises:
+        ValueError: naming the element, both values, and what a move of this length can explain.
+
+    Example:
+        >>> check_earth_jump((3.5, 73.0, 15000.0), (4.0, 72.5, 15400.0), 50.0)
+        >>> check_earth_jump((3.5, 40.0, 25000.0), (3.5, -40.0, 25000.0), 50.0)
+        Traceback (most recent call last):
+        ValueError: inclination changed from 40 to -40 deg over 50 km, by 41955 nT of the field vector; a move of this \
+length explains at most 5000 nT: the reading is wrong, or the distance is
+    """
+    check_numbers(3, before=before, after=after, noise=noise)
+    check_number(0, distance_km=distance_km, noise=min(noise))
+    horizontal = min(before[2], after[2])
+    total = min(TOTAL_NT[1], *(b / max(math.cos(math.radians(i)), 1e-6) for _, i, b in (before, after)))
+    radius = 2 * horizontal, 2 * total, 1.0
+    noise_nt = math.radians(noise[0]) * horizontal, math.radians(noise[1]) * total, noise[2]
+    for index, (name, unit) in enumerate((("declination", "deg"), ("inclination", "deg"), ("B_H", "nT"))):
+        change = abs(after[index] - before[index])
+        change = change if index == 2 else abs(math.sin(math.radians(change / 2)))
+        most = DISTURBANCE_NT + SLOPE_NT_KM * distance_km + _SIGMAS * math.sqrt(2) * noise_nt[index]
+        if radius[index] * change > most:
+            raise ValueError(
+                f"{name} changed from {before[index]:g} to {after[index]:g} {unit} over {distance_km:g} km, by "
+                f"{radius[index] * change:.0f} nT of the field vector; a move of this length explains at most "
+                f"{most:.0f} nT: the reading is wrong, or the distance is"
+            )
+
+
+# The vehicle and its sensors
+
+
+def out_of_range(limits: Sequence[Sequence[float]], elements: Sequence[float]) -> str:
+    """Return which element is beyond the range that a navigator was trained or tested in; empty if none is.
+
+    Args:
+        limits: least and greatest D [deg], I [deg], B_H [nT].
+        elements: D, I, B_H.
+
+    Example:
+        >>> out_of_range(((-180.0, -90.0, 2000.0), (180.0, 90.0, math.inf)), (0.0, 88.0, 1500.0))
+        'B_H 1500 nT is out of the range of the navigator, 2000 to inf nT'
+    """
+    for name, unit, value, least, most in zip(NAMES, UNITS, elements, *limits, strict=True):
         if not least <= value <= most:
-            return f"{name} {value:g} {unit} is out of the range of the policy, {least:g} to {most:g} {unit}"
+            return f"{name} {value:g} {unit} is out of the range of the navigator, {least:g} to {most:g} {unit}"
     return ""
 
 
@@ -107,7 +204,7 @@ def measured(std: Sequence[float]) -> tuple[bool, ...]:
     return tuple(value / slope < MISSING_KM for value, slope in zip(std, SLOPES, strict=True))
 
 
-def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Reading, move_km: float) -> Path:
+def unchanged_km(unchanged: Sequence[float], before: Sequence[float], after: Incomplete, move_km: float) -> Triple:
     """Return the path since each element last changed ``(3,)`` [km], without moves that end without reading it.
 
     Args:
@@ -142,23 +239,3 @@ def stuck(unchanged: Sequence[float], max_move_km: float) -> str:
     least_km = every_km if min(unchanged) >= every_km else one_km
     names = [name for name, km in zip(NAMES, unchanged, strict=True) if km >= least_km]
     return f"no change of {', '.join(names)} over {least_km:.0f} km: a sensor is stuck" if names else ""
-
-
-def check_move(distance_km: float, max_move_km: float) -> None:
-    """Raise unless a vehicle can have made a move.
-
-    Args:
-        distance_km: its length.
-        max_move_km: longest move; a vehicle may drift a tenth farther.
-
-    Raises:
-        ValueError: naming the value and what would be right.
-
-    Example:
-        >>> check_move(30.0, max_move_km=50.0)
-    """
-    if distance_km > LONGER * max_move_km:
-        raise ValueError(
-            f"distance {distance_km:g} km is longer than the longest move of this vehicle, {max_move_km:g} km: it must "
-            "be in kilometers, and since the last step; report a longer way in parts, None for the readings between"
-        )

@@ -1,7 +1,7 @@
 """Navigation on board one vehicle: plain numbers in, a command out, without an environment.
 
 Angles are in degrees, clockwise from the vehicle's north, true or magnetic, distances in kilometers, and intensities in
-nanotesla.
+nanotesla. The step is that of :mod:`magrl.tracking.pilot`.
 """
 
 from __future__ import annotations
@@ -14,44 +14,37 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 
 from magrl import tracking
-from magrl.agents import FieldPolicy, kalman, load_pretrained
 from magrl.checks import check_type
-from magrl.envs.geomagnetic import PUBLIC_KEYS
-from magrl.field.elements import NAMES
-from magrl.navigators import Secant
-from magrl.sensor_std import STD_KEYS, SensorStd
-from magrl.tracking import ArrivalDecision, Way
-from magrl.transforms import TrackView
-from magrl.transforms.errors.known_start import START_KEYS
-from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.files import write_atomically
+from magrl.sensor_std import OUTAGE_STD, SensorStd
+from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
+from magrl.tracking.belief import DRIFT, PLACE
+from magrl.tracking.network import load_pilot, policy_content, pretrained
+from magrl.vehicle.onboard import limits
 from magrl.vehicle.onboard.command import Command
-from magrl.vehicle.onboard.estimator import Estimator
 from magrl.vehicle.onboard.journal import Journal, Options, Step
-from magrl.vehicle.onboard.limits import check_move, measured, move_limits, out_of_range, stuck, unchanged_km, view_of
-from magrl.vehicle.onboard.readings import (
-    EQUATOR_SLOPE_DEG,
-    check_earth_distance,
-    check_earth_jump,
-    check_earth_reading,
-)
-from magrl.vehicle.onboard.start import Elements, calibrated, check_start, known_elements, nearby_elements
+from magrl.vehicle.onboard.known import Knowledge, check_first_reading
 
-NAMED = ("anywhere", "secant", "kalman")
-"""Navigators by name; any other is given as a module."""
+USUAL: dict[str, Any] = {
+    "arrival": "declared",
+    "max_steps": 120,
+    "confidence": 0.8,
+    "drift": 0.03,  # of a log to 3 %, and a current of as much
+    "wander_km": 0.1,
+}
+"""Rules of a vehicle, in place of those of :class:`~magrl.tracking.Rules` or of the training."""
 LONGEST_WAY_KM = 2500.0
 """Estimated way beyond which an agent without a map is out of range: there its observation of the way saturates."""
 LOST_SURPRISE = 20.0
-"""Mean of the last surprises (:meth:`Estimator.surprise`) beyond which the readings contradict each other. With the
+"""Mean of the last surprises (:class:`~magrl.tracking.Track`) beyond which the readings contradict each other. With the
 right accuracy, it stayed below 7 in simulation, under the conditions of four vehicles."""
-Values = tuple[float, ...]
 _SURPRISES, _LEAST_SURPRISES = 8, 2
 _UNCHECKED = {
-    "true": "the sign of D and the compass were not checked: give here or near in start",
-    "magnetic": "the compass was not checked: give here or near in start",
+    "true": "the sign of D and the compass were not checked: give the start",
+    "magnetic": "the compass was not checked: give the start",
 }
 _NOT_STARTED = "the vehicle has no destination yet: call start(target) first"
 
@@ -64,109 +57,95 @@ class Onboard:
     move. Each returns a :class:`Command`. A call that raises an error changes nothing: repeat it with right values.
 
     Args:
-        navigator: ``"anywhere"`` for the pretrained agent, ``"secant"`` or ``"kalman"``; or a policy from
-            :func:`magrl.load_policy`, or a navigator, of which the vehicle gets a copy.
-        options: those of :class:`~magrl.vehicle.onboard.journal.Options`.
+        navigator: ``"anywhere"`` for the pretrained agent, ``"kalman"``, or a file of
+            :func:`~magrl.tracking.save_pilot`, which run without TorchRL; ``"secant"``, a file of
+            :func:`magrl.save_policy`, a policy or a navigator, of which the vehicle gets a copy.
+        options: those of :class:`~magrl.vehicle.onboard.journal.Options`. Rules that are not given are those of the
+            training, but :data:`USUAL`. The limits of a move are at most those of the training.
 
     Raises:
-        ValueError: for an option out of its range, an unknown navigator, one that reads more than the vehicle knows,
-            or moves that are shorter than those of a trained policy.
+        ValueError: for an option out of its range, an unknown navigator, or one that reads more than the vehicle knows.
 
     Example:
-        >>> vehicle = Onboard("secant", sensor_std=(0.02, 0.02, 2.0))
+        >>> vehicle = Onboard("kalman", sensor_std=(0.02, 0.02, 2.0))
         >>> vehicle.start((-11.6, 75.4, 13240.0))
         >>> command = vehicle.step(3.5, 73.0, 15000.0, heading=290.0)
-        >>> round(command.distance_km, 1), command.heading_deg, command.stop
-        (6.1, 290.0, None)
-        >>> round(vehicle.step(3.4, 73.0, 14995.0, heading=290.0, distance=6.0).turn_deg, 3)
-        90.0
+        >>> command.distance_km, command.stop
+        (0.0, None)
     """
 
     target: Any = None
     """Elements at the destination; None before :meth:`start`."""
 
-    def __init__(self, navigator: str | TensorDictModuleBase = "anywhere", **options: Any) -> None:
-        check_type((str, TensorDictModuleBase), navigator=navigator)
-        given = Options(**options)
-        source = load_pretrained("anywhere") if navigator == "anywhere" else navigator
-        policy = None if isinstance(source, str) else source
-        self.max_move_km, self.max_turn_deg = move_limits(policy, given.max_move_km, given.max_turn_deg)
-        self.options, self._sensor_std = given, given.accuracy
-        if isinstance(policy, FieldPolicy) and isinstance(view_of(policy), TrackView):  # nothing signals the arrival
-            policy = policy.adapted(search=False, max_steps=given.max_steps)
-        self._source = source if policy is None else copy.deepcopy(policy).cpu()
-        self.navigator = self._new_navigator()
-        name, weights = type(self.navigator).__name__, self.navigator.state_dict().values()
-        content = b"".join(value.cpu().numpy().tobytes() for value in weights if isinstance(value, torch.Tensor))
-        resolved = {"max_move_km": self.max_move_km, "max_turn_deg": self.max_turn_deg, "navigator": name}
-        self.options = given.replace(**resolved, weights=hashlib.sha256(content).hexdigest())
-        if unknown := sorted({*map(str, self.navigator.in_keys)} - {*PUBLIC_KEYS, *STD_KEYS, "elapsed_steps", "done"}):
-            raise ValueError(f"{name} reads {', '.join(unknown)}, which a vehicle does not know")
-        self._view, self._estimator = view_of(self.navigator), Estimator(self.navigator)
-
-    def _new_navigator(self) -> Any:
-        """Return the navigator before its first step."""
-        if not isinstance(self._source, str):
-            return copy.deepcopy(self._source)
-        options, bounds = self.options, (self.max_move_km, math.radians(self.max_turn_deg))
-        if self._source == "secant":
-            elements = NAMES[1:] if options.magnetic else NAMES
-            return Secant(*bounds, elements=elements, sensor_std=self._sensor_std)
-        if self._source == "kalman":
-            limits = {"max_move_km": bounds[0], "max_turn_rad": bounds[1], "max_steps": options.max_steps}
-            return kalman(**limits, search=False)
-        raise ValueError(f"unknown navigator {self._source!r}: choose from {', '.join(NAMED)}, or give a policy")
+    def __init__(self, navigator: str | nn.Module = "anywhere", **options: Any) -> None:
+        check_type((str, nn.Module), navigator=navigator)
+        rules, self._network, self._other = _source(navigator)
+        given = Options(**rules.model_dump() | USUAL | options)
+        most = rules.model_dump(include={"max_move_km", "max_turn_rad"}) if self._network else {}
+        name, module = "anywhere" if self._network else "kalman", self._network or nn.Identity()
+        self._range = ((-180.0, -90.0, limits.LEAST_NT), (180.0, 90.0, math.inf))
+        if self._other:
+            name, module, most, self._range = (
+                getattr(self._other, part) for part in ("name", "navigator", "most", "range")
+            )
+        shorter = {limit: min(getattr(given, limit), value) for limit, value in most.items()}
+        content = b"".join(value.cpu().numpy().tobytes() for value in module.state_dict().values())
+        self.options = given.replace(**shorter, navigator=name, weights=hashlib.sha256(content).hexdigest())
 
     def start(
         self,
         target: Sequence[float | None],
-        here: Sequence[float] | None = None,
+        start: Sequence[float] | None = None,
         *,
-        here_std: Sequence[float] | None = None,
-        near: Sequence[float] | None = None,
+        start_std: Sequence[float] | None = None,
         date: str | None = None,
+        model: str | None = NEWEST,
+        start_km: float = 0.1,
+        target_km: float = 0.1,
+        altitude_km: float = 0.0,
     ) -> None:
-        """Begin an episode to a destination given by its elements: D [deg], I [deg], B_H [nT].
+        """Begin an episode to a destination, with what the vehicle knows.
 
-        Where the start is known, the first reading shows the constant errors of the sensors, which are subtracted from
-        all readings (:func:`magrl.transforms.calibration`); and a reading that does not fit the place raises an error.
+        With a date, the vehicle carries a model of the Earth, by default the newest that ships with the library. Where
+        it also knows its place, it follows it along the way, and steers between places. Without a date, it knows
+        nothing of the Earth but the spectrum of its field, as in the paper. Where the elements at the start are known,
+        the first reading shows the constant errors of the sensors (:func:`magrl.tracking.known`). A first reading that
+        does not fit the start raises an error.
 
         Args:
-            target: elements of the destination; D does not count where the vehicle's north is magnetic, and may be
-                None.
-            here: elements at the start; or its latitude and longitude [deg], with a ``date``.
-            here_std: standard deviations of the elements at the start: by default 0 for elements, and for a position
-                those of a model of the core (:data:`magrl.vehicle.onboard.start.MODEL_STD`).
-            near: latitude and longitude [deg] of the start, known to 200 km; it serves only to check the
-                first reading and the distance of the target.
-            date: date for a position, such as ``"2026-06-30"``.
+            target: elements of the destination, D [deg], I [deg], B_H [nT]; or its latitude and longitude [deg]. D does
+                not count where the vehicle's north is magnetic, and may be None.
+            start: latitude and longitude of the start [deg], with a date; or the elements there.
+            start_std: standard deviations of the elements at the start, 0 by default.
+            date: date of the flight, such as ``"2026-06-30"``.
+            model: model of the Earth that the vehicle carries (:func:`magrl.tracking.earth_model`); None for none.
+            start_km: root mean square error of the place of the start [km].
+            target_km: the same of the destination.
+            altitude_km: altitude of the flight, for the model [km].
 
         Raises:
-            ValueError: for elements that are not possible on the Earth, or beyond the range of the policy.
+            ValueError: for elements that are not possible on the Earth, or beyond the range of the policy; a place
+                without a model; or a model that does not cover the date.
         """
         target = self._comparable(target) if len(target) == 3 else target
-        given: dict[str, Any] = {"target": target, "here": here, "here_std": here_std, "near": near, "date": date}
+        given: dict[str, Any] = {"target": target, "start": start, "start_std": start_std, "date": date}
+        given |= {"model": model, "start_km": start_km, "target_km": target_km, "altitude_km": altitude_km}
         journal = Journal(options=self.options, **given)
-        check_earth_reading(*journal.target, what="the target")
-        if text := out_of_range(self._view, journal.target):
+        known = Knowledge.of(journal)
+        limits.check_earth_reading(*known.target, what="the target")
+        if text := limits.out_of_range(self._range, known.target):
             raise ValueError(f"the target: {text}")
-        here, near, goal = journal.here, journal.near, journal.target
-        nearby = None if near is None else nearby_elements(near, date, goal, self._longest_way())
-        elements = None if here is None else known_elements(here, journal.here_std, date)
-        self._near = nearby and (self._comparable(nearby[0]), nearby[1])
-        self._here = elements and (self._comparable(elements[0]), elements[1])
-        self._journal, self.target = journal, goal
-        self._error, self._sensor_std = self._calibrated()
-        self.navigator = self._new_navigator()
-        self._estimator = Estimator(self.navigator)
+        self._journal, self._knowledge = journal, known
+        self.target = self._comparable(known.target)
+        self._known = known.elements and (self._comparable(known.elements), known.std)
+        self._rules = Rules(**{name: getattr(self.options, name) for name in Rules.model_fields} | known.rules)
+        self._std = SensorStd(*(torch.tensor(std, dtype=torch.float64) for std in self.options.accuracy))
         self._steps: tuple[Step, ...] = ()
-        self._last_command: Command | None = None
-        self._raw: tuple[Any, ...] = (None, None, None)  # the last reading, without calibration
-        self._last, self._surprises = Values(), Values()  # the last reading with its course
-        self._unchanged = (0.0, 0.0, 0.0)  # path since each element last changed [km]
+        self._state: State | None = None
+        self._raw: Any = None  # the last reading
+        self._surprises: tuple[float, ...] = ()
+        self._unchanged: limits.Triple = (0.0, 0.0, 0.0)  # path since each element last changed [km]
         self._unread_km = 0.0  # path since the last complete reading
-        self._radians = Values()  # commanded headings that were reported in radians
-        self._northward = Values()  # the first inclination, and how far magnetic north the vehicle has come [km]
 
     def step(
         self,
@@ -175,7 +154,6 @@ class Onboard:
         horizontal_intensity: float | None,
         heading: float,
         distance: float = 0.0,
-        time: float | None = None,
     ) -> Command:
         """Return what to do after a move.
 
@@ -189,8 +167,6 @@ class Onboard:
             horizontal_intensity: B_H there [nT].
             heading: heading of the move [deg], -360 to 360; in the first step the heading at the start.
             distance: length of the move [km]; 0 in the first step.
-            time: time of the message, by any clock that does not run backward. A repeated message is then no second
-                move: it returns the same command.
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -200,152 +176,138 @@ class Onboard:
             raise RuntimeError(_NOT_STARTED)
         given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
         if self.options.magnetic and declination is not None:
-            raise ValueError(
-                f"declination {declination!r}: headings are from magnetic north, and D is not measured: None"
-            )
-        step = Step(**given, heading=heading, distance=distance, time=time)
-        if self._last_command is None or not step.repeats(self._steps[-1]):
-            self._last_command = self._move(step)
-            self._steps += (step,)
-        return self._last_command
+            raise ValueError(f"declination {declination!r}: headings are from magnetic north, D is not measured: None")
+        step = Step(**given, heading=heading, distance=distance)
+        command = self._move(step)
+        self._steps += (step,)
+        return command
 
     def _move(self, step: Step) -> Command:
         """Return what to do after a new move."""
-        read = self._comparable(step.reading)
-        raw: Any = tuple(old if new is None else new for new, old in zip(read, self._raw, strict=True))
-        check_earth_reading(*raw)
-        error = self._error if self._last else self._calibrated(raw)[0]
-        reading = math.remainder(raw[0] - error[0], 360), raw[1] - error[1], raw[2] - error[2]
-        self._check(step, reading)
+        read = self._comparable((step.declination, step.inclination, step.horizontal_intensity))
+        raw: Any = tuple(old if new is None else new for new, old in zip(read, self._raw or read, strict=True))
+        limits.check_earth_reading(*raw)
+        self._check(step, raw)
         course = math.remainder(math.radians(step.heading), 2 * math.pi)
-        turn = math.remainder(course - self._last[3], 2 * math.pi) if self._last else 0.0
-        noise = zip(read, self._sensor_std.noise, strict=True)
-        std = self._sensor_std._replace(noise=[OUTAGE_STD if new is None else sigma for new, sigma in noise])
+        reading = self._reading(step.distance, course, raw, read)
         with torch.inference_mode():
-            self._error = error
-            seen = self._seen(reading, course, (step.distance, turn), std)
-            if self._last and read[1:] != (None, None):
-                self._surprises = (*self._surprises, self._estimator.surprise(seen))[-_SURPRISES:]
-            action = self._estimator.act(seen)
-            self._last = (*reading, course)
-            self._remember(step, raw)
-            return self._command(seen, action, course)
-
-    def _remember(self, step: Step, raw: Values) -> None:
-        """Keep what later steps are compared with."""
-        read = self._comparable(step.reading)
-        self._unchanged = unchanged_km(self._unchanged, self._raw, read, step.distance)
-        self._raw = raw
+            if self._state is None:
+                track = tracking.begin(self._rules, reading)
+                self._other = self._other and self._other.begun(self.options, reading)
+            else:
+                track = tracking.advance(self._rules, self._state, reading)
+            action, decision = self._act(track, reading)
+        if self._state is not None and read[1:] != (None, None):
+            self._surprises = (*self._surprises, track.surprise.item())[-_SURPRISES:]
+        self._unchanged = limits.unchanged_km(self._unchanged, self._raw or raw, read, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
-        declination, inclination, _, course = self._last
-        first, north = self._northward or (inclination, 0.0)
-        self._northward = first, north + step.distance * math.cos(course - math.radians(declination))
-        if self._last_command:
-            self._radians = step.in_radians(self._radians, self._last_command.heading_deg)
+        self._raw, self._state = raw, track.state
+        return self._command(track, decision, action, course)
+
+    def _reading(self, km: float, course: float, raw: limits.Triple, read: limits.Incomplete) -> Reading:
+        """Return the reading of the pilot; a missing element is the last one, with the accuracy of an outage."""
+        rows = raw, self.target, *(self._known or ())
+        field, target, *there = torch.tensor(rows, dtype=torch.float32)
+        missing = torch.tensor([value is None for value in read])
+        std = self._std._replace(noise=self._std.noise.masked_fill(missing, OUTAGE_STD))
+        distance, heading = torch.tensor((km, course), dtype=torch.float32)
+        known, known_std = there or (None, None)
+        reading = Reading(field, target, distance, heading, std, torch.tensor(len(self._steps)), known, known_std)
+        return reading._replace(place=self._knowledge.place, target_place=self._knowledge.target_place)
+
+    def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
+        """Return the action of the navigator, with its declaration, and the decision behind that."""
+        if self._other is None:
+            action, decision = tracking.act(self._rules, track, reading, self._network)
+            assert decision is not None
+            return action, decision
+        return tracking.declaring(self._rules, track, reading, self._other.move(reading))
 
     def _comparable(self, elements: Any) -> Any:
         """Return D, I, B_H, with 0 for D where the vehicle does not measure it."""
         return (0.0, *elements[1:]) if self.options.magnetic else elements
 
-    def _calibrated(self, reading: Elements | None = None) -> tuple[Values, SensorStd]:
-        """Return the constant error of readings, as far as it is known, and the accuracy without it."""
-        stated = self.options.accuracy
-        if reading and self._near:
-            check_start(reading, self._near[0], stated, self._near[1])
-        return ((0.0, 0.0, 0.0), stated) if self._here is None else calibrated(*self._here, stated, reading)
-
-    def _check(self, step: Step, reading: Elements) -> None:
+    def _check(self, step: Step, reading: limits.Triple) -> None:
         """Raise unless a reading and a distance are possible, and possible together."""
-        check_move(step.distance, self.max_move_km)
-        if self._last:
-            check_earth_jump(self._last[:3], reading, step.distance + self._unread_km, self._sensor_std.noise)
+        longest = self.options.max_move_km
+        if step.distance > limits.LONGER * longest:
+            raise ValueError(
+                f"distance {step.distance:g} km is longer than the longest move of this vehicle, {longest:g} km: it "
+                "must be in kilometers, and since the last step; report a longer way in parts, with None between"
+            )
+        if self._state is not None:
+            limits.check_earth_jump(self._raw, reading, step.distance + self._unread_km, self.options.sensor_std.noise)
             return
         if step.distance != 0:
             raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
-        if text := out_of_range(self._view, reading):
+        if self._known:
+            check_first_reading(reading, self._known[0], self.options.accuracy, self._known[1])
+        if text := limits.out_of_range(self._range, reading):
             raise ValueError(f"the reading at the start: {text}")
-        check_earth_distance(reading, self.target, self._longest_way())
+        longest = LONGEST_WAY_KM if self._network else self.options.max_steps * self.options.max_move_km
+        limits.check_earth_distance(reading, self.target, longest)
 
-    def _longest_way(self) -> float:
-        """Return how far the target may be [km]."""
-        return LONGEST_WAY_KM if self._estimator.trained else self.options.max_steps * self.max_move_km
-
-    def _seen(self, reading: Elements, course: float, move: tuple[float, float], std: SensorStd) -> TensorDict:
-        """Return what a policy reads, in a batch of one."""
-        rows = {"field": reading, "target_field": self.target, "move": move, "heading": (course,)}
-        rows |= dict(zip(STD_KEYS, std, strict=True))
-        if self._here is not None:
-            known = self._error, *self._here, self.options.accuracy.bias
-            rows |= dict(zip(START_KEYS, known, strict=True))
-        seen = {key: torch.tensor([row], dtype=torch.float32) for key, row in rows.items()}
-        seen |= {"elapsed_steps": torch.tensor([[len(self._steps)]]), "done": torch.zeros(1, 1, dtype=torch.bool)}
-        return TensorDict(seen, [1], device="cpu")
-
-    def _command(self, seen: TensorDictBase, action: list[float], course: float) -> Command:
-        """Return the command: to stop, to go to a near estimated destination, or the action of the navigator."""
-        left = torch.tensor([self.options.max_steps - 1 - len(self._steps)])
-        decision = self._estimator.decide(seen, left, self.options.arrival_km)
-        posterior = self._estimator.posterior
-        way, probability = posterior.way(), decision.probability.item()
-        radius = posterior.radius(self.options.confidence).item()
-        stop, reason = self._stop(way, decision, radius, declared=action[2:] > [0.0])
-        if not (stop or self._steps or self._here or self._near):
+    def _command(self, track: Track, decision: ArrivalDecision, action: Tensor, course: float) -> Command:
+        """Return the command: to stop, or the action of the navigator."""
+        radius = track.posterior.radius(self.options.confidence).item()
+        stop, reason = self._stop(track, decision, radius)
+        if not (stop or self._steps or self._known):
             reason = _UNCHECKED[self.options.north]
-        if stop:
-            action = [0.0, 0.0]
-        elif decision.way.norm() < self.options.arrival_km:
-            limits = decision.stop_km.unsqueeze(-1), self.max_move_km, math.radians(self.max_turn_deg)
-            action = tracking.approach(decision.way, seen["heading"], *limits)[0].tolist()
-        steer = math.degrees(course + action[1]) % 360.0
-        north, east = way.displacement[0].tolist()
-        (nn, ne), (en, ee) = way.covariance[0].tolist()
-        estimates = (north, east), ((nn, ne), (en, ee)), probability, stop, reason, radius
-        return Command(action[0], math.degrees(action[1]), steer, *estimates)
+        distance, turn = (0.0, 0.0) if stop else action[:2].tolist()
+        steer = math.degrees(course + turn) % 360.0
+        north, east = track.way.displacement.tolist()
+        (nn, ne), (en, ee) = track.way.covariance.tolist()
+        estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), stop, reason, radius
+        return Command(distance, math.degrees(turn), steer, *estimates, *self._place(track.state))
 
-    def _stop(self, way: Way, decision: ArrivalDecision, radius_km: float, declared: bool) -> tuple[str | None, str]:
+    def _place(self, state: State) -> tuple[Any, ...]:
+        """Return the estimated place [deg], its covariance [km^2] and the drift, where the vehicle knows its place."""
+        if self._rules.start_km is None:
+            return ()
+        covariance = state.covariance[PLACE, PLACE].tolist()
+        return tuple(state.place.tolist()), tuple(map(tuple, covariance)), tuple(state.mean[DRIFT].tolist())
+
+    def _stop(self, track: Track, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""
         options, level = self.options, sum(self._surprises) / max(len(self._surprises), 1)
-        if text := self._lost(level):
+        if text := self._lost(track, level):
             return "lost", text
-        if text := out_of_range(self._view, self._last[:3]):
+        if text := limits.out_of_range(self._range, self._raw):
             return "out of range", text
-        way_km, error_km = way.displacement.norm().item(), way.covariance[0].trace().sqrt().item()
-        if self._estimator.trained and way_km - 2 * error_km > LONGEST_WAY_KM:
+        way_km, error_km = track.way.displacement.norm().item(), track.way.covariance.trace().sqrt().item()
+        if self._network and way_km - 2 * error_km > LONGEST_WAY_KM:
             return "out of range", f"the way is {way_km:.0f} ± {error_km:.0f} km, the policy's {LONGEST_WAY_KM:g} km"
-        wanted = ("arrived", "the policy declares its arrival") if declared else (None, "")
         if not decision.declare.item() or level > LOST_SURPRISE:
-            return wanted
+            return None, ""
         if decision.probability.item() >= options.confidence:
             probability = f"an estimated probability of {decision.probability.item():.2f}"
-            return "arrived", f"within {options.arrival_km:g} km with {probability}"
+            return "arrived", f"within {options.radius_km:g} km with {probability}"
         near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"
         if len(self._steps) >= options.max_steps - 1:
             return "nearest", f"out of steps: {near}"
         if 0 < decision.attainable.item() < options.confidence:  # 0 where nothing is known yet
             return "nearest", f"as near as these sensors allow: {near}"
-        return wanted
+        return None, ""
 
-    def _lost(self, level: float) -> str:
+    def _lost(self, track: Track, level: float) -> str:
         """Return why readings or moves cannot be those of a vehicle, as text; empty if they can.
 
         Args:
+            track: estimates after the reading.
             level: mean of the last surprises.
         """
-        useful = measured(self._sensor_std.noise)
+        useful = limits.measured(self.options.sensor_std.noise)
         useful = (useful[0] and not self.options.magnetic, *useful[1:])
-        if text := stuck([km * use for km, use in zip(self._unchanged, useful, strict=True)], self.max_move_km):
+        unchanged = [km * use for km, use in zip(self._unchanged, useful, strict=True)]
+        if text := limits.stuck(unchanged, self.options.max_move_km):
             return text
-        if len(self._radians) > 1:
-            steered = " and ".join(f"{heading:.0f}" for heading in self._radians)
-            return f"the headings {steered} deg were reported in radians: degrees are expected"
         if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
             causes = "the sign of I, its zero (from the horizontal), swapped elements, units, sensors and compass"
             return f"readings deviate {level**0.5:.0f} times as much as expected: check {causes}"
-        first, north_km = self._northward
-        change = abs(self._last[1] - first) * 100 / max(abs(north_km), 1e-9) if abs(north_km) >= 100 else math.inf
-        slope = min(change, self._estimator.steepest_inclination)
-        if useful[1] and abs(self._last[1]) <= math.pi / 2 and slope < EQUATOR_SLOPE_DEG:
-            return f"inclination {self._last[1]:g} hardly changes: it looks like radians; degrees are expected"
+        inclination, local = self._raw[1], track.local
+        slope = local.gradient[1].norm() + 2 * local.covariance[1, 1:, 1:].trace().sqrt()
+        if useful[1] and abs(inclination) <= math.pi / 2 and 100 * slope.item() < limits.EQUATOR_SLOPE_DEG:
+            return f"inclination {inclination:g} hardly changes: it looks like radians; degrees are expected"
         return ""
 
     def save(self, path: Path | str) -> None:
@@ -357,7 +319,7 @@ class Onboard:
         """
         if self.target is None:
             raise RuntimeError(_NOT_STARTED)
-        self._journal.replace(steps=self._steps).write(Path(path))
+        write_atomically(Path(path), self._journal.replace(steps=self._steps).content())
 
     def restore(self, path: Path | str) -> None:
         """Repeat the steps of a file of :meth:`save`: the same readings then give the same commands, bit for bit.
@@ -371,7 +333,22 @@ class Onboard:
             if value != options[name]:
                 raise ValueError(f"{path} is of a vehicle with another {name}, {value!r}")
         resumed = copy.copy(self)
-        resumed.start(journal.target, journal.here, here_std=journal.here_std, near=journal.near, date=journal.date)
+        resumed.start(**{name: value for name, value in journal if name not in ("format", "options", "steps")})
         for step in journal.steps:
             resumed.step(**dict(step))
         self.__dict__ = resumed.__dict__
+
+
+def _source(navigator: str | nn.Module) -> tuple[Rules, nn.Module | None, Any]:
+    """Return the rules and the network of a pilot, or another navigator, which needs TorchRL."""
+    rules: Any = getattr(navigator, "rules", None)
+    if navigator == "kalman":
+        return Rules(), None, None
+    if isinstance(rules, Rules):
+        return rules, copy.deepcopy(getattr(navigator, "network", None)), None
+    path = pretrained("anywhere") if navigator == "anywhere" else navigator
+    if isinstance(path, Path) or (str(path).endswith(".safetensors") and "rules" in policy_content(str(path))):
+        return *load_pilot(str(path)), None
+    from magrl.vehicle.onboard.others import Other
+
+    return Rules(), None, Other(navigator)

@@ -85,16 +85,3 @@ def test_the_environment_must_allow_the_farthest_move() -> None:
         with pytest.raises(ValueError, match=message):
             _ = TransformedEnv(nav(drift_km=drift_km), errors()).specs
     assert TransformedEnv(nav(drift_km=7.01), errors()).action_spec.space.high[0, 0] == 50
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"log_scale": 0.3}, "log_scale 0.3 .*above 0"),
-        ({"current_km_h": 1.0}, "speed_km_h .*None"),
-        ({"in_keys": ["move"]}, r"3 in_keys .*\['move'\]"),
-    ],
-)
-def test_bad_options(options: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        MotionError(**options)

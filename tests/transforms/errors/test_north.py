@@ -68,18 +68,3 @@ def test_references_on_the_market(name: str) -> None:
     assert math.hypot(state["sensor_std"][0, 0], state["bias_std"][0, 0]) == pytest.approx(growth * total[name])
     assert state["drift_std"][0, 0].item() == pytest.approx(growth * (0.125 if name == "marine" else 0))
     assert ("position" in error.in_keys) == (name != "low-cost")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"constant_deg": -1.0}, "constant_deg .*-1.0"),
-        ({"drift_deg": 1.0}, "drift_length_km .*None"),
-        ({"in_keys": ("heading",)}, r"3 or 4 in_keys .*\['heading'\]"),
-    ],
-)
-def test_bad_options(options: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        NorthReferenceError(**options)
-    with pytest.raises(ValueError, match="'fiber-optic', 'marine', 'low-cost', got 'sextant'"):
-        north_reference("sextant", speed_km_h=1.0)

@@ -9,8 +9,8 @@ import torch
 from support.errors import actions, flown, nav, under
 from torchrl.envs import TransformedEnv
 
-from magrl.transforms import SensorErrors, VectorErrors
-from magrl.transforms.errors.sensors import OUTAGE_STD
+from magrl.sensor_std import OUTAGE_STD
+from magrl.transforms import SensorErrors
 
 
 def test_constant_errors_by_hand() -> None:
@@ -64,19 +64,3 @@ def test_drift_by_steps_without_a_move() -> None:
     before, after = flown(TransformedEnv(nav(4000), errors), torch.zeros(1, 4000, 2))
     pair = torch.stack([state["sensor_error"][:, 6] for state in (before, after)])
     assert torch.corrcoef(pair)[0, 1].item() == pytest.approx(math.exp(-0.5), abs=0.05)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"bias": (0.1, -0.1, 1.0)}, "bias must be .* from 0 on, got -0.1"),
-        ({"bias": (0.1, 0.1)}, r"bias must be 3 finite numbers, got \(0.1, 0.1\)"),
-        ({"drift": (0.1, 0.1, 1.0)}, "drift_length .*None"),
-        ({"outage_rate": 1}, "outage_rate .*1"),
-        ({"noise": (1.0, 1.0), "vector": VectorErrors()}, "got 2 elements"),
-        ({"vector": VectorErrors(), "in_keys": ["field"]}, r"3 in_keys .*\['field'\]"),
-    ],
-)
-def test_bad_options(options: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SensorErrors(**options)

@@ -68,13 +68,3 @@ def test_the_constant_part_is_the_mean_error_over_the_headings() -> None:
         for sign, read in ((1, vector.disturb(elements.expand(20_000, 3), heading, constants)), (-1, elements)):
             mean += sign / 8 * field_vector(read - torch.tensor([1.0, 0.0, 0.0]) * torch.rad2deg(heading))
     torch.testing.assert_close(mean.std(0), vector.constant_std(elements), rtol=0.02, atol=0)
-
-
-@pytest.mark.parametrize(
-    "sizes",
-    [{"hard_iron_nt": (1.0, -1.0, 0.0)}, {"soft_iron": ((1.0,),)}],
-)
-def test_bad_options(sizes: dict) -> None:
-    (name,) = sizes
-    with pytest.raises(ValueError, match=f"{name} must be"):
-        VectorErrors(**sizes)

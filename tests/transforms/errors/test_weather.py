@@ -10,7 +10,7 @@ import torch
 from support.errors import flown, nav
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from magrl.field import WEATHER, WeatherRecord, weather_record
 from magrl.field.elements import field_vector
@@ -128,20 +128,12 @@ def test_the_clock_stops_at_the_span() -> None:
     assert [state["weather_clock"][0].tolist() for state in states] == [[0, 0], [0, 24], [0, 48], [0, 60], [0, 60]]
 
 
-# Starts
-
-
-def starts(env: EnvBase) -> Tensor:
-    return env.reset()["weather_clock"][:, 0]
-
-
 # Errors
 
 
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: MagneticWeather(speed_km_h=0), "speed_km_h .*0"),
         (lambda: MagneticWeather("college", speed_km_h=SHIP, span_h=24.1), r"24.1 h .*'college'.*23.9 h"),
         (lambda: MagneticWeather(speed_km_h=SHIP)(nav().reset()), "needs span_h"),
         # 50 moves of 50 km at 6.1 km/h take 411 h, and 13 days follow the disturbed one

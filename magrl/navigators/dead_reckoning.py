@@ -1,0 +1,75 @@
+"""Dead reckoning: by compass and log from a known start to the coordinates of the destination."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from magrl.envs import GeomagneticNavEnv
+from magrl.geodesy import geodesic, move_place, steer
+from magrl.navigators.base import Navigator
+from magrl.sensor_std import SensorStd
+from magrl.transforms.errors.known_place import PLACE_KEYS
+
+ARRIVED_KM = 0.5
+"""Reckoned distance from the destination at which it has arrived [km]."""
+
+
+class DeadReckoning(Navigator):
+    """Steer to the coordinates of the destination by the reckoned place alone; the field is not read.
+
+    What every vehicle with a known start does without this library. Where the environment has no
+    :class:`~magrl.transforms.KnownPlace`, start and destination are those of the environment, without an error. It
+    steers from true north. Where the arrival must be declared, it declares at the reckoned destination.
+
+    Args:
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+        declares: whether the action has a third number, which declares the arrival.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> bool(env.rollout(50, DeadReckoning(), break_when_any_done=False)["next", "success"].any(1).all())
+        True
+    """
+
+    name = "dead_reckoning"
+    label = "dead reckoning"
+    description = "dead reckoning"
+    needs = "the start and the destination"
+    optional_keys: ClassVar[tuple[str, ...]] = PLACE_KEYS
+
+    def __init__(self, declares: bool = False, **limits: Any) -> None:
+        super().__init__(**limits)
+        self.declares, self.action_size = declares, 2 + declares
+        self.in_keys = ["move", "heading", "start_position", "target_position", "elapsed_steps"]
+
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
+        """Return whether the arrival must be declared."""
+        return {"declares": env.arrival.declared}
+
+    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
+        """Return the reckoned place ``(N, 2)``."""
+        return {"place": _known(seen, 0).double()}
+
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
+        """Return the action toward the destination."""
+        heading = seen["heading"].squeeze(-1).double()
+        place = move_place(memory["place"], heading, seen["move"][..., 0].double())
+        memory["place"] = place
+        distance, bearing = geodesic(*place.unbind(-1), *_known(seen, 1).double().unbind(-1))
+        action = torch.stack(steer(heading, bearing, distance, self.max_move_km, self.max_turn_rad), -1)
+        if not self.declares:
+            return action
+        arrived = (distance < ARRIVED_KM).unsqueeze(-1)
+        return torch.cat((action.masked_fill(arrived, 0.0), 2.0 * arrived - 1), -1)
+
+
+def _known(seen: TensorDictBase, which: int) -> Tensor:
+    """Return the place of the start (0) or the destination (1) that the vehicle knows."""
+    key = PLACE_KEYS[which]
+    return seen[key] if key in seen.keys() else seen[("start_position", "target_position")[which]]  # noqa: SIM118

@@ -1,0 +1,123 @@
+"""The network that corrects a plan, and the files of pilots: rules, and weights of a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from magrl.checks import check_choice, check_finite, check_number, check_type, short
+from magrl.files import load_tensors, save_tensors
+from magrl.tracking.observation import OBSERVATION_SIZE
+from magrl.tracking.pilot import Rules
+
+FILE_FORMAT = 4
+"""Format of the files of policies."""
+MOST_LAYERS = 64
+"""Largest number of hidden layers."""
+_PRETRAINED = Path(__file__).parent.parent / "navigators" / "pretrained"
+
+
+def correction_network(num_cells: Sequence[int], device: torch.device | str | None = None) -> nn.Sequential:
+    """Return a perceptron from an observation ``(..., 19)`` to a correction ``(..., 2)`` of the plan, which is 0 at
+    first.
+
+    Args:
+        num_cells: width of each hidden layer, with layer normalization and ReLU.
+        device: device of the parameters.
+
+    Raises:
+        ValueError: for a size that is not a whole number from 1 to 65536.
+
+    Example:
+        >>> correction_network((32, 32))(torch.zeros(5, 19))[0]
+        tensor([0., 0.], grad_fn=<SelectBackward0>)
+    """
+    check_type(Sequence, num_cells=num_cells)
+    check_number(1, MOST_LAYERS, whole=True, hidden_layers=len(num_cells))
+    layers: list[nn.Module] = []
+    width = OBSERVATION_SIZE
+    for cells in num_cells:
+        check_number(1, 65536, whole=True, num_cells=cells)
+        layers += [nn.Linear(width, cells, device=device), nn.LayerNorm(cells, device=device), nn.ReLU()]
+        width = cells
+    last = nn.Linear(width, 2, device=device)
+    for parameter in last.parameters():
+        if device != "meta":
+            nn.init.zeros_(parameter)
+    return nn.Sequential(*layers, last)
+
+
+def save_pilot(path: Path | str, rules: Rules, network: nn.Module | None) -> None:
+    """Write the rules of a pilot and its network, one of :func:`correction_network`, for :func:`load_pilot`.
+
+    Raises:
+        TypeError: for another network.
+        OSError: if the file cannot be written.
+    """
+    if not isinstance(network, nn.Sequential):
+        raise TypeError(f"the network of a pilot must be one of correction_network, got {type(network).__name__}")
+    weights = {key: value for key, value in network.state_dict().items() if isinstance(value, Tensor)}
+    num_cells = [layer.out_features for layer in network if isinstance(layer, nn.Linear)][:-1]
+    plain = rules.model_dump(exclude={"model", "start_km", "target_km"})
+    content = {"format": FILE_FORMAT, "rules": plain, "num_cells": num_cells, "weights": weights}
+    save_tensors(content, Path(path))
+
+
+def policy_content(path: Path | str) -> dict[str, Any]:
+    """Return the content of the file of a policy of any kind.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: for a damaged file, or one of another format.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no policy file at {path}")
+    content = load_tensors(path)
+    version = content.pop("format", None) if isinstance(content, dict) else None
+    if version != FILE_FORMAT:
+        raise ValueError(
+            f"{path} is a policy of format {short(version)}; this version reads format {FILE_FORMAT}: train it again"
+        )
+    return content
+
+
+def load_pilot(path: Path | str) -> tuple[Rules, nn.Sequential]:
+    """Read the rules and the network of :func:`save_pilot`. Reading a file runs no code from it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: for a file that is not a pilot, of another format, or with weights of other shapes.
+
+    Example:
+        >>> rules, network = load_pilot(pretrained("anywhere"))
+        >>> rules.max_steps, len(network)
+        (120, 10)
+    """
+    content = policy_content(path)
+    try:
+        rules, cells, weights = Rules(**content.pop("rules")), content.pop("num_cells"), content.pop("weights")
+        # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
+        network = correction_network(cells, "meta")
+        network.load_state_dict(weights, assign=True)
+        check_finite(weights.items(), "weights")
+    except Exception as error:  # whatever foreign content raises
+        raise ValueError(f"{path} does not hold a valid pilot: {' '.join(str(error).split())}") from error
+    return rules, network.float().requires_grad_(False).eval()
+
+
+def pretrained(name: str) -> Path:
+    """Return the file of a pretrained pilot; beside it is a card with its training, figures and limits.
+
+    Raises:
+        ValueError: for an unknown name, listing the known ones.
+
+    Example:
+        >>> pretrained("anywhere").name
+        'anywhere.safetensors'
+    """
+    check_choice(sorted(path.stem for path in _PRETRAINED.glob("*.safetensors")), pretrained_policy=name)
+    return _PRETRAINED / f"{name}.safetensors"

@@ -1,0 +1,298 @@
+"""Elements that are known at a place, and readings that do not fit them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from magrl.checks import check_number, check_numbers
+from magrl.field import IGRF, elements_at
+from magrl.field.elements import FIELD_NT, NAMES, element_difference, field_vector, measured_elements
+from magrl.field.igrf import parse_date
+from magrl.sensor_std import SensorStd
+from magrl.tracking import NEWEST, SLOPES, EarthModel, earth_model
+from magrl.vehicle.onboard.journal import Journal
+from magrl.vehicle.onboard.limits import check_earth_reading
+
+MODEL_STD = (0.26, 0.20, 133.0)
+"""Standard deviations of D [deg], I [deg], B_H [nT] of a model of the core, which omits crust and currents.
+
+To that of D, ``MODEL_D_NT / B_H`` degrees are added in squares. Source: the error model of the World Magnetic Model
+2025 (technical report, NOAA NCEI and British Geological Survey, 2024).
+"""
+MODEL_D_NT = 5417.0
+MOST_SIGMAS = 5.0
+"""Deviation of a first reading beyond which it does not fit the known elements, in standard deviations."""
+SLACK_NT = 100.0
+"""Deviation of the field vector that always fits; chosen [nT]."""
+IRON_NT = 2000.0
+"""Standard deviation of the iron of a vehicle along each of its axes, before a calibration; chosen [nT]."""
+IRON_COST = 15.0
+"""What iron must explain more, as a sum of squared standard deviations, since it can take any value; chosen."""
+
+Elements = tuple[float, float, float]
+
+
+def known_elements(
+    here: Sequence[float], std: Sequence[float] | None = None, date: str | None = None
+) -> tuple[Elements, Elements]:
+    """Return the elements at a known place, and their standard deviations.
+
+    Args:
+        here: D [deg], I [deg], B_H [nT], which are exact by default; or latitude and longitude [deg], at which they
+            follow from IGRF, by default with the accuracy :data:`MODEL_STD`.
+        std: standard deviations of the elements.
+        date: date for IGRF, such as ``"2026-06-30"``.
+
+    Raises:
+        ValueError: for other than two or three numbers, elements that are not possible on the Earth, or a date that is
+            missing or not needed.
+
+    Example:
+        >>> elements, std = known_elements((60.4, 5.3), date="2026-06-30")
+        >>> [round(value, 1) for value in elements], [round(value, 2) for value in std]
+        ([2.8, 73.1, 15002.9], [0.44, 0.2, 133.0])
+    """
+    if len(here) not in (2, 3):
+        raise ValueError(f"here must be D, I and B_H, or latitude and longitude, got {here!r}")
+    check_numbers(len(here), here=here)
+    if (date is None) == (len(here) == 2):
+        rule = "a latitude and longitude need a date" if date is None else "elements need no date"
+        raise ValueError(f"here {tuple(here)}: {rule}, got date {date!r}")
+    if date is None:
+        elements, usual = (float(here[0]), float(here[1]), float(here[2])), (0.0, 0.0, 0.0)
+    else:
+        check_number(-90, 90, latitude=here[0])
+        check_number(-360, 360, longitude=here[1])
+        declination, inclination, intensity = elements_at(IGRF(date), torch.tensor(here, dtype=torch.float64)).tolist()
+        elements = declination, inclination, intensity
+        usual = tuple(model_std(torch.tensor(elements, dtype=torch.float64)).tolist())
+    check_earth_reading(*elements, what="here")
+    if std is not None:
+        check_numbers(3, 0, here_std=std)
+    return elements, usual if std is None else (std[0], std[1], std[2])
+
+
+class Knowledge(NamedTuple):
+    """What a vehicle knows when it starts.
+
+    Attributes:
+        target: elements of the destination.
+        elements: elements at the start, and their standard deviations ``std``; None where they are not known.
+        rules: values of :class:`~magrl.tracking.Rules`: the model of the Earth, and the errors of the places.
+        place: latitude and longitude of the start [deg], and ``target_place`` those of the destination; None where a
+            vehicle does not use them.
+    """
+
+    target: Elements
+    elements: Elements | None
+    std: Elements
+    rules: dict[str, Any]
+    place: Tensor | None = None
+    target_place: Tensor | None = None
+
+    @classmethod
+    def of(cls, journal: Journal) -> Knowledge:
+        """Return what the arguments of :meth:`~magrl.vehicle.onboard.Onboard.start` tell.
+
+        Raises:
+            ValueError: for a place without a model, or elements that are not possible on the Earth.
+        """
+        model = _carried_model(journal)
+        target, start = (_place_or_elements(getattr(journal, name), name, model) for name in ("target", "start"))
+        assert target is not None
+        elements, std = (start.elements, start.std) if start else (None, (0.0,) * 3)
+        if journal.start_std is not None:
+            check_numbers(3, 0, start_std=journal.start_std)
+            std = journal.start_std
+        rules: dict[str, Any] = {} if model is None else {"model": model}
+        if start is None or start.place is None:
+            return cls(target.elements, elements, std, rules)
+        d, i, h = (math.hypot(own, slope * journal.start_km) for own, slope in zip(std, SLOPES, strict=True))
+        rules |= {"start_km": journal.start_km} | ({} if target.place is None else {"target_km": journal.target_km})
+        return cls(target.elements, elements, (d, i, h), rules, start.place, target.place)
+
+
+def _carried_model(journal: Journal) -> EarthModel | None:
+    """Return the model of the Earth that a vehicle carries; without a date, the default is none."""
+    if journal.date is None:
+        if journal.model not in (None, NEWEST):
+            raise ValueError(f"model {journal.model!r} needs the date of the flight, such as '2026-06-30', got None")
+        return None
+    parse_date(journal.date)
+    return earth_model(journal.model, journal.date, journal.altitude_km) if journal.model is not None else None
+
+
+class _Known(NamedTuple):
+    """Elements, their standard deviations, and the place from which they follow."""
+
+    elements: Elements
+    std: Elements
+    place: Tensor | None
+
+
+def _place_or_elements(given: Sequence[float] | None, name: str, model: EarthModel | None) -> _Known | None:
+    """Return what is known of a start or a target, given its elements or its place."""
+    if given is None:
+        return None
+    if len(given) not in (2, 3):
+        raise ValueError(f"{name} must be D, I and B_H, or latitude and longitude, got {tuple(given)}")
+    check_numbers(len(given), **{name: given})
+    if len(given) == 3:
+        declination, inclination, intensity = given
+        check_earth_reading(declination, inclination, intensity, what=f"the {name}")
+        return _Known((declination, inclination, intensity), (0.0, 0.0, 0.0), None)
+    if model is None:
+        raise ValueError(
+            f"{name} {tuple(given)} is a place, which needs a model of the Earth: give the date of the flight"
+        )
+    check_number(-90, 90, latitude=given[0])
+    check_number(-360, 360, longitude=given[1])
+    place = torch.tensor(given, dtype=torch.float64)
+    declination, inclination, intensity = model.elements(place).tolist()
+    elements = declination, inclination, intensity
+    d, i, h = model_std(torch.tensor(elements, dtype=torch.float64)).tolist()
+    return _Known(elements, (d, i, h), place)
+
+
+def check_first_reading(
+    reading: Elements, elements: Elements, sensor_std: SensorStd, elements_std: Sequence[float]
+) -> None:
+    """Raise unless the first reading fits the elements at the start.
+
+    Args:
+        reading: D [deg], I [deg], B_H [nT].
+        elements: D, I, B_H at the start.
+        sensor_std: accuracy of the sensors.
+        elements_std: standard deviations of the elements.
+
+    Raises:
+        ValueError: with the element that does not fit, and the mistake that would explain it, if one is known.
+
+    Example:
+        >>> sensors, exact = SensorStd(bias=(0.5, 0.1, 50.0)), (0.0, 0.0, 0.0)
+        >>> check_first_reading((3.4, 73.1, 14950.0), (3.5, 73.0, 15000.0), sensors, exact)
+        >>> check_first_reading((3.4, -73.1, 14950.0), (3.5, 73.0, 15000.0), sensors, exact)
+        Traceback (most recent call last):
+        ValueError: the first reading, D 3.4, I -73.1, B_H 14950, does not fit the start, D 3.5, I 73, B_H 15000 (I \
+deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis points up, and down is expected
+    """
+    read, there = torch.tensor([[reading], [elements]], dtype=torch.float64)
+    parts = torch.tensor([sensor_std.noise, sensor_std.bias, elements_std], dtype=torch.float64)
+    std = parts.norm(dim=0)
+    text = deviation(read, there, std)[0]
+    if text is None:
+        return
+    texts = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
+    cause = likely_mistake(read, there, std, torch.zeros(1).double(), {})
+    cause = cause or "check sensors, calibration, compass and place, or state a larger bias"
+    raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({text}): {cause}")
+
+
+def model_std(elements: Tensor) -> Tensor:
+    """Return the standard deviations of D [deg], I [deg], B_H [nT] of a model of the core ``(..., 3)``.
+
+    Args:
+        elements: ``(..., 3)`` elements of the model.
+
+    Example:
+        >>> model_std(torch.tensor([3.5, 73.0, 15000.0]))
+        tensor([  0.4450,   0.2000, 133.0000])
+    """
+    std = elements.new_tensor(MODEL_STD).expand_as(elements)
+    return torch.hypot(std, torch.nn.functional.pad(MODEL_D_NT / elements[..., 2:], (0, 2)))
+
+
+def _most(expected: Tensor, std: Tensor) -> Tensor:
+    """Return the largest deviations from expected elements that are likely ``(..., 3)``."""
+    strength = torch.stack((expected[..., 2].clamp_min(SLACK_NT), field_vector(expected).norm(dim=-1)), -1)
+    slack = torch.cat((torch.rad2deg(SLACK_NT / strength), torch.full_like(strength[..., :1], SLACK_NT)), -1)
+    return MOST_SIGMAS * std + slack
+
+
+def deviation(elements: Tensor, expected: Tensor, std: Tensor) -> list[str | None]:
+    """Return how each reading deviates from expected elements, as text; None for one that fits.
+
+    Args:
+        elements: ``(N, 3)`` D [deg], I [deg], B_H [nT].
+        expected: ``(N, 3)`` the elements at their places.
+        std: ``(..., 3)`` standard deviations of the difference.
+
+    Example:
+        >>> deviation(torch.tensor([[3.4, -73.1, 14950.0]]), torch.tensor([[3.5, 73.0, 15000.0]]), torch.zeros(3))
+        ['I deviates by 146.1, where 0.112 is likely']
+    """
+    off, most = element_difference(elements, expected).abs(), _most(expected, std)
+    worst = (off / most).max(-1)
+    rows = zip(worst.values.tolist(), worst.indices.tolist(), off.tolist(), most.tolist(), strict=True)
+    return [
+        f"{NAMES[k]} deviates by {values[k]:.4g}, where {limits[k]:.3g} is likely" if share > 1 else None
+        for share, k, values, limits in rows
+    ]
+
+
+def likely_mistake(
+    elements: Tensor, expected: Tensor, std: Tensor, heading_deg: Tensor, others: Mapping[str, Tensor]
+) -> str | None:
+    """Return the mistake that explains most of some readings, better than others and than iron; None without one.
+
+    Iron is a constant vector in the vehicle's axes, whose standard deviation is :data:`IRON_NT`.
+
+    Args:
+        elements: ``(N, 3)`` D [deg], I [deg], B_H [nT].
+        expected: ``(N, 3)`` the elements at their places.
+        std: ``(..., 3)`` standard deviations of the difference.
+        heading_deg: ``(N,)`` headings.
+        others: elements at other places, by a text that says what is then wrong with the places.
+
+    Example:
+        >>> there = torch.tensor([[3.5, 73.0, 15000.0]]).double()
+        >>> read = torch.tensor([[3.4, -73.1, 14950.0]]).double()
+        >>> likely_mistake(read, there, torch.tensor([0.5, 0.1, 50.0]), torch.zeros(1).double(), {})
+        'it fits with -I: the vertical axis points up, and down is expected'
+    """
+    iron, rest = _iron(elements, expected, heading_deg)
+    guesses = {text: (read, expected) for text, read in _mistakes(elements, expected, heading_deg).items()}
+    guesses |= {text: (elements, there) for text, there in others.items()} | {"": (rest, expected)}
+    costs = {"": math.inf}
+    for text, (read, there) in guesses.items():
+        shares = element_difference(read, there) / _most(there, std)
+        if (shares.abs() <= 1).all(-1).double().mean() > 0.5:  # others may be spikes, whose squares are limited
+            costs[text] = MOST_SIGMAS**2 * shares.square().sum(-1).clamp_max(3.0).sum().item()
+    costs[""] += IRON_COST + (iron / IRON_NT).square().sum().item()
+    return min(costs, key=lambda text: costs[text]) or None
+
+
+def _iron(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the iron in the vehicle's axes [nT] that explains readings best, and the elements without it."""
+    cos, sin = torch.cos(torch.deg2rad(heading_deg)), torch.sin(torch.deg2rad(heading_deg))
+    none, read = torch.zeros_like(cos), field_vector(elements).unsqueeze(-1)
+    turn = torch.stack((cos, -sin, none, sin, cos, none, none, none, none + 1), -1).unflatten(-1, (3, 3))
+    iron = (turn.mT @ (read - field_vector(expected).unsqueeze(-1))).median(0).values
+    return iron, measured_elements((read - turn @ iron).squeeze(-1))
+
+
+def _mistakes(elements: Tensor, expected: Tensor, heading_deg: Tensor) -> dict[str, Tensor]:
+    """Return what readings would be without each of the mistakes that engineers make."""
+    d, i, b = elements.unbind(-1)
+    wrong = {
+        "it fits with -I: the vertical axis points up, and down is expected": (d, -i, b),
+        "it fits with -D: D is positive where magnetic north is east of true north": (-d, i, b),
+        "it fits with -D and -I: the axes point left and up, and right and down are expected": (-d, -i, b),
+        "it fits in radians, and degrees are expected": (d.rad2deg(), i.rad2deg(), b),
+        "I fits in radians, and degrees are expected": (d, i.rad2deg(), b),
+        "D fits in radians, and degrees are expected": (d.rad2deg(), i, b),
+        "the heading fits in radians, and degrees are expected": (d - heading_deg + heading_deg.rad2deg(), i, b),
+        "D and I are swapped": (i, d, b),
+        "it fits with D + 180: the horizontal axes point backward": (d + 180, i, b),
+        "it fits with 90 - D: the horizontal axes are swapped": (90 - d, i, b),
+        "B_H is the total intensity: the horizontal one is expected": (d, i, b * i.deg2rad().cos()),
+        "D is 0: the heading is from magnetic north, and true north is expected": (d + expected[..., 0], i, b),
+    }
+    units = [(unit, factor) for unit, factor in FIELD_NT.items() if factor > 1]
+    wrong |= {f"B_H looks like {unit}, and nanotesla are expected": (d, i, factor * b) for unit, factor in units}
+    return {text: torch.stack(values, -1) for text, values in wrong.items()}

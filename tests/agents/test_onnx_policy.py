@@ -1,0 +1,273 @@
+"""Policies of any algorithm and library as ONNX files: exported, compared, saved, loaded, flown and refused."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from onnx import ModelProto, TensorProto, helper
+from support.networks import network_file
+from tensordict import TensorDictBase
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
+
+from magrl.agents import FieldPolicy, export_policy, load_policy, save_policy
+from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation import evaluate
+from magrl.evaluation.rollout import evaluation_rollout
+from magrl.transforms import ReadingView, SensorErrors
+from magrl.vehicle.onboard import Onboard
+
+NOISE = (0.05, 0.05, 5.0)
+LIMITS = {"max_move_km": 50.0, "max_turn_rad": math.pi / 2}
+READINGS = ReadingView(**LIMITS)
+
+
+def plain_env(**options: object) -> EnvBase:
+    return TransformedEnv(GeomagneticNavEnv(num_envs=5, seed=3, **options), SensorErrors(NOISE, seed=1))
+
+
+# Exports
+
+
+def test_a_stochastic_actor_of_torchrl_flies_alike_after_saving(tmp_path: Path) -> None:
+    """By its deterministic sample, under noise; the export changes neither the actor nor random numbers."""
+    base = plain_env()
+    view = base.base_env.observation_view()
+    env = TransformedEnv(base, Compose(*view.observation_transforms(), view.action_transform()), auto_unwrap=True)
+    torch.manual_seed(0)
+    network = nn.Sequential(MLP(view.size, 4, num_cells=[16]), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=env.action_spec_unbatched,
+        distribution_class=TanhNormal,
+    )
+    state = torch.get_rng_state()
+    save_policy(tmp_path / "own.onnx", actor, view)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert actor.training
+    policy = load_policy(tmp_path / "own.onnx")
+    assert (policy.view, policy.in_keys) == (view, ["field", "target_field", "move", "heading"])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        wanted = evaluation_rollout(env, actor)
+    found = evaluation_rollout(plain_env(), policy)
+    assert wanted["action"].std(0).min() > 1e-3
+    torch.testing.assert_close(found["next", "position"], wanted["next", "position"], rtol=1e-5, atol=1e-4)
+
+
+class Recurrent(nn.Module):
+    """A network with a memory, which reads plain readings and counts its steps."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer, self.head = nn.GRU(9, 8, num_layers=2, batch_first=True), nn.Linear(8, 2)
+
+    def forward(self, observation: Tensor, hidden: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        output, after = self.layer((observation / 1e4).unsqueeze(1), hidden.transpose(0, 1).contiguous())
+        return (self.head(output.squeeze(1)) + count / 10).tanh(), after.transpose(0, 1), count + 1
+
+
+class Twice(TensorDictModuleBase):
+    """A policy that is called twice in each step."""
+
+    def __init__(self, policy: FieldPolicy) -> None:
+        super().__init__()
+        self.policy, self.in_keys, self.out_keys = policy, policy.in_keys, policy.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.policy(self.policy(tensordict))
+
+
+def test_a_recurrent_network_keeps_its_memory_for_each_vehicle(tmp_path: Path) -> None:
+    """From the start of its episode on, where others start at other steps; a second call changes nothing."""
+    torch.manual_seed(0)
+    network, env = Recurrent(), plain_env(arrival="distance", radius_km=300.0)
+    save_policy(tmp_path / "own.onnx", network, READINGS, memory={"hidden": (2, 8), "count": (1,)})
+    policy = load_policy(tmp_path / "own.onnx")
+    flown = env.rollout(12, Twice(policy), break_when_any_done=False)
+    assert len(set(flown["next", "done"].squeeze(-1).int().argmax(1).tolist())) > 1
+    observation = torch.cat([flown[key] for key in READINGS.keys], -1)
+    for vehicle in range(5):
+        memory = torch.zeros(1, 2, 8), torch.zeros(1, 1)
+        for step in range(12):
+            if flown["elapsed_steps"][vehicle, step] == 0:
+                memory = tuple(map(torch.zeros_like, memory))
+            with torch.no_grad():
+                action, *memory = network(observation[vehicle, step][None], *memory)
+            expected = READINGS.action_transform().denormalize("action", action)[0]
+            torch.testing.assert_close(flown["action"][vehicle, step], expected, rtol=1e-4, atol=1e-4)
+
+
+def squashed(x: Tensor) -> Tensor:
+    return x[..., :2].sigmoid()
+
+
+class Calling(nn.Module):
+    """A module of a function."""
+
+    def __init__(self, function: Callable) -> None:
+        super().__init__()
+        self.function = function
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.function(x)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda x: squashed(x - x.mean(0)), "acts differently, by .* must depend on the same row"),
+        (lambda x: squashed(x) if x.sum() > 0 else squashed(-x), "PyTorch cannot export it: "),
+    ],
+    ids=["batch", "branch"],
+)
+def test_what_cannot_be_exported_is_refused_with_its_reason(function: Callable, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        export_policy(Calling(function), READINGS)
+
+
+# Flights
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """The file of a network with a memory, from another library."""
+    save_policy(tmp_path / "own.onnx", network_file(tmp_path, READINGS.size, memory=True), READINGS)
+    return tmp_path / "own.onnx"
+
+
+def test_a_file_stands_in_tables_by_its_name(own: Path) -> None:
+    """Several episodes in turn, as all at once."""
+    episodes = evaluate(str(own), "paper-100", num_envs=40, errors=NOISE, max_steps=4)
+    alike = evaluate(load_policy(own), "paper-100", num_envs=100, errors=NOISE, max_steps=4)
+    torch.testing.assert_close(episodes["length_km"][:40], alike["length_km"][:40], atol=0.1, rtol=1e-4)
+
+
+def test_a_policy_flies_on_board(own: Path, tmp_path: Path) -> None:
+    """The commands of a vehicle that is stopped and resumed are the actions of the policy in the environment."""
+    env, policy = GeomagneticNavEnv(num_envs=1, seed=3), load_policy(own)
+    assert policy.in_keys == [*READINGS.keys, "elapsed_steps"]
+    state, vehicle = env.reset(), Onboard(policy, max_steps=50, radius_km=5.0)
+    vehicle.start(state["target_field"][0].tolist())
+    for step in range(5):
+        seen = *state["field"][0].tolist(), math.degrees(state["heading"].item()), state["move"][0, 0].item()
+        command, (distance, turn) = vehicle.step(*seen), policy(state)["action"][0].tolist()
+        assert (command.distance_km, math.radians(command.turn_deg)) == pytest.approx((distance, turn), abs=1e-3)
+        state = env.step(state)["next"]
+        if step == 3:
+            vehicle.save(tmp_path / "way.pt")
+            vehicle = Onboard(load_policy(own), max_steps=50, radius_km=5.0)
+            vehicle.restore(tmp_path / "way.pt")
+
+
+def test_a_policy_of_three_numbers_declares_its_arrival(tmp_path: Path) -> None:
+    view = ReadingView(keys=["elapsed_steps"], **LIMITS)
+    for bias, steps in ((9.0, 1), (-9.0, 50)):
+        save_policy(tmp_path / "own.onnx", network_file(tmp_path, 1, actions=3, bias=bias), view)
+        assert (evaluate(str(tmp_path / "own.onnx"), "paper-100", arrival="declared")["steps"] == steps).all()
+    with pytest.raises(ValueError, match=r"declares its arrival: fly it with arrival 'declared', not 'objective'"):
+        evaluate(str(tmp_path / "own.onnx"), "paper-100")
+
+
+# Refusals: each part of a valid file renamed, retyped, resized, of one batch, dropped or doubled
+
+
+def renamed(value) -> None:
+    value.name = "obs"
+
+
+def retyped(value) -> None:
+    value.type.tensor_type.elem_type = TensorProto.DOUBLE
+
+
+def resized(value) -> None:
+    value.type.tensor_type.shape.dim[1].dim_value += 1
+
+
+def single(value) -> None:
+    value.type.tensor_type.shape.dim[0].dim_value = 1
+
+
+def refused(model: ModelProto, path: Path) -> str:
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(ValueError, match="does not hold a valid policy: ") as error:
+        load_policy(path)
+    assert str(path) in str(error.value)
+    return str(error.value)
+
+
+@pytest.fixture
+def model(own: Path) -> ModelProto:
+    return ModelProto.FromString(own.read_bytes())
+
+
+def test_each_part_of_the_graph_is_checked(model: ModelProto, tmp_path: Path) -> None:
+    for end in ("input", "output"):
+        for number in range(2):
+            for change in (renamed, retyped, resized, single, None):
+                changed = copy.deepcopy(model)
+                values = getattr(changed.graph, end)
+                change(values[number]) if change else values.pop(number)
+                if end == "input" or change not in (resized, single):  # notes that bind nothing
+                    refused(changed, tmp_path / "changed.onnx")
+    for number in range(4):
+        changed = copy.deepcopy(model)
+        changed.graph.node.pop(number)
+        refused(changed, tmp_path / "changed.onnx")
+
+
+def test_messages_say_what_would_be_right(model: ModelProto, tmp_path: Path) -> None:
+    for change, message in (
+        (renamed, "it must take 'observation' and the memory, and return 'action' and 'next_NAME'"),
+        (single, r"'observation' must be float32 (N, 9) for any N (dynamic_axes"),
+    ):
+        changed = copy.deepcopy(model)
+        change(changed.graph.input[0])
+        if change is renamed:
+            changed.graph.node[0].input[0] = "obs"
+        assert message in refused(changed, tmp_path / "changed.onnx")
+    noise = helper.make_node("RandomNormal", [], ["noise"], shape=[2])
+    model.graph.node.append(noise)
+    assert "its operations RandomNormal are refused" in refused(model, tmp_path / "changed.onnx")
+    model.graph.node.pop()
+    model.graph.initializer[0].external_data.add(key="location", value="/etc/passwd")
+    assert "its weights ['weights'] are in another file" in refused(model, tmp_path / "changed.onnx")
+
+
+def test_each_entry_of_the_description_is_checked(own: Path, tmp_path: Path) -> None:
+    model = ModelProto.FromString(own.read_bytes())
+    (entry,) = model.metadata_props
+    content = json.loads(entry.value)
+    damaged = [{key: value for key, value in content.items() if key != name} for name in ("format", "kind", "view")]
+    damaged += [content | {name: value} for name in content for value in (None, [], "region", 7)]
+    damaged += [content | {"more": 1}, [], 5]
+    damaged += [content | {"view": content["view"] | {name: value}} for name in content["view"] for value in ("x", -1)]
+    for change in damaged:
+        entry.value = json.dumps(change)
+        refused(model, tmp_path / "changed.onnx")
+    del model.metadata_props[:]
+    assert "state what the network observes by save_policy('policy.onnx', FILE, view)" in refused(
+        model, tmp_path / "changed.onnx"
+    )
+
+
+def test_wrong_arguments_are_refused(own: Path, tmp_path: Path, monkeypatch) -> None:
+    with pytest.raises(TypeError, match=r"is saved with what it observes: save_policy\('policy.onnx', network, view\)"):
+        save_policy(tmp_path / "other.onnx", nn.Linear(9, 2))
+    with pytest.raises(ValueError, match=r"an exported network ends with \.onnx, .*got '.*policy.safetensors'"):
+        save_policy(tmp_path / "policy.safetensors", load_policy(own))
+    with pytest.raises(ValueError, match=r"keys must be some of field, target_field, .*got \['position'\]"):
+        ReadingView(keys=["position"], **LIMITS)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ImportError, match=r"the package onnx: pip install 'magrl\[onnx\]'"):
+        load_policy(own)

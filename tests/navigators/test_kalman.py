@@ -1,0 +1,149 @@
+"""Navigators by a belief of the field: repeated calls, declarations, and files of pilots."""
+
+from __future__ import annotations
+
+import copy
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+import magrl
+from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation import evaluate, summarize
+from magrl.files import load_tensors, save_tensors
+from magrl.navigators import Anywhere, Declaring, Kalman, Secant
+from magrl.tracking import Rules, correction_network
+from magrl.tracking.network import pretrained
+from magrl.transforms import SensorErrors
+
+STD, BIAS = (0.05, 0.05, 5.0), (0.1, 0.1, 10.0)
+
+
+@pytest.fixture
+def env() -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(num_envs=5, seed=3, start_heading="random")
+
+
+@pytest.mark.parametrize("make", [Kalman, Anywhere, lambda: Declaring(Secant())], ids=["kalman", "anywhere", "secant"])
+def test_a_second_call_on_a_state_changes_nothing(env, make) -> None:
+    """Also where episodes start at different steps, and after a batch of another size."""
+
+    def flown(calls: int) -> list[list[Tensor]]:
+        env.set_seed(3)
+        state, actions, policy = env.reset(), [], make()
+        policy(GeomagneticNavEnv(num_envs=2, seed=0).rollout(2)[:, -1])
+        for step in range(5):
+            actions.append([policy(state.clone())["action"] for _ in range(calls)])
+            state = step_mdp(env.step(state.set("action", actions[-1][0][..., :2])))
+            begin = torch.tensor([[True], [False], [False], [False], [False]])
+            state = env.reset(state.set("_reset", begin)) if step == 1 else state
+        return actions
+
+    for (once,), (first, second) in zip(flown(1), flown(2), strict=True):
+        assert torch.equal(first, once)
+        assert torch.equal(second, once)
+
+
+@pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), BIAS])
+def test_an_untrained_correction_is_the_move_of_kalman(bias: tuple[float, ...]) -> None:
+    base = GeomagneticNavEnv(num_envs=200, seed=0, start_heading="random")
+    env = TransformedEnv(base, SensorErrors(STD, bias=bias, seed=0))
+    agents = Kalman(step_price=2.0), Anywhere(source=correction_network((8,)), step_price=2.0)
+    plain, corrected = (env.set_seed(0) and env.rollout(5, agent, auto_reset=True)["action"] for agent in agents)
+    torch.testing.assert_close(corrected, plain)
+
+
+@pytest.mark.parametrize("name", ["kalman", "anywhere", "secant"])
+def test_every_navigator_declares(name: str) -> None:
+    summary = summarize(evaluate(name, "paper-100", arrival="declared"))
+    assert summary["success_rate"] >= 97
+    assert summary["success_rate"] + summary["false_arrival_rate"] == 100
+    assert 80 < summary["spl_to_arrival"] < summary["spl"]
+
+
+def test_where_the_start_is_known_more_declarations_are_right() -> None:
+    """It shows the constant errors of the sensors."""
+    options = {"arrival": "declared", "errors": "ship", "max_steps": 30}
+    unknown, known = (evaluate("kalman", "paper-100", known_start=std, **options) for std in (None, (0.0, 0.0, 0.0)))
+    assert known["success"].sum() > unknown["success"].sum() + 10
+
+
+def test_moves_stay_within_adapted_limits() -> None:
+    env = GeomagneticNavEnv(num_envs=50, seed=0, start_heading="random")
+    action = env.rollout(2, Anywhere().adapted(max_move_km=10.0, max_turn_rad=0.5))["action"]
+    assert 5 < action[..., 0].max() <= 10 + 1e-4
+    assert 0.45 < action[..., 1].abs().max() <= 0.5 + 1e-4
+
+
+def test_actions_are_alike_by_any_default_type_of_floating_point_numbers() -> None:
+    def actions() -> Tensor:
+        return GeomagneticNavEnv(num_envs=3, seed=0).rollout(5, Anywhere())["action"]
+
+    expected = actions()
+    torch.set_default_dtype(torch.float64)
+    try:
+        torch.testing.assert_close(actions(), expected, rtol=0, atol=1e-3)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+# Files
+
+
+def test_a_pilot_flies_alike_after_saving(env, tmp_path: Path) -> None:
+    path, network = tmp_path / "mine.safetensors", correction_network((8, 4))
+    torch.nn.init.normal_(network[-1].weight)
+    agent = Anywhere(Rules(step_price=2.0, range_km=500.0), network)
+    magrl.save_policy(path, agent)
+    loaded = magrl.load_policy(path)
+    assert loaded.rules == agent.rules
+    state = env.rollout(3)[:, -1]
+    wanted, found = (copy.deepcopy(one)(state.clone())["action"] for one in (agent, loaded))
+    assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"format": [1] * 10**5},
+            r"a policy of format \[1, 1, .{70}\.\.\.; this version reads format 4: train it again",
+        ),
+        ({"rules": {"max_steps": 0}}, "max_steps"),
+        ({"rules": {"speed": 3}}, "speed"),
+        ({"num_cells": [10**9]}, "num_cells must be"),
+        ({"num_cells": [8, 8]}, r"size mismatch|Missing key"),
+        ({"weights": {}}, "Missing key"),
+    ],
+)
+def test_damaged_files_are_refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.safetensors"
+    magrl.save_policy(path, Anywhere(source=correction_network((8,))))
+    save_tensors(load_tensors(path) | change, path)
+    with pytest.raises(ValueError, match=message) as error:
+        Anywhere(source=path)
+    assert str(path) in str(error.value)
+
+
+def test_weights_that_are_not_finite_and_missing_files_are_refused(tmp_path: Path) -> None:
+    path, network = tmp_path / "mine.safetensors", correction_network((8,))
+    torch.nn.init.constant_(network[0].weight, math.nan)
+    magrl.save_policy(path, Anywhere(source=network))
+    with pytest.raises(ValueError, match="is not finite"):
+        Anywhere(source=path)
+    with pytest.raises(FileNotFoundError, match=r"no policy file at .*none"):
+        Anywhere(source=tmp_path / "none.safetensors")
+
+
+def test_every_pretrained_pilot_is_small_and_has_a_card() -> None:
+    file = pretrained("anywhere")
+    assert file.stat().st_size < 1_000_000
+    card = file.with_suffix(".md").read_text()
+    assert all(f"## {part}\n" in card for part in ("Training", "Data", "Figures", "Limits"))
+    with pytest.raises(ValueError, match="pretrained_policy must be one of 'anywhere', got 'nowhere'"):
+        pretrained("nowhere")

@@ -1,0 +1,105 @@
+"""The step of a vehicle: rules, batches in which some vehicles begin, search, prices and declarations."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from support.readings import first_reading, moved
+from support.tracks import STD, f64
+from tensordict import TensorDict
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+from magrl.sensor_std import SensorStd
+from magrl.tracking import ArrivalDecision, Reading, Rules, advance, begin, blank, declaring, pilot
+from magrl.tracking.pilot import step
+from magrl.transforms.track import reading_of
+
+ERRORS = SensorStd(STD, (0.5, 0.3, 60.0), (0.3, 0.2, 30.0), (20.0, 20.0, 20.0))
+RULES = Rules(range_km=350.0, crust_nt=20.0)
+
+
+def reading(seen: TensorDict, number: int) -> Reading:
+    """A reading with the same errors for each vehicle."""
+    read = reading_of(seen.set("elapsed_steps", torch.full((len(seen), 1), number)))
+    return read._replace(std=SensorStd(*(f64(*std).expand(len(seen), 3) for std in ERRORS)))
+
+
+@pytest.fixture
+def readings() -> tuple[Reading, Reading]:
+    """Those of four vehicles at the start and after a move."""
+    first = first_reading()
+    return reading(first, 0), reading(moved(first, 40.0, 0.3, f64(0.3, 0.5, 60.0)), 1)
+
+
+def test_vehicles_that_begin_do_not_touch_those_that_go_on(readings) -> None:
+    started = begin(RULES, readings[0])
+    went = advance(RULES, started.state, readings[1])
+    fresh = torch.tensor([True, False, False, True])
+
+    def mixed(new: Tensor, old: Tensor) -> Tensor:
+        return torch.where(fresh.reshape(4, *[1] * (new.ndim - 1)), new, old)
+
+    std = SensorStd(*map(mixed, readings[0].std, readings[1].std))
+    both = Reading(*map(mixed, readings[0][:4], readings[1][:4]), std, mixed(readings[0].step, readings[1].step))
+    track = step(RULES, started.state, both)
+    for found, new, old in zip(*map(tree_leaves, (track, started, went)), strict=True):
+        torch.testing.assert_close(found, mixed(new, old), rtol=0, atol=0, equal_nan=True)
+    assert [part.shape for part in blank(readings[0])] == [part.shape for part in track.state]
+    assert [part.dtype for part in blank(readings[0])][:5] == [part.dtype for part in track.state][:5]
+
+
+def test_a_place_without_an_arrival_is_left() -> None:
+    """A vehicle that is told of its arrival, and has not arrived where the destination seems to be, aims elsewhere."""
+    seen = first_reading()
+    seen["target_field"] = seen["field"].clone()
+    still = moved(seen, 0.1, 0.0, f64(0.0, 0.0, 0.0))
+    for rule in ("distance", "declared"):
+        rules = RULES.replace(arrival=rule)
+        track = advance(rules, begin(rules, reading(seen, 0)).state, reading(still, 1))
+        apart = (track.aim - track.way.displacement).norm(dim=-1)
+        assert (apart > 5).all() if rules.signaled else (apart == 0).all()
+
+
+def test_each_vehicle_may_have_its_own_price_of_a_step(readings) -> None:
+    """With a higher price moves are longer; without caution they are nearer to the way."""
+    own = begin(RULES, readings[0]._replace(price=f64(0.1, 0.1, 30.0, 30.0)))
+    cheap, dear, careless = (
+        begin(RULES.replace(step_price=price, caution=caution), readings[0]).plan
+        for price, caution in ((0.1, 0.3), (30.0, 0.3), (0.1, 0.0))
+    )
+    torch.testing.assert_close(own.plan, torch.cat((cheap[:2], dear[2:])))
+    assert (cheap.norm(dim=-1) < dear.norm(dim=-1) - 10).any()
+    ahead, aside = (torch.cosine_similarity(plan, own.way.displacement) for plan in (careless, cheap))
+    assert ahead.mean() > aside.mean() + 0.05
+
+
+def test_it_goes_to_the_estimated_place_where_that_is_near(readings, monkeypatch) -> None:
+    """20 km to the east of a vehicle that heads north, at a probability that is worth no declaration; and 30 km.
+
+    Where it is near enough, 10 km to the west, it turns to read on another heading. The fourth declares.
+    """
+    near = f64((0.0, 20.0), (0.0, 30.0), (0.0, -10.0), (0.0, 0.0))
+    sure, worth = f64(0.1, 0.1, 0.1, 0.7), f64(0.5, 0.5, 0.5, 0.5)
+    decision = ArrivalDecision(sure, worth, sure, near, torch.full((4,), 12.0))
+    monkeypatch.setattr(pilot, "decide", lambda *_: decision)
+    seen = readings[0]._replace(heading=f64(0.0, 0.0, 0.0, 0.0))
+    action = f64((50.0, -1.0)).expand(4, 2)
+    sent, quarter = declaring(RULES, begin(RULES, seen), seen, action)[0], math.pi / 2
+    expected = [[20.0 - 12.0, quarter, -1.0], [50.0, -1.0, -1.0], [0.0, quarter, -1.0], [0.0, 0.0, 1.0]]
+    torch.testing.assert_close(sent, f64(*expected))
+    sent = declaring(RULES.replace(confidence=0.8), begin(RULES, seen), seen, action)[0]
+    assert sent[:, 2].tolist() == [-1.0] * 4
+
+
+WRONG = {"max_move_km": 0.0, "max_turn_rad": 4.0, "max_steps": 0, "zeta": math.nan, "arrival": "guessed"}
+WRONG |= {"radius_km": -1.0, "confidence": 2.0, "range_km": math.inf, "crust_nt": -1.0, "step_price": 0.0}
+WRONG |= {"caution": -0.1, "search": True}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_rules_out_of_range_are_named(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        Rules(**{name: WRONG[name]})

@@ -1,0 +1,141 @@
+"""What a vehicle knows: models of the Earth, its place and drift, the anomaly of the field, and the far away."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from magrl import IGRF, evaluate
+from magrl.envs import earth_scenario
+from magrl.field.elements import elements_jacobian, measured_elements
+from magrl.geodesy import geodesic, move
+from magrl.sensor_std import PERFECT, SensorStd
+from magrl.tracking import Motion, Rules, destination, earth_model, posterior, start
+from magrl.tracking.belief import DRIFT, PLACE, at_place, moved, read
+from magrl.tracking.earth import secular_variance
+from magrl.tracking.local import slopes
+from magrl.tracking.prior import lasting_covariances
+from magrl.transforms import CONDITIONS
+
+PLACES = torch.tensor([[50.0, 10.0], [-20.0, 150.0], [70.0, -120.0], [5.0, 179.9]], dtype=torch.float64)
+
+
+def std_of(*stds: tuple[float, float, float], count: int = len(PLACES)) -> SensorStd:
+    given = [torch.tensor(std, dtype=torch.float64).expand(count, 3) for std in (*stds, *[(0.0,) * 3] * 4)]
+    return SensorStd(*given[:4])
+
+
+def test_local_coefficients_have_the_field_and_its_slopes() -> None:
+    model = earth_model("IGRF-14", "2025-01-01")
+    coefficients = model.coefficients(PLACES)
+    torch.testing.assert_close(coefficients[:, :3], model.field(*PLACES.unbind(-1)), rtol=0, atol=1e-6)
+    for axis, bearing in enumerate((0.0, math.pi / 2)):
+        course, half = (
+            torch.full((len(PLACES),), bearing, dtype=torch.float64),
+            torch.full((len(PLACES),), 0.5).double(),
+        )
+        ends = [model.field(*move(*PLACES.unbind(-1), course + turn, half)) for turn in (0.0, math.pi)]
+        torch.testing.assert_close(slopes(coefficients, PLACES)[:, :3, axis], ends[0] - ends[1], rtol=0, atol=0.02)
+
+
+def test_a_belief_follows_its_model() -> None:
+    motion = Motion(earth_model("IGRF-14", "2025-01-01"), drift=0.01, wander_km=0.1)
+    belief = at_place(PLACES, 5.0, std_of(), motion)
+    for _ in range(4):
+        belief = moved(belief, torch.full((4,), 50.0), torch.tensor([1.0, 2.0, -1.0, 3.0]), std_of(), motion)
+    torch.testing.assert_close(belief.field, motion.model.field(*belief.place.unbind(-1)), rtol=0, atol=1e-6)
+    variance = belief.covariance[:, PLACE, PLACE].diagonal(dim1=-2, dim2=-1).sum(-1)
+    expected = 5.0**2 + 2 * (200 * 0.01) ** 2 + 2 * 200 * 0.1**2  # start, drift, wander
+    torch.testing.assert_close(variance, torch.full((4,), expected).double(), rtol=0.05, atol=0)  # meridians converge
+
+
+def test_readings_correct_place_and_drift() -> None:
+    model = earth_model("IGRF-14", "2025-01-01")
+    motion, std = Motion(model, drift=0.05), std_of((0.01, 0.01, 1.0))
+    course, distance = torch.tensor([1.0, 2.0, -1.0, 3.0]).double(), torch.full((4,), 50.0).double()
+    true, belief = PLACES, at_place(PLACES, 5.0, std, motion)
+    for _ in range(8):
+        belief = moved(belief, distance, course, std, motion)
+        true = torch.stack(move(*true.unbind(-1), course, distance), -1)
+        true = torch.stack(move(*true.unbind(-1), torch.zeros(4), torch.full((4,), 2.0)), -1)  # 4 % northward
+        belief = read(belief, measured_elements(model.field(*true.unbind(-1))), std.noise)
+    assert (geodesic(*true.unbind(-1), *belief.place.unbind(-1))[0] < 2.0).all()
+    torch.testing.assert_close(belief.mean[:, DRIFT.start], torch.full((4,), 0.04).double(), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize(("years", "predicted", "fields"), [(20.0, False, (675, 1177)), (5.0, True, (50, 84))])
+def test_secular_change(years: float, predicted: bool, fields: tuple[float, float]) -> None:
+    """Of IGRF of 2005 and of IGRF-13: in truth 743 and 1310 nT, 48 and 82 nT in 2025, by IGRF-14."""
+    variance = secular_variance(years, predicted)
+    n = torch.arange(len(variance))
+    level, down = (((n + 1) * factor * variance).sum().sqrt().item() for factor in (n / 2, n + 1))
+    assert (level, down) == pytest.approx(fields, rel=0.1)
+
+
+def test_an_old_model_places_a_vehicle_without_a_place() -> None:
+    place = torch.tensor([[50.0, 10.0]], dtype=torch.float64)
+    reading, std = measured_elements(IGRF("2025-01-01")(*place.unbind(-1))), std_of((0.1, 0.1, 10.0), count=1)
+    from magrl.tracking.belief import before
+
+    belief = before(reading, std, model=earth_model("IGRF-2005", "2025-01-01"))
+    assert abs(belief.latitude.item() - 50.0) < 3.0
+    assert not belief.located.any()
+
+
+@pytest.mark.parametrize(("drift", "crust"), [((0.2, 0.1, 30.0), 0.0), ((0.0, 0.0, 0.0), 30.0)])
+def test_the_anomaly_has_the_stated_effect(drift: tuple[float, float, float], crust: float) -> None:
+    field = torch.tensor([15000.0, 3000.0, 40000.0], dtype=torch.float64)
+    std = SensorStd(*(torch.tensor(x, dtype=torch.float64) for x in ((0.0,) * 3, drift, drift, (0.0,) * 3)))
+    anomaly, jacobian = lasting_covariances(field, std, crust)[1], elements_jacobian(field)
+    variance = (jacobian @ anomaly @ jacobian.mT).diagonal()
+    expected = torch.tensor(drift, dtype=torch.float64).square() + crust**2 * jacobian.square().sum(-1)
+    torch.testing.assert_close(variance, expected, rtol=0.01, atol=0)
+
+
+def test_a_destination_out_of_reach_is_not_known() -> None:
+    field, std = IGRF("2025-01-01"), std_of((0.05, 0.05, 5.0))
+    belief = start(measured_elements(field(*PLACES.unbind(-1))), std)
+
+    def seen(distance_km: float) -> Tensor:
+        there = move(*PLACES.unbind(-1), torch.zeros(4).double(), torch.full((4,), distance_km).double())
+        return posterior(destination(belief, measured_elements(field(*there)), 400.0)).radius(0.9)
+
+    assert (seen(400.0) < 1500.0).all()
+    assert (seen(6000.0) > 5000.0).any()
+
+
+@pytest.mark.parametrize(
+    ("model", "date", "message"),
+    [
+        ("IGRF-12", "2025-01-01", "model 'IGRF-12' must be IGRF-13, IGRF-14"),
+        ("IGRF-13", "2026-06-01", "model IGRF-13 is valid to 2025, not in 2026.4"),
+        ("IGRF-2030", "2025-01-01", "from 1900 to 2025"),
+    ],
+)
+def test_models_that_do_not_cover_the_date(model: str, date: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        earth_model(model, date)
+
+
+@pytest.mark.parametrize(("rules", "message"), [({"start_km": 5.0}, "needs a model"), ({"target_km": 5.0}, "start_km")])
+def test_rules_that_do_not_fit(rules: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Rules(**rules)
+
+
+def test_a_model_and_a_start_beat_dead_reckoning() -> None:
+    scenario = earth_scenario(16, 3, max_move_km=90.0, max_latitude=70, distance_range_km=(300.0, 500.0))
+    scenario = scenario.replace(max_move_km=50.0, max_steps=40, arrival="declared", start_heading="random")
+    scenario = scenario.with_tasks(scenario.random_tasks(24, 3))
+    told = {"errors": "underwater", "model": "IGRF-13", "start_km": 5.0, "seed": 3}
+    share = {name: evaluate(name, scenario, **told)["success"].double().mean() for name in ("kalman", "dead_reckoning")}
+    assert share["kalman"] > share["dead_reckoning"] + 0.15
+
+
+def test_the_drift_that_a_vehicle_states() -> None:
+    assert CONDITIONS["ship"].motion_std == pytest.approx((0.0276, 0.0), abs=5e-4)
+    assert CONDITIONS["laboratory"].motion_std == (0.0, 0.0)
+    assert PERFECT.noise == (0.0, 0.0, 0.0)
