@@ -135,7 +135,7 @@ def verify(folder: Path, tasks: int = 32, seed: int | None = None) -> tuple[list
     Each row must agree with the track and with itself. Some of the tasks, drawn at random, are flown again and must end
     alike, unless they end differently from starts moved by :data:`SHIFTS_DEG` as well: then rounding decides. Claimed
     means must not be better than those of repeated tasks, nor than those of new tasks, which the submitter has not
-    seen. All limits come from the track and from what is flown here.
+    seen. All limits come from the track and from the flights of the verifier.
 
     Args:
         folder: folder of :func:`run`.

@@ -110,7 +110,7 @@ def make(
         tables: Names of tables in tables.toml; all by default.
         navigators: Navigators in place of those of the table, as in recipes/evaluate.py.
         tasks: Number of tasks in place of that of the table.
-        confidence: Minimum probability at which vehicles declare their arrival, in place of 0.
+        confidence: Minimum probability at which vehicles declare their arrival; 0 by default.
         out: Folder of the tables and their episodes, which are replaced; by default tables are printed.
 
     Raises:

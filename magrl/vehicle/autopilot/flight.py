@@ -135,7 +135,7 @@ class _Record:
         return lines
 
     def _repeat(self, done: float) -> None:
-        """Repeat the messages after some lines, up to the first line that is none."""
+        """Repeat the messages after some lines, up to the first line that is no message."""
         with self._path.open("rb") as file:
             for line in file:
                 if not line.endswith(b"\n"):  # it was not written whole
