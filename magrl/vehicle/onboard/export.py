@@ -152,4 +152,7 @@ def _onnx(exported: torch.export.ExportedProgram) -> bytes:
     options: dict[str, Any] = {"input_names": INPUTS, "output_names": OUTPUTS, "dynamo": True}
     options |= {"custom_translation_table": translations, "verbose": False}
     program: Any = torch.onnx.export(exported, **options)
+    for value in (value for node in program.model.graph for value in node.outputs):
+        if value.name in INPUTS:  # an operation may have the name of an input
+            value.name = f"{value.name}_value"
     return program.model_proto.SerializeToString()
