@@ -23,7 +23,9 @@ class DeadReckoning(Navigator):
 
     What every vehicle with a known start does without this library. Where the environment has no
     :class:`~magrl.transforms.KnownPlace`, start and destination are those of the environment, without an error. It
-    steers from true north. Where the arrival must be declared, it declares at the reckoned destination.
+    steers from true north; headings from magnetic north are not corrected for the declination.
+
+    Where the arrival must be declared, it declares at the reckoned destination.
 
     Args:
         max_move_km: longest move [km].

@@ -26,7 +26,8 @@ PLACES = 12_000
 random tasks within .5 points."""
 SPREAD_YEARS = 20.0
 """Least age of a model in the prior of a vehicle that knows no place [years]: places far apart are joined to one normal
-distribution, which is too sure where the places that fit are few."""
+distribution, which is too sure where the places that fit are few. Set on the tasks of table
+known, to the age of the model beside it."""
 HIGHEST_LATITUDE = 78.0
 """Latitude up to which these are [deg]."""
 
