@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from torchrl.envs import TransformedEnv
+from torchrl.envs import CatTensors, Compose, TransformedEnv
 
 from magrl.envs.navigation import anywhere_env, navigation_env
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.transforms import SPEEDS_KM_H, MagneticWeather, SensorErrors, Spikes
+from magrl.transforms import SPEEDS_KM_H, MagneticWeather, NoGoAreas, SensorErrors, Spikes, TrueWay
 
 STORM_NOISE = (0.05, 0.05, 5.0)
 """White noise of the task *Storm*, which the data sheet states: D [deg], I [deg], B_H [nT]."""
@@ -51,10 +51,32 @@ def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     return readings_env(num_envs, **{"transforms": errors} | options)
 
 
+def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
+    """Return the environment *Box* with no-go areas between start and destination, and a deadline of 20 steps.
+
+    The way straight ahead is closed in most episodes, and areas are seen only from nearby: who is greedy fails.
+
+    Args:
+        num_envs: vehicles in the batch.
+        **options: of :func:`~magrl.envs.navigation.navigation_env`, with ``max_steps=20`` by default. The observation
+            ``"flat"`` ends with the areas in sight (:class:`~magrl.transforms.NoGoAreas`).
+
+    Example:
+        >>> no_go_env(4, seed=0).rollout(3)["observation"].shape
+        torch.Size([4, 3, 22])
+    """
+    env = navigation_env(num_envs, **{"max_steps": 20} | options)
+    env.insert_transform(0, Compose(TrueWay(), NoGoAreas()))  # the reward reads the success that areas leave
+    for joined in [step for step in env.transform if isinstance(step, CatTensors)][:1]:
+        env.append_transform(CatTensors([*joined.in_keys, "areas"], "observation", del_keys=False, sort=False))
+    return env
+
+
 NAMED_ENVS: dict[str, Callable[..., TransformedEnv]] = {
     "box": navigation_env,
     "anywhere": anywhere_env,
     "readings": readings_env,
     "storm": storm_env,
+    "nogo": no_go_env,
 }
 """Functions that make the environments of the named tasks."""

@@ -8,6 +8,7 @@ module where that makes sense.
 from magrl.transforms.alignment import AlignmentReward as AlignmentReward
 from magrl.transforms.alignment import FieldGradient as FieldGradient
 from magrl.transforms.alignment import GradientHeading as GradientHeading
+from magrl.transforms.areas import NoGoAreas as NoGoAreas
 from magrl.transforms.errors.base import true_keys as true_keys
 from magrl.transforms.errors.conditions import CONDITIONS as CONDITIONS
 from magrl.transforms.errors.conditions import Conditions as Conditions

@@ -1,0 +1,246 @@
+"""Learning curves on the named tasks: algorithms of stable-baselines3 and sb3-contrib, and the recipes of this library.
+
+    python recipes/tables/sweep.py                                     # everything: about five hours on two cores
+    python recipes/tables/sweep.py --tasks box --algorithms PPO --seeds 0
+    python recipes/tables/sweep.py --no-train                          # table and figure of the runs that exist
+
+A run that has ended is not repeated, so that the same command resumes a sweep. SR and SPL are of the first episode of
+200 vehicles (bars.py), without exploration. The settings of an algorithm are the same for all tasks.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import multiprocessing
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from magrl.envs.sb3 import BatchedVecEnv
+from magrl.evaluation.intervals import interquartile_mean, stratified_bootstrap
+from magrl.evaluation.tables import markdown_table
+from magrl.training import UsageError, command
+
+import gymnasium
+import numpy as np
+import torch
+import tyro
+from bars import BARS, SEED, VEHICLES, bar, bars_of
+from matplotlib.figure import Figure
+from pandas import DataFrame, concat, read_csv
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from tqdm import tqdm
+
+IDS = {"box": "", "anywhere": "Anywhere", "readings": "Readings", "storm": "Storm", "nogo": "NoGo"}
+POINTS = 10
+"""Points of a learning curve."""
+Row = dict[str, Any]
+
+
+class Algorithm(NamedTuple):
+    """An algorithm: how to make it, vehicles, steps on each task [thousands], and its settings."""
+
+    make: Callable[..., Any]
+    num_envs: int
+    thousands: dict[str, int]
+    settings: dict[str, Any]
+
+
+ON_POLICY = {"n_steps": 32, "batch_size": 2048, "n_epochs": 5, "learning_rate": 1e-3}
+OFF_POLICY = {"learning_rate": 1e-3, "learning_starts": 1024, "train_freq": 1, "gradient_steps": 8, "batch_size": 256}
+OFF_POLICY |= {"gamma": 0.9, "tau": 0.01, "buffer_size": 200_000, "policy_kwargs": {"net_arch": [128, 128, 128]}}
+EXPLORED = {"action_noise": NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))}
+WIDE = {"policy_kwargs": {"net_arch": [64, 64], "log_std_init": -0.5}}
+MEMORY = {"policy_kwargs": {"lstm_hidden_size": 64, "net_arch": [64], "log_std_init": -0.5}}
+ALGORITHMS = {
+    "PPO": Algorithm(
+        partial(PPO, "MlpPolicy"),
+        256,
+        {"box": 1000, "nogo": 1000, "anywhere": 200, "readings": 500, "storm": 500},
+        ON_POLICY | WIDE,
+    ),
+    "SAC": Algorithm(partial(SAC, "MlpPolicy"), 64, {"box": 50}, OFF_POLICY),
+    "TD3": Algorithm(partial(TD3, "MlpPolicy"), 64, {"box": 50}, OFF_POLICY | EXPLORED),
+    "RecurrentPPO": Algorithm(
+        partial(RecurrentPPO, "MlpLstmPolicy"), 256, {"box": 300, "readings": 300, "storm": 300}, ON_POLICY | MEMORY
+    ),
+}
+RECIPES = {
+    "GG-TD3": ("box", "td3_gradient_guided.py"),
+    "ppo_anywhere": ("anywhere", "ppo_anywhere.py", "--preset", "fast"),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to train, and where."""
+
+    tasks: tuple[str, ...] = tuple(IDS)
+    """Named tasks."""
+    algorithms: tuple[str, ...] = (*ALGORITHMS, *RECIPES)
+    """Algorithms; each is trained on its own tasks among these."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of weights, exploration and training tasks."""
+    jobs: int = 2
+    """Runs at a time, with one thread each."""
+    train: bool = True
+    """Whether to train what is missing."""
+    out: Path = Path("runs/sweep")
+    """Folder of the runs."""
+    results: Path = Path("docs/results")
+    """Folder of table, data and figure."""
+
+
+def score(act: Callable[..., Any], task: str) -> Row:
+    """Return success rate and SPL [%] of the first episode of each vehicle."""
+    envs = gymnasium.make_vec(f"magrl/GeomagneticNavigation{IDS[task]}-v0", num_envs=VEHICLES)
+    (observations, _), state, first = envs.reset(seed=SEED), None, np.ones(VEHICLES, dtype=bool)
+    ended = {name: np.full(VEHICLES, np.nan) for name in ("success", "spl")}
+    while np.isnan(ended["spl"]).any():
+        actions, state = act(observations, state, first, deterministic=True)
+        observations, _, terminated, truncated, info = envs.step(actions)
+        first = terminated | truncated
+        new = first & np.isnan(ended["spl"])
+        for name, values in ended.items():
+            values[new] = info[name][new] if new.any() else values[new]
+    return {"SR": 100 * ended["success"].mean(), "SPL": 100 * ended["spl"].mean()}
+
+
+class Curve(BaseCallback):
+    """Score the policy at :data:`POINTS` numbers of steps, off the clock."""
+
+    def __init__(self, task: str, steps: int) -> None:
+        super().__init__()
+        self.task, self.steps, self.rows, self.began = task, steps, list[Row](), time.process_time()
+
+    def point(self) -> None:
+        """Add a point."""
+        paused = time.process_time()
+        row = {"steps": self.num_timesteps, "cpu_s": paused - self.began}
+        self.rows.append(row | score(self.model.predict, self.task))
+        self.began += time.process_time() - paused
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= len(self.rows) * self.steps / POINTS:
+            self.point()
+        return True
+
+
+def trained(task: str, name: str, seed: int) -> list[Row]:
+    """Train an algorithm of another library; return its learning curve."""
+    chosen = ALGORITHMS[name]
+    envs = gymnasium.make_vec(
+        f"magrl/GeomagneticNavigation{IDS[task]}-v0", num_envs=chosen.num_envs, autoreset_mode="SameStep"
+    )
+    model = chosen.make(BatchedVecEnv(envs), seed=seed, device="cpu", **deepcopy(chosen.settings))
+    curve = Curve(task, 1000 * chosen.thousands[task])
+    model.learn(curve.steps, callback=curve)
+    return [
+        *curve.rows,
+        {"steps": curve.steps, "seconds": time.perf_counter() - curve.began} | score(model.predict, task),
+    ]
+
+
+def recipe(name: str, seed: int, folder: Path) -> list[Row]:
+    """Train by a recipe; return its learning curve on the validation tasks, and its score as the last point."""
+    task, script, *options = RECIPES[name]
+    began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    options += ["--seed", str(seed), "--out", str(folder), "--wandb-mode", "disabled"]
+    subprocess.run([sys.executable, f"recipes/{script}", *options], check=True, stdout=subprocess.DEVNULL)
+    with (folder / "train.csv").open() as file:
+        points = [row for row in csv.DictReader(file) if row["eval_spl"]]
+    names = {"steps": "frames", "SR": "eval_success_rate", "SPL": "eval_spl"}
+    rows = [{key: float(point[column]) for key, column in names.items()} for point in points]
+    final = bar(task, str(next(folder.glob("policy.*"))))
+    cpu_s = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - began
+    return [*rows, rows[-1] | {"cpu_s": cpu_s, "SR": final["SR"], "SPL": final["SPL"]}]
+
+
+def run(config: Config, task: str, name: str, seed: int) -> Path:
+    """Train one run, unless its file exists; return the file."""
+    path = config.out / f"{task}-{name}-seed{seed}.csv"
+    if not path.exists():
+        torch.set_num_threads(1)
+        rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
+        about = {"task": task, "algorithm": name, "seed": seed}
+        unfinished = path.with_suffix(".part")
+        DataFrame([about | row for row in rows]).round(2).to_csv(unfinished, index=False)
+        unfinished.rename(path)
+    return path
+
+
+def planned(config: Config) -> Iterator[tuple[str, str, int]]:
+    """Yield task, algorithm and seed of all runs, in the order of their seeds."""
+    for seed, name in itertools.product(config.seeds, config.algorithms):
+        tasks = [RECIPES[name][0]] if name in RECIPES else ALGORITHMS[name].thousands
+        yield from ((task, name, seed) for task in tasks if task in config.tasks)
+
+
+def table(curves: DataFrame) -> str:
+    """Return the Markdown table of final scores, and of the bars of each task."""
+    last, rows = curves.groupby(["task", "algorithm", "seed"], sort=False).last().reset_index(), []
+    for (task, name), runs in last.groupby(["task", "algorithm"], sort=False):
+        low, high = stratified_bootstrap([torch.tensor(runs["SPL"].to_numpy())])
+        rate, spl = (interquartile_mean(torch.tensor(runs[key].to_numpy())).item() for key in ("SR", "SPL"))
+        size = f"{runs['steps'].max() / 1000:.0f} k, {runs['cpu_s'].median() / 60:.1f} min"
+        rows.append([task, f"{name}, {len(runs)} seeds", size, f"{rate:.1f}", f"{spl:.1f} ({low:.1f}–{high:.1f})"])
+    for task in curves["task"].unique():
+        for name in bars_of(task):
+            scores = bar(task, name)
+            rows.append([task, f"*{BARS[name]}*", "—", f"{scores['SR']:.1f}", f"{scores['SPL']:.1f}"])
+    order = list(IDS)
+    rows.sort(key=lambda row: order.index(row[0]))
+    return markdown_table(["task", "agent", "training", "SR [%]", "SPL [%], IQM (95 % interval)"], rows)
+
+
+def figure(curves: DataFrame) -> Figure:
+    """Return SPL over steps: medians over seeds, and bands from the least to the highest."""
+    tasks = [task for task in IDS if task in set(curves["task"])]
+    drawn = Figure(figsize=(3.2 * len(tasks), 3.4), layout="constrained")
+    for axes, task in zip(drawn.subplots(1, len(tasks), sharey=True, squeeze=False)[0], tasks, strict=True):
+        for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
+            points = runs.assign(point=runs.groupby("seed").cumcount()).groupby("point")
+            steps, spl = points["steps"].median(), points["SPL"]
+            color = f"C{[*ALGORITHMS, *RECIPES].index(name)}"
+            axes.plot(steps, spl.median(), color=color, label=name)
+            axes.fill_between(steps, spl.min(), spl.max(), color=color, alpha=0.2, lw=0)
+        axes.set(title=task, xscale="log", xlabel="steps", ylim=(0, 100))
+        axes.legend(fontsize="small")
+    drawn.axes[0].set_ylabel("SPL [%]")
+    return drawn
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Train what is missing, and write table, data and figure."""
+    config = tyro.cli(Config, description=__doc__, args=args)
+    config.out.mkdir(parents=True, exist_ok=True)
+    jobs, paths = list(planned(config)), []
+    if not jobs:
+        raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
+    if config.train:
+        os.environ["OMP_NUM_THREADS"] = "1"
+        with ProcessPoolExecutor(config.jobs, multiprocessing.get_context("spawn")) as pool:
+            for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
+                done.result()
+    paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
+    curves = concat([read_csv(path) for path in paths])
+    curves.to_csv(config.results / "scores.csv.gz", index=False)
+    (config.results / "scores.md").write_text(table(curves))
+    figure(curves).savefig(config.results / "scores.png", dpi=130)
+
+
+if __name__ == "__main__":
+    command("sweep.py", main)
