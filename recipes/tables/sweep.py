@@ -75,7 +75,7 @@ ALGORITHMS = {
     "SAC": Algorithm(partial(SAC, "MlpPolicy"), 64, {"box": 50}, OFF_POLICY),
     "TD3": Algorithm(partial(TD3, "MlpPolicy"), 64, {"box": 50}, OFF_POLICY | EXPLORED),
     "RecurrentPPO": Algorithm(
-        partial(RecurrentPPO, "MlpLstmPolicy"), 256, {"box": 300, "readings": 300, "storm": 300}, ON_POLICY | MEMORY
+        partial(RecurrentPPO, "MlpLstmPolicy"), 256, {"readings": 300, "storm": 300}, ON_POLICY | MEMORY
     ),
 }
 RECIPES = {
@@ -159,7 +159,7 @@ def recipe(name: str, seed: int, folder: Path) -> list[Row]:
     task, script, *options = RECIPES[name]
     began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     options += ["--seed", str(seed), "--out", str(folder), "--wandb-mode", "disabled"]
-    subprocess.run([sys.executable, f"recipes/{script}", *options], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([sys.executable, f"recipes/{script}", *options], check=True, capture_output=True)
     with (folder / "train.csv").open() as file:
         points = [row for row in csv.DictReader(file) if row["eval_spl"]]
     names = {"steps": "frames", "SR": "eval_success_rate", "SPL": "eval_spl"}
