@@ -11,7 +11,7 @@ import copy
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -137,6 +137,7 @@ class GeomagneticNavEnv(EnvBase):
         self._tracks = TrackRecorder(self.max_steps + 1 if render_mode else 0)
         self.register_buffer("vehicle", torch.arange(num_envs, device=self.device))
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
+        self._ahead: TensorDict | None = None
         self._make_specs(self.edge.reachable(self.max_move_km + self.drift_km))
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
@@ -200,6 +201,11 @@ class GeomagneticNavEnv(EnvBase):
         self.reward_spec = self._batched(Unbounded((1,), dtype=torch.float32))
         self.full_done_spec = self._batched(Composite(dict.fromkeys(("done", "terminated", "truncated"), specs.FLAG)))
 
+    def to(self, device: Any) -> Self:
+        """Move the environment to a device."""
+        self._ahead = None
+        return super().to(device)
+
     def _batched(self, spec: TensorSpec) -> TensorSpec:
         return spec.expand(self.num_envs, *spec.shape).to(self.device)
 
@@ -215,12 +221,8 @@ class GeomagneticNavEnv(EnvBase):
         mask = torch.ones_like(self.vehicle, dtype=torch.bool)
         if tensordict is not None:
             mask = tensordict.get("_reset", mask).reshape(self.num_envs)
-        chosen = mask.nonzero().squeeze(-1)
-        # The rows of the others are placeholders: the base class puts their running state back.
-        rows = self._start_of(chosen if len(chosen) else torch.zeros_like(self.vehicle[:1]))
-        start = rows[(mask.cumsum(0) - 1).clamp_min(0)]
-        # Counted out of place: a rollout or a checkpoint may hold the old tensor.
-        self.episode = self.episode.index_add(0, chosen, torch.ones_like(chosen))
+        start = self._next_starts(mask)  # the base class puts the running state of the others back
+        self.episode = self.episode + mask  # out of place: a rollout or a checkpoint may hold the old tensor
         self._tracks.add(start, mask)
         return start
 
@@ -229,6 +231,24 @@ class GeomagneticNavEnv(EnvBase):
         state = super()._reset_proc_data(tensordict, tensordict_reset)
         specs.check_state(state["objective_weights"])
         return state
+
+    def _next_starts(self, mask: Tensor) -> TensorDict:
+        """Return the starts of the next episodes ``(N,)``; those outside ``mask`` may be of episodes before.
+
+        A start of many vehicles costs hardly more than one: all that were used are computed together, and kept.
+        """
+        if self._ahead is None:
+            self._ahead = self._start_of(torch.arange(self.num_envs, device=self.device))
+        used = (self._ahead[EPISODE_STREAM] != self._streams(self.vehicle, self.episode)).squeeze(-1)
+        if (used & mask).any():
+            rows = used.nonzero().squeeze(-1)
+            self._ahead = self._ahead.clone()  # a rollout may hold the old tensors
+            self._ahead[rows] = self._start_of(rows)
+        return self._ahead.copy()
+
+    def _streams(self, vehicle: Tensor, episode: Tensor) -> Tensor:
+        """Return the stream of random numbers of episodes, ``(P, 1)``, which names an episode of any seed."""
+        return counter_stream(self.seed, torch.stack((vehicle, episode), -1)).unsqueeze(-1)
 
     def _start_of(self, row: Tensor) -> TensorDict:
         """Return the first observation of the next episode of the vehicles in some rows, ``(P,)``."""
@@ -254,7 +274,7 @@ class GeomagneticNavEnv(EnvBase):
                 "objective": guidance.objective(field, target_field, weights).float(),
                 "objective_weights": weights.float(),
                 "region": region.unsqueeze(-1),
-                EPISODE_STREAM: counter_stream(self.seed, torch.stack((vehicle, episode), -1)).unsqueeze(-1),
+                EPISODE_STREAM: self._streams(vehicle, episode),
                 **{term: zeros[:, :1].float() for term in specs.REWARD_TERMS},
                 **{flag: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for flag in flags},
                 **({DISPLACEMENT: zeros} if self.drift_km else {}),

@@ -43,10 +43,10 @@ def make_collector(
         torch.Size([2, 2])
         >>> collector.shutdown()
     """
-    options = {"device": env.device, **options}
     if len(workers) <= 1:
         options |= {"track_traj_ids": False, "auto_register_policy_transforms": False}
         return Collector(env, policy, return_same_td=True, **options)  # a batch is used before the next one is made
+    options = {"device": env.device, **options}
     if backend == "ray":
         options |= {"backend_options": _ray_options(env, len(workers))}
     return Collector(list(workers), policy, backend=backend, sync=True, **options)

@@ -235,7 +235,7 @@ class StatefulTransform(ObservationTransform):
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make the state part of the input, so that batched and parallel environments pass it to the next step."""
         input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
+        if not self.state_keys or self.parent is None:
             return input_spec
         observed = self.transform_observation_spec(observed_spec(self).clone())
         return with_state(input_spec, {key: self._leaf(observed, key) for key in self.state_keys})
@@ -274,8 +274,10 @@ class StepReward(StatefulTransform):
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
         """Remove the bounds of the reward, or add it."""
-        key, like = self.out_keys[0], self._leaf(observed_spec(self), self.in_keys[0])
-        self._add(reward_spec, reward_spec[key] if key in reward_spec.keys(True, True) else like, key, 1)
+        key = self.out_keys[0]
+        known = key in reward_spec.keys(True, True)
+        like = reward_spec[key] if known else self._leaf(observed_spec(self), self.in_keys[0])
+        self._add(reward_spec, like, key, 1)
         return reward_spec
 
 
