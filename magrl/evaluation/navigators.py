@@ -13,7 +13,7 @@ from magrl.agents import load_policy
 from magrl.agents.trained import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators import NAVIGATORS, Anywhere, Declaring, Kalman, Navigator
+from magrl.navigators import NAVIGATORS, Anywhere, DeadReckoning, Declaring, Kalman, Navigator
 from magrl.navigators.kalman import LIMITS
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking.network import policy_content
@@ -170,6 +170,8 @@ def fitted(policy: TensorDictModuleBase, env: GeomagneticNavEnv, **rules: Any) -
     if isinstance(policy, Kalman):
         shorter = {key: min(env.limits[key], getattr(policy.rules, key)) for key in LIMITS}
         return policy.adapted(**env.limits | rules | shorter)
+    if isinstance(policy, DeadReckoning) and "model" in rules:
+        policy = DeadReckoning.for_env(env, chart=rules["model"])
     if isinstance(policy, TrainedPolicy):
         policy = policy.for_env(env)
     if not env.arrival.declared or getattr(policy, "declares", False):

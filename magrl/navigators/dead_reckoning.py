@@ -12,6 +12,7 @@ from magrl.envs import GeomagneticNavEnv
 from magrl.geodesy import geodesic, move_place, steer
 from magrl.navigators.base import Navigator
 from magrl.sensor_std import SensorStd
+from magrl.tracking import EarthModel
 from magrl.transforms.errors.known_place import PLACE_KEYS
 
 ARRIVED_KM = 0.5
@@ -22,15 +23,15 @@ class DeadReckoning(Navigator):
     """Steer to the coordinates of the destination by the reckoned place alone; the field is not read.
 
     What every vehicle with a known start does without this library. Where the environment has no
-    :class:`~magrl.transforms.KnownPlace`, start and destination are those of the environment, without an error. It
-    steers from true north; headings from magnetic north are not corrected for the declination.
-
-    Where the arrival must be declared, it declares at the reckoned destination.
+    :class:`~magrl.transforms.KnownPlace`, start and destination are those of the environment, without an error.
+    Headings from magnetic north are corrected by the declination of a chart at the reckoned place, if it has one. Where
+    the arrival must be declared, it declares at the reckoned destination.
 
     Args:
         max_move_km: longest move [km].
         max_turn_rad: largest turn [rad].
         declares: whether the action has a third number, which declares the arrival.
+        chart: model of the Earth (:func:`magrl.tracking.earth_model`), of which it reads the declination.
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
@@ -42,11 +43,11 @@ class DeadReckoning(Navigator):
     label = "dead reckoning"
     description = "dead reckoning"
     needs = "the start and the destination"
-    optional_keys: ClassVar[tuple[str, ...]] = PLACE_KEYS
+    optional_keys: ClassVar[tuple[str, ...]] = (*PLACE_KEYS, "bias_std")
 
-    def __init__(self, declares: bool = False, **limits: Any) -> None:
+    def __init__(self, declares: bool = False, chart: EarthModel | None = None, **limits: Any) -> None:
         super().__init__(**limits)
-        self.declares, self.action_size = declares, 2 + declares
+        self.declares, self.action_size, self.chart = declares, 2 + declares, chart
         self.in_keys = ["move", "heading", "start_position", "target_position", "elapsed_steps"]
 
     @staticmethod
@@ -61,14 +62,24 @@ class DeadReckoning(Navigator):
     def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
         """Return the action toward the destination."""
         heading = seen["heading"].squeeze(-1).double()
-        place = move_place(memory["place"], heading, seen["move"][..., 0].double())
+        place = move_place(
+            memory["place"], self._from_north(heading, memory["place"], seen), seen["move"][..., 0].double()
+        )
         memory["place"] = place
+        heading = self._from_north(heading, place, seen)
         distance, bearing = geodesic(*place.unbind(-1), *_known(seen, 1).double().unbind(-1))
         action = torch.stack(steer(heading, bearing, distance, self.max_move_km, self.max_turn_rad), -1)
         if not self.declares:
             return action
         arrived = (distance < ARRIVED_KM).unsqueeze(-1)
         return torch.cat((action.masked_fill(arrived, 0.0), 2.0 * arrived - 1), -1)
+
+    def _from_north(self, heading: Tensor, place: Tensor, seen: TensorDictBase) -> Tensor:
+        """Return headings ``(N,)`` from true north: a compass that states nothing of D is corrected by the chart."""
+        std = seen.get("bias_std", None)
+        if self.chart is None or std is None:
+            return heading
+        return heading + torch.where(std[..., 0].isinf(), torch.deg2rad(self.chart.elements(place)[..., 0]), 0.0)
 
 
 def _known(seen: TensorDictBase, which: int) -> Tensor:

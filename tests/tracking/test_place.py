@@ -135,6 +135,15 @@ def test_a_model_and_a_start_beat_dead_reckoning() -> None:
     assert share["kalman"] > share["dead_reckoning"] + 0.15
 
 
+def test_a_chart_of_declination_corrects_a_compass() -> None:
+    scenario = earth_scenario(16, 3, max_latitude=60, distance_range_km=(300.0, 500.0)).replace(arrival="declared")
+    scenario = scenario.with_tasks(scenario.random_tasks(24, 3))
+    told = {"north": "magnetic", "start_km": 1.0, "max_steps": 40, "seed": 3}
+    with_chart = evaluate("dead_reckoning", scenario, model="IGRF-13", **told)["success"]
+    assert with_chart.all()
+    assert evaluate("dead_reckoning", scenario, **told)["success"].double().mean() < 0.5
+
+
 def test_the_drift_that_a_vehicle_states() -> None:
     assert CONDITIONS["ship"].motion_std == pytest.approx((0.0276, 0.0), abs=5e-4)
     assert CONDITIONS["laboratory"].motion_std == (0.0, 0.0)
