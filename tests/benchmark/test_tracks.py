@@ -47,6 +47,7 @@ TRACES = {
     "magrl/GeomagneticNavigationAnywhere-v0": "f5029032a8bd1797",
     "magrl/GeomagneticNavigationReadings-v0": "f5029032a8bd1797",
     "magrl/GeomagneticNavigationStorm-v0": "b87790311c6df3aa",
+    "magrl/GeomagneticNavigationNoGo-v0": "07186ba7145404d2",
 }
 MEANS = {
     "magrl/GeomagneticNavigation-v0": (
@@ -64,6 +65,10 @@ MEANS = {
     "magrl/GeomagneticNavigationStorm-v0": (
         "0.22147 0.62033 0.20247 0.93796 0.11654 -0.00011 -0.41611 -1.20649 0.39367 0.95445 1.98381 1.1683 "
         "0.2927 0.33669 -0.2636 -0.32069 -0.21112 0.19012 -0.15552 0.51251 -0.2111"
+    ),
+    "magrl/GeomagneticNavigationNoGo-v0": (
+        "-0.13159 0.04892 0.32537 0.14425 -0.06559 -0.02325 -0.00028 -0.00078 0.55169 -0.22901 -0.69724 0.10619 "
+        "-0.10018 0.00653 0.00395 0.06185 0.0051 -0.00124 0.02318 0 0 0 -0.16681"
     ),
 }
 FIRST, SIZE = np.array([1, 0]), np.array([25, 1.5])  # of actions in km and rad, from those in [-1, 1]

@@ -1,0 +1,57 @@
+"""No-go areas."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, TransformedEnv
+
+from magrl.envs import GeomagneticNavEnv
+from magrl.envs.named import no_go_env
+from magrl.evaluation.navigators import make_navigator
+from magrl.transforms import NoGoAreas, TrueWay
+from magrl.transforms.areas import distance_km, turned
+
+
+def flown(**options: object) -> TensorDict:
+    env = no_go_env(64, observation="dict", scale_actions=False, seed=3, **options)
+    return env.rollout(20, make_navigator("geodesic", env.base_env), break_when_any_done=False)["next"]
+
+
+def test_a_leg_that_meets_an_area_ends_the_episode_without_success() -> None:
+    """Straight to the destination, an episode succeeds where the straight line is free, but for the last part of it."""
+    steps = flown()
+    start = TransformedEnv(GeomagneticNavEnv(num_envs=64, seed=3), Compose(TrueWay(), NoGoAreas())).reset()
+    centers, radii = NoGoAreas.discs(start["no_go_areas"])
+    free = (distance_km(centers, start["no_go_areas"][:, -2:], torch.zeros(64, 2)) > radii).all(-1)
+    ended = steps["done"].squeeze(-1)
+    length = (ended.cumsum(1) == 0).sum(1)
+    success = steps["success"].squeeze(-1)[torch.arange(64), length]
+    assert 0 < free.sum() < 32
+    assert (success == free).double().mean() > 0.95  # the earth is no plane
+    assert steps["terminated"].squeeze(-1)[torch.arange(64), length].all()
+    assert not (steps["success"] & ~steps["terminated"]).any()
+
+
+def test_areas_are_seen_only_from_nearby() -> None:
+    """Ahead to the right, at a third of the sight: two thirds of the unit vector, and the share of the radius."""
+    areas = NoGoAreas(number=1, radius_km=(20.0, 40.0), sight_km=75.0)
+    relative = turned(torch.tensor([[[45 / 2**0.5, 45 / 2**0.5]]]), torch.tensor([[[0.7]]]))
+    seen = areas._seen(relative, torch.tensor([[20.0]]), torch.tensor([[0.7]]))
+    expected = torch.tensor([[2 / 3 / 2**0.5, 2 / 3 / 2**0.5, 0.5]])
+    torch.testing.assert_close(seen, expected)
+    assert not areas._seen(3 * relative, torch.tensor([[20.0]]), torch.tensor([[0.7]])).any()
+
+
+def test_observation_of_the_task() -> None:
+    env = no_go_env(8, seed=0)
+    state = env.rollout(3)
+    assert state["observation"].shape[-1] == 13 + state["areas"].shape[-1]
+    assert (state["observation"][..., 13:] == state["areas"]).all()
+
+
+@pytest.mark.parametrize("options", [{"number": 0}, {"radius_km": (-1.0, 5.0)}, {"sight_km": 0.0}])
+def test_bad_options(options: dict) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        NoGoAreas(**options)
