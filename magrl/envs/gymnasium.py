@@ -1,9 +1,9 @@
 """The environment for Gymnasium: one vehicle as an ``Env``, a batch of them as a ``VectorEnv``.
 
 ``import magrl`` registers the named tasks: ``magrl/GeomagneticNavigation-v0``, which is *Box*, and with the endings
-``Anywhere-v0``, ``Readings-v0``, ``Storm-v0`` and ``NoGo-v0``. The classes run :data:`magrl.envs.named.NAMED_ENVS`, the TorchRL
-environments behind the transforms of the recipes, and only convert tensors to arrays: the same seed and the same
-actions give the same bits.
+``Anywhere-v0``, ``Readings-v0``, ``Storm-v0`` and ``NoGo-v0``. The classes run :data:`magrl.envs.named.NAMED_ENVS`,
+the TorchRL environments behind the transforms of the recipes, and only convert tensors to arrays: the same seed and the
+same actions give the same bits.
 """
 
 from __future__ import annotations
