@@ -50,7 +50,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 RECIPE = "ppo_anywhere.py"
-LOSSES = ("loss_critic", "loss_actor")
+LOSSES = ("loss_critic", "loss_actor", "kl_approx", "clip_fraction", "explained_variance")
 OBSERVED = ("observation", "true_way_scaled", "highest_spl")
 TRANSITION = (
     *OBSERVED,

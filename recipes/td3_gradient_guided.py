@@ -43,6 +43,7 @@ from torchrl.modules import AdditiveGaussianModule
 
 RECIPE = "td3_gradient_guided.py"
 TRANSITION = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
+LOSSES = ("loss_critic", "loss_actor", "q_value", "learning_rate", "exploration_noise")
 ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 
 
@@ -192,7 +193,7 @@ def train(config: Config) -> dict[str, float]:
     """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
     torch.manual_seed(config.seed)
     name = f"td3_gradient_guided-{config.preset}" if config.guided else f"td3-{config.preset.removeprefix('td3-')}"
-    with Run(config, recipe=RECIPE, name=name) as run:
+    with Run(config, recipe=RECIPE, name=name, losses=LOSSES) as run:
         # Environments
         options = config.model_dump(include=ENV_OPTIONS)
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
@@ -222,12 +223,15 @@ def train(config: Config) -> dict[str, float]:
         for batch in run.batches():
             buffer.extend(batch.reshape(-1).select(*TRANSITION))
             noise.step()
+            stats.losses["exploration_noise"] = noise.sigma
+            stats.losses["learning_rate"] = torch.tensor(config.linear("learning_rate", run.remaining))
             for optimizer in (critic_optimizer, actor_optimizer):
-                optimizer.param_groups[0]["lr"] = config.linear("learning_rate", run.remaining)
+                optimizer.param_groups[0]["lr"] = stats.losses["learning_rate"].item()
             if len(buffer) < config.batch_size:
                 continue
             for transitions in buffer.sample().split(config.batch_size):
-                stats.losses["loss_critic"], _ = loss.value_loss(transitions)
+                stats.losses["loss_critic"], values = loss.value_loss(transitions)
+                stats.losses["q_value"] = values["target_value"].mean()
                 optimize(stats.losses["loss_critic"], critic_optimizer)
                 stats.updates += 1
                 if stats.updates % config.policy_delay == 0:  # delayed updates of actor and targets

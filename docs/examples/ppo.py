@@ -40,6 +40,7 @@ from torchrl.objectives.value import GAE
 
 RECIPE = "ppo.py"
 LOSSES = ("loss_critic", "loss_actor", "loss_entropy", "entropy")
+LOSSES += ("kl_approx", "clip_fraction", "explained_variance")
 NEXT = ("observation", "reward", "done", "terminated")
 TRANSITION = ("observation", "action", "action_log_prob", *(("next", k) for k in NEXT))
 

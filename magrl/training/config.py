@@ -44,7 +44,8 @@ LONGEST_KM = 4400.0
 Rising = Annotated[tuple[Positive, Positive], AfterValidator(_check_rising)]
 
 
-CHANGEABLE = ("device", "logger", "wandb_mode", "checkpoint_every", "out", "resume")
+WANDB_OPTIONS = ("wandb_entity", "wandb_group", "wandb_tags")
+CHANGEABLE = ("device", "logger", "wandb_mode", *WANDB_OPTIONS, "log_every", "checkpoint_every", "out", "resume")
 """Settings that may be edited in ``config.json`` before a run is resumed: they are not part of the training."""
 
 
@@ -72,6 +73,14 @@ class RunConfig(CheckedModel):
     """Logger of the curves, besides train.csv (docs/training.md); tensorboard needs the extra magrl[tensorboard]."""
     wandb_mode: WandbMode = "offline"
     """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
+    wandb_entity: str | None = None
+    """User or team of wandb; that of the login by default."""
+    wandb_group: str | None = None
+    """Group of runs in wandb; the name of the run without its seed by default."""
+    wandb_tags: tuple[str, ...] = ()
+    """Tags of the run in wandb."""
+    log_every: Count = 5
+    """Collected batches between points of the curves; each evaluation is a point, too."""
     checkpoint_every: NonNegative = 30.0
     """Time between checkpoints [s]."""
     scenario: Path | None = None

@@ -35,7 +35,9 @@ class TrainingStatistics:
 
     Attributes:
         frames, episodes, iterations, updates: counts since the start of the training.
-        losses: last value of each loss, by name.
+        losses: last value of each loss and diagnostic, by name.
+        first_cohort: frames after which every vehicle has ended an episode. The means before are not known: only short
+            episodes have ended.
 
     Example:
         >>> from tensordict import TensorDict
@@ -50,7 +52,8 @@ class TrainingStatistics:
     def __init__(self, window: int = 200) -> None:
         self.frames = self.episodes = self.iterations = self.updates = 0
         self.losses: dict[str, Tensor] = {}
-        keys = ("success_rate", "return", *(f"return_{term}" for term in RETURN_TERMS))
+        self.first_cohort = 0
+        keys = ("success_rate", "episode_steps", "return", *(f"return_{term}" for term in RETURN_TERMS))
         self._windows: dict[str, deque[float]] = {key: deque(maxlen=window) for key in keys}
 
     def add(self, batch: TensorDictBase) -> None:
@@ -66,15 +69,18 @@ class TrainingStatistics:
         self.frames += batch.numel()
         self.episodes += int(ended.sum())
         self._windows["success_rate"].extend((100 * after["success"][ended].double()).tolist())
+        if "elapsed_steps" in after.keys():  # noqa: SIM118 - a TensorDict
+            self._windows["episode_steps"].extend(after["elapsed_steps"][ended].tolist())
         for name in ("", *(f"_{term}" for term in RETURN_TERMS)):
             value = after.get(f"episode_reward{name}", None)
             if value is not None:
                 self._windows[f"return{name}"].extend(value[ended].tolist())
 
     def row(self) -> dict[str, float]:
-        """Return the counts, the means over the window (NaN before the first episode ends) and the losses."""
+        """Return the counts, the means over the window (NaN before they are known) and the losses."""
         counts = {key: getattr(self, key) for key in ("frames", "episodes", "updates")}
-        means = {key: sum(values) / len(values) if values else math.nan for key, values in self._windows.items()}
+        known = self.frames >= self.first_cohort
+        means = {k: sum(values) / len(values) if values and known else math.nan for k, values in self._windows.items()}
         return {**counts, **means, **{name: loss.item() for name, loss in self.losses.items()}}
 
     def state_dict(self) -> dict[str, Any]:

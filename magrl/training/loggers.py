@@ -151,6 +151,7 @@ class WandbRun(CurveLog):
         config: settings shown with the run.
         group: runs that belong together.
         tags: labels to filter runs by.
+        entity: user or team; that of the login by default.
         run_id: id of the run; an existing run is resumed.
 
     Example:
@@ -169,10 +170,11 @@ class WandbRun(CurveLog):
         group: str = "",
         tags: Sequence[str] = (),
         *,
+        entity: str | None = None,
         run_id: str = "",
     ) -> None:
         self.folder, self.run_id = folder, run_id or uuid.uuid4().hex[:8]
-        options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags)}
+        options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags), "entity": entity}
         super().__init__("wandb", None if mode == "disabled" else lambda: _wandb_logger(folder, mode, config, options))
 
     def _try(self, action: Callable[[], Any]) -> Any:
@@ -227,7 +229,7 @@ def open_log(logger: str, folder: Path, config: Mapping[str, Any], wandb_mode: s
         folder: run folder.
         config: settings shown by wandb.
         wandb_mode: ``offline``, ``online`` or ``disabled``.
-        **wandb_options: ``group``, ``tags`` and ``run_id`` of :class:`WandbRun`.
+        **wandb_options: ``group``, ``tags``, ``entity`` and ``run_id`` of :class:`WandbRun`.
 
     Raises:
         ValueError: for an unknown logger or mode, or a logger that is not installed.

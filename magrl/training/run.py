@@ -34,7 +34,7 @@ from magrl.evaluation.rollout import evaluation_rollout
 from magrl.files import write_json
 from magrl.navigators import Anywhere
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder, locked
-from magrl.training.config import CHANGEABLE, RunConfig
+from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
 from magrl.training.loggers import open_log
 
@@ -87,7 +87,7 @@ class Run:
         recipe: file name of the recipe.
         name: label of the agent, and first part of the name of the default run folder; the name of a scenario file
             and the sensors' noise are added to it.
-        losses: names of the losses that the loop puts into ``run.statistics.losses``.
+        losses: names of the losses and diagnostics that the loop puts into ``run.statistics.losses``.
 
     Raises:
         UsageError: on entry, for a folder that is in use, or a scenario that cannot be read.
@@ -195,6 +195,7 @@ class Run:
         """
         self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
         self._network = policy.actor if isinstance(policy, FieldPolicy) else policy
+        self.statistics.first_cohort = env.num_envs * env.max_steps * len(getattr(collector, "procs", (1,)))
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
         parts = {"configuration": self, **parts}  # restored first
         parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}
@@ -214,10 +215,11 @@ class Run:
 
     def _make_log(self, resumed: bool) -> RunLog:
         terms = ("return", *(f"return_{term}" for term in RETURN_TERMS))
-        columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", *self.losses)
+        columns = ("frames", "episodes", "updates", "seconds", *terms, "success_rate", "episode_steps", *self.losses)
         columns += tuple(f"eval_{key}" for key in EVALUATED)
         opened = self.config.logger, self.folder, self.settings, self.config.wandb_mode
-        labeled = partial(open_log, *opened, group=self.name, tags=(self.name,))
+        entity, group, tags = (getattr(self.config, name) for name in WANDB_OPTIONS)
+        labeled = partial(open_log, *opened, group=group or self.name, tags=(self.name, *tags), entity=entity)
         return RunLog(self.folder, columns, labeled, resumed=resumed, began=self._began)
 
     @property
@@ -247,6 +249,8 @@ class Run:
                 self._check_weights()
                 if self.complete or self.statistics.iterations % self.config.eval_every == 0:
                     progress.set_postfix_str(self._evaluate())
+                elif self.statistics.iterations % self.config.log_every == 0:
+                    self.log.row(self.statistics.row() | {"seconds": self.log.seconds})
                 progress.update(getattr(self.statistics, counted) - progress.n)
                 stopped = self.stop.exit_code is not None
                 if not self.complete and (stopped or time.perf_counter() - saved >= self.config.checkpoint_every):
@@ -350,4 +354,5 @@ def passes_paper(row: dict[str, float]) -> bool:
         True
     """
     published = paper.TABLE_2["gg_td3"]
-    return row["eval_success_rate"] >= published.success_rate and row["eval_spl"] >= round(published.spl, 1)
+    rate, spl = (row.get(f"eval_{name}", 0.0) for name in ("success_rate", "spl"))
+    return rate >= published.success_rate and spl >= round(published.spl, 1)
