@@ -73,9 +73,9 @@ class RunConfig(CheckedModel):
     """Logger of the curves, besides train.csv (docs/training.md); tensorboard needs the extra magrl[tensorboard]."""
     wandb_mode: WandbMode = "offline"
     """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
-    wandb_entity: str | None = None
+    wandb_entity: str = ""
     """User or team of wandb; that of the login by default."""
-    wandb_group: str | None = None
+    wandb_group: str = ""
     """Group of runs in wandb; the name of the run without its seed by default."""
     wandb_tags: tuple[str, ...] = ()
     """Tags of the run in wandb."""

@@ -170,11 +170,11 @@ class WandbRun(CurveLog):
         group: str = "",
         tags: Sequence[str] = (),
         *,
-        entity: str | None = None,
+        entity: str = "",
         run_id: str = "",
     ) -> None:
         self.folder, self.run_id = folder, run_id or uuid.uuid4().hex[:8]
-        options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags), "entity": entity}
+        options = {"id": self.run_id, "resume": "allow", "group": group, "tags": list(tags), "entity": entity or None}
         super().__init__("wandb", None if mode == "disabled" else lambda: _wandb_logger(folder, mode, config, options))
 
     def _try(self, action: Callable[[], Any]) -> Any:

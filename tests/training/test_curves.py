@@ -29,6 +29,9 @@ def test_statistics_count_ended_episodes_only() -> None:
         "episode_reward_proximity": [9.0, -100.0, -50.0],
     }
     statistics.add(steps([False, True, True], [False, True, False], **sums))
+    statistics.first_cohort = statistics.frames + 1
+    assert math.isnan(statistics.row()["return"]), "only short episodes have ended"
+    statistics.first_cohort = 0
     statistics.losses["loss_critic"] = torch.tensor(0.25)
     row = statistics.row()
     assert (row["frames"], row["episodes"], row["updates"], statistics.iterations) == (3, 2, 0, 1)

@@ -34,7 +34,7 @@ def in_run(config: RunConfig) -> Run:
 
 def train(folder: Path, width: int = 1, **options: object) -> None:
     """A training whose agent flies at random and learns nothing."""
-    options = {"total_frames": 12, "eval_every": 2, "eval_tasks_small": 2, "eval_tasks": 2} | options
+    options = {"total_frames": 12, "eval_every": 2, "log_every": 2, "eval_tasks_small": 2, "eval_tasks": 2} | options
     with in_run(RunConfig(out=folder, wandb_mode="disabled", **options)) as run:
         torch.manual_seed(run.config.seed)
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=2, seed=0, max_steps=2)
