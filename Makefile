@@ -68,11 +68,9 @@ RUNS_table-paper-run := $(WHOLE)
 RUNS_table-sequences := $(MEMORY)
 RUNS_figure-learning-return := $(GUIDED) $(PLAIN)
 RUNS_figure-learning-success := $(GUIDED) $(PLAIN)
-RUNS_figure-learning-spl := $(GUIDED) $(PLAIN)
-RUNS_figure-noise := $(NOISY)
 RUNS_figure-paper-run := $(WHOLE)
 TABLES ?= $(shell sed -n 's/^\[\([a-z0-9_-]*\)\]$$/\1/p' recipes/tables/tables.toml)
-FIGURES ?= place-error section-4 noise conditions globe two-elements prices reliability $(shell sed -n 's/^\[curves\.\([a-z-]*\)\]$$/\1/p' recipes/tables/figures.toml)
+FIGURES ?= place-error section-4 conditions globe two-elements reliability $(shell sed -n 's/^\[curves\.\([a-z-]*\)\]$$/\1/p' recipes/tables/figures.toml)
 
 tables: $(TABLES:%=table-%)  ## make the tables of the documentation, all or TABLES="earth noise"; hours with all trainings
 	$(RECIPE)/tables/publish.py README.md $(wildcard docs/*.md)

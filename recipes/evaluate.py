@@ -87,7 +87,7 @@ class Config(ScenarioOptions):
     errors: Noise | str | None = None
     """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
     vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, phone, or a file (.toml or .json,
-    docs/conditions.md); by default the noise of the runs, or 0."""
+    docs/results.md); by default the noise of the runs, or 0."""
     north: Literal["true", "magnetic"] = "true"
     """North of the vehicles: true (they measure D), or magnetic (a compass; they measure I and B_H alone). A boat, a
     drone and a phone have a compass in any case."""

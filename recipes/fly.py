@@ -64,7 +64,7 @@ class Config:
     errors: tuple[float, float, float] | str = (0.0, 0.0, 0.0)
     """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
     vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, phone, or a file (.toml or .json,
-    docs/conditions.md)."""
+    docs/results.md)."""
     north: Literal["true", "magnetic"] = "true"
     """North of the vehicle: true (it measures D), or magnetic (a compass: it measures I and B_H alone). A boat, a drone
     and a phone have a compass in any case."""

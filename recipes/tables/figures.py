@@ -1,12 +1,11 @@
 """Draw the figures of the documentation.
 
-    python recipes/tables/figures.py section-4 learning-spl       # from runs of evaluations and trainings
+    python recipes/tables/figures.py section-4 learning-return    # from runs of evaluations and trainings
     python recipes/tables/figures.py conditions globe --out runs  # from new flights; five minutes and one minute
 
 From new flights: place-error (dead reckoning against the belief of the place), conditions (the cost of each error
-alone), globe (a map of the Earth), noise (SPL over the noise, in
-the paper's box), prices (SPL over steps), reliability (of stated probabilities). From runs: section-4 (field contours
-4-1, trajectories 4-4, convergence 4-5, box plots 4-6), and the learning curves of figures.toml.
+alone), globe (a map of the Earth), reliability (of stated probabilities). From runs: section-4 (field contours 4-1,
+trajectories 4-4, convergence 4-5, box plots 4-6), and the learning curves of figures.toml.
 """
 
 from __future__ import annotations
@@ -98,17 +97,6 @@ def curves(name: str) -> Figures:
 # From new flights
 
 
-def noise(tasks: int | None = None) -> Figures:
-    """Return SPL over the noise, from the flights of table noise."""
-    options = declared()["noise"] | ({"tasks": tasks} if tasks else {})
-    flights = Flights.of(**{key: value for key, value in options.items() if key not in ("kind", "navigators")})
-    levels = {
-        name: {pilot.partition("=")[0]: flights.summaries(pilot, errors) for pilot in options["navigators"]}
-        for name, errors in flights.errors.items()
-    }
-    return {"figures/noise": plots.noise_figure(levels)}
-
-
 def look(navigator: str) -> dict[str, Any]:
     """Return color, marker and label of a navigator in panels."""
     color, marker = LOOKS[navigator]
@@ -150,22 +138,6 @@ def globe(tasks: int = 10_000) -> Figures:
     """Return the map of the tasks of table globe, with perfect sensors."""
     ends = earth_tasks(tasks)
     return {"figures/globe": globe_map(ends, measured("anywhere", ends, NO_NOISE))}
-
-
-def prices(tasks: int = 1000) -> Figures:
-    """Return SPL over the steps, a panel for each level of noise, a point for each price of a step."""
-    flights, figure = Flights(tasks=tasks), Figure(figsize=(9, 3.2), layout="constrained")
-    panels = figure.subplots(1, len(flights.errors), sharex=True, sharey=True)
-    for (title, errors), axes in zip(tqdm(flights.errors.items(), unit="level"), panels, strict=True):
-        for name in ("anywhere", "kalman"):
-            pilots = [{"name": name, "step_price": price} for price in (0.1, 0.5, 2.0, 8.0, 30.0)]
-            points = [flights.summaries(pilot, errors)[0] for pilot in pilots]
-            axes.plot([point["steps"] for point in points], [point["spl"] for point in points], **look(name))
-        axes.set(title=title, xlabel="steps")
-        axes.grid(alpha=0.3)
-    panels[0].set_ylabel("SPL [%]")
-    panels[0].legend()
-    return {"figures/prices": figure}
 
 
 def reliability_diagram(tasks: int = 2000) -> Figures:
@@ -215,11 +187,9 @@ def place_error(tasks: int = 64) -> Figures:
 FIGURES: Mapping[str, Callable[..., Figures]] = {
     "place-error": place_error,
     "section-4": section_4,
-    "noise": noise,
     "conditions": conditions,
     "globe": globe,
     "two-elements": lambda: {"figures/two-elements": two_elements_map()},
-    "prices": prices,
     "reliability": reliability_diagram,
 }
 
@@ -229,8 +199,8 @@ def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = Non
 
     Args:
         figures: Names of figures.
-        tasks: Number of tasks of new flights; by default 200 for conditions, 10 000 for globe, 2000 for reliability,
-            and 1000 otherwise.
+        tasks: Number of tasks of new flights; by default 64 for place-error, 200 for conditions, 10 000 for globe, and
+            2000 for reliability.
         out: Folder of the folders figures and results; files of the same name are replaced.
 
     Raises:

@@ -26,7 +26,7 @@ Spec = str | Mapping[str, Any]
 """Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
 MEASURES = ("success_rate", "spl")
 """Measures in a cell of a table."""
-OWN_OPTIONS = ("north", "known_start", "confidence", "model", "start_km", "rules")
+OWN_OPTIONS = ("north", "confidence", "model", "start_km", "rules")
 """Options of flights that a navigator may have by itself."""
 
 
@@ -158,12 +158,11 @@ def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
 def names(navigator: Spec) -> list[str]:
     """Return the label of a navigator, with its options, what it was trained on, and what it is given.
 
-    A start that is known exactly has no numbers. What a vehicle knows of the Earth and its start is what it is given.
+    What a vehicle knows of the Earth and its start is what it is given.
     """
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
     text, trained, given = about(options.pop("name").partition("=")[0])
     model, start_km, _ = (options.pop(key, None) for key in ("model", "start_km", "rules"))
     told = [*([model] if model else []), *([f"start ± {start_km:g} km"] if start_km is not None else [])]
-    shown = {key: "" if value == [0.0, 0.0, 0.0] else value for key, value in options.items()}
-    label = ", ".join([text, *(f"{key.replace('_', ' ')} {value}".strip() for key, value in shown.items())])
+    label = ", ".join([text, *(f"{key.replace('_', ' ')} {value}" for key, value in options.items())])
     return [label, trained, " and ".join(told) or given]

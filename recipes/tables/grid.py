@@ -1,8 +1,8 @@
 """Make the tables that recipes/tables/tables.toml declares: navigators by errors, tasks and runs.
 
-    python recipes/tables/grid.py earth conditions --out docs/results        # writes earth.md, earth.csv.gz, ...
-    python recipes/tables/grid.py earth --navigators mine.onnx  # the same table of other navigators
-    python recipes/tables/grid.py earth --tasks 200                          # faster
+    python recipes/tables/grid.py earth known --out docs/results  # writes earth.md, earth.csv.gz, ...
+    python recipes/tables/grid.py earth --navigators mine.onnx    # the same table of other navigators
+    python recipes/tables/grid.py earth --tasks 200               # faster
 
 Without --out, tables are printed. Navigators are given the accuracy of their sensors. Tables of trained agents read
 the run folders that they name; `make tables` trains what is missing.

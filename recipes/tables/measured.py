@@ -1,10 +1,11 @@
 """Make the table of a measured field: does the destination lie where a vehicle on a recorded track states it?
 
-    python recipes/tables/measured.py swarm.csv --out docs/results
+    python recipes/tables/measured.py LOG.csv --out docs/results
 
-The log is one of recipes/replay_log.py with positions and their `altitude_km`. Each piece of the track is a
-flight from its first row to its last. The vehicle reads D, I, B_H of the log with white noise. The destination's
-elements, and those of a known start, are of the log, as from a survey, or of IGRF at its altitude.
+The log is one of recipes/replay_log.py with positions and their `altitude_km`; docs/results.md says which one the
+published table has. Each piece of the track is a flight from its first row to its last. The vehicle reads D, I, B_H of
+the log with white noise. The destination's elements, and those of a known start, are of the log, as from a survey, or
+of IGRF at its altitude.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from magrl.vehicle.onboard.known import MODEL_STD
 
 import torch
 import tyro
-from matplotlib.figure import Figure
 from torch import Tensor
 
 RECIPE = "measured.py"
@@ -65,7 +65,7 @@ def pieces(track: Track, low_km: float, high_km: float) -> Tensor:
 
 def flown(track: Track, rows: Tensor, noise: Tensor, target: Tensor, start: Tensor | None, range_km: float) -> Tensor:
     """Return for each reading ``(P, T - 1)`` the stated probability of the region whose border is at the destination,
-    the error of the estimated way and the distance left [km], ``(P, T - 1, 3)``.
+    and the error of the estimated way [km], ``(P, T - 1, 2)``.
 
     A region holds all places that are more probable than those on its border, so that it is right if the first is
     uniform from 0 to 1.
@@ -97,21 +97,19 @@ def flown(track: Track, rows: Tensor, noise: Tensor, target: Tensor, start: Tens
         true = left.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
         density = [log_density(goal, points.double()) for points in (places.points, true.unsqueeze(-2))]
         inside = (places.weights * (density[0] > density[1])).sum(-1)
-        found.append(torch.stack((inside.double(), (places.way().displacement - true).norm(dim=-1), left), -1))
+        found.append(torch.stack((inside.double(), (places.way().displacement - true).norm(dim=-1)), -1))
     return torch.stack(found, 1)
 
 
-def cells(
-    track: Track, length: tuple[float, float], noise: Tensor, source: str, start: bool
-) -> tuple[list[str], Tensor]:
-    """Return coverage and errors of all pieces of a length as text, and what they are made of."""
+def cells(track: Track, length: tuple[float, float], noise: Tensor, source: str, start: bool) -> list[str]:
+    """Return coverage and errors of all pieces of a length as text."""
     rows, elements = pieces(track, *length), track.field if source == "measured" else track.model
     first = elements[rows[:, 0]] if start else None
     result = flown(track, rows, noise, elements[rows[:, -1]], first, RANGE_KM[length])
-    inside, error, left = result.unbind(-1)
+    inside, error = result.unbind(-1)
     covered = [f"{100 * (inside <= p).double().mean():.0f}" for p in PROBABILITIES]
     halfway = error[:, rows.shape[1] // 2].median()
-    return [*covered, f"{halfway:.0f}", f"{error[:, -1].median():.0f}"], torch.stack((left, error), -1)
+    return [*covered, f"{halfway:.0f}", f"{error[:, -1].median():.0f}"]
 
 
 def make(
@@ -121,34 +119,24 @@ def make(
     date: str | None = None,
     out: Path | None = None,
 ) -> None:
-    """Print the table, or write it and its figure.
+    """Print the table, or write it.
 
     Args:
         log: Log with positions and altitudes.
         noise: White noise that is added to D [deg], I [deg], B_H [nT].
         date: Date of IGRF; by default that of the log.
-        out: Folder of measured.md and of figures/measured.png.
+        out: Folder of measured.md.
     """
     track, std, table = read_track(log, date), torch.tensor(noise).double(), []
-    figure = Figure(figsize=(9, 3.4), layout="constrained")
-    panels = dict(zip(RANGE_KM, figure.subplots(1, 2), strict=True))
-    for length, axes in panels.items():
-        for source, start in itertools.product(("measured", "IGRF"), (False, True)):
-            texts, drawn = cells(track, length, std, source, start)
-            known_or_not = "known" if start else "not known"
-            table.append(["{:g}–{:g} km".format(*length), source, known_or_not, *texts])
-            left, error = drawn.median(0).values.T
-            axes.plot(left, error, "-o", ms=3, label=f"destination {source}, start {known_or_not}")
-        axes.set(xlabel="distance left [km]", title="{:g}–{:g} km".format(*length), yscale="log")
-        axes.set_ylabel("median error of the way [km]")
-    panels[next(iter(panels))].legend(fontsize=7)
+    for length, source, start in itertools.product(RANGE_KM, ("measured", "IGRF"), (False, True)):
+        texts = cells(track, length, std, source, start)
+        table.append(["{:g}–{:g} km".format(*length), source, "known" if start else "not known", *texts])
     heads = [*(f"in the {100 * p:.0f} % region, %" for p in PROBABILITIES), "error halfway, km", "error at the end, km"]
     text = markdown_table(["distance", "destination", "start", *heads], table)
     if out is None:
         print(text)
         return
     (out / "measured.md").write_text(text.rstrip() + "\n")
-    figure.savefig(out.parent / "figures" / "measured.png", dpi=110)
 
 
 if __name__ == "__main__":

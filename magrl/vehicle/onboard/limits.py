@@ -36,7 +36,7 @@ DISTURBANCE_NT = 2000.0
 _SLACK_DEG = 1.0  # of an inclination
 _SIGMAS = 8.0  # of the noise of a difference
 LEAST_NT = 2000.0
-"""Least B_H for an agent without a map: below, it fails more often (docs/earth.md, the whole globe) [nT]."""
+"""Least B_H for an agent without a map: below, it fails more often (docs/results.md, the whole globe) [nT]."""
 STUCK_KM = (100.0, 400.0)
 """Path without a change of any element, and of one element, after which a sensor counts as stuck, but at least 2 and 8
 of the longest moves [km]. Coarse readings of one element can stay equal that long; chosen."""
