@@ -10,11 +10,15 @@ the run folders that they name; `make tables` trains what is missing.
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +29,7 @@ from magrl.evaluation.tables import ABOUT, markdown_table
 from magrl.files import check_writable, read_document
 from magrl.training import UsageError, command
 
+import torch
 import tyro
 from pandas import read_csv
 from tqdm import tqdm
@@ -34,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from evaluate import Config, evaluate
 
 import globe
-from flights import MEASURES, Flights, Spec, Table, cell, names, paired_difference, runs_of
+from flights import MEASURES, Flights, Measures, Spec, Table, cell, names, paired_difference, runs_of
 
 RECIPE = "grid.py"
 FILE, RUNS = Path(__file__).parent / "tables.toml", Path("runs")
@@ -45,6 +50,7 @@ def flights(
     *,
     against: Sequence[Spec] = (),
     measures: Sequence[str] = MEASURES,
+    jobs: int = 1,
     **options: Any,
 ) -> Table:
     """Return a row for each navigator, and a column for each level of noise, or each of some conditions.
@@ -61,9 +67,10 @@ def flights(
         label, _, given = names(navigator)
         return f"{label} ({given})" if labels.count(label) > 1 else label
 
-    for navigator in tqdm(navigators, unit="row"):
+    cells = mapped(partial(episodes_of, options), list(itertools.product(navigators, made.errors)), jobs)
+    for navigator in navigators:
         name = title(navigator)
-        episodes = {level: made.episodes(navigator, errors) for level, errors in made.errors.items()}
+        episodes = {level: next(cells) for level in made.errors}
         spl[name] = [runs[0]["spl"] for runs in episodes.values()]
         rows.append([*names(navigator), *(cell(runs, measures) for runs in episodes.values())])
         for level, runs in episodes.items():
@@ -74,6 +81,21 @@ def flights(
         differences = (paired_difference(*pair, region) for pair in zip(spl[first], spl[other], strict=True))
         rows.append([f"{first} − {other}, SPL", "—", "—", *differences])
     return Table(markdown_table([*ABOUT, *made.errors], rows), tables)
+
+
+def episodes_of(options: Mapping[str, Any], chosen: tuple[Spec, str]) -> list[Measures]:
+    """Return the episodes of a navigator at one level of errors, once for each run."""
+    (navigator, level), made = chosen, Flights.of(**options)
+    return made.episodes(navigator, made.errors[level])
+
+
+def mapped(function: Callable[[Any], Any], values: Sequence[Any], jobs: int) -> Iterator[Any]:
+    """Yield the results of a function in the order of its values, in some processes of one thread each."""
+    if jobs == 1:
+        yield from tqdm(map(function, values), total=len(values), unit="cell")
+        return
+    with ProcessPoolExecutor(jobs, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        yield from tqdm(pool.map(function, values), total=len(values), unit="cell")
 
 
 def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> Table:
@@ -102,6 +124,7 @@ def make(
     navigators: tuple[str, ...] | None = None,
     tasks: int | None = None,
     confidence: float | None = None,
+    jobs: int | None = None,
     out: Path | None = None,
 ) -> None:
     """Make tables.
@@ -111,12 +134,13 @@ def make(
         navigators: Navigators in place of those of the table, as in recipes/evaluate.py.
         tasks: Number of tasks in place of that of the table.
         confidence: Minimum probability at which vehicles declare their arrival; 0 by default.
+        jobs: Processes that fly, with one thread each; of tables of the kind flights.
         out: Folder of the tables and their episodes, which are replaced; by default tables are printed.
 
     Raises:
         UsageError: for a table, a navigator or an option that is wrong, or a run that is missing.
     """
-    specs, changes = declared(), {"navigators": navigators, "tasks": tasks, "confidence": confidence}
+    specs, changes = declared(), {"navigators": navigators, "tasks": tasks, "confidence": confidence, "jobs": jobs}
     changes = {key: value for key, value in changes.items() if value is not None}
     if unknown := [name for name in tables if name not in specs]:
         raise UsageError(f"{FILE} declares no table {', '.join(unknown)}: choose from {', '.join(specs)}")
