@@ -12,11 +12,11 @@ import magrl  # noqa: E402 - this tree, not an installed version
 
 project, author, version = "magrl", "The magrl developers", magrl.__version__
 project_copyright = author
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.apidoc", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 
 linked = re.findall(r"\((results/[\w-]+\.md)\)", "".join(page.read_text() for page in ROOT.glob("docs/*.md")))
 tables = {f"results/{path.name}" for path in ROOT.glob("docs/results/*.md")}
-exclude_patterns = [*sorted(tables - set(linked)), "api/modules.rst"]  # tables inside pages; a second list of modules
+exclude_patterns = sorted(tables - set(linked))  # tables inside pages
 
 html_theme = "furo"
 html_title = f"magrl {version}"
@@ -28,11 +28,8 @@ nb_execution_mode, nb_execution_timeout = "force", 600  # a cell [s]
 nb_execution_raise_on_error = nb_execution_in_temp = nb_merge_streams = True
 nb_output_stderr = "remove"  # warnings and logs of libraries
 
-apidoc_modules = [{"path": "../magrl", "destination": "api", "separate_modules": True, "max_depth": 1}]
-apidoc_options = ["members", "show-inheritance"]
 autodoc_mock_imports = ["stable_baselines3"]
 autodoc_default_options = {"ignore-module-all": True}  # describe a name only where it is defined
-apidoc_module_first = True
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False  # do not repeat TorchRL's docstrings
 napoleon_google_docstring = True
