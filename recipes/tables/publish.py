@@ -29,12 +29,16 @@ def selected(table: str, columns: str | None) -> str:
     if columns is None:
         return table
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
-    heads, _, cells = zip(*([part.strip() for part in column.partition("=")] for column in columns.split("|")), strict=True)
+    heads, _, cells = zip(
+        *([part.strip() for part in column.partition("=")] for column in columns.split("|")), strict=True
+    )
     if missing := [head for head in heads if head not in rows[0]]:
         raise UsageError(f"the table has no column {', '.join(missing)}: choose from {', '.join(rows[0])}")
     places = [rows[0].index(head) for head in heads]
     kept = {place: wanted.split(" or ") for place, wanted in zip(places, cells, strict=True) if wanted}
-    if missing := [cell for place, wanted in kept.items() for cell in wanted if cell not in {row[place] for row in rows}]:
+    if missing := [
+        cell for place, wanted in kept.items() for cell in wanted if cell not in {row[place] for row in rows}
+    ]:
         raise UsageError(f"the table has no row {', '.join(missing)}")
     body = [row for row in rows[2:] if all(row[place] in wanted for place, wanted in kept.items())]
     return markdown_table(list(heads), [[row[place] for place in places] for row in body])

@@ -7,7 +7,6 @@ import importlib.util
 import inspect
 import io
 import json
-import math
 import re
 import runpy
 import shlex
@@ -17,16 +16,13 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
-import torch
 from support.recipes import load
-from torchrl.data import Binary, Bounded, Composite
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.data import Composite
 
 import magrl
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario
-from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading
 
 publish = load("tables/publish")
 ROOT = Path(__file__).parent.parent.parent
@@ -37,7 +33,10 @@ NOTEBOOK = ROOT / "docs" / "tutorial.ipynb"
 CELLS = json.loads(NOTEBOOK.read_text())["cells"]
 BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
-SCRIPTS = [ROOT / "docs" / "examples" / name for name in ("ddpg_anywhere.py", "turns.py", "onnx_step.py")]
+SCRIPTS = [
+    ROOT / "docs" / "examples" / name
+    for name in ("ddpg_anywhere.py", "navigator.py", "sac.py", "sb3_anywhere.py", "turns.py", "onnx_step.py")
+]
 EXAMPLES += [(path, path.read_text()) for path in SCRIPTS]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
 BUDGET = {
@@ -46,7 +45,8 @@ BUDGET = {
     "= 400_000, 500": "= 256, 4",
     "num_envs=512, ": "num_envs=8, ",
     '"batch_size": 2048': '"batch_size": 256',
-    '"sac.onnx", "test-1000"': '"sac.onnx", "figure-4-1"',
+    'onnx", "test-1000"': 'onnx", "figure-4-1"',
+    "learn(200_000)": "learn(8192)",
     "= 100_000, 1024, 1000": "= 128, 4, 2",
     "earth_scenario(64, ": "earth_scenario(2, max_steps=5, ",
     "earth_scenario(128, ": "earth_scenario(2, max_steps=5, ",
