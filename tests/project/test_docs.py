@@ -171,6 +171,14 @@ def test_tables_are_those_that_were_measured(page: Path) -> None:
         assert len(set(lines)) == len(lines), f"{name} has a row twice"
 
 
+def test_a_page_may_show_some_rows() -> None:
+    table = "| name | SPL % |\n|---|---|\n| secant | 99.0 |\n| kalman | 98.0 |\n| geodesic | 100.0 |"
+    rows = publish.selected(table, "SPL % | name = kalman or geodesic").splitlines()
+    assert rows == ["| SPL % | name |", "|---|---|", "| 98.0 | kalman |", "| 100.0 | geodesic |"]
+    with pytest.raises(publish.UsageError, match="no row mars"):
+        publish.selected(table, "name = mars or kalman")
+
+
 def test_the_verdict_of_the_reproduction_has_the_numbers_that_were_measured() -> None:
     results = publish.selected((ROOT / "docs/results/paper-run.md").read_text(), "navigator | SR % | SPL % | TNT steps")
     lines = TEXTS[ROOT / "docs/reproduction.md"].partition("| steps |\n")[2].splitlines()[1:5]
