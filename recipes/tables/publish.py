@@ -4,6 +4,7 @@
 
 A document marks the place and the file of a table by `<!-- table: docs/results/NAME.md -->` and `<!-- end -->`. Names
 of columns after the file, as in `<!-- table: docs/results/NAME.md | navigator | SPL % -->`, leave out the others.
+`| navigator = secant or Kalman |` also leaves out the rows whose cell in that column is another one.
 """
 
 from __future__ import annotations
@@ -23,16 +24,24 @@ def selected(table: str, columns: str | None) -> str:
     """Return some columns of a table, by their headings with ``|`` between them; without any, the whole table.
 
     Raises:
-        UsageError: for a heading that the table lacks.
+        UsageError: for a heading or a cell that the table lacks.
     """
     if columns is None:
         return table
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
-    heads = [head.strip() for head in columns.split("|")]
+    heads, _, cells = zip(
+        *([part.strip() for part in column.partition("=")] for column in columns.split("|")), strict=True
+    )
     if missing := [head for head in heads if head not in rows[0]]:
         raise UsageError(f"the table has no column {', '.join(missing)}: choose from {', '.join(rows[0])}")
-    chosen = [[row[rows[0].index(head)] for head in heads] for row in rows]
-    return markdown_table(chosen[0], chosen[2:])
+    places = [rows[0].index(head) for head in heads]
+    kept = {place: wanted.split(" or ") for place, wanted in zip(places, cells, strict=True) if wanted}
+    if missing := [
+        cell for place, wanted in kept.items() for cell in wanted if cell not in {row[place] for row in rows}
+    ]:
+        raise UsageError(f"the table has no row {', '.join(missing)}")
+    body = [row for row in rows[2:] if all(row[place] in wanted for place, wanted in kept.items())]
+    return markdown_table(list(heads), [[row[place] for place in places] for row in body])
 
 
 def publish(documents: Sequence[Path], root: Path = Path()) -> None:
