@@ -94,6 +94,15 @@ def _expanded_igrf(box: Region, date: datetime.datetime, generation: int, altitu
     return field
 
 
+@lru_cache(maxsize=8)
+def _mean_changes(field: FieldModel | FieldBank, region: Regions) -> Tensor:
+    """Return the mean change of each element over :data:`FLOOR_KM` in each region ``(K, 3)``; kept, as it takes most of
+    the time in which an environment over many regions is made."""
+    index = torch.arange(len(region)).reshape(-1, 1, 1)
+    slopes = elements_gradient_at(field, region.grid(21), index).norm(dim=-1)
+    return FLOOR_KM * slopes.flatten(1, 2).mean(1)
+
+
 class Scenario(CheckedModel):
     """Where tasks lie, the field there, and how far apart their ends are; by default those of the paper.
 
@@ -255,9 +264,7 @@ class Scenario(CheckedModel):
         count = len(self.region)
         if self.objective_floors is not None:
             return torch.tensor(self.objective_floors, dtype=torch.float64).repeat(count, 1)
-        index = torch.arange(count).reshape(-1, 1, 1)
-        slopes = elements_gradient_at(field, self.region.grid(21), index).norm(dim=-1)
-        return FLOOR_KM * slopes.flatten(1, 2).mean(1)
+        return _mean_changes(field, self.region).clone()
 
     def random_tasks(self, num_tasks: int, seed: int) -> Tasks:
         """Return a frozen set of random tasks, see :func:`magrl.envs.tasks.task_set`."""

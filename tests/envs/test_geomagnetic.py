@@ -369,6 +369,13 @@ def test_partial_reset_leaves_the_others_as_they_were(mask: list[int]) -> None:
     assert step["elapsed_steps"].flatten().tolist() == [1 if m else 4 for m in mask]
 
 
+def test_starts_computed_ahead_are_dropped_by_a_move() -> None:
+    env = make(2)
+    env.reset(env.reset().set("_reset", torch.tensor([[False], [True]])))
+    assert env._ahead is not None
+    assert env.to("cpu:0")._ahead is None
+
+
 def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
     mask = torch.tensor([True, False, True])
     for env in (make(3), navigation_env(3)):  # TorchRL hides the merge from an environment under transforms

@@ -62,7 +62,7 @@ class MagneticNorth(ReadingErrors):
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys that a step reads from the TensorDict before it."""
-        return [*super().state_keys, *self.true_keys[1:]]
+        return [self.numbers_key, self.stream_key, *self.true_keys[1:]]
 
     def _constants(self, stream: Tensor) -> Tensor:
         return torch.zeros_like(stream.unsqueeze(-1), dtype=torch.get_default_dtype())

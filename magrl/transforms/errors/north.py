@@ -118,7 +118,7 @@ class NorthReferenceError(ReadingErrors):
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys that a step reads from the TensorDict before it."""
-        return [*super().state_keys, self.true_keys[1]]
+        return [self.numbers_key, self.stream_key, self.true_keys[1]]
 
     def _constants(self, stream: Tensor) -> Tensor:
         normal = stream_normal(stream, 1).to(torch.get_default_dtype())

@@ -39,6 +39,16 @@ def test_errors_are_those_of_the_seeds_and_of_each_vehicle() -> None:
     assert_same(env.reset(), three[0])
 
 
+def test_a_step_with_all_errors_traces_as_one_graph() -> None:
+    env = all_errors(2)
+    state = env.rand_action(env.reset())
+
+    def step(before: TensorDict) -> TensorDict:
+        return env.transform._step(before, env.base_env._step(before))
+
+    assert_same(torch.compile(step, fullgraph=True, backend="eager")(state), step(state))
+
+
 def test_numbers_are_those_of_the_counters() -> None:
     env = under(SensorErrors(STD, seed=7), num_envs=3)
     for episode in range(2):
