@@ -38,7 +38,9 @@ def test_batches_have_errors_of_their_own_that_repeat() -> None:
     tasks = named_tasks("figure-4-1")
     thrice = Scenario().with_tasks(Tasks(tasks.start.repeat(3, 1), tasks.target.repeat(3, 1)))
     for options in ({"errors": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
-        one, again = (evaluate("secant", thrice, num_envs=1, max_steps=5, **options)["smoothness_deg"] for _ in range(2))
+        one, again = (
+            evaluate("secant", thrice, num_envs=1, max_steps=5, **options)["smoothness_deg"] for _ in range(2)
+        )
         assert torch.equal(one, again)
         assert one.unique().numel() == 3
     perfect = evaluate("secant", thrice, num_envs=1, max_steps=5)
