@@ -48,7 +48,7 @@ def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distanc
 
 @pytest.mark.usefixtures("without_figure")
 def test_a_vehicle_without_a_signal_declares_its_arrival(tmp_path: Path) -> None:
-    config = recipe.Config("60.4N 5.3E", "60.2N 1.1W", errors="ship", navigator="secant", out=tmp_path)
+    config = recipe.Config("60.4N 5.3E", "60.2N 3.3E", errors="ship", navigator="secant", out=tmp_path)
     alone, calibrated = (
         recipe.fly(replace(config, known_start=known))["without_signal"] for known in (None, (0.0, 0.0, 0.0))
     )
