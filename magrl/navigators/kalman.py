@@ -36,7 +36,7 @@ class Kalman(Navigator):
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> bool(env.rollout(50, Kalman(), break_when_any_done=False)["next", "success"].any(1).all())
+        >>> bool(env.rollout(15, Kalman(), break_when_any_done=False)["next", "success"].any(1).all())
         True
     """
 

@@ -124,16 +124,21 @@ class MinMaxNorm(ObservationTransform):
     def set_container(self, container: Transform | EnvBase) -> None:
         """Read the bounds that are missing from the specs of the environment that the transform is attached to."""
         super().set_container(container)
-        missing = [key for key in self._bounded_keys if getattr(self, f"low_{self._index(key)}") is None]
-        parent = self.parent if missing else None  # TorchRL builds a parent anew for each transform
+        parent = self.parent if self._missing() else None  # TorchRL builds a parent anew for each transform
         if parent is None:
             return
-        for spec in (parent.full_observation_spec, parent.full_action_spec, parent.full_state_spec):
+        for name in ("full_action_spec", "full_observation_spec", "full_state_spec"):
+            missing = self._missing()
+            spec = getattr(parent, name) if missing else Composite()  # TorchRL computes each from all transforms
             for key in missing:
                 leaf = spec[key] if key in spec.keys(True, True) else None
                 if isinstance(leaf, Bounded):
                     row = (0,) * len(parent.batch_size)
                     self._set_bounds(key, leaf.space.low[row], leaf.space.high[row])
+
+    def _missing(self) -> list[NestedKey]:
+        """Return the keys without bounds."""
+        return [key for key in self._bounded_keys if getattr(self, f"low_{self._index(key)}") is None]
 
     # Data
 

@@ -35,7 +35,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("results") / "comparison"
     texts = [f"gg_td3={run}", "secant", "pso", "afsa:flown"]
-    evaluate.main([*texts, "--tasks", "4", "--out", str(out)])
+    evaluate.main([*texts, "--tasks", "4", "--max-steps", "12", "--out", str(out)])
     return out
 
 
@@ -104,7 +104,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     config = {"scenario": path, "out": out, "wandb_mode": "disabled", "export": tracks}
     with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5 to at least 7\.5$"):
         evaluate.evaluate(evaluate.Config(("secant",), **config))
-    options = {"margin_deg": 8.0, "max_steps": 90, "max_turn_deg": 120.0, "start_heading": "random"}
+    options = {"margin_deg": 8.0, "max_steps": 20, "max_turn_deg": 120.0, "start_heading": "random"}
     own = load_scenario(path, margin_deg=8.0)
     run = make_run(
         tmp_path / "run", GeomagneticNavEnv(own), scenario="scenario.toml", zeta=0.02, start_heading="random"

@@ -41,15 +41,14 @@ def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
 @pytest.mark.usefixtures("without_figure")
 def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distance(tmp_path: Path) -> None:
     config = recipe.Config("60.4N 5.3E", "62.0N 6.8W", errors=(0.05, 0.05, 5.0), out=tmp_path)
-    first, second = recipe.fly(config), recipe.fly(config)
-    assert first == second
-    assert first["outcome"] == "arrived"
-    assert first["zeta"] == pytest.approx(0.01 * (400 / first["shortest_km"]) ** 2, rel=1e-6)
+    result = recipe.fly(config)
+    assert result["outcome"] == "arrived"
+    assert result["zeta"] == pytest.approx(0.01 * (400 / result["shortest_km"]) ** 2, rel=1e-6)
 
 
 @pytest.mark.usefixtures("without_figure")
 def test_a_vehicle_without_a_signal_declares_its_arrival(tmp_path: Path) -> None:
-    config = recipe.Config("60.4N 5.3E", "60.2N 1.1W", errors="ship", navigator="kalman", out=tmp_path)
+    config = recipe.Config("60.4N 5.3E", "60.2N 3.3E", errors="ship", navigator="secant", out=tmp_path)
     alone, calibrated = (
         recipe.fly(replace(config, known_start=known))["without_signal"] for known in (None, (0.0, 0.0, 0.0))
     )

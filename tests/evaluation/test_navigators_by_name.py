@@ -20,6 +20,7 @@ from magrl.evaluation.navigators import (
     needs,
     trained_on,
 )
+from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import NAVIGATORS
 from magrl.navigators.secant import probe_length
 from magrl.sensor_std import SensorStd
@@ -115,9 +116,9 @@ def test_a_price_of_a_step_is_an_option_of_the_agent_without_a_map() -> None:
     assert not torch.equal(first, second)
 
 
-@pytest.mark.parametrize("limits", [{"max_move_km": 10, "max_steps": 250}, {"max_turn_deg": 20}])
+@pytest.mark.parametrize("limits", [{"max_move_km": 20, "max_steps": 120}, {"max_turn_deg": 20}])
 def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment(limits: dict[str, int]) -> None:
-    episodes = evaluate("anywhere", "paper-100", start_heading="random", **limits)
+    episodes = evaluate("anywhere", first_tasks(choose_tasks(None, "paper-100"), 12), start_heading="random", **limits)
     assert episodes["success"].double().mean() >= 0.99
     assert episodes["spl"].mean() > 0.98
 

@@ -38,18 +38,15 @@ def test_batches_have_errors_of_their_own_that_repeat() -> None:
     tasks = named_tasks("figure-4-1")
     thrice = Scenario().with_tasks(Tasks(tasks.start.repeat(3, 1), tasks.target.repeat(3, 1)))
     for options in ({"errors": (0.05, 0.05, 5.0)}, {"start_heading": "random"}):
-        one, again = (evaluate("secant", thrice, num_envs=1, **options)["smoothness_deg"] for _ in range(2))
+        one, again = (
+            evaluate("secant", thrice, num_envs=1, max_steps=5, **options)["smoothness_deg"] for _ in range(2)
+        )
         assert torch.equal(one, again)
         assert one.unique().numel() == 3
-    perfect = evaluate("secant", thrice, num_envs=1)
+    perfect = evaluate("secant", thrice, num_envs=1, max_steps=5)
     torch.testing.assert_close(perfect["length_km"], perfect["length_km"][:1].expand(3))
     ship = evaluate("secant", thrice, errors="ship", max_steps=5)
     assert (ship["steps"] <= 5).all()
-
-
-def test_navigators_declare_their_arrival_where_it_must_be_declared() -> None:
-    episodes = evaluate("secant", "paper-100", arrival="declared", radius_km=40.0)
-    assert summarize(episodes)["success_rate"] > 80
 
 
 def test_a_stochastic_policy_is_evaluated_without_exploration() -> None:
@@ -94,14 +91,14 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
 def test_a_pretrained_policy_flies_as_by_its_name(options: dict) -> None:
     """Within the limits of the environment, which it gets from `evaluate`, or from a loop of one's own."""
     scenario = first_tasks(choose_tasks(None, "paper-100"), 3)
-    policy, options = Anywhere(), {"max_steps": 12, **options}
+    policy, options = Anywhere(), {"max_steps": 6, **options}
     flights = (evaluate(agent, scenario, errors=(0.05, 0.05, 5.0), **options) for agent in ("anywhere", policy))
     named, given = flights
     assert all(torch.equal(named[key], given[key]) for key in named.keys())  # noqa: SIM118
     base = GeomagneticNavEnv(scenario, num_envs=3, seed=0, **options)
     env = TransformedEnv(base, SensorErrors((0.05, 0.05, 5.0)))
     with torch.no_grad():
-        own = env.rollout(12, fitted(policy, base), break_when_any_done=False, break_when_all_done=True)
+        own = env.rollout(6, fitted(policy, base), break_when_any_done=False, break_when_all_done=True)
     assert torch.equal(episode_measures(own, env)["length_km"], named["length_km"])
 
 

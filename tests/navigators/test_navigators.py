@@ -65,8 +65,8 @@ def scrambled(state: TensorDict, keys: set[str]) -> TensorDict:
 @pytest.mark.parametrize(("noise", "spl"), [((0.0, 0.0, 0.0), 99.5), (NOISE, 95.0)])
 def test_kalman_arrives_without_a_map(noise: tuple[float, ...], spl: float) -> None:
     """From any heading, by the standard deviations that come with the readings."""
-    scenario = Scenario(tasks=task_set(60, seed=93))
-    base = GeomagneticNavEnv(scenario, num_envs=60, seed=0, start_heading="random")
+    scenario = Scenario(tasks=task_set(30, seed=93))
+    base = GeomagneticNavEnv(scenario, num_envs=30, seed=0, start_heading="random")
     summary = flown(TransformedEnv(base, SensorErrors(noise)), Kalman())
     assert summary["success_rate"] == 100
     assert summary["spl"] > spl

@@ -45,12 +45,12 @@ def test_critics_see_the_true_way_and_the_return_is_the_reward() -> None:
 
 
 def test_agents_that_declare_are_rewarded_for_right_declarations_alone() -> None:
-    env = training_env(arrival="declared", radius_km=25.0, max_steps=40)
+    env = training_env(arrival="declared", radius_km=25.0, max_steps=20)
     check_env_specs(env)
     assert env.action_spec.shape == (6, 2)
     actor = make_correcting_actor(correction_network((8,)), recipe.rules_of(env.base_env, recipe.FAST))
     assert actor.in_keys == ["observation", ("track", "plan"), "heading"]
-    td = env.rollout(40, actor, break_when_any_done=False)["next"]
+    td = env.rollout(20, actor, break_when_any_done=False)["next"]
     first = td["done"].cumsum(1) - td["done"].long() == 0
     assert ((td["declared"] & first).sum(1) == 1).all()
     right = td["success"] & first

@@ -46,7 +46,7 @@ def test_the_return_is_the_sum_of_its_terms() -> None:
 def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled, same_outcome, outcome, capsys) -> None:
     """With networks, optimizers, running episodes and the noise of their sensors; the run folder is complete."""
     whole, run = tmp_path / "whole", tmp_path / "run"
-    frames = {"steps_per_batch": 2, "total_frames": 160, "noise": NOISE, "eval_every": 3}
+    frames = {"steps_per_batch": 2, "total_frames": 96, "noise": NOISE, "eval_every": 3}
     result = module.train(small(module, whole, **frames))
     with signalled(4, signal.SIGINT), pytest.raises(SystemExit) as stop:
         module.train(small(module, run, **frames))
@@ -60,7 +60,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     files = {"config.json", "train.csv", "policy.safetensors", "eval.json", "training.png"}
     assert files <= {path.name for path in whole.iterdir()} <= files | {".lock", "trajectories.png"}
     written, config = (json.loads((whole / f"{name}.json").read_text()) for name in ("eval", "config"))
-    assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 160)
+    assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 96)
     assert written["spl"] == result["spl"]
     assert (config["recipe"], config["noise"]) == (module.RECIPE, list(NOISE))
     rows, weights = outcome(whole)

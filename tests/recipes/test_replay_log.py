@@ -46,9 +46,10 @@ def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
 
 def test_the_first_position_may_be_known(tmp_path: Path) -> None:
     """The way to the last position, or to another one, is then known from the first row on."""
-    log, date = pd.read_csv(LOG), ["--date", "2025-01-01"]
+    log, date, path = pd.read_csv(LOG)[:12], ["--date", "2025-01-01"], tmp_path / "log.csv"
+    log.to_csv(path, index=False)
     for options in ([], ["--target-position", "62.5", "1.0"]):
-        recipe.main([str(LOG), *NOISE, *date, "--start-km", "0.5", *options, "--out", str(tmp_path / "out")])
+        recipe.main([str(path), *NOISE, *date, "--start-km", "0.5", *options, "--out", str(tmp_path / "out")])
         assert pd.read_csv(tmp_path / "out" / "log.csv")["miss_km"].max() < 3
     log.drop(columns=["latitude", "longitude"]).to_csv(tmp_path / "blind.csv", index=False)
     for path, more in ((LOG, []), (tmp_path / "blind.csv", date)):

@@ -83,8 +83,7 @@ def test_a_partial_reset_begins_the_chosen_rows_alone() -> None:
     assert_equal([leaf[chosen] for leaf in found], [leaf[chosen] for leaf in begun])
 
 
-@pytest.mark.parametrize("make", [erring, declaring])
-@pytest.mark.parametrize("several", [lambda make: make(), partial(SerialEnv, 2), parallel], ids=["", "serial", "pool"])
+@pytest.mark.parametrize(("make", "several"), [(erring, partial(SerialEnv, 2)), (declaring, parallel)])
 def test_specs_hold_in_environments_of_every_kind(make, several) -> None:
     env = several(make)
     try:

@@ -612,6 +612,7 @@ def encoded(world: World, rng: random.Random) -> Iterator[Any]:
 # The command
 
 
+ADDRESSES = ("udp:99999", "/dev/none,4800", "udpin:0.0.0.0:99999", "/dev/none,fast", "")
 WORDS = ["--target", *map(str, THERE), "--noise", "0.05", "0.05", "5"]
 
 
@@ -622,8 +623,14 @@ def test_the_command_looks_up_its_destination() -> None:
     assert board._known[1][1:] == pytest.approx((0.2, 133.0), rel=1e-4)  # as a model of the core
 
 
-@pytest.mark.parametrize("address", ["udp:99999", "/dev/none,4800", "udpin:0.0.0.0:99999", "/dev/none,fast", ""])
-@pytest.mark.parametrize("extra", [[], ["--nmea"], ["--nmea", "--cruise", "5"], ["--level"], ["--altitude", "1"]])
+@pytest.mark.parametrize(
+    ("address", "extra"),
+    [
+        *((address, []) for address in ADDRESSES),
+        *((address, ["--nmea"]) for address in ADDRESSES),
+        *((ADDRESSES[0], extra) for extra in (["--nmea", "--cruise", "5"], ["--level"], ["--altitude", "1"])),
+    ],
+)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves a socket open
 def test_a_wrong_command_is_refused_in_one_line(address, extra, capsys, tmp_path) -> None:
     target = ["--target", "-11.6", "75.4", "13240"]

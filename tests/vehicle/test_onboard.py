@@ -100,10 +100,8 @@ def check(command: Command, policy: Navigator, after: TensorDictBase) -> None:
     ("name", "noise", "stated", "north"),
     [
         ("anywhere", NONE, 1.0, "true"),
-        ("secant", NOISE, 1.0, "true"),
         ("anywhere", (0.1, 0.1, 10.0), 2.5, "true"),
         ("kalman", (0.05, 0.05, 5.0), 0.4, "true"),
-        ("kalman", NOISE, 1.0, "magnetic"),
         ("secant", NOISE, 1.0, "magnetic"),
     ],
 )
@@ -205,7 +203,6 @@ def test_a_file_of_a_pilot_and_shorter_moves(tmp_path: Path) -> None:
 CODE = """
 import sys
 from magrl.vehicle.onboard import Onboard
-functions, calls, others = set(), 0, 0
 def profile(frame, event, argument):
     global calls, others
     code = frame.f_code
@@ -213,24 +210,27 @@ def profile(frame, event, argument):
         functions.add((code.co_filename, code.co_qualname))
         calls += 1
     others += "torchrl" in code.co_filename or "tensordict" in code.co_filename
-vehicle = Onboard(sys.argv[1], sensor_std=(0.02, 0.02, 2.0))
-vehicle.start((-11.6, 75.4, 13240.0))
-vehicle.step(3.5, 73.0, 15000.0, 290.0)
-vehicle.step(3.4, 73.0, 14995.0, 290.0, 20.0)
-sys.setprofile(profile)
-vehicle.step(3.3, 73.1, 14985.0, 290.0, 20.0)
-sys.setprofile(None)
-print(len(functions), calls, others, any(name in sys.modules for name in ("torchrl", "tensordict")))
+for name in ("anywhere", "kalman"):
+    functions, calls, others = set(), 0, 0
+    vehicle = Onboard(name, sensor_std=(0.02, 0.02, 2.0))
+    vehicle.start((-11.6, 75.4, 13240.0))
+    vehicle.step(3.5, 73.0, 15000.0, 290.0)
+    vehicle.step(3.4, 73.0, 14995.0, 290.0, 20.0)
+    sys.setprofile(profile)
+    vehicle.step(3.3, 73.1, 14985.0, 290.0, 20.0)
+    sys.setprofile(None)
+    print(len(functions), calls, others, any(name in sys.modules for name in ("torchrl", "tensordict")))
 """
 
 
-@pytest.mark.parametrize("name", ["anywhere", "kalman"])
-def test_a_pilot_runs_without_torchrl_in_few_calls(name: str) -> None:
-    run = subprocess.run([sys.executable, "-c", CODE, name], capture_output=True, text=True, check=True)
-    functions, calls, *others = run.stdout.split()
-    assert others == ["0", "False"]
-    assert int(functions) <= 130
-    assert int(calls) <= 800
+def test_a_pilot_runs_without_torchrl_in_few_calls() -> None:
+    run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
+    rows = [line.split() for line in run.stdout.splitlines()]
+    assert len(rows) == 2
+    for functions, calls, *others in rows:
+        assert others == ["0", "False"]
+        assert int(functions) <= 130
+        assert int(calls) <= 800
 
 
 # A known start
@@ -606,7 +606,7 @@ def test_a_stuck_sensor(held: tuple[int, ...], moves: int | None, reason: str) -
             break
 
 
-@pytest.mark.parametrize(("useless", "std"), [(0, 5.0), (1, 20.0), (2, 5000.0), (0, 1e4), (1, 1e4), (2, 1e4)])
+@pytest.mark.parametrize(("useless", "std"), [(0, 5.0), (1, 1e4), (2, 5000.0)])
 def test_an_element_that_is_stated_as_useless_never_ends_a_way(useless: int, std: float) -> None:
     """Its sensor always shows the same, even an inclination that looks like radians."""
     here = [3.5, 1.3, 30000.0] if useless == 1 else list(HERE)

@@ -69,16 +69,16 @@ def test_workers_have_noise_of_their_own() -> None:
         return {level for _ in range(3) for level in env.reset()["sensor_std"][..., 0].flatten().tolist() if level}
 
     def serial(seed: int) -> EnvBase:
-        env = SerialEnv(4, partial(anywhere_env, **options))
+        env = SerialEnv(3, partial(anywhere_env, **options))
         env.set_seed(seed)
         return env
 
     def one_by_one(seed: int) -> EnvBase:
-        return SerialEnv(4, [partial(anywhere_env, seed=seed * 4 + k, **options) for k in range(4)])
+        return SerialEnv(3, [partial(anywhere_env, seed=seed * 3 + k, **options) for k in range(3)])
 
-    for make in (serial, one_by_one, lambda seed: anywhere_env(4, seed=seed, **options)):
+    for make in (serial, one_by_one, lambda seed: anywhere_env(3, seed=seed, **options)):
         first = levels(make, 0)
-        assert len(first) >= 8  # 15 % of the 12 levels are 0
+        assert len(first) >= 6  # 15 % of the 9 levels are 0
         assert first == levels(make, 0)
         assert not first & levels(make, 1)
 
