@@ -237,7 +237,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 done.result()
     paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
     curves = concat([read_csv(path) for path in paths])
-    curves.to_csv(config.results / "scores.csv.gz", index=False)
+    curves.to_csv(config.results / "scores.csv", index=False)
     (config.results / "scores.md").write_text(table(curves))
     figure(curves).savefig(config.results / "scores.png", dpi=130)
 
