@@ -200,26 +200,29 @@ def table(curves: DataFrame) -> str:
     for task in curves["task"].unique():
         for name in bars_of(task):
             scores = bar(task, name)
-            rows.append([task, f"*{BARS[name]}*", "—", f"{scores['SR']:.1f}", f"{scores['SPL']:.1f}"])
+            rows.append([task, BARS[name], "—", f"{scores['SR']:.1f}", f"{scores['SPL']:.1f}"])
     order = list(IDS)
     rows.sort(key=lambda row: order.index(row[0]))
     return markdown_table(["task", "agent", "training", "SR [%]", "SPL [%], IQM (95 % interval)"], rows)
 
 
 def figure(curves: DataFrame) -> Figure:
-    """Return SPL over steps: medians over seeds, and bands from the least to the highest."""
+    """Return SPL over steps: medians over seeds, bands from the least to the highest, and the bars of the tasks."""
     tasks = [task for task in IDS if task in set(curves["task"])]
-    drawn = Figure(figsize=(3.2 * len(tasks), 3.4), layout="constrained")
-    for axes, task in zip(drawn.subplots(1, len(tasks), sharey=True, squeeze=False)[0], tasks, strict=True):
+    drawn = Figure(figsize=(10, 6.2), layout="constrained")
+    for axes, task in zip(drawn.subplots(2, 3, sharey=True).flat, tasks, strict=False):
         for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
             points = runs.assign(point=runs.groupby("seed").cumcount()).groupby("point")
             steps, spl = points["steps"].median(), points["SPL"]
             color = f"C{[*ALGORITHMS, *RECIPES].index(name)}"
             axes.plot(steps, spl.median(), color=color, label=name)
             axes.fill_between(steps, spl.min(), spl.max(), color=color, alpha=0.2, lw=0)
-        axes.set(title=task, xscale="log", xlabel="steps", ylim=(0, 100))
-        axes.legend(fontsize="small")
-    drawn.axes[0].set_ylabel("SPL [%]")
+        for name, style in zip(bars_of(task)[1:], (":", "--", "-"), strict=True):
+            axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
+        axes.set(title=task, xscale="log", xlabel="steps", ylabel="SPL [%]", ylim=(0, 102), xlim=(5e3, None))
+        axes.legend(fontsize="x-small", loc="lower right" if task in ("box", "anywhere") else "upper left")
+    for axes in drawn.axes[len(tasks) :]:
+        axes.remove()
     return drawn
 
 
