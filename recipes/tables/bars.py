@@ -3,8 +3,8 @@
     python recipes/tables/bars.py    # a minute; prints the table of docs/environment.md
 
 The seed is reserved for evaluations: ``envs.reset(seed=SEED)`` of 200 vehicles starts the same episodes. Oracles are
-the true bearing, which knows where vehicle and destination are, and the shortest path around all no-go areas. *Readings*
-has the episodes of *Anywhere*: only what a policy observes is different.
+the true bearing, which knows where vehicle and destination are, and the shortest path around all no-go areas. The
+episodes of *Readings* are those of *Anywhere*: only what a policy observes is different.
 """
 
 from __future__ import annotations

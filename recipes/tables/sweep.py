@@ -220,7 +220,7 @@ def figure(curves: DataFrame) -> Figure:
         for name, style in zip(bars_of(task)[1:], (":", "--", "-"), strict=True):
             axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
         axes.set(title=task, xscale="log", xlabel="steps", ylabel="SPL [%]", ylim=(0, 102), xlim=(5e3, None))
-        axes.legend(fontsize="x-small", loc="lower right" if task in ("box", "anywhere") else "upper left")
+        axes.legend(fontsize="x-small", loc="best")
     for axes in drawn.axes[len(tasks) :]:
         axes.remove()
     return drawn
