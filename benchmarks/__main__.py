@@ -86,7 +86,9 @@ class Report:
         if missing := OTHERS.keys() - self.content.keys():
             raise SystemExit(f"nothing is published: {', '.join(missing)} was not measured")
         results = DOCS / "results"
-        (results / "performance.md").write_text(f"{table(self.rows)}\n{self.summary()}")
+        page = results / "performance.md"
+        _, heading, others = page.read_text().partition("\n## ")  # tables of other measurements
+        page.write_text(f"{table(self.rows)}\n{self.summary()}{heading}{others}")
         (results / "profile.md").write_text(shares_table(self.content["profile"]))
         cost_figure(self.content["vehicles"]).savefig(results / "cost-by-vehicles.png", dpi=110)
 

@@ -6,6 +6,7 @@ import time
 
 from benchmarks.timing import Row, alternate
 from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
+from magrl.training.collectors import make_collector
 from magrl.transforms import (
     AlignmentReward,
     FieldGradient,
@@ -15,7 +16,6 @@ from magrl.transforms import (
     north_reference,
 )
 
-from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 
 VEHICLES = 1024
@@ -59,7 +59,7 @@ class Collecting:
         steps = [*guidance, *view.observation_transforms(), view.action_transform()]
         steps += [RewardSum(), RewardScaling(loc=0.0, scale=0.05)]
         env = TransformedEnv(base, Compose(*steps))
-        collector = Collector(env, env.rand_action, frames_per_batch=num_envs, total_frames=-1, track_traj_ids=False)
+        collector = make_collector(env, env.rand_action, frames_per_batch=num_envs, total_frames=-1)
         self.batches = iter(collector)
 
     def __call__(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -55,16 +56,17 @@ def covariance_after(
     slopes = (residual[..., :1, :] - residual[..., 1:, :]).flatten(-2) / apart  # of the prediction: 3 north, 3 east
     reading, noise = _readings(goal, moves.float(), errors, readings)
     covariance, state = belief.covariance, COEFFICIENTS + 1
-    spread = covariance.float() @ reading.flatten(-3, -2).mT  # (..., S, 3 M)
-    shared = (at_place.float() @ spread[..., :state, :]).unflatten(-1, (-1, 3))  # (..., 9, M, 3)
+    spread = reading.flatten(-3, -2) @ covariance.float()  # (..., 3 M, S)
+    shared = (at_place.float() @ spread[..., :state].mT).unflatten(-1, (-1, 3))  # (..., 9, M, 3)
     shared = _entries_first(shared.movedim(-3, -2))  # (9, 3, ..., M)
-    total = _entries_first(reading @ spread.unflatten(-1, (-1, 3)).movedim(-2, -3) + noise)
+    spread = spread.unflatten(-2, (-1, 3))
+    total = [(reading[..., i, :] * spread[..., j, :]).sum(-1) + noise[..., i, j] for i, j in _ENTRIES]
     gain = _product(shared, _inverse_entries(total))
     now = value @ covariance[..., :state, :state] @ value.mT
     square = (place.unsqueeze(-2) - moves).square().sum(-1)
     left = square**DEGREE * closure().left_out_nt ** 2 + goal.noise_at(square)
     after = _entries_first(now.unsqueeze(-3) + left[..., None, None] * eye) - _product(gain[:3], shared[:3])
-    weight = _inverse_entries(after)
+    weight = _inverse_entries([after[i, j] for i, j in _ENTRIES])
     slopes = slopes.movedim(-1, 0).float().unsqueeze(-1)  # (6, ..., 1)
     squares = _product(gain[3:], shared[3:]) + slopes.unsqueeze(0) * slopes.unsqueeze(1)
     blocks = squares[:3, :3], squares[:3, 3:], squares[3:, 3:]
@@ -145,7 +147,7 @@ def _product(left: Tensor, right: Tensor) -> Tensor:
     return (left.unsqueeze(1) * right.unsqueeze(0)).sum(2)
 
 
-def _inverse_entries(matrix: Tensor) -> Tensor:
-    """Return the inverses of symmetric matrices ``(3, 3, ...)``."""
-    (a, b, c, d, e, f), _ = _inverse([matrix[i, j] for i, j in _ENTRIES])
+def _inverse_entries(entries: Sequence[Tensor]) -> Tensor:
+    """Return the inverses ``(3, 3, ...)`` of symmetric matrices of six entries ``(...)``."""
+    (a, b, c, d, e, f), _ = _inverse(entries)
     return torch.stack((a, b, c, b, d, e, c, e, f)).unflatten(0, (3, 3))

@@ -37,6 +37,9 @@ SHORTEST = 1 / 40
 """The least length of a move that is compared, as a share of the way."""
 ANGLES_DEG = (-90, -60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60, 90)
 """Their directions, from that of the way [deg]."""
+KEPT = 40
+"""Number of the moves, those of least path and price, of which it is forecast what a reading teaches. On random
+planets, all 65 do no better (docs/results/performance.md)."""
 CORRECTION = 0.5
 """Unit of the corrections of a plan: of the logarithm of the length, and of the direction [rad]."""
 
@@ -146,8 +149,10 @@ def planned_move(
     shift = aim - (posterior.points * posterior.weights.unsqueeze(-1)).sum(-2)
     distance = posterior.mean_distance(moves - shift.unsqueeze(-2)).to(aim.dtype)  # that of now is the same for all
     cost = moves.norm(dim=-1) + distance * (1 + step_km / max_move_km).unsqueeze(-1)
+    kept = cost.topk(min(KEPT, cost.shape[-1]), -1, largest=False).indices
+    moves, left = (x.gather(-2, kept.unsqueeze(-1).expand(*kept.shape, 2)) for x in (moves, left))
     after = covariance_after(goal, aim, moves, errors)
-    best = (cost + caution * _detour(left, after)).argmin(-1)[..., None, None]
+    best = (cost.gather(-1, kept) + caution * _detour(left, after)).argmin(-1)[..., None, None]
     return moves.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 
 

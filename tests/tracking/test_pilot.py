@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from magrl.sensor_std import SensorStd
-from magrl.tracking import ArrivalDecision, Reading, Rules, advance, begin, blank, declaring, pilot
+from magrl.tracking import ArrivalDecision, Reading, Rules, State, act, advance, begin, blank, declaring, pilot
 from magrl.tracking.pilot import step
 from magrl.transforms.track import reading_of
 
@@ -32,6 +32,15 @@ def readings() -> tuple[Reading, Reading]:
     """Those of four vehicles at the start and after a move."""
     first = first_reading()
     return reading(first, 0), reading(moved(first, 40.0, 0.3, f64(0.3, 0.5, 60.0)), 1)
+
+
+@pytest.mark.slow
+def test_a_decision_traces_as_one_graph(readings) -> None:
+    def decided(state: State, reading: Reading) -> Tensor:
+        return act(RULES, advance(RULES, state, reading), reading)[0]
+
+    given = begin(RULES, readings[0]).state, readings[1]
+    torch.testing.assert_close(torch.compile(decided, fullgraph=True, backend="eager")(*given), decided(*given))
 
 
 def test_vehicles_that_begin_do_not_touch_those_that_go_on(readings) -> None:
