@@ -36,11 +36,27 @@ def test_ppo_trains(tmp_path: Path) -> None:
     assert evaluate(policy, "paper-100", max_steps=2).shape == (100,)
 
 
-@pytest.mark.parametrize("compass", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_recurrent_ppo_trains(tmp_path: Path, compass: bool) -> None:
-    """The saved policy reads readings, moves and, with a compass, headings."""
-    result = recurrent.train(recurrent.Config(**SIZES, observe_heading=compass, out=tmp_path))
+def test_recurrent_ppo_trains(tmp_path: Path, monkeypatch) -> None:
+    """What is to be exported acts for each vehicle, and returns its memory."""
+
+    def checked(module, view: ReadingView, memory: dict[str, tuple[int, ...]]) -> str:
+        state = [torch.zeros(3, *shape) for shape in memory.values()]
+        action, *after = module(torch.rand(3, view.size), *state)
+        assert action.shape == (3, 2)
+        assert [value.shape for value in after] == [value.shape for value in state]
+        return "secant"
+
+    monkeypatch.setattr(recurrent, "export_policy", checked)
+    monkeypatch.setattr(recurrent, "save_policy", lambda *_: None)
+    result = recurrent.train(recurrent.Config(**SIZES, observe_heading=False, out=tmp_path))
     assert json.loads((tmp_path / "eval.json").read_text())["spl"] == result["spl"]
+
+
+@pytest.mark.slow  # the export takes most of the time
+@pytest.mark.parametrize("compass", [True, False])
+def test_a_trained_memory_is_exported(tmp_path: Path, compass: bool) -> None:
+    """The saved policy reads readings, moves and, with a compass, headings."""
+    recurrent.train(recurrent.Config(**SIZES, observe_heading=compass, out=tmp_path))
     policy = load_policy(tmp_path / "policy.onnx")
     assert policy.in_keys == ["field", "target_field", "move", *["heading"] * compass, "elapsed_steps"]
     action = evaluate(f"policy={tmp_path}", "paper-100", max_steps=2, start_heading="random" if compass else "north")
