@@ -19,7 +19,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NormalizeObservation
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks, geomagnetic, planet_scenario
 from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
@@ -96,25 +96,6 @@ def test_batch_flies_as_in_torchrl(reward: str) -> None:
         ends, arrivals = ends + done.sum(), arrivals + terminated.sum()
     assert ends > 3 * NUM, "every vehicle was to fly more than one episode"
     assert arrivals >= 3, "episodes were to end on arrival, apart from the others"
-
-
-def test_one_vehicle_flies_as_in_torchrl() -> None:
-    env, reference = make(reward="paper", **SHORT), torchrl_env(1, 11)
-    wrapped = GymEnv(ENV_ID, **SHORT).reset(seed=11)  # back into TorchRL
-    state, (observation, info) = reference.reset(), env.reset(seed=11)
-    assert torch.equal(wrapped["observation"], state["observation"][0])
-    for actions in random_actions(1, 1):
-        equal(observation, state["observation"][0])
-        assert info == {}
-        state = reference.step(state.set("action", torch.from_numpy(actions)))
-        observation, reward, terminated, truncated, info = env.step(actions[0])
-        after = state["next"][0]
-        equal(observation, after["observation"])
-        assert (reward, terminated, truncated) == tuple(after[k].item() for k in ("reward", "terminated", "truncated"))
-        state = reference.step_mdp(state)
-        if terminated or truncated:
-            assert info["steps"] <= SHORT["max_steps"]
-            state, (observation, info) = reference.reset(), env.reset()
 
 
 # Without a map

@@ -17,7 +17,7 @@ from magrl.envs.navigation import anywhere_env
 from magrl.envs.random_regions import planet_scenario
 from magrl.sensor_std import STD_KEYS
 from magrl.transforms import TRUE_KEYS, MagneticNorth, NorthReferenceError, SensorErrors
-from magrl.transforms.errors.base import check_sizes, gauss_markov
+from magrl.transforms.errors.base import gauss_markov
 
 ERRORS = ("motion_error", "weather_clock", "sensor_error", "north_error")
 
@@ -151,12 +151,6 @@ def test_gauss_markov_does_not_depend_on_the_steps() -> None:
         assert value.mean().item() == pytest.approx(2 * math.exp(-0.3), abs=0.01)
         assert value.std().item() == pytest.approx(0.5 * math.sqrt(1 - math.exp(-0.6)), rel=0.01)
     assert torch.equal(gauss_markov(start, 0.5, math.inf, 100.0, once), 0.5 * once)
-
-
-@pytest.mark.parametrize("values", [(0.1, -0.1), (0.1, math.nan), (), 0.1, "abc"])
-def test_bad_sizes(values: object) -> None:
-    with pytest.raises(ValueError, match=r"bias must be .*, got"):
-        check_sizes(bias=values)
 
 
 def test_bad_shapes_and_keys() -> None:
