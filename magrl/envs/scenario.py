@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import datetime
 import math
+from collections.abc import Hashable
 from functools import lru_cache
 from typing import Annotated, Any, Literal, Self
 
@@ -264,6 +265,8 @@ class Scenario(CheckedModel):
         count = len(self.region)
         if self.objective_floors is not None:
             return torch.tensor(self.objective_floors, dtype=torch.float64).repeat(count, 1)
+        if not isinstance(field, Hashable):
+            return _mean_changes.__wrapped__(field, self.region)
         return _mean_changes(field, self.region).clone()
 
     def random_tasks(self, num_tasks: int, seed: int) -> Tasks:

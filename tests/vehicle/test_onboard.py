@@ -229,8 +229,8 @@ def test_a_pilot_runs_without_torchrl_in_few_calls() -> None:
     assert len(rows) == 2
     for functions, calls, *others in rows:
         assert others == ["0", "False"]
-        assert int(functions) <= 130
-        assert int(calls) <= 800
+        assert int(functions) <= 128
+        assert int(calls) <= 660
 
 
 # A known start
