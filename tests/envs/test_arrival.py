@@ -3,43 +3,23 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import pytest
 import torch
+from support.environments import near, paper_env
 from torchrl.envs.utils import check_env_specs, step_mdp
 
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
-from magrl.field import FieldModel
-from magrl.geodesy import move
-
-
-@cache
-def field() -> FieldModel:
-    return Scenario().build_field()
-
-
-def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0} | options))
+from magrl.envs import GeomagneticNavEnv
 
 
 def declared(num_envs: int = 2, radius_km: float = 25.0, **options: object) -> GeomagneticNavEnv:
-    return nav(num_envs, arrival="declared", radius_km=radius_km, **options)
-
-
-def near(*distances_km: float, rule: str = "declared") -> GeomagneticNavEnv:
-    """Vehicles whose targets are some distances northward; a radius of 10 km."""
-    start = torch.tensor([[-5.0, 165.0]], dtype=torch.float64).expand(len(distances_km), 2)
-    reach = torch.tensor(distances_km, dtype=torch.float64)
-    target = torch.stack(move(*start.unbind(-1), torch.zeros_like(reach), reach), -1)
-    scenario = Scenario(field=field(), tasks=Tasks(start, target))
-    return GeomagneticNavEnv(scenario, num_envs=len(reach), arrival=rule, radius_km=10.0, seed=0)
+    return paper_env(num_envs, arrival="declared", radius_km=radius_km, **options)
 
 
 def test_actions_of_another_size_are_refused() -> None:
     for env, size, message in (
         (declared(), 2, "must be 3 numbers, distance, turn and declare, got 2: for a policy that does not declare"),
-        (nav(), 3, "must be 2 numbers, distance and turn, got 3$"),
+        (paper_env(), 3, "must be 2 numbers, distance and turn, got 3$"),
     ):
         with pytest.raises(ValueError, match=message):
             env.step(env.reset().set("action", torch.zeros(2, size)))
@@ -52,7 +32,7 @@ def test_specs() -> None:
     assert env.action_spec.space.low[0].tolist() == pytest.approx([0.0, -math.pi / 2, -1.0])
     assert env.action_spec.space.high[0].tolist() == pytest.approx([50.0, math.pi / 2, 1.0])
     assert env.observation_spec["move"].shape == (3, 2)
-    assert set(env.observation_spec.keys()) - set(nav().observation_spec.keys()) == {"declared"}
+    assert set(env.observation_spec.keys()) - set(paper_env().observation_spec.keys()) == {"declared"}
 
 
 def test_a_declaration_within_the_radius_is_a_success_and_elsewhere_a_false_arrival() -> None:

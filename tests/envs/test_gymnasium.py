@@ -1,14 +1,12 @@
 """The Gymnasium interface: the same bits as TorchRL, the conventions of Gymnasium, and stable-baselines3."""
 
 import importlib
-import importlib.util
 import math
 import os
 import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -18,6 +16,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NormalizeObservation
+from support.recipes import load
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
@@ -29,7 +28,6 @@ from magrl.field import elements_at
 from magrl.tracking import OBSERVATION_SIZE
 from magrl.transforms import AlignmentReward, FieldGradient, GradientHeading, SensorErrors, TargetDifference
 
-ROOT = Path(__file__).parent.parent.parent
 PAPER = Scenario(field=Scenario().build_field())
 """The paper's scenario, with its field built once for all tests."""
 NUM, STEPS = 5, 25
@@ -112,7 +110,7 @@ def test_a_batch_without_a_map_flies_as_in_torchrl() -> None:
     assert (state["sensor_std"] > 0).any()
     equal(envs.reset(seed=11)[0], state["observation"])
     returns, ends = np.zeros(NUM), 0
-    for actions in random_actions(NUM, 0, 17):
+    for actions in random_actions(NUM, 0, 21):
         step, state = env.step_and_maybe_reset(state.set("action", torch.from_numpy(actions)))
         observations, rewards, *_, info = envs.step(actions)
         equal(observations, state["observation"])
@@ -436,18 +434,10 @@ def test_checkers_find_nothing() -> None:
 # stable-baselines3
 
 
-def load(path: str) -> ModuleType:
-    pytest.importorskip("stable_baselines3")
-    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_stable_baselines3_example(tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("stable_baselines3")
     monkeypatch.setenv("SB3_LOGDIR", str(tmp_path))
-    example = load("docs/examples/sb3.py")
+    example = load("../docs/examples/sb3")
     small = {"num_envs": 8, "total_timesteps": 80, "learning_starts": 60, "gradient_steps": 1, "eval_tasks": 4}
     result = example.main(example.Config("sac", **small))
     assert result.keys() == {"success", "spl", "steps"}

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from geographiclib.geodesic import Geodesic
+from support.field_checks import f64
 
 from magrl.envs import PAPER_REGION, Region, Regions
 from magrl.envs.regions import one_region
@@ -13,10 +14,6 @@ from magrl.geodesy import geodesic, move
 ANTIMERIDIAN = Region((-5, 5), (170, 190))
 ARCTIC = Region((80, 90), (-180, 180))
 WORLD = Region((-90, 90), (-180, 180))
-
-
-def f64(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 CONTAINED = [

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from geographiclib.geodesic import Geodesic
+from support.field_checks import f64
 
 from magrl import paper
 from magrl.envs import PAPER_REGION, Region, Regions, Tasks, named_tasks, task_set
@@ -15,10 +16,6 @@ from magrl.geodesy import geodesic, wrap_longitude
 ANTIMERIDIAN = Region((-5, 5), (170, 190))
 ARCTIC = Region((80, 90), (-180, 180))
 WORLD = Region((-90, 90), (-180, 180))
-
-
-def f64(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def distances(tasks):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from support.field_checks import f64
 
 from magrl.field.elements import (
     NAMES,
@@ -20,10 +21,6 @@ from magrl.field.elements import (
 
 SHAPES = ((), (3,), (2, 3), (0,))
 DTYPES = (torch.float32, torch.float64)
-
-
-def f64(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def random_fields(*shape, seed=0):

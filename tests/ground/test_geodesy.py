@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from geographiclib.geodesic import Geodesic
+from support.field_checks import f64
 
 from magrl.geodesy import (
     WGS84_A_KM,
@@ -26,10 +27,6 @@ from magrl.geodesy import (
 KARNEY = Geodesic.WGS84
 DTYPES = (torch.float32, torch.float64)
 SHAPES = ((), (3,), (2, 3), (0,))
-
-
-def f64(*values):
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def globe(count, seed):

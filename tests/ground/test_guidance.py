@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from support.tracks import f64, randn
 
 from magrl.geodesy import wrap_angle
 from magrl.guidance import (
@@ -21,14 +22,6 @@ from magrl.guidance import (
 
 DTYPES = (torch.float32, torch.float64)
 FLOORS = torch.tensor(OBJECTIVE_FLOORS, dtype=torch.float64)
-
-
-def f64(*values):
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def randn(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 # --- objective, Eq. 2-6 -----------------------------------------------------------------------------------------------

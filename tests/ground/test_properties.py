@@ -15,6 +15,7 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
+from support.field_checks import f64
 from torch import Tensor
 
 from magrl import geodesy
@@ -23,10 +24,6 @@ from magrl.field.spherical import SphericalHarmonicField
 from magrl.guidance import objective, objective_weights, parallel_approach
 
 MILLIMETER = 1e-6
-
-
-def f64(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def scalars(*values: float) -> tuple[Tensor, ...]:

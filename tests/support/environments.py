@@ -1,4 +1,4 @@
-"""Environments that the tests of several packages share: another domain with nested keys, and other processes."""
+"""Environments that several packages share: another domain with nested keys, the paper's, and other processes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import multiprocessing
 import pickle
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,7 +15,9 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv
 
-from magrl.geodesy import wrap_angle
+from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
+from magrl.field import FieldModel
+from magrl.geodesy import move, wrap_angle
 
 
 def nested(name: str) -> NestedKey:
@@ -86,6 +88,24 @@ class PlaneEnv(EnvBase):
         done = torch.zeros_like(angle, dtype=torch.bool)
         agents = TensorDict(seen, self.batch_size)
         return TensorDict({"agents": agents, "done": done, "terminated": done.clone()}, self.batch_size)
+
+
+@cache
+def paper_field() -> FieldModel:
+    return Scenario().build_field()
+
+
+def paper_env(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
+    return GeomagneticNavEnv(Scenario(field=paper_field()), num_envs=num_envs, **({"seed": 0} | options))
+
+
+def near(*distances_km: float, rule: str = "declared") -> GeomagneticNavEnv:
+    """Vehicles whose targets are some distances northward; a radius of 10 km."""
+    start = torch.tensor([[-5.0, 165.0]], dtype=torch.float64).expand(len(distances_km), 2)
+    reach = torch.tensor(distances_km, dtype=torch.float64)
+    target = torch.stack(move(*start.unbind(-1), torch.zeros_like(reach), reach), -1)
+    scenario = Scenario(field=paper_field(), tasks=Tasks(start, target))
+    return GeomagneticNavEnv(scenario, num_envs=len(reach), arrival=rule, radius_km=10.0, seed=0)
 
 
 def parallel(factory: Callable[[], EnvBase]) -> ParallelEnv:

@@ -2,40 +2,18 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import pytest
 import torch
+from support.environments import near, paper_env
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from magrl.envs import GeomagneticNavEnv, Scenario, Tasks
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
-from magrl.field import FieldModel
-from magrl.geodesy import move
 from magrl.navigators import Declaring, Secant
 from magrl.transforms import SensorErrors
 
 STD, BIAS = (0.05, 0.05, 5.0), (0.1, 0.1, 10.0)
-
-
-@cache
-def field() -> FieldModel:
-    return Scenario().build_field()
-
-
-def nav(num_envs: int = 2, **options: object) -> GeomagneticNavEnv:
-    return GeomagneticNavEnv(Scenario(field=field()), num_envs=num_envs, **({"seed": 0} | options))
-
-
-def near(*distances_km: float, rule: str = "declared") -> GeomagneticNavEnv:
-    """Vehicles whose targets are some distances northward; a radius of 10 km."""
-    start = torch.tensor([[-5.0, 165.0]], dtype=torch.float64).expand(len(distances_km), 2)
-    reach = torch.tensor(distances_km, dtype=torch.float64)
-    target = torch.stack(move(*start.unbind(-1), torch.zeros_like(reach), reach), -1)
-    scenario = Scenario(field=field(), tasks=Tasks(start, target))
-    return GeomagneticNavEnv(scenario, num_envs=len(reach), arrival=rule, radius_km=10.0, seed=0)
 
 
 # Navigators that declare
@@ -45,7 +23,7 @@ def test_declarations_are_as_often_right_as_they_say_and_confidence_prevents_fal
     """Of vehicles with constant errors, of which readings show only a part."""
     rates = []
     for confidence in (0.0, 0.8):
-        base = nav(60, arrival="declared", max_steps=20)
+        base = paper_env(60, arrival="declared", max_steps=20)
         env = TransformedEnv(base, SensorErrors(STD, bias=BIAS, seed=1))
         navigator = Declaring(Secant(sensor_std=STD), **base.limits, confidence=confidence)
         rollout = evaluation_rollout(env, navigator)
@@ -82,6 +60,6 @@ def test_measures_by_hand() -> None:
     assert summary["false_arrival_rate_low"] == pytest.approx(4.56, abs=0.01)
     assert summary["navigation_error_km"] == pytest.approx(7.0, abs=1e-4)
     assert summary["navigation_error_km_declared"] == pytest.approx((5 + 9 + 20) / 3, abs=1e-4)
-    plain = episode_measures(evaluation_rollout(nav(), Secant()))
+    plain = episode_measures(evaluation_rollout(paper_env(), Secant()))
     assert "false_arrival" not in plain
     assert "false_arrival_rate" not in summarize(plain)

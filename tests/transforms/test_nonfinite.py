@@ -6,23 +6,12 @@ from pathlib import Path
 import pytest
 import td3_gradient_guided as recipe
 import torch
+from support.recipes import small
 
 from magrl.training.checkpoints import read_checkpoint
 
-SMALL = {
-    "num_envs": 4,
-    "num_cells": (8,),
-    "batch_size": 8,
-    "buffer_size": 200,
-    "init_random_frames": 8,
-    "updates_per_batch": 1,
-    "eval_every": 100,
-    "eval_tasks_small": 2,
-    "eval_tasks": 2,
-    "total_frames": 80,
-    "wandb_mode": "disabled",
-    "checkpoint_every": 0.0,
-}
+SMALL = {"num_envs": 4, "num_cells": (8,), "batch_size": 8, "init_random_frames": 8, "updates_per_batch": 1}
+SMALL |= {"eval_every": 100, "eval_tasks_small": 2, "eval_tasks": 2, "total_frames": 80, "checkpoint_every": 0.0}
 BAD_STEP = 5  # of twenty
 
 
@@ -61,7 +50,7 @@ def test_training_stops_at_the_first_non_finite_value(
     owner = recipe.GeomagneticNavEnv if name == "_step" else recipe.TD3Loss
     monkeypatch.setattr(owner, name, poisoned(getattr(owner, name), *options))
     with pytest.raises(FloatingPointError, match=message):
-        recipe.train(recipe.Config(**SMALL, out=tmp_path / "run"))
+        recipe.train(small(recipe, tmp_path / "run", **SMALL))
     (file,) = sorted((tmp_path / "run" / "checkpoints").glob("*.safetensors"))[-1:]
     weights = read_checkpoint(file)["parts"]["loss"]
     assert all(torch.isfinite(value).all() for value in weights.values() if isinstance(value, torch.Tensor))
