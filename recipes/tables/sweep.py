@@ -190,20 +190,21 @@ def planned(config: Config) -> Iterator[tuple[str, str, int]]:
 
 
 def table(curves: DataFrame) -> str:
-    """Return the Markdown table of final scores, and of the bars of each task."""
+    """Return the Markdown table of final scores and of the bars: interquartile means, with intervals over seeds."""
     last, rows = curves.groupby(["task", "algorithm", "seed"], sort=False).last().reset_index(), []
     for (task, name), runs in last.groupby(["task", "algorithm"], sort=False):
         low, high = stratified_bootstrap([torch.tensor(runs["SPL"].to_numpy())])
         rate, spl = (interquartile_mean(torch.tensor(runs[key].to_numpy())).item() for key in ("SR", "SPL"))
-        size = f"{runs['steps'].max() / 1000:.0f} k, {runs['cpu_s'].median() / 60:.1f} min"
-        rows.append([task, f"{name}, {len(runs)} seeds", size, f"{rate:.1f}", f"{spl:.1f} ({low:.1f}–{high:.1f})"])
+        size = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k"
+        minutes = f"{runs['cpu_s'].median() / 60:.1f} min"
+        rows.append([task, name, size, minutes, f"{rate:.1f}", f"{spl:.1f} ({low:.1f}–{high:.1f})"])
     for task in curves["task"].unique():
         for name in bars_of(task):
             scores = bar(task, name)
-            rows.append([task, BARS[name], "—", f"{scores['SR']:.1f}", f"{scores['SPL']:.1f}"])
+            rows.append([task, BARS[name], "—", "—", f"{scores['SR']:.1f}", f"{scores['SPL']:.1f}"])
     order = list(IDS)
     rows.sort(key=lambda row: order.index(row[0]))
-    return markdown_table(["task", "agent", "training", "SR [%]", "SPL [%], IQM (95 % interval)"], rows)
+    return markdown_table(["task", "agent", "seeds × steps", "CPU", "SR %", "SPL %"], rows)
 
 
 def figure(curves: DataFrame) -> Figure:
