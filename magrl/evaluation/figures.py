@@ -16,10 +16,8 @@ from matplotlib.ticker import EngFormatter
 
 from magrl.envs import Region, Tasks
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
-from magrl.evaluation.intervals import interquartile_mean
-from magrl.evaluation.navigators import NAVIGATOR_COLORS, NAVIGATOR_NAMES, parse_navigator
+from magrl.evaluation.navigators import NAVIGATOR_COLORS, NAVIGATOR_NAMES
 from magrl.evaluation.navigators import label as navigator_label
-from magrl.evaluation.tables import Summaries, known_values
 from magrl.field import FieldModel, elements_at
 from magrl.field.elements import NAMES, UNITS
 
@@ -224,47 +222,4 @@ def box_plots(measures: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
         for box, name in zip(boxes["boxes"], measures, strict=True):
             box.set(facecolor=NAVIGATOR_COLORS[name], alpha=0.6)
         axes.set_xticks(range(1, len(names) + 1), names)
-    return figure
-
-
-def noise_figure(levels: Mapping[str, Summaries], mode: str = "look-ahead") -> Figure:
-    """Return SPL over the noise level: a line for each navigator, and the range of its runs where it has several.
-
-    Navigators below 50 % at every level are outside the axis if others are better; the legend marks them.
-
-    Args:
-        levels: by noise level, lowest first, the summaries of the runs of each navigator. A level that a navigator did
-            not fly, or flew without an SPL, leaves a gap.
-        mode: mode of metaheuristics without one in their name; ``flown`` is drawn dashed.
-
-    Raises:
-        ValueError: for an unknown navigator, or none.
-
-    Example:
-        >>> levels = {"no noise": {"secant": [{"spl": 99.0}]}, "0.1°, 0.1°, 10 nT": {"secant": [{"spl": 60.0}]}}
-        >>> noise_figure(levels).axes[0].lines[0].get_ydata().tolist()
-        [99.0, 60.0]
-    """
-    names = dict.fromkeys(name for summaries in levels.values() for name in summaries)
-    if not names:
-        raise ValueError(f"levels must hold the summaries of at least one navigator, got {dict(levels)}")
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes, shown = figure.subplots(), list[float]()
-    for name in names:
-        text = navigator_label(name, mode).partition(" (")[0]
-        color, line = NAVIGATOR_COLORS[parse_navigator(name).name], "--" if text.endswith("flown") else "-"
-        runs = [known_values(run.get("spl") for run in summaries.get(name, ())) for summaries in levels.values()]
-        middle = [interquartile_mean(torch.tensor(values)).item() if values else np.nan for values in runs]
-        low, high = ([end(values, default=np.nan) for values in runs] for end in (min, max))
-        good = np.nanmax([*middle, -np.inf]) >= 50
-        shown += low if good else []
-        text += "" if good else " (below 50 %)"
-        axes.plot(middle, marker="o", ms=4, lw=1.5, ls=line, color=color, label=text)
-        axes.fill_between(range(len(runs)), low, high, color=color, alpha=0.2, lw=0)
-    axes.set_xticks(range(len(levels)), list(levels))
-    axes.set(xlabel="standard deviations of the readings of D, I, $B_H$", ylabel="SPL [%]")
-    if shown:
-        axes.set_ylim(np.nanmin(shown) - 3, 101)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
     return figure

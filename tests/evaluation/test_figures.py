@@ -23,25 +23,6 @@ def test_training_figure_shows_the_columns_of_a_training() -> None:
     assert [text.get_text() for text in panels[1].get_legend().get_texts()] == list(TERMS)
 
 
-def test_noise_figure_shows_average_and_range_of_runs() -> None:
-    """Four runs of one navigator, one run of another that did not fly at the second level, in its mode."""
-    runs = [{"spl": spl} for spl in (80.0, 90.0, 92.0, 99.0)]
-    levels = {"none": {"gg_td3": runs, "ga": [{"spl": 5.0}]}, "high": {"gg_td3": [{"spl": 70.0}, {"spl": None}]}}
-    axes = figures.noise_figure(levels, "flown").axes[0]
-    assert [line.get_ydata().tolist() for line in axes.lines] == [[91, 70], pytest.approx([5, math.nan], nan_ok=True)]
-    assert [line.get_linestyle() for line in axes.lines] == ["-", "--"]
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["Gradient-Guided TD3", "GA, flown (below 50 %)"]
-    assert [text.get_text() for text in axes.get_xticklabels()] == ["none", "high"]
-    edge = axes.collections[0].get_paths()[0].vertices
-    assert {tuple(point) for point in edge} == {(0, 80), (0, 99), (1, 70)}
-    for levels in ({}, {"none": {}}):
-        with pytest.raises(ValueError, match="at least one navigator"):
-            figures.noise_figure(levels)
-    with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
-        figures.noise_figure({"none": {"dowsing": runs}})
-
-
 def test_learning_curves_show_the_mean_over_the_common_frames() -> None:
     """Two runs, of which one ends earlier and one has a gap; a navigator without values has no line."""
     runs = [([0, 100], [0.0, 50.0]), ([0, 50, 80], [10.0, math.nan, 90.0])]

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from support.recipes import load
 from tensordict import TensorDict
 from torchrl.data.datasets import MinariExperienceReplay
 
@@ -17,7 +18,7 @@ from magrl.envs import PUBLIC_KEYS
 from magrl.training import UsageError
 
 minari = pytest.importorskip("minari")
-recipe = pytest.importorskip("offline_dataset")
+recipe = load("../docs/examples/offline_dataset")
 SMALL = ["--regions", "2", "--episodes", "6", "--distance-range-km", "60", "90", "--max-steps", "9", "--seed", "1"]
 
 
@@ -60,8 +61,8 @@ def test_torchrl_loads_them_from_disk(tmp_path: Path, monkeypatch) -> None:
 def test_the_environment_in_the_metadata_repeats_them(noise: str) -> None:
     data = minari.load_dataset(f"magrl/earth-secant-{noise}-v0")
     metadata, episodes = data.storage.metadata, list(data.iterate_episodes())
-    assert metadata["command"] == "python recipes/offline_dataset.py --field earth --episodes 6 --regions 2 " + (
-        "--distance-range-km 60.0 90.0 --max-steps 9 --seed 1"
+    assert metadata["command"] == "python docs/examples/offline_dataset.py --field earth " + (
+        "--episodes 6 --regions 2 --distance-range-km 60.0 90.0 --max-steps 9 --seed 1"
     )
     envs = eval(metadata["environment"], {"gymnasium": gymnasium, "magrl": magrl})
     assert envs.single_observation_space == data.observation_space

@@ -1,7 +1,7 @@
 """Write offline datasets in the format of Minari: flights at random, of `secant` and of `kalman`, with noise.
 
-    python recipes/offline_dataset.py                                  # 1000 episodes each, in runs/minari
-    python recipes/offline_dataset.py --field planets --seed 1 --out runs/planets
+    python docs/examples/offline_dataset.py                                  # 1000 episodes each, in runs/minari
+    python docs/examples/offline_dataset.py --field planets --seed 1 --out runs/planets
     MINARI_DATASETS_PATH=runs/minari minari list local
 
 Takes two minutes on one core, and needs the extra `minari`. There is one dataset for each policy and level of white
@@ -74,7 +74,7 @@ def command_line(config: Config) -> str:
     """Return the command of the settings, without the folder."""
     values = config.model_dump(exclude={"out"}).items()
     words = (f"--{key.replace('_', '-')} {str(value).strip('()').replace(',', '')}" for key, value in values)
-    return " ".join((f"python recipes/{RECIPE}", *words))
+    return " ".join((f"python docs/examples/{RECIPE}", *words))
 
 
 def make_envs(config: Config, noise: Noise) -> tuple[GeomagneticNavVectorEnv, str]:

@@ -1,0 +1,78 @@
+"""The sweep of algorithms over the named tasks, and its bars."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from pandas import read_csv
+from support.recipes import RECIPES, load
+
+from magrl.envs import planet_scenario
+
+pytest.importorskip("sb3_contrib")
+sys.path.insert(0, str(RECIPES / "tables"))
+sweep = load("tables/sweep")
+bars = sys.modules["bars"]
+RESULTS = RECIPES.parent / "docs" / "results"
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch) -> None:
+    monkeypatch.setattr(sweep, "VEHICLES", 4)
+    monkeypatch.setattr(sweep, "POINTS", 2)
+    settings = {"n_steps": 4, "batch_size": 16}
+    for name in ("PPO", "RecurrentPPO"):
+        chosen = sweep.ALGORITHMS[name]
+        few = dict.fromkeys(chosen.thousands, 0.064)
+        changed = chosen._replace(num_envs=8, thousands=few, settings=chosen.settings | settings)
+        monkeypatch.setitem(sweep.ALGORITHMS, name, changed)
+
+
+@pytest.mark.parametrize(("task", "name"), [("nogo", "PPO"), ("readings", "RecurrentPPO")])
+def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monkeypatch, task: str, name: str) -> None:
+    monkeypatch.setattr("magrl.envs.navigation._planets", lambda: planet_scenario(4, seed=0))
+    config = sweep.Config(out=tmp_path)
+    rows = read_csv(sweep.run(config, task, name, 0))
+    assert rows["steps"].tolist() == [8, 32, 64, 64]
+    assert rows[["task", "algorithm", "seed"]].drop_duplicates().to_numpy().tolist() == [[task, name, 0]]
+    assert rows[["SR", "SPL"]].to_numpy().min() >= 0
+    assert rows["cpu_s"].is_monotonic_increasing
+    monkeypatch.setattr(sweep, "trained", None)
+    assert len(read_csv(sweep.run(config, task, name, 0))) == len(rows)
+
+
+def test_jobs_of_one_seed_come_first() -> None:
+    jobs = list(sweep.planned(sweep.Config(tasks=("box", "storm"), seeds=(3, 4))))
+    assert [seed for *_, seed in jobs] == sorted(seed for *_, seed in jobs)
+    names = {"PPO", "SAC", "TD3", "GG-TD3"}
+    assert {(task, name) for task, name, seed in jobs if seed == 4} == {("box", name) for name in names} | {
+        ("storm", name) for name in ("PPO", "RecurrentPPO")
+    }
+
+
+def test_the_oracle_goes_around_the_areas(monkeypatch) -> None:
+    monkeypatch.setattr(bars, "VEHICLES", 40)
+    bars.bar.cache_clear()
+    around, straight = (bars.bar("nogo", name) for name in ("detour", "geodesic"))
+    bars.bar.cache_clear()
+    assert around["SR"] == 100.0
+    assert around["SPL"] > 95
+    assert straight["SR"] < 50
+
+
+def test_the_figure_shows_the_published_scores() -> None:
+    text = (RESULTS / "scores.png").read_bytes()
+    assert f"Description\0{sweep.digest((RESULTS / 'scores.csv').read_bytes())}".encode() in text
+
+
+def test_the_table_has_the_middle_of_the_runs(monkeypatch) -> None:
+    monkeypatch.setattr(sweep, "bars_of", lambda task: [])  # noqa: ARG005
+    curves = read_csv(RESULTS / "scores.csv")
+    chosen = curves[(curves["task"] == "storm") & (curves["algorithm"] == "PPO")]
+    last = torch.tensor(chosen.groupby("seed")["SPL"].last().to_numpy()).sort().values
+    (line,) = [line for line in sweep.table(chosen).splitlines() if "| PPO |" in line]
+    assert f"{last[1:4].mean():.1f} (" in line
+    assert line.split(" (")[0] in (RESULTS / "scores.md").read_text()
