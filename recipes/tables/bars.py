@@ -24,6 +24,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 SEED, VEHICLES = paper.FIRST_RESERVED_SEED + 69, 200
 BARS = {"secant": "secant", "kalman": "kalman", "anywhere": "anywhere (pretrained)"}
@@ -62,6 +63,12 @@ class Detour(TensorDictModuleBase):
         return nodes[torch.arange(len(nodes)), first] - place
 
 
+def flown(task: str, navigator: str) -> tuple[EnvBase, TensorDictBase]:
+    """Return the environment of a task, and the first episode of each vehicle; arguments as of :func:`bar`."""
+    env = NAMED_ENVS[task](VEHICLES, observation="dict", scale_actions=False, seed=SEED)
+    return env, evaluation_rollout(env, Detour() if navigator == "detour" else make_navigator(navigator, env.base_env))
+
+
 @cache
 def bar(task: str, navigator: str) -> dict[str, float]:
     """Return success rate and SPL [%], steps, and the mean return of the default reward.
@@ -70,10 +77,7 @@ def bar(task: str, navigator: str) -> dict[str, float]:
         task: name of the task.
         navigator: one of :data:`BARS`, or the file of a policy.
     """
-    task = "anywhere" if task == "readings" else task
-    env = NAMED_ENVS[task](VEHICLES, observation="dict", scale_actions=False, seed=SEED)
-    policy = Detour() if navigator == "detour" else make_navigator(navigator, env.base_env)
-    rollout = evaluation_rollout(env, policy)
+    env, rollout = flown("anywhere" if task == "readings" else task, navigator)
     measures, after = episode_measures(rollout, env), rollout["next"]
     earned = (after["reward"].squeeze(-1) * first_episode_mask(after["done"])).sum(1).mean().item()
     success, spl, steps = (measures[name].double().mean().item() for name in ("success", "spl", "steps"))

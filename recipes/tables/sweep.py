@@ -29,15 +29,19 @@ from typing import Any, NamedTuple
 
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation.intervals import interquartile_mean, stratified_bootstrap
+from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.tables import markdown_table
 from magrl.training import UsageError, command
+from magrl.transforms import NoGoAreas
 
 import gymnasium
 import numpy as np
 import torch
 import tyro
-from bars import BARS, SEED, VEHICLES, bar, bars_of
+from bars import BARS, SEED, VEHICLES, bar, bars_of, flown
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from pandas import DataFrame, concat, read_csv
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO, SAC, TD3
@@ -210,7 +214,7 @@ def figure(curves: DataFrame) -> Figure:
     """Return SPL over steps: medians over seeds, bands from the least to the highest, and the bars of the tasks."""
     tasks = [task for task in IDS if task in set(curves["task"])]
     drawn = Figure(figsize=(10, 6.2), layout="constrained")
-    for axes, task in zip(drawn.subplots(2, 3, sharey=True).flat, tasks, strict=False):
+    for axes, task in zip(drawn.subplots(2, 3).flat, tasks, strict=False):
         for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
             points = runs.assign(point=runs.groupby("seed").cumcount()).groupby("point")
             steps, spl = points["steps"].median(), points["SPL"]
@@ -221,9 +225,25 @@ def figure(curves: DataFrame) -> Figure:
             axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
         axes.set(title=task, xscale="log", xlabel="steps", ylabel="SPL [%]", ylim=(0, 102), xlim=(5e3, None))
         axes.legend(fontsize="x-small", loc="best")
-    for axes in drawn.axes[len(tasks) :]:
+    if len(tasks) < len(drawn.axes):
+        draw_areas(drawn.axes[len(tasks)])
+    for axes in drawn.axes[len(tasks) + 1 :]:
         axes.remove()
     return drawn
+
+
+def draw_areas(axes: Axes, vehicle: int = 1) -> None:
+    """Draw the no-go areas of an episode, straight to the destination and around them, in the plane there."""
+    for name in ("geodesic", "detour"):
+        steps = flown("nogo", name)[1][vehicle]
+        numbers = steps["no_go_areas"][first_episode_mask(steps["next", "done"][None])[0]]
+        axes.plot(*numbers[:, -2:].flip(-1).T, ".-", label=BARS[name].partition(" (")[0])
+    centers, radii = NoGoAreas.discs(numbers[0])
+    for (north, east), radius in zip(centers.tolist(), radii.tolist(), strict=True):
+        axes.add_patch(Circle((east, north), radius, color="gray", alpha=0.3))
+    axes.plot(0, 0, "k^", label="destination")
+    axes.set(title="an episode of nogo", xlabel="east [km]", ylabel="north [km]", aspect="equal", adjustable="datalim")
+    axes.legend(fontsize="x-small", loc="best")
 
 
 def digest(data: bytes) -> str:
