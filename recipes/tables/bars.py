@@ -21,6 +21,8 @@ from magrl.evaluation.tables import markdown_table
 from magrl.transforms.areas import NoGoAreas, distance_km, turned
 
 import torch
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -87,6 +89,20 @@ def bar(task: str, navigator: str) -> dict[str, float]:
 def bars_of(task: str) -> list[str]:
     """Return the bars of a task, the oracle last."""
     return ["secant", "kalman", "anywhere", "detour" if task == "nogo" else "geodesic"]
+
+
+def draw_areas(axes: Axes, vehicle: int = 1) -> None:
+    """Draw the no-go areas of an episode, straight to the destination and around them, in the plane there."""
+    for name in ("geodesic", "detour"):
+        steps = flown("nogo", name)[1][vehicle]
+        numbers = steps["no_go_areas"][first_episode_mask(steps["next", "done"][None])[0]]
+        axes.plot(*numbers[:, -2:].flip(-1).T, ".-", label=BARS[name].partition(" (")[0])
+    centers, radii = NoGoAreas.discs(numbers[0])
+    for (north, east), radius in zip(centers.tolist(), radii.tolist(), strict=True):
+        axes.add_patch(Circle((east, north), radius, color="gray", alpha=0.3))
+    axes.plot(0, 0, "k^", label="destination")
+    axes.set(title="an episode of nogo", xlabel="east [km]", ylabel="north [km]", aspect="equal", adjustable="datalim")
+    axes.legend(fontsize="x-small", loc="best")
 
 
 if __name__ == "__main__":

@@ -29,19 +29,15 @@ from typing import Any, NamedTuple
 
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation.intervals import interquartile_mean, stratified_bootstrap
-from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.tables import markdown_table
 from magrl.training import UsageError, command
-from magrl.transforms import NoGoAreas
 
 import gymnasium
 import numpy as np
 import torch
 import tyro
-from bars import BARS, SEED, VEHICLES, bar, bars_of, flown
-from matplotlib.axes import Axes
+from bars import BARS, SEED, VEHICLES, bar, bars_of, draw_areas
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from pandas import DataFrame, concat, read_csv
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO, SAC, TD3
@@ -230,20 +226,6 @@ def figure(curves: DataFrame) -> Figure:
     for axes in drawn.axes[len(tasks) + 1 :]:
         axes.remove()
     return drawn
-
-
-def draw_areas(axes: Axes, vehicle: int = 1) -> None:
-    """Draw the no-go areas of an episode, straight to the destination and around them, in the plane there."""
-    for name in ("geodesic", "detour"):
-        steps = flown("nogo", name)[1][vehicle]
-        numbers = steps["no_go_areas"][first_episode_mask(steps["next", "done"][None])[0]]
-        axes.plot(*numbers[:, -2:].flip(-1).T, ".-", label=BARS[name].partition(" (")[0])
-    centers, radii = NoGoAreas.discs(numbers[0])
-    for (north, east), radius in zip(centers.tolist(), radii.tolist(), strict=True):
-        axes.add_patch(Circle((east, north), radius, color="gray", alpha=0.3))
-    axes.plot(0, 0, "k^", label="destination")
-    axes.set(title="an episode of nogo", xlabel="east [km]", ylabel="north [km]", aspect="equal", adjustable="datalim")
-    axes.legend(fontsize="x-small", loc="best")
 
 
 def digest(data: bytes) -> str:
