@@ -365,7 +365,7 @@ def test_bad_options() -> None:
         ({"observation": 5}, "observation must be a Sequence, got 5"),
         ({"observation": ("field", "wings")}, "observation names 'wings', which is not among the keys"),
         ({"transforms": [5]}, r"transforms\[0\] must be a Transform, got 5"),
-        ({"task": "boxes"}, "task must be one of 'box', 'anywhere', 'readings', 'storm', got 'boxes'"),
+        ({"task": "boxes"}, "task must be one of 'box', 'anywhere', 'readings', 'storm', 'nogo', got 'boxes'"),
         ({"observation": "goal", "reward": "spl"}, "goals need .*reward='goal'.* got observation='goal', reward='spl'"),
         ({"reward": "goal"}, "goals need observation='goal'.* got observation='flat'"),
         ({"observation": "goal", "arrival": "distance"}, "arrival='objective', got .*arrival='distance'"),
