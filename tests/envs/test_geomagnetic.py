@@ -376,6 +376,17 @@ def test_starts_computed_ahead_are_dropped_by_a_move() -> None:
     assert env.to("cpu:0")._ahead is None
 
 
+def test_starts_computed_ahead_do_not_change_with_what_a_reset_returned() -> None:
+    env = make(2)
+    with torch.inference_mode():
+        first = env.reset()
+    env.set_seed(0)
+    again = env.reset()
+    again["field"].add_(1.0)
+    env.set_seed(0)
+    assert_same(env.reset(), first)
+
+
 def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
     mask = torch.tensor([True, False, True])
     for env in (make(3), navigation_env(3)):  # TorchRL hides the merge from an environment under transforms
