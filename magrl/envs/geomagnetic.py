@@ -206,6 +206,10 @@ class GeomagneticNavEnv(EnvBase):
         self._ahead = None
         return super().to(device)
 
+    def _load_from_state_dict(self, *args: Any) -> None:
+        self._ahead = None
+        super()._load_from_state_dict(*args)
+
     def _batched(self, spec: TensorSpec) -> TensorSpec:
         return spec.expand(self.num_envs, *spec.shape).to(self.device)
 

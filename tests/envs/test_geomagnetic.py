@@ -387,6 +387,13 @@ def test_starts_computed_ahead_do_not_change_with_what_a_reset_returned() -> Non
     assert_same(env.reset(), first)
 
 
+def test_starts_computed_ahead_are_dropped_by_a_state_that_is_loaded() -> None:
+    env, other = make(2), make(2, objective_floors=(1.0, 1.0, 100.0))
+    env.reset()
+    env.load_state_dict(other.state_dict())
+    assert_same(env.reset(), other.reset())
+
+
 def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
     mask = torch.tensor([True, False, True])
     for env in (make(3), navigation_env(3)):  # TorchRL hides the merge from an environment under transforms
