@@ -25,7 +25,7 @@ class NoGoAreas(EpisodeNumbers):
 
     Args:
         number: discs of an episode.
-        radius_km: lowest and highest radius [km].
+        radius_km: lowest and highest radius [km]; at most two thirds of the way from a center to either end of a task.
         sight_km: distance from the edge within which a disc is seen [km].
         seen: discs that are observed at once, nearest first.
         **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeNumbers`. The
@@ -102,6 +102,8 @@ class NoGoAreas(EpisodeNumbers):
         right = torch.stack((-start[..., 1], start[..., 0]), -1) / start.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         centers = along * start.unsqueeze(-2) + beside * right.unsqueeze(-2)
         radii = self.radius_km[0] + (self.radius_km[1] - self.radius_km[0]) * radius
+        ends_km = torch.minimum(centers.norm(dim=-1), (centers - start.unsqueeze(-2)).norm(dim=-1))
+        radii = torch.minimum(radii, 2 / 3 * ends_km)  # both ends of a short task are free
         return torch.cat((torch.cat((centers, radii.unsqueeze(-1)), -1).flatten(-2), start), -1)
 
     def _seen(self, relative: Tensor, radii: Tensor, heading: Tensor) -> Tensor:

@@ -51,6 +51,13 @@ def test_observation_of_the_task() -> None:
     assert (state["observation"][..., 13:] == state["areas"]).all()
 
 
+def test_no_area_covers_a_start_or_a_destination() -> None:
+    """Of the shortest tasks, too."""
+    env = no_go_env(64, seed=0, distance_range_km=(30.0, 120.0))
+    centers, radii = NoGoAreas.discs(env.reset()["no_go_areas"])
+    assert (centers.norm(dim=-1) > radii).all()
+
+
 @pytest.mark.parametrize("options", [{"number": 0}, {"radius_km": (-1.0, 5.0)}, {"sight_km": 0.0}])
 def test_bad_options(options: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
