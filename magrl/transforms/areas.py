@@ -37,7 +37,8 @@ class NoGoAreas(EpisodeNumbers):
             [km], then the vehicle's position. It is privileged.
 
     Raises:
-        ValueError: for a number that is not a whole number above 0, a negative radius, or a sight that is not above 0.
+        ValueError: for a number that is not a whole number above 0, a negative radius, a highest one of 0 or below
+            the lowest, or a sight that is not above 0.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
@@ -66,6 +67,7 @@ class NoGoAreas(EpisodeNumbers):
         check_number(1, whole=True, number=number, seen=seen)
         check_number(0, above=True, sight_km=sight_km)
         check_numbers(2, 0.0, radius_km=radius_km)
+        check_number(radius_km[0], above=not radius_km[0], highest_radius_km=radius_km[1])
         self.number, self.seen, self.sight_km = number, min(seen, number), float(sight_km)
         self.radius_km = tuple(map(float, radius_km))
         self.size = 3 * number + 2
