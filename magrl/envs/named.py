@@ -67,7 +67,7 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """
     env = navigation_env(num_envs, **{"max_steps": 20} | options)
     env.insert_transform(0, Compose(TrueWay(), NoGoAreas()))  # the reward reads the success that areas leave
-    for joined in [step for step in env.transform if isinstance(step, CatTensors)][:1]:
+    for joined in [s for s in env.transform if isinstance(s, CatTensors) and s.out_keys == ["observation"]][-1:]:
         env.append_transform(CatTensors([*joined.in_keys, "areas"], "observation", del_keys=False, sort=False))
     return env
 

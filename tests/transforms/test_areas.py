@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import CatTensors, Compose, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.named import no_go_env
@@ -49,6 +49,14 @@ def test_observation_of_the_task() -> None:
     state = env.rollout(3)
     assert state["observation"].shape[-1] == 13 + state["areas"].shape[-1]
     assert (state["observation"][..., 13:] == state["areas"]).all()
+
+
+def test_areas_join_the_observation_alone() -> None:
+    """Not what other transforms concatenate."""
+    joined = [CatTensors(["move", "heading"], "own", del_keys=False)]
+    state = no_go_env(2, seed=0, transforms=joined).reset()
+    assert state["observation"].shape == (2, 22)
+    assert "observation" not in no_go_env(2, seed=0, transforms=joined, observation="dict").reset()
 
 
 def test_no_area_covers_a_start_or_a_destination() -> None:
