@@ -59,6 +59,13 @@ def test_areas_join_the_observation_alone() -> None:
     assert "observation" not in no_go_env(2, seed=0, transforms=joined, observation="dict").reset()
 
 
+@pytest.mark.parametrize("options", [{"reward": "paper"}, {"reward": "base"}, {"observation": "goal"}])
+def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused(options: dict) -> None:
+    with pytest.raises(ValueError, match="reward"):
+        no_go_env(**options)
+    assert no_go_env(reward="spl", seed=0).reset()["observation"].shape == (1, 22)
+
+
 def test_no_area_covers_a_start_or_a_destination() -> None:
     """Of the shortest tasks, too."""
     env = no_go_env(64, seed=0, distance_range_km=(30.0, 120.0))
