@@ -17,6 +17,7 @@ import itertools
 import multiprocessing
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -38,6 +39,7 @@ import numpy as np
 import torch
 import tyro
 from bars import BARS, SEED, VEHICLES, bar, bars_of, draw_areas
+from filelock import FileLock
 from matplotlib.figure import Figure
 from pandas import DataFrame, concat, read_csv
 from sb3_contrib import RecurrentPPO
@@ -172,13 +174,15 @@ def recipe(name: str, seed: int, folder: Path) -> list[Row]:
 def run(config: Config, task: str, name: str, seed: int) -> Path:
     """Train one run, unless its file exists; return the file."""
     path = config.out / f"{task}-{name}-seed{seed}.csv"
-    if not path.exists():
-        torch.set_num_threads(1)
-        rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
-        about = {"task": task, "algorithm": name, "seed": seed}
-        unfinished = path.with_suffix(".part")
-        DataFrame([about | row for row in rows]).round(2).to_csv(unfinished, index=False)
-        unfinished.rename(path)
+    with FileLock(path.with_suffix(".lock")):  # of other sweeps in this folder
+        if not path.exists():
+            torch.set_num_threads(1)
+            shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
+            rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
+            about = {"task": task, "algorithm": name, "seed": seed}
+            unfinished = path.with_suffix(".part")
+            DataFrame([about | row for row in rows]).round(2).to_csv(unfinished, index=False)
+            unfinished.rename(path)
     return path
 
 
