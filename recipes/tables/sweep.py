@@ -242,15 +242,15 @@ def main(args: Sequence[str] | None = None) -> None:
     """Train what is missing, and write table, data and figure."""
     config = tyro.cli(Config, description=__doc__, args=args)
     config.out.mkdir(parents=True, exist_ok=True)
-    jobs, paths = list(planned(config)), []
-    if not jobs:
-        raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
+    jobs = list(planned(config))
     if config.train:
         os.environ["OMP_NUM_THREADS"] = "1"
         with ProcessPoolExecutor(config.jobs, multiprocessing.get_context("spawn")) as pool:
             for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
                 done.result()
     paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
+    if not paths:
+        raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
     curves = concat([read_csv(path) for path in paths])
     curves.to_csv(config.results / "scores.csv", index=False)
     (config.results / "scores.md").write_text(table(curves))

@@ -13,6 +13,7 @@ from pandas import read_csv
 from support.recipes import RECIPES, load
 
 from magrl.envs import planet_scenario
+from magrl.training import UsageError
 
 pytest.importorskip("sb3_contrib")
 sys.path.insert(0, str(RECIPES / "tables"))
@@ -65,6 +66,12 @@ def test_two_sweeps_in_a_folder_train_a_run_once(tmp_path: Path, monkeypatch) ->
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(lambda _: sweep.run(sweep.Config(out=tmp_path), "box", "PPO", 0), range(2)))
     assert begun == [("box", "PPO", 0)]
+
+
+@pytest.mark.parametrize("options", [[], ["--tasks", "mars"]])
+def test_a_sweep_without_runs_says_so(tmp_path: Path, options: list[str]) -> None:
+    with pytest.raises(UsageError, match="none of the algorithms"):
+        sweep.main(["--no-train", "--out", str(tmp_path), "--results", str(tmp_path), *options])
 
 
 def test_jobs_of_one_seed_come_first() -> None:
