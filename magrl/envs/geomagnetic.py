@@ -206,6 +206,10 @@ class GeomagneticNavEnv(EnvBase):
         self._ahead = None
         return super().to(device)
 
+    def _load_from_state_dict(self, *args: Any) -> None:
+        self._ahead = None
+        super()._load_from_state_dict(*args)
+
     def _batched(self, spec: TensorSpec) -> TensorSpec:
         return spec.expand(self.num_envs, *spec.shape).to(self.device)
 
@@ -242,9 +246,9 @@ class GeomagneticNavEnv(EnvBase):
         used = (self._ahead[EPISODE_STREAM] != self._streams(self.vehicle, self.episode)).squeeze(-1)
         if (used & mask).any():
             rows = used.nonzero().squeeze(-1)
-            self._ahead = self._ahead.clone()  # a rollout may hold the old tensors
+            self._ahead = self._ahead.clone()  # tensors of an inference mode cannot be written outside of it
             self._ahead[rows] = self._start_of(rows)
-        return self._ahead.copy()
+        return self._ahead.clone()  # who is given it may write into it
 
     def _streams(self, vehicle: Tensor, episode: Tensor) -> Tensor:
         """Return the stream of random numbers of episodes, ``(P, 1)``, which names an episode of any seed."""

@@ -7,6 +7,7 @@ from typing import Any
 
 from torchrl.envs import CatTensors, Compose, TransformedEnv
 
+from magrl.checks import check_choice
 from magrl.envs.navigation import anywhere_env, navigation_env
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.transforms import SPEEDS_KM_H, MagneticWeather, NoGoAreas, SensorErrors, Spikes, TrueWay
@@ -61,13 +62,17 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
         **options: of :func:`~magrl.envs.navigation.navigation_env`, with ``max_steps=20`` by default. The observation
             ``"flat"`` ends with the areas in sight (:class:`~magrl.transforms.NoGoAreas`).
 
+    Raises:
+        ValueError: for a reward other than ``"progress"`` and ``"spl"``: it would pay for an arrival through an area.
+
     Example:
         >>> no_go_env(4, seed=0).rollout(3)["observation"].shape
         torch.Size([4, 3, 22])
     """
+    check_choice(("progress", "spl"), reward=options.setdefault("reward", "progress"))
     env = navigation_env(num_envs, **{"max_steps": 20} | options)
     env.insert_transform(0, Compose(TrueWay(), NoGoAreas()))  # the reward reads the success that areas leave
-    for joined in [step for step in env.transform if isinstance(step, CatTensors)][:1]:
+    for joined in [s for s in env.transform if isinstance(s, CatTensors) and s.out_keys == ["observation"]][-1:]:
         env.append_transform(CatTensors([*joined.in_keys, "areas"], "observation", del_keys=False, sort=False))
     return env
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import datetime
 import math
-from collections.abc import Hashable
 from functools import lru_cache
 from typing import Annotated, Any, Literal, Self
 
@@ -265,9 +264,10 @@ class Scenario(CheckedModel):
         count = len(self.region)
         if self.objective_floors is not None:
             return torch.tensor(self.objective_floors, dtype=torch.float64).repeat(count, 1)
-        if not isinstance(field, Hashable):
+        try:
+            return _mean_changes(field, self.region).clone()  # type: ignore[arg-type]
+        except TypeError:  # a field without a hash
             return _mean_changes.__wrapped__(field, self.region)
-        return _mean_changes(field, self.region).clone()
 
     def random_tasks(self, num_tasks: int, seed: int) -> Tasks:
         """Return a frozen set of random tasks, see :func:`magrl.envs.tasks.task_set`."""

@@ -186,7 +186,7 @@ class Run:
         Args:
             policy: agent for evaluations, which is saved.
             validation: environment of the validation tasks.
-            env: environment inside the collector; with several collectors, each has its own.
+            env: environment inside the collector; with several collectors, one of as many vehicles as theirs together.
             collector: source of batches.
             parts: everything else that checkpoints must hold, such as loss, optimizers and replay buffer.
 
@@ -195,7 +195,7 @@ class Run:
         """
         self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
         self._network = policy.actor if isinstance(policy, FieldPolicy) else policy
-        self.statistics.first_cohort = env.num_envs * env.max_steps * len(getattr(collector, "procs", (1,)))
+        self.statistics.first_cohort = env.num_envs * env.max_steps
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
         parts = {"configuration": self, **parts}  # restored first
         parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}

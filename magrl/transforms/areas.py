@@ -25,7 +25,7 @@ class NoGoAreas(EpisodeNumbers):
 
     Args:
         number: discs of an episode.
-        radius_km: lowest and highest radius [km].
+        radius_km: lowest and highest radius [km]; at most two thirds of the way from a center to either end of a task.
         sight_km: distance from the edge within which a disc is seen [km].
         seen: discs that are observed at once, nearest first.
         **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeNumbers`. The
@@ -37,7 +37,8 @@ class NoGoAreas(EpisodeNumbers):
             [km], then the vehicle's position. It is privileged.
 
     Raises:
-        ValueError: for a number that is not a whole number above 0, a negative radius, or a sight that is not above 0.
+        ValueError: for a number that is not a whole number above 0, a negative radius, a highest one of 0 or below
+            the lowest, or a sight that is not above 0.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
@@ -66,6 +67,7 @@ class NoGoAreas(EpisodeNumbers):
         check_number(1, whole=True, number=number, seen=seen)
         check_number(0, above=True, sight_km=sight_km)
         check_numbers(2, 0.0, radius_km=radius_km)
+        check_number(radius_km[0], above=not radius_km[0], highest_radius_km=radius_km[1])
         self.number, self.seen, self.sight_km = number, min(seen, number), float(sight_km)
         self.radius_km = tuple(map(float, radius_km))
         self.size = 3 * number + 2
@@ -102,6 +104,8 @@ class NoGoAreas(EpisodeNumbers):
         right = torch.stack((-start[..., 1], start[..., 0]), -1) / start.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         centers = along * start.unsqueeze(-2) + beside * right.unsqueeze(-2)
         radii = self.radius_km[0] + (self.radius_km[1] - self.radius_km[0]) * radius
+        ends_km = torch.minimum(centers.norm(dim=-1), (centers - start.unsqueeze(-2)).norm(dim=-1))
+        radii = torch.minimum(radii, 2 / 3 * ends_km)  # both ends of a short task are free
         return torch.cat((torch.cat((centers, radii.unsqueeze(-1)), -1).flatten(-2), start), -1)
 
     def _seen(self, relative: Tensor, radii: Tensor, heading: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ import itertools
 import multiprocessing
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -38,6 +39,7 @@ import numpy as np
 import torch
 import tyro
 from bars import BARS, SEED, VEHICLES, bar, bars_of, draw_areas
+from filelock import FileLock
 from matplotlib.figure import Figure
 from pandas import DataFrame, concat, read_csv
 from sb3_contrib import RecurrentPPO
@@ -172,13 +174,15 @@ def recipe(name: str, seed: int, folder: Path) -> list[Row]:
 def run(config: Config, task: str, name: str, seed: int) -> Path:
     """Train one run, unless its file exists; return the file."""
     path = config.out / f"{task}-{name}-seed{seed}.csv"
-    if not path.exists():
-        torch.set_num_threads(1)
-        rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
-        about = {"task": task, "algorithm": name, "seed": seed}
-        unfinished = path.with_suffix(".part")
-        DataFrame([about | row for row in rows]).round(2).to_csv(unfinished, index=False)
-        unfinished.rename(path)
+    with FileLock(path.with_suffix(".lock")):  # of other sweeps in this folder
+        if not path.exists():
+            torch.set_num_threads(1)
+            shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
+            rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
+            about = {"task": task, "algorithm": name, "seed": seed}
+            unfinished = path.with_suffix(".part")
+            DataFrame([about | row for row in rows]).round(2).to_csv(unfinished, index=False)
+            unfinished.rename(path)
     return path
 
 
@@ -238,15 +242,15 @@ def main(args: Sequence[str] | None = None) -> None:
     """Train what is missing, and write table, data and figure."""
     config = tyro.cli(Config, description=__doc__, args=args)
     config.out.mkdir(parents=True, exist_ok=True)
-    jobs, paths = list(planned(config)), []
-    if not jobs:
-        raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
+    jobs = list(planned(config))
     if config.train:
         os.environ["OMP_NUM_THREADS"] = "1"
         with ProcessPoolExecutor(config.jobs, multiprocessing.get_context("spawn")) as pool:
             for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
                 done.result()
     paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
+    if not paths:
+        raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
     curves = concat([read_csv(path) for path in paths])
     curves.to_csv(config.results / "scores.csv", index=False)
     (config.results / "scores.md").write_text(table(curves))

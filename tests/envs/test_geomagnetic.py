@@ -376,6 +376,24 @@ def test_starts_computed_ahead_are_dropped_by_a_move() -> None:
     assert env.to("cpu:0")._ahead is None
 
 
+def test_starts_computed_ahead_do_not_change_with_what_a_reset_returned() -> None:
+    env = make(2)
+    with torch.inference_mode():
+        first = env.reset()
+    env.set_seed(0)
+    again = env.reset()
+    again["field"].add_(1.0)
+    env.set_seed(0)
+    assert_same(env.reset(), first)
+
+
+def test_starts_computed_ahead_are_dropped_by_a_state_that_is_loaded() -> None:
+    env, other = make(2), make(2, objective_floors=(1.0, 1.0, 100.0))
+    env.reset()
+    env.load_state_dict(other.state_dict())
+    assert_same(env.reset(), other.reset())
+
+
 def test_a_reset_of_some_needs_the_state_of_the_others() -> None:
     mask = torch.tensor([True, False, True])
     for env in (make(3), navigation_env(3)):  # TorchRL hides the merge from an environment under transforms

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -71,6 +72,21 @@ def test_floors_are_25_km_of_travel_there() -> None:
     assert Scenario().floors(Scenario().build_field()).tolist() == [[0.05, 0.4, 15.0]]
     followed = Scenario(objective_floors=None)
     assert followed.floors(followed.build_field())[0].tolist() == pytest.approx((0.05, 0.4, 15.0), rel=0.5)
+
+
+def test_floors_take_a_field_that_cannot_be_hashed() -> None:
+    """A frozen class has a hash, but not where its values have none."""
+
+    @dataclass(frozen=True)
+    class Field:
+        values: list[RegionalField]
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.values[0], name)
+
+    field = Scenario().build_field()
+    scenario = Scenario(objective_floors=None)
+    assert torch.equal(scenario.floors(Field([field])), scenario.floors(field))
 
 
 def test_replace_checks_anew_and_changes_nothing_else() -> None:

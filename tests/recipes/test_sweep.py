@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from pandas import read_csv
 from support.recipes import RECIPES, load
 
 from magrl.envs import planet_scenario
+from magrl.training import UsageError
 
 pytest.importorskip("sb3_contrib")
 sys.path.insert(0, str(RECIPES / "tables"))
@@ -42,6 +45,33 @@ def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monk
     assert rows["cpu_s"].is_monotonic_increasing
     monkeypatch.setattr(sweep, "trained", None)
     assert len(read_csv(sweep.run(config, task, name, 0))) == len(rows)
+
+
+def test_an_interrupted_training_by_a_recipe_begins_again(tmp_path: Path, monkeypatch) -> None:
+    """The recipe refuses the folder of a run."""
+    (tmp_path / "box-GG-TD3-seed0").mkdir()
+    monkeypatch.setattr(sweep, "recipe", lambda name, seed, folder: [{"steps": folder.exists()}])  # noqa: ARG005
+    assert read_csv(sweep.run(sweep.Config(out=tmp_path), "box", "GG-TD3", 0))["steps"].tolist() == [False]
+
+
+def test_two_sweeps_in_a_folder_train_a_run_once(tmp_path: Path, monkeypatch) -> None:
+    begun = []
+
+    def trained(*job: object) -> list[dict]:
+        begun.append(job)
+        time.sleep(0.3)
+        return [{"steps": 1}]
+
+    monkeypatch.setattr(sweep, "trained", trained)
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda _: sweep.run(sweep.Config(out=tmp_path), "box", "PPO", 0), range(2)))
+    assert begun == [("box", "PPO", 0)]
+
+
+@pytest.mark.parametrize("options", [[], ["--tasks", "mars"]])
+def test_a_sweep_without_runs_says_so(tmp_path: Path, options: list[str]) -> None:
+    with pytest.raises(UsageError, match="none of the algorithms"):
+        sweep.main(["--no-train", "--out", str(tmp_path), "--results", str(tmp_path), *options])
 
 
 def test_jobs_of_one_seed_come_first() -> None:

@@ -239,3 +239,13 @@ def test_workers_fly_random_tasks_of_their_own() -> None:
     seeds = [worker_seed(seed, index) for seed in (0, 1, 1_999_999_999) for index in range(3)]
     assert len(set(seeds)) == len(seeds)
     assert all(0 <= seed < 2_000_000_000 for seed in seeds)
+
+
+def test_the_vehicles_of_all_workers_end_their_first_episodes_together(tmp_path: Path) -> None:
+    """The environment of the training has as many as they."""
+    with in_run(RunConfig(out=tmp_path / "run", wandb_mode="disabled")) as run:
+        env, collector = GeomagneticNavEnv(num_envs=8, seed=0, max_steps=5), SimpleNamespace(procs=[0, 1])
+        collector.shutdown = lambda: None
+        policy = FieldPolicy(PolicyConfig(env.observation_view(), (8,)))
+        run.start(policy=policy, validation=env, env=env, collector=collector)
+        assert run.statistics.first_cohort == 8 * 5

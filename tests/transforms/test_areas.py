@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import CatTensors, Compose, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.named import no_go_env
@@ -51,7 +51,38 @@ def test_observation_of_the_task() -> None:
     assert (state["observation"][..., 13:] == state["areas"]).all()
 
 
-@pytest.mark.parametrize("options", [{"number": 0}, {"radius_km": (-1.0, 5.0)}, {"sight_km": 0.0}])
+def test_areas_join_the_observation_alone() -> None:
+    """Not what other transforms concatenate."""
+    joined = [CatTensors(["move", "heading"], "own", del_keys=False)]
+    state = no_go_env(2, seed=0, transforms=joined).reset()
+    assert state["observation"].shape == (2, 22)
+    assert "observation" not in no_go_env(2, seed=0, transforms=joined, observation="dict").reset()
+
+
+@pytest.mark.parametrize("options", [{"reward": "paper"}, {"reward": "base"}, {"observation": "goal"}])
+def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused(options: dict) -> None:
+    with pytest.raises(ValueError, match="reward"):
+        no_go_env(**options)
+    assert no_go_env(reward="spl", seed=0).reset()["observation"].shape == (1, 22)
+
+
+def test_no_area_covers_a_start_or_a_destination() -> None:
+    """Of the shortest tasks, too."""
+    env = no_go_env(64, seed=0, distance_range_km=(30.0, 120.0))
+    centers, radii = NoGoAreas.discs(env.reset()["no_go_areas"])
+    assert (centers.norm(dim=-1) > radii).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"number": 0},
+        {"radius_km": (-1.0, 5.0)},
+        {"radius_km": (0.0, 0.0)},
+        {"radius_km": (40.0, 15.0)},
+        {"sight_km": 0.0},
+    ],
+)
 def test_bad_options(options: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         NoGoAreas(**options)
