@@ -224,9 +224,10 @@ def train(config: Config) -> dict[str, float]:
             buffer.extend(batch.reshape(-1).select(*TRANSITION))
             noise.step()
             stats.losses["exploration_noise"] = noise.sigma
-            stats.losses["learning_rate"] = torch.tensor(config.linear("learning_rate", run.remaining))
+            rate = config.linear("learning_rate", run.remaining)
+            stats.losses["learning_rate"] = torch.tensor(rate, dtype=torch.float64)
             for optimizer in (critic_optimizer, actor_optimizer):
-                optimizer.param_groups[0]["lr"] = stats.losses["learning_rate"].item()
+                optimizer.param_groups[0]["lr"] = rate
             if len(buffer) < config.batch_size:
                 continue
             for transitions in buffer.sample().split(config.batch_size):

@@ -241,6 +241,9 @@ def digest(data: bytes) -> str:
 def main(args: Sequence[str] | None = None) -> None:
     """Train what is missing, and write table, data and figure."""
     config = tyro.cli(Config, description=__doc__, args=args)
+    for name in (*config.tasks, *config.algorithms):
+        if name not in (known := (*IDS, *ALGORITHMS, *RECIPES)):
+            raise UsageError(f"unknown task or algorithm {name!r}: choose from {', '.join(known)}")
     config.out.mkdir(parents=True, exist_ok=True)
     jobs = list(planned(config))
     if config.train:
