@@ -1,7 +1,7 @@
 """Learning curves on the named tasks: algorithms of stable-baselines3 and sb3-contrib, and the recipes of this library.
 
     pip install -c constraints.txt -e '.[bench]'
-    python recipes/tables/sweep.py                                     # everything: about five hours on two cores
+    python recipes/tables/sweep.py                                     # everything: about three hours on two cores
     python recipes/tables/sweep.py --tasks box --algorithms PPO --seeds 0
     python recipes/tables/sweep.py --no-train                          # table and figure of the runs that exist
 
