@@ -55,7 +55,7 @@ def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
 def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """Return the environment *Box* with no-go areas between start and destination, and a deadline of 20 steps.
 
-    The way straight ahead is closed in most episodes, and areas are seen only from nearby: who is greedy fails.
+    The straight path is blocked in most episodes, and areas are seen only from nearby: a greedy policy fails.
 
     Args:
         num_envs: vehicles in the batch.
