@@ -70,7 +70,7 @@ def test_two_sweeps_in_a_folder_train_a_run_once(tmp_path: Path, monkeypatch) ->
 
 @pytest.mark.parametrize("options", [[], ["--tasks", "mars"]])
 def test_a_sweep_without_runs_says_so(tmp_path: Path, options: list[str]) -> None:
-    with pytest.raises(UsageError, match="none of the algorithms|unknown task"):
+    with pytest.raises(UsageError, match=r"none of the algorithms|unknown task"):
         sweep.main(["--no-train", "--out", str(tmp_path), "--results", str(tmp_path), *options])
 
 
