@@ -160,113 +160,6 @@ class Conditions:
         return _rounded(calibration(reading, reading, SensorStd(*std), known_std)[1])
 
 
-_CALIBRATED = VectorErrors(hard_iron_nt=(5.0,) * 3, soft_iron=((1e-4,) * 3,) * 3, attitude_deg=(0.01, 0.01))
-_MEMS = VectorErrors(hard_iron_nt=(30.0,) * 3, soft_iron=((5e-4,) * 3,) * 3, attitude_deg=(0.05, 0.05))
-_SWUNG = VectorErrors(hard_iron_nt=(100.0,) * 3, soft_iron=((1e-3,) * 3,) * 3, attitude_deg=(0.2, 0.2))
-_PHONE = VectorErrors(hard_iron_nt=(300.0,) * 3, soft_iron=((2e-3,) * 3,) * 3, attitude_deg=(0.3, 0.3))
-_MONTH = {"record": "boulder-2016", "span_h": 480.0}
-
-CONDITIONS: Mapping[str, Conditions] = {
-    preset.name: preset
-    for preset in (
-        Conditions("laboratory"),
-        Conditions(
-            "aircraft",
-            SPEEDS_KM_H["aircraft"],
-            sensors={"noise": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
-            north="fiber-optic",
-            motion={"current_km_h": 2.1},
-            weather={"record": "quiet"},
-        ),
-        Conditions(
-            "ship",
-            SPEEDS_KM_H["ship"],
-            sensors={"noise": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
-            north="fiber-optic",
-            motion={"log_scale": 0.01, "current_km_h": 0.9},
-            weather={"record": "quiet", "span_h": 240.0},
-        ),
-        Conditions(
-            "underwater",
-            SPEEDS_KM_H["underwater"],
-            sensors={"noise": (0.02, 0.02, 2.0), "vector": _CALIBRATED},
-            north="fiber-optic",
-            motion={"log_scale": 0.002, "current_km_h": 0.36, "eddies_km_h": 0.36, "eddy_km": 100.0},
-            weather=_MONTH,
-        ),
-        Conditions(
-            "low-cost",
-            SPEEDS_KM_H["ship"],
-            sensors={
-                "noise": (0.2, 0.1, 75.0),
-                "resolution": (0.0, 0.0, 13.0),
-                "drift": (0.0, 0.0, 10.0),
-                "drift_length": 200.0,
-                "outage_rate": 0.02,
-                "vector": _MEMS,
-            },
-            north="low-cost",
-            motion={"log_scale": 0.05, "log_noise": 0.01, "current_km_h": 0.9},
-            weather=_MONTH,
-        ),
-        Conditions(
-            "boat",
-            12.0,
-            sensors={"noise": (0.1, 0.05, 30.0), "resolution": (0.0, 0.0, 13.0), "vector": _MEMS},
-            north=MAGNETIC,
-            motion={"log_scale": 0.02, "current_km_h": 0.9},
-            weather=_MONTH,
-        ),
-        Conditions(
-            "drone",
-            90.0,
-            sensors={"noise": (0.2, 0.1, 50.0), "resolution": (0.0, 0.0, 13.0), "vector": _SWUNG},
-            north=MAGNETIC,
-            motion={"log_scale": 0.03, "current_km_h": 7.0},
-            weather={"record": "quiet"},
-        ),
-        Conditions(
-            "phone",
-            12.0,
-            sensors={"noise": (0.3, 0.15, 80.0), "resolution": (0.0, 0.0, 150.0), "vector": _PHONE},
-            north=MAGNETIC,
-            motion={"log_scale": 0.05, "current_km_h": 0.9},
-            weather=_MONTH,
-        ),
-    )
-}
-"""Presets. We take a standard's limit as two standard deviations. Values marked "chosen" have no source: we did not
-read the document that is named with them, which only indicates the kind of device.
-
-Readings:
-
-- ``noise``: chosen, the lowest level of noise of the published tables; it includes the vehicle's motion.
-  Low-cost: roll and pitch to 0.4 degrees root mean square (Moog Crossbow NAV440, data sheet rev. B), as a mean of 16
-  readings (chosen), at :data:`TYPICAL_FIELD`.
-- Hard iron: 5 nT (chosen, as the offset error of a fluxgate such as Bartington Mag-03, for what calibration leaves);
-  low-cost 30 nT (chosen). Soft iron: 1e-4 and 5e-4 (chosen).
-- Roll and pitch: 0.01 degrees (chosen, as of the fiber-optic gyrocompass Octans); low-cost 0.05 degrees (chosen).
-- Resolution 13 nT: PNI RM3100 at 200 cycles (support article of PNI). Drift and outages: chosen.
-
-- Boat, drone, phone: hard iron 30, 100, 300 nT, soft iron 5e-4, 1e-3, 2e-3, roll and pitch 0.05, 0.2, 0.3 degrees, and
-  noise of means of readings (all chosen). Resolution of the phone 150 nT: AKM AK09918 (data sheet 016014242-E-00).
-
-North: see :data:`~magrl.transforms.NORTH_REFERENCES`; boat, drone and phone have a compass alone.
-
-Motion:
-
-- Aircraft: inertial navigation to 2 nautical miles per hour for 95 % of flights (chosen, as 14 CFR part 121, appendix
-  G), that is, a constant error of the velocity with a root mean square of 2.1 km/h.
-- Ship: log to 2 % of the speed (chosen, as IMO Resolution A.824(19)); current of half a knot (chosen).
-- Underwater: Doppler velocity log to 0.4 % (chosen, as Teledyne RDI Workhorse Navigator); current and eddies of 0.1 m/s
-  (chosen).
-- Low-cost: log to 10 % (chosen), current as for the ship.
-- Boat, drone, phone: log to 4, 6, 10 %, and an unknown current, or wind, of 0.9, 7, 0.9 km/h (chosen).
-
-Weather: see :data:`magrl.field.WEATHER`; a quiet day for aircraft and ship, 20 days of a month for the others (chosen).
-"""
-
-
 def _rounded(sensor_std: SensorStd) -> SensorStd:
     """Return standard deviations as plain numbers."""
     return SensorStd(*(tuple(round(number, 6) for number in std.tolist()) for std in sensor_std))
@@ -291,13 +184,25 @@ def load_conditions(path: Path | str) -> Conditions:
     """
     path = Path(path)
     try:
-        content = {"name": path.stem} | read_document(path)
-        sensors = dict(content.get("sensors", {}))
-        if "vector" in sensors:
-            sensors["vector"] = VectorErrors(**sensors["vector"])
-        return Conditions(**content | {"sensors": sensors})
+        return _conditions(path.stem, read_document(path))
     except (ValueError, TypeError, OSError) as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _conditions(name: str, content: Mapping[str, Any]) -> Conditions:
+    """Return the conditions that a table of a file holds."""
+    content = {"name": name, **content}
+    sensors = dict(content.get("sensors", {}))
+    if "vector" in sensors:
+        sensors["vector"] = VectorErrors(**sensors["vector"])
+    return Conditions(**content | {"sensors": sensors})
+
+
+CONDITIONS: Mapping[str, Conditions] = {
+    name: _conditions(name, content)
+    for name, content in read_document(Path(__file__).with_name("presets.toml")).items()
+}
+"""Presets, each with its sources: ``presets.toml``."""
 
 
 def conditions_named(name: str) -> Conditions:
