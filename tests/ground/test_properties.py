@@ -21,7 +21,6 @@ from torch import Tensor
 from magrl import geodesy
 from magrl.field.elements import measured_elements, seven_elements
 from magrl.field.spherical import SphericalHarmonicField
-from magrl.guidance import objective, objective_weights, parallel_approach
 
 MILLIMETER = 1e-6
 
@@ -143,64 +142,3 @@ def test_the_field_has_no_sources_and_no_curl(
     tolerance = 1e-7 * float(tensor.norm()) + 1e-9 * float(model(*scalars(latitude, longitude, altitude_km)).norm())
     assert abs(float(tensor.trace())) < tolerance
     assert float((tensor - tensor.T).abs().max()) < tolerance
-
-
-# --- Guidance ---------------------------------------------------------------------------------------------------------
-
-
-@st.composite
-def approaches(draw: st.DrawFn, crossing: SearchStrategy[float]) -> tuple[Tensor, Tensor]:
-    """Errors ``(2,)`` and gradients ``(2, 2)`` of two elements, the gradients crossing at some angle [rad]."""
-    first, sizes = draw(ANGLES), [draw(between(1e-3, 1e3)) for _ in range(2)]
-    second = first + draw(crossing)
-    gradient = f64(math.cos(first), math.sin(first), math.cos(second), math.sin(second)).reshape(2, 2)
-    errors = [draw(between(0.01, 100)) * draw(st.sampled_from((-1, 1))) * size for size in sizes]
-    return f64(*errors), gradient * f64(*sizes).unsqueeze(-1)
-
-
-def signed(low_deg: float, high_deg: float) -> SearchStrategy[float]:
-    """Angles between limits to either side [rad]."""
-    return st.floats(low_deg, high_deg).flatmap(lambda x: st.sampled_from((math.radians(x), -math.radians(x))))
-
-
-CROSSING = approaches(signed(3, 177))
-
-
-def heading_of(error: Tensor, gradient: Tensor) -> float:
-    heading, valid = parallel_approach(torch.zeros(2, dtype=torch.float64), error, gradient)
-    assert valid
-    return float(heading)
-
-
-@given(CROSSING)
-def test_the_heading_closes_both_elements_in_proportion(approach: tuple[Tensor, Tensor]) -> None:
-    error, gradient = approach
-    heading = heading_of(error, gradient)
-    change = gradient @ f64(math.cos(heading), math.sin(heading))  # per km
-    share = change / error
-    assert (share > 0).all()
-    torch.testing.assert_close(share[0], share[1], rtol=1e-9, atol=0)
-
-
-@given(CROSSING, ANGLES)
-def test_turning_the_axes_turns_the_heading(approach: tuple[Tensor, Tensor], turn: float) -> None:
-    error, gradient = approach
-    sin, cos = math.sin(turn), math.cos(turn)
-    turned = gradient @ f64(cos, -sin, sin, cos).reshape(2, 2)  # components along axes turned clockwise
-    difference = heading_of(error, gradient) - turn - heading_of(error, turned)
-    assert abs(math.remainder(difference, 2 * math.pi)) < 1e-9
-
-
-@given(CROSSING, between(1e-3, 1e3), between(1e-3, 1e3))
-def test_the_units_of_an_element_do_not_matter(approach: tuple[Tensor, Tensor], one: float, two: float) -> None:
-    error, gradient = approach
-    units = f64(one, two)
-    difference = heading_of(error, gradient) - heading_of(error * units, gradient * units.unsqueeze(-1))
-    assert abs(math.remainder(difference, 2 * math.pi)) < 1e-9
-    there = torch.cat((f64(0.0), error))  # D, the first, is in degrees always
-    here, floors = torch.zeros_like(there), torch.full_like(there, 0.01)
-    plain, scaled = (
-        objective(0.3 * there * unit, there * unit, objective_weights(here, there * unit, floors * unit))
-        for unit in (f64(1, 1, 1), f64(1, one, two))
-    )
-    torch.testing.assert_close(scaled, plain)
