@@ -7,16 +7,14 @@ import warnings
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase, set_interaction_type
-from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from magrl.agents.trained import Memory
 from magrl.checks import short
 
 DESCRIPTION = "magrl"
@@ -30,7 +28,7 @@ TOLERANCE = 1e-4
 _CHECKED = 5  # observations on which a network is checked
 
 
-class OnnxNetwork(Memory):
+class OnnxNetwork(nn.Module):
     """A network of an ONNX file as an actor: from ``observation`` ``(..., K)`` to ``action`` in [-1, 1].
 
     The file has the input ``observation`` ``(N, K)`` and the output ``action`` ``(N, 2)``, or ``(N, 3)`` for a policy
@@ -47,8 +45,6 @@ class OnnxNetwork(Memory):
             with weights in other files, or whose action is not finite.
     """
 
-    out_keys: ClassVar[list[str]] = ["action"]
-
     def __init__(self, content: bytes, size: int) -> None:
         super().__init__()
         self.content, self.size = content, size
@@ -58,9 +54,8 @@ class OnnxNetwork(Memory):
         inputs = {each.name: each for each in session.get_inputs()}
         outputs = [each.name for each in session.get_outputs()]
         memory = [name for name in inputs if name != "observation"]
-        self.state_keys = tuple(f"next_{name}" for name in memory)
-        self.in_keys = ["observation", *["elapsed_steps"] * bool(memory)]
-        if "observation" not in inputs or set(outputs) != {"action", *self.state_keys}:
+        self.after = tuple(f"next_{name}" for name in memory)
+        if "observation" not in inputs or set(outputs) != {"action", *self.after}:
             raise ValueError(
                 "it must take 'observation' and the memory, and return 'action' and 'next_NAME' for each NAME of the "
                 f"memory (input_names, output_names of torch.onnx.export), got {[*inputs]} and {outputs}"
@@ -73,30 +68,16 @@ class OnnxNetwork(Memory):
             raise ValueError(f"'action' must be finite, (N, 2) or (N, 3), got {short(action.tolist())}")
         if (found := [tuple(part.shape[1:]) for part in after]) != [*self.shapes.values()]:
             raise ValueError(f"the memory must keep its shapes {[*self.shapes.values()]}, the outputs have {found}")
-        self.declares = action.shape[-1] == 3
+        self.action_size = action.shape[-1]
 
     def run(self, observation: Tensor, memory: Mapping[str, Tensor]) -> list[Tensor]:
         """Return the action in [-1, 1] and the next memory for observations ``(N, K)``."""
         values = {key: memory[key].expand(len(observation), *shape) for key, shape in self.shapes.items()}
         values["observation"] = observation
         feed = {key: value.detach().cpu().float().numpy() for key, value in values.items()}
-        found = _session(self.content).run(["action", *self.state_keys], feed)
+        found = _session(self.content).run(["action", *self.after], feed)
         action, *after = (torch.from_numpy(part).to(observation.device) for part in found)
         return [action.clamp(-1, 1), *after]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` ``(..., 2)`` or ``(..., 3)`` in [-1, 1]."""
-        seen, memory = tensordict.select(*self.in_keys), {key: torch.zeros(1) for key in self.shapes}
-        before, starts = self._state_before(seen) if memory else (None, torch.zeros(()))
-        if before is not None:
-            kept, begun = [before.reshape(-1)[key] for key in self.state_keys], starts.reshape(-1)
-            parts = (torch.where(expand_as_right(begun, part), 0, part) for part in kept)
-            memory = dict(zip(self.shapes, parts, strict=True))
-        action, *after = self.run(seen["observation"].reshape(-1, self.size), memory)
-        if memory:
-            state = TensorDict(dict(zip(self.state_keys, after, strict=True)), len(action), device=seen.device)
-            self._keep_state(seen, before, starts, state.reshape(seen.shape))
-        return tensordict.set("action", action.reshape(*seen.shape, -1))
 
 
 def with_description(content: bytes, description: Mapping[str, Any]) -> bytes:

@@ -21,10 +21,10 @@ from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with_description
-from magrl.agents.trained import TrainedPolicy
 from magrl.checks import check_finite, check_type
+from magrl.envs import GeomagneticNavEnv
 from magrl.files import save_tensors, write_atomically
-from magrl.navigators import Anywhere
+from magrl.navigators import Anywhere, Navigator
 from magrl.tracking.network import FILE_FORMAT, policy_content, save_pilot
 from magrl.transforms import ObservationView, ReadingView
 
@@ -71,7 +71,7 @@ class PolicyConfig:
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
 
 
-class FieldPolicy(TrainedPolicy):
+class FieldPolicy(Navigator):
     """A trained agent as a navigator of the plain environment, in physical units.
 
     Args:
@@ -89,17 +89,32 @@ class FieldPolicy(TrainedPolicy):
         torch.Size([2, 2, 2])
     """
 
-    def __init__(self, config: PolicyConfig, actor: TensorDictModuleBase | None = None) -> None:
-        super().__init__()
+    trained_on, optional_keys = "tasks of its own", ()
+
+    def __init__(self, config: PolicyConfig, actor: TensorDictModuleBase | OnnxNetwork | None = None) -> None:
         check_type(PolicyConfig, config=config)
+        super().__init__(config.view.max_move_km, config.view.max_turn_rad)
         self.config, self.view = config, config.view
-        self.in_keys = list(config.view.in_keys)
+        self.in_keys = list(dict.fromkeys((*config.view.in_keys, "elapsed_steps")))
         self.observe = Compose(*config.view.observation_transforms())
         self.actor = config.make_actor().float() if actor is None else actor  # environments write float32
-        if isinstance(self.actor, OnnxNetwork):
-            self.declares = self.actor.declares
-            self.in_keys = list(dict.fromkeys([*self.in_keys, *self.actor.in_keys[1:]]))
+        self.action_size = getattr(self.actor, "action_size", 2)
         self.act = config.view.action_transform(declared=self.declares)
+
+    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
+        """Return the memory of a network at the start of an episode: zeros."""
+        shapes = getattr(self.actor, "shapes", {}).items()
+        return {name: torch.zeros(len(seen), *shape, device=seen.device) for name, shape in shapes}
+
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
+        """Return distance [km] and turn [rad], and the declaration if the network has one."""
+        observed = self.observe(seen.select(*self.view.in_keys))
+        if isinstance(self.actor, OnnxNetwork):
+            action, *after = self.actor.run(observed["observation"], memory)
+            memory.update(dict(zip(self.actor.shapes, after, strict=True)))
+        else:
+            action = self.actor(observed)["action"]
+        return self.act.denormalize("action", action)
 
     def check_fits(self, env: EnvBase) -> None:
         """Raise unless an environment has the field of the policy, and allows its moves and turns.
@@ -107,8 +122,14 @@ class FieldPolicy(TrainedPolicy):
         Raises:
             ValueError: naming the element and both ranges, or both limits.
         """
-        super().check_fits(env)
         view, base = self.view, getattr(env, "base_env", env)
+        check_type(GeomagneticNavEnv, env=base)
+        if self.declares and not base.arrival.declared:
+            raise ValueError(
+                f"the policy declares its arrival: fly it with arrival 'declared', not {base.arrival.rule!r}"
+            )
+        if isinstance(view, ObservationView):
+            view.check_covers(base.field, base.region.grid(81).to(base.device))
         (move, turn), (longest, largest) = (
             (round(part.max_move_km, 3), round(math.degrees(part.max_turn_rad), 3)) for part in (view, base)
         )
@@ -118,11 +139,6 @@ class FieldPolicy(TrainedPolicy):
                 f"{longest:g} km and {largest:g}°: evaluate with max_move_km={move:g} and max_turn_deg={turn:g}, or "
                 "train one for these limits"
             )
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` ``(..., 2)``: distance [km] and turn [rad]."""
-        action = self.actor(self.observe(tensordict.select(*self.in_keys)))["action"]
-        return tensordict.set("action", self.act.denormalize("action", action))
 
 
 def export_policy(

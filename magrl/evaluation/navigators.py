@@ -10,11 +10,9 @@ from typing import Any, NamedTuple
 from tensordict.nn import TensorDictModuleBase
 
 from magrl.agents import load_policy
-from magrl.agents.trained import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators import NAVIGATORS, Anywhere, DeadReckoning, Declaring, Kalman, Navigator
-from magrl.navigators.kalman import LIMITS
+from magrl.navigators import NAVIGATORS, Anywhere, Declaring, Navigator
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking.network import policy_content
 
@@ -151,7 +149,7 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
     if options:
         raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
     try:
-        return load_policy(path, env.device).for_env(env)
+        return load_policy(path, env.device).fitted(env, {})
     except ValueError as error:
         raise ValueError(f"{text}: {error}") from error
 
@@ -160,23 +158,14 @@ def fitted(policy: TensorDictModuleBase, env: GeomagneticNavEnv, **rules: Any) -
     """Return a policy within the limits of an environment, which declares its arrival where it must.
 
     Args:
-        policy: navigator, trained policy, or another policy of the plain environment, which is returned as it is.
-        env: environment without errors.
-        rules: values of :class:`magrl.tracking.Rules` for its declarations, such as ``confidence``.
-
-    Raises:
-        ValueError: for a policy of another field or of longer moves.
+        policy: any; those of the library say themselves how they fit (:meth:`Navigator.fitted`).
+        env: environment.
+        **rules: further :class:`~magrl.tracking.Rules`, such as ``confidence``.
     """
-    if isinstance(policy, Kalman):
-        shorter = {key: min(env.limits[key], getattr(policy.rules, key)) for key in LIMITS}
-        return policy.adapted(**env.limits | rules | shorter)
-    if isinstance(policy, DeadReckoning) and "model" in rules:
-        policy = DeadReckoning.for_env(env, chart=rules["model"])
-    if isinstance(policy, TrainedPolicy):
-        policy = policy.for_env(env)
-    if not env.arrival.declared or getattr(policy, "declares", False):
+    if not isinstance(policy, Navigator):
         return policy
-    return Declaring(policy, **env.limits | rules) if isinstance(policy, TrainedPolicy | Navigator) else policy
+    policy = policy.fitted(env, rules)
+    return Declaring(policy, **env.limits | rules) if env.arrival.declared and not policy.declares else policy
 
 
 def _kind(name: str) -> TrainedAgent | type[Navigator]:

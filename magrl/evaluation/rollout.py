@@ -10,9 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from magrl.agents.trained import TrainedPolicy
 from magrl.checks import check_type
 from magrl.envs import GeomagneticNavEnv
+from magrl.navigators import Navigator
 
 LARGE_KEYS = [(*root, "track", name) for root in ((), ("next",)) for name in ("state", "posterior")]
 """Keys that rollouts leave out."""
@@ -51,7 +51,7 @@ def next_rollout(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
     """Return the next episode of each vehicle, without exploration or gradients."""
     if not callable(policy):
         raise TypeError(f"policy must be callable with a TensorDict, got {policy!r}")
-    if isinstance(policy, TrainedPolicy):
+    if isinstance(policy, Navigator):
         policy.check_fits(env)
     failed = torch.zeros(env.num_envs, 1, dtype=torch.bool, device=env.device)
 

@@ -8,13 +8,14 @@ vehicle has not been, has ``oracle = True``; ``needs`` states what it knows besi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from magrl.checks import check_number
 from magrl.envs import GeomagneticNavEnv
@@ -120,6 +121,11 @@ class Navigator(TensorDictModuleBase):
         self.out_keys = ["action"]
         self.memory: TensorDictBase | None = None
 
+    @property
+    def declares(self) -> bool:
+        """Whether its action has a third number, which declares the arrival."""
+        return self.action_size > 2
+
     @classmethod
     def for_env(
         cls, env: GeomagneticNavEnv, *, sensor_std: SensorStd | Sequence[float] = PERFECT, **options: Any
@@ -141,6 +147,14 @@ class Navigator(TensorDictModuleBase):
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
         """Return the options of the constructor, beside bounds, that follow from an environment and its sensors."""
         return {}
+
+    def check_fits(self, env: EnvBase) -> None:
+        """Raise a ValueError where an environment is none that it was made for."""
+
+    def fitted(self, env: GeomagneticNavEnv, rules: Mapping[str, Any]) -> Navigator:  # noqa: ARG002
+        """Return it for an environment, with rules of :class:`~magrl.tracking.Rules` that say what a vehicle knows."""
+        self.check_fits(env)
+        return self
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:  # noqa: ARG002
         """Return the memory of vehicles at the start of an episode: tensors ``(N, ...)``; none by default."""
@@ -177,7 +191,7 @@ class Navigator(TensorDictModuleBase):
         known = memory is not None and memory.shape == step.shape and memory.device == step.device
         if memory is not None and known and not (step == 0).any():
             return memory
-        common = {"action": seen["heading"].new_zeros(len(step), self.action_size)}
+        common = {"action": torch.zeros(len(step), self.action_size, dtype=torch.float32, device=step.device)}
         common |= {"decided_at": torch.full_like(step, -1), "field_readings": torch.zeros_like(step)}
         common |= {"over": torch.zeros_like(step, dtype=torch.bool)}
         first = TensorDict(self.first_memory(seen) | common, batch_size=step.shape, device=step.device)

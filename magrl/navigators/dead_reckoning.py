@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -47,13 +48,17 @@ class DeadReckoning(Navigator):
 
     def __init__(self, declares: bool = False, chart: EarthModel | None = None, **limits: Any) -> None:
         super().__init__(**limits)
-        self.declares, self.action_size, self.chart = declares, 2 + declares, chart
+        self.action_size, self.chart = 2 + declares, chart
         self.in_keys = ["move", "heading", "start_position", "target_position", "elapsed_steps"]
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004
         """Return whether the arrival must be declared."""
         return {"declares": env.arrival.declared}
+
+    def fitted(self, env: GeomagneticNavEnv, rules: Mapping[str, Any]) -> DeadReckoning:
+        """Return it with the vehicle's model of the Earth as its chart."""
+        return DeadReckoning.for_env(env, chart=rules["model"]) if "model" in rules else self
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         """Return the reckoned place ``(N, 2)``."""

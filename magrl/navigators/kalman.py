@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -68,6 +69,11 @@ class Kalman(Navigator):
         other._modules, other.memory = dict(self._modules), None
         other._follow(self.rules.replace(**changes))
         return other
+
+    def fitted(self, env: GeomagneticNavEnv, rules: Mapping[str, Any]) -> Self:
+        """Return it within the limits of an environment, or its own where these are shorter."""
+        shorter = {key: min(env.limits[key], getattr(self.rules, key)) for key in LIMITS}
+        return self.adapted(**env.limits | dict(rules) | shorter)
 
     @staticmethod
     def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:  # noqa: ARG004

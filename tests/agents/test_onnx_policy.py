@@ -57,7 +57,7 @@ def test_a_stochastic_actor_of_torchrl_flies_alike_after_saving(tmp_path: Path) 
     assert torch.equal(torch.get_rng_state(), state)
     assert actor.training
     policy = load_policy(tmp_path / "own.onnx")
-    assert (policy.view, policy.in_keys) == (view, ["field", "target_field", "move", "heading"])
+    assert (policy.view, policy.in_keys) == (view, ["field", "target_field", "move", "heading", "elapsed_steps"])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         wanted = evaluation_rollout(env, actor)
     found = evaluation_rollout(plain_env(), policy)
