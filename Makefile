@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere replay test coverage test-slow test-newest matrix check format docs bench mutate tables figures pictures help clean
+.PHONY: train fly anywhere test coverage test-slow test-newest matrix check format docs bench mutate tables figures pictures help clean
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RECIPE)/td3_gradient_guided.py $(ARGS)
@@ -14,9 +14,6 @@ fly: $(VENV)/.installed  ## fly the pretrained agent from Bergen to Reykjavik; s
 
 anywhere: $(VENV)/.installed  ## train the agent without a map for all distances; three quarters of an hour on one core
 	OMP_NUM_THREADS=1 $(RECIPE)/ppo_anywhere.py $(ARGS)
-
-replay: runs/td3_gradient_guided-fast-seed0/eval.json  ## write a replay page, replay.html in the run folder
-	$(RECIPE)/replay.py runs/td3_gradient_guided-fast-seed0 $(ARGS)
 
 # Processes share the modules that pytest compiles, also where the environment asks Python to keep none.
 test: $(VENV)/.installed-dev  ## run the fast tests, one process per core with one thread each

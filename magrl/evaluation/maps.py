@@ -26,12 +26,13 @@ from magrl.checks import check_number, check_tensor
 from magrl.envs import Region, Regions
 from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
-from magrl.evaluation.metrics import episode_measures
-from magrl.evaluation.replay import PIECES, episode_tracks
+from magrl.evaluation.metrics import episode_measures, moved
 from magrl.field import FieldModel
 from magrl.geodesy import geodesic, move, polar
 from magrl.tracking import Way
 
+PIECES = 4
+"""Pieces in which a move is drawn, since a geodesic is not a straight line on the map."""
 LAND, ESTIMATE = "#8c6d46", "#56B4E9"
 """Colors of coastlines, and of estimates of the destination."""
 FRAME_MS, LAST_FRAME_MS, GIF_COLORS = 150, 1280, 256
@@ -104,6 +105,40 @@ def frame(positions: Tensor) -> Region:
     return Region((max(north - half_north, -88.0), min(north + half_north, 88.0)), (east - half_east, east + half_east))
 
 
+def episode_tracks(rollout: TensorDictBase, region: Region | Regions) -> list[Tensor]:
+    """Return the track of the first episode of each vehicle, each move in :data:`PIECES` pieces of its geodesic.
+
+    Args:
+        rollout: ``(M, T)`` from the environment.
+        region: region of the tasks.
+
+    Returns:
+        ``M`` tensors ``(PIECES * steps + 1, 2)``, latitude and unwrapped longitude [deg]; every ``PIECES``-th is a
+        way-point.
+
+    Raises:
+        ValueError: for a rollout of other dimensions.
+
+    Example:
+        >>> from magrl.envs.geomagnetic import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(seed=0)
+        >>> track, = episode_tracks(env.rollout(3), env.region)
+        >>> len(track) == 3 * PIECES + 1
+        True
+    """
+    rollout, region = rollout.cpu(), one_region(region)
+    steps = episode_measures(rollout)["steps"].tolist()
+    latitude, longitude = rollout["position"].unsqueeze(-2).unbind(-1)
+    share = torch.arange(PIECES, dtype=torch.float64) / PIECES
+    distance, heading = (part.unsqueeze(-1) for part in moved(rollout["next"]))
+    legs = torch.stack(move(latitude, longitude, heading, distance * share), -1)
+    legs[..., 0, :] = rollout["position"]
+    rows = zip(legs, rollout["next", "position"], steps, strict=True)
+    return [
+        region.unwrapped(torch.cat((leg[:count].flatten(0, 1), after[count - 1 : count]))) for leg, after, count in rows
+    ]
+
+
 def trajectories_figure(
     rollouts: TensorDictBase | Mapping[str, TensorDictBase],
     field: FieldModel,
@@ -167,7 +202,7 @@ def _draw_map(
         shown: ``(P, 2)`` positions that the map must hold beside the tracks and the shortest paths [deg].
 
     Returns:
-        The tracks (:func:`~magrl.evaluation.replay.episode_tracks`), and the height of a figure of 8 inches.
+        The tracks (:func:`episode_tracks`), and the height of a figure of 8 inches.
     """
     tracks, ends = episode_tracks(rollout, region), [rollout[f"{end}_position"][:, 0] for end in ("start", "target")]
     shortest = region.unwrapped(shortest_path(*ends))

@@ -38,7 +38,7 @@ assert gymnasium.make("magrl/GeomagneticNavigation-v0").reset(seed=0)[0].shape =
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
-from magrl.evaluation import maps, replay
+from magrl.evaluation import maps
 
 assert Path(magrl.__file__).is_relative_to(sys.prefix), magrl.__file__
 assert version("magrl") == magrl.__version__, (version("magrl"), magrl.__version__)
@@ -54,7 +54,6 @@ for pilot in (navigators.Secant(), navigators.NAVIGATORS["pso"].for_env(plain, m
     print(magrl.summarize(magrl.episode_measures(rollout))["success_rate"])
 maps.trajectories_figure(rollout, plain.field, plain.region).savefig("episodes.png")
 assert plain.render().shape == (700, 700, 3)
-replay.write_replay("page.html", replay.replay_data({"pso": rollout}, plain.field, plain.region, zeta=0.01))
 """
 MYPY = """
 [mypy]
@@ -105,7 +104,6 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     data = {
         "py.typed",
         "__init__.pyi",
-        "evaluation/templates/replay.html",
         "evaluation/coastlines.npz",
         "field/wmmhr2025.cof.gz",
     }
