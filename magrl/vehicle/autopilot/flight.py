@@ -6,20 +6,18 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Protocol
 
 from magrl.checks import short
 from magrl.files import write_atomically
 from magrl.training.checkpoints import locked
-from magrl.vehicle.autopilot.loop import LOG, NO_STATE, Loop, Measurement, clock, tolerated
+from magrl.vehicle.autopilot.loop import LOG, Loop, Measurement, clock, tolerated
 from magrl.vehicle.onboard import Command
 
 HEADER = "time_s,mag_x_nT,mag_y_nT,mag_z_nT,roll_deg,pitch_deg,heading_{north}_deg,speed_m_s,received_s\n"
 """Columns of the recorded messages, which :func:`magrl.vehicle.logs.read_log` reads."""
-STATE_LINES = 2000
-"""Messages after which the state is saved: as many are repeated at most."""
 
 
 class Link(Protocol):
@@ -44,10 +42,9 @@ class Link(Protocol):
 def fly(loop: Loop, link: Link, folder: Path | str) -> Iterator[Command]:
     """Steer through a link until the vehicle stops, and yield each new command.
 
-    ``messages.csv`` in the folder holds the messages that count, and ``flight.json`` the options of the vehicle and of
-    the loop, its start, its moves, and the state of the loop after some of the messages. If the files exist, the
-    messages after that are repeated without sending anything, and the flight continues with the same commands, of which
-    the last one is yielded again. Between, the vehicle is taken to have kept its heading and its speed.
+    ``messages.csv`` in the folder holds the messages that count, and ``flight.json`` the options of the flight. If the
+    files exist, the messages are repeated without sending anything, and the flight continues with the same commands, of
+    which the last one is yielded again. Between, the vehicle is taken to have kept its heading and its speed.
 
     An error of the system in sending and in writing is logged, and the steering goes on. What was not written is
     written later.
@@ -102,74 +99,50 @@ def _steered(loop: Loop, link: Link, record: _Record) -> Iterator[Command]:
 
 
 class _Record:
-    """The files of a flight: what they hold is repeated, and what counts is added."""
+    """The files of a flight: its options, and its messages, which are repeated and to which new ones are added."""
 
     def __init__(self, loop: Loop, folder: Path) -> None:
-        self._loop, self._state, self._path = loop, folder / "flight.json", folder / "messages.csv"
+        self._loop, self._path, self._waiting = loop, folder / "messages.csv", bytearray()
+        self._check_options(folder / "flight.json")
         if not self._path.exists():
             write_atomically(self._path, HEADER.format(north=loop.vehicle.options.north).encode())
-        journal = json.loads(loop.vehicle._journal.model_dump_json(exclude={"steps"}))
-        calibration = loop.calibration and loop.calibration.model_dump(mode="json")
-        self._options = journal.pop("options") | journal | {"read_s": loop.read_s, "calibration": calibration}
-        self._lines, self._waiting = 0, bytearray()
-        self._repeat(self._restored() if self._state.exists() else 1)
+        self._repeat()
         self._file = self._path.open("ab", buffering=0)
-        self._save()
 
-    def _restored(self) -> int:
-        """Restore the state, and return how many lines of the record it includes."""
-        try:
-            saved = json.loads(self._state.read_bytes())
-            options, steps, state, lines = (saved[name] for name in ("options", "steps", "loop", "lines"))
-        except (ValueError, KeyError, TypeError) as error:
-            LOG.warning("%s is damaged, and all messages are repeated: %r", self._state, error)
-            return 1
-        texts = [
-            f"{name} {short(options.get(name))}" for name, own in self._options.items() if options.get(name) != own
-        ]
-        if texts:
-            raise ValueError(f"{self._state} is of a flight with {', '.join(texts)}: give these, or another folder")
-        for step in steps:
-            self._loop.command = self._loop.vehicle.step(**step)
-        vars(self._loop).update(state)
-        return lines
+    def _check_options(self, path: Path) -> None:
+        """Write the options of a flight; raise where others are written already."""
+        journal = json.loads(self._loop.vehicle._journal.model_dump_json(exclude={"steps"}))
+        calibration = self._loop.calibration and self._loop.calibration.model_dump(mode="json")
+        options = journal.pop("options") | journal | {"read_s": self._loop.read_s, "calibration": calibration}
+        written = options
+        with suppress(OSError, ValueError):  # a new flight, or a file that is damaged
+            written = dict(json.loads(path.read_bytes()))
+        if texts := [f"{name} {short(written.get(name))}" for name, own in options.items() if written.get(name) != own]:
+            raise ValueError(f"{path} is of a flight with {', '.join(texts)}: give these, or another folder")
+        write_atomically(path, json.dumps(options).encode())
 
-    def _repeat(self, done: float) -> None:
-        """Repeat the messages after some lines, up to the first line that is no message."""
+    def _repeat(self) -> None:
+        """Repeat the messages, without lines that are none."""
         with self._path.open("rb") as file:
-            for line in file:
+            for number, line in enumerate(file, 1):
                 if not line.endswith(b"\n"):  # it was not written whole
                     os.truncate(self._path, file.tell() - len(line))
-                    return
-                self._lines += 1
-                if self._lines <= done:
-                    continue
-                try:
-                    time, *rest = line.decode().rstrip("\n").split(",")
-                    self._loop.take(Measurement._make([float(time), *(float(cell) if cell else None for cell in rest)]))
-                except (TypeError, ValueError, RuntimeError) as error:
-                    LOG.error("line %d of %s is no message, those before it count: %s", self._lines, self._path, error)
-                    done = math.inf
+                elif number > 1:
+                    try:
+                        time, *rest = line.decode().rstrip("\n").split(",")
+                        cells = (float(cell) if cell else None for cell in rest)
+                        self._loop.take(Measurement._make([float(time), *cells]))
+                    except (TypeError, ValueError, RuntimeError) as error:
+                        LOG.error("line %d of %s is no message: %s", number, self._path, error)
 
     def close(self) -> None:
         """Close the record."""
         self._file.close()
 
     def write(self, measurement: Measurement) -> None:
-        """Write a message, and now and then the state after it; what cannot be written waits for the next message."""
-        self._lines += 1
+        """Write a message; what cannot be written waits for the next one."""
         cells = ("" if value is None else repr(float(value)) for value in measurement)
         self._waiting += ",".join(cells).encode() + b"\n"
         with tolerated("messages wait in memory, since they cannot be written"):
             while self._waiting:
                 del self._waiting[: self._file.write(self._waiting)]
-            if self._lines % STATE_LINES == 0:
-                self._save()
-
-    def _save(self) -> None:
-        """Save the state."""
-        steps = [dict(step) for step in self._loop.vehicle._steps]
-        state = {name: value for name, value in vars(self._loop).items() if name not in NO_STATE}
-        content = {"options": self._options, "steps": steps, "loop": state, "lines": self._lines}
-        with tolerated("the state of the flight is not saved"):
-            write_atomically(self._state, json.dumps(content, default=float).encode())

@@ -40,8 +40,6 @@ _SHORT_KM = 1.0  # a shorter way is that of a turn, not a move
 _LEAST_SAMPLES = 3
 _ONE_READING_KM = 1e9
 _QUANTITIES = (*AXES, *ATTITUDE, "speed")
-NO_STATE = ("vehicle", "read_s", "calibration", "command", "heard", "_shift")
-"""Attributes of a loop that are given, or known from the vehicle; the others are its state, which is plain data."""
 _ZERO = time.time() - time.monotonic()
 _SAID: dict[str, float] = {}  # what was logged, and when
 _Place = tuple[float, float]
