@@ -56,7 +56,7 @@ SHOWN = 24
 """Number of tasks in trajectories.png."""
 Pair = tuple[TensorDictModuleBase, ...]
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
-MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency", "spl_to_arrival")
+MEASURES += ("smoothness_deg", "heading_mae_deg", "heading_rmse_deg", "path_efficiency")
 
 
 def free_folder() -> Path:
@@ -204,7 +204,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         name, _, run = text.partition("=")
         began = time.perf_counter()
         rollout = flight.fly(navigator)
-        measured = episode_measures(rollout, env)
+        measured = episode_measures(rollout)
         readings = getattr(navigator, "field_readings", torch.zeros(1)).double().mean().item()
         summary = summarize(measured) | {"field_readings": readings, "seconds": time.perf_counter() - began}
         number = len(results.summaries.setdefault(name, []))

@@ -190,7 +190,7 @@ def _next_episodes(env: EnvBase, policy: TensorDictModuleBase) -> TensorDict:
     """Return the measures of the next episode of each vehicle, ``(num_envs,)``, and count exactly this episode."""
     base = getattr(env, "base_env", env)
     before = base.episode
-    measures = episode_measures(next_rollout(env, policy), env)
+    measures = episode_measures(next_rollout(env, policy))
     base.episode = before
     env.reset()
     return TensorDict(measures, [env.num_envs])

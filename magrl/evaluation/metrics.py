@@ -11,12 +11,9 @@ import math
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from magrl.checks import check_type
-from magrl.envs import GeomagneticNavEnv
-from magrl.envs.measures import path_measures, spl
-from magrl.evaluation.arrival_distance import distance_to_arrival
+from magrl.envs.measures import path_measures
 from magrl.evaluation.intervals import bootstrap_interval, wilson_interval
 from magrl.geodesy import geodesic, wrap_angle
 
@@ -43,7 +40,7 @@ def first_episode_mask(done: Tensor) -> Tensor:
     return done.long().cumsum(1) - done.long() == 0
 
 
-def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = None) -> dict[str, Tensor]:
+def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
     """Return the measures of the first episode of each vehicle.
 
     Args:
@@ -96,10 +93,6 @@ def episode_measures(rollout: TensorDictBase, env: GeomagneticNavEnv | None = No
     if "declared" in rollout["next"].keys():  # noqa: SIM118 - a TensorDict is no mapping
         declared = rollout["next", "declared"].squeeze(2).gather(1, last).squeeze(1)
         measures["false_arrival"] = declared & ~success
-    if env is not None:
-        check_type(EnvBase, env=env)
-        near_km = _nearest_arrival(rollout, env, measures["shortest_km"])
-        measures["spl_to_arrival"] = spl(success, near_km, length_km)
     return measures
 
 
@@ -121,15 +114,6 @@ def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
     move = steps.get("true_move", steps["move"])
     course = steps.get("true_course", steps.get("true_heading", steps["heading"]))
     return move[..., 0].double(), course.squeeze(-1).double()
-
-
-def _nearest_arrival(rollout: TensorDictBase, env: GeomagneticNavEnv, shortest_km: Tensor) -> Tensor:
-    """Return the distance from each start to the nearest place where a vehicle has arrived, ``(M,)`` [km]."""
-    if env.arrival.rule != "objective":
-        return (shortest_km - env.arrival.radius_km).clamp_min(0)
-    start, target = rollout["start_position"][:, 0], rollout["target_position"][:, 0]
-    weights, region = rollout["objective_weights"][:, 0], rollout["region"][:, 0, 0]
-    return distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region)
 
 
 def _turns(heading: Tensor, moving: Tensor) -> Tensor:
@@ -182,8 +166,6 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
     summary |= {f"final_distance_km_{name}": error.double().quantile(q).item() for name, q in QUANTILES.items()}
     efficiency = episodes["path_efficiency"]
     summary |= _percent("spl", episodes["spl"]) | _percent("path_efficiency", efficiency[~efficiency.isnan()])
-    if "spl_to_arrival" in episodes:
-        summary |= _percent("spl_to_arrival", episodes["spl_to_arrival"])
     summary["trajectory_length_m"] = 1000 * episodes["length_km"][success].mean().item()
     summary["trajectory_length_m_all"] = 1000 * episodes["length_km"].mean().item()
     summary["steps"] = episodes["steps"][success].double().mean().item()

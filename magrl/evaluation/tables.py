@@ -31,7 +31,6 @@ COLUMNS = {
     "SPL %": ("spl", ".2f"),
     "TNT steps": ("steps", ".2f"),
     "worst run, SPL %": ("worst", ".2f"),
-    "SPL to arrival %": ("spl_to_arrival", ".2f"),
     "path efficiency %": ("path_efficiency", ".2f"),
     "NE km": ("navigation_error_km", ".1f"),
     "within 10 km %": ("success_rate_within_10km", ".1f"),
@@ -58,7 +57,7 @@ KILOMETERS = {
 """Distance columns, first in some tables: over long distances, the objective hides the final distance. False arrivals
 are shown where vehicles declare their arrival."""
 
-INTERVALS = ("success_rate", "spl", "spl_to_arrival", "path_efficiency", "steps")
+INTERVALS = ("success_rate", "spl", "path_efficiency", "steps")
 """Measures that are shown with an interval."""
 
 ABOUT = ("navigator", "trained on", "given")

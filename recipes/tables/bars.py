@@ -79,8 +79,8 @@ def bar(task: str, navigator: str) -> dict[str, float]:
         task: name of the task.
         navigator: one of :data:`BARS`, or the file of a policy.
     """
-    env, rollout = flown("anywhere" if task == "readings" else task, navigator)
-    measures, after = episode_measures(rollout, env), rollout["next"]
+    _, rollout = flown("anywhere" if task == "readings" else task, navigator)
+    measures, after = episode_measures(rollout), rollout["next"]
     earned = (after["reward"].squeeze(-1) * first_episode_mask(after["done"])).sum(1).mean().item()
     success, spl, steps = (measures[name].double().mean().item() for name in ("success", "spl", "steps"))
     return {"SR": 100 * success, "SPL": 100 * spl, "steps": steps, "return": earned}

@@ -7,20 +7,11 @@ import pytest
 import torch
 from support.episodes import episode, point
 from tensordict import TensorDict
-from torch import Tensor
-from torchrl.envs import RewardSum, TransformedEnv
 
-from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks, planet_scenario
 from magrl.envs.arrival import check_zeta
 from magrl.envs.measures import path_efficiency, path_measures, spl
-from magrl.evaluation.arrival_distance import distance_to_arrival
 from magrl.evaluation.intervals import wilson_interval
 from magrl.evaluation.metrics import episode_measures, first_episode_mask, moved, summarize
-from magrl.evaluation.rollout import evaluation_rollout
-from magrl.field import IGRF, elements_at
-from magrl.geodesy import geodesic, move
-from magrl.guidance import objective
-from magrl.navigators import Secant
 
 TOLERANCES = {"heading_mae_deg": 0.2, "heading_rmse_deg": 0.1, "navigation_error_km": 0.1}
 TURN = math.degrees(math.atan2(40, 30))
@@ -160,9 +151,6 @@ def test_summary_of_one_success_and_one_failure() -> None:
     summary = summarize(episodes)
     assert (summary["spl_low"], summary["spl_high"]) == pytest.approx((0, 80))  # of two values, both or neither
     assert [summary[f"path_efficiency{end}"] for end in ("", "_low", "_high")] == [75, 75, 75]  # one of them moved
-    assert "spl_to_arrival" not in summary
-    summary |= summarize(episodes | {"spl_to_arrival": torch.tensor([0.6, 0.0])})
-    assert [summary[f"spl_to_arrival{end}"] for end in ("", "_low", "_high")] == pytest.approx([30, 0, 60])
     expected = {"success_rate": 50, "success_rate_within_10km": 50, "success_rate_within_25km": 100, "num_tasks": 2}
     expected |= {"trajectory_length_m": 500_000, "trajectory_length_m_all": 750_000, "steps": 10, "steps_all": 30}
     assert summary.items() >= (expected | {"navigation_error_km": 8}).items()
@@ -191,111 +179,15 @@ def test_summary_without_success_is_nan_and_not_zero() -> None:
     assert all(math.isnan(summarize(nowhere)[f"path_efficiency{end}"]) for end in ("", "_low", "_high"))
 
 
-def nearest_on_grids(env: GeomagneticNavEnv, state: TensorDict, task: int, half_km: float) -> float:
-    """Return the distance to the nearest place of arrival on a grid, and on finer ones around that place: to 0.5 m."""
-    row = state[task : task + 1]
-    center, nearest = torch.zeros(2, 1, dtype=torch.float64), math.inf
-    for _ in range(4):
-        line = torch.linspace(-half_km, half_km, 121, dtype=torch.float64)
-        north, east = torch.cartesian_prod(line, line).T + center
-        places = torch.stack(move(*row["target_position"].T, torch.atan2(east, north), torch.hypot(north, east)), -1)
-        weights, target_field = row["objective_weights"].double(), row["target_field"].double()
-        f = objective(elements_at(env.field, places), target_field, weights)
-        inside = ((f < env.zeta) & env.edge.contains(places)).squeeze(-1)
-        distance_km, _ = geodesic(*row["start_position"].T, *places[inside].T)
-        nearest, index = (x.item() for x in distance_km.min(0))
-        center, half_km = torch.stack((north[inside], east[inside]))[:, index : index + 1], half_km / 20
-    return nearest
-
-
-def nearest_km(env: GeomagneticNavEnv, state: TensorDict) -> Tensor:
-    keys = ("start_position", "target_position", "objective_weights")
-    return distance_to_arrival(*(state[key] for key in keys), env.field, env.zeta, env.edge, state["region"][:, 0])
-
-
-@pytest.mark.parametrize(("zeta", "half_km"), [(0.001, 30.0), (0.01, 90.0), (0.1, 200.0)])
-def test_distance_to_arrival_is_that_of_a_search_on_grids(zeta: float, half_km: float) -> None:
-    env = GeomagneticNavEnv(num_envs=4, seed=2, zeta=zeta)
-    state = env.reset()
-    expected = [nearest_on_grids(env, state, task, half_km) for task in range(4)]
-    assert nearest_km(env, state).tolist() == pytest.approx(expected, abs=0.02)
-
-
-def test_places_outside_the_region_are_no_arrival() -> None:
-    """The destination lies on the northern edge and the start beyond it: the nearest place is on the edge."""
-    tasks = Tasks(torch.tensor([[-3.0, 165.0]]).double(), torch.tensor([[-6.0, 165.0]]).double())
-    env = GeomagneticNavEnv(Scenario(tasks=tasks), seed=0)
-    state = env.reset()
-    free_km = nearest_km(env, state).item()
-    env.edge = Regions.of(Region((-12.0, -6.0), (158.0, 172.0)))
-    meridian_km, _ = geodesic(*tasks.start.T, *tasks.target.T)
-    assert nearest_km(env, state).item() == pytest.approx(meridian_km.item(), abs=0.01)
-    assert free_km < meridian_km.item() - 10
-
-
-def test_spl_to_arrival_is_weighted_by_the_nearer_distance() -> None:
-    env = GeomagneticNavEnv(num_envs=8, seed=0)
-    near_km = nearest_km(env, env.reset())
-    env.set_seed(0)
-    transformed = TransformedEnv(env, RewardSum())
-    rollout = evaluation_rollout(transformed, Secant(probe_km=10))
-    got = episode_measures(rollout, transformed)
-    assert got["success"].all()
-    assert got["spl_to_arrival"].tolist() == pytest.approx((near_km / got["length_km"]).tolist())
-    assert (got["spl_to_arrival"] < got["spl"]).all()
-    assert "spl_to_arrival" not in episode_measures(rollout)
-
-
-def test_each_of_many_regions_has_its_own_field() -> None:
-    """Tasks in three regions of other planets: as in an environment of each region alone."""
-    many = planet_scenario(3, seed=0)
-    env = GeomagneticNavEnv(many, num_envs=6, seed=0)
-    rollout = env.rollout(1)
-    start, target, weights, region = (
-        rollout[key][:, 0] for key in ("start_position", "target_position", "objective_weights", "region")
-    )
-    got = distance_to_arrival(start, target, weights, env.field, env.zeta, env.edge, region.squeeze(-1))
-    assert len(region.unique()) > 1
-    for task, index in enumerate(region.flatten().tolist()):
-        alone = partial(env.field, index=torch.tensor(index))
-        alone.value_and_gradient = partial(env.field.value_and_gradient, index=torch.tensor(index))
-        row = (x[task : task + 1] for x in (start, target, weights))
-        box, zero = Regions.of(env.edge[index]), torch.zeros(1, dtype=torch.int64)
-        expected = distance_to_arrival(*row, alone, env.zeta, box, zero)
-        assert got[task].item() == pytest.approx(expected.item(), abs=1e-6)
-    assert episode_measures(rollout, env)["spl_to_arrival"].isfinite().all()
-
-
-def test_an_episode_without_a_way_is_measured_without_nan() -> None:
-    """The vehicle starts where it has arrived, and stays there or moves."""
-    here = torch.tensor([[-5.0, 165.0]] * 2).double()
-    env = GeomagneticNavEnv(num_envs=2, seed=0)
-    state = env.reset().update({"start_position": here, "target_position": here})
-    assert nearest_km(env, state).tolist() == [0, 0]
-    beside = state.update({"start_position": here + 0.001})
-    assert nearest_km(env, beside).tolist() == [0, 0]
-    assert spl(torch.tensor([True, True]), nearest_km(env, state), torch.tensor([0.0, 5.0])).tolist() == [1, 0]
-    near = GeomagneticNavEnv(num_envs=1, seed=0, arrival="distance", radius_km=25)
-    flight = episode([(0.5, 0.0)], point(20.0, 0.0), True, 1)
-    assert episode_measures(flight, near)["spl_to_arrival"].item() == 0  # already arrived, and moved
-
-
 def test_bad_values_are_named() -> None:
-    places, index = torch.zeros(2, 2), torch.zeros(2, dtype=torch.int64)
-    ones = torch.ones(2, 3), IGRF("2022-01-01"), 0.01, Regions.of(Region((-10, 0), (160, 170))), index
     for call, message in (
         (lambda: episode_measures(TensorDict(batch_size=[2, 0])), r"each at least 1, got \(2, 0\)"),
         (lambda: summarize({"success": torch.ones(2)}), "success must be bool"),
         (lambda: summarize({"success": torch.ones(2, 2) > 0}), "success must be bool of shape"),
         (lambda: summarize({"success": torch.ones(0) > 0}), "success must be bool of shape"),
         *((partial(check_zeta, zeta), f"^zeta must be a finite number above 0, got {zeta}$") for zeta in (0, -1)),
-        (lambda: distance_to_arrival(places[:, :1], places, *ones), r"start .*\(2, 1\)"),
-        (lambda: distance_to_arrival(places, places[:, :1], *ones), r"target .*\(2, 1\)"),
-        (lambda: distance_to_arrival(places, places, ones[0][:, :2], *ones[1:]), r"weights .*\(2, 2\)"),
     ):
         with pytest.raises(ValueError, match=message):
             call()
     with pytest.raises(TypeError, match=r"^rollout must be a TensorDictBase"):
         episode_measures({})
-    with pytest.raises(TypeError, match=r"^env must be a EnvBase"):
-        episode_measures(episode([(5.0, 0.0)], (0.0, 165.0), False, 1), 5)

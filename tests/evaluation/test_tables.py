@@ -39,7 +39,7 @@ def test_worst_run_and_interval_over_tasks() -> None:
 
 def test_rows_of_one_and_of_several_runs() -> None:
     one = {"success_rate": 100.0, "success_rate_low": 99.6, "success_rate_high": 100.0, "spl": 99.0, "steps": 9.0}
-    one |= {"spl_low": 98.0, "spl_high": 99.5, "path_efficiency": 97.0, "spl_to_arrival": 96.0, "smoothness_deg": 170.0}
+    one |= {"spl_low": 98.0, "spl_high": 99.5, "path_efficiency": 97.0, "smoothness_deg": 170.0}
     several = [{**one, "spl": spl} for spl in RUNS]
     head, _, published, guided, secant = comparison_table({"gg_td3": several, "secant": [one]}).splitlines()
     rows = [dict(zip(cells(head), cells(line), strict=True)) for line in (published, guided, secant)]
@@ -52,7 +52,6 @@ def test_rows_of_one_and_of_several_runs() -> None:
     assert [row["SPL %"] for row in rows] == ["88.41", "98.50 [97.00–100.00]", "99.00 (98.00–99.50)"]
     assert [row["worst run, SPL %"] for row in rows] == ["—", "97.00", "—"]
     assert [row["SR %"] for row in rows] == ["97.0", "100.0 [100.0–100.0]", "100.0 (99.6–100.0)"]
-    assert [row["SPL to arrival %"] for row in rows] == ["—", "96.00 [96.00–96.00]", "96.00"]
     assert [row["smoothness °"] for row in rows] == ["—", "170.0", "170.0"]
     head, _, guided, _ = short_table({"gg_td3": several, "secant": [one]}).splitlines()
     assert cells(guided)[3:6] == ["100.0 [100.0–100.0]", "98.5 [97.0–100.0]", "97.0"]

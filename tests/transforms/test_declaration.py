@@ -50,10 +50,9 @@ def test_measures_by_hand() -> None:
         return torch.cat((torch.zeros(4, 2), declare.expand_as(heading)), -1)
 
     policy = TensorDictModule(act, in_keys=["heading"], out_keys=["action"])
-    episodes = episode_measures(evaluation_rollout(env, policy), env)
+    episodes = episode_measures(evaluation_rollout(env, policy))
     assert episodes["success"].tolist() == [True, True, False, False]
     assert episodes["false_arrival"].tolist() == [False, False, True, False]
-    assert episodes["spl_to_arrival"].tolist() == [1, 1, 0, 0]
     summary = summarize(episodes)
     assert summary["success_rate"] == 50
     assert summary["false_arrival_rate"] == 25
