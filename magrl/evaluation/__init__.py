@@ -1,4 +1,4 @@
-"""Evaluation: rollouts, measures and their intervals, tables, figures, replay pages, and tracks for maps."""
+"""Evaluation: rollouts, measures and their intervals, tables, figures, and tracks for maps."""
 
 from magrl.evaluation.flight import Flight as Flight
 from magrl.evaluation.flight import evaluate as evaluate

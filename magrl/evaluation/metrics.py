@@ -45,19 +45,16 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
 
     Args:
         rollout: ``(M, T)`` from ``env.rollout``, with the keys of :class:`magrl.envs.GeomagneticNavEnv`.
-        env: environment of the rollout, or transforms around it, for ``spl_to_arrival``.
 
     Returns:
         Tensors ``(M,)``: ``success`` bool; ``steps``; ``shortest_km``, ``length_km``, ``navigation_error_km``, ``spl``
         and ``path_efficiency`` as in :func:`magrl.envs.measures.path_measures`; ``smoothness_deg``, the mean interior
         angle at way-points (180 is straight, NaN without way-points); ``heading_mae_deg`` and ``heading_rmse_deg``,
-        deviations from the bearing to the destination over the moves of nonzero length (NaN without any); with ``env``
-        also ``spl_to_arrival``, the SPL whose shortest path leads to the nearest place where a vehicle has arrived
-        (:func:`magrl.evaluation.arrival_distance.distance_to_arrival`) instead of to the destination. Where vehicles
+        deviations from the bearing to the destination over the legs of nonzero length (NaN without any). Where vehicles
         declare their arrival, also ``false_arrival`` bool: the episode ended with a declaration and no success.
 
     Raises:
-        TypeError: for an ``env`` that is no environment.
+        TypeError: for a rollout of another type.
         ValueError: for a rollout of other dimensions, or without a vehicle or a step.
         KeyError: for a missing key.
 
@@ -136,10 +133,9 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
         ``success_rate_within_10km`` and ``success_rate_within_25km`` [%], the share of episodes that end within that
         distance of the destination, whatever the field there, and ``final_distance_km_median`` and
         ``final_distance_km_p90``, the median and the 90th percentile over all episodes of the distance left at the end;
-        ``spl`` [%] with its bootstrap 95 % interval
-        ``spl_low`` and ``spl_high``, likewise ``path_efficiency`` over the episodes that moved, and ``spl_to_arrival``
-        where it was measured; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper, and with
-        the suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
+        ``spl`` [%] with its bootstrap 95 % interval ``spl_low`` and ``spl_high``, likewise ``path_efficiency`` over the
+        episodes that moved; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper, and with the
+        suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
         ``heading_rmse_deg`` over successes; ``num_tasks``. Means over no episode are NaN. Where vehicles declare their
         arrival, also ``false_arrival_rate`` [%] with its Wilson 95 % interval, and ``navigation_error_km_declared``,
         the mean over all episodes that ended with a declaration.

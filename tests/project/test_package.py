@@ -109,6 +109,7 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     }
     data |= {
         "field/weather.npz",
+        "transforms/errors/presets.toml",
         "navigators/pretrained/anywhere.safetensors",
         "navigators/pretrained/anywhere.md",
     }
