@@ -51,9 +51,8 @@ docs: $(VENV)/.installed-docs  ## build the documentation in build/docs
 bench: $(VENV)/.installed-dev  ## run the benchmarks; about four minutes on two cores
 	$(RUN)/python -m benchmarks $(ARGS)
 
-mutate: $(VENV)/.installed-mutation  ## run mutation tests of the mathematics; ten minutes on one core
-	$(RUN)/mutmut run $(ARGS)
-	$(RUN)/mutmut results
+mutate: $(VENV)/.installed-dev  ## try random mutants of the code, 40 or ARGS="--count 100 --seed 1"; half an hour on one core
+	$(RUN)/python -m benchmarks.mutants $(ARGS)
 
 # Tables and figures. Runs that exist are used again; `make -j2` trains and makes two at a time, with one thread each.
 ONE := OMP_NUM_THREADS=1 $(RECIPE)
@@ -107,7 +106,7 @@ help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## /  \1\t/p' $(MAKEFILE_LIST) | expand -t 14
 
 clean:  ## remove .venv and build outputs
-	rm -rf $(VENV) build mutants .coverage *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build .coverage *.egg-info .pytest_cache .ruff_cache .mypy_cache
 
 # Install torch first, so that no other package installs another build of it.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -122,8 +121,4 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
-	touch $@
-
-$(VENV)/.installed-mutation: $(VENV)/.installed-dev
-	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[mutation]'
 	touch $@

@@ -134,8 +134,8 @@ def summarize(episodes: dict[str, Tensor] | TensorDictBase) -> dict[str, float]:
         distance of the destination, whatever the field there, and ``final_distance_km_median`` and
         ``final_distance_km_p90``, the median and the 90th percentile over all episodes of the distance left at the end;
         ``spl`` [%] with its bootstrap 95 % interval ``spl_low`` and ``spl_high``, likewise ``path_efficiency`` over the
-        episodes that moved; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper, and with the
-        suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
+        episodes that moved; ``trajectory_length_m`` and ``steps`` over successes, probably as in the paper, and with
+        the suffix ``_all`` over all episodes; ``navigation_error_km``, ``smoothness_deg``, ``heading_mae_deg`` and
         ``heading_rmse_deg`` over successes; ``num_tasks``. Means over no episode are NaN. Where vehicles declare their
         arrival, also ``false_arrival_rate`` [%] with its Wilson 95 % interval, and ``navigation_error_km_declared``,
         the mean over all episodes that ended with a declaration.

@@ -49,7 +49,7 @@ base = magrl.GeomagneticNavEnv(num_envs=4, seed=0)
 guided = [magrl.FieldGradient(base.field), magrl.GradientHeading(), magrl.AlignmentReward()]
 assert TransformedEnv(base, Compose(*guided)).rollout(3)["next", "reward"].shape == (4, 3, 1)
 plain = magrl.GeomagneticNavEnv(num_envs=4, seed=0, render_mode="rgb_array")
-for pilot in (navigators.Secant(), navigators.NAVIGATORS["pso"].for_env(plain, mode="flown")):
+for pilot in (navigators.Secant(), navigators.NAVIGATORS["pso"].for_env(plain)):
     rollout = plain.rollout(12, pilot, break_when_any_done=False)
     print(magrl.summarize(magrl.episode_measures(rollout))["success_rate"])
 maps.trajectories_figure(rollout, plain.field, plain.region).savefig("episodes.png")

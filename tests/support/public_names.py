@@ -31,8 +31,7 @@ def is_code(member: object) -> bool:
 def own_names(module: ModuleType) -> Iterator[str]:
     """Functions and classes that a module defines itself."""
     for name, member in vars(module).items():
-        private = name.startswith("_") or "__mutmut" in name  # of mutation tests
-        if is_code(member) and member.__module__ == module.__name__ and not private:
+        if is_code(member) and member.__module__ == module.__name__ and not name.startswith("_"):
             yield name
 
 
