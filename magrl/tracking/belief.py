@@ -174,7 +174,7 @@ def before(near: Tensor, errors: SensorStd, crust_nt: float = 0.0, model: EarthM
     check_tensor(3, near=near)
     near, magnetic = near.double(), torch.as_tensor(errors.bias)[..., 0].isinf().expand(near.shape[:-1])
     mean, covariance = expected(field_vector(near), latitude_cells() if model is None else model.cells())
-    if torch.compiler.is_compiling() or torch.compiler.is_exporting() or magnetic.any():  # its table is large
+    if torch.compiler.is_compiling() or magnetic.any():  # its table is large
         north = torch.where(magnetic.unsqueeze(-1), near * near.new_tensor((0.0, 1.0, 1.0)), near)
         cells = latitude_cells(ANGLES) if model is None else model.cells(magnetic=True)
         unknown = expected(field_vector(north), cells)

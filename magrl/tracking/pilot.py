@@ -1,7 +1,7 @@
 """The step of a vehicle that navigates by its own readings: a reading and a record in, a record and an action out.
 
 :func:`begin` and :func:`advance` keep the record, :func:`act` chooses the move, and all three are pure functions: the
-same ones run in simulation, on board, in exported programs and in training. A step in ten lines::
+same ones run in simulation, on board and in training. A step in ten lines::
 
     belief = moved(belief, distance, heading, std, motion)          # dead reckoning of the field and the place
     new = innovation(belief, field, std.noise)                      # the reading minus its prediction

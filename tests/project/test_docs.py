@@ -35,7 +35,7 @@ BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
 SCRIPTS = [
     ROOT / "docs" / "examples" / name
-    for name in ("ddpg_anywhere.py", "navigator.py", "sac.py", "sb3_anywhere.py", "turns.py", "onnx_step.py")
+    for name in ("ddpg_anywhere.py", "navigator.py", "sac.py", "sb3_anywhere.py", "turns.py")
 ]
 EXAMPLES += [(path, path.read_text()) for path in SCRIPTS]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]

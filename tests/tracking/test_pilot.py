@@ -35,11 +35,14 @@ def readings() -> tuple[Reading, Reading]:
 
 
 @pytest.mark.slow
-def test_a_decision_traces_as_one_graph(readings) -> None:
-    def decided(state: State, reading: Reading) -> Tensor:
-        return act(RULES, advance(RULES, state, reading), reading)[0]
+def test_a_step_traces_as_one_graph(readings) -> None:
+    """The first reading, a later one, and the declaration."""
+    rules = RULES.replace(arrival="declared")
 
-    given = begin(RULES, readings[0]).state, readings[1]
+    def decided(state: State, reading: Reading) -> Tensor:
+        return act(rules, step(rules, state, reading), reading)[0]
+
+    given = begin(rules, readings[0]).state, readings[1]
     torch.testing.assert_close(torch.compile(decided, fullgraph=True, backend="eager")(*given), decided(*given))
 
 
