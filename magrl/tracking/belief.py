@@ -494,5 +494,5 @@ def _without(covariance: Tensor, index: int) -> Tensor:
 
 
 def _elements(field: Tensor) -> Tensor:
-    """Return D, I, B_H of a field; the angles by way of single precision, as ONNX Runtime has no other arc tangent."""
+    """Return D, I, B_H of a field, in the single precision with which the pretrained agent was trained."""
     return measured_elements(field.float()).to(field)

@@ -93,7 +93,7 @@ def reader(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     ("page", "code"),
-    [pytest.param(*x, marks=[pytest.mark.slow] if "write_step(" in x[1] else []) for x in EXAMPLES],
+    EXAMPLES,
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_python_examples_run(page: Path, code: str, reader: Path, monkeypatch) -> None:
