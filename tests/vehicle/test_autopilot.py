@@ -8,7 +8,6 @@ import math
 import random
 import runpy
 import socket
-import sys
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -21,7 +20,7 @@ from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move
 from magrl.vehicle.autopilot import Loop, Measurement, fly
 from magrl.vehicle.autopilot.__main__ import main, parser, vehicle
-from magrl.vehicle.autopilot.loop import _SAID, LOG
+from magrl.vehicle.autopilot.loop import LOG, SAID
 from magrl.vehicle.autopilot.mavlink import MavlinkLink, Messages
 from magrl.vehicle.autopilot.nmea import NmeaLink, Sentences
 from magrl.vehicle.logs import axes_of_elements, read_log
@@ -40,7 +39,7 @@ EXAMPLE = Path(__file__).parent.parent.parent / "docs" / "examples" / "jsbsim_ve
 @pytest.fixture(autouse=True)
 def _forget() -> None:
     """Nothing was logged before a test."""
-    _SAID.clear()
+    SAID.clear()
     LOG.handlers.clear()
 
 
@@ -79,9 +78,9 @@ class World:
         axes = axes_of_elements(torch.tensor(elements(self.place)), torch.tensor(attitude))
         shown = self.heading - OFFSET * (self.north == "magnetic")
         field = [self.rng.gauss(value, self.noise) for value in axes.tolist()]
-        yield Measurement(self.time, None, None, None, *attitude[:2], shown % 360, received=self.time)
-        yield Measurement(self.time + 0.01, *field, received=self.time)
-        yield Measurement(self.time + 0.02, speed=self.speed, received=self.time)
+        yield Measurement(self.time, None, None, None, *attitude[:2], shown % 360)
+        yield Measurement(self.time + 0.01, *field)
+        yield Measurement(self.time + 0.02, speed=self.speed)
 
     def steer(self, heading_deg: float) -> None:
         self.steered += 1
@@ -155,19 +154,17 @@ def record(folder: Path) -> list[str]:
 
 @pytest.mark.parametrize("number", range(3))
 def test_a_killed_flight_continues_with_the_same_commands(flown, number, tmp_path, caplog) -> None:
-    """After a torn or a damaged line, and with damaged options."""
+    """After a torn line, a damaged one, and one with a cell too many."""
     lines = record(flown[2])
     cut, other = sorted(random.Random(number).sample(range(2, len(lines)), 2))
     before = [*fly(loop(), Played(lines[1:cut]), tmp_path)]
     torn = (lines[cut][:7], "\0\0\0\n", f"{lines[cut].strip()},5.0\n")[number]
     with (tmp_path / "messages.csv").open("a") as file:
         file.write(torn)
-    if number == 1:
-        (tmp_path / "flight.json").write_text("{")  # damaged
     assert [*fly(loop(), Played([]), tmp_path)] == before[-1:]
     after = [*fly(loop(), Played(lines[cut:other]), tmp_path), *[*fly(loop(), Played(lines[other:]), tmp_path)][1:]]
     assert before + after[len(before[-1:]) :] == flown[1] or not before
-    assert ("is no message" in caplog.text) == (number > 0)
+    assert caplog.messages.count(f"1 lines of {tmp_path / 'messages.csv'} are no messages and are skipped") == 1
 
 
 def test_a_flight_with_other_options_is_refused(tmp_path) -> None:
@@ -203,7 +200,7 @@ def full(*_: Any) -> None:
 
 
 def test_errors_of_the_system_do_not_end_the_steering(flown, tmp_path, caplog, monkeypatch) -> None:
-    """The line fails and the disk is full now and then: the commands are the same, and all messages are written."""
+    """The line fails and the disk is full now and then: the commands are the same."""
     rng, lines, opened = random.Random(0), record(flown[2]), Path.open
 
     class Broken(Played):
@@ -215,20 +212,14 @@ def test_errors_of_the_system_do_not_end_the_steering(flown, tmp_path, caplog, m
 
     class Disk:
         def __init__(self, file: Any) -> None:
-            self.file, self.close, self.left = file, file.close, 800
+            self.write, self.close = lambda content: full() if rng.random() < 0.5 else file.write(content), file.close
 
-        def write(self, content: bytes) -> int:
-            self.left -= 1
-            full() if self.left > 0 and rng.random() < 0.7 else None
-            return self.file.write(content[: rng.randrange(200)])
-
-    [*fly(loop(), Played([]), tmp_path)]
     monkeypatch.setattr(Path, "open", lambda *a, **k: Disk(opened(*a, **k)) if a[1:] == ("ab",) else opened(*a, **k))
     link = Broken(lines[1:])
     assert [*fly(loop(), link, tmp_path)] == flown[1]
     assert link.steered >= 2 * len(flown[1]) - 1
-    assert record(tmp_path) == lines
-    for text in ("the heading is not sent", "the command is not reported", "messages wait"):
+    assert {*record(tmp_path)} < {*lines}
+    for text in ("the heading is not sent", "the command is not reported", "a message is not recorded"):
         assert len([line for line in caplog.messages if text in line]) == 1  # not each time
 
 
@@ -237,7 +228,7 @@ def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
         def messages(self) -> Iterator[Measurement]:
             messages = [*super().messages()]
             order = messages + messages[:2] if self.rng.random() < 0.5 else messages[::-1]
-            old = Measurement(self.time - 3 * STEP_S, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0, self.time)
+            old = Measurement(self.time - 3 * STEP_S, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0)
             yield from (*order, old)
 
     world = Late(noise=0.0)
@@ -245,23 +236,23 @@ def test_messages_may_come_late_twice_and_out_of_order(tmp_path) -> None:
     assert world.left_km < 25
 
 
-@pytest.mark.parametrize("number", range(2))
-def test_no_clock_moves_the_vehicle(number, caplog) -> None:
-    """Times that are wrong once or from then on, and silence, against the time of receipt."""
-    rng, flight, now, shift = random.Random(number), loop(), 0.0, 0.0
-    jumps = (2**32 / 1e3, 30 * 86400.0, 3600.0, 61.0, -1000.0, -2.6e6, math.nan, 1e18)
-    for _ in range(3000):
-        now += 600.0 if number % 2 and rng.random() < 0.002 else 1.0
-        shift += rng.choice(jumps[:-2]) if rng.random() < 0.01 else 0.0
-        once = rng.choice([*jumps, -now - shift]) if rng.random() < 0.05 else 0.0
-        flight.take(Measurement(now + shift + once, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, SPEED, received=now))
-    assert flight._place == (pytest.approx(SPEED * now / 1000, abs=2.0), 0.0)
-    assert "not believed" in caplog.text
+def test_a_clock_that_is_set_does_not_move_the_vehicle(caplog) -> None:
+    """Back to 0, as after a restart of the autopilot, and forward by a day."""
+    flight, times = loop(), [*range(100, 110), *range(5), *range(86400, 86405)]
+    for time in times:
+        flight.take(Measurement(time, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, SPEED))
+    assert flight.now == 109 + 4 + 4
+    assert "was set by" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"time": math.nan}, {"x": math.inf}, {"pitch": 91.0}, {"speed": -1.0}, {"speed": 1e4}]
+)
+def test_a_message_that_is_not_possible_does_not_count(wrong, caplog) -> None:
+    flight = loop()
+    flight.take(Measurement(**({"time": 1.0} | wrong)))
+    assert flight.heard is None
     assert "does not count" in caplog.text
-    assert ("no message for" in caplog.text) == bool(number % 2)
-    place = flight._place[0]
-    flight.take(Measurement(now + 9000.0, speed=SPEED, received=now + 9000.0))
-    assert flight._place[0] - place == pytest.approx(SPEED * 3.6, abs=2.0)  # of an hour at most
 
 
 # Readings
@@ -306,7 +297,7 @@ def test_a_bad_reading_is_named_and_the_vehicle_goes_on(change, text) -> None:
 def test_a_long_way_is_reported_in_parts_and_once(good) -> None:
     flight = readings(lambda _, m: m, 10)
     before = len(flight.vehicle._steps)
-    messages = (m._replace(time=m.time + gap, received=gap) for gap in (2000.0, 2100.0) for m in World().messages())
+    messages = (m._replace(time=m.time + gap) for gap in (2000.0, 2100.0) for m in World().messages())
     while len(flight.vehicle._steps) == before:  # it was not heard of for half an hour
         message = next(messages)
         flight.take(message if good or message.x is None else message._replace(x=-message.x))
@@ -552,59 +543,6 @@ def test_a_serial_port_is_read_and_written() -> None:
     link.port.close()
 
 
-@pytest.mark.parametrize("kind", ["mavlink", "nmea"])
-def test_mutated_messages_do_no_harm(kind) -> None:
-    """2000 messages of which a bit, a byte or a field is changed: no error, and no heading out of range."""
-    rng, world, flight = random.Random(0), World(speed=300.0, step_s=3.0), loop()
-    source, buffer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
-    buffer.robust_parsing = True
-    messages, sentences, commands, count = Messages(), Sentences(), [], 0
-
-    def take(content: bytes) -> None:
-        if kind == "nmea":
-            found = [*sentences.measurements(content, world.time)]
-        else:
-            parsed = buffer.parse_buffer(content) or ()
-            found = [messages.measurement(message) for message in parsed if message.get_type() in messages.names]
-        for item in filter(None, found):
-            ended = flight.command and flight.command.stop
-            commands.extend([] if ended else [flight.take(item)])
-
-    while count < 2000:
-        for content in [*nmea(world)] if kind == "nmea" else [m.pack(source) for m in encoded(world, rng)]:
-            for _ in range(2):
-                count += 1
-                damaged = bytearray(content)
-                damaged[rng.randrange(len(damaged))] = rng.randrange(256)
-                whole = kind == "nmea" and rng.random() < 0.5  # with a checksum that fits
-                take(sentence(damaged[1:-5].decode("latin1")) if whole else bytes(damaged))
-            take(content)
-        if flight.steer_deg is not None:
-            world.steer(flight.steer_deg)
-    sent = [command for command in commands if command]
-    assert len(sent) > 3
-    assert all(0 <= command.heading_deg <= 360 and 0 <= command.distance_km <= 50 for command in sent)
-
-
-def encoded(world: World, rng: random.Random) -> Iterator[Any]:
-    """Messages of MAVLink, some of which have numbers that cannot be true."""
-    for message in world.messages():
-        ms = int(1000 * message.time)
-        wrong = rng.choice([math.nan, math.inf, -1e30, 1e30, 0.0])
-        if message.heading is not None:
-            angles = [math.radians(value) for value in message[4:7]]
-            yield mavlink.MAVLink_attitude_message(ms, wrong, *angles[1:], 0, 0, 0)
-            yield mavlink.MAVLink_attitude_message(ms, *angles, 0, 0, 0)
-        if message.x is not None:
-            axes = [value / 1e5 for value in message[1:4]]
-            if rng.random() < 0.2:
-                yield mavlink.MAVLink_highres_imu_message(1000 * ms, *[0] * 6, wrong, *axes[1:], *[0] * 4, 0)
-            yield mavlink.MAVLink_highres_imu_message(1000 * ms, *[0] * 6, *axes, *[0] * 4, 0)
-        if message.speed is not None:
-            yield mavlink.MAVLink_vfr_hud_message(wrong, wrong, 0, 0, 0, 0)
-            yield mavlink.MAVLink_vfr_hud_message(message.speed, 0, 0, 0, 0, 0)
-
-
 # The command
 
 
@@ -649,10 +587,6 @@ def test_the_command_flies_on(flown, monkeypatch, capsys, tmp_path) -> None:
     assert len(lines) == 1 + len(flown[1])
     assert lines[1].endswith("; the sign of D and the compass were not checked: give the start")
     assert "stop: arrived, within 25 km" in shown
-    with monkeypatch.context() as patch:
-        patch.setattr(sys.stdout, "write", full)
-        main([*command[:-1], str(tmp_path / "full")])  # nothing can be printed
-    assert record(tmp_path / "full") == record(tmp_path)
     main(command)
     again = capsys.readouterr().out.splitlines()
     assert again[0].startswith(f"continues the flight in {tmp_path}")

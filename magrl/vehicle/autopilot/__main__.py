@@ -70,7 +70,7 @@ def _main(options: argparse.Namespace) -> None:
     calibration = Calibration.load(options.calibration) if options.calibration else None
     options.bias = options.bias or (calibration.std if calibration else (0.0, 0.0, 0.0))
     loop, connection = Loop(vehicle(options), read_s=options.read_s, calibration=calibration), link(options)
-    LOG.handlers, logging.raiseExceptions = [logging.StreamHandler(sys.stdout)], False
+    LOG.handlers = [logging.StreamHandler(sys.stdout)]
     LOG.setLevel(logging.INFO)
     say = LOG.getChild("commands").info  # each one, however often
     if (options.out / "messages.csv").exists():

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Protocol
 
@@ -16,7 +16,7 @@ from magrl.training.checkpoints import locked
 from magrl.vehicle.autopilot.loop import LOG, Loop, Measurement, clock, tolerated
 from magrl.vehicle.onboard import Command
 
-HEADER = "time_s,mag_x_nT,mag_y_nT,mag_z_nT,roll_deg,pitch_deg,heading_{north}_deg,speed_m_s,received_s\n"
+HEADER = "time_s,mag_x_nT,mag_y_nT,mag_z_nT,roll_deg,pitch_deg,heading_{north}_deg,speed_m_s\n"
 """Columns of the recorded messages, which :func:`magrl.vehicle.logs.read_log` reads."""
 
 
@@ -46,8 +46,8 @@ def fly(loop: Loop, link: Link, folder: Path | str) -> Iterator[Command]:
     files exist, the messages are repeated without sending anything, and the flight continues with the same commands, of
     which the last one is yielded again. Between, the vehicle is taken to have kept its heading and its speed.
 
-    An error of the system in sending and in writing is logged, and the steering goes on. What was not written is
-    written later.
+    Lines that are no messages are skipped, and their number is logged. An error of the system in sending or in writing
+    is logged, and the steering goes on.
 
     Args:
         loop: loop that has taken no message.
@@ -102,7 +102,7 @@ class _Record:
     """The files of a flight: its options, and its messages, which are repeated and to which new ones are added."""
 
     def __init__(self, loop: Loop, folder: Path) -> None:
-        self._loop, self._path, self._waiting = loop, folder / "messages.csv", bytearray()
+        self._loop, self._path = loop, folder / "messages.csv"
         self._check_options(folder / "flight.json")
         if not self._path.exists():
             write_atomically(self._path, HEADER.format(north=loop.vehicle.options.north).encode())
@@ -114,35 +114,32 @@ class _Record:
         journal = json.loads(self._loop.vehicle._journal.model_dump_json(exclude={"steps"}))
         calibration = self._loop.calibration and self._loop.calibration.model_dump(mode="json")
         options = journal.pop("options") | journal | {"read_s": self._loop.read_s, "calibration": calibration}
-        written = options
-        with suppress(OSError, ValueError):  # a new flight, or a file that is damaged
-            written = dict(json.loads(path.read_bytes()))
+        written = json.loads(path.read_bytes()) if path.exists() else options
         if texts := [f"{name} {short(written.get(name))}" for name, own in options.items() if written.get(name) != own]:
             raise ValueError(f"{path} is of a flight with {', '.join(texts)}: give these, or another folder")
         write_atomically(path, json.dumps(options).encode())
 
     def _repeat(self) -> None:
-        """Repeat the messages, without lines that are none."""
-        with self._path.open("rb") as file:
-            for number, line in enumerate(file, 1):
-                if not line.endswith(b"\n"):  # it was not written whole
-                    os.truncate(self._path, file.tell() - len(line))
-                elif number > 1:
-                    try:
-                        time, *rest = line.decode().rstrip("\n").split(",")
-                        cells = (float(cell) if cell else None for cell in rest)
-                        self._loop.take(Measurement._make([float(time), *cells]))
-                    except (TypeError, ValueError, RuntimeError) as error:
-                        LOG.error("line %d of %s is no message: %s", number, self._path, error)
+        """Repeat the messages; skip and count lines that are none."""
+        *lines, cut = self._path.read_bytes().split(b"\n")
+        os.truncate(self._path, self._path.stat().st_size - len(cut))  # it was not written whole
+        skipped = 1 if cut else 0
+        for line in lines[1:]:
+            try:
+                time, *rest = line.decode().split(",")
+                cells = (float(cell) if cell else None for cell in rest)
+                self._loop.take(Measurement._make([float(time), *cells]))
+            except (TypeError, ValueError):
+                skipped += 1
+        if skipped:
+            LOG.warning("%d lines of %s are no messages and are skipped", skipped, self._path)
 
     def close(self) -> None:
         """Close the record."""
         self._file.close()
 
     def write(self, measurement: Measurement) -> None:
-        """Write a message; what cannot be written waits for the next one."""
+        """Write a message."""
         cells = ("" if value is None else repr(float(value)) for value in measurement)
-        self._waiting += ",".join(cells).encode() + b"\n"
-        with tolerated("messages wait in memory, since they cannot be written"):
-            while self._waiting:
-                del self._waiting[: self._file.write(self._waiting)]
+        with tolerated("a message is not recorded"):
+            self._file.write(",".join(cells).encode() + b"\n")

@@ -27,12 +27,8 @@ FASTEST_M_S = 1000.0
 """A greater speed is an error of the message; chosen [m/s]."""
 STALE_S = 2.0
 """A sample of the field counts if the attitude is at most as old; chosen [s]."""
-GREATEST = 1e11
-"""A greater number is an error of the message; as a time, it would have no digits for milliseconds; chosen."""
-GAP_S = 3600.0
-"""A longer silence counts as this one; chosen [s]."""
-LATE_S, AHEAD_S = 60.0, 15.0
-"""A message may be as much earlier than the one before, and later than the time since then explains; chosen [s]."""
+LATE_S, GAP_S = 60.0, 3600.0
+"""A message may be as much earlier, and later, than the one before; beyond, the vehicle's clock was set; chosen [s]."""
 TURN_S = 120.0
 """A turn on the spot ends at the latest after this time; chosen [s]."""
 _ALIGNED_DEG = 10.0  # the turn is made
@@ -41,15 +37,16 @@ _LEAST_SAMPLES = 3
 _ONE_READING_KM = 1e9
 _QUANTITIES = (*AXES, *ATTITUDE, "speed")
 _ZERO = time.time() - time.monotonic()
-_SAID: dict[str, float] = {}  # what was logged, and when
+SAID: dict[str, float] = {}
+"""What was logged, and when [s]."""
 _Place = tuple[float, float]
 
 
 def _is_due(record: logging.LogRecord) -> bool:
     """Return whether a kind of message was not logged for a while."""
-    due = clock() - _SAID.get(record.msg, -math.inf) >= SELDOM_S
+    due = clock() - SAID.get(record.msg, -math.inf) >= SELDOM_S
     if due:
-        _SAID[record.msg] = clock()
+        SAID[record.msg] = clock()
     return due
 
 
@@ -99,8 +96,7 @@ class Measurement(NamedTuple):
     """Content of one message of an autopilot; None for what it does not have.
 
     ``time`` is in seconds of the vehicle's clock; ``x``, ``y``, ``z`` is the field, forward, right, down [nT];
-    ``roll``, ``pitch``, ``heading`` are in degrees; ``speed`` is forward, in m/s; ``received`` is the time of receipt,
-    in seconds of :func:`clock`, with which ``time`` is compared. The loop fills it in, unless a simulator states it.
+    ``roll``, ``pitch``, ``heading`` are in degrees; ``speed`` is forward, in m/s.
 
     Example:
         >>> Measurement(12.5, heading=290.0, speed=None).heading
@@ -115,14 +111,13 @@ class Measurement(NamedTuple):
     pitch: float | None = None
     heading: float | None = None
     speed: float | None = None
-    received: float | None = None
 
     @property
     def possible(self) -> bool:
         """Whether all numbers can be true."""
         numbers = [value for value in self if value is not None]
         tilt, speed = self.pitch or 0.0, self.speed or 0.0
-        return all(abs(x) <= GREATEST for x in numbers) and abs(tilt) <= 90 and 0 <= speed <= FASTEST_M_S
+        return all(map(math.isfinite, numbers)) and abs(tilt) <= 90 and 0 <= speed <= FASTEST_M_S
 
 
 class Loop:
@@ -132,7 +127,7 @@ class Loop:
     seconds, without spikes, and reports the mean of the field at the mean of its places: one step a move. A field that
     does not change in any digit, that is missing or that the vehicle rejects is reported as missing, and the vehicle
     continues by dead reckoning. Messages may come late, twice or out of order. The time is that of the vehicle's clock;
-    where it runs backward, or ahead of the time of receipt, the time of receipt counts.
+    where that was set, time goes on from the last message.
 
     The heading is from true north, or, where that of the vehicle is magnetic, of any reference that turns slowly: the
     loop measures its angle from magnetic north at each reading.
@@ -163,7 +158,7 @@ class Loop:
         self.now = -math.inf
         """Time of the last message [s]."""
         self.heard: Measurement | None = None
-        """The last message, with the time that is believed; None for one that does not count."""
+        """The last message, at its time in the loop; None for one that does not count."""
         self.command: Command | None = None
         self.note = ""
         """What the last reading lacked, as text; empty if nothing."""
@@ -172,8 +167,7 @@ class Loop:
         self._offset = 0.0  # of the autopilot's north from that of the vehicle [deg]
         self._since = -math.inf  # time of the last command, or the start of the reading
         self._reading: list[tuple[float, ...]] | None = []
-        self._received, self._slack = 0.0, 0.0  # receipt of the last message; how far the vehicle's clock is behind [s]
-        self._shift = 0.0  # of the vehicle's clock, where it jumped [s]
+        self._shift = 0.0  # of the vehicle's clock, where it was set [s]
 
     @property
     def steer_deg(self) -> float | None:
@@ -197,11 +191,8 @@ class Loop:
         if not measurement.possible:
             LOG.warning("a message does not count, since a value is not possible: %s", measurement)
             return None
-        received = clock() if measurement.received is None else measurement.received
-        if self.now == -math.inf:
-            self.now, self._received = measurement.time, received
-        time = self._believed(measurement.time, received)
-        self.heard = measurement = measurement._replace(time=time, received=received)
+        time = self._on_time(measurement.time)
+        self.heard = measurement = measurement._replace(time=time)
         self._advance(time)
         values = [(name, value) for name in _QUANTITIES if (value := getattr(measurement, name)) is not None]
         new = {name: (time, value) for name, value in values if time > self._latest.get(name, (-math.inf, 0.0))[0]}
@@ -214,17 +205,14 @@ class Loop:
             return None
         return self._read(sampled="x" in new)
 
-    def _believed(self, time: float, received: float) -> float:
-        """Return the time of a message: that of the vehicle's clock, or the time of receipt where that clock jumps."""
-        self._slack = min(self._slack + max(received - self._received, 0.0), GAP_S)
-        self._received, ahead = received, time + self._shift - self.now
-        if not -LATE_S <= ahead <= self._slack + AHEAD_S:
-            LOG.warning("the vehicle's clock jumps by %.0f s: not believed, %.0f s count", ahead, self._slack)
-            ahead = self._slack
-            self._shift = self.now + ahead - time
-        elif ahead <= 0 and self._slack > LATE_S:
-            LOG.warning("the vehicle's clock is %.0f s behind the time of receipt", self._slack)
-        self._slack -= min(max(ahead, 0.0), self._slack)
+    def _on_time(self, time: float) -> float:
+        """Return the time of a message: that of the vehicle's clock, or that of the last message where it was set."""
+        if self.now == -math.inf:
+            self.now = time
+        ahead = time + self._shift - self.now
+        if not -LATE_S <= ahead <= GAP_S:
+            LOG.warning("the vehicle's clock was set by %.0f s: time goes on from the last message", ahead)
+            self._shift -= ahead
         return time + self._shift
 
     def _advance(self, time: float) -> None:
