@@ -119,6 +119,16 @@ class Step(Inputs):
     heading: float = Field(ge=-360, le=360)
     distance: float = Field(0.0, ge=0)
 
+    @property
+    def elements(self) -> tuple[float | None, float | None, float | None]:
+        """D [deg], I [deg], B_H [nT]; None for one that was not read."""
+        return self.declination, self.inclination, self.horizontal_intensity
+
+    @property
+    def course(self) -> float:
+        """Heading of the move [rad], -pi to pi."""
+        return math.remainder(math.radians(self.heading), 2 * math.pi)
+
 
 class Journal(Inputs):
     """Hold all inputs of a vehicle since its start, which determine its state with any navigator.

@@ -142,7 +142,7 @@ class Onboard:
         self._std = SensorStd(*(torch.tensor(std, dtype=torch.float64) for std in self.options.accuracy))
         self._steps: tuple[Step, ...] = ()
         self._state: State | None = None
-        self._raw: Any = None  # the last reading
+        self._last: Any = None  # the last elements
         self._surprises: tuple[float, ...] = ()
         self._unchanged: limits.Triple = (0.0, 0.0, 0.0)  # path since each element last changed [km]
         self._unread_km = 0.0  # path since the last complete reading
@@ -174,22 +174,22 @@ class Onboard:
         """
         if self.target is None:
             raise RuntimeError(_NOT_STARTED)
-        given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
         if self.options.magnetic and declination is not None:
             raise ValueError(f"declination {declination!r}: headings are from magnetic north, D is not measured: None")
+        given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
         step = Step(**given, heading=heading, distance=distance)
-        command = self._move(step)
+        command = self._after(step)
         self._steps += (step,)
         return command
 
-    def _move(self, step: Step) -> Command:
+    def _after(self, step: Step) -> Command:
         """Return what to do after a new move."""
-        read = self._comparable((step.declination, step.inclination, step.horizontal_intensity))
-        raw: Any = tuple(old if new is None else new for new, old in zip(read, self._raw or read, strict=True))
-        limits.check_earth_reading(*raw)
-        self._check(step, raw)
-        course = math.remainder(math.radians(step.heading), 2 * math.pi)
-        reading = self._reading(step.distance, course, raw, read)
+        read = self._comparable(step.elements)
+        last = self._last or read
+        elements: Any = tuple(old if new is None else new for new, old in zip(read, last, strict=True))
+        limits.check_earth_reading(*elements)
+        self._check(step, elements)
+        reading = self._reading(step, elements)
         with torch.inference_mode():
             if self._state is None:
                 track = tracking.begin(self._rules, reading)
@@ -199,18 +199,18 @@ class Onboard:
             action, decision = self._act(track, reading)
         if self._state is not None and read[1:] != (None, None):
             self._surprises = (*self._surprises, track.surprise.item())[-_SURPRISES:]
-        self._unchanged = limits.unchanged_km(self._unchanged, self._raw or raw, read, step.distance)
+        self._unchanged = limits.unchanged_km(self._unchanged, last, read, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
-        self._raw, self._state = raw, track.state
-        return self._command(track, decision, action, course)
+        self._last, self._state = elements, track.state
+        return self._command(track, decision, action, step.course)
 
-    def _reading(self, km: float, course: float, raw: limits.Triple, read: limits.Incomplete) -> Reading:
+    def _reading(self, step: Step, elements: limits.Triple) -> Reading:
         """Return the reading of the pilot; a missing element is the last one, with the accuracy of an outage."""
-        rows = raw, self.target, *(self._known or ())
+        rows = elements, self.target, *(self._known or ())
         field, target, *there = torch.tensor(rows, dtype=torch.float32)
-        missing = torch.tensor([value is None for value in read])
+        missing = torch.tensor([value is None for value in self._comparable(step.elements)])
         std = self._std._replace(noise=self._std.noise.masked_fill(missing, OUTAGE_STD))
-        distance, heading = torch.tensor((km, course), dtype=torch.float32)
+        distance, heading = torch.tensor((step.distance, step.course), dtype=torch.float32)
         known, known_std = there or (None, None)
         reading = Reading(field, target, distance, heading, std, torch.tensor(len(self._steps)), known, known_std)
         return reading._replace(place=self._knowledge.place, target_place=self._knowledge.target_place)
@@ -227,8 +227,8 @@ class Onboard:
         """Return D, I, B_H, with 0 for D where the vehicle does not measure it."""
         return (0.0, *elements[1:]) if self.options.magnetic else elements
 
-    def _check(self, step: Step, reading: limits.Triple) -> None:
-        """Raise unless a reading and a distance are possible, and possible together."""
+    def _check(self, step: Step, elements: limits.Triple) -> None:
+        """Raise unless elements and a distance are possible together."""
         longest = self.options.max_move_km
         if step.distance > limits.LONGER * longest:
             raise ValueError(
@@ -236,16 +236,17 @@ class Onboard:
                 "must be in kilometers, and since the last step; report a longer way in parts, with None between"
             )
         if self._state is not None:
-            limits.check_earth_jump(self._raw, reading, step.distance + self._unread_km, self.options.sensor_std.noise)
+            since_km, noise = step.distance + self._unread_km, self.options.sensor_std.noise
+            limits.check_earth_jump(self._last, elements, since_km, noise)
             return
         if step.distance != 0:
             raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
         if self._known:
-            check_first_reading(reading, self._known[0], self.options.accuracy, self._known[1])
-        if text := limits.out_of_range(self._range, reading):
+            check_first_reading(elements, self._known[0], self.options.accuracy, self._known[1])
+        if text := limits.out_of_range(self._range, elements):
             raise ValueError(f"the reading at the start: {text}")
         longest = LONGEST_WAY_KM if self._network else self.options.max_steps * self.options.max_move_km
-        limits.check_earth_distance(reading, self.target, longest)
+        limits.check_earth_distance(elements, self.target, longest)
 
     def _command(self, track: Track, decision: ArrivalDecision, action: Tensor, course: float) -> Command:
         """Return the command: to stop, or the action of the navigator."""
@@ -272,7 +273,7 @@ class Onboard:
         options, level = self.options, sum(self._surprises) / max(len(self._surprises), 1)
         if text := self._lost(track, level):
             return "lost", text
-        if text := limits.out_of_range(self._range, self._raw):
+        if text := limits.out_of_range(self._range, self._last):
             return "out of range", text
         way_km, error_km = track.way.displacement.norm().item(), track.way.covariance.trace().sqrt().item()
         if self._network and way_km - 2 * error_km > LONGEST_WAY_KM:
@@ -304,7 +305,7 @@ class Onboard:
         if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
             causes = "the sign of I, its zero (from the horizontal), swapped elements, units, sensors and compass"
             return f"readings deviate {level**0.5:.0f} times as much as expected: check {causes}"
-        inclination, local = self._raw[1], track.local
+        inclination, local = self._last[1], track.local
         slope = local.gradient[1].norm() + 2 * local.covariance[1, 1:, 1:].trace().sqrt()
         if useful[1] and abs(inclination) <= math.pi / 2 and 100 * slope.item() < limits.EQUATOR_SLOPE_DEG:
             return f"inclination {inclination:g} hardly changes: it looks like radians; degrees are expected"
