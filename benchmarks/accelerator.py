@@ -68,7 +68,7 @@ def parts(vehicles: int, device: torch.device) -> dict[str, Callable[[], object]
         "posterior of the destination": lambda: tracking.posterior(goal),
         "track: belief, posterior and plan": lambda: tracking.advance(rules, track.state, after),
         "track, where some vehicles start": lambda: step(rules, track.state, after),
-        "declaration of the arrival": lambda: tracking.decide(declared, track, after),
+        "declaration of the arrival": lambda: tracking.declaring(declared, track, after, track.plan),
     }
 
 

@@ -384,24 +384,20 @@ def moving(rules: Rules, plan: Tensor, heading: Tensor) -> Tensor:
     return torch.stack(steer(heading, torch.atan2(east, north), torch.hypot(north, east), *limits), -1)
 
 
-def decide(rules: Rules, track: Track, reading: Reading) -> ArrivalDecision:
-    """Return whether to declare that the destination is within the radius; see
-    :func:`~magrl.tracking.arrival_decision`."""
+def declaring(rules: Rules, track: Track, reading: Reading, action: Tensor) -> tuple[Tensor, ArrivalDecision]:
+    """Return an action ``(..., 2)`` with the declaration ``(..., 3)``: 1 where the vehicle has arrived, else -1.
+
+    Where it is probably within the radius, and further readings are not worth their cost
+    (:func:`~magrl.tracking.arrival_decision`), it stays and declares.
+    Before, where its estimated distance is less than the radius, it approaches the estimated place and stops where
+    readings are worth most (:func:`~magrl.tracking.approach`). Elsewhere it moves as ``action`` says.
+    """
     state, left = track.state, rules.max_steps - 1 - reading.step
     price = rules.step_price if reading.price is None else reading.price
     trip = Trip(state.path, state.home, left, price, rules.max_move_km)
     goal, std = _goal(rules, state, reading), _accuracy(state, reading)
-    return arrival_decision(goal, track.posterior, std, trip, rules.radius_km)
-
-
-def declaring(rules: Rules, track: Track, reading: Reading, action: Tensor) -> tuple[Tensor, ArrivalDecision]:
-    """Return an action ``(..., 2)`` with the declaration ``(..., 3)``: 1 where the vehicle has arrived, else -1.
-
-    Where it is probably within the radius, and further readings are not worth their cost, it stays and declares.
-    Before, where its estimated distance is less than the radius, it approaches the estimated place and stops where
-    readings are worth most (:func:`~magrl.tracking.approach`). Elsewhere it moves as ``action`` says.
-    """
-    decision, heading = decide(rules, track, reading), _true(reading, track.state.north).heading.unsqueeze(-1)
+    decision = arrival_decision(goal, track.posterior, std, trip, rules.radius_km)
+    heading = _true(reading, state.north).heading.unsqueeze(-1)
     way, stop = (part.to(action.dtype) for part in (decision.way, decision.stop_km.unsqueeze(-1)))
     near = way.norm(dim=-1, keepdim=True) < rules.radius_km
     action = torch.where(near, approach(way, heading, stop, rules.max_move_km, rules.max_turn_rad).to(action), action)

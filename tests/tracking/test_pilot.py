@@ -96,7 +96,7 @@ def test_it_goes_to_the_estimated_place_where_that_is_near(readings, monkeypatch
     near = f64((0.0, 20.0), (0.0, 30.0), (0.0, -10.0), (0.0, 0.0))
     sure, worth = f64(0.1, 0.1, 0.1, 0.7), f64(0.5, 0.5, 0.5, 0.5)
     decision = ArrivalDecision(sure, worth, sure, near, torch.full((4,), 12.0))
-    monkeypatch.setattr(pilot, "decide", lambda *_: decision)
+    monkeypatch.setattr(pilot, "arrival_decision", lambda *_: decision)
     seen = readings[0]._replace(heading=f64(0.0, 0.0, 0.0, 0.0))
     action = f64((50.0, -1.0)).expand(4, 2)
     sent, quarter = declaring(RULES, begin(RULES, seen), seen, action)[0], math.pi / 2

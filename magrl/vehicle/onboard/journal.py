@@ -124,11 +124,6 @@ class Step(Inputs):
         """D [deg], I [deg], B_H [nT]; None for one that was not read."""
         return self.declination, self.inclination, self.horizontal_intensity
 
-    @property
-    def course(self) -> float:
-        """Heading of the move [rad], -pi to pi."""
-        return math.remainder(math.radians(self.heading), 2 * math.pi)
-
 
 class Journal(Inputs):
     """Hold all inputs of a vehicle since its start, which determine its state with any navigator.

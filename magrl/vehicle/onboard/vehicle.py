@@ -189,7 +189,8 @@ class Onboard:
         elements: Any = tuple(old if new is None else new for new, old in zip(read, last, strict=True))
         limits.check_earth_reading(*elements)
         self._check(step, elements)
-        reading = self._reading(step, elements)
+        course = math.remainder(math.radians(step.heading), 2 * math.pi)
+        reading = self._reading(step, elements, course)
         with torch.inference_mode():
             if self._state is None:
                 track = tracking.begin(self._rules, reading)
@@ -202,15 +203,15 @@ class Onboard:
         self._unchanged = limits.unchanged_km(self._unchanged, last, read, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
         self._last, self._state = elements, track.state
-        return self._command(track, decision, action, step.course)
+        return self._command(track, decision, action, course)
 
-    def _reading(self, step: Step, elements: limits.Triple) -> Reading:
+    def _reading(self, step: Step, elements: limits.Triple, course: float) -> Reading:
         """Return the reading of the pilot; a missing element is the last one, with the accuracy of an outage."""
         rows = elements, self.target, *(self._known or ())
         field, target, *there = torch.tensor(rows, dtype=torch.float32)
         missing = torch.tensor([value is None for value in self._comparable(step.elements)])
         std = self._std._replace(noise=self._std.noise.masked_fill(missing, OUTAGE_STD))
-        distance, heading = torch.tensor((step.distance, step.course), dtype=torch.float32)
+        distance, heading = torch.tensor((step.distance, course), dtype=torch.float32)
         known, known_std = there or (None, None)
         reading = Reading(field, target, distance, heading, std, torch.tensor(len(self._steps)), known, known_std)
         return reading._replace(place=self._knowledge.place, target_place=self._knowledge.target_place)
