@@ -118,7 +118,7 @@ AXES = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
         (lambda m: m / 1e5, {}, "intensity is 0.49.*, which looks like gauss"),
         (lambda m: m / 1e3, {}, "looks like microtesla"),
         (lambda m: m / 264, {}, "is 188.*, where about 5[0-9]* nT are expected: scale raw counts to nanotesla"),
-        (lambda m: 50000 * m / m.norm(dim=-1, keepdim=True), {}, "the length 50000: log the field as measured"),
+        (lambda m: 50000 * m / m.norm(dim=-1, keepdim=True), {}, "the same length: log the field as measured"),
         (lambda m: m[:, [1, 0, 2]], {}, "fit right, forward, down, and forward.*: a left-handed frame"),
         (lambda m: m * torch.tensor([1.0, -1.0, -1.0]), {}, "fit forward, minus right, minus down, and [^:]*, or the"),
         (lambda m: m @ AXES, {}, "fit forward, right, minus down.*: a left-handed frame; change the sign of one axis"),

@@ -49,7 +49,7 @@ RADIANS = np.pi / 180
 @pytest.mark.parametrize(
     ("change", "texts"),
     [
-        (lambda t: t.assign(D=-t["D"]), ["15 of 15 readings do not fit IGRF, rows 1, 2, 3, 4, 5, ... .*fits with -D"]),
+        (lambda t: t.assign(D=-t["D"]), ["15 of 15 readings do not fit IGRF, from row 1 on .*fits with -D"]),
         (lambda t: t.assign(I=-t["I"]), ["fits with -I: the vertical axis points up"]),
         (lambda t: t.assign(D=t["D"] * RADIANS), ["D fits in radians"]),
         (lambda t: t.assign(D=t["D"] * RADIANS, I=t["I"] * RADIANS), ["fits in radians"]),
@@ -67,7 +67,6 @@ RADIANS = np.pi / 180
             lambda t: t.assign(distance=t["distance"] / 1.852),
             ["1.85 times as far apart .*they look like nautical miles"],
         ),
-        (lambda t: t.assign(distance=t["distance"] / 1.69), ["1.69 times as far apart .*they look like statute miles"]),
         (lambda t: t.assign(distance=t["distance"] * 1000), ["0.001 times as far apart .*they look like meters"]),
         (lambda t: t.assign(distance=t["distance"] * 3), ["0.333 times as far apart .*check the log and its unit"]),
         (
@@ -76,16 +75,11 @@ RADIANS = np.pi / 180
         ),
         (lambda t: t.rename(columns={"latitude": "longitude", "longitude": "latitude"}), ["swapped", ".*"]),
         (
-            lambda t: t.assign(latitude=t["longitude"] * 3),
-            ["latitude -1.* is not from -90 to 90 deg"],
+            lambda t: t.assign(D=t["D"].where(t.index != 3, 40.0)),
+            ["1 of 15 .*, from row 4 on .D deviates .*: spikes, or iron"],
         ),
-        (lambda t: t.assign(D=t["D"].where(t.index != 3, 40.0)), ["1 of 15 .*, row 4 .D deviates .*: spikes, or iron"]),
         (lambda t: t.assign(B_H=t["B_H"] + 5000), ["no calibration, iron near the sensor, or a heading that is wrong"]),
         (lambda t: t.assign(I=t["I"].where(t.index != 0, 0), B_H=t["B_H"].where(t.index != 0, 0)), ["1 of 15"]),
-        (
-            lambda t: t.assign(**{name: t[name].where(t.index > 1, 0) for name in ("latitude", "longitude")}),
-            ["rows 1, 2 at latitude 0, longitude 0: no position was known there"],
-        ),
     ],
 )
 def test_mistakes_are_named(change, texts: list[str]) -> None:

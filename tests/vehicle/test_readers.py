@@ -203,18 +203,6 @@ def test_ros(tmp_path: Path, version: int, storage: str) -> None:
         check(read_log(file))
 
 
-def test_a_log_without_a_magnetometer_tells_how_to_log_one(tmp_path: Path) -> None:
-    silent = b"".join(line for line in nmea().splitlines(keepends=True) if b"XDR" not in line)
-    contents = {"vehicle_magnetometer or sensor_mag": ulog({}), "log MAG, by": dataflash(health=(0, 0))}
-    contents |= {"send XDR with MAG_X_NT": silent, "name its columns mag_x_nT": b"time,heading\n0,5\n"}
-    logs = {text: written(tmp_path / str(len(text)), content) for text, content in contents.items()}
-    logs["request RAW_IMU, SCALED_IMU2"] = telemetry(tmp_path / "log.tlog", "PX4", 9.0, field=False)
-    logs["record a topic of sensor_msgs/MagneticField"] = bag(tmp_path / "log.bag", 1, "bag", "MagneticField")
-    for text, path in logs.items():
-        with pytest.raises(ValueError, match=f"no x of the magnetometer is among .*: .*{text}"):
-            read_log(path)
-
-
 def test_nmea(tmp_path: Path) -> None:
     """A heading from true north is preferred to that of the compass, a speed through the water to that over ground."""
     path = written(tmp_path / "log.txt", nmea())

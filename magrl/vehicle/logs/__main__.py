@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas
@@ -27,18 +26,12 @@ from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration, calibrate
 from magrl.vehicle.logs.comparison import difference_from_igrf, mistakes
 from magrl.vehicle.logs.readers import read_log
-from magrl.vehicle.logs.readings import STD_NAMES, obstacles, readings_of
+from magrl.vehicle.logs.readings import STD_NAMES, readings_of
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Log, total_intensity
 from magrl.vehicle.logs.vectors import NORTHS
 
 _DIGITS = {"time": 2, "D": 4, "I": 4, "B_H": 2, "heading": 3, "distance": 4, "latitude": 6, "longitude": 6}
 _DIGITS |= {"altitude": 4, "D_std": 4, "I_std": 4, "B_H_std": 2}
-
-
-_NO_NORTH = (
-    "the heading is not from true north, so D tells nothing of the place: the vehicle navigates by I, B_H and magnetic "
-    "headings, and where their contours are nearly parallel, it finds a line and not a place"
-)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -67,20 +60,10 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def _main(options: argparse.Namespace) -> None:
     log = read_log(*options.log, sensor=options.sensor)
-    date, missing = options.date or log.date, [] if options.calibrate else obstacles(log, options.north)
     notes = [*log.notes, *([] if options.calibrate else remarks(log, options))]
     print("\n".join([*summary(log), *(f"note: {text}" for text in notes)]), flush=True)
-    if missing and not obstacles(log, "true"):  # the north alone is missing, and D may show it
-        missing += mistakes(readings_of(log, north="true", **_parts(options)), date)
-    if missing:
-        raise ValueError("; ".join(missing))
+    date = options.date or log.date
     print("\n".join(swing(log, options, date) if options.calibrate else way(log, options, date)))
-
-
-def _parts(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of readings."""
-    iron = Calibration.load(options.calibration) if options.calibration else None
-    return {"every_km": options.every_km, "calibration": iron}
 
 
 def summary(log: Log) -> list[str]:
@@ -101,8 +84,6 @@ def remarks(log: Log, options: argparse.Namespace) -> list[str]:
     texts = []
     if missing := " and ".join(name for name in ATTITUDE[:2] if name not in log.samples):
         texts.append(f"no {missing}: the vehicle is taken as level, and I is wrong by up to its tilt; log both angles")
-    if _north(log, options) in ("magnetic", "model"):
-        texts.append(_NO_NORTH)
     if not options.calibration:
         texts.append("no calibration: iron remains, unless the autopilot corrected it; swing, and give --calibration")
     return texts
@@ -136,8 +117,8 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
 
 def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     """Write the readings of a log, and return them beside IGRF, with the likely mistakes."""
-    parts = _parts(options)
-    table = readings_of(log, north=options.north, **parts)
+    iron = Calibration.load(options.calibration) if options.calibration else None
+    table = readings_of(log, every_km=options.every_km, north=options.north, calibration=iron)
     lines = [f"first reading: {_elements(table.iloc[0][list(NAMES)])}; {int(table['spikes'].sum())} spikes left out"]
     if "latitude" in table and date:
         mean = difference_from_igrf(table, date).mean(0)
@@ -145,7 +126,7 @@ def way(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
     lines += [f"warning: {text}" for text in mistakes(table, date)]
     if len(table) < 2:
         return [*lines, "one reading: no file is written; choose shorter moves by --every-km"]
-    return [*lines, *_written(table, log, options, parts["calibration"])]
+    return [*lines, *_written(table, log, options, iron)]
 
 
 def _written(table: DataFrame, log: Log, options: argparse.Namespace, iron: Calibration | None) -> list[str]:
@@ -157,8 +138,6 @@ def _written(table: DataFrame, log: Log, options: argparse.Namespace, iron: Cali
     std = np.sqrt(np.square(table[list(STD_NAMES)]).mean()).replace(OUTAGE_STD, 0.0)  # of D that is not measured
     noise, bias = (" ".join(f"{value:.3g}" for value in values) for values in (std, iron.std if iron else np.zeros(3)))
     missing = "" if iron else "; no calibration: give --bias of your sensors"
-    if std.isna().any():
-        noise, missing = "D I B_H", f"; too few samples for --noise: give that of your sensors{missing}"
     magnetic = "" if _north(log, options) == "true" else " --north magnetic"
     return [
         f"{len(table)} readings, moves of {table['distance'][1:].mean():.3g} km: {out}",

@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 from magrl.checks import CheckedModel, check_number, check_tensor
 from magrl.field.elements import elements_jacobian, field_vector
 from magrl.files import DamagedFileError, write_json
-from magrl.vehicle.logs.units import intensity_mistake
+from magrl.vehicle.logs.units import check_intensity
 from magrl.vehicle.logs.vectors import rotation
 from magrl.vehicle.onboard.known import known_elements
 
@@ -285,11 +285,9 @@ def _check_samples(axes: Tensor, total: float) -> None:
         row = int((~axes.isfinite().all(-1)).nonzero()[0])
         raise ValueError(f"sample {row + 1} is {axes[row].tolist()}: leave out samples that are not finite")
     lengths = axes.norm(dim=-1)
-    length, change = float(lengths.median()), float(lengths.std())
-    if mistake := intensity_mistake(length, total):
-        raise ValueError(mistake)
-    if change < 1e-6 * length:
-        raise ValueError(f"all samples have the length {length:g}: log the field as measured, not its direction alone")
+    check_intensity(float(lengths.median()), total)
+    if lengths.std() < 1e-6 * total:
+        raise ValueError("all samples have the same length: log the field as measured, not its direction alone")
 
 
 def _check_axes(axes: Tensor, level: Tensor) -> None:

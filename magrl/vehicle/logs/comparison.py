@@ -12,16 +12,14 @@ from magrl.field import IGRF
 from magrl.field.elements import NAMES, element_difference, measured_elements
 from magrl.geodesy import geodesic
 from magrl.sensor_std import OUTAGE_STD
-from magrl.vehicle.logs.units import out_of_range
 from magrl.vehicle.onboard.known import deviation, likely_mistake, model_std
 
 MOST_SPIKES = 0.2
 """Share of readings up to which those that do not fit are spikes, and not a mistake in all; chosen."""
 MOST_DRIFT, LEAST_TURN_DEG = 0.25, 20.0
 """Share of a distance and angle of a course that currents explain; chosen."""
-LENGTHS_KM = {"nautical miles": 1.852, "statute miles": 1.609344, "meters": 0.001}
+LENGTHS_KM = {"nautical miles": 1.852, "meters": 0.001}
 _PLACE = "latitude", "longitude", "altitude"
-_SHOWN = 5
 
 
 def difference_from_igrf(readings: DataFrame, date: str) -> Tensor:
@@ -60,23 +58,12 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     if "latitude" not in readings or "longitude" not in readings:
         return []
     place = _places(readings)
-    texts = []
-    nowhere = (place[:, :2] == 0).all(-1)
-    if nowhere.any():
-        texts.append(f"{_rows(nowhere.nonzero())} at latitude 0, longitude 0: no position was known there")
-    rows = readings[~nowhere.numpy()]
-    if not len(rows):
-        return texts
-    place = place[~nowhere]
-    if text := out_of_range("latitude", place[:, 0].numpy()):
-        return [*texts, text]
-    elements = _columns(rows, *NAMES)
+    elements = _columns(readings, *NAMES)
     expected = elements if date is None else _igrf_elements(place, date)
-    if date is not None:
-        texts += _field_mistakes(rows, expected, place, date)
-    if not _measured(rows):
-        rows = rows.assign(heading=rows["heading"] + (expected - elements)[:, 0].numpy())
-    return texts + _move_mistakes(rows, place[:, :2], expected[:, 0])
+    texts = [] if date is None else _field_mistakes(readings, expected, place, date)
+    if not _measured(readings):
+        readings = readings.assign(heading=readings["heading"] + (expected - elements)[:, 0].numpy())
+    return texts + _move_mistakes(readings, place[:, :2], expected[:, 0])
 
 
 def _columns(readings: DataFrame, *names: str) -> Tensor:
@@ -86,13 +73,6 @@ def _columns(readings: DataFrame, *names: str) -> Tensor:
 def _places(readings: DataFrame) -> Tensor:
     """Return latitude, longitude [deg] and altitude [km] ``(N, 3)``; sea level where it is not known."""
     return _columns(readings.assign(**{} if "altitude" in readings else {"altitude": 0.0}), *_PLACE)
-
-
-def _rows(rows: Tensor) -> str:
-    """Return the numbers of rows from 1 on, the first of them."""
-    numbers = [str(int(row) + 1) for row in rows.flatten()]
-    more = ", ..." if len(numbers) > _SHOWN else ""
-    return f"row{'s' * (len(numbers) > 1)} {', '.join(numbers[:_SHOWN])}{more}"
 
 
 def _igrf_elements(place: Tensor, date: str) -> Tensor:
@@ -111,8 +91,8 @@ def _field_mistakes(readings: DataFrame, expected: Tensor, place: Tensor, date: 
     wrong = torch.tensor([text is not None for text in deviations])
     if not wrong.any():
         return []
-    detail, rows = next(filter(None, deviations)), _rows(wrong.nonzero())
-    start = f"{int(wrong.sum())} of {len(wrong)} readings do not fit IGRF, {rows} ({detail})"
+    row = int(wrong.nonzero()[0])
+    start = f"{int(wrong.sum())} of {len(wrong)} readings do not fit IGRF, from row {row + 1} on ({deviations[row]})"
     if wrong.double().mean() <= MOST_SPIKES:
         return [f"{start}: spikes, or iron near the vehicle there"]
     latitude, longitude, altitude = place[wrong].unbind(-1)

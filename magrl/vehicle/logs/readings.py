@@ -16,12 +16,12 @@ from torch import Tensor
 
 from magrl.checks import check_choice, check_number, short
 from magrl.field.elements import NAMES, elements_jacobian, measured_elements
-from magrl.files import numbers_of, read_table, read_text
+from magrl.files import read_table, read_text
 from magrl.geodesy import geodesic
 from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration
-from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Log, check_times, date_of, times_of
-from magrl.vehicle.logs.units import COLUMNS, UNITS, out_of_range, unit_of
+from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Log, date_of, new_times, numbers, times_of
+from magrl.vehicle.logs.units import COLUMNS, UNITS, check_range, unit_of
 from magrl.vehicle.logs.vectors import NORTHS, axes_of_elements, rotation
 
 SPIKE_SIGMAS = 5.0
@@ -66,12 +66,12 @@ def readings_of(
         >>> readings_of(log, every_km=25.0, north="true")[["B_H", "distance"]].round().values.tolist()
         [[19998.0, 0.0], [19992.0, 25.0], [19987.0, 25.0], [19982.0, 25.0]]
     """
-    if texts := obstacles(log, north):
-        raise ValueError("; ".join(texts))
     axes = log.tensor(*AXES) if calibration is None else calibration.apply(log.tensor(*AXES))
     if "heading" not in log.samples and north in (None, "magnetic"):
-        log = with_compass(log, axes)
-    north = north or log.north or ""
+        log = _with_compass(log, axes)
+    north = north or log.north
+    if north is None:
+        raise ValueError(f"the log does not state the north of the heading: give north, one of {', '.join(NORTHS)}")
     check_choice(NORTHS, north=north)
     check_number(0, above=True, every_km=every_km)
     field = (rotation(log.tensor(*ATTITUDE)) @ axes.unsqueeze(-1)).squeeze(-1).numpy()
@@ -87,43 +87,8 @@ def readings_of(
     return table.assign(samples=groups.size(), spikes=np.bincount(part[~clean], minlength=len(table)))
 
 
-def obstacles(log: Log, north: str | None = None) -> list[str]:
-    """Return all that a log lacks for :func:`readings_of`, as sentences with the remedy; none where nothing is missing.
-
-    Args:
-        log: samples.
-        north: north of the heading; default that of the log.
-
-    Example:
-        >>> obstacles(Log(DataFrame({"time": [0.0], "x": [0.0], "y": [0.0], "z": [0.0], "speed": [1.0]}), "by hand"))
-        []
-    """
-    texts, columns = [], log.samples.columns
-    if "heading" in columns and not (north or log.north):
-        texts.append(f"the log does not state the north of the heading: give north, one of {', '.join(NORTHS)}")
-    elif "heading" not in columns and north in ("true", "model"):
-        texts.append(
-            f"the log has no heading, only {', '.join(columns)}: log it, or give north magnetic, for a compass"
-        )
-    if not {"distance", "speed"} & {*columns} and not {"latitude", "longitude"} <= {*columns}:
-        texts.append(
-            "the log has neither distances nor speeds nor positions, for the moves between readings: log one of them"
-        )
-    return texts
-
-
-def with_compass(log: Log, axes: Tensor) -> Log:
-    """Return a log with headings from magnetic north, of its own field.
-
-    Args:
-        log: samples without a heading, with roll and pitch, or of a vehicle that is level.
-        axes: ``(N, 3)`` the field, forward, right, down [nT].
-
-    Example:
-        >>> log = Log(DataFrame({"time": [0.0], "x": [0.0], "y": [-20000.0], "z": [40000.0]}), "by hand")
-        >>> with_compass(log, log.tensor("x", "y", "z")).samples["heading"].tolist()  # magnetic north is to the left
-        [90.0]
-    """
+def _with_compass(log: Log, axes: Tensor) -> Log:
+    """Return a log with headings from magnetic north, of its own field ``(N, 3)``, leveled by roll and pitch."""
     tilt = torch.nn.functional.pad(log.tensor(*ATTITUDE[:2]), (0, 1))
     forward, right, _ = (rotation(tilt) @ axes.unsqueeze(-1)).squeeze(-1).unbind(-1)
     heading = torch.rad2deg(torch.atan2(-right, forward)).remainder(360)
@@ -155,31 +120,39 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
     """
     try:
         raw = read_table(read_text(Path(path)), dtype=str)
+        log = DataFrame({"row": np.arange(len(raw)) + 1} | _columns(raw, names))  # the header is not counted
+        if len(log) < 2:
+            raise ValueError("it must hold at least two rows")
+        log.attrs = {"notes": [], "date": None}
+        if time in raw:
+            times = times_of(raw[time])
+            new = new_times(times)
+            log.insert(1, "time", raw[time])
+            log = log[new].reset_index(drop=True)
+            log.attrs = {"notes": _repeated(new), "date": date_of(float(times[0]))}
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
-    log, wrong = DataFrame({"row": np.arange(len(raw)) + 1}), list[str]()  # the header is not counted
-    located = any(names.get(key) in raw for key in ("latitude", "longitude"))
+    return log
+
+
+def _repeated(new: NDArray[np.bool_]) -> list[str]:
+    left = int((~new).sum())
+    return [f"{left} rows with the time of the row before left out"] if left else []
+
+
+def _columns(raw: DataFrame, names: Mapping[str, str]) -> dict[str, Array]:
+    """Return the columns of readings by their keys."""
+    columns, located = {}, any(names.get(key) in raw for key in ("latitude", "longitude"))
     for key, name in names.items():
         kind = "field" if key == "B_H" else COLUMNS.get(key, ("angle",))[0]
         others = {f"{name}_{unit}".lower() for unit in UNITS[kind]}
         name = next((other for other in raw if name not in raw and other.lower() in others), name)
         if name in raw:
-            log[key] = (unit_of(name, kind) or 1.0) * numbers_of(raw[name].fillna(""), wrong)
-            wrong += filter(None, [out_of_range(key, log[key].to_numpy())])
+            columns[key] = (unit_of(name, kind) or 1.0) * numbers(raw[name].fillna(""))
+            check_range(key, columns[key])
         elif key in ("D", "I", "B_H", "heading", "distance") or (located and key != "altitude"):
-            wrong.append(f"no column is {name!r}: name that of {key}, one of {short([*raw], 300)}")
-    if wrong:
-        raise ValueError(f"cannot read {path}: {'; '.join(wrong)}")
-    if len(log) < 2:
-        raise ValueError(f"{path} must hold at least two rows, got {len(log)}")
-    log.attrs = {"notes": [], "date": None}
-    if time in raw:
-        log.insert(1, "time", raw[time])
-        times, notes = times_of(raw[time])
-        new, more = check_times(times, "the unit of the times")
-        log = log[new].reset_index(drop=True)
-        log.attrs = {"notes": [*notes, *more], "date": date_of(float(times[0]))}
-    return log
+            raise ValueError(f"no column is {name!r}: name that of {key}, one of {short([*raw], 300)}")
+    return columns
 
 
 def joined(table: DataFrame, every_km: float) -> DataFrame:
@@ -222,10 +195,12 @@ def _path(log: Log) -> Array:
         step = np.diff(samples["time"], prepend=samples["time"].iloc[0])
         length = samples["distance"] if "distance" in samples else samples["speed"] * step / 1000
         heading = np.radians(samples["heading"])
-    else:
+    elif {"latitude", "longitude"} <= {*samples}:
         place = log.tensor("latitude", "longitude")
         distance, bearing = geodesic(*place[:-1].unbind(-1), *place[1:].unbind(-1))
         length, heading = (np.concatenate(([0.0], values.numpy())) for values in (distance, bearing))
+    else:
+        raise ValueError("the log has neither distances nor speeds nor positions, for the moves: log one of them")
     return np.cumsum(np.stack((length * np.cos(heading), length * np.sin(heading)), -1), 0)
 
 

@@ -15,25 +15,22 @@ from pandas import DataFrame, Series
 
 from magrl.checks import short
 from magrl.files import numbers_of
-from magrl.vehicle.logs.units import COLUMNS, Array, out_of_range
+from magrl.vehicle.logs.units import COLUMNS, Array, check_range
 
 AXES, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "heading")
 _ANGLES = ("roll", "heading", "longitude")  # which jump by 360 degrees
 _EPOCH = 1e8  # seconds: a time beyond is since 1970, one before since the log began
-_GAP, _GAP_SHARE = 10.0, 1e-3  # of the usual step, and of the log
 Streams = Mapping[str, tuple[Array, Array]]
 """Times [s] and values of each column, in the units of :data:`~magrl.vehicle.logs.units.COLUMNS`."""
 
 
 class Recording(NamedTuple):
-    """Content of one file: columns, format and sensors, the north of its heading where it is stated, notes, and what is
-    wrong with its columns."""
+    """Content of one file: columns, format and sensors, the north of its heading where it is stated, and notes."""
 
     streams: Streams
     source: str
     north: str | None = None
     notes: Sequence[str] = ()
-    wrong: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -100,54 +97,35 @@ def date_of(time: float) -> str | None:
     return datetime.datetime.fromtimestamp(time, datetime.UTC).date().isoformat() if _EPOCH < time < 4.1e9 else None
 
 
-def check_times(time: Array, unit: str = "s") -> tuple[NDArray[np.bool_], list[str]]:
-    """Return which rows have a new time, and notes on times that repeat and on gaps.
+def new_times(time: Array) -> NDArray[np.bool_]:
+    """Return which rows have another time than the row before.
 
     Args:
         time: ``(N,)``.
-        unit: its unit, for the notes.
 
     Raises:
-        ValueError: for times that run backward, with the row, or are not finite.
+        ValueError: for times that are not finite or run backward, with the row.
 
     Example:
-        >>> check_times(np.array([0.0, 1.0, 1.0, 2.0]))
-        (array([ True, True, False, True]), ['1 row with the time of the row before left out'])
+        >>> new_times(np.array([0.0, 1.0, 1.0, 2.0]))
+        array([ True, True, False, True])
     """
-    if unit == "s" and (text := out_of_range("time", time)):
-        raise ValueError(text)
     if not np.isfinite(time).all():
         raise ValueError(f"row {int(np.argmin(np.isfinite(time))) + 1} has no time")
     step = np.diff(time)
     if (step < 0).any():
-        row = int(np.argmax(step < 0))
+        row = int((step < 0).argmax())
         raise ValueError(
             f"time runs backward from row {row + 1} to {row + 2}, from {time[row]:.10g} to {time[row + 1]:.10g}: "
             "sort the rows, or split the log where its clock was set"
         )
-    new = np.concatenate(([True], step > 0))
-    notes = []
-    if repeated := int((~new).sum()):
-        notes.append(f"{_count(repeated, 'row')} with the time of the row before left out")
-    step = step[step > 0]
-    least = max(_GAP * np.median(step), _GAP_SHARE * step.sum()) if len(step) else 0.0
-    if count := int((step > least).sum()):
-        notes.append(f"{_count(count, 'gap')}, the longest of {step.max():g} {unit}")
-    return new, notes
+    return np.concatenate(([True], step > 0))
 
 
-def _count(number: int, name: str) -> str:
-    return f"{number} {name}{'s' if number > 1 else ''}"
-
-
-def samples_of(streams: Streams, remedy: str = "name its columns mag_x_nT, ...") -> tuple[DataFrame, list[str]]:
+def samples_of(streams: Streams) -> tuple[DataFrame, list[str]]:
     """Return the samples at the times of the magnetometer, with notes; other columns are interpolated.
 
     Samples before the first and after the last attitude are left out; the first and last position and speed hold there.
-
-    Args:
-        streams: columns.
-        remedy: what to do where there is no magnetometer.
 
     Raises:
         ValueError: for a log without a magnetometer, or times that run backward.
@@ -160,22 +138,24 @@ def samples_of(streams: Streams, remedy: str = "name its columns mag_x_nT, ...")
     """
     logged = [name for name, (time, _) in streams.items() if len(time)]
     if missing := [name for name in AXES if name not in logged]:
-        raise ValueError(f"no {missing[0]} of the magnetometer is among {', '.join(logged) or 'no columns'}: {remedy}")
+        raise ValueError(
+            f"no {missing[0]} of the magnetometer is among {', '.join(logged) or 'no columns'}: log it, in CSV as "
+            "mag_x_nT, and in other formats as in docs/logs.md"
+        )
     time = streams["x"][0]
-    new, notes = check_times(time)
+    check_range("time", time)
+    new = new_times(time)
     table = {"time": time[new]} | {
         name: _at(time[new], name, *streams[name]) for name in COLUMNS if name in streams and name != "time"
     }
     samples = pandas.DataFrame(table)
     whole = np.isfinite(samples[[name for name in (*AXES, *ATTITUDE) if name in samples]]).all(axis=1)
-    zero = (samples[list(AXES)] == 0).all(axis=1) & whole
-    if not (whole & ~zero).any():
+    whole &= (samples[list(AXES)] != 0).any(axis=1)  # three zeros: the magnetometer did not answer
+    if not whole.any():
         raise ValueError("no sample has a field and an attitude at the same time: check both times, and the sensor")
-    if left := int((~whole).sum()):
-        notes.append(f"{_count(left, 'sample')} without attitude or axes left out")
-    if zero.any():
-        notes.append(f"{_count(int(zero.sum()), 'sample')} of three zeros left out: the magnetometer did not answer")
-    samples = samples[whole & ~zero].reset_index(drop=True)
+    left = len(time) - int(whole.sum())
+    notes = [f"{left} of {len(time)} samples left out: without a new time, axes or attitude"] if left else []
+    samples = samples[whole].reset_index(drop=True)
     if "distance" in samples:
         samples["distance"] = samples["distance"].diff().fillna(0.0)
     return samples, notes
@@ -193,8 +173,25 @@ def _at(time: Array, name: str, times: Array, values: Array) -> Array:
     return (column + 180) % 360 - 180 if name in ("roll", "longitude") else column % 360 if turning else column
 
 
-def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:
-    """Return times of numbers, or of texts in seconds since 1970, and notes.
+def numbers(column: Series) -> Array:
+    """Return the numbers of a column, NaN for blank cells.
+
+    Raises:
+        ValueError: for a cell that is no finite number, with its row.
+
+    Example:
+        >>> numbers(Series(["1.5", None]))
+        array([1.5, nan])
+    """
+    wrong: list[str] = []
+    values = numbers_of(column, wrong)
+    if wrong:
+        raise ValueError(wrong[0])
+    return values
+
+
+def times_of(column: Series, factor: float = 1.0) -> Array:
+    """Return times of numbers, or of texts in seconds since 1970, in UTC where they have no time zone.
 
     Args:
         column: numbers, or ISO 8601 texts; NaN for blank cells.
@@ -205,21 +202,18 @@ def times_of(column: Series, factor: float = 1.0) -> tuple[Array, list[str]]:
 
     Example:
         >>> times_of(Series(["2026-06-30T12:00:00"], name="time"))
-        (array([1.7828208e+09]), ['the times have no time zone: they are taken as UTC'])
+        array([1.7828208e+09])
     """
     wrong: list[str] = []
-    numbers = numbers_of(column, wrong)
+    values = numbers_of(column, wrong)
     if not wrong:
-        return factor * numbers, []
-    if np.isfinite(numbers).any():
+        return factor * values
+    if np.isfinite(values).any():
         raise ValueError(wrong[0])
     parsed = pandas.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
     bad = parsed.isna() & column.notna()
     if bad.any():
         row = int(bad.argmax())
-        raise ValueError(
-            f"row {row + 1}, {column.name}: {short(column.iloc[row])} is no time such as 2026-06-30T12:00:00Z"
-        )
-    zoned = column.dropna().str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True)
-    notes = [] if zoned.all() else ["the times have no time zone: they are taken as UTC"]
-    return (parsed - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float), notes
+        text = f"{short(column.iloc[row])} is no time such as 2026-06-30T12:00:00Z"
+        raise ValueError(f"row {row + 1}, {column.name}: {text}")
+    return (parsed - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float)

@@ -90,43 +90,48 @@ def column_of(header: str) -> tuple[str, float] | None:
     return None
 
 
-def out_of_range(name: str, values: Array) -> str | None:
-    """Return which value of a column is not possible, as text; None if all are.
+def check_range(name: str, values: Array) -> None:
+    """Raise unless all values of a column are possible.
 
     Args:
-        name: one of :data:`COLUMNS`.
+        name: one of :data:`COLUMNS`, or another angle.
         values: in the units of the samples of a log.
 
+    Raises:
+        ValueError: with the first value that is not possible, and its unit.
+
     Example:
-        >>> out_of_range("pitch", np.array([2.0, 200.0]))
-        'pitch 200 is not from -90 to 90 deg: check it and its unit, as in pitch_rad'
+        >>> check_range("pitch", np.array([2.0, 200.0]))
+        Traceback (most recent call last):
+        ValueError: pitch 200 is not from -90 to 90 deg: check it and its unit, as in pitch_rad
     """
     kind, _, _, low, high = COLUMNS.get(name, ("angle", "", "", *_ANY))
     wrong = values[(values < low - _ROUNDING) | (values > high + _ROUNDING)]
-    if not len(wrong):
-        return None
-    unit, other, *_ = UNITS[kind]
-    return f"{name} {wrong[0]:.10g} is not from {low:g} to {high:g} {unit}: check it and its unit, as in {name}_{other}"
+    if len(wrong):
+        unit, other, *_ = UNITS[kind]
+        limits = f"{name} {wrong[0]:.10g} is not from {low:g} to {high:g} {unit}"
+        raise ValueError(f"{limits}: check it and its unit, as in {name}_{other}")
 
 
-def intensity_mistake(total: float, expected: float = EARTH_NT) -> str | None:
-    """Return what is wrong with a total intensity, as a sentence with the remedy; None where it is within 45 %, or
-    within a factor of 4 and in no other unit.
+def check_intensity(total: float, expected: float = EARTH_NT) -> None:
+    """Raise unless a total intensity is within 45 %, or within a factor of 4 and in no other unit.
 
     Args:
         total: median total intensity of a log, in an unknown unit.
         expected: total intensity at its place [nT], by default that of the Earth.
 
+    Raises:
+        ValueError: with the unit that it probably has.
+
     Example:
-        >>> intensity_mistake(48.0)
-        'the total intensity is 48, which looks like microtesla: name the columns mag_x_microtesla, ...'
+        >>> check_intensity(48.0)
+        Traceback (most recent call last):
+        ValueError: the total intensity is 48, which looks like microtesla: name the columns mag_x_microtesla, ...
     """
     ratio = total / expected
     unit = next((unit for unit, size in FIELD_NT.items() if 0.55 < ratio * size < 1.45), "")
     if unit == "nanotesla" or (not unit and 0.25 < ratio < 4):
-        return None
-    if unit:
-        return f"the total intensity is {total:g}, which looks like {unit}: name the columns mag_x_{unit}, ..."
-    return (
-        f"the total intensity is {total:g}, where about {expected:.0f} nT are expected: scale raw counts to nanotesla"
-    )
+        return
+    looks = f"which looks like {unit}: name the columns mag_x_{unit}, ..."
+    raw = f"where about {expected:.0f} nT are expected: scale raw counts to nanotesla"
+    raise ValueError(f"the total intensity is {total:g}, {looks if unit else raw}")
