@@ -88,22 +88,3 @@ def test_a_short_log_is_compared(folder: Path, capsys) -> None:
     (folder / "short.csv").write_text("\n".join(rows))
     main([str(folder / "short.csv")])
     assert "one reading: no file is written" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("way.csv", ["--calibration", "none.json"], "none.json is not a calibration"),
-        ("swing.txt", [], "a log is a file of CSV"),
-        (
-            "swing.csv",
-            ["--calibrate", "quay.json", "--here", "1"],
-            "here must be D, I and B_H, or latitude",
-        ),
-    ],
-)
-def test_errors_of_the_command(folder: Path, monkeypatch, capsys, name: str, options, message: str) -> None:
-    monkeypatch.chdir(folder / "raw")
-    with pytest.raises(SystemExit, match="2"):
-        main([name, *options])
-    assert message in capsys.readouterr().err
