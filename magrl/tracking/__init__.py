@@ -30,10 +30,8 @@ from magrl.tracking.network import load_pilot as load_pilot
 from magrl.tracking.network import save_pilot as save_pilot
 from magrl.tracking.noise import NoiseEstimate as NoiseEstimate
 from magrl.tracking.noise import noise_estimate as noise_estimate
-from magrl.tracking.noise import spike_factor as spike_factor
 from magrl.tracking.observation import OBSERVATION_SIZE as OBSERVATION_SIZE
 from magrl.tracking.observation import track_observation as track_observation
-from magrl.tracking.observation import turned as turned
 from magrl.tracking.pilot import Reading as Reading
 from magrl.tracking.pilot import Rules as Rules
 from magrl.tracking.pilot import State as State
@@ -45,7 +43,6 @@ from magrl.tracking.pilot import blank as blank
 from magrl.tracking.pilot import declaring as declaring
 from magrl.tracking.pilot import moving as moving
 from magrl.tracking.pilot import observation as observation
-from magrl.tracking.planning import CAUTION as CAUTION
 from magrl.tracking.planning import LENGTHS as LENGTHS
 from magrl.tracking.planning import SLOPES as SLOPES
 from magrl.tracking.planning import STEP_PRICE as STEP_PRICE

@@ -9,7 +9,6 @@ from magrl.vehicle.logs.readings import joined as joined
 from magrl.vehicle.logs.readings import read_readings as read_readings
 from magrl.vehicle.logs.readings import readings_of as readings_of
 from magrl.vehicle.logs.samples import Log as Log
-from magrl.vehicle.logs.samples import samples_of as samples_of
 from magrl.vehicle.logs.vectors import attitude_of as attitude_of
 from magrl.vehicle.logs.vectors import axes_of_elements as axes_of_elements
 from magrl.vehicle.logs.vectors import elements_of_axes as elements_of_axes

@@ -102,8 +102,8 @@ def swing(log: Log, options: argparse.Namespace, date: str | None) -> list[str]:
             raise ValueError("the log has no position: state the place of the swing by --here, such as --here 60.4 5.3")
         here = log.tensor("latitude", "longitude").median(0).values.tolist()
     attitude = log.tensor(*ATTITUDE) if _north(log, options) == "true" else None
-    settings = {"date": date if len(here) == 2 else None, "alignment_deg": options.alignment_deg}
-    calibration = calibrate(log.tensor(*AXES), here, attitude_deg=attitude, **settings)
+    axes, alignment = log.tensor(*AXES), options.alignment_deg
+    calibration = calibrate(axes, here, date=date, attitude_deg=attitude, alignment_deg=alignment)
     check_writable(options.calibrate)
     calibration.save(options.calibrate)
     offset = "{:.0f}, {:.0f}, {:.0f} nT".format(*calibration.offset_nt)

@@ -14,7 +14,8 @@ from pydantic import Strict
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from magrl.checks import CheckedModel, check_number, check_tensor
+from magrl.checks import CheckedModel, check_number, check_numbers, check_tensor
+from magrl.field import IGRF, elements_at
 from magrl.field.elements import elements_jacobian, field_vector
 from magrl.files import DamagedFileError, write_json
 from magrl.vehicle.logs.units import check_intensity
@@ -124,7 +125,7 @@ def calibrate(
         axes_nt: ``(N, 3)`` forward, right, down [nT].
         here: D [deg], I [deg], B_H [nT] at the place, or latitude and longitude [deg] for IGRF, as in
             :meth:`magrl.vehicle.onboard.Onboard.start`.
-        date: date for IGRF.
+        date: date for IGRF, which latitude and longitude need.
         here_std: standard deviations of the elements.
         attitude_deg: ``(N, 3)`` roll, pitch, heading from true north [deg].
         alignment_deg: standard deviation of the misalignment of the axes before the swing [deg].
@@ -144,7 +145,10 @@ def calibrate(
         >>> [round(offset) for offset in swung.offset_nt], swung.method
         ([500, 0, -200], 'ellipsoid')
     """
-    elements, elements_std = known_elements(here, here_std, date)
+    model = None if date is None else lambda place: elements_at(IGRF(date), place)
+    elements, model_std, _ = known_elements(here, "here", model)
+    elements_std = model_std if here_std is None else here_std
+    check_numbers(3, 0, here_std=elements_std)
     check_number(0, above=True, alignment_deg=alignment_deg)
     axes, reference = axes_nt.double(), field_vector(torch.tensor(elements, dtype=torch.float64))
     scale, std = float(reference.norm()), torch.tensor(elements_std, dtype=torch.float64)

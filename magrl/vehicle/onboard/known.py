@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from magrl.checks import check_number, check_numbers
-from magrl.field import IGRF, elements_at
 from magrl.field.elements import FIELD_NT, NAMES, element_difference, field_vector, measured_elements
 from magrl.field.igrf import parse_date
 from magrl.sensor_std import SensorStd
@@ -37,44 +36,50 @@ IRON_COST = 15.0
 Elements = tuple[float, float, float]
 
 
-def known_elements(
-    here: Sequence[float], std: Sequence[float] | None = None, date: str | None = None
-) -> tuple[Elements, Elements]:
-    """Return the elements at a known place, and their standard deviations.
+class Known(NamedTuple):
+    """Elements of a place, their standard deviations, and latitude and longitude [deg] from which they follow."""
+
+    elements: Elements
+    std: Elements
+    place: Tensor | None
+
+
+def known_elements(given: Sequence[float], name: str, model: Callable[[Tensor], Tensor] | None) -> Known:
+    """Return what is known of a place, given its elements, which are exact, or its latitude and longitude [deg].
 
     Args:
-        here: D [deg], I [deg], B_H [nT], which are exact by default; or latitude and longitude [deg], at which they
-            follow from IGRF, by default with the accuracy :data:`MODEL_STD`.
-        std: standard deviations of the elements.
-        date: date for IGRF, such as ``"2026-06-30"``.
+        given: D [deg], I [deg], B_H [nT]; or latitude and longitude, at which they follow from a model with the
+            accuracy of :func:`model_std`.
+        name: name of the place in messages.
+        model: elements ``(3,)`` of the model at a place ``(2,)``; None without a date.
 
     Raises:
-        ValueError: for other than two or three numbers, elements that are not possible on the Earth, or a date that is
-            missing or not needed.
+        ValueError: for other than two or three numbers, elements that are not possible on the Earth, or a place without
+            a model.
 
     Example:
-        >>> elements, std = known_elements((60.4, 5.3), date="2026-06-30")
-        >>> [round(value, 1) for value in elements], [round(value, 2) for value in std]
+        >>> known = known_elements((60.4, 5.3), "here", earth_model("IGRF-14", "2026-06-30").elements)
+        >>> [round(value, 1) for value in known.elements], [round(value, 2) for value in known.std]
         ([2.8, 73.1, 15002.9], [0.44, 0.2, 133.0])
     """
-    if len(here) not in (2, 3):
-        raise ValueError(f"here must be D, I and B_H, or latitude and longitude, got {here!r}")
-    check_numbers(len(here), here=here)
-    if (date is None) == (len(here) == 2):
-        rule = "a latitude and longitude need a date" if date is None else "elements need no date"
-        raise ValueError(f"here {tuple(here)}: {rule}, got date {date!r}")
-    if date is None:
-        elements, usual = (float(here[0]), float(here[1]), float(here[2])), (0.0, 0.0, 0.0)
-    else:
-        check_number(-90, 90, latitude=here[0])
-        check_number(-360, 360, longitude=here[1])
-        declination, inclination, intensity = elements_at(IGRF(date), torch.tensor(here, dtype=torch.float64)).tolist()
-        elements = declination, inclination, intensity
-        usual = tuple(model_std(torch.tensor(elements, dtype=torch.float64)).tolist())
-    check_earth_reading(*elements, what="here")
-    if std is not None:
-        check_numbers(3, 0, here_std=std)
-    return elements, usual if std is None else (std[0], std[1], std[2])
+    if len(given) not in (2, 3):
+        raise ValueError(f"{name} must be D, I and B_H, or latitude and longitude, got {tuple(given)}")
+    check_numbers(len(given), **{name: given})
+    if len(given) == 3:
+        declination, inclination, intensity = map(float, given)
+        check_earth_reading(declination, inclination, intensity, what=f"the {name}")
+        return Known((declination, inclination, intensity), (0.0, 0.0, 0.0), None)
+    if model is None:
+        raise ValueError(
+            f"{name} {tuple(given)} is a place, which needs a model of the Earth: give the date of the flight"
+        )
+    check_number(-90, 90, latitude=given[0])
+    check_number(-360, 360, longitude=given[1])
+    place = torch.tensor(given, dtype=torch.float64)
+    declination, inclination, intensity = model(place).tolist()
+    elements = declination, inclination, intensity
+    d, i, h = model_std(torch.tensor(elements, dtype=torch.float64)).tolist()
+    return Known(elements, (d, i, h), place)
 
 
 class Knowledge(NamedTuple):
@@ -103,8 +108,9 @@ class Knowledge(NamedTuple):
             ValueError: for a place without a model, or elements that are not possible on the Earth.
         """
         model = _carried_model(journal)
-        target, start = (_place_or_elements(getattr(journal, name), name, model) for name in ("target", "start"))
-        assert target is not None
+        elements_of = None if model is None else model.elements
+        target = known_elements(journal.target, "target", elements_of)
+        start = None if journal.start is None else known_elements(journal.start, "start", elements_of)
         elements, std = (start.elements, start.std) if start else (None, (0.0,) * 3)
         if journal.start_std is not None:
             check_numbers(3, 0, start_std=journal.start_std)
@@ -125,38 +131,6 @@ def _carried_model(journal: Journal) -> EarthModel | None:
         return None
     parse_date(journal.date)
     return earth_model(journal.model, journal.date, journal.altitude_km) if journal.model is not None else None
-
-
-class _Known(NamedTuple):
-    """Elements, their standard deviations, and the place from which they follow."""
-
-    elements: Elements
-    std: Elements
-    place: Tensor | None
-
-
-def _place_or_elements(given: Sequence[float] | None, name: str, model: EarthModel | None) -> _Known | None:
-    """Return what is known of a start or a target, given its elements or its place."""
-    if given is None:
-        return None
-    if len(given) not in (2, 3):
-        raise ValueError(f"{name} must be D, I and B_H, or latitude and longitude, got {tuple(given)}")
-    check_numbers(len(given), **{name: given})
-    if len(given) == 3:
-        declination, inclination, intensity = given
-        check_earth_reading(declination, inclination, intensity, what=f"the {name}")
-        return _Known((declination, inclination, intensity), (0.0, 0.0, 0.0), None)
-    if model is None:
-        raise ValueError(
-            f"{name} {tuple(given)} is a place, which needs a model of the Earth: give the date of the flight"
-        )
-    check_number(-90, 90, latitude=given[0])
-    check_number(-360, 360, longitude=given[1])
-    place = torch.tensor(given, dtype=torch.float64)
-    declination, inclination, intensity = model.elements(place).tolist()
-    elements = declination, inclination, intensity
-    d, i, h = model_std(torch.tensor(elements, dtype=torch.float64)).tolist()
-    return _Known(elements, (d, i, h), place)
 
 
 def check_first_reading(

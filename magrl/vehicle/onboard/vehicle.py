@@ -321,7 +321,7 @@ class Onboard:
         """
         if self.target is None:
             raise RuntimeError(_NOT_STARTED)
-        write_atomically(Path(path), self._journal.replace(steps=self._steps).content())
+        write_atomically(Path(path), self._journal.replace(steps=self._steps).model_dump_json().encode())
 
     def restore(self, path: Path | str) -> None:
         """Repeat the steps of a file of :meth:`save`: the same readings then give the same commands, bit for bit.
