@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from magrl.vehicle.logs import read_log
-from magrl.vehicle.logs.units import COLUMNS, UNITS, column_of, unit_of
+from magrl.vehicle.logs.conventions import COLUMNS, UNITS, column_of, unit_of
 
 HEADER = "time_s,mag_x_nT,mag_y_nT,mag_z_nT,heading_true_deg"
 ROWS = ("0,15000,1000,48000,350", "1,15100,1100,48100,10", "2,15200,1200,48200,30")

@@ -166,7 +166,7 @@ class Loop:
         self._place, self._origin, self._path = (0.0, 0.0), (0.0, 0.0), 0.0  # [km]; the origin is that of a reading
         self._offset = 0.0  # of the autopilot's north from that of the vehicle [deg]
         self._since = -math.inf  # time of the last command, or the start of the reading
-        self._reading: list[tuple[float, ...]] | None = []
+        self._samples: list[tuple[float, ...]] | None = []
         self._shift = 0.0  # of the vehicle's clock, where it was set [s]
 
     @property
@@ -199,11 +199,11 @@ class Loop:
         self._latest |= new
         if self.missing:
             return None
-        if self._reading is None and self._is_there():
-            self._reading, self._since = [], time
-        if self._reading is None:
+        if self._samples is None and self._is_there():
+            self._samples, self._since = [], time
+        if self._samples is None:
             return None
-        return self._read(sampled="x" in new)
+        return self._sample(sampled="x" in new)
 
     def _on_time(self, time: float) -> float:
         """Return the time of a message: that of the vehicle's clock, or that of the last message where it was set."""
@@ -238,21 +238,21 @@ class Loop:
         away = math.dist(self._place, self._origin) + self._value("speed") * self.read_s / 2000
         return away >= command.distance_km or self._path >= 2 * command.distance_km
 
-    def _read(self, *, sampled: bool) -> Command | None:
+    def _sample(self, *, sampled: bool) -> Command | None:
         """Add a sample to the reading, and return the command after the last one."""
-        assert self._reading is not None
+        assert self._samples is not None
         if self._since == -math.inf:  # the first reading begins
             self._since = self.now
         fresh = all(self.now - self._latest[name][0] <= STALE_S for name in ATTITUDE)
         if sampled and fresh:
-            self._reading.append((self.now, *map(self._value, (*AXES, *ATTITUDE)), *self._place))
+            self._samples.append((self.now, *map(self._value, (*AXES, *ATTITUDE)), *self._place))
         if self.now - self._since < self.read_s:
             return None
-        rows, self._reading = np.array(self._reading), None
+        rows, self._samples = np.array(self._samples), None
         self.command = self._step(rows)
         self._since, self._path = self.now, 0.0
         if self.command is None:
-            self._reading = []
+            self._samples = []
         return self.command
 
     def _step(self, rows: np.ndarray) -> Command | None:

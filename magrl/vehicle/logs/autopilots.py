@@ -18,9 +18,8 @@ import torch
 
 from magrl.checks import UsageError
 from magrl.field.elements import FIELD_NT
+from magrl.vehicle.logs.conventions import UNITS, attitude_of, column_of, from_enu
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Recording
-from magrl.vehicle.logs.units import UNITS, column_of
-from magrl.vehicle.logs.vectors import attitude_of, from_enu
 
 MODEL_NORTH = (
     "the heading is that of a compass plus the declination of a model, so D is that of the model and is not used "

@@ -18,8 +18,7 @@ from magrl.checks import CheckedModel, check_number, check_numbers, check_tensor
 from magrl.field import IGRF, elements_at
 from magrl.field.elements import elements_jacobian, field_vector
 from magrl.files import DamagedFileError, write_json
-from magrl.vehicle.logs.units import check_intensity
-from magrl.vehicle.logs.vectors import rotation
+from magrl.vehicle.logs.conventions import check_intensity, rotation
 from magrl.vehicle.onboard.known import known_elements
 
 GAIN_STD, SOFT_IRON_STD, HARD_IRON_STD = 0.3, 0.05, 1.0

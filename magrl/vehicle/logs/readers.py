@@ -12,8 +12,8 @@ from pandas import DataFrame
 from magrl.checks import UsageError, short
 from magrl.files import read_table, read_text
 from magrl.vehicle.logs.autopilots import read_ardupilot, read_bag, read_nmea, read_ulg
+from magrl.vehicle.logs.conventions import check_intensity, check_range, column_of
 from magrl.vehicle.logs.samples import AXES, Log, Recording, numbers, samples_of, times_of, total_intensity
-from magrl.vehicle.logs.units import check_intensity, check_range, column_of
 
 
 def read_log(*paths: Path | str, sensor: str | None = None) -> Log:
@@ -79,7 +79,7 @@ def _recording(path: Path, sensor: str | None) -> Recording:
 
 
 def read_csv(path: Path) -> Recording:
-    """Read a CSV file with a header: see :data:`~magrl.vehicle.logs.units.COLUMNS` for names and units.
+    """Read a CSV file with a header: see :data:`~magrl.vehicle.logs.conventions.COLUMNS` for names and units.
 
     Times are numbers or ISO 8601 texts. Blank cells do not count; other columns are ignored.
     """

@@ -20,9 +20,8 @@ from magrl.files import read_table, read_text
 from magrl.geodesy import geodesic
 from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration
+from magrl.vehicle.logs.conventions import COLUMNS, NORTHS, UNITS, axes_of_elements, check_range, rotation, unit_of
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Log, date_of, new_times, numbers, times_of
-from magrl.vehicle.logs.units import COLUMNS, UNITS, check_range, unit_of
-from magrl.vehicle.logs.vectors import NORTHS, axes_of_elements, rotation
 
 SPIKE_SIGMAS = 5.0
 _BLOCKS = 10  # of the samples of a reading, whose means are nearly independent
@@ -46,7 +45,7 @@ def readings_of(
     Args:
         log: samples. Without a heading, it is that of a compass: the horizontal field, leveled by roll and pitch.
         every_km: least length of a move.
-        north: north of the heading, one of :data:`~magrl.vehicle.logs.vectors.NORTHS`; default that of the log.
+        north: north of the heading, one of :data:`~magrl.vehicle.logs.conventions.NORTHS`; default that of the log.
         calibration: correction of the axes.
 
     Returns:
@@ -83,7 +82,7 @@ def readings_of(
             samples[name] = log.samples[name] if name == "altitude" else np.unwrap(log.samples[name], period=360)
     clean = ~_spikes(field, part)
     groups = samples[clean].groupby(part[clean])
-    table = _readings(groups.mean(), _covariance(field[clean], part[clean]), north)
+    table = _table(groups.mean(), _covariance(field[clean], part[clean]), north)
     return table.assign(samples=groups.size(), spikes=np.bincount(part[~clean], minlength=len(table)))
 
 
@@ -245,7 +244,7 @@ def _covariance(field: Array, part: NDArray[np.int64]) -> Array:
     return np.mean(covariances, 0) if covariances else np.full((3, 3), np.nan)
 
 
-def _readings(mean: DataFrame, covariance: Array, north: str) -> DataFrame:
+def _table(mean: DataFrame, covariance: Array, north: str) -> DataFrame:
     """Return the columns of readings from the means of parts."""
     field = torch.tensor(mean[_FIELD].to_numpy(float))
     jacobian = elements_jacobian(field)

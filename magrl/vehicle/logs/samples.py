@@ -15,13 +15,13 @@ from pandas import DataFrame, Series
 
 from magrl.checks import short
 from magrl.files import numbers_of
-from magrl.vehicle.logs.units import COLUMNS, Array, check_range
+from magrl.vehicle.logs.conventions import COLUMNS, Array, check_range
 
 AXES, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "heading")
 _ANGLES = ("roll", "heading", "longitude")  # which jump by 360 degrees
 _EPOCH = 1e8  # seconds: a time beyond is since 1970, one before since the log began
 Streams = Mapping[str, tuple[Array, Array]]
-"""Times [s] and values of each column, in the units of :data:`~magrl.vehicle.logs.units.COLUMNS`."""
+"""Times [s] and values of each column, in the units of :data:`~magrl.vehicle.logs.conventions.COLUMNS`."""
 
 
 class Recording(NamedTuple):
@@ -42,7 +42,7 @@ class Log:
             and those that the log has of ``roll``, ``pitch``, ``heading`` [deg], ``speed`` [m/s], ``distance`` since
             the sample before [km], ``latitude``, ``longitude`` [deg], ``altitude`` [km].
         source: format and sensors.
-        north: north of the heading, one of :data:`~magrl.vehicle.logs.vectors.NORTHS`, where the log states it.
+        north: north of the heading, one of :data:`~magrl.vehicle.logs.conventions.NORTHS`, where the log states it.
         notes: what a reader of the log must know.
 
     Example:

@@ -1,4 +1,5 @@
-"""The inputs of a vehicle as declared models: options, start and steps, which together are its saved state.
+"""The inputs of a vehicle as declared models: options, start and steps, which together are its saved state; and the
+command that it returns.
 
 A number may be one of Python, NumPy or torch; it becomes a finite Python float.
 """
@@ -6,15 +7,17 @@ A number may be one of Python, NumPy or torch; it becomes a finite Python float.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import torch
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
 from magrl.sensor_std import OUTAGE_STD, PERFECT, SensorStd
-from magrl.tracking import Rules
+from magrl.tracking import Rules, Way
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
@@ -158,3 +161,53 @@ class Journal(Inputs):
             return cls(**from_json(content))
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path} is not the state of a vehicle: {error}") from error
+
+
+@dataclass(frozen=True)
+class Command:
+    """Hold the command of a step and the estimates of the destination.
+
+    Args:
+        distance_km: distance to move; 0 to stay and read again.
+        turn_deg: turn before the move, to the right.
+        heading_deg: heading after that turn, 0 to 360: what to steer.
+        way_km: mean of the way to the destination, northward and eastward.
+        way_covariance_km2: its covariance, by rows.
+        confidence: estimated probability that the destination is within ``radius_km`` of the options.
+        stop: None, or ``"arrived"``, ``"nearest"`` (these sensors allow no better), ``"lost"`` or ``"out of range"``;
+            the distance is then 0.
+        reason: why to stop, as text; in the first command, what was not checked.
+        error_radius_km: radius that holds the destination with the ``confidence`` of the options.
+        place: estimated latitude and longitude [deg], where the vehicle knows its start; else None.
+        place_covariance_km2: covariance of the place, northward and eastward.
+        drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the way].
+
+    Example:
+        >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
+        5.0
+    """
+
+    distance_km: float
+    turn_deg: float
+    heading_deg: float
+    way_km: tuple[float, float]
+    way_covariance_km2: tuple[tuple[float, float], tuple[float, float]]
+    confidence: float
+    stop: str | None = None
+    reason: str = ""
+    error_radius_km: float = math.inf
+    place: tuple[float, float] | None = None
+    place_covariance_km2: tuple[tuple[float, float], tuple[float, float]] | None = None
+    drift: tuple[float, float] | None = None
+
+    @property
+    def error_km(self) -> float:
+        """Root mean square error of the estimated way: the root of the trace of its covariance [km]."""
+        return math.sqrt(self.way_covariance_km2[0][0] + self.way_covariance_km2[1][1])
+
+    @property
+    def axes(self) -> tuple[float, float, float]:
+        """Standard deviations of the estimated way along the long axis of its ellipse and across it [km], and the
+        direction of that axis [deg, 0 to 180]: a long ellipse is a line on which the destination is."""
+        along, across, bearing = Way(torch.tensor(self.way_km), torch.tensor(self.way_covariance_km2)).axes()
+        return along.item(), across.item(), bearing.item()

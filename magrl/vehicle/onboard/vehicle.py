@@ -24,8 +24,7 @@ from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
 from magrl.tracking.belief import DRIFT, PLACE
 from magrl.tracking.network import load_pilot, policy_content, pretrained
 from magrl.vehicle.onboard import limits
-from magrl.vehicle.onboard.command import Command
-from magrl.vehicle.onboard.journal import Journal, Options, Step
+from magrl.vehicle.onboard.journal import Command, Journal, Options, Step
 from magrl.vehicle.onboard.known import Knowledge, check_first_reading
 
 USUAL: dict[str, Any] = {
