@@ -63,17 +63,7 @@ RADIANS = np.pi / 180
         (lambda t: t.assign(heading=t["heading"] - t["D"]), ["as D is -16 deg: the heading is from magnetic north"]),
         (lambda t: t.assign(heading=t["heading"] + 180), ["the heading is reciprocal, or the vehicle goes astern"]),
         (lambda t: t.assign(heading=t["heading"] + 70), ["the course .* is -70 deg to the right.*check the compass"]),
-        (
-            lambda t: t.assign(distance=t["distance"] / 1.852),
-            ["1.85 times as far apart .*they look like nautical miles"],
-        ),
-        (lambda t: t.assign(distance=t["distance"] * 1000), ["0.001 times as far apart .*they look like meters"]),
         (lambda t: t.assign(distance=t["distance"] * 3), ["0.333 times as far apart .*check the log and its unit"]),
-        (
-            lambda t: t.assign(longitude=-t["longitude"]),
-            ["longitudes are positive toward the west", "course"],
-        ),
-        (lambda t: t.rename(columns={"latitude": "longitude", "longitude": "latitude"}), ["swapped", ".*"]),
         (
             lambda t: t.assign(D=t["D"].where(t.index != 3, 40.0)),
             ["1 of 15 .*, from row 4 on .D deviates .*: spikes, or iron"],

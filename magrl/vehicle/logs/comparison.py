@@ -18,7 +18,6 @@ MOST_SPIKES = 0.2
 """Share of readings up to which those that do not fit are spikes, and not a mistake in all; chosen."""
 MOST_DRIFT, LEAST_TURN_DEG = 0.25, 20.0
 """Share of a distance and angle of a course that currents explain; chosen."""
-LENGTHS_KM = {"nautical miles": 1.852, "meters": 0.001}
 _PLACE = "latitude", "longitude", "altitude"
 
 
@@ -60,7 +59,7 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     place = _places(readings)
     elements = _columns(readings, *NAMES)
     expected = elements if date is None else _igrf_elements(place, date)
-    texts = [] if date is None else _field_mistakes(readings, expected, place, date)
+    texts = [] if date is None else _field_mistakes(readings, expected)
     if not _measured(readings):
         readings = readings.assign(heading=readings["heading"] + (expected - elements)[:, 0].numpy())
     return texts + _move_mistakes(readings, place[:, :2], expected[:, 0])
@@ -82,7 +81,7 @@ def _igrf_elements(place: Tensor, date: str) -> Tensor:
 # Readings
 
 
-def _field_mistakes(readings: DataFrame, expected: Tensor, place: Tensor, date: str) -> list[str]:
+def _field_mistakes(readings: DataFrame, expected: Tensor) -> list[str]:
     """Return which readings do not fit IGRF at their positions, and why."""
     elements, std = _columns(readings, *NAMES), model_std(expected)
     if not _measured(readings):
@@ -95,16 +94,8 @@ def _field_mistakes(readings: DataFrame, expected: Tensor, place: Tensor, date: 
     start = f"{int(wrong.sum())} of {len(wrong)} readings do not fit IGRF, from row {row + 1} on ({deviations[row]})"
     if wrong.double().mean() <= MOST_SPIKES:
         return [f"{start}: spikes, or iron near the vehicle there"]
-    latitude, longitude, altitude = place[wrong].unbind(-1)
-    places = {
-        "they fit if latitude and longitude are swapped": (longitude.clamp(-90, 90), latitude, altitude),
-        "they fit if longitudes are positive toward the west, and east is expected": (latitude, -longitude, altitude),
-        "they fit if latitudes are positive toward the south, and north is expected": (-latitude, longitude, altitude),
-        "they fit if altitudes are in meters, and kilometers are expected": (latitude, longitude, altitude / 1000),
-    }
-    others = {text: _igrf_elements(torch.stack(place, -1), date) for text, place in places.items()}
     heading = _columns(readings, "heading")[wrong, 0]
-    cause = likely_mistake(elements[wrong], expected[wrong], std[wrong], heading, others)
+    cause = likely_mistake(elements[wrong], expected[wrong], std[wrong], heading)
     return [f"{start}: {cause or 'no calibration, iron near the sensor, or a heading that is wrong'}"]
 
 
@@ -125,9 +116,8 @@ def _move_mistakes(readings: DataFrame, place: Tensor, declination: Tensor) -> l
         return []
     texts, ratio = [], float((distance[going] / moved[going]).median())
     if abs(ratio - 1) > MOST_DRIFT:
-        unit = min(LENGTHS_KM, key=lambda name: abs(math.log(ratio / LENGTHS_KM[name])))
-        likely = f"they look like {unit}" if abs(ratio / LENGTHS_KM[unit] - 1) < 0.1 else "check the log and its unit"
-        texts.append(f"the positions are {ratio:.3g} times as far apart as the distances of the moves: {likely}")
+        far = f"the positions are {ratio:.3g} times as far apart as the distances of the moves"
+        texts.append(f"{far}: check the log and its unit")
     turn, east = torch.rad2deg(bearing[going]) - heading[going], declination[1:][going]
     course = torch.deg2rad(turn)
     drift = math.degrees(torch.atan2(course.sin().mean(), course.cos().mean()).item())

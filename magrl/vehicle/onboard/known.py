@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -162,7 +162,7 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     if text is None:
         return
     texts = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
-    cause = likely_mistake(read, there, std, torch.zeros(1).double(), {})
+    cause = likely_mistake(read, there, std, torch.zeros(1).double())
     cause = cause or "check sensors, calibration, compass and place, or state a larger bias"
     raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({text}): {cause}")
 
@@ -209,9 +209,7 @@ def deviation(elements: Tensor, expected: Tensor, std: Tensor) -> list[str | Non
     ]
 
 
-def likely_mistake(
-    elements: Tensor, expected: Tensor, std: Tensor, heading_deg: Tensor, others: Mapping[str, Tensor]
-) -> str | None:
+def likely_mistake(elements: Tensor, expected: Tensor, std: Tensor, heading_deg: Tensor) -> str | None:
     """Return the mistake that explains most of some readings, better than others and than iron; None without one.
 
     Iron is a constant vector in the vehicle's axes, whose standard deviation is :data:`IRON_NT`.
@@ -221,20 +219,18 @@ def likely_mistake(
         expected: ``(N, 3)`` the elements at their places.
         std: ``(..., 3)`` standard deviations of the difference.
         heading_deg: ``(N,)`` headings.
-        others: elements at other places, by a text that says what is then wrong with the places.
 
     Example:
         >>> there = torch.tensor([[3.5, 73.0, 15000.0]]).double()
         >>> read = torch.tensor([[3.4, -73.1, 14950.0]]).double()
-        >>> likely_mistake(read, there, torch.tensor([0.5, 0.1, 50.0]), torch.zeros(1).double(), {})
+        >>> likely_mistake(read, there, torch.tensor([0.5, 0.1, 50.0]), torch.zeros(1).double())
         'it fits with -I: the vertical axis points up, and down is expected'
     """
     iron, rest = _iron(elements, expected, heading_deg)
-    guesses = {text: (read, expected) for text, read in _mistakes(elements, expected, heading_deg).items()}
-    guesses |= {text: (elements, there) for text, there in others.items()} | {"": (rest, expected)}
+    guesses = _mistakes(elements, expected, heading_deg) | {"": rest}
     costs = {"": math.inf}
-    for text, (read, there) in guesses.items():
-        shares = element_difference(read, there) / _most(there, std)
+    for text, read in guesses.items():
+        shares = element_difference(read, expected) / _most(expected, std)
         if (shares.abs() <= 1).all(-1).double().mean() > 0.5:  # others may be spikes, whose squares are limited
             costs[text] = MOST_SIGMAS**2 * shares.square().sum(-1).clamp_max(3.0).sum().item()
     costs[""] += IRON_COST + (iron / IRON_NT).square().sum().item()
