@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -125,18 +124,6 @@ def test_each_part_of_a_file(tmp_path: Path) -> None:
         wide = header.startswith(("mag", "heading"))
         assert (" is not from " in message(tmp_path, whole((place, "-1e13")))) != wide
     assert "row 2 has more cells than the header" in message(tmp_path, whole((3, "48000,1")))
-
-
-def test_a_file_that_is_cut_anywhere(tmp_path: Path) -> None:
-    """It is refused, or says so, or lacks whole rows."""
-    path = written(tmp_path, *map(",".join, whole()), header="")
-    content = path.read_text().lstrip()
-    for length in range(0, len(content) - len("0.1,60,5,10"), 3):
-        path.write_text(content[:length])
-        with suppress(ValueError):
-            log = read_log(path)
-            assert log.samples["z"].eq(48000).all()
-            assert len(log.samples) < 3
 
 
 def test_two_files_of_one_vehicle(tmp_path: Path) -> None:
