@@ -30,13 +30,11 @@ from magrl.checks import check_choice
 from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.envs.measures import path_measures
 from magrl.envs.named import NAMED_ENVS
-from magrl.transforms.goals import goal_reward
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v0"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 VectorStep = tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
-_NAMED: dict[str, tuple[str, ...]] = {"dict": PUBLIC_KEYS, "goal": ("observation", "achieved_goal", "desired_goal")}
 # A forked process lacks the threads of its parent, and would wait for them.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
@@ -69,21 +67,6 @@ def _observation_space(env: TransformedEnv, keys: tuple[str, ...], *, flat: bool
 def _array(tensor: Tensor) -> NDArray[Any]:
     """Return a copy as an array: writing into it does not change the environment."""
     return np.array(tensor.detach().cpu().numpy())
-
-
-def goal_rewards(achieved_goal: Any, desired_goal: Any, info: Any = None) -> NDArray[Any]:  # noqa: ARG001
-    """Return the rewards of ``observation="goal"``, 1 at an arrival and 0 elsewhere: ``compute_reward``, ``(...)``.
-
-    Args:
-        achieved_goal: ``(..., 6)`` what was achieved by a step.
-        desired_goal: ``(..., 6)`` the goal, or another one in hindsight.
-        info: ignored.
-
-    Example:
-        >>> goal_rewards(np.zeros((2, 6)), np.zeros((2, 6)))
-        array([1., 1.])
-    """
-    return _array(goal_reward(*(torch.as_tensor(goal) for goal in (achieved_goal, desired_goal))))
 
 
 def _keep_spec(env: Any, spec: EnvSpec) -> None:
@@ -146,10 +129,9 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         check_choice(NAMED_ENVS, task=task)
         self.torchrl_env = NAMED_ENVS[task](num_envs, render_mode=render_mode, **options)
         observation = options.get("observation", "flat")  # or another array, by default of the task
-        keys = _NAMED.get(observation, ("observation",)) if isinstance(observation, str) else observation
-        self._keys, self._flat = tuple(keys), isinstance(observation, str) and observation not in _NAMED
-        if observation == "goal":  # stable-baselines3 takes whatever has such a method for an environment of goals
-            self.compute_reward = goal_rewards
+        self._flat = isinstance(observation, str) and observation != "dict"
+        keys = PUBLIC_KEYS if observation == "dict" else observation
+        self._keys = ("observation",) if self._flat else tuple(keys)
         self.single_observation_space = _observation_space(self.torchrl_env, self._keys, flat=self._flat)
         self.single_action_space = _box(self.torchrl_env.action_spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -265,8 +247,6 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
         self._envs = GeomagneticNavVectorEnv(1, render_mode=render_mode, autoreset_mode="Disabled", **options)
         self.torchrl_env, self.render_mode = self._envs.torchrl_env, render_mode
-        if options.get("observation") == "goal":
-            self.compute_reward = goal_rewards
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
 

@@ -17,8 +17,6 @@ from magrl.tracking import STEP_PRICE, Rules
 from magrl.transforms import (
     AlignmentReward,
     FieldGradient,
-    GoalObservation,
-    GoalReward,
     GradientHeading,
     HighestSPL,
     MinMaxNorm,
@@ -33,8 +31,8 @@ from magrl.transforms import (
 )
 from magrl.transforms.track import known_keys
 
-OBSERVATIONS = ("flat", "track", "readings", "goal", "dict")
-REWARDS = ("progress", "paper", "base", "spl", "goal")
+OBSERVATIONS = ("flat", "track", "readings", "dict")
+REWARDS = ("progress", "paper", "base", "spl")
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
 
@@ -43,7 +41,7 @@ def navigation_env(
     num_envs: int = 1,
     *,
     observation: str | Sequence[str] = "flat",
-    reward: str | None = None,
+    reward: str = "progress",
     transforms: Sequence[Transform] = (),
     scale_actions: bool = True,
     alignment_weight: float = 3.0,
@@ -57,18 +55,16 @@ def navigation_env(
         observation: ``"flat"`` adds ``observation``, ``(N, 13)``, scaled to the region: the input of the recipes'
             networks. ``"track"`` adds ``observation``, ``(N, 19)``, the estimates of the own track
             (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 20)``, readings without estimates
-            (:class:`~magrl.transforms.ReadingObservation`), in any number of regions. ``"goal"`` adds ``observation``,
-            ``achieved_goal`` and ``desired_goal`` (:class:`~magrl.transforms.GoalObservation`). ``"dict"`` leaves the
-            public keys in physical units, and so does a list of keys, which the Gymnasium interface observes. The view
-            of ``"flat"`` and ``"goal"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
+            (:class:`~magrl.transforms.ReadingObservation`), in any number of regions. ``"dict"`` leaves the public
+            keys in physical units, and so does a list of keys, which the Gymnasium interface observes. The view of
+            ``"flat"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
         transforms: added after the guidance: errors of sensors, estimates, rewards. They are cloned.
         reward: ``"progress"``, the default, is :class:`~magrl.transforms.ProgressReward`: kilometers nearer to the
             destination over 50, plus 10 at the arrival, minus 0.1 a step. ``"paper"`` is the paper's: decrease of the
             objective, 200 at the arrival, and alignment with the theoretical heading by the true field, over several
             regions by the pair of elements that crosses best. It has a trap: to stand still and turn to that heading
             earns 117 in 50 steps. ``"base"`` is that without the alignment. ``"spl"`` is
-            :class:`~magrl.transforms.SPLReward`, in which each step costs 0.5 % of SPL. ``"goal"``, that of goals
-            alone, is 1 at the arrival and 0 elsewhere (:func:`~magrl.transforms.goals.goal_reward`).
+            :class:`~magrl.transforms.SPLReward`, in which each step costs 0.5 % of SPL.
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
         alignment_weight: zeta_3 of Eq. 3-6 [1/rad], of the paper's reward.
         alignment_offset: heading deviation at which the alignment term turns into a penalty [rad].
@@ -77,8 +73,7 @@ def navigation_env(
     Raises:
         TypeError: for an unknown option, ``scale_actions`` that is not a bool, or an object among the transforms
             that is not a transform.
-        ValueError: for any option out of its range, naming it and its value, ``"flat"`` or ``"goal"`` over several
-            regions, or goals with another reward or rule of arrival.
+        ValueError: for any option out of its range, naming it and its value, or ``"flat"`` over several regions.
 
     Example:
         >>> navigation_env(4, seed=0).reset()["observation"].shape
@@ -87,7 +82,6 @@ def navigation_env(
     check_type(Sequence, observation=observation)
     if isinstance(observation, str):
         check_choice(OBSERVATIONS, observation=observation)
-    reward = reward or ("goal" if observation == "goal" else "progress")
     check_choice(REWARDS, reward=reward)
     check_type(bool, scale_actions=scale_actions)
     check_type(Transform, **{f"transforms[{number}]": transform for number, transform in enumerate(transforms)})
@@ -102,7 +96,7 @@ def navigation_env(
     elif reward == "spl":
         steps += [TrueWay(), HighestSPL(), RandomStepPrice((STEP_PRICE, STEP_PRICE)), SPLReward()]
     env = TransformedEnv(base, Compose(*steps, *(transform.clone() for transform in _parts(transforms))))
-    for transform in _observation(env, observation, reward):
+    for transform in _observation(env, observation):
         env.append_transform(transform)
     if scale_actions:
         env.append_transform(MinMaxNorm(in_keys_inv=["action"]))
@@ -139,20 +133,15 @@ def _planets() -> Scenario:
     return planet_scenario(PLANET_REGIONS, seed=0, max_latitude=70.0, distance_range_km=(300.0, 500.0))
 
 
-def _observation(env: TransformedEnv, observation: str | Sequence[str], reward: str) -> list[Transform]:
+def _observation(env: TransformedEnv, observation: str | Sequence[str]) -> list[Transform]:
     """Return the transforms of an observation; raise where it does not fit."""
-    base, rule = env.base_env, env.base_env.arrival.rule
-    if "goal" in (observation, reward) and (observation, reward, rule) != ("goal", "goal", "objective"):
-        given = f"observation={observation!r}, reward={reward!r} and arrival={rule!r}"
-        raise ValueError(f"goals need observation='goal', reward='goal' and arrival='objective', got {given}")
-    if observation in ("flat", "goal"):
+    base = env.base_env
+    if observation == "flat":
         if len(base.region) > 1:
-            message = f"observation={observation!r} is scaled to one region, the scenario has {len(base.region)}"
+            message = f"observation='flat' is scaled to one region, the scenario has {len(base.region)}"
             raise ValueError(f"{message}: take observation='track', or 'dict' for raw readings")
-        env.view = view = base.observation_view()
-        if observation == "flat":
-            return view.observation_transforms()
-        return [GoalObservation(view, base.zeta, base.objective_floors[0].tolist()), GoalReward()]
+        env.view = base.observation_view()
+        return env.view.observation_transforms()
     if observation == "track":
         return [TrackField(Rules(**base.limits), known_keys(env.observation_spec))]
     return [ReadingObservation()] if observation == "readings" else []

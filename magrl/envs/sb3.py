@@ -85,8 +85,8 @@ class BatchedVecEnv(VecEnv):
         setattr(self.envs, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call a method of the shared environment, once for all vehicles, or ``compute_reward`` for some of them."""
-        self._all_or_none(None if method_name == "compute_reward" else indices)
+        """Call a method of the shared environment, once for all vehicles."""
+        self._all_or_none(indices)
         return [getattr(self.envs, method_name)(*args, **kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:

@@ -29,8 +29,6 @@ from magrl.transforms.errors.spikes import Spikes as Spikes
 from magrl.transforms.errors.vector import VectorErrors as VectorErrors
 from magrl.transforms.errors.weather import SPEEDS_KM_H as SPEEDS_KM_H
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
-from magrl.transforms.goals import GoalObservation as GoalObservation
-from magrl.transforms.goals import GoalReward as GoalReward
 from magrl.transforms.rewards import DistanceCost as DistanceCost
 from magrl.transforms.rewards import EpisodeSum as EpisodeSum
 from magrl.transforms.rewards import HighestSPL as HighestSPL

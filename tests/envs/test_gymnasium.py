@@ -170,42 +170,6 @@ def test_tasks_for_a_memory_show_readings_alone(task: str) -> None:
     assert (error.square().mean() > 9 * told.square().mean()) == (task == "storm")
 
 
-# Goals
-
-
-def test_the_reward_of_goals_is_the_arrival() -> None:
-    envs = make_vec(50, observation="goal", autoreset_mode="SameStep", distance_range_km=(40, 120), zeta=0.3)
-    envs.reset(seed=0)
-    arrived = 0.0
-    for actions in random_actions(50, 3, 40):
-        seen, rewards, terminated, _, info = envs.step(actions)
-        for row in np.flatnonzero(info.get("_final_obs", [])):
-            for name in seen:
-                seen[name][row] = info["final_obs"][row][name]
-        goals = seen["achieved_goal"], seen["desired_goal"]
-        np.testing.assert_array_equal(envs.unwrapped.compute_reward(*goals, {}), rewards)
-        success = info["final_info"]["success"] if info else np.zeros(50, dtype=bool)
-        np.testing.assert_array_equal(rewards == 1, terminated & success)
-        assert envs.unwrapped.compute_reward(goals[0], goals[0], {}).all()
-        arrived += rewards.sum()
-    assert arrived > 10
-
-
-def test_hindsight_of_stable_baselines3() -> None:
-    """Over a batch, and over single environments."""
-    sb3 = pytest.importorskip("stable_baselines3")
-    from magrl.envs.sb3 import BatchedVecEnv
-
-    envs = make_vec(4, observation="goal", max_steps=5, autoreset_mode="SameStep")
-    for env in (BatchedVecEnv(envs), make(observation="goal", max_steps=5)):
-        settings = {"learning_starts": 24, "batch_size": 8, "device": "cpu", "policy_kwargs": {"net_arch": [8]}}
-        model = sb3.SAC("MultiInputPolicy", env, replay_buffer_class=sb3.HerReplayBuffer, **settings)
-        model.learn(40)
-        rewards = model.replay_buffer.sample(200).rewards
-        assert 0 < rewards.mean() < 1  # arrivals in hindsight alone
-        assert not model.replay_buffer.rewards.any()
-
-
 # Modes of autoreset
 
 MODES = {"default": {}, "disabled": {"autoreset_mode": "Disabled"}}
@@ -366,9 +330,6 @@ def test_bad_options() -> None:
         ({"observation": ("field", "wings")}, "observation names 'wings', which is not among the keys"),
         ({"transforms": [5]}, r"transforms\[0\] must be a Transform, got 5"),
         ({"task": "boxes"}, "task must be one of 'box', 'anywhere', 'readings', 'storm', 'nogo', got 'boxes'"),
-        ({"observation": "goal", "reward": "spl"}, "goals need .*reward='goal'.* got observation='goal', reward='spl'"),
-        ({"reward": "goal"}, "goals need observation='goal'.* got observation='flat'"),
-        ({"observation": "goal", "arrival": "distance"}, "arrival='objective', got .*arrival='distance'"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
             make(**options)

@@ -59,7 +59,7 @@ def test_areas_join_the_observation_alone() -> None:
     assert "observation" not in no_go_env(2, seed=0, transforms=joined, observation="dict").reset()
 
 
-@pytest.mark.parametrize("options", [{"reward": "paper"}, {"reward": "base"}, {"observation": "goal"}])
+@pytest.mark.parametrize("options", [{"reward": "paper"}, {"reward": "base"}])
 def test_rewards_that_would_pay_for_an_arrival_through_an_area_are_refused(options: dict) -> None:
     with pytest.raises(ValueError, match="reward"):
         no_go_env(**options)

@@ -24,8 +24,6 @@ from magrl.transforms import (
     AngleVector,
     DistanceCost,
     FieldGradient,
-    GoalObservation,
-    GoalReward,
     GradientHeading,
     HighestSPL,
     MinMaxNorm,
@@ -89,7 +87,6 @@ ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     ),
     "every error": (nav, every_error),
     "progress": (nav, lambda: Compose(TrueWay(), NoGoAreas(), ProgressReward())),
-    "goal": (nav, lambda: Compose(GoalObservation(nav().observation_view(), 0.01, (0.05, 0.4, 15.0)), GoalReward())),
     "plane": (partial(PlaneEnv, (3,), torch.float64), of_a_plane),
     "scaled pendulum": (PendulumEnv, pendulum),
 }
