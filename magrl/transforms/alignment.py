@@ -18,7 +18,7 @@ from magrl.field import FieldBank
 from magrl.field.elements import element_index
 from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import wrap_angle
-from magrl.transforms.base import GivenKeys, ObservationTransform, StepReward
+from magrl.transforms.base import Keys, ObservationTransform, StepReward
 
 
 class FieldGradient(ObservationTransform):
@@ -55,8 +55,8 @@ class FieldGradient(ObservationTransform):
     def __init__(
         self,
         field: FieldModel | FieldBank | Callable[[Tensor], Tensor],
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         indexed = getattr(field, "indexed", False)
         super().__init__(["position", "region"] if indexed and in_keys is None else in_keys, out_keys)
@@ -140,8 +140,8 @@ class GradientHeading(ObservationTransform):
 
     def __init__(
         self,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
         *,
         pair: tuple[str | int, str | int] | str = ("D", "I"),
         min_crossing_deg: float = 2.0,
@@ -212,7 +212,12 @@ class AlignmentReward(StepReward):
     out_sizes = {"reward_alignment": (1,)}
 
     def __init__(
-        self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, weight: float = 3.0, offset: float = math.pi / 4
+        self,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
+        *,
+        weight: float = 3.0,
+        offset: float = math.pi / 4,
     ) -> None:
         super().__init__(in_keys, out_keys)
         check_number(weight=weight, offset=offset)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar, TypeAlias, TypeVar, cast
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -12,12 +12,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from magrl.checks import check_choice
-
 T = TypeVar("T")
 Keys = Sequence[NestedKey]
-GivenKeys: TypeAlias = NestedKey | Keys | Mapping[str, NestedKey] | None
-"""Keys as a user gives them: at most four in order, or a mapping of names to keys; None for the default keys."""
 
 
 class ObservationTransform(Transform):
@@ -27,13 +23,13 @@ class ObservationTransform(Transform):
     class attributes; without names, each key is its own name.
 
     Args:
-        in_keys: keys that are read: a mapping of names to keys, where a default name that is left out stands for
-            itself; or up to four keys in the order of the names, of which the optional ones may be left out.
+        in_keys: keys that are read, in the order of the names; optional ones at the end may be left out.
         out_keys: keys that are written, in the same way.
         **inverse: ``in_keys_inv`` and ``out_keys_inv`` of an invertible transform.
 
     Raises:
-        ValueError: for a name that the class does not have, or another number of keys.
+        ValueError: for another number of keys.
+        TypeError: for anything else than keys.
 
     Example:
         >>> import torch
@@ -46,7 +42,7 @@ class ObservationTransform(Transform):
         tensor([0.5000])
     """
 
-    default_in_keys: ClassVar[Keys] = ()
+    default_in_keys: Keys = ()
     """Names of the keys that are read by default."""
     default_out_keys: ClassVar[Keys] = ()
     """Names of the keys that are written by default."""
@@ -59,7 +55,7 @@ class ObservationTransform(Transform):
     out_sizes: Mapping[NestedKey, tuple[int, ...]] = {}
     """Last dimensions of unbounded values that are written, by name."""
 
-    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, **inverse: Any) -> None:
+    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None, **inverse: Any) -> None:
         self.in_names, ins = _chosen(in_keys, self.default_in_keys, self.optional_in_keys)
         self.out_names, outs = _chosen(out_keys, self.default_out_keys, self.optional_out_keys)
         super().__init__(in_keys=ins, out_keys=outs, **inverse)
@@ -322,53 +318,30 @@ def sorted_keys(container: TensorDictBase | Composite) -> list[str]:
     return sorted(str(key) for key in container.keys(True, True))
 
 
-def key_list(keys: NestedKey | Keys) -> list[NestedKey]:
-    """Return one key or several as a list; a tuple of strings is one nested key.
+def key_list(keys: Keys) -> list[NestedKey]:
+    """Return keys as a list; a string is one key, a sequence of strings several ones, as in TorchRL.
 
     Raises:
         TypeError: for anything else.
 
     Example:
-        >>> key_list("heading"), key_list(("next", "heading")), key_list(["heading", "move"])
-        (['heading'], [('next', 'heading')], ['heading', 'move'])
+        >>> key_list("heading"), key_list(["heading", ("next", "move")])
+        (['heading'], ['heading', ('next', 'move')])
     """
-    if isinstance(keys, str) or (isinstance(keys, tuple) and keys and all(isinstance(k, str) for k in keys)):
-        return [unravel_key(keys)]
-    return several_keys(keys)
-
-
-def several_keys(keys: Keys) -> list[NestedKey]:
-    """Return keys as a list; a sequence of strings is always several keys.
-
-    Raises:
-        TypeError: for a single string, or anything else that is not a sequence of keys.
-
-    Example:
-        >>> several_keys(("field", "target_field"))
-        ['field', 'target_field']
-    """
-    if isinstance(keys, str) or not isinstance(keys, Iterable) or not all(isinstance(k, (str, tuple)) for k in keys):
-        raise TypeError(f"keys must be a sequence of names or of nested names, got {keys!r}")
+    keys = [keys] if isinstance(keys, str) else keys
+    if not isinstance(keys, Sequence) or not all(isinstance(key, (str, tuple)) for key in keys):
+        raise TypeError(f"keys must be a list of names or of nested names, got {keys!r}")
     return [unravel_key(key) for key in keys]
 
 
-def _chosen(given: GivenKeys, default: Keys, optional: Keys) -> tuple[list[NestedKey], list[NestedKey]]:
-    """Return names and keys, of those that a user gives; a tuple is one nested key where one key is usual.
+def _chosen(given: Keys | None, default: Keys, optional: Keys) -> tuple[list[NestedKey], list[NestedKey]]:
+    """Return names and keys, of those that a user gives.
 
     Raises:
-        ValueError: for a name that is not among the default and the optional ones, or another number of keys.
+        ValueError: for another number of keys.
     """
-    names = list(dict.fromkeys((*default, *optional)))
-    if given is None:
-        return list(default), list(default)
-    if isinstance(given, Mapping):
-        for name in given:
-            check_choice(names, key=name)
-        chosen = [name for name in names if name in default or name in given]
-        return chosen, [unravel_key(given.get(name, name)) for name in chosen]
-    keys = several_keys(cast(Keys, given)) if len(default) > 1 else key_list(given)
-    if default and not len(set(default) - set(optional)) <= len(keys) <= min(len(names), 4):
+    names, keys = list(dict.fromkeys((*default, *optional))), key_list(default if given is None else given)
+    if default and not len(set(default) - set(optional)) <= len(keys) <= len(names):
         rest = f" ({', '.join(map(str, optional))} may be left out)" * bool(optional)
-        order = ", ".join(map(str, names))
-        raise ValueError(f"give up to 4 keys in the order {order}{rest}, or a mapping of names to keys, got {keys}")
+        raise ValueError(f"give keys in the order {', '.join(map(str, names))}{rest}, got {keys}")
     return (names if default else keys)[: len(keys)], keys

@@ -14,7 +14,7 @@ from torchrl.data import Composite
 from magrl.checks import check_number, check_numbers
 from magrl.counters import stream_uniform
 from magrl.geodesy import geodesic
-from magrl.transforms.base import GivenKeys, ObservationTransform, StatefulTransform, StepReward
+from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, StepReward
 from magrl.transforms.errors.base import Episode, EpisodeNumbers
 
 
@@ -85,8 +85,8 @@ class ProgressReward(StepReward):
 
     def __init__(
         self,
-        in_keys: GivenKeys = None,
-        out_keys: GivenKeys = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
         *,
         unit_km: float = 50.0,
         arrival: float = 10.0,
@@ -174,7 +174,7 @@ class SPLReward(StepReward):
 
     default_in_keys = ("highest_spl", "step_price")
 
-    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, scale: float = 10.0) -> None:
+    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None, *, scale: float = 10.0) -> None:
         super().__init__(in_keys, out_keys)
         check_number(0, above=True, scale=scale)
         self.scale = float(scale)
@@ -285,7 +285,7 @@ class DistanceCost(StepReward):
     default_in_keys = ("move",)
     state_keys = ()
 
-    def __init__(self, cost: float, in_keys: GivenKeys = None, out_keys: GivenKeys = None) -> None:
+    def __init__(self, cost: float, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         super().__init__(in_keys, out_keys)
         check_number(0, cost=cost)
         self.cost = float(cost)

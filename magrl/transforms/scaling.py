@@ -48,10 +48,10 @@ class MinMaxNorm(ObservationTransform):
 
     def __init__(
         self,
-        in_keys: NestedKey | Keys = (),
-        out_keys: NestedKey | Keys | None = None,
-        in_keys_inv: NestedKey | Keys = (),
-        out_keys_inv: NestedKey | Keys | None = None,
+        in_keys: Keys = (),
+        out_keys: Keys | None = None,
+        in_keys_inv: Keys = (),
+        out_keys_inv: Keys | None = None,
         *,
         bounds: Mapping[NestedKey, tuple[Tensor | float, Tensor | float]] | None = None,
         interval: tuple[float, float] = (-1.0, 1.0),

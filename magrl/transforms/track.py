@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-from magrl.checks import check_type
+from magrl.checks import check_choice, check_type
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import (
     OBSERVATION_SIZE,
@@ -27,7 +27,7 @@ from magrl.tracking import (
     declaring,
     observation,
 )
-from magrl.transforms.base import ObservationTransform, StatefulTransform, observed_spec, sorted_keys, with_state
+from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, observed_spec, sorted_keys, with_state
 from magrl.transforms.errors.known_place import PLACE_KEYS
 from magrl.transforms.errors.known_start import START_KEYS
 
@@ -75,12 +75,12 @@ class TrackField(StatefulTransform):
         rules: what the vehicle knows before it starts.
         optional: keys of :data:`KNOWN_KEYS` that the environment has (:func:`known_keys`).
         in_keys: reading and target ``(..., 3)``, the last move ``(..., K)`` (distance [km] first), heading ``(..., 1)``
-            [rad], number of the step ``(..., 1)``; as a mapping of names to keys.
+            [rad], number of the step ``(..., 1)``, and the optional ones.
         out_keys: the track and the observation ``(..., 19)``.
 
     Raises:
         TypeError: for rules of another type.
-        ValueError: for shapes that do not match.
+        ValueError: for an optional key that is not known, or shapes that do not match.
 
     Example:
         >>> from magrl.envs import GeomagneticNavEnv
@@ -90,19 +90,18 @@ class TrackField(StatefulTransform):
         torch.Size([2, 5, 2])
     """
 
-    default_in_keys = READ_KEYS
     default_out_keys = ("track", "observation")
-    optional_in_keys = KNOWN_KEYS
     in_sizes = {"field": (3,), "target_field": (3,), "heading": (1,), "elapsed_steps": (1,)}
 
     def __init__(
         self,
         rules: Rules | None = None,
         optional: Sequence[str] = (),
-        in_keys: Mapping[str, NestedKey] | None = None,
+        in_keys: Keys | None = None,
         **keys: Any,
     ) -> None:
-        super().__init__({**dict(zip(optional, optional, strict=True)), **(in_keys or {})}, **keys)
+        self.default_in_keys = _read_keys(optional)
+        super().__init__(in_keys, **keys)
         rules = Rules() if rules is None else rules
         check_type(Rules, rules=rules)
         self.rules = rules
@@ -167,6 +166,13 @@ def _spec(leaves: TensorDictBase, batch: torch.Size, shape: torch.Size, device: 
     return Composite(specs, shape=batch, device=device)
 
 
+def _read_keys(optional: Sequence[str]) -> tuple[str, ...]:
+    """Return the keys that a track reads, with the optional ones."""
+    for key in optional:
+        check_choice(KNOWN_KEYS, optional=key)
+    return (*READ_KEYS, *optional)
+
+
 def known_keys(observation_spec: Composite) -> list[str]:
     """Return the keys of :data:`KNOWN_KEYS` that an environment has.
 
@@ -188,8 +194,7 @@ class DeclareArrival(ObservationTransform):
     Args:
         rules: those of the track.
         optional: those of the track.
-        in_keys: as of :class:`TrackField`.
-        track_key: key of the track.
+        in_keys: those of the track.
 
     Raises:
         ValueError: for an environment whose action has no third number.
@@ -203,23 +208,14 @@ class DeclareArrival(ObservationTransform):
         torch.Size([2, 2])
     """
 
-    default_in_keys = READ_KEYS
-    optional_in_keys = KNOWN_KEYS
     in_sizes = TrackField.in_sizes
     invertible = True
 
-    def __init__(
-        self,
-        rules: Rules,
-        optional: Sequence[str] = (),
-        in_keys: Mapping[str, NestedKey] | None = None,
-        *,
-        track_key: str = "track",
-    ) -> None:
-        keys = {**dict(zip(optional, optional, strict=True)), **(in_keys or {})}
-        super().__init__(keys, in_keys_inv=["action"], out_keys_inv=["action"])
+    def __init__(self, rules: Rules, optional: Sequence[str] = (), in_keys: Keys | None = None) -> None:
+        self.default_in_keys = _read_keys(optional)
+        super().__init__(in_keys, in_keys_inv=["action"], out_keys_inv=["action"])
         check_type(Rules, rules=rules)
-        self.rules, self.track_key = rules, track_key
+        self.rules = rules
 
     def _compute(self, values: list[Tensor]) -> Sequence[Tensor]:  # noqa: ARG002
         return []
@@ -230,7 +226,7 @@ class DeclareArrival(ObservationTransform):
             return tensordict
         *seen, action = values
         seen = TensorDict(dict(zip(self.in_names, seen, strict=True)), batch_size=action.shape[:-1])
-        track = track_of(tensordict[self.track_key])
+        track = track_of(tensordict["track"])
         return tensordict.set(self.in_keys_inv[0], declaring(self.rules, track, reading_of(seen), action)[0])
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
@@ -243,10 +239,10 @@ class DeclareArrival(ObservationTransform):
             )
         if self.parent is not None:
             observed = observed_spec(self)
-            if self.track_key not in observed.keys(include_nested=True):
+            if "track" not in observed.keys():  # noqa: SIM118 - a Composite is no mapping
                 keys = sorted_keys(observed)
-                raise KeyError(f"DeclareArrival reads {self.track_key!r}, which is not among {keys}: add a TrackField")
-            input_spec = with_state(input_spec, {name: observed[name] for name in (*self.in_keys, self.track_key)})
+                raise KeyError(f"DeclareArrival reads 'track', which is not among {keys}: add a TrackField")
+            input_spec = with_state(input_spec, {name: observed[name] for name in (*self.in_keys, "track")})
         low, high = action.space.low[..., :2], action.space.high[..., :2]
         input_spec["full_action_spec"][key] = Bounded(low, high, low.shape, device=action.device, dtype=action.dtype)
         return input_spec

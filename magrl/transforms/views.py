@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec, Unbounded
 from torchrl.envs import CatTensors, Transform
@@ -38,7 +37,7 @@ class AngleVector(ObservationTransform):
         tensor([1., 0.])
     """
 
-    def __init__(self, in_keys: NestedKey | Keys, out_keys: NestedKey | Keys) -> None:
+    def __init__(self, in_keys: Keys, out_keys: Keys) -> None:
         super().__init__(in_keys, out_keys)
         if len(self.in_keys) != len(self.out_keys):
             raise ValueError(f"in_keys {self.in_keys} do not pair with out_keys {self.out_keys}")

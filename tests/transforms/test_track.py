@@ -22,7 +22,7 @@ from magrl.navigators import Declaring, Secant
 from magrl.tracking import Rules, State, Track, advance, begin, observation
 from magrl.tracking.belief import CONSTANT, STATES
 from magrl.transforms import DeclareArrival, KnownStart, SensorErrors, TrackField
-from magrl.transforms.track import KNOWN_KEYS, known_keys, reading_of, track_of
+from magrl.transforms.track import KNOWN_KEYS, READ_KEYS, known_keys, reading_of, track_of
 
 BIAS = (0.5, 0.3, 60.0)
 close = partial(torch.testing.assert_close, equal_nan=True)
@@ -112,7 +112,7 @@ def test_a_step_depends_on_what_is_in_the_tensordict_alone() -> None:
 
 def test_keys_may_have_other_names() -> None:
     renamed = RenameTransform(["field"], ["reading"], create_copy=True)
-    track = TrackField(RULES, in_keys={"field": "reading"}, out_keys=["map", "seen"])
+    track = TrackField(RULES, in_keys=["reading", *READ_KEYS[1:]], out_keys=["map", "seen"])
     env = TransformedEnv(GeomagneticNavEnv(num_envs=4, seed=0, max_steps=5), Compose(renamed, track))
     torch.testing.assert_close(flown(env)["next", "seen"], flown(tracked())["next", "observation"])
 
@@ -138,8 +138,8 @@ def test_a_known_start_shows_the_constant_errors() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"in_keys": {"field": "move"}}, r"reads 'move' as .*3\), got \(3, 2\)"),
-        ({"in_keys": {"readings": "field"}}, "key must be one of 'field', .*'readings'"),
+        ({"in_keys": ["move", *READ_KEYS[1:]]}, r"reads 'move' as .*3\), got \(3, 2\)"),
+        ({"optional": ["readings"]}, "optional must be one of 'sensor_std', .*'readings'"),
     ],
 )
 def test_wrong_keys_are_named(options: dict, message: str) -> None:

@@ -21,7 +21,7 @@ from magrl.checks import check_number, check_numbers
 from magrl.counters import advanced, counter_stream
 from magrl.geodesy import wrap_longitude
 from magrl.sensor_std import STD_KEYS, SensorStd
-from magrl.transforms.base import GivenKeys, Keys, StatefulTransform
+from magrl.transforms.base import Keys, StatefulTransform
 
 TYPICAL_FIELD = (10.0, 60.0, 24000.0)
 """D [deg], I [deg], B_H [nT] at middle latitudes, for which accuracy is stated where errors depend on the field.
@@ -81,7 +81,7 @@ class EpisodeNumbers(StatefulTransform):
     step_draws = 0
     """Random numbers of each reading."""
 
-    def __init__(self, in_keys: GivenKeys = None, out_keys: GivenKeys = None, *, seed: int = 0) -> None:
+    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None, *, seed: int = 0) -> None:
         super().__init__(in_keys, out_keys)
         check_number(whole=True, seed=seed)
         self.seed = int(seed)
@@ -229,7 +229,7 @@ class ReadingErrors(EpisodeErrors):
     true_keys: ClassVar[tuple[str, ...]] = ("true_field",)
     _accuracy: Tensor
 
-    def __init__(self, *keys: GivenKeys, stated: SensorStd | None = None, **options: Any) -> None:
+    def __init__(self, *keys: Keys | None, stated: SensorStd | None = None, **options: Any) -> None:
         super().__init__(*keys, **options)
         self.stated = stated
 

@@ -12,7 +12,7 @@ from torchrl.data import Composite
 
 from magrl.geodesy import wrap_angle
 from magrl.sensor_std import SensorStd
-from magrl.transforms.base import GivenKeys
+from magrl.transforms.base import Keys
 from magrl.transforms.errors.base import Episode, ReadingErrors
 
 
@@ -53,7 +53,7 @@ class MagneticNorth(ReadingErrors):
     in_sizes = {"heading": (1,), "field": (3,), "target_field": (3,)}
     size = 1
 
-    def __init__(self, in_keys: GivenKeys = None) -> None:
+    def __init__(self, in_keys: Keys | None = None) -> None:
         super().__init__(in_keys)
         self.out_keys: list[NestedKey] = list(self.in_keys)
         self.in_keys_inv, self.out_keys_inv = [self.in_keys[0], self.in_keys[2]], list(self.true_keys[1:])

@@ -17,7 +17,7 @@ from magrl.checks import check_choice, check_number
 from magrl.counters import stream_normal
 from magrl.geodesy import wrap_angle, wrap_longitude
 from magrl.sensor_std import SensorStd
-from magrl.transforms.base import GivenKeys
+from magrl.transforms.base import Keys
 from magrl.transforms.errors.base import Episode, ReadingErrors, gauss_markov
 
 SCHULER_HOURS = 1.407
@@ -100,7 +100,7 @@ class NorthReferenceError(ReadingErrors):
         *,
         drift_length_km: float | None = None,
         fixed: bool = False,
-        in_keys: GivenKeys = None,
+        in_keys: Keys | None = None,
         **options: Any,
     ) -> None:
         super().__init__(in_keys, **options)

@@ -157,4 +157,4 @@ def test_bad_shapes_and_keys() -> None:
     with pytest.raises(ValueError, match=r"SensorErrors reads 'field' as \(\.\.\., 2\), got \(2, 3\)"):
         _ = under(SensorErrors((1.0, 1.0))).specs
     with pytest.raises(ValueError, match="would overwrite 'target_field', which the environment reads back"):
-        _ = under(SensorErrors(STD, in_keys=["target_field"], out_keys="target_field")).specs
+        _ = under(SensorErrors(STD, in_keys=["target_field"], out_keys=["target_field"])).specs
