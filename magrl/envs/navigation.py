@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any
@@ -44,8 +43,6 @@ def navigation_env(
     reward: str = "progress",
     transforms: Sequence[Transform] = (),
     scale_actions: bool = True,
-    alignment_weight: float = 3.0,
-    alignment_offset: float = math.pi / 4,
     **options: Any,
 ) -> TransformedEnv:
     """Return the navigation environment behind the transforms of the recipes.
@@ -66,8 +63,6 @@ def navigation_env(
             earns 117 in 50 steps. ``"base"`` is that without the alignment. ``"spl"`` is
             :class:`~magrl.transforms.SPLReward`, in which each step costs 0.5 % of SPL.
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
-        alignment_weight: zeta_3 of Eq. 3-6 [1/rad], of the paper's reward.
-        alignment_offset: heading deviation at which the alignment term turns into a penalty [rad].
         **options: of :class:`magrl.envs.GeomagneticNavEnv`.
 
     Raises:
@@ -90,9 +85,8 @@ def navigation_env(
     if reward == "progress":
         steps += [TrueWay(), ProgressReward()]
     elif reward == "paper":  # before errors of the sensors
-        alignment = AlignmentReward(weight=alignment_weight, offset=alignment_offset)
         heading = GradientHeading() if len(base.region) == 1 else GradientHeading(pair="auto")
-        steps += [FieldGradient(base.field), heading, alignment]
+        steps += [FieldGradient(base.field), heading, AlignmentReward()]
     elif reward == "spl":
         steps += [TrueWay(), HighestSPL(), RandomStepPrice((STEP_PRICE, STEP_PRICE)), SPLReward()]
     env = TransformedEnv(base, Compose(*steps, *(transform.clone() for transform in _parts(transforms))))

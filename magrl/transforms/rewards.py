@@ -17,6 +17,9 @@ from magrl.geodesy import geodesic
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, StepReward
 from magrl.transforms.errors.base import Episode, EpisodeNumbers
 
+UNIT_KM = 50.0
+"""Distance of a reward of 1 [km]: the longest move by default."""
+
 
 class TrueWay(ObservationTransform):
     """Write the true way to the destination in the vehicle's frame. Privileged: for critics and rewards only.
@@ -64,12 +67,11 @@ class ProgressReward(StepReward):
     Args:
         in_keys: true way ``(..., 2)`` [km], and the flag success ``(..., 1)``.
         out_keys: one reward ``(..., 1)``.
-        unit_km: distance of a reward of 1 [km].
         arrival: reward for the arrival.
         price: price of a step.
 
     Raises:
-        ValueError: for a unit that is not above 0, a negative reward or price, or another number of keys.
+        ValueError: for a negative reward or price, or another number of keys.
 
     Source:
         A. Y. Ng, D. Harada and S. Russell, Policy invariance under reward transformations, ICML (1999).
@@ -88,14 +90,12 @@ class ProgressReward(StepReward):
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
         *,
-        unit_km: float = 50.0,
         arrival: float = 10.0,
         price: float = 0.1,
     ) -> None:
         super().__init__(in_keys, out_keys)
-        check_number(0, above=True, unit_km=unit_km)
         check_number(0, arrival=arrival, price=price)
-        self.unit_km, self.arrival, self.price = float(unit_km), float(arrival), float(price)
+        self.arrival, self.price = float(arrival), float(price)
 
     @property
     def state_keys(self) -> list[NestedKey]:
@@ -104,7 +104,7 @@ class ProgressReward(StepReward):
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         nearer_km = state[0].norm(dim=-1, keepdim=True) - values[0].norm(dim=-1, keepdim=True)
-        tensordict.set(self.out_keys[0], nearer_km / self.unit_km + self.arrival * values[1].to(nearer_km) - self.price)
+        tensordict.set(self.out_keys[0], nearer_km / UNIT_KM + self.arrival * values[1].to(nearer_km) - self.price)
 
 
 class HighestSPL(StatefulTransform):
