@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,7 @@ class Conditions:
     def __post_init__(self) -> None:
         check_type(str, name=self.name)
         check_number(0, above=True, speed_km_h=self.speed_km_h)
-        self.transforms()  # an error before they are used
+        _ = self._errors  # a wrong option raises here
 
     @property
     def perfect(self) -> bool:
@@ -83,20 +83,29 @@ class Conditions:
             >>> [type(error).__name__ for error in CONDITIONS["aircraft"].transforms()]
             ['MotionError', 'MagneticWeather', 'SensorErrors', 'NorthReferenceError']
         """
-        errors: list[EpisodeErrors] = []
-        if self.motion:
-            errors.append(MotionError(**self.motion, speed_km_h=self.speed_km_h, seed=seed))
+        return [make(seed=seed) for make in self._makers]
+
+    @cached_property
+    def _makers(self) -> list[Callable[..., EpisodeErrors]]:
+        """Functions that make the errors with a seed."""
+        makers: list[Callable[..., EpisodeErrors]] = [partial(SensorErrors, **self.sensors)]
         if self.weather is not None:
-            errors.append(MagneticWeather(**self.weather, speed_km_h=self.speed_km_h, seed=seed))
-        errors.append(SensorErrors(**self.sensors, seed=seed))
+            makers.insert(0, partial(MagneticWeather, **self.weather, speed_km_h=self.speed_km_h))
+        if self.motion:
+            makers.insert(0, partial(MotionError, **self.motion, speed_km_h=self.speed_km_h))
         if self.north == MAGNETIC:
-            errors.append(MagneticNorth())
+            makers.append(_compass)
         elif isinstance(self.north, str):
             check_choice((MAGNETIC, *NORTH_REFERENCES), north=self.north)
-            errors.append(north_reference(self.north, speed_km_h=self.speed_km_h, seed=seed))
+            makers.append(partial(north_reference, self.north, speed_km_h=self.speed_km_h))
         elif self.north:
-            errors.append(NorthReferenceError(**self.north, seed=seed))
-        return errors
+            makers.append(partial(NorthReferenceError, **self.north))
+        return makers
+
+    @cached_property
+    def _errors(self) -> list[EpisodeErrors]:
+        """The errors, built once: what a vehicle knows of them does not depend on a seed."""
+        return self.transforms()
 
     def drift_km(self, max_move_km: float) -> float:
         """Return how much farther than a longest move the errors may carry a vehicle, rounded up [km].
@@ -113,14 +122,14 @@ class Conditions:
             >>> CONDITIONS["laboratory"].drift_km(50.0), CONDITIONS["ship"].drift_km(50.0)
             (0.0, 4.0)
         """
-        farthest_km = max(error.farthest_km(max_move_km) for error in self.transforms())
+        farthest_km = max(error.farthest_km(max_move_km) for error in self._errors)
         return float(max(self.motion is not None, math.ceil(farthest_km - max_move_km)))
 
     @cached_property
     def std(self) -> SensorStd:
         """Standard deviations of the errors of the readings, as a vehicle knows them, at :data:`TYPICAL_FIELD`."""
         field = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
-        variances = sum(torch.stack(error.accuracy(field)).square() for error in self.transforms())
+        variances = sum(torch.stack(error.accuracy(field)).square() for error in self._errors)
         return _rounded(SensorStd(*torch.as_tensor(variances).sqrt()))
 
     @cached_property
@@ -134,11 +143,12 @@ class Conditions:
             >>> [round(number, 3) for number in CONDITIONS["ship"].motion_std]
             [0.027, 0.0]
         """
-        motion = {"log_scale": 0.0, "log_noise": 0.0, "current_km_h": 0.0, "eddies_km_h": 0.0, "eddy_km": 200.0}
-        log, noise, current, eddies, length = (({**motion, **(self.motion or {})})[key] for key in motion)
+        motion = self._errors[0] if isinstance(self._errors[0], MotionError) else MotionError()
+        log, noise = motion.log
         north = self.std.bias[0] if math.isfinite(self.std.bias[0]) else 0.0
-        shares = log, current / self.speed_km_h, math.radians(north)
-        random = (eddies / self.speed_km_h) ** 2 / 2 * length / math.pi + noise**2 / 2 * MOVE_KM
+        shares = log, motion.current_km_h / self.speed_km_h, math.radians(north)
+        eddies = (motion.eddies_km_h / self.speed_km_h) ** 2 / 2 * motion.eddy_km / math.pi
+        random = eddies + noise**2 / 2 * MOVE_KM
         return math.hypot(*shares) / math.sqrt(2), math.sqrt(random)
 
     def std_at(self, known_start: Sequence[float] | None) -> SensorStd:
@@ -158,6 +168,11 @@ class Conditions:
         check_numbers(3, 0, known_start=known_start)
         reading, known_std, *std = torch.tensor((TYPICAL_FIELD, known_start, *self.std), dtype=torch.float64)
         return _rounded(calibration(reading, reading, SensorStd(*std), known_std)[1])
+
+
+def _compass(seed: int) -> MagneticNorth:  # noqa: ARG001
+    """Return a compass, which draws no random numbers."""
+    return MagneticNorth()
 
 
 def _rounded(sensor_std: SensorStd) -> SensorStd:

@@ -94,7 +94,8 @@ class MotionError(EpisodeErrors):
         check_number(0, above=True, eddy_km=eddy_km)
         check_number(0, above=True, optional=not (current_km_h or eddies_km_h), speed_km_h=speed_km_h)
         self.log, self.compass, self.fixed = (log_scale, log_noise), (compass_deg, heading_noise_deg), fixed
-        self.current_km_h, self.eddies_km_h, self.speed_km_h = current_km_h, eddies_km_h, float(speed_km_h or 1.0)
+        self.current_km_h, self.speed_km_h = current_km_h, float(speed_km_h or 1.0)
+        self.eddies_km_h, self.eddy_km = eddies_km_h, eddy_km
         shortest, _ = self._stretch
         if shortest <= 0:
             raise ValueError(f"log_scale {log_scale} and log_noise {log_noise} must keep every distance above 0")
