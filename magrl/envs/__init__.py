@@ -1,7 +1,5 @@
 """The navigation environment, its scenarios and tasks, and its Gymnasium interface (:mod:`magrl.envs.gymnasium`)."""
 
-from magrl.envs.geomagnetic import PRIVILEGED_KEYS as PRIVILEGED_KEYS
-from magrl.envs.geomagnetic import PUBLIC_KEYS as PUBLIC_KEYS
 from magrl.envs.geomagnetic import GeomagneticNavEnv as GeomagneticNavEnv
 from magrl.envs.random_regions import earth_scenario as earth_scenario
 from magrl.envs.random_regions import planet_scenario as planet_scenario
@@ -10,6 +8,8 @@ from magrl.envs.regions import Region as Region
 from magrl.envs.regions import Regions as Regions
 from magrl.envs.scenario import Scenario as Scenario
 from magrl.envs.scenario_files import load_scenario as load_scenario
+from magrl.envs.specs import PRIVILEGED_KEYS as PRIVILEGED_KEYS
+from magrl.envs.specs import PUBLIC_KEYS as PUBLIC_KEYS
 from magrl.envs.tasks import TASK_SETS as TASK_SETS
 from magrl.envs.tasks import Tasks as Tasks
 from magrl.envs.tasks import named_tasks as named_tasks

@@ -34,21 +34,6 @@ from magrl.geodesy import displaced, move, polar, wrap_angle
 from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
 from magrl.transforms.views import ObservationView
 
-PUBLIC_KEYS = ("field", "target_field", "move", "heading")
-"""Keys that every policy may read, beside ``elapsed_steps``."""
-PRIVILEGED_KEYS = (
-    "position",
-    "target_position",
-    "start_position",
-    "objective",
-    "objective_weights",
-    "success",
-    "region",
-    EPISODE_STREAM,
-    *specs.REWARD_TERMS,
-)
-"""Keys that a policy may not read if it navigates by the field alone."""
-
 
 class GeomagneticNavEnv(EnvBase):
     """Vehicles that cross a region to a destination of which they know only the magnetic elements.
@@ -195,8 +180,9 @@ class GeomagneticNavEnv(EnvBase):
     def _make_specs(self, boxes: Regions) -> None:
         bounds = specs.field_bounds(self.field, boxes)
         options = self.max_move_km, self.max_turn_rad, len(self.region), self.arrival.declared, self.drift_km
-        self.observation_spec = self._batched(specs.observation_spec(bounds, *options))
+        self.observation_spec = self._batched(specs.observation_spec(specs.Limits(bounds, *options)))
         self.state_spec = specs.state_spec(self.observation_spec)
+        self._constant_keys = [name for name, _ in self.state_spec.items() if specs.KEYS[name].constant]
         self.action_spec = self._batched(specs.float_bounds(self.action_low, self.action_high))
         self.reward_spec = self._batched(Unbounded((1,), dtype=torch.float32))
         self.full_done_spec = self._batched(Composite(dict.fromkeys(("done", "terminated", "truncated"), specs.FLAG)))
@@ -262,30 +248,22 @@ class GeomagneticNavEnv(EnvBase):
         # Rounded as the vehicle observes it: a move of length 0 must not change the objective.
         field, target_field = field.float().double(), target_field.float().double()
         weights = guidance.objective_weights(field, target_field, self.objective_floors[region]).float().double()
-        zeros = field.new_zeros(len(vehicle), 2)
-        heading = zeros[:, :1] if self.start_heading == "north" else random_headings(self.seed, vehicle, episode)
-        flags = ("success", "done", "terminated", "truncated", *([specs.DECLARED] if self.arrival.declared else []))
-        return TensorDict(
-            {
-                "field": field.float(),
-                "target_field": target_field.float(),
-                "move": zeros.float(),
-                "heading": heading.float(),
-                "elapsed_steps": torch.zeros_like(vehicle).unsqueeze(-1),
-                "position": start,
-                "target_position": target,
-                "start_position": start,
-                "objective": guidance.objective(field, target_field, weights).float(),
-                "objective_weights": weights.float(),
-                "region": region.unsqueeze(-1),
-                EPISODE_STREAM: self._streams(vehicle, episode),
-                **{term: zeros[:, :1].float() for term in specs.REWARD_TERMS},
-                **{flag: torch.zeros_like(zeros[:, :1], dtype=torch.bool) for flag in flags},
-                **({DISPLACEMENT: zeros} if self.drift_km else {}),
-            },
-            batch_size=vehicle.shape,
-            device=self.device,
-        )
+        values = {
+            "field": field.float(),
+            "target_field": target_field.float(),
+            "position": start,
+            "target_position": target,
+            "start_position": start,
+            "objective": guidance.objective(field, target_field, weights).float(),
+            "objective_weights": weights.float(),
+            "region": region.unsqueeze(-1),
+            EPISODE_STREAM: self._streams(vehicle, episode),
+        }
+        if self.start_heading == "random":
+            values["heading"] = random_headings(self.seed, vehicle, episode).float()
+        others = {**self.observation_spec, **self.full_done_spec}
+        zeros = {name: spec.zero()[row] for name, spec in others.items() if name not in values}
+        return TensorDict(values | zeros, batch_size=vehicle.shape, device=self.device)
 
     def _tasks(self, vehicle: Tensor, episode: Tensor) -> Tasks:
         if self.tasks is None:
@@ -308,7 +286,7 @@ class GeomagneticNavEnv(EnvBase):
         truncated = (step >= self.max_steps) & ~terminated
         after = TensorDict(
             {
-                **{key: tensordict[key] for key in (*specs.CONSTANT_KEYS, *([DISPLACEMENT] if self.drift_km else []))},
+                **{key: tensordict[key] for key in self._constant_keys},
                 "field": field.float(),
                 "move": action[:, :2].float(),
                 "heading": heading.float().unsqueeze(-1),

@@ -27,9 +27,9 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import CatTensors, TransformedEnv
 
 from magrl.checks import check_choice
-from magrl.envs.geomagnetic import PUBLIC_KEYS
 from magrl.envs.measures import path_measures
 from magrl.envs.named import NAMED_ENVS
+from magrl.envs.specs import PUBLIC_KEYS
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v0"

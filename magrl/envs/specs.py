@@ -1,12 +1,14 @@
-"""TensorDict specs of the navigation environment, each for one vehicle."""
+"""Keys of the navigation environment, and their specs, each for one vehicle."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from magrl.checks import check_tensor, require
 from magrl.envs.regions import Regions
@@ -17,17 +19,97 @@ REWARD_TERMS = ("reward_destination", "reward_proximity")
 """Privileged keys of the terms whose sum is ``reward``; 0 at a reset."""
 DECLARED = "declared"
 """Flag that the vehicle has declared its arrival, where it must."""
-CONSTANT_KEYS = ("target_field", "target_position", "start_position", "objective_weights", "region", EPISODE_STREAM)
-"""Keys that keep their values throughout an episode."""
-STATE_KEYS = (*CONSTANT_KEYS, "heading", "elapsed_steps", "position", "objective", DISPLACEMENT)
-"""Keys that a step reads: the state of an episode."""
-
 
 _NORTH_EAST = torch.tensor((90.0, 180.0), dtype=torch.float64)
 POSITION = Bounded(-_NORTH_EAST, _NORTH_EAST, dtype=torch.float64)
 """Spec of a latitude and a longitude [deg]."""
 FLAG = Binary(1, dtype=torch.bool)
 """Spec of a flag."""
+NUMBER, INTEGER = Unbounded((1,), dtype=torch.float32), Unbounded((1,), dtype=torch.int64)
+"""Specs of a number without bounds."""
+
+
+class Limits(NamedTuple):
+    """What bounds the values of an environment.
+
+    Args:
+        field: lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+        num_regions: number of regions.
+        declared: whether vehicles declare their arrival.
+        drift_km: how much farther than its command errors of motion may carry a vehicle [km].
+
+    Example:
+        >>> Limits((torch.zeros(3), torch.ones(3)), 50.0, 1.5).move.space.low
+        tensor([ 0.0000, -1.5000])
+    """
+
+    field: tuple[Tensor, Tensor]
+    max_move_km: float
+    max_turn_rad: float
+    num_regions: int = 1
+    declared: bool = False
+    drift_km: float = 0.0
+
+    @property
+    def move(self) -> Bounded:
+        """Spec of a move: distance [km] and turn [rad]."""
+        highest = torch.tensor((self.max_move_km, self.max_turn_rad), dtype=torch.float32)
+        return float_bounds(highest * torch.tensor((0, -1)), highest)
+
+    @property
+    def displacement(self) -> Bounded:
+        """Spec of a displacement from the end of a commanded move to that of a true one [km]."""
+        reach = 2 * self.max_move_km + self.drift_km
+        return Bounded(-reach, reach, (2,), dtype=torch.float64)
+
+
+class Key(NamedTuple):
+    """A key of what a vehicle observes after a step.
+
+    Args:
+        spec: spec of one vehicle, by the limits.
+        public: whether every policy may read it.
+        constant: whether a step leaves it as it is.
+        state: whether a step reads it; so it does with what is constant.
+        needs: name of the limit without which there is no such key.
+
+    Example:
+        >>> Key(lambda limits: FLAG).public
+        False
+    """
+
+    spec: Callable[[Limits], TensorSpec]
+    public: bool = False
+    constant: bool = False
+    state: bool = False
+    needs: str = "field"
+
+
+KEYS = {
+    "field": Key(lambda limits: float_bounds(*limits.field), public=True),
+    "target_field": Key(lambda limits: float_bounds(*limits.field), public=True, constant=True),
+    "move": Key(lambda limits: limits.move, public=True),
+    "heading": Key(lambda _: Bounded(-math.pi, math.pi, (1,), dtype=torch.float32), public=True, state=True),
+    "elapsed_steps": Key(lambda _: INTEGER, public=True, state=True),
+    "position": Key(lambda _: POSITION, state=True),
+    "target_position": Key(lambda _: POSITION, constant=True),
+    "start_position": Key(lambda _: POSITION, constant=True),
+    "objective": Key(lambda _: NUMBER, state=True),
+    "objective_weights": Key(lambda _: NUMBER.expand(3), constant=True),
+    "success": Key(lambda _: FLAG),
+    "region": Key(lambda limits: Bounded(0, limits.num_regions - 1, (1,), dtype=torch.int64), constant=True),
+    EPISODE_STREAM: Key(lambda _: INTEGER, constant=True),
+    **{term: Key(lambda _: NUMBER) for term in REWARD_TERMS},
+    DECLARED: Key(lambda _: FLAG, public=True, needs="declared"),
+    DISPLACEMENT: Key(lambda limits: limits.displacement, constant=True, needs="drift_km"),
+}
+"""Keys of the environment; a reset fills those with 0 that it does not name."""
+PUBLIC_KEYS = tuple(name for name, key in KEYS.items() if key.public and name not in ("elapsed_steps", DECLARED))
+"""Keys that every policy may read, beside ``elapsed_steps``."""
+PRIVILEGED_KEYS = tuple(name for name, key in KEYS.items() if not key.public and name != DISPLACEMENT)
+"""Keys that a policy may not read if it navigates by the field alone; :data:`magrl.transforms.TRUE_KEYS` has others."""
 
 
 def field_bounds(field: FieldModel | FieldBank, boxes: Regions) -> tuple[Tensor, Tensor]:
@@ -75,51 +157,14 @@ def region_elements(field: FieldModel | FieldBank, regions: Regions, points: int
     return elements_at(field, regions.grid(points).flatten(1, 2), index.unsqueeze(-1))
 
 
-def observation_spec(
-    field_bounds: tuple[Tensor, Tensor],
-    max_move_km: float,
-    max_turn_rad: float,
-    num_regions: int = 1,
-    declared: bool = False,
-    drift_km: float = 0.0,
-) -> Composite:
+def observation_spec(limits: Limits) -> Composite:
     """Return the spec of what a vehicle observes after a step, privileged keys included.
 
-    Args:
-        field_bounds: lowest and highest D [deg], I [deg], B_H [nT], ``(3,)`` each.
-        max_move_km: longest move [km].
-        max_turn_rad: largest turn [rad].
-        num_regions: number of regions.
-        declared: whether there is the flag ``declared``.
-        drift_km: how much farther than its command errors of motion may carry a vehicle [km]; above 0, there is the key
-            ``displacement``.
-
     Example:
-        >>> observation_spec((torch.zeros(3), torch.ones(3)), 50.0, 1.5).expand(4)["field"].shape
+        >>> observation_spec(Limits((torch.zeros(3), torch.ones(3)), 50.0, 1.5)).expand(4)["field"].shape
         torch.Size([4, 3])
     """
-    field, number = float_bounds(*field_bounds), Unbounded((1,), dtype=torch.float32)
-    highest_move = torch.tensor((max_move_km, max_turn_rad), dtype=torch.float32)
-    more = {DECLARED: FLAG} if declared else {}
-    reach = 2 * max_move_km + drift_km  # from the end of a commanded move to that of a true one
-    more |= {DISPLACEMENT: Bounded(-reach, reach, (2,), dtype=torch.float64)} if drift_km else {}
-    return Composite(
-        field=field,
-        target_field=field.clone(),
-        move=float_bounds(highest_move * torch.tensor((0, -1)), highest_move),
-        heading=Bounded(-math.pi, math.pi, (1,), dtype=torch.float32),
-        elapsed_steps=Unbounded((1,), dtype=torch.int64),
-        position=POSITION.clone(),
-        target_position=POSITION.clone(),
-        start_position=POSITION.clone(),
-        objective=number,
-        objective_weights=number.expand(3),
-        success=FLAG.clone(),
-        region=Bounded(0, num_regions - 1, (1,), dtype=torch.int64),
-        episode_stream=Unbounded((1,), dtype=torch.int64),
-        **{term: number.clone() for term in REWARD_TERMS},
-        **more,
-    )
+    return Composite({name: key.spec(limits).clone() for name, key in KEYS.items() if getattr(limits, key.needs)})
 
 
 def float_bounds(low: Tensor, high: Tensor) -> Bounded:
@@ -187,9 +232,9 @@ def state_spec(observation: Composite) -> Composite:
     """Return the spec of the keys that a step reads; a transform may overwrite the others, as ``field``.
 
     Example:
-        >>> bounds = torch.zeros(3), torch.ones(3)
-        >>> "field" in state_spec(observation_spec(bounds, 50.0, 1.5)).keys()
+        >>> limits = Limits((torch.zeros(3), torch.ones(3)), 50.0, 1.5)
+        >>> "field" in state_spec(observation_spec(limits)).keys()
         False
     """
-    keys = [key for key in STATE_KEYS if key in observation.keys()]  # noqa: SIM118 - a Composite is no mapping
-    return Composite({key: observation[key].clone() for key in keys}, shape=observation.shape)
+    state = {name: spec.clone() for name, spec in observation.items() if KEYS[name].state or KEYS[name].constant}
+    return Composite(state, shape=observation.shape)

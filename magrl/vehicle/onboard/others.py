@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from magrl.agents import load_policy
-from magrl.envs.geomagnetic import PUBLIC_KEYS
+from magrl.envs import PUBLIC_KEYS
 from magrl.field.elements import NAMES, element_difference
 from magrl.geodesy import wrap_angle
 from magrl.navigators import Secant
