@@ -12,13 +12,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magrl.checks import check_number, check_numbers
+from magrl.checks import check_number
 from magrl.field.igrf import igrf_coefficients
 
 KNOWN_DEGREE = 13
 """Highest degree of IGRF."""
 STRENGTH, TILT_DEG, SPREAD = (0.7, 1.3), 40.0, (0.5, 2.0)
-"""Ranges of the strength of the dipole [Earth's], its tilt [deg] and the factor of a variance, by default."""
+"""Ranges of the strength of the dipole [Earth's], its largest tilt [deg] and the factor of a variance."""
 
 
 def power_spectrum(gauss: Tensor) -> Tensor:
@@ -49,9 +49,6 @@ def random_planets(
     seed: int,
     *,
     degree: int = 13,
-    strength: tuple[float, float] = STRENGTH,
-    tilt_deg: float = TILT_DEG,
-    spread: tuple[float, float] = SPREAD,
 ) -> Tensor:
     """Return Gauss coefficients of planets whose fields have the Earth's spectrum.
 
@@ -66,16 +63,13 @@ def random_planets(
         seed: random seed; the result is a pure function of the arguments.
         degree: highest degree N. Above 13, the spectrum continues the line through the logarithms of the power of
             degrees 2 to 13; this is the field of the core, without the crust.
-        strength: smallest and largest strength of the dipole, in units of the Earth's.
-        tilt_deg: largest tilt of the dipole [deg].
-        spread: smallest and largest factor of the variance of a degree.
 
     Returns:
         Complex ``(count, N + 1, N + 1)`` tables ``g - i h`` [nT], for :class:`~magrl.field.SphericalHarmonicField` and
         :class:`~magrl.field.FieldBank`.
 
     Raises:
-        ValueError: for a count, degree or seed that is not a whole number in its range, or an interval that falls.
+        ValueError: for a count, degree or seed that is not a whole number in its range.
 
     Example:
         >>> planets = random_planets(1000, seed=0)
@@ -86,20 +80,18 @@ def random_planets(
     """
     check_number(1, whole=True, count=count, degree=degree)
     check_number(0, 2**63 - 1, whole=True, seed=seed)
-    check_number(0, 180, tilt_deg=tilt_deg)
-    _check_interval(strength=strength, spread=spread)
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
 
     variance = _earth_variance(degree)
-    factor = uniform(*spread, count, degree + 1, 1, 1)
+    factor = uniform(*SPREAD, count, degree + 1, 1, 1)
     normal = torch.randn(count, degree + 1, degree + 1, 2, generator=generator, dtype=torch.float64)
     gauss = torch.view_as_complex(normal * torch.sqrt(variance.reshape(-1, 1, 1) * factor)).tril()
     gauss[..., 0] = gauss[..., 0].real.to(gauss.dtype)
-    dipole = math.sqrt(float(power_spectrum(_earth())[1]) / 2) * uniform(*strength, count)
-    tilt = torch.deg2rad(uniform(0.0, tilt_deg, count))  # from the south pole, to a side
+    dipole = math.sqrt(float(power_spectrum(_earth())[1]) / 2) * uniform(*STRENGTH, count)
+    tilt = torch.deg2rad(uniform(0.0, TILT_DEG, count))  # from the south pole, to a side
     gauss[:, 1, 0] = (-dipole * torch.cos(tilt)).to(gauss.dtype)
     gauss[:, 1, 1] = torch.polar(dipole * torch.sin(tilt), uniform(0.0, 2 * math.pi, count))
     return gauss
@@ -122,7 +114,7 @@ class GaussMoments(NamedTuple):
 
 
 def gauss_moments(degree: int = KNOWN_DEGREE) -> GaussMoments:
-    """Return the moments of the Gauss coefficients of :func:`random_planets` with its default options.
+    """Return the moments of the Gauss coefficients of :func:`random_planets`.
 
     Args:
         degree: highest degree N.
@@ -157,10 +149,3 @@ def _earth_variance(degree: int) -> Tensor:
 
 def _earth() -> Tensor:
     return igrf_coefficients("2022-01-01", 13)
-
-
-def _check_interval(**intervals: tuple[float, float]) -> None:
-    check_numbers(2, **intervals)
-    for name, (low, high) in intervals.items():
-        if not 0 <= low <= high:
-            raise ValueError(f"{name} must rise from a number that is not negative, got {(low, high)}")

@@ -156,7 +156,7 @@ class ObservationTransform(Transform):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _leaf(self, spec: Composite, key: NestedKey) -> TensorSpec:
-        if key not in spec.keys(True, True):
+        if key not in spec.keys(True):
             raise KeyError(f"{type(self).__name__} reads {key!r}, which is not among {sorted_keys(spec)}")
         return spec[key]
 

@@ -59,13 +59,6 @@ def test_dipoles_are_tilted_and_have_the_earth_s_polarity(planets: Tensor) -> No
     assert (EARTH[1, 0].real < 0) & (planets[:, 1, 0].real < 0).all()
 
 
-def test_the_ranges_can_be_chosen() -> None:
-    moment = dipoles(random_planets(500, seed=1, strength=(2.0, 2.0), tilt_deg=0.0))
-    torch.testing.assert_close(moment[:, 2], -2 * dipoles(EARTH.unsqueeze(0)).norm().expand(500))
-    assert moment[:, :2].abs().max() < 1e-9
-    assert random_planets(3, seed=1, spread=(0.0, 0.0))[:, 2:].abs().max() == 0
-
-
 def test_a_seed_gives_the_same_planets_and_another_gives_others() -> None:
     state = torch.get_rng_state()
     first = random_planets(5, seed=7)
@@ -89,9 +82,7 @@ def test_the_spectrum_continues_above_degree_13() -> None:
     assert -1.5 < slope < -0.9  # the Earth's core: about a factor of 3 a degree
 
 
-@pytest.mark.parametrize(
-    "options", [{"count": 0}, {"seed": -1}, {"degree": 1.5}, {"tilt_deg": 181.0}, {"strength": (2.0, 1.0)}]
-)
+@pytest.mark.parametrize("options", [{"count": 0}, {"seed": -1}, {"degree": 1.5}])
 def test_bad_options_raise(options: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         random_planets(**{"count": 1, "seed": 0} | options)

@@ -106,7 +106,7 @@ def test_a_step_depends_on_what_is_in_the_tensordict_alone() -> None:
     state = step_mdp(rollout[:, -2].clone()).set("action", torch.tensor([30.0, 0.5]).expand(4, 2))
     one, two = (tracked().step(state.clone())["next"] for _ in range(2))
     assert_equal(track_of(one["track"]), track_of(two["track"]))
-    with pytest.raises(KeyError, match=r"TrackField reads its state \[\('track', 'state', 'mean'\)"):
+    with pytest.raises(KeyError, match=r"TrackField reads its state .*track.*state.*mean"):
         tracked().step(state.exclude("track"))
 
 
@@ -131,7 +131,7 @@ def test_without_noise_it_finds_gradient_and_destination() -> None:
 def test_a_known_start_shows_the_constant_errors() -> None:
     """They are estimated from what was read before the calibration, by the errors of then."""
     rollout = flown(erring(40, rules=Rules(), max_steps=50), 4)
-    found, true = rollout["next", "track", "state", "mean"][:, -1, CONSTANT], rollout["sensor_error"][:, 0, :3]
+    found, true = rollout["next", "track", "state", "mean"][:, -1, CONSTANT], rollout["sensor_error", "bias"][:, 0]
     assert ((found - true).std(0) < 0.5 * true.std(0)).all()
 
 

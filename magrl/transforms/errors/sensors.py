@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from magrl.checks import check_number, check_type
@@ -17,6 +17,8 @@ from magrl.transforms.errors.base import Episode, ReadingErrors, check_sizes, ga
 from magrl.transforms.errors.levels import LEVEL_DRAWS
 from magrl.transforms.errors.vector import VectorErrors
 
+LEVELS = ("noise_std", "bias_std", "drift_std")
+"""Names of the standard deviations that are drawn for an episode."""
 DRIFT_KM = 200.0
 """Correlation length of a drift [km]; chosen."""
 
@@ -51,8 +53,8 @@ class SensorErrors(ReadingErrors):
             acts.
         out_keys: the reading ``(..., E)``, in place by default.
         **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
-            episode are bias, scale error, drift, last reading, drawn standard deviations of noise, bias and drift, and
-            those of ``vector``.
+            episode are the nested keys ``bias``, ``scale``, ``drift``, ``reading`` (the last one), with ``levels`` the
+            drawn standard deviations ``noise_std``, ``bias_std`` and ``drift_std``, and ``vector`` of that.
 
     Raises:
         ValueError: for sizes that are negative or of another number than ``noise``, a rate outside [0, 1), a length
@@ -113,49 +115,49 @@ class SensorErrors(ReadingErrors):
         self.drift_length, self.outage_rate, self.vector = float(drift_length), float(outage_rate), vector
         self.fixed, self.levels, self.in_sizes = fixed, levels, {"field": (self.count,), "heading": (1,)}
         self.level_draws = LEVEL_DRAWS + 1 + self.count if levels else 0
-        self.size = 7 * self.count + (vector.size if vector else 0)
+        names = ("bias", "scale", "drift", "reading", *(LEVELS if levels else ()))
+        self.entries = dict.fromkeys(names, self.count) | ({"vector": vector.size} if vector else {})
         self.draws = self.level_draws + 2 * self.count + (vector.draws if vector else 0)
         self.step_draws = 2 * self.count + 1
         self._set_accuracy()
 
-    def _constants(self, stream: Tensor) -> Tensor:
-        """Return the errors of an episode ``(..., size)``, without drift and last reading."""
+    def _constants(self, stream: Tensor) -> TensorDict:
+        """Return the errors of an episode by name, with a drift and a last reading of 0."""
         ends = [self.level_draws, self.level_draws + 2 * self.count]
         level, constant, vector = stream_uniform(stream, self.draws).tensor_split(ends, -1)
         drawn = torch.ones_like(constant) if self.fixed else normal_of(constant)
         bias, scale = (drawn * self._sizes[1:3].flatten()).split(self.count, -1)
-        further, *levels = self._drawn_levels(level)
-        constants = self.vector.constants(normal_of(vector)) if self.vector else vector
-        return torch.cat((bias + further, scale, torch.zeros_like(drawn), *levels, constants), -1)
+        numbers = {"bias": bias, "scale": scale, "drift": torch.zeros_like(bias), "reading": torch.zeros_like(bias)}
+        if self.levels is not None:
+            level, share, normal = level.split((LEVEL_DRAWS, 1, self.count), -1)
+            noise_std, bias_std = self.levels(level).split(self.count, -1)
+            numbers["bias"] = bias + bias_std * share.sqrt() * normal_of(normal)
+            numbers |= dict(zip(LEVELS, (noise_std, bias_std, bias_std * (1 - share).sqrt()), strict=True))
+        if self.vector is not None:
+            numbers["vector"] = self.vector.constants(normal_of(vector))
+        return TensorDict(numbers, batch_size=stream.shape)
 
-    def _drawn_levels(self, uniform: Tensor) -> tuple[Tensor, ...]:
-        """Return a constant error, and the standard deviations of noise, bias and drift, of an episode ``(..., E)``."""
-        if self.levels is None:
-            return (uniform.new_zeros(*uniform.shape[:-1], self.count),) * 4
-        level, share, normal = uniform.split((LEVEL_DRAWS, 1, self.count), -1)
-        noise_std, bias_std = self.levels(level).split(self.count, -1)
-        return bias_std * share.sqrt() * normal_of(normal), noise_std, bias_std, bias_std * (1 - share).sqrt()
-
-    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
-        (value, *others), count, dtype = values, self.count, values[0].dtype
+    def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> TensorDict:
+        (value, *others), dtype = values, values[0].dtype
         errors, stream, first = episode
         noise_std, _, _, drift_std, resolution = self._sizes.to(dtype)
+        *stated, iron = self._accuracy.to(dtype)
+        if self.levels is not None:
+            levels = [errors[name] for name in LEVELS]
+            noise_std, drift_std = torch.hypot(noise_std, levels[0]), torch.hypot(drift_std, levels[2])
+            stated = list(map(torch.hypot, stated, levels))
         uniform = stream_uniform(stream, self.step_draws)
-        noise, walk = normal_of(uniform[..., :-1]).to(dtype).split(count, -1)
-        bias, scale, drift, last, *levels, vector = errors.tensor_split([count * k for k in range(1, 8)], -1)
-        noise_std, drift_std = torch.hypot(noise_std, levels[0]), torch.hypot(drift_std, levels[2])
+        noise, walk = normal_of(uniform[..., :-1]).to(dtype).split(self.count, -1)
         distance = math.inf if first else others[0][..., :1] if others else 1.0
-        drift = gauss_markov(drift, drift_std, distance, self.drift_length, walk)
-        reading = self.vector.disturb(value, others[1], vector) if self.vector else value
-        reading = reading + (reading * scale + bias + drift + noise * noise_std)
+        drift = gauss_markov(errors["drift"], drift_std, distance, self.drift_length, walk)
+        reading = self.vector.disturb(value, others[1], errors["vector"]) if self.vector else value
+        reading = reading + (reading * errors["scale"] + errors["bias"] + drift + noise * noise_std)
         reading = torch.where(resolution > 0, torch.round(reading / resolution) * resolution, reading)
         missing = (uniform[..., -1:] < self.outage_rate) & (not first)
-        reading = torch.where(missing, last, reading)
-        *stated, iron = self._accuracy.to(dtype)
-        noise, slow, drifting = map(torch.hypot, stated, levels)
-        std = SensorStd(torch.where(missing, OUTAGE_STD, noise), slow, drifting, iron)
+        reading = torch.where(missing, errors["reading"], reading)
+        std = SensorStd(torch.where(missing, OUTAGE_STD, stated[0]), stated[1], stated[2], iron)
         self._measure(tensordict, value, reading, std)
-        return torch.cat((bias, scale, drift, reading, *levels, vector), -1)
+        return errors.clone(recurse=False).update({"drift": drift, "reading": reading})
 
     def accuracy(self, field: Tensor) -> SensorStd:
         """Return the standard deviations that the errors add to a reading, without ``levels``, each ``(..., E)``.

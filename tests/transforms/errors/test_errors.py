@@ -19,7 +19,7 @@ from magrl.sensor_std import STD_KEYS
 from magrl.transforms import TRUE_KEYS, MagneticNorth, NorthReferenceError, SensorErrors
 from magrl.transforms.errors.base import gauss_markov
 
-ERRORS = ("motion_error", "weather_clock", "sensor_error", "north_error")
+ERRORS = ("motion_error", "weather_clock", ("sensor_error", "bias"), "north_error")
 
 
 def test_errors_are_those_of_the_seeds_and_of_each_vehicle() -> None:
