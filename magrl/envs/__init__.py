@@ -7,7 +7,7 @@ from magrl.envs.regions import PAPER_REGION as PAPER_REGION
 from magrl.envs.regions import Region as Region
 from magrl.envs.regions import Regions as Regions
 from magrl.envs.scenario import Scenario as Scenario
-from magrl.envs.scenario_files import load_scenario as load_scenario
+from magrl.envs.scenario import load_scenario as load_scenario
 from magrl.envs.specs import PRIVILEGED_KEYS as PRIVILEGED_KEYS
 from magrl.envs.specs import PUBLIC_KEYS as PUBLIC_KEYS
 from magrl.envs.tasks import TASK_SETS as TASK_SETS

@@ -24,10 +24,9 @@ from magrl import guidance
 from magrl.checks import check_choice, check_number, check_type
 from magrl.counters import counter_stream
 from magrl.envs import specs
-from magrl.envs.arrival import Arrival
 from magrl.envs.regions import Regions, one_region
 from magrl.envs.rendering import TrackRecorder, draw_tracks, rgb_array
-from magrl.envs.scenario import Scenario
+from magrl.envs.scenario import Arrival, Scenario
 from magrl.envs.tasks import Tasks, random_headings, sample_tasks
 from magrl.field import elements_at, elements_range
 from magrl.geodesy import displaced, move, polar, wrap_angle

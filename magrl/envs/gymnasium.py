@@ -1,9 +1,9 @@
 """The environment for Gymnasium: one vehicle as an ``Env``, a batch of them as a ``VectorEnv``.
 
 ``import magrl`` registers the named tasks: ``magrl/GeomagneticNavigation-v0``, which is *Box*, and with the endings
-``Anywhere-v0``, ``Readings-v0``, ``Storm-v0`` and ``NoGo-v0``. The classes run :data:`magrl.envs.named.NAMED_ENVS`,
-the TorchRL environments behind the transforms of the recipes, and only convert tensors to arrays: the same seed and the
-same actions give the same bits.
+``Anywhere-v0``, ``Readings-v0``, ``Storm-v0`` and ``NoGo-v0``. The classes run the
+TorchRL environments of :data:`magrl.envs.navigation.NAMED_ENVS`, and only convert tensors to arrays: the same seed and
+the same actions give the same bits.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from torchrl.envs import CatTensors, TransformedEnv
 
 from magrl.checks import check_choice
 from magrl.envs.measures import path_measures
-from magrl.envs.named import NAMED_ENVS
+from magrl.envs.navigation import NAMED_ENVS
 from magrl.envs.specs import PUBLIC_KEYS
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
@@ -94,7 +94,7 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         render_mode: None, or ``"rgb_array"``: an image of each vehicle.
         autoreset_mode: mode, or its value: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``.
         max_episode_steps: Gymnasium's name of ``max_steps``.
-        task: name of the task in :data:`magrl.envs.named.NAMED_ENVS`, which an id sets.
+        task: name of the task in :data:`magrl.envs.navigation.NAMED_ENVS`, which an id sets.
         **options: of the function there, all of which take those of :func:`magrl.envs.navigation.navigation_env`.
 
     Raises:

@@ -6,15 +6,15 @@ import copy
 import datetime
 import math
 from functools import lru_cache
-from typing import Annotated, Any, Literal, Self
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import torch
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from torch import Tensor
 
 from magrl import guidance, paper
-from magrl.checks import CheckedModel, check_number, check_numbers, short
-from magrl.envs.arrival import check_zeta
+from magrl.checks import CheckedModel, check_number, check_numbers, check_type, short
 from magrl.envs.regions import PAPER_REGION, Region, Regions, check_expansions
 from magrl.envs.specs import field_bounds
 from magrl.envs.tasks import Tasks, check_distance_range, check_tasks, task_set
@@ -28,9 +28,76 @@ from magrl.field import (
     igrf_coefficients,
     parse_date,
 )
+from magrl.files import read_document
+from magrl.geodesy import geodesic
 
+MAX_OBJECTIVE = 3
+"""Largest objective F at the start: each of the three elements adds at most 1 (Eq. 2-6)."""
 FLOOR_KM = 25.0
 """Distance of travel whose mean change of each element is the default floor of Eq. 2-6 away from the paper's box."""
+
+
+def check_zeta(zeta: float) -> float:
+    """Return an arrival threshold on the objective; raise unless it lies between 0 and the largest F at the start.
+
+    Raises:
+        ValueError: with the value and the reason.
+
+    Example:
+        >>> check_zeta(5)
+        Traceback (most recent call last):
+        ValueError: zeta must be below 3, got 5: the objective F is at most 3 at the start, so every vehicle has arrived
+    """
+    check_number(0, above=True, zeta=zeta)
+    if zeta >= MAX_OBJECTIVE:
+        reason = f"the objective F is at most {MAX_OBJECTIVE} at the start, so every vehicle has arrived"
+        raise ValueError(f"zeta must be below {MAX_OBJECTIVE}, got {zeta!r}: {reason}")
+    return zeta
+
+
+class Arrival(NamedTuple):
+    """When an episode ends at a destination, and whether that is a success; see ``Scenario.arrival``.
+
+    Args:
+        rule: ``"objective"``: an episode ends where the objective F is below ``zeta``, which is a success.
+            ``"distance"``: it ends within ``radius_km`` of the destination, which is a success. ``"declared"``: it ends
+            with a move whose third number is above 0, by which the vehicle declares that it has arrived. That is a
+            success within ``radius_km`` of the destination, and a false arrival elsewhere.
+        zeta: arrival threshold on the objective.
+        radius_km: largest distance from the destination of an arrival, or of a correct declaration [km].
+
+    Example:
+        >>> Arrival("declared", zeta=0.01, radius_km=25.0).declared
+        True
+    """
+
+    rule: str
+    zeta: float
+    radius_km: float
+
+    @property
+    def declared(self) -> bool:
+        """Whether the vehicle declares its arrival."""
+        return self.rule == "declared"
+
+    def __call__(self, action: Tensor, objective: Tensor, place: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Return whether episodes end with an arrival, and whether an arrival counts as a success there.
+
+        Args:
+            action: ``(N, 2)``, or ``(N, 3)`` by declaration.
+            objective: ``(N, 1)`` objective F at the vehicle's place.
+            place: ``(N, 2)`` latitude, longitude [deg].
+            target: ``(N, 2)`` destination [deg].
+
+        Returns:
+            ``(N, 1)`` bool each.
+        """
+        if self.rule == "objective":
+            arrived = objective < self.zeta
+        else:
+            distance_km, _ = geodesic(*place.unbind(-1), *target.unbind(-1))
+            arrived = distance_km.unsqueeze(-1) <= self.radius_km
+        return (action[:, 2:] > 0 if self.declared else arrived), arrived
 
 
 def numbers_validator(name: str, count: int) -> BeforeValidator:
@@ -281,3 +348,80 @@ class Scenario(CheckedModel):
             5
         """
         return self.replace(tasks=tasks, names=())
+
+
+def _name(value: object) -> object:
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 200:
+        raise ValueError(f"name must be a text of 1 to 200 printable characters, got {short(value)}")
+    return value
+
+
+class TaskEntry(CheckedModel):
+    """A task in a file."""
+
+    start: Annotated[tuple[float, float], numbers_validator("start", 2)]
+    target: Annotated[tuple[float, float], numbers_validator("target", 2)]
+    name: Annotated[str | None, BeforeValidator(_name)] = Field(None, validate_default=False)
+
+
+class TaskEntries(CheckedModel):
+    """The tasks in a file."""
+
+    tasks: list[TaskEntry]
+
+
+def load_scenario(path: Path | str, **changes: Any) -> Scenario:
+    """Read a scenario from a TOML or JSON file, whose keys are the fields of :class:`Scenario`.
+
+    ``region`` and ``date`` are required. ``generation`` is 14 and ``objective_floors`` follow the region unless given.
+    ``tasks`` is a list of tables with ``start`` and ``target`` (latitude, longitude in degrees) and perhaps ``name``.
+
+    Args:
+        path: file that ends in ``.toml`` or ``.json``.
+        **changes: fields of :class:`Scenario` that replace those of the file.
+
+    Raises:
+        FileNotFoundError: if it does not exist.
+        ValueError: naming the file, the key, the value and what would be right.
+
+    Example:
+        >>> import tempfile
+        >>> lines = "date = 2026-07-01", "region = {latitude = [40, 50], longitude = [-30, -20]}"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "azores.toml").write_text(chr(10).join(lines))
+        ...     load_scenario(Path(folder) / "azores.toml").region
+        Regions(Region(latitude=(40.0, 50.0), longitude=(-30.0, -20.0)))
+    """
+    check_type((Path, str), path=path)
+    path = Path(path)
+    try:
+        scenario = _scenario(read_document(path), changes)
+        scenario.build_field()
+        return scenario
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no scenario file at {path}") from None
+    except (ValueError, TypeError, OSError, RecursionError, OverflowError) as error:
+        raise ValueError(f"{path}: {error or type(error).__name__}") from error
+
+
+def _scenario(content: Any, changes: dict[str, Any]) -> Scenario:
+    if not isinstance(content, dict):
+        raise ValueError(f"a scenario file must hold a table, got {short(content)}")
+    keys = [name for name in Scenario.model_fields if name not in ("field", "names")]
+    if unknown := [key for key in content if key not in keys]:
+        raise ValueError(f"unknown key {short(unknown[0])}: choose from {', '.join(keys)}")
+    if missing := [name for name in ("region", "date") if name not in content]:
+        raise ValueError(f"{missing[0]} is missing: a scenario file must hold region and date")
+    values: dict[str, Any] = {"generation": 14, "objective_floors": None} | content
+    if "tasks" in content:
+        values["names"], values["tasks"] = _listed_tasks(content["tasks"])
+    return Scenario(**(values | changes))
+
+
+def _listed_tasks(listed: Any) -> tuple[tuple[str, ...], Tasks | None]:
+    """Return names and ends of a list of tables."""
+    entries = TaskEntries(tasks=listed).tasks
+    if not entries:
+        return (), None
+    start, target = torch.tensor([(e.start, e.target) for e in entries], dtype=torch.float64).unbind(1)
+    return tuple(e.name or f"task {number}" for number, e in enumerate(entries, 1)), Tasks(start, target)

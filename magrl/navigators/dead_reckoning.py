@@ -14,7 +14,7 @@ from magrl.geodesy import geodesic, move_place, steer
 from magrl.navigators.base import Navigator
 from magrl.sensor_std import SensorStd
 from magrl.tracking import EarthModel
-from magrl.transforms.errors.known_place import PLACE_KEYS
+from magrl.transforms.errors.known import PLACE_KEYS
 
 ARRIVED_KM = 0.5
 """Reckoned distance from the destination at which it has arrived [km]."""

@@ -17,8 +17,7 @@ from magrl.navigators.base import Navigator
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking.network import load_pilot, pretrained
 from magrl.tracking.pilot import Reading, Rules, State, Track, act, advance, begin, blank, declaring, step
-from magrl.transforms.errors.known_place import PLACE_KEYS
-from magrl.transforms.errors.known_start import START_KEYS
+from magrl.transforms.errors.known import PLACE_KEYS, START_KEYS
 from magrl.transforms.track import READ_KEYS, reading_of
 
 

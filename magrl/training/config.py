@@ -16,7 +16,7 @@ from torchrl.envs import Transform
 from magrl import paper
 from magrl.checks import CheckedModel, UsageError, check_type
 from magrl.envs import Scenario, load_scenario
-from magrl.envs.arrival import check_zeta
+from magrl.envs.scenario import check_zeta
 from magrl.files import read_document
 from magrl.training.loggers import Logger, WandbMode, check_logger
 from magrl.transforms import MotionError

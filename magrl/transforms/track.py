@@ -28,8 +28,7 @@ from magrl.tracking import (
     observation,
 )
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, observed_spec, sorted_keys, with_state
-from magrl.transforms.errors.known_place import PLACE_KEYS
-from magrl.transforms.errors.known_start import START_KEYS
+from magrl.transforms.errors.known import PLACE_KEYS, START_KEYS
 
 READ_KEYS = ("field", "target_field", "move", "heading", "elapsed_steps")
 """Keys that a track reads at each step."""

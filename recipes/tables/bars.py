@@ -13,7 +13,7 @@ import math
 from functools import cache
 
 from magrl import paper
-from magrl.envs.named import NAMED_ENVS
+from magrl.envs.navigation import NAMED_ENVS
 from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import make_navigator

@@ -8,8 +8,8 @@ import torch
 from support.episodes import episode, point
 from tensordict import TensorDict
 
-from magrl.envs.arrival import check_zeta
 from magrl.envs.measures import path_efficiency, path_measures, spl
+from magrl.envs.scenario import check_zeta
 from magrl.evaluation.intervals import wilson_interval
 from magrl.evaluation.metrics import episode_measures, first_episode_mask, moved, summarize
 

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import CatTensors, Compose, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.named import no_go_env
+from magrl.envs.navigation import no_go_env
 from magrl.evaluation.navigators import make_navigator
 from magrl.transforms import NoGoAreas, TrueWay
 from magrl.transforms.areas import distance_km, turned

@@ -16,7 +16,7 @@ from magrl.checks import check_choice, check_number, check_numbers, check_type
 from magrl.files import read_document
 from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
-from magrl.transforms.errors.known_start import KnownStart, calibration
+from magrl.transforms.errors.known import KnownStart, calibration
 from magrl.transforms.errors.magnetic_north import MagneticNorth
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NORTH_REFERENCES, NorthReferenceError, north_reference

@@ -11,7 +11,7 @@ from torchrl.envs import Compose, TransformedEnv, check_env_specs
 
 from magrl.sensor_std import SensorStd
 from magrl.transforms import CONDITIONS, Conditions, KnownStart, SensorErrors, calibration, with_conditions
-from magrl.transforms.errors.known_start import START_KEYS
+from magrl.transforms.errors.known import START_KEYS
 
 STD = (0.02, 0.02, 2.0), (0.5, 0.1, 20.0), (0.3, 0.05, 10.0), (0.1, 0.0, 0.0)  # noise, bias, drift, known
 
