@@ -354,21 +354,6 @@ def test_a_flight_does_not_depend_on_the_size_of_the_batch() -> None:
     assert small["next", "done"].sum() > 3 * few
 
 
-@pytest.mark.parametrize("mask", [[1, 0, 0, 0, 0], [0, 1, 0, 1, 1], [1, 1, 1, 1, 1], [0, 0, 0, 0, 0]])
-def test_partial_reset_leaves_the_others_as_they_were(mask: list[int]) -> None:
-    env = make(5)
-    td = env.step_mdp(fly(env, *random_actions(3, 5))[-1])
-    before = td.clone()
-    chosen = torch.tensor(mask, dtype=torch.bool)
-    after = env.reset(td.set("_reset", chosen.unsqueeze(-1)))
-    assert_same(after.select(*ENTRIES, *FLAGS)[~chosen], before.select(*ENTRIES, *FLAGS)[~chosen])
-    assert (after["elapsed_steps"][chosen] == 0).all()
-    assert (after["position"] != before["position"])[chosen].all()
-    assert torch.equal(after["position"][chosen], after["start_position"][chosen])
-    step = env.step(after.set("action", torch.full((5, 2), 1.0)))["next"]
-    assert step["elapsed_steps"].flatten().tolist() == [1 if m else 4 for m in mask]
-
-
 def test_starts_computed_ahead_are_dropped_by_a_move() -> None:
     env = make(2)
     env.reset(env.reset().set("_reset", torch.tensor([[False], [True]])))

@@ -15,7 +15,6 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import NormalizeObservation
 from support.recipes import load
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
@@ -217,12 +216,6 @@ def test_modes_fly_the_same_episodes(mode: dict) -> None:
     for some, others in zip(*flights, strict=True):
         assert len(some) > 16
         assert some == others[: len(some)]
-
-
-def test_wrappers_that_need_the_next_step() -> None:
-    envs = NormalizeObservation(make_vec(**SHORT))
-    envs.reset(seed=0)
-    assert np.isfinite(envs.step(random_actions(NUM, 0, 1)[0])[0]).all()
 
 
 # Limits

@@ -6,6 +6,8 @@ import copy
 import pickle
 from collections.abc import Callable
 
+import pytest
+import torch
 from torchrl.envs import EnvBase, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -29,6 +31,19 @@ class Conformance:
         check_env_specs(copy.deepcopy(env))
         check_env_specs(TransformedEnv(base(), env.transform.clone()))
         check_env_specs(TransformedEnv(base(), pickle.loads(pickle.dumps(make()))))
+
+    def test_a_partial_reset_leaves_the_others_alone(self, base: Base, make: Make) -> None:
+        env = TransformedEnv(base(), make())
+        if not env.batch_size or not env.base_env.batch_locked or not hasattr(env.base_env, "vehicle"):
+            pytest.skip("the environment keeps no state of some")
+        state = env.rollout(3, break_when_any_done=False)[:, -1]["next"]
+        chosen = torch.arange(len(state)) % 2 == 0
+        after = env.reset(state.clone().set("_reset", chosen.unsqueeze(-1)))
+        again = TransformedEnv(base(), make())
+        begun = [again.reset() for _ in range(2)][1]  # the second episode of all
+        for key in begun.keys(True, True):
+            torch.testing.assert_close(after[key][~chosen], state[key][~chosen], rtol=0, atol=0, equal_nan=True)
+            torch.testing.assert_close(after[key][chosen], begun[key][chosen], rtol=0, atol=0, equal_nan=True)
 
     def test_parent_specs_are_not_mutated(self, base: Base, make: Make) -> None:
         plain = base()

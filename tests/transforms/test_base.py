@@ -12,27 +12,36 @@ import pytest
 import torch
 from support.conformance import Conformance
 from support.environments import PlaneEnv, nested, parallel
-from support.errors import all_errors, every_error, field, nav
+from support.errors import all_errors, every_error, field, nav, sensor_errors
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, EnvBase, PendulumEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from magrl.sensor_std import STD_KEYS
+from magrl.tracking import Rules
 from magrl.transforms import (
     AlignmentReward,
     AngleVector,
+    DeclareArrival,
     DistanceCost,
+    EpisodeSum,
     FieldGradient,
     GradientHeading,
     HighestSPL,
+    KnownPlace,
+    KnownStart,
+    MagneticNorth,
     MinMaxNorm,
     NoGoAreas,
     ProgressReward,
     RandomStepPrice,
+    ReadingObservation,
     SensorErrors,
     SPLReward,
     TargetDifference,
+    TrackField,
     TrueWay,
     sensor_levels,
 )
@@ -75,6 +84,15 @@ def of_a_plane() -> Transform:
     )
 
 
+def memory() -> Transform:
+    return Compose(ReadingObservation(), EpisodeSum(["reward_proximity"]))
+
+
+def declared() -> Transform:
+    rules = Rules(arrival="declared")
+    return Compose(TrackField(rules), DeclareArrival(rules))
+
+
 def pendulum() -> Transform:
     return MinMaxNorm(["th", "thdot"], ["a", "b"], ["action"], ["torque"], interval=(0.0, 1.0))
 
@@ -87,6 +105,9 @@ ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
     ),
     "every error": (nav, every_error),
     "progress": (nav, lambda: Compose(TrueWay(), NoGoAreas(), ProgressReward())),
+    "known": (nav, lambda: Compose(SensorErrors(bias=(0.1, 0.1, 20.0)), KnownStart(), KnownPlace(5.0, 2.0), memory())),
+    "compass": (nav, lambda: Compose(sensor_errors(), MagneticNorth(), TrackField(Rules(), STD_KEYS))),
+    "declared": (lambda: nav(arrival="declared"), declared),
     "plane": (partial(PlaneEnv, (3,), torch.float64), of_a_plane),
     "scaled pendulum": (PendulumEnv, pendulum),
 }
@@ -225,16 +246,6 @@ class TestConformanceOnData:
             transform(td)
         transform.set_missing_tolerance(True)
         assert (transform(td.clone()) == td).all()
-
-
-def test_partial_reset_leaves_the_others_alone() -> None:
-    env = TransformedEnv(nav(4), guided())
-    td = env.rollout(3, break_when_any_done=False)[:, -1]["next"]
-    chosen = torch.tensor([True, False, False, True])
-    after = env.reset(td.clone().set("_reset", chosen.unsqueeze(-1)))
-    for key in ("m", "course", "field_difference", "field_gradient", "gradient_heading", "sensor_std"):
-        assert torch.equal(after[key][~chosen], td[key][~chosen]), key
-        assert (after[key] != td[key])[chosen].flatten(1).any(-1).all() or key == "sensor_std", key
 
 
 @pytest.mark.parametrize("make", [lambda: AngleVector(["heading"], ["heading"]), lambda: MinMaxNorm(["target_field"])])

@@ -83,19 +83,6 @@ def test_workers_have_noise_of_their_own() -> None:
         assert not first & levels(make, 1)
 
 
-def test_partial_reset_leaves_the_other_vehicles_alone() -> None:
-    env = all_errors(4)
-    state = flown(env, actions(3, 4))[-1]
-    chosen = torch.tensor([False, True, True, False])
-    after = env.reset(state.clone().set("_reset", chosen.unsqueeze(-1)))
-    assert_same(after, state, ~chosen)
-    for key in ERRORS:
-        assert (after[key] != state[key])[chosen].any(-1).all(), key
-    second = all_errors(4)
-    second.reset()
-    assert torch.equal(after["sensor_stream"][chosen], second.reset()["sensor_stream"][chosen])
-
-
 def test_accuracy_adds_up_and_the_first_error_keeps_the_truth() -> None:
     """At each step once: sqrt(0.3^2 + 0.4^2) = 0.5."""
     env = under(SensorErrors((0.3, 0.1, 5.0)), NorthReferenceError(0.4, random_deg=0.4, fixed=True), num_envs=2000)

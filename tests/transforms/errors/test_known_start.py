@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from support.errors import nav
-from torchrl.envs import Compose, TransformedEnv, check_env_specs
+from torchrl.envs import Compose, TransformedEnv
 
 from magrl.sensor_std import SensorStd
 from magrl.transforms import CONDITIONS, Conditions, KnownStart, SensorErrors, calibration, with_conditions
@@ -41,7 +41,6 @@ def test_without_other_errors_the_whole_difference_is_constant(bias: float, expe
 def test_the_error_of_the_start_is_subtracted_from_all_readings_of_an_episode() -> None:
     errors = SensorErrors((0.01, 0.01, 1.0), bias=(0.5, 0.2, 50.0), seed=3)
     env = TransformedEnv(nav(3, max_steps=4), Compose(errors, KnownStart(known_std=(0.02, 0.01, 3.0))))
-    check_env_specs(env)
     rollout = env.rollout(9, break_when_any_done=False)
     error, first = rollout["next", "start_error"], rollout[:, 0]
     assert torch.equal(first["start_field"], first["true_field"])
