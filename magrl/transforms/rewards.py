@@ -17,8 +17,8 @@ from magrl.geodesy import geodesic
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, StepReward
 from magrl.transforms.errors.base import Episode, EpisodeNumbers
 
-UNIT_KM = 50.0
-"""Distance of a reward of 1 [km]: the longest move by default."""
+UNIT_KM, ARRIVAL, PRICE = 50.0, 10.0, 0.1
+"""Distance of a reward of 1 [km], the longest move by default; reward for the arrival; price of a step."""
 
 
 class TrueWay(ObservationTransform):
@@ -60,18 +60,16 @@ class ProgressReward(StepReward):
     """Write the reward for getting nearer to the destination, for the arrival, and minus the price of a step.
 
     The first term is ``gamma * phi(after) - phi(before)`` with ``gamma`` 1 and the potential ``phi`` of minus the
-    distance, which leaves the optimal policy without discount unchanged: a detour and its way back add up to 0. With
-    the default numbers, an episode of up to 90 steps earns less than any arrival at the same destination if it ends
-    without one. In place of the reward of the environment. Privileged.
+    distance, which leaves the optimal policy without discount unchanged: a detour and its way back add up to 0. An
+    episode of up to 90 steps earns less than any arrival at the same destination if it ends without one. In place of
+    the reward of the environment. Privileged.
 
     Args:
         in_keys: true way ``(..., 2)`` [km], and the flag success ``(..., 1)``.
         out_keys: one reward ``(..., 1)``.
-        arrival: reward for the arrival.
-        price: price of a step.
 
     Raises:
-        ValueError: for a negative reward or price, or another number of keys.
+        ValueError: for another number of keys.
 
     Source:
         A. Y. Ng, D. Harada and S. Russell, Policy invariance under reward transformations, ICML (1999).
@@ -85,18 +83,6 @@ class ProgressReward(StepReward):
 
     default_in_keys = ("true_way", "success")
 
-    def __init__(
-        self,
-        in_keys: Keys | None = None,
-        out_keys: Keys | None = None,
-        *,
-        arrival: float = 10.0,
-        price: float = 0.1,
-    ) -> None:
-        super().__init__(in_keys, out_keys)
-        check_number(0, arrival=arrival, price=price)
-        self.arrival, self.price = float(arrival), float(price)
-
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys that a step reads from the TensorDict before it: the true way."""
@@ -104,7 +90,7 @@ class ProgressReward(StepReward):
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
         nearer_km = state[0].norm(dim=-1, keepdim=True) - values[0].norm(dim=-1, keepdim=True)
-        tensordict.set(self.out_keys[0], nearer_km / UNIT_KM + self.arrival * values[1].to(nearer_km) - self.price)
+        tensordict.set(self.out_keys[0], nearer_km / UNIT_KM + ARRIVAL * values[1].to(nearer_km) - PRICE)
 
 
 class HighestSPL(StatefulTransform):
