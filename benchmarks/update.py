@@ -1,4 +1,4 @@
-"""Gradient step of the recipe beside plain PyTorch and TorchRL's loss, and in bfloat16 beside float32."""
+"""Gradient step of the recipe beside plain PyTorch and TorchRL's loss."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl.objectives import SoftUpdate as TorchRLSoftUpdate
 from torchrl.objectives import TD3Loss as TorchRLTD3Loss
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "recipes"))
-from td3_gradient_guided import PAPER, Config
+from td3_gradient_guided import Config
 
 CONFIG = Config()
 SATURATION = CONFIG.saturation_weight
@@ -40,15 +40,13 @@ def transitions(size: int, batch: int) -> TensorDict:
 class Recipe:
     """The body of the recipe's loop over batches, with the same parts."""
 
-    def __init__(self, size: int, config: Config = CONFIG, precision: str = "float32") -> None:
-        actor, critic = (
-            make(size, config.num_cells, layer_norm=config.layer_norm) for make in (make_actor, make_critic)
-        )
-        noise = {"policy_noise": config.policy_noise, "noise_clip": config.noise_clip}
-        self.loss = TD3Loss(actor, critic, gamma=config.gamma, **noise, precision=precision)
-        self.target_update = SoftUpdate(self.loss, tau=config.tau)
-        self.critic_optimizer = torch.optim.Adam(self.loss.critic_parameters(), lr=config.learning_rate, fused=True)
-        self.actor_optimizer = torch.optim.Adam(self.loss.actor_parameters(), lr=config.learning_rate, fused=True)
+    def __init__(self, size: int) -> None:
+        shape = {"num_cells": CONFIG.num_cells, "layer_norm": CONFIG.layer_norm}
+        noise = {"policy_noise": CONFIG.policy_noise, "noise_clip": CONFIG.noise_clip}
+        self.loss = TD3Loss(make_actor(size, **shape), make_critic(size, **shape), gamma=CONFIG.gamma, **noise)
+        self.target_update = SoftUpdate(self.loss, tau=CONFIG.tau)
+        self.critic_optimizer = torch.optim.Adam(self.loss.critic_parameters(), lr=CONFIG.learning_rate, fused=True)
+        self.actor_optimizer = torch.optim.Adam(self.loss.actor_parameters(), lr=CONFIG.learning_rate, fused=True)
         self.updates = 0
 
     def update(self, batch: TensorDict) -> None:
@@ -138,25 +136,17 @@ class Plain:
 
 
 def rows(repeats: int = 15) -> list[Row]:
-    """Return the comparisons of the presets fast and paper; a time is the mean of ten steps."""
+    """Return the comparisons of the preset fast; a time is the mean of ten steps."""
     torch.manual_seed(0)
     recipe, plain, stock = (kind(OBSERVATION_SIZE) for kind in (Recipe, Plain, Stock))
     batch = transitions(OBSERVATION_SIZE, CONFIG.batch_size)
     after = batch["next"]
     tensors = (batch["observation"], batch["action"], after["reward"], after["observation"], after["terminated"])
-    large = transitions(OBSERVATION_SIZE, PAPER.batch_size)
-    rounded, exact = (Recipe(OBSERVATION_SIZE, PAPER, precision) for precision in ("bfloat16", "float32"))
     return [
         alternate(what, magrl, baseline, goal=goal, repeats=repeats, inner=10)
         for what, magrl, baseline, goal in (
             ("gradient step: plain PyTorch", lambda: recipe.update(batch), lambda: plain.update(*tensors), "≥ 0.95"),
             ("gradient step: TorchRL's TD3Loss", lambda: recipe.update(batch), lambda: stock.update(batch), "≥ 1"),
-            (
-                "gradient step of preset paper, bfloat16: float32",
-                lambda: rounded.update(large),
-                lambda: exact.update(large),
-                "≥ 1.43",
-            ),
         )
     ]
 

@@ -105,8 +105,6 @@ class Config(RunConfig):
     """Transitions per gradient step."""
     init_random_frames: Annotated[int, Field(ge=0)] = 1024
     """Number of initial steps with random actions."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Precision of the hidden layers in gradient steps; bfloat16 is faster where the processor has it."""
 
     @model_validator(mode="after")
     def _fits(self) -> Config:
@@ -207,7 +205,7 @@ def train(config: Config) -> dict[str, float]:
         critic = make_critic(view.size, config.num_cells, layer_norm=config.layer_norm, device=env.device)
 
         # Loss, with clipped double Q and target policy smoothing
-        loss = TD3Loss(actor, critic, **config.model_dump(include={"gamma", "policy_noise", "noise_clip", "precision"}))
+        loss = TD3Loss(actor, critic, **config.model_dump(include={"gamma", "policy_noise", "noise_clip"}))
         loss.set_keys(terminated="done" if config.time_limit_ends else "terminated")
         target_update = SoftUpdate(loss, tau=config.tau)
         critic_optimizer = Adam(loss.critic_parameters(), lr=config.learning_rate, fused=True)

@@ -40,7 +40,7 @@ def make_mlp(inputs: int, outputs: int, num_cells: Sequence[int], *, layer_norm:
     for width in num_cells:
         check_number(1, 65536, whole=True, num_cells=width)
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": width} for width in num_cells]}
-    network = MLP(
+    return MLP(
         in_features=inputs,
         out_features=outputs,
         num_cells=list(num_cells),
@@ -49,38 +49,6 @@ def make_mlp(inputs: int, outputs: int, num_cells: Sequence[int], *, layer_norm:
         device=device,
         **(norm if layer_norm else {}),
     )
-    for index in (0, len(network) - 1):
-        network[index] = Float32Linear(network[index])
-    return network
-
-
-class Float32Linear(nn.Linear):
-    """A linear layer that keeps float32 where the layers around it are cast to bfloat16 (``torch.autocast``).
-
-    bfloat16 has three significant digits. In the first layer they would round off small differences of the observed
-    elements, in the last the differences between the values of actions.
-
-    Args:
-        layer: layer whose parameters it takes over.
-
-    Example:
-        >>> layer = Float32Linear(nn.Linear(4, 2))
-        >>> with torch.autocast("cpu", dtype=torch.bfloat16):
-        ...     layer(torch.zeros(5, 4, dtype=torch.bfloat16)).dtype
-        torch.float32
-    """
-
-    def __init__(self, layer: nn.Linear) -> None:
-        super().__init__(layer.in_features, layer.out_features, device="meta")
-        self.weight, self.bias = layer.weight, layer.bias
-
-    def forward(self, input: Tensor) -> Tensor:
-        """Return the output of the layer, as ``nn.Linear``."""
-        kind = input.device.type
-        if not torch.is_autocast_enabled(kind):
-            return super().forward(input)
-        with torch.autocast(kind, enabled=False):
-            return super().forward(input.float())
 
 
 def make_actor(

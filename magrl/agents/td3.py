@@ -20,7 +20,7 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate as TorchRLSoftUpdate
 from torchrl.objectives import TD3Loss as TorchRLTD3Loss
 
-from magrl.checks import check_choice, check_number, check_tensor, check_type
+from magrl.checks import check_number, check_tensor, check_type
 
 
 class Networks(NamedTuple):
@@ -51,12 +51,10 @@ class TD3Loss(TorchRLTD3Loss):
         gamma: discount factor.
         policy_noise: standard deviation of the noise of target policy smoothing.
         noise_clip: largest noise of target policy smoothing.
-        precision: ``"float32"``, or ``"bfloat16"`` for the hidden layers of networks from :func:`make_actor` and
-            :func:`make_critic`; their first and last layers, the loss and all parameters stay in float32.
 
     Raises:
         TypeError: for an actor or a critic of another type.
-        ValueError: for a discount outside [0, 1], a negative noise, or another precision.
+        ValueError: for a discount outside [0, 1] or a negative noise.
 
     Example:
         >>> from tensordict import TensorDict
@@ -78,13 +76,11 @@ class TD3Loss(TorchRLTD3Loss):
         gamma: float,
         policy_noise: float,
         noise_clip: float,
-        precision: str = "float32",
     ) -> None:
         check_type(TensorDictSequential, actor=actor)
         check_type(ValueOperator, critic=critic)
         check_number(0, 1, gamma=gamma)
         check_number(0, policy_noise=policy_noise, noise_clip=noise_clip)
-        check_choice(("float32", "bfloat16"), precision=precision)
         super().__init__(
             actor,
             critic,
@@ -95,7 +91,6 @@ class TD3Loss(TorchRLTD3Loss):
             deactivate_vmap=True,  # each critic is a module of its own
         )
         self.make_value_estimator(gamma=gamma)
-        self.precision = precision
 
     @cached_property
     def networks(self) -> Networks:
@@ -130,7 +125,7 @@ class TD3Loss(TorchRLTD3Loss):
         """
         action, after = tensordict["action"], tensordict["next"]
         noise = (torch.randn_like(action) * self.policy_noise).clamp(-self.noise_clip, self.noise_clip)
-        with torch.inference_mode(), self._cast(action):
+        with torch.inference_mode():
             # Target policy smoothing: noise on the action of the target actor
             next_action = self.networks.target_actor(after.select(*self.actor_network.in_keys))["action"]
             next_action = (next_action + noise).clamp(self.min_action, self.max_action)
@@ -140,8 +135,7 @@ class TD3Loss(TorchRLTD3Loss):
             alive = (~after[self.tensor_keys.terminated]).to(target_q.dtype)
             target_value = after["reward"] + self.value_estimator.gamma * alive * target_q
         obs_action = self._critic_input(tensordict, action)
-        with self._cast(action):
-            q1, q2 = (critic(obs_action) for critic in self.networks.critics)
+        q1, q2 = (critic(obs_action) for critic in self.networks.critics)
         loss = ((q1 - target_value).square() + (q2 - target_value).square()).mean()
         return loss, {"target_value": target_value}
 
@@ -154,13 +148,9 @@ class TD3Loss(TorchRLTD3Loss):
         Returns:
             A scalar, and all outputs of the actor with their gradient, such as ``logits`` and ``action``.
         """
-        with self._cast(tensordict["action"]):
-            outputs = self.networks.actor(tensordict.select(*self.actor_network.in_keys))
-            q1 = self.networks.frozen_critic(self._critic_input(tensordict, outputs["action"]))
+        outputs = self.networks.actor(tensordict.select(*self.actor_network.in_keys))
+        q1 = self.networks.frozen_critic(self._critic_input(tensordict, outputs["action"]))
         return -q1.mean(), {key: outputs[key] for key in self.actor_network.out_keys}
-
-    def _cast(self, like: Tensor) -> torch.autocast:
-        return torch.autocast(like.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
 
     def _critic_input(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         return torch.cat([*(tensordict[key] for key in self.qvalue_network.in_keys[:-1]), action], -1)

@@ -98,27 +98,6 @@ def test_actor_loss_has_no_gradient_of_the_critics() -> None:
     assert all(p.grad is None for critic in critics for p in critic.parameters())
 
 
-def test_bfloat16_rounds_the_hidden_layers_alone() -> None:
-    """Losses agree to the three digits of the type. Both have gradients in float32, and the loss is not rounded."""
-    torch.manual_seed(0)
-    actor, critic, batch = make_actor(13, (64, 64)), make_critic(13, (64, 64)), transitions()
-    options = {"gamma": 0.9, "policy_noise": 0.0, "noise_clip": 0.5}
-    exact, rounded = (updated(TD3Loss(actor, critic, **options, precision=kind)) for kind in ("float32", "bfloat16"))
-    rounded.load_state_dict(exact.state_dict())
-    for name, weights in (("value_loss", "critic_parameters"), ("actor_loss", "actor_parameters")):
-        losses = [getattr(loss, name)(batch.clone())[0] for loss in (exact, rounded)]
-        assert losses[0].dtype == losses[1].dtype == torch.float32
-        assert losses[0] != losses[1]
-        torch.testing.assert_close(*losses, rtol=0.01, atol=0.01)
-        gradients = [
-            torch.autograd.grad(value, getattr(loss, weights)())
-            for value, loss in zip(losses, (exact, rounded), strict=True)
-        ]
-        for one, other in zip(*gradients, strict=True):
-            assert one.dtype == other.dtype == torch.float32
-            assert (one - other).norm() < 0.1 * one.norm()
-
-
 def test_soft_update_moves_the_targets_by_tau() -> None:
     loss = make_loss()
     update = SoftUpdate(loss, tau=0.25)  # which makes targets equal to the weights
