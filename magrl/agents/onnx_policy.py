@@ -20,9 +20,6 @@ from magrl.checks import short
 DESCRIPTION = "magrl"
 """Entry of the metadata of a file that describes its policy, as JSON."""
 FORMAT = 1
-REFUSED = {"If", "Loop", "Scan", "Dropout", "Bernoulli", "Multinomial"}
-REFUSED |= {f"Random{kind}{like}" for kind in ("Normal", "Uniform") for like in ("", "Like")}
-"""Operations that branch, repeat or draw: an action would depend on more than its inputs, or take any time."""
 TOLERANCE = 1e-4
 """Largest difference of an exported action in [-1, 1]: float32 operations in another order."""
 _CHECKED = 5  # observations on which a network is checked
@@ -41,15 +38,13 @@ class OnnxNetwork(nn.Module):
 
     Raises:
         ImportError: without the extra ``onnx``.
-        ValueError: for a file with other inputs or outputs, with operations of :data:`REFUSED` or of other libraries,
-            with weights in other files, or whose action is not finite.
+        ValueError: for a file with other inputs or outputs, that does not run, or whose action is not finite.
     """
 
     def __init__(self, content: bytes, size: int) -> None:
         super().__init__()
         self.content, self.size = content, size
         self.register_buffer("file", torch.frombuffer(bytearray(content), dtype=torch.uint8))
-        _check_graph(content)
         session = _session(content)
         inputs = {each.name: each for each in session.get_inputs()}
         outputs = [each.name for each in session.get_outputs()]
@@ -182,17 +177,6 @@ def _check_input(found: Any, shape: Sequence[int]) -> None:
             f"{found.name!r} must be float32 (N, {', '.join(map(str, shape))}) for any N (dynamic_axes or "
             f"dynamic_shapes of torch.onnx.export), got {found.type} {found.shape}"
         )
-
-
-def _check_graph(content: bytes) -> None:
-    """Raise unless a file has plain operations alone, which do the same in each call, and its weights inside."""
-    model = _library("onnx").load_model_from_string(content)
-    nodes = [*model.graph.node, *(node for function in model.functions for node in function.node)]
-    own = {function.domain for function in model.functions} | {"", "ai.onnx"}
-    if refused := sorted({node.op_type for node in nodes if node.op_type in REFUSED or node.domain not in own}):
-        raise ValueError(f"its operations {', '.join(refused)} are refused: they branch, repeat, draw, or are foreign")
-    if outside := [tensor.name for tensor in model.graph.initializer if tensor.external_data]:
-        raise ValueError(f"its weights {short(outside)} are in another file: save them in this one")
 
 
 @lru_cache(maxsize=8)

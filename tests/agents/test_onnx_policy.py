@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 import json
 import math
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from onnx import ModelProto, TensorProto, helper
+from onnx import ModelProto, TensorProto
 from support.networks import network_file
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictModuleBase
@@ -179,86 +180,58 @@ def test_a_policy_of_three_numbers_declares_its_arrival(tmp_path: Path) -> None:
         evaluate(str(tmp_path / "own.onnx"), "paper-100")
 
 
-# Refusals: each part of a valid file renamed, retyped, resized, of one batch, dropped or doubled
+# Refusals
 
 
-def renamed(value) -> None:
-    value.name = "obs"
-
-
-def retyped(value) -> None:
-    value.type.tensor_type.elem_type = TensorProto.DOUBLE
-
-
-def resized(value) -> None:
-    value.type.tensor_type.shape.dim[1].dim_value += 1
-
-
-def single(value) -> None:
-    value.type.tensor_type.shape.dim[0].dim_value = 1
-
-
-def refused(model: ModelProto, path: Path) -> str:
+def refused(model: ModelProto, path: Path, message: str) -> None:
     path.write_bytes(model.SerializeToString())
-    with pytest.raises(ValueError, match="does not hold a valid policy: ") as error:
+    with pytest.raises(ValueError, match=rf"{re.escape(str(path))} does not hold a valid policy: .*{message}"):
         load_policy(path)
-    assert str(path) in str(error.value)
-    return str(error.value)
 
 
-@pytest.fixture
-def model(own: Path) -> ModelProto:
-    return ModelProto.FromString(own.read_bytes())
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("name", "obs", "it must take 'observation' and the memory, and return 'action' and 'next_NAME'"),
+        ("elem_type", TensorProto.DOUBLE, ""),
+        (0, 1, r"'observation' must be float32 \(N, 9\) for any N \(dynamic_axes"),
+    ],
+)
+def test_wrong_names_types_and_sizes_are_refused(own: Path, tmp_path: Path, field, value, message: str) -> None:
+    model = ModelProto.FromString(own.read_bytes())
+    entry = model.graph.input[0]
+    if field == "name":
+        entry.name = model.graph.node[0].input[0] = value
+    elif field == "elem_type":
+        entry.type.tensor_type.elem_type = value
+    else:
+        entry.type.tensor_type.shape.dim[field].dim_value = value
+    refused(model, tmp_path / "changed.onnx", message)
 
 
-def test_each_part_of_the_graph_is_checked(model: ModelProto, tmp_path: Path) -> None:
-    for end in ("input", "output"):
-        for number in range(2):
-            for change in (renamed, retyped, resized, single, None):
-                changed = copy.deepcopy(model)
-                values = getattr(changed.graph, end)
-                change(values[number]) if change else values.pop(number)
-                if end == "input" or change not in (resized, single):  # notes that bind nothing
-                    refused(changed, tmp_path / "changed.onnx")
-    for number in range(4):
+def test_a_graph_that_does_not_run_is_refused(own: Path, tmp_path: Path) -> None:
+    model = ModelProto.FromString(own.read_bytes())
+    for number in range(len(model.graph.node)):
         changed = copy.deepcopy(model)
         changed.graph.node.pop(number)
-        refused(changed, tmp_path / "changed.onnx")
+        refused(changed, tmp_path / "changed.onnx", "")
 
 
-def test_messages_say_what_would_be_right(model: ModelProto, tmp_path: Path) -> None:
-    for change, message in (
-        (renamed, "it must take 'observation' and the memory, and return 'action' and 'next_NAME'"),
-        (single, r"'observation' must be float32 (N, 9) for any N (dynamic_axes"),
-    ):
-        changed = copy.deepcopy(model)
-        change(changed.graph.input[0])
-        if change is renamed:
-            changed.graph.node[0].input[0] = "obs"
-        assert message in refused(changed, tmp_path / "changed.onnx")
-    noise = helper.make_node("RandomNormal", [], ["noise"], shape=[2])
-    model.graph.node.append(noise)
-    assert "its operations RandomNormal are refused" in refused(model, tmp_path / "changed.onnx")
-    model.graph.node.pop()
-    model.graph.initializer[0].external_data.add(key="location", value="/etc/passwd")
-    assert "its weights ['weights'] are in another file" in refused(model, tmp_path / "changed.onnx")
-
-
-def test_each_entry_of_the_description_is_checked(own: Path, tmp_path: Path) -> None:
+def test_a_wrong_description_is_refused(own: Path, tmp_path: Path) -> None:
     model = ModelProto.FromString(own.read_bytes())
     (entry,) = model.metadata_props
     content = json.loads(entry.value)
-    damaged = [{key: value for key, value in content.items() if key != name} for name in ("format", "kind", "view")]
-    damaged += [content | {name: value} for name in content for value in (None, [], "region", 7)]
-    damaged += [content | {"more": 1}, [], 5]
-    damaged += [content | {"view": content["view"] | {name: value}} for name in content["view"] for value in ("x", -1)]
-    for change in damaged:
+    for change in ({}, content | {"format": 7}, content | {"kind": "map"}, content | {"view": {"max_move_km": -1}}):
         entry.value = json.dumps(change)
-        refused(model, tmp_path / "changed.onnx")
+        refused(model, tmp_path / "changed.onnx", "")
     del model.metadata_props[:]
-    assert "state what the network observes by save_policy('policy.onnx', FILE, view)" in refused(
-        model, tmp_path / "changed.onnx"
-    )
+    message = r"state what the network observes by save_policy\('policy.onnx', FILE, view\)"
+    refused(model, tmp_path / "changed.onnx", message)
+
+
+def test_a_network_of_another_view_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"'observation' must be float32 \(N, 9\) for any N .*got tensor\(float\) .*8"):
+        export_policy(network_file(tmp_path, 8), READINGS)
 
 
 def test_wrong_arguments_are_refused(own: Path, tmp_path: Path, monkeypatch) -> None:
@@ -270,4 +243,4 @@ def test_wrong_arguments_are_refused(own: Path, tmp_path: Path, monkeypatch) -> 
         ReadingView(keys=["position"], **LIMITS)
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ImportError, match=r"the package onnx: pip install 'magrl\[onnx\]'"):
-        load_policy(own)
+        save_policy(tmp_path / "other.onnx", own, READINGS)
