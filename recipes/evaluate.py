@@ -1,7 +1,7 @@
 """Compare navigators on the same tasks, as in Section 4.4 of the paper.
 
     python recipes/evaluate.py secant parallel                                  # without training
-    python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso:flown --out runs/comparison
+    python recipes/evaluate.py gg_td3=runs/A gg_td3=runs/B td3=runs/C ga pso --out runs/comparison
     python recipes/evaluate.py secant --scenario my.toml --export tracks.geojson    # own tasks, tracks for a map
     python recipes/evaluate.py secant gg_td3=runs/A --tasks 300 --tasks-seed 7 --errors 0.05 0.05 5
     python recipes/evaluate.py kalman parallel --errors ship                    # errors of a real vehicle
@@ -12,8 +12,7 @@
 Trained agents are named by their run folders. By default, scenario, arrival threshold, start heading and sensor noise
 are those of the training. If the runs differ in one of these, give its option. A warning below the table names agents
 that were trained with other settings, or whose training is not finished.
-Metaheuristics evaluate candidate moves in one of two modes, `--mode` or a suffix such as `ga:flown`: `look-ahead` reads
-the field at the end of every candidate for free (an oracle), `flown` makes every candidate a move.
+Metaheuristics read the field at the end of every candidate leg for free (an oracle).
 
 Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, settings.json, table.md, short.md and
 trajectories.png (the first tasks of each navigator).
@@ -82,8 +81,6 @@ class Config(ScenarioOptions):
     the paper's."""
     export: Path | None = None
     """GeoJSON file for the tracks of all episodes (.geojson)."""
-    mode: Literal["look-ahead", "flown"] = "look-ahead"
-    """How metaheuristics evaluate a candidate move."""
     errors: Noise | str | None = None
     """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
     vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, phone, or a file (.toml or .json,
@@ -171,7 +168,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         check_logger("wandb", config.wandb_mode)
         if config.export:
             export.check_suffix(config.export)
-        check_distinct(config.navigators, config.mode)
+        check_distinct(config.navigators)
         config, warnings = settle(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
@@ -179,9 +176,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         options = {key: getattr(config, key) for key in told}
         flights = [Flight(scenario, **options), Flight(example, **options)]
         config = replace(config, north="magnetic" if flights[0].sensor_std.magnetic else "true")  # also by a preset
-        navigators = [
-            tuple(flight.navigator(text, mode=config.mode) for flight in flights) for text in config.navigators
-        ]
+        navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]
         if config.export:
             check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")
@@ -218,7 +213,7 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         if config.export:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
-            results.rollouts[label(name, config.mode)] = rollout[:SHOWN].clone()
+            results.rollouts[label(name)] = rollout[:SHOWN].clone()
             results.paths += path_rows(name, example_flight.fly(example))
     write(config, env, results)
     return results.summaries
@@ -235,7 +230,7 @@ def settings(config: Config, env: GeomagneticNavEnv) -> dict[str, Any]:
         "arrival": env.arrival.rule,
         "radius_km": env.arrival.radius_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        **{key: getattr(config, key) for key in ("tasks", "north", "known_start", "model", "start_km", "mode", "seed")},
+        **{key: getattr(config, key) for key in ("tasks", "north", "known_start", "model", "start_km", "seed")},
         "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
         **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
         **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
@@ -264,9 +259,9 @@ def write(config: Config, env: GeomagneticNavEnv, results: Results) -> None:
     notes = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)
     notes += "".join(f"\nWarning: {text}.\n" for text in results.warnings)
     ahead = config.kilometers or env.arrival.rule != "objective"
-    whole = comparison_table(results.summaries, config.mode, published=not config.scenario, kilometers=ahead)
+    whole = comparison_table(results.summaries, published=not config.scenario, kilometers=ahead)
     (config.out / "table.md").write_text(whole + notes)
-    (config.out / "short.md").write_text(short_table(results.summaries, config.mode, kilometers=ahead) + notes)
+    (config.out / "short.md").write_text(short_table(results.summaries, kilometers=ahead) + notes)
     figure = trajectories_figure(results.rollouts, env.field, env.region, names=env.scenario.names)
     figure.savefig(config.out / "trajectories.png", dpi=120)
     if config.export:

@@ -25,7 +25,6 @@ class TrainedAgent(NamedTuple):
     description: str
     trained_on: str = "the region"
     needs: str = Navigator.needs
-    options: tuple[str, ...] = ()
 
 
 OWN = "policy"
@@ -56,7 +55,7 @@ class NavigatorText(NamedTuple):
 
     Args:
         name: name of the navigator.
-        option: mode of a metaheuristic, or label of an own policy.
+        option: label of an own policy.
         source: run folder of a trained agent, or file of a policy.
     """
 
@@ -87,44 +86,41 @@ def make_navigator(
     env: GeomagneticNavEnv,
     *,
     sensor_std: SensorStd | Sequence[float] = PERFECT,
-    mode: str = "look-ahead",
     seed: int = 0,
     **options: Any,
 ) -> TensorDictModuleBase:
-    """Return the navigator that a text such as ``secant``, ``pso:flown`` or ``gg_td3=RUN`` names.
+    """Return the navigator that a text such as ``secant``, ``sac.onnx`` or ``gg_td3=RUN`` names.
 
     Args:
-        text: name; after ``=`` the run folder of a trained agent, or the file of a policy; after ``:`` the mode of a
-            metaheuristic, or the label of a policy, as in ``policy:SAC=sac.onnx``; or that file alone.
+        text: name; after ``=`` the run folder of a trained agent, or the file of a policy; after ``:`` the label of a
+            policy, as in ``policy:SAC=sac.onnx``; or that file alone.
         env: environment that it navigates in.
         sensor_std: accuracy of the sensors, for navigators that weigh their readings; three numbers are white noise of
             D [deg], I [deg], B_H [nT]. Agents read it from the TensorDict.
-        mode: mode of a metaheuristic without one in ``text``.
         seed: random seed of a metaheuristic.
         options: further options of the class of a navigator without training, such as ``caution`` of ``kalman``, or of
             the view of an agent without a map, such as ``step_price``.
 
     Raises:
         TypeError: for options that the class does not have, or of another trained agent.
-        ValueError: for an unknown name, a trained agent without a run or trained in another field, a run or a mode for
-            a navigator that takes none, or an unknown mode.
+        ValueError: for an unknown name, a trained agent without a run or trained in another field, or a run for a
+            navigator that takes none.
         FileNotFoundError: for a run without a policy.
 
     Example:
         >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
-        >>> make_navigator("pso:flown", env).oracle, make_navigator("parallel", env).oracle
+        >>> make_navigator("secant", env).oracle, make_navigator("parallel", env).oracle
         (False, True)
     """
     name, option, source = parse_navigator(text)
     if name in TRAINED and (not option or name == OWN):
         return _load(text, env, options)
     kind = NAVIGATORS.get(name)
-    if kind is None or (source and kind is not Anywhere) or (option and "mode" not in kind.options):
+    if kind is None or (source and kind is not Anywhere) or option:
         trained = [f"{agent}=RUN" for agent in WITH_RUN if agent != OWN]
         names = [*trained, "policy:NAME=FILE", *NAVIGATORS]
         raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(names)}")
-    shared = {"mode": option or mode, "seed": seed}
-    options = {key: value for key, value in shared.items() if key in kind.options} | options
+    options = ({"seed": seed} if "seed" in kind.options else {}) | options
     options |= {"source": policy_file(source)} if source else {}
     return kind.for_env(env, sensor_std=sensor_std, **options).to(env.device)
 
@@ -174,26 +170,20 @@ def _kind(name: str) -> TrainedAgent | type[Navigator]:
     return KINDS[name]
 
 
-def needs(name: str, default_mode: str = "look-ahead") -> str:
+def needs(name: str) -> str:
     """Return what a navigator needs beside its readings and their standard deviations, for a column of a table.
 
     Args:
-        name: name without a run, for example ``pso`` or ``pso:flown``.
-        default_mode: mode of a metaheuristic without one in ``name``.
+        name: name without a run, for example ``pso``.
 
     Raises:
         ValueError: for an unknown name.
 
     Example:
-        >>> needs("secant"), needs("mean_jacobian"), needs("td3")
-        ('nothing', 'a map of the region', 'nothing')
-        >>> needs("pso"), needs("pso:flown"), needs("kalman")
-        ('the field at other places', 'nothing', "the field's spectrum")
+        >>> needs("secant"), needs("pso"), needs("kalman")
+        ('nothing', 'the field at other places', "the field's spectrum")
     """
-    base, option, _ = parse_navigator(name)
-    kind = _kind(base)
-    flown = "mode" in kind.options and (option or default_mode) == "flown"
-    return Navigator.needs if flown else kind.needs
+    return _kind(parse_navigator(name).name).needs
 
 
 def trained_on(name: str) -> str:
@@ -209,42 +199,37 @@ def trained_on(name: str) -> str:
     return _kind(parse_navigator(name).name).trained_on
 
 
-def label(name: str, default_mode: str = "look-ahead") -> str:
-    """Return the label of a navigator in tables, which states how a metaheuristic reads the field.
+def label(name: str) -> str:
+    """Return the label of a navigator in tables.
 
     Args:
-        name: name without a run, for example ``pso``, ``pso:flown`` or ``policy:SAC``.
-        default_mode: mode of a metaheuristic without one in ``name``.
+        name: name without a run, for example ``pso`` or ``policy:SAC``.
 
     Raises:
         ValueError: for an unknown name.
 
     Example:
-        >>> label("pso"), label("ga:flown"), label("policy:SAC")
-        ('PSO, look-ahead (an oracle)', 'GA, flown', 'SAC')
+        >>> label("pso"), label("policy:SAC")
+        ('PSO, look-ahead (an oracle)', 'SAC')
     """
     base, option, _ = parse_navigator(name)
     kind = _kind(base)
-    if "mode" not in kind.options:
-        return option if base == OWN and option else kind.description
-    flown = (option or default_mode) == "flown"
-    return kind.description + (", flown" if flown else ", look-ahead (an oracle)")
+    return option if base == OWN and option else kind.description
 
 
-def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> None:
+def check_distinct(texts: Sequence[str]) -> None:
     """Raise if a navigator is given twice, or the pretrained agent beside own runs under its name.
 
     Neither is a spread over runs.
 
     Args:
         texts: navigators, as :func:`make_navigator` takes them.
-        default_mode: mode of metaheuristics without one in their text.
 
     Raises:
         ValueError: naming the text.
 
     Example:
-        >>> check_distinct(["gg_td3=runs/A", "gg_td3=runs/B", "ga", "ga:flown"])
+        >>> check_distinct(["gg_td3=runs/A", "gg_td3=runs/B", "ga"])
         >>> check_distinct(["td3=runs/A", "td3=runs/A/"])
         Traceback (most recent call last):
         ValueError: td3=runs/A/ is given twice: the same episodes again are no spread over runs
@@ -252,7 +237,7 @@ def check_distinct(texts: Sequence[str], default_mode: str = "look-ahead") -> No
     seen: set[object] = set()
     for text in texts:
         name, option, source = parse_navigator(text)
-        key = Path(source).resolve() if source else (name, option or default_mode)
+        key = Path(source).resolve() if source else (name, option)
         if key in seen:
             raise ValueError(f"{text} is given twice: the same episodes again are no spread over runs")
         if source and name == Anywhere.name and name in texts:

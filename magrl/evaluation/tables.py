@@ -126,14 +126,11 @@ def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> 
     return "\n".join([row(*head), "|---" * len(head) + "|", *(row(*cells) for cells in rows)])
 
 
-def comparison_table(
-    summaries: Summaries, mode: str = "look-ahead", *, published: bool = True, kilometers: bool = False
-) -> str:
+def comparison_table(summaries: Summaries, *, published: bool = True, kilometers: bool = False) -> str:
     """Return the paper's Table 2 and further measures for navigators, below the paper's own rows.
 
     Args:
         summaries: by navigator, one summary for each run, with ``field_readings``.
-        mode: mode of metaheuristics without one in their name.
         published: whether the paper's rows are shown; they are of its own region.
         kilometers: whether the columns of :data:`KILOMETERS` come first.
 
@@ -153,21 +150,21 @@ def comparison_table(
             shown.add(base)
             published_row = [paper.TABLE_2[base]._asdict()]
             rows.append([f"{NAVIGATOR_NAMES[base]}, paper", "—", "—", 1, *_cells(published_row, columns)])
-        rows.append([*about(name, mode), len(results), *_cells(results, columns)])
+        rows.append([*about(name), len(results), *_cells(results, columns)])
     return markdown_table([*ABOUT, "runs", *columns], rows) + "\n"
 
 
-def about(name: str, default_mode: str = "look-ahead") -> list[str]:
+def about(name: str) -> list[str]:
     """Return the label of a navigator, what it was trained on and what it is given, for the columns :data:`ABOUT`.
 
     Raises:
         ValueError: for an unknown name.
 
     Example:
-        >>> about("pso:flown")
-        ['PSO, flown', 'nothing', 'nothing']
+        >>> about("kalman")
+        ['Kalman (dual control)', 'nothing', "the field's spectrum"]
     """
-    return [label(name, default_mode), trained_on(name), needs(name, default_mode)]
+    return [label(name), trained_on(name), needs(name)]
 
 
 def _kilometers(summaries: Summaries, wanted: bool) -> dict[str, tuple[str, str]]:
@@ -203,12 +200,11 @@ def cell(results: Sequence[Summary], key: str, form: str) -> str:
     return f"{text} ({ends[0]:{form}}–{ends[1]:{form}})" if len(results) == 1 and ends else text
 
 
-def short_table(summaries: Summaries, mode: str = "look-ahead", *, kilometers: bool = False) -> str:
+def short_table(summaries: Summaries, *, kilometers: bool = False) -> str:
     """Return the main measures of navigators, without the paper's rows.
 
     Args:
         summaries: by navigator, one summary for each run.
-        mode: mode of metaheuristics without one in their name.
         kilometers: whether the columns of :data:`KILOMETERS` come first.
 
     Raises:
@@ -220,5 +216,5 @@ def short_table(summaries: Summaries, mode: str = "look-ahead", *, kilometers: b
         | 1.0 | — | 1.0 | 1.0 |
     """
     columns = _kilometers(summaries, kilometers) | SHORT_COLUMNS
-    rows = [[*about(name, mode), *_cells(results, columns)] for name, results in summaries.items()]
+    rows = [[*about(name), *_cells(results, columns)] for name, results in summaries.items()]
     return markdown_table([*ABOUT, *columns], rows) + "\n"

@@ -111,7 +111,7 @@ class Navigator(TensorDictModuleBase):
     action_size = 2
     """Numbers of the action: 3 with a declaration of the arrival."""
     options: tuple[str, ...] = ()
-    """Further options of :meth:`for_env` that a command has: ``mode``, ``seed``."""
+    """Further options of :meth:`for_env` that a command has: ``seed``."""
 
     def __init__(self, max_move_km: float = 50.0, max_turn_rad: float = math.pi / 2) -> None:
         super().__init__()

@@ -53,15 +53,7 @@ def test_every_navigator_has_labels_and_a_color_and_moves(env: GeomagneticNavEnv
         assert needs(name) == getattr(navigator, "needs", needs(name))
 
 
-def test_labels_and_needs_of_a_metaheuristic_depend_on_its_mode(env: GeomagneticNavEnv) -> None:
-    cases = (("pso", "look-ahead", False), ("pso", "flown", True), ("pso:flown", "look-ahead", True))
-    for name, default, flown in cases:
-        navigator = make_navigator(name, env, mode=default)
-        assert navigator.oracle is not flown
-        assert label(name, default) == ("PSO, flown" if flown else "PSO, look-ahead (an oracle)")
-        assert needs(name, default) == navigator.needs == ("nothing" if flown else "the field at other places")
-    assert label("ga:look-ahead", "flown") == "GA, look-ahead (an oracle)"
-    assert (trained_on("policy:flown"), needs("policy:flown")) == ("tasks of its own", "nothing")
+def test_unknown_names_have_no_label() -> None:
     for function in (label, needs, trained_on):
         with pytest.raises(ValueError, match="unknown navigator 'dowsing'"):
             function("dowsing")
@@ -89,7 +81,7 @@ def test_a_policy_of_any_algorithm_is_a_file_or_a_folder(env: GeomagneticNavEnv,
 
 
 def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_path: Path) -> None:
-    for text in ("dowsing", "secant=runs/a", "secant:flown", f"td3:flown={run}"):
+    for text in ("dowsing", "secant=runs/a", "secant:own", f"td3:own={run}"):
         with pytest.raises(
             ValueError, match=f"unknown navigator '{text}': choose from gg_td3=RUN, .*anywhere=RUN, .*kalman, anywhere"
         ):
@@ -98,7 +90,6 @@ def test_texts_that_name_no_navigator(env: GeomagneticNavEnv, run: Path, tmp_pat
         ("gg_td3", ValueError, "gg_td3 needs the folder of a finished run: gg_td3=RUN"),
         ("policy:SAC", ValueError, "policy needs the folder of a finished run or the file of a policy"),
         (f"td3={tmp_path}", FileNotFoundError, "there is no policy file at"),
-        ("ga:dreamt", ValueError, "mode must be one of .*dreamt"),
     ):
         with pytest.raises(error, match=message):
             make_navigator(text, env)
@@ -124,11 +115,11 @@ def test_the_agent_without_a_map_flies_within_the_limits_of_the_environment(limi
 
 
 def test_navigators_that_are_given_twice(run: Path) -> None:
-    check_distinct(["secant", "ga", "ga:flown", f"td3={run}", "policy:A=a.safetensors", "policy:B=b.safetensors"])
-    for texts, mode, message in (
-        (("secant", "ga", "secant"), "look-ahead", "^secant is given twice: the same episodes again are no spread"),
-        ((f"gg_td3={run}", f"td3={run.parent / 'x' / '..' / run.name}"), "look-ahead", "^td3=.* is given twice"),
-        (("anywhere", f"anywhere={run}"), "look-ahead", "has the name of the pretrained anywhere: write policy:LABEL="),
+    check_distinct(["secant", "ga", f"td3={run}", "policy:A=a.safetensors", "policy:B=b.safetensors"])
+    for texts, message in (
+        (("secant", "ga", "secant"), "^secant is given twice: the same episodes again are no spread"),
+        ((f"gg_td3={run}", f"td3={run.parent / 'x' / '..' / run.name}"), "^td3=.* is given twice"),
+        (("anywhere", f"anywhere={run}"), "has the name of the pretrained anywhere: write policy:LABEL="),
     ):
         with pytest.raises(ValueError, match=message):
-            check_distinct(texts, mode)
+            check_distinct(texts)

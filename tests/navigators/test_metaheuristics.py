@@ -12,9 +12,9 @@ from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.field import elements_at
 from magrl.geodesy import move
 from magrl.navigators import NAVIGATORS
-from magrl.navigators.metaheuristics import MODES, ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
-from magrl.navigators.metaheuristics.base import reachable, take
+from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm, reachable, take
 
+FIELD = Scenario().build_field()
 every_algorithm = pytest.mark.parametrize("name", ["afsa", "ga", "pso"])
 
 
@@ -33,14 +33,14 @@ def bowl(candidate: torch.Tensor) -> torch.Tensor:
     return (candidate - torch.tensor([0.5, -0.3], dtype=torch.float64)).norm(dim=-1)
 
 
-def searched(algorithm, generations: int, evaluate) -> tuple[torch.Tensor, torch.Tensor]:
+def searched(algorithm, generations: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean over 40 searches of the best fitness in the first and in the last of some generations."""
     state = algorithm.first_state(torch.zeros(40, 1))
     best = []
     for _ in range(generations):
         fitness = bowl(state["population"])
         best.append(fitness.min(1).values.mean())
-        state.update(algorithm.evolve(state, fitness, evaluate))
+        state.update(algorithm.evolve(state, fitness, bowl))
     return best[0], best[-1]
 
 
@@ -53,14 +53,13 @@ def test_reachable_by_hand() -> None:
 
 @every_algorithm
 def test_generations_come_nearer_to_the_best(name: str) -> None:
-    for evaluate in (bowl, None):
-        first, last = searched(NAVIGATORS[name](mode="flown", population_size=10), 25, evaluate)
-        assert last < first / 2
+    first, last = searched(NAVIGATORS[name](FIELD, population_size=10), 25)
+    assert last < first / 2
 
 
 @every_algorithm
 def test_first_population_fills_the_disc(name: str) -> None:
-    population = NAVIGATORS[name](mode="flown", population_size=50).first_state(torch.zeros(100, 1))["population"]
+    population = NAVIGATORS[name](FIELD, population_size=50).first_state(torch.zeros(100, 1))["population"]
     radius = population.norm(dim=-1)
     assert radius.max() <= 1
     assert abs((radius < 0.5).double().mean() - 0.25) < 0.03
@@ -68,47 +67,47 @@ def test_first_population_fills_the_disc(name: str) -> None:
 
 
 def test_elites_live_on() -> None:
-    algorithm = GeneticAlgorithm(mode="flown", population_size=6, elites=2)
+    algorithm = GeneticAlgorithm(FIELD, population_size=6, elites=2)
     state = algorithm.first_state(torch.zeros(4, 1))
     fitness = bowl(state["population"])
-    after = algorithm.evolve(state, fitness, None)["population"]
+    after = algorithm.evolve(state, fitness, bowl)["population"]
     best = take(state["population"], fitness.argsort(1)[:, :2])
     assert torch.equal(after[:, :2], best)
 
 
 def test_tournament_of_all_is_won_by_the_best() -> None:
-    algorithm = GeneticAlgorithm(mode="flown", population_size=3, tournament_size=60, mutation_rate=0.0)
+    algorithm = GeneticAlgorithm(FIELD, population_size=3, tournament_size=60, mutation_rate=0.0)
     state = algorithm.first_state(torch.zeros(5, 1))
     fitness = torch.tensor([[2.0, 1.0, 3.0]], dtype=torch.float64).expand(5, 3)
-    after = algorithm.evolve(state, fitness, None)["population"]
+    after = algorithm.evolve(state, fitness, bowl)["population"]
     torch.testing.assert_close(after, state["population"][:, 1:2].expand(5, 3, 2))
 
 
 def test_particle_without_pull_coasts() -> None:
-    algorithm = ParticleSwarm(mode="flown", population_size=3, inertia=0.5, cognitive=0.0, social=0.0)
+    algorithm = ParticleSwarm(FIELD, population_size=3, inertia=0.5, cognitive=0.0, social=0.0)
     state = algorithm.first_state(torch.zeros(2, 1))
     state["population"] = state["population"] / 4
     state["velocity"] = torch.full_like(state["velocity"], 0.2)
-    after = algorithm.evolve(state, bowl(state["population"]), None)
+    after = algorithm.evolve(state, bowl(state["population"]), bowl)
     torch.testing.assert_close(after["population"], state["population"] + 0.1)
 
 
 def test_particles_remember_their_best() -> None:
-    algorithm = ParticleSwarm(mode="flown", population_size=2)
+    algorithm = ParticleSwarm(FIELD, population_size=2)
     state = algorithm.first_state(torch.zeros(1, 1))
     first = state["population"].clone()
-    state.update(algorithm.evolve(state, torch.tensor([[1.0, 5.0]], dtype=torch.float64), None))
+    state.update(algorithm.evolve(state, torch.tensor([[1.0, 5.0]], dtype=torch.float64), bowl))
     second = state["population"].clone()
-    state.update(algorithm.evolve(state, torch.tensor([[2.0, 4.0]], dtype=torch.float64), None))
+    state.update(algorithm.evolve(state, torch.tensor([[2.0, 4.0]], dtype=torch.float64), bowl))
     assert state["lowest"].tolist() == [[1.0, 4.0]]
     assert torch.equal(state["best"], torch.stack((first[:, 0], second[:, 1]), 1))
 
 
 def test_fish_follows_its_better_neighbor_and_no_farther_than_its_step() -> None:
-    algorithm = ArtificialFishSwarm(mode="flown", population_size=3, visual=0.5, step=0.1, crowding=1.0)
+    algorithm = ArtificialFishSwarm(FIELD, population_size=3, visual=0.5, step=0.1, crowding=1.0)
     fish = torch.tensor([[[0.0, 0.0], [0.4, 0.0], [0.0, 0.9]]], dtype=torch.float64)
     state = TensorDict({"population": fish}, batch_size=[1])
-    after = algorithm.evolve(state, torch.tensor([[2.0, 1.0, 0.5]], dtype=torch.float64), None)["population"]
+    after = algorithm.evolve(state, torch.tensor([[2.0, 1.0, 0.5]], dtype=torch.float64), bowl)["population"]
     moved = after - fish
     assert 0 < moved[0, 0, 0] <= 0.1  # the first fish sees the second, not the best of all
     assert moved[0, 0, 1] == 0
@@ -117,7 +116,7 @@ def test_fish_follows_its_better_neighbor_and_no_farther_than_its_step() -> None
 
 @every_algorithm
 def test_look_ahead_is_an_oracle_that_arrives(env, name: str) -> None:
-    navigator = NAVIGATORS[name].for_env(env, mode="look-ahead", seed=0)
+    navigator = NAVIGATORS[name].for_env(env, seed=0)
     rollout = flight(env, navigator)
     episodes = episode_measures(rollout)
     summary = summarize(episodes)
@@ -134,12 +133,12 @@ def test_look_ahead_is_an_oracle_that_arrives(env, name: str) -> None:
 def test_look_ahead_is_never_worse_than_its_first_guess(env, name: str) -> None:
     env.set_seed(0)
     state = env.reset()
-    one = NAVIGATORS[name].for_env(env, mode="look-ahead", seed=5, generations=1)
-    more = NAVIGATORS[name].for_env(env, mode="look-ahead", seed=5, generations=6)
+    one = NAVIGATORS[name].for_env(env, seed=5, generations=1)
+    more = NAVIGATORS[name].for_env(env, seed=5, generations=6)
     first, last = (env.step(nav(state.clone()))["next", "objective"] for nav in (one, more))
     assert (last <= first + 1e-6).all()
     assert (last < first - 1e-3).any()
-    candidates = NAVIGATORS[name].for_env(env, mode="look-ahead", seed=5).first_state(state["heading"])["population"]
+    candidates = NAVIGATORS[name].for_env(env, seed=5).first_state(state["heading"])["population"]
     distance, turn = reachable(candidates, state["heading"].double(), math.pi / 2)
     start = state["position"].unsqueeze(1)
     ends = move(start[..., 0], start[..., 1], state["heading"] + turn, 50 * distance)
@@ -149,29 +148,11 @@ def test_look_ahead_is_never_worse_than_its_first_guess(env, name: str) -> None:
 
 
 @every_algorithm
-def test_flown_fitness_is_what_the_move_took_off_the_objective(env, name: str) -> None:
-    navigator = NAVIGATORS[name].for_env(env, mode="flown", seed=0, population_size=4)
-    env.set_seed(0)
-    state, objectives = env.reset(), []
-    for _ in range(4):
-        objectives.append(state["objective"])
-        state = env.step(navigator(state))["next"]
-    population = navigator.memory["state", "population"].clone()
-    ratio = torch.cat((*objectives[1:], state["objective"]), -1) / torch.cat(objectives, -1)
-    graded = []
-    navigator.evolve = lambda now, fitness, _: graded.append(fitness) or {"population": now["population"]}
-    navigator(state)
-    torch.testing.assert_close(graded[0], ratio.log().double(), atol=1e-3, rtol=1e-3)
-    assert torch.equal(navigator.memory["state", "population"][:, 1:], population[:, 1:])
-
-
-@every_algorithm
-@pytest.mark.parametrize("mode", MODES)
-def test_a_seed_repeats_the_moves(env, name: str, mode: str) -> None:
+def test_a_seed_repeats_the_moves(env, name: str) -> None:
     moves = []
     for seed in (1, 1, 2):
         env.set_seed(0)  # back to each vehicle's first task
-        navigator = NAVIGATORS[name].for_env(env, mode=mode, seed=seed)
+        navigator = NAVIGATORS[name].for_env(env, seed=seed)
         moves.append(env.rollout(6, navigator, break_when_any_done=False)["action"])
     assert torch.equal(moves[0], moves[1])
     assert not torch.equal(moves[0], moves[2])
@@ -179,21 +160,10 @@ def test_a_seed_repeats_the_moves(env, name: str, mode: str) -> None:
 
 def test_bad_options_are_refused_with_their_value() -> None:
     for algorithm, options, message in (
-        (GeneticAlgorithm, {"mode": "dreamt"}, "dreamt"),
-        (GeneticAlgorithm, {"mode": "look-ahead"}, "look-ahead"),
         (GeneticAlgorithm, {"population_size": 1}, "population_size.*1"),
-        (GeneticAlgorithm, {"spread": 1.5}, "spread.*1.5"),
         (GeneticAlgorithm, {"elites": 8, "population_size": 8}, "elites.*8"),
-        (GeneticAlgorithm, {"objective_floors": (1.0, 0.0, 1.0)}, r"objective_floors.*0\.0"),
         (ParticleSwarm, {"inertia": 3.0}, "inertia.*3.0"),
         (ArtificialFishSwarm, {"max_turn_rad": 9.0}, "9.0"),
     ):
         with pytest.raises(ValueError, match=message):
-            algorithm(**({"mode": "flown"} | options))
-
-
-def test_field_belongs_to_look_ahead(env) -> None:
-    with pytest.raises(ValueError, match="flown"):
-        ParticleSwarm(mode="flown", field=env.field)
-    with pytest.raises(ValueError, match="dreamt"):
-        GeneticAlgorithm.for_env(env, mode="dreamt")
+            algorithm(FIELD, **options)

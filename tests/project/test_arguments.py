@@ -15,8 +15,6 @@ import pytest
 import torch
 from support.public_names import public_members
 
-from magrl.navigators.metaheuristics import Metaheuristic
-
 HOMES = ("geodesy", "guidance", "field", "transforms", "envs", "navigators")
 PLACES = torch.zeros(4)
 VALUES: dict[str, Any] = {
@@ -79,8 +77,6 @@ def cases() -> Iterator[Any]:
             continue
         required = [x for x in signature(member) if x.default is x.empty]
         good = {x.name: BOX if kind(x) == "tuple[float, float]" else VALUES.get(x.name) for x in required}
-        if inspect.isclass(member) and issubclass(member, Metaheuristic):
-            good["mode"] = "flown"
         sound = not any(good[x.name] is None or "FieldModel" in kind(x) for x in required)
         for parameter in signature(member) if sound else ():
             if kind(parameter) in WRONG and parameter.name not in UNCHECKED:

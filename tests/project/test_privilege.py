@@ -22,10 +22,9 @@ from magrl.tracking import Rules
 from magrl.transforms import CONDITIONS, TRUE_KEYS, MagneticNorth, ReadingView, TrackField
 from magrl.transforms.errors.base import EPISODE_STREAM
 
-ORACLES = {"parallel", "geodesic"}
+ORACLES = {"parallel", "geodesic", "ga", "pso", "afsa"}
 PLACES = {"dead_reckoning": ("start_position", "target_position")}
 """Private keys of the places that a navigator knows."""
-METAHEURISTICS = {"ga", "pso", "afsa"}  # oracles but in the mode "flown"
 CONDITION = CONDITIONS["low-cost"]
 PRIVATE = {*PRIVILEGED_KEYS, *TRUE_KEYS}
 COMPASS = {"compass_declination", "compass_stream", "true_target_field"}
@@ -76,8 +75,7 @@ def policy(kind: str, folder: Path) -> TensorDictModuleBase:
 @pytest.mark.parametrize(
     "kind",
     [
-        *sorted(set(NAVIGATORS) - ORACLES - METAHEURISTICS),
-        *(f"{name}:flown" for name in sorted(METAHEURISTICS)),
+        *sorted(set(NAVIGATORS) - ORACLES),
         *("feedforward", "exported", "declaring"),
     ],
 )
