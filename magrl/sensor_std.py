@@ -18,7 +18,9 @@ STD_KEYS = ("sensor_std", "bias_std", "drift_std", "iron_std")
 """Keys of the fields of :class:`SensorStd` in a TensorDict, each ``(..., 3)``."""
 OUTAGE_STD = 1e4
 """Standard deviation of a repeated reading, in the unit of each element: a filter ignores it."""
-_NONE = (0.0, 0.0, 0.0)
+Noise = tuple[float, float, float]
+"""Standard deviations of white noise on D [deg], I [deg], B_H [nT]."""
+_NONE: Noise = (0.0, 0.0, 0.0)
 
 
 class SensorStd(NamedTuple):

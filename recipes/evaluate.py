@@ -10,8 +10,8 @@
     python recipes/evaluate.py sac.onnx secant                                  # a policy of another algorithm
 
 Trained agents are named by their run folders. By default, scenario, arrival threshold, start heading and sensor noise
-are those of the training. If the runs differ in one of these, give its option. A warning below the table names agents
-that were trained with other settings, or whose training is not finished.
+are those of the training, from the file of the policy. If the runs differ in one of these, give its option. A line
+below the table names the settings that an option overrides.
 Metaheuristics read the field at the end of every candidate leg for free (an oracle).
 
 Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, settings.json, table.md, short.md and
@@ -29,16 +29,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario, named_tasks
+from magrl.envs import load_scenario, named_tasks
 from magrl.evaluation import Flight, episode_measures, export, summarize
 from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.metrics import first_episode_mask
-from magrl.evaluation.navigators import check_distinct, label
+from magrl.evaluation.navigators import check_distinct, label, training_settings
 from magrl.evaluation.rollout import with_true_field
-from magrl.evaluation.runs import NO_NOISE, Noise, agreed, trained_runs, unfinished
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
 from magrl.evaluation.tables import comparison_table, short_table
 from magrl.files import check_writable, write_json
+from magrl.sensor_std import PERFECT, Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
 from magrl.training.loggers import WandbMode, WandbRun, check_logger
@@ -118,7 +118,6 @@ class Results:
     paths: list[dict[str, Any]] = field(default_factory=list)
     tracks: list[export.Track] = field(default_factory=list)
     rollouts: dict[str, TensorDictBase] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
 
 
 def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]]:
@@ -131,33 +130,29 @@ def path_rows(name: str, rollout: TensorDictBase) -> list[dict[str, float | str]
     return [{"navigator": name, "step": step} | dict(zip(names, row, strict=True)) for step, row in enumerate(values)]
 
 
-def settle(config: Config) -> tuple[Config, list[str]]:
-    """Return the settings with those of the scenario, or of the runs, where none were chosen, and warnings.
+def with_training_settings(config: Config) -> tuple[Config, list[str]]:
+    """Return the settings, where none were chosen those of the scenario or else of the trainings, and notes.
 
     Raises:
-        ValueError: for runs that differ in a setting that was not chosen.
-        FileNotFoundError: for a run without its scenario file.
+        ValueError: for trainings that differ in a setting that was not chosen.
+        FileNotFoundError: for a missing file.
     """
-    every = trained_runs(config.navigators)
-    # Agents that train anywhere have seen every heading, many levels of noise, and no region in particular.
-    runs = [run for run in every if run.kind != "anywhere"]
-    path, places = config.scenario, list[str]()
-    if config.tasks != "figure-4-1":  # which lies in the paper's region
-        path, places = agreed(runs, "scenario", config.scenario, None)
-    scenario = load_scenario(path, **config.changes()) if path else Scenario(**config.changes())
-    zeta, thresholds = agreed(every, "zeta", scenario.given("zeta"), 0.01)
-    heading, headings = agreed(runs, "start_heading", scenario.given("start_heading"), "north")
-    errors, accuracies = agreed(runs, "errors", config.errors, NO_NOISE)
-    settled = replace(config, scenario=path, zeta=zeta, start_heading=heading, errors=errors)
-    return settled, [*thresholds, *unfinished(config.navigators), *headings, *accuracies, *places]
+    chosen = {name: getattr(config, name) for name in ("scenario", "errors", "zeta", "start_heading")}
+    if config.scenario:
+        own = load_scenario(config.scenario, **config.changes())
+        chosen |= {name: own.given(name) for name in ("zeta", "start_heading")}
+    settings, notes = training_settings(config.navigators, **chosen)
+    if config.tasks == "figure-4-1":  # which lies in the paper's region
+        settings["scenario"] = config.scenario
+    return replace(config, **{"errors": PERFECT.noise} | settings), notes
 
 
 def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]]:
     """Make environments and navigators, and the folder of the results.
 
     Returns:
-        Settings with those of the runs; flights of the tasks and of the example task; each navigator for both;
-        warnings.
+        Settings with those of the trainings; flights of the tasks and of the example task; each navigator for both;
+        notes.
 
     Raises:
         UsageError: for anything that is wrong with the settings.
@@ -169,20 +164,18 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         if config.export:
             export.check_suffix(config.export)
         check_distinct(config.navigators)
-        config, warnings = settle(config)
+        config, notes = with_training_settings(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
         told = ("errors", "north", "known_start", "model", "start_km", "confidence", "seed")
-        options = {key: getattr(config, key) for key in told}
-        flights = [Flight(scenario, **options), Flight(example, **options)]
-        config = replace(config, north="magnetic" if flights[0].sensor_std.magnetic else "true")  # also by a preset
+        flights = [Flight(tasks, **{key: getattr(config, key) for key in told}) for tasks in (scenario, example)]
         navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]
         if config.export:
             check_writable(config.export)
         check_writable(create_run_folder(config.out) / "summary.json")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
-    return config, flights, navigators, warnings
+    return config, flights, navigators, notes
 
 
 def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
@@ -192,9 +185,8 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         UsageError: for anything that is wrong with the settings, before anything is flown.
     """
     torchrl_logger.setLevel("WARNING")
-    config, (flight, example_flight), navigators, warnings = prepare(config)
-    env, names = flight.base, task_names(flight.base.scenario)
-    results = Results(warnings=warnings)
+    config, (flight, example_flight), navigators, notes = prepare(config)
+    names, results = task_names(flight.base.scenario), Results()
     for text, (navigator, example) in zip(tqdm(config.navigators, unit="navigator"), navigators, strict=True):
         name, _, run = text.partition("=")
         began = time.perf_counter()
@@ -208,20 +200,20 @@ def evaluate(config: Config) -> dict[str, list[dict[str, float]]]:
         columns = {key: measured[key].tolist() for key in (*MEASURES, "false_arrival") if key in measured}
         results.episodes += [
             {"navigator": name, "run": number, "task": task, **{key: column[task] for key, column in columns.items()}}
-            for task in range(env.num_envs)
+            for task in range(flight.base.num_envs)
         ]
         if config.export:
             results.tracks += export.tracks(rollout, names, navigator=name, run=number)
         if number == 0:
             results.rollouts[label(name)] = rollout[:SHOWN].clone()
             results.paths += path_rows(name, example_flight.fly(example))
-    write(config, env, results)
+    write(config, flight, results, notes)
     return results.summaries
 
 
-def settings(config: Config, env: GeomagneticNavEnv) -> dict[str, Any]:
+def settings(config: Config, flight: Flight) -> dict[str, Any]:
     """Return what was flown and how, without a path of this machine."""
-    texts = (text.partition("=") for text in config.navigators)
+    texts, env = (text.partition("=") for text in config.navigators), flight.base
     return {
         "navigators": [f"{name}{equals}{Path(run).name}" for name, equals, run in texts],
         "num_tasks": env.num_envs,
@@ -230,43 +222,50 @@ def settings(config: Config, env: GeomagneticNavEnv) -> dict[str, Any]:
         "arrival": env.arrival.rule,
         "radius_km": env.arrival.radius_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
-        **{key: getattr(config, key) for key in ("tasks", "north", "known_start", "model", "start_km", "seed")},
+        "north": north(flight),
+        **{key: getattr(config, key) for key in ("tasks", "known_start", "model", "start_km", "seed")},
         "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
         **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
         **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
     }
 
 
-def write(config: Config, env: GeomagneticNavEnv, results: Results) -> None:
+def north(flight: Flight) -> str:
+    """Return the north of the vehicles, which errors of a real vehicle may decide."""
+    return "magnetic" if flight.sensor_std.magnetic else "true"
+
+
+def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]) -> None:
     """Write the files of the results, and the runs as a table in wandb."""
+    env = flight.base
     for name, rows in (("episodes", results.episodes), ("runs", results.runs), ("paths", results.paths)):
         with (config.out / f"{name}.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
     write_json(config.out / "summary.json", results.summaries)
-    write_json(config.out / "settings.json", settings(config, env))
+    write_json(config.out / "settings.json", settings(config, flight))
     text, noisy = "{:g} deg, {:g} deg, {:g} nT".format, not isinstance(config.errors, str) and any(config.errors or ())
     lines = {
         "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
-        "North": config.north != "true" and config.north,
+        "North": north(flight) != "true" and north(flight),
         "Conditions": isinstance(config.errors, str) and config.errors,
         "Model of the Earth": config.model or "",
         "Error of the known start": "" if config.start_km is None else f"{config.start_km:g} km",
         "Known start, standard deviations of D, I, B_H": config.known_start and text(*config.known_start),
         "Standard deviations of the noise on D, I and B_H": noisy and text(*config.errors),
     }
-    notes = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)
-    notes += "".join(f"\nWarning: {text}.\n" for text in results.warnings)
+    below = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)
+    below += "".join(f"\nNote: {note}.\n" for note in notes)
     ahead = config.kilometers or env.arrival.rule != "objective"
     whole = comparison_table(results.summaries, published=not config.scenario, kilometers=ahead)
-    (config.out / "table.md").write_text(whole + notes)
-    (config.out / "short.md").write_text(short_table(results.summaries, kilometers=ahead) + notes)
+    (config.out / "table.md").write_text(whole + below)
+    (config.out / "short.md").write_text(short_table(results.summaries, kilometers=ahead) + below)
     figure = trajectories_figure(results.rollouts, env.field, env.region, names=env.scenario.names)
     figure.savefig(config.out / "trajectories.png", dpi=120)
     if config.export:
         export.write_tracks(config.export, results.tracks)
-    run = WandbRun(config.out, config.wandb_mode, settings(config, env), "evaluation", list(results.summaries))
+    run = WandbRun(config.out, config.wandb_mode, settings(config, flight), "evaluation", list(results.summaries))
     run.table("eval/navigators", results.runs)
     run.close()
 

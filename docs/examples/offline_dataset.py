@@ -32,7 +32,7 @@ from magrl.envs.gymnasium import ANYWHERE_ID, GeomagneticNavVectorEnv
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
-from magrl.evaluation.runs import Noise
+from magrl.sensor_std import Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.config import Count, Rising, Seed
 from magrl.transforms import SensorErrors

@@ -78,6 +78,9 @@ class FieldPolicy(Navigator):
         config: what the policy observes, and the shape of its network.
         actor: trained actor of that shape; one with new weights by default.
 
+    Attributes:
+        training: settings of the training that an evaluation shares, which its file holds.
+
     Raises:
         TypeError: for a configuration of another type.
 
@@ -100,6 +103,7 @@ class FieldPolicy(Navigator):
         self.actor = config.make_actor().float() if actor is None else actor  # environments write float32
         self.action_size = getattr(self.actor, "action_size", 2)
         self.act = config.view.action_transform(declared=self.declares)
+        self.training: dict[str, Any] = {}
 
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         """Return the memory of a network at the start of an episode: zeros."""
@@ -220,7 +224,8 @@ def save_policy(
         write_atomically(Path(path), with_description(policy.actor.content, described))
         return
     weights = {key: value for key, value in policy.actor.state_dict().items() if isinstance(value, Tensor)}
-    save_tensors({"format": FILE_FORMAT, "config": config, "weights": weights}, Path(path))
+    content = {"format": FILE_FORMAT, "config": config, "weights": weights, "training": policy.training}
+    save_tensors(content, Path(path))
 
 
 def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy | Anywhere:
@@ -273,11 +278,12 @@ def _reading(path: Path | str) -> Iterator[None]:
         raise ValueError(f"{path} does not hold a valid policy: {' '.join(str(error).split())}") from error
 
 
-def _rebuild(config: Any, weights: Any) -> FieldPolicy:
+def _rebuild(config: Any, weights: Any, training: Any = None) -> FieldPolicy:
     rebuilt = _config(**config)
     # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
     rebuilt.make_actor("meta").load_state_dict(weights, assign=True)
     check_finite(weights.items(), "weights")
     policy = FieldPolicy(rebuilt)
     policy.actor.load_state_dict(weights)
+    policy.training = dict(training or {})
     return policy

@@ -15,11 +15,10 @@ from torch import Tensor
 from magrl import paper
 from magrl.envs import PUBLIC_KEYS, Scenario, Tasks, earth_scenario, named_tasks
 from magrl.evaluation import Flight
-from magrl.evaluation.runs import NO_NOISE, Noise
-from magrl.sensor_std import STD_KEYS
+from magrl.sensor_std import PERFECT, STD_KEYS, Noise
 from magrl.transforms import Conditions, conditions_named
 
-LEVELS: tuple[Noise, ...] = (NO_NOISE, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
+LEVELS: tuple[Noise, ...] = (PERFECT.noise, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
 """Standard deviations of the noise on D [deg], I [deg], B_H [nT]."""
 VEHICLES = ("aircraft", "ship", "underwater", "low-cost")
 """Conditions of vehicles with true north."""
@@ -56,8 +55,6 @@ class Track:
     """Radius in which vehicles declare their arrival [km]; by default they get a signal, by the paper's rule."""
     confidence: float = 0.0
     """Minimum probability at which vehicles declare their arrival."""
-    signal_km: float | None = None
-    """Radius in which a signal ends the episode [km]."""
     north: str = "true"
     """North of the vehicles, ``"true"`` or ``"magnetic"``."""
     known_start: Sequence[float] | None = None
@@ -68,8 +65,6 @@ class Track:
     """Whether the tasks are those of the paper's box, ``test-1000``, in place of random regions."""
     date: str = "2025-01-01"
     """Date of IGRF-14 outside the paper's box."""
-    task_seed: int = SEED
-    """Seed of regions and tasks."""
     seed: int = 0
     """Seed of errors and of random start headings."""
     keys: Sequence[str] = (*READINGS, *STD_KEYS)
@@ -89,10 +84,9 @@ class Track:
         size: dict[str, Any] = {"half_size_deg": 20, "degree": 16, "max_latitude": 75} if far else {"max_latitude": 70}
         size |= {"distance_range_km": tuple(self.distance_km), "max_move_km": 50.0 + DRIFT_KM * bool(self.conditions)}
         size |= {"date": self.date, "start_heading": "random"} | ({"crust": True, "degree": 60} if self.crust else {})
-        earth = Scenario() if self.box else earth_scenario(self.regions, self.task_seed, **size)
-        tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, self.task_seed)
+        earth = Scenario() if self.box else earth_scenario(self.regions, SEED, **size)
+        tasks = named_tasks("test-1000") if self.box else earth.random_tasks(self.tasks, SEED)
         rule: dict[str, Any] = {"arrival": "declared", "radius_km": self.within_km} if self.within_km else {}
-        rule |= {"arrival": "distance", "radius_km": self.signal_km} if self.signal_km else {}
         scenario = earth.replace(max_steps=self.max_steps, **rule)
         return scenario.with_tasks(Tasks(*(ends[: self.tasks] for ends in tasks)))
 
@@ -140,12 +134,12 @@ def digest(values: Tensor, digits: int = 6) -> str:
 
 
 TRACKS = {
-    "box-v2": Track(box=True, levels=(NO_NOISE, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))),
+    "box-v2": Track(box=True, levels=(PERFECT.noise, (0.02, 0.02, 2.0), (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))),
     "earth-v2": Track(tasks=2000),
     "alone-v2": Track(within_km=25, max_steps=80),
     "vehicles-v1": Track(within_km=25, max_steps=80, conditions=VEHICLES),
     "north-v1": Track(
-        within_km=25, max_steps=80, north="magnetic", levels=(NO_NOISE, (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))
+        within_km=25, max_steps=80, north="magnetic", levels=(PERFECT.noise, (0.05, 0.05, 5.0), (0.1, 0.1, 10.0))
     ),
     "sequences-v2": Track(keys=READINGS),
 }

@@ -6,6 +6,7 @@ A navigator has the same color in every figure.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,15 @@ from matplotlib.ticker import EngFormatter
 
 from magrl.envs import Region, Tasks
 from magrl.envs.rendering import START, SYMBOLS, TARGET, draw_contours
-from magrl.evaluation.navigators import NAVIGATOR_COLORS, NAVIGATOR_NAMES
+from magrl.evaluation.navigators import KINDS, NAVIGATOR_NAMES
 from magrl.evaluation.navigators import label as navigator_label
 from magrl.field import FieldModel, elements_at
 from magrl.field.elements import NAMES, UNITS
 
+_COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#44AA99", "#E69F00", "#56B4E9", "#000000"]
+_COLORS += ["#882255", "#332288", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
+NAVIGATOR_COLORS = dict(zip(KINDS, cycle(_COLORS), strict=False))
+"""Color of each navigator in every figure."""
 LINES = ("#0072B2", "#D55E00", "#009E73")
 TRAINING_PANELS = {
     "return": {"return": "return"},

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,10 +43,6 @@ WITH_RUN = (*TRAINED, Anywhere.name)
 KINDS: dict[str, TrainedAgent | type[Navigator]] = {**TRAINED, **NAVIGATORS}
 NAVIGATOR_NAMES = {name: kind.label for name, kind in KINDS.items()}
 """Label of each navigator in figures."""
-_COLORS = ["#D55E00", "#0072B2", "#999999", "#009E73", "#CC79A7", "#44AA99", "#E69F00", "#56B4E9", "#000000"]
-_COLORS += ["#882255", "#332288", "#999933", "#AA4499", "#6699CC", "#661100", "#117733"]
-NAVIGATOR_COLORS = dict(zip(KINDS, cycle(_COLORS), strict=False))
-"""Color of each navigator in every figure, and in files for maps."""
 
 
 class NavigatorText(NamedTuple):
@@ -131,6 +126,62 @@ def policy_file(source: str) -> Path:
     if path.is_dir():
         path /= "policy.onnx" if (path / "policy.onnx").is_file() else "policy.safetensors"
     return path
+
+
+def training_settings(texts: Sequence[str], **chosen: Any) -> tuple[dict[str, Any], list[str]]:
+    """Return the settings of the trainings of navigators, and a line on each that is overridden.
+
+    Args:
+        texts: navigators, as :func:`make_navigator` takes them.
+        chosen: settings that override those of the trainings: ``scenario``, ``zeta``, ``start_heading``, ``errors``;
+            None for those of the trainings.
+
+    Returns:
+        Settings; those without a value in ``chosen`` and in any training are left out.
+
+    Raises:
+        ValueError: for trainings that differ in a setting without a choice, or an agent under the name of another.
+        FileNotFoundError: for a missing policy.
+
+    Example:
+        >>> training_settings(["secant", "anywhere"], zeta=0.02, errors=None)
+        ({'zeta': 0.02}, [])
+    """
+    settings = {name: value for name, value in chosen.items() if value is not None}
+    fixed, others = set(settings), dict[str, list[str]]()
+    for text in texts:
+        for name, value in _trained_with(text).items():
+            if _content(settings.setdefault(name, value)) == _content(value):
+                continue
+            if name not in fixed:
+                values = f"{settings[name]} and {value} ({text})"
+                raise ValueError(f"trained with different {name}, {values}: choose with --{name.replace('_', '-')}")
+            others.setdefault(name, []).append(f"{value} ({text})")
+    return settings, [f"{name} is {settings[name]}, in training {', '.join(other)}" for name, other in others.items()]
+
+
+def _trained_with(text: str) -> dict[str, Any]:
+    """Return the settings in the file of a policy; none of a navigator without one."""
+    name, _, source = parse_navigator(text)
+    path = policy_file(source)
+    if name not in WITH_RUN or not source or path.suffix == ".onnx":
+        return {}
+    content = policy_content(path)
+    found = {"zeta": content["rules"]["zeta"]} if "rules" in content else dict(content.get("training", {}))
+    kinds = {True: "gg_td3", False: "td3"}
+    kind = Anywhere.name if "rules" in content else kinds.get(found.pop("guided", None), OWN)
+    if OWN not in (name, kind) and name.removesuffix("_noise") != kind:
+        raise ValueError(f"{source} was trained as {kind}, not {name}: write {kind}={source}")
+    if "noise" in found:
+        found["errors"] = tuple(found.pop("noise"))
+    if found.get("scenario"):
+        found["scenario"] = path.parent / found["scenario"]
+    return found
+
+
+def _content(value: Any) -> Any:
+    """Return a value for comparisons: of a scenario file, its text."""
+    return value.read_text() if isinstance(value, Path) and value.is_file() else value
 
 
 def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> TensorDictModuleBase:

@@ -140,7 +140,7 @@ def comparison_table(summaries: Summaries, *, published: bool = True, kilometers
     Example:
         >>> measures = {key: 1.0 for key, _ in COLUMNS.values()}
         >>> print(comparison_table({"td3": [measures]}).splitlines()[2])
-        | TD3, paper | — | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — | — |
+        | TD3, paper | — | — | 1 | 89.0 | 511984 | 73.63 | 22.09 | — | — | — | — | — | — | — |
     """
     rows, shown = list[list[object]](), set[str]()
     columns = _kilometers(summaries, kilometers) | COLUMNS

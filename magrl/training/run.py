@@ -40,6 +40,8 @@ from magrl.training.loggers import open_log
 
 EVALUATED = ("success_rate", "spl", "steps", "navigation_error_km")
 """Measures of the validation tasks in ``train.csv``, there with the prefix ``eval_``."""
+SHARED = ("guided", "scenario", "zeta", "start_heading", "noise")
+"""Settings that the file of the policy holds, for evaluations."""
 
 
 class StopRequest:
@@ -195,6 +197,8 @@ class Run:
         """
         self.policy, self.validation, self.env, self.collector = policy, validation, env, collector
         self._network = policy.actor if isinstance(policy, FieldPolicy) else policy
+        if isinstance(policy, FieldPolicy):
+            policy.training = {name: value for name, value in self.settings.items() if name in SHARED}
         self.statistics.first_cohort = env.num_envs * env.max_steps
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
         parts = {"configuration": self, **parts}  # restored first

@@ -22,9 +22,9 @@ from magrl.envs.rendering import draw_tracks
 from magrl.evaluation import Flight, evaluation_rollout
 from magrl.evaluation import figures as plots
 from magrl.evaluation.navigators import label
-from magrl.evaluation.runs import NO_NOISE
 from magrl.field import IGRF
 from magrl.files import check_writable
+from magrl.sensor_std import PERFECT
 from magrl.tracking import Rules
 from magrl.training import UsageError, command
 from magrl.transforms import Conditions, TrackField, load_conditions
@@ -137,7 +137,7 @@ def conditions(tasks: int = 200) -> Figures:
 def globe(tasks: int = 10_000) -> Figures:
     """Return the map of the tasks of table globe, with perfect sensors."""
     ends = earth_tasks(tasks)
-    return {"figures/globe": globe_map(ends, measured("anywhere", ends, NO_NOISE))}
+    return {"figures/globe": globe_map(ends, measured("anywhere", ends, PERFECT.noise))}
 
 
 def reliability_diagram(tasks: int = 2000) -> Figures:

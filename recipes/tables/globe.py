@@ -17,11 +17,11 @@ from magrl.envs.specs import state_spec
 from magrl.envs.tasks import task_set
 from magrl.evaluation import Flight, episode_measures
 from magrl.evaluation.maps import coastlines
-from magrl.evaluation.runs import NO_NOISE, Noise
 from magrl.evaluation.tables import markdown_table
 from magrl.field import IGRF, elements_at, elements_gradient_at
 from magrl.geodesy import geodesic, move
 from magrl.guidance import OBJECTIVE_FLOORS
+from magrl.sensor_std import PERFECT, Noise
 
 import numpy as np
 import torch
@@ -124,7 +124,7 @@ def table(results: Mapping[str, Measures], sorted_by: Measures) -> str:
 def globe(navigators: Sequence[Spec], *, tasks: int = 10_000, noise: Noise = (0.05, 0.05, 5.0)) -> Table:
     """Return a row for each band of tasks, with perfect and with noisy sensors, of one navigator."""
     (navigator,), ends = navigators, earth_tasks(tasks)
-    levels = {"perfect sensors": NO_NOISE, "{:g}°, {:g}°, {:g} nT".format(*noise): noise}
+    levels = {"perfect sensors": PERFECT.noise, "{:g}°, {:g}°, {:g} nT".format(*noise): noise}
     results = {name: measured(navigator, ends, level) for name, level in levels.items()}
     episodes = [
         episode_table(values, ends.region, navigator=names(navigator)[0], level=level)

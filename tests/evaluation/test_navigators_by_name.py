@@ -7,11 +7,11 @@ import torch
 from support.networks import network_file
 from torchrl.envs import StepCounter, TransformedEnv
 
-from magrl.agents import FieldPolicy, PolicyConfig, save_policy
+from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Region, Scenario
 from magrl.evaluation import evaluate
+from magrl.evaluation.figures import NAVIGATOR_COLORS
 from magrl.evaluation.navigators import (
-    NAVIGATOR_COLORS,
     NAVIGATOR_NAMES,
     TRAINED,
     check_distinct,
@@ -19,11 +19,13 @@ from magrl.evaluation.navigators import (
     make_navigator,
     needs,
     trained_on,
+    training_settings,
 )
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
-from magrl.navigators import NAVIGATORS
+from magrl.navigators import NAVIGATORS, Anywhere
 from magrl.navigators.secant import probe_length
 from magrl.sensor_std import SensorStd
+from magrl.tracking.network import pretrained
 from magrl.transforms import ReadingView
 
 STD, BIAS = (0.3, 0.0, 3.0), (0.4, 0.1, 4.0)
@@ -123,3 +125,36 @@ def test_navigators_that_are_given_twice(run: Path) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             check_distinct(texts)
+
+
+def trained(env: GeomagneticNavEnv, folder: Path, **settings: object) -> Path:
+    """Return the folder of a policy whose file holds settings of its training."""
+    policy = FieldPolicy(PolicyConfig(env.observation_view(), (8,), layer_norm=False))
+    policy.training = {"guided": True, "scenario": None, "zeta": 0.01, "noise": (0.0, 0.0, 0.0)} | settings
+    folder.mkdir()
+    save_policy(folder / "policy.safetensors", policy)
+    if settings.get("scenario"):
+        (folder / "scenario.toml").write_text("date = 2026-07-01")
+    return folder
+
+
+def test_settings_of_a_training_are_read_from_the_file_of_the_policy(env: GeomagneticNavEnv, tmp_path: Path) -> None:
+    """An option overrides them, with a note; a scenario is the same by its content."""
+    one, other = (trained(env, tmp_path / name, zeta=0.02, noise=STD, scenario="scenario.toml") for name in "ab")
+    plain, texts = trained(env, tmp_path / "c"), ["secant", f"gg_td3={one}", f"gg_td3_noise={other}"]
+    settings = {"zeta": 0.02, "errors": STD, "scenario": one / "scenario.toml"}
+    assert training_settings(texts, zeta=None) == (settings, [])
+    note = f"zeta is 0.5, in training 0.02 (gg_td3={one}), 0.02 (gg_td3_noise={other})"
+    assert training_settings(texts, zeta=0.5) == (settings | {"zeta": 0.5}, [note])
+    with pytest.raises(ValueError, match=r"trained with different scenario, .* \(gg_td3=.*c\): choose with --scenario"):
+        training_settings([*texts, f"gg_td3={plain}"])
+    with pytest.raises(ValueError, match=rf"{plain} was trained as gg_td3, not td3: write gg_td3={plain}"):
+        training_settings([f"td3={plain}"])
+    save_policy(tmp_path / "pilot.safetensors", Anywhere(zeta=0.03))
+    assert training_settings([f"anywhere={tmp_path / 'pilot.safetensors'}"]) == ({"zeta": 0.03}, [])
+
+
+def test_a_policy_file_without_settings_of_a_training_is_loaded() -> None:
+    path = pretrained("anywhere")
+    assert load_policy(path).rules.max_steps == 120
+    assert training_settings([str(path)])[0] == {"zeta": 0.01}
