@@ -6,7 +6,7 @@ import time
 
 from benchmarks.timing import Row, alternate
 from magrl.envs import GeomagneticNavEnv, Scenario, planet_scenario
-from magrl.training.collectors import make_collector
+from magrl.training.run import make_collector
 from magrl.transforms import (
     AlignmentReward,
     FieldGradient,

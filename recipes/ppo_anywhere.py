@@ -24,8 +24,8 @@ from magrl.agents.networks import make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.tracking import OBSERVATION_SIZE, RANGE_KM, Rules, correction_network
 from magrl.training import Run, command, parse_config
-from magrl.training.collectors import make_collector
 from magrl.training.config import Count, Discount, NonNegative, PlanetConfig, Positive, Rising
+from magrl.training.run import make_collector
 from magrl.transforms import (
     DeclareArrival,
     HighestSPL,

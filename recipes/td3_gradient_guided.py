@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Annotated, Literal
 
 from magrl import paper
@@ -20,8 +19,8 @@ from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_cr
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
-from magrl.training.collectors import CollectorBackend, make_collector, worker_seed
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RunConfig
+from magrl.training.run import make_collector
 from magrl.transforms import (
     AlignmentReward,
     DistanceCost,
@@ -36,7 +35,7 @@ import torch
 from pydantic import Field, model_validator
 from tensordict.nn import TensorDictSequential
 from torch.optim import Adam
-from torchrl.collectors import BaseCollector
+from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
@@ -54,10 +53,6 @@ class Config(RunConfig):
     """Source of the defaults: tuned for two cores, or the paper's Table 1; td3- without guidance."""
     guided: bool = True
     """Gradient guidance: the theoretical heading and its alignment reward."""
-    collectors: Count = 1
-    """Number of collecting processes; with more than one, runs are not reproducible bit for bit."""
-    collector_backend: CollectorBackend = "process"
-    """Backend of several collectors: processes of this machine, or a Ray cluster."""
 
     # Environment
     start_heading: Literal["north", "random"] = "north"
@@ -115,8 +110,6 @@ class Config(RunConfig):
             raise ValueError(f"buffer_size {self.buffer_size} does not hold one batch of {self.batch_size}")
         if self.batch_size > math.ceil(self.total_frames / self.num_envs) * self.num_envs:
             raise ValueError(f"batch_size {self.batch_size} must not exceed total_frames: no gradient step is possible")
-        if self.num_envs % self.collectors:
-            raise ValueError(f"num_envs {self.num_envs} cannot be divided evenly among {self.collectors} collectors")
         return self
 
 
@@ -155,16 +148,9 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
     return TransformedEnv(base, Compose(*(guidance if config.guided else []), *sensors, *scaling, *rewards))
 
 
-def worker_env(config: Config, view: ObservationView, index: int) -> TransformedEnv:
-    """Make the environment of one of several collecting processes: its share of the vehicles, on tasks of its own."""
-    options = config.model_dump(include=ENV_OPTIONS)
-    options |= {"seed": worker_seed(config.seed, index), "num_envs": config.num_envs // config.collectors}
-    return make_env(GeomagneticNavEnv(config.load_scenario().with_tasks(None), **options), view, config)
-
-
 def make_collection(
-    env: TransformedEnv, actor: TensorDictSequential, view: ObservationView, config: Config
-) -> tuple[AdditiveGaussianModule, BaseCollector, TensorDictReplayBuffer]:
+    env: TransformedEnv, actor: TensorDictSequential, config: Config
+) -> tuple[AdditiveGaussianModule, Collector, TensorDictReplayBuffer]:
     """Return exploration noise, collector and replay buffer; a sample holds all batches of an iteration."""
     noise = AdditiveGaussianModule(
         spec=env.action_spec_unbatched,
@@ -176,8 +162,6 @@ def make_collection(
     collector = make_collector(
         env,
         TensorDictSequential(actor, noise),
-        workers=[partial(worker_env, config, view, index) for index in range(config.collectors)],
-        backend=config.collector_backend,
         frames_per_batch=config.num_envs,
         total_frames=config.total_frames,
         init_random_frames=config.init_random_frames,
@@ -211,7 +195,7 @@ def train(config: Config) -> dict[str, float]:
         critic_optimizer = Adam(loss.critic_parameters(), lr=config.learning_rate, fused=True)
         actor_optimizer = Adam(loss.actor_parameters(), lr=config.learning_rate, fused=True)
 
-        noise, collector, buffer = make_collection(env, actor, view, config)
+        noise, collector, buffer = make_collection(env, actor, config)
         policy = FieldPolicy(network, actor).to(env.device)
         parts = {"critic_optimizer": critic_optimizer, "actor_optimizer": actor_optimizer, "noise": noise}
         run.start(
@@ -238,8 +222,6 @@ def train(config: Config) -> dict[str, float]:
                     penalty = run.remaining * config.saturation_weight * saturation_penalty(outputs["logits"])
                     optimize(stats.losses["loss_actor"] + penalty, actor_optimizer)
                     target_update.step()  # Polyak averaging
-            if config.collectors > 1:
-                collector.update_policy_weights_()
         return run.finish(test)
 
 

@@ -16,8 +16,8 @@ from magrl.agents import FieldPolicy, PolicyConfig, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
-from magrl.training.collectors import make_collector
 from magrl.training.config import Count, NonNegative, Positive, RunConfig, Share
+from magrl.training.run import make_collector
 from magrl.transforms import (
     AlignmentReward,
     DistanceCost,

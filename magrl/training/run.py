@@ -17,10 +17,11 @@ from types import FrameType
 from typing import Any, Self
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
-from torchrl.collectors import BaseCollector, Collector
+from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
@@ -73,6 +74,25 @@ class StopRequest:
         if self.exit_code is not None:
             raise KeyboardInterrupt
         self.exit_code = 128 + number  # exit status that a shell reports for a process ended by a signal
+
+
+def make_collector(env: EnvBase, policy: TensorDictModuleBase, **options: Any) -> Collector:
+    """Return a collector whose batches are used before the next one is made.
+
+    Args:
+        env: environment; its device is that of the batches.
+        policy: policy with its exploration.
+        **options: options of TorchRL's ``Collector``, such as ``frames_per_batch`` and ``total_frames``.
+
+    Example:
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> collector = make_collector(env, env.rand_action, frames_per_batch=4, total_frames=8)
+        >>> next(iter(collector)).shape
+        torch.Size([2, 2])
+        >>> collector.shutdown()
+    """
+    options |= {"track_traj_ids": False, "auto_register_policy_transforms": False}
+    return Collector(env, policy, return_same_td=True, **options)
 
 
 class Run:
@@ -180,7 +200,7 @@ class Run:
         policy: FieldPolicy | Anywhere,
         validation: EnvBase,
         env: GeomagneticNavEnv,
-        collector: BaseCollector,
+        collector: Collector,
         **parts: Stateful,
     ) -> None:
         """Take the parts of the training, and restore them from the newest checkpoint of a run that is resumed.
@@ -188,7 +208,7 @@ class Run:
         Args:
             policy: agent for evaluations, which is saved.
             validation: environment of the validation tasks.
-            env: environment inside the collector; with several collectors, one of as many vehicles as theirs together.
+            env: environment inside the collector.
             collector: source of batches.
             parts: everything else that checkpoints must hold, such as loss, optimizers and replay buffer.
 
@@ -203,8 +223,7 @@ class Run:
         self._modules = {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
         parts = {"configuration": self, **parts}  # restored first
         parts |= {"statistics": self.statistics, "best": self.best, "random": GlobalRNGState()}
-        if isinstance(collector, Collector):  # other processes start new episodes
-            parts["episodes"] = RunningEpisodes(collector, env)
+        parts["episodes"] = RunningEpisodes(collector, env)
         self._exits.callback(collector.shutdown)
         self.checkpoints = Checkpoints(self.folder / "checkpoints", parts)
         resumed = bool(self.config.resume and self.checkpoints.files())  # otherwise it starts again from its seed
@@ -300,7 +319,7 @@ class Run:
         Raises:
             SystemExit: after a signal, with its exit code; the policy so far is saved.
         """
-        from magrl.evaluation import figures, maps  # matplotlib is slow to import, and collecting processes do without
+        from magrl.evaluation import figures, maps  # matplotlib is slow to import
 
         seconds = self.log.seconds
         self._network.load_state_dict(self.best.weights or self._network.state_dict())

@@ -6,7 +6,6 @@ import multiprocessing
 import random
 import re
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -128,7 +127,6 @@ def test_noise_is_observed_and_the_guidance_is_by_the_truth() -> None:
         (recipe, "--total-frames 512", "batch_size 1024 must not exceed total_frames: no gradient step is possible"),
         (recipe, "--buffer-size 16", "buffer_size 16 does not hold one batch of 1024"),
         (recipe, "--final-exploration-noise 0.3", "final_exploration_noise 0.3 must not exceed exploration_noise 0.2"),
-        (recipe, "--num-envs 8 --collectors 3", "num_envs 8 cannot be divided evenly among 3 collectors"),
         (recipe, "--noise 0.05 0.05", "Missing value for argument '--noise'. Expected 3 values"),
         (ppo_anywhere, "--distance-range-km 500 300", "must be two rising numbers, got (500.0, 300.0)"),
         (ppo_anywhere, "--distance-range-km 150 6000", "must end at 4400 km or below, the side of a region"),
@@ -199,47 +197,6 @@ def test_many_kills(tmp_path: Path, same_outcome, seed: int, monkeypatch) -> Non
             survived, process = survived + 1, context.Process(target=recipe.main, args=(["--resume", str(folder)],))
     assert same_outcome(folder, whole)
     assert survived >= 1
-
-
-@pytest.fixture
-def _without_ray():
-    yield
-    if "ray" in sys.modules:
-        sys.modules["ray"].shutdown()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("without_figures", "_without_ray")
-@pytest.mark.parametrize("backend", ["process", "ray"])
-def test_interrupted_training_of_several_processes_resumes(
-    backend: str, tmp_path: Path, signalled, monkeypatch
-) -> None:
-    """Other processes start new episodes; frames and updates add up, and weights that change here act there."""
-    if backend == "ray":
-        pytest.importorskip("ray")
-    made, sizes = {}, {"num_envs": 8, "num_cells": (8,), "batch_size": 16, "init_random_frames": 16, "total_frames": 80}
-    config = small(recipe, tmp_path / "run", collectors=2, collector_backend=backend, updates_per_batch=1, **sizes)
-    with signalled(4, signal.SIGTERM), pytest.raises(SystemExit):
-        recipe.train(config)
-
-    def recorded(name: str) -> None:
-        kind = getattr(recipe, name)
-        monkeypatch.setattr(recipe, name, lambda *args, **options: made.setdefault(name, kind(*args, **options)))
-
-    def turn_right(*_: object, **__: object) -> None:
-        with torch.no_grad():
-            made["TD3Loss"].networks.actor[0].module[-1].bias.fill_(50.0)
-
-    recorded("TD3Loss")
-    recorded("TensorDictReplayBuffer")
-    monkeypatch.setattr(recipe, "optimize", turn_right)
-    recipe.main(["--resume", str(config.out)])
-    result = json.loads((config.out / "eval.json").read_text())
-    assert (result["frames"], result["updates"]) == (80, 9)
-    stored = made["TensorDictReplayBuffer"][:]
-    assert all(len(batch["observation"].unique(dim=0)) == 8 for batch in stored.split(8))
-    assert (stored["action"][: 4 * 8] < 0).any()
-    assert (stored["action"][-8:] > 0.3).all()  # 1, less the noise of exploration
 
 
 @pytest.mark.slow

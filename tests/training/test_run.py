@@ -1,4 +1,4 @@
-"""Runs around a training: folder, settings, noise, resume after any end, and workers."""
+"""Runs around a training: folder, settings, noise, and resume after any end."""
 
 import csv
 import errno
@@ -18,7 +18,6 @@ from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv
 from magrl.training import Run, RunConfig, UsageError, command, curves, run
 from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
-from magrl.training.collectors import worker_seed
 from magrl.training.config import CHANGEABLE, resumed_config
 from magrl.training.curves import TrainingStatistics
 from magrl.training.run import StopRequest, passes_paper
@@ -145,7 +144,7 @@ def test_run_that_ended_before_its_first_checkpoint_starts_again(tmp_path: Path,
 
 @pytest.mark.usefixtures("without_figures")
 def test_training_seconds_count_from_the_start_of_the_run(tmp_path: Path, signalled, monkeypatch) -> None:
-    """Collectors, whose processes may take long to start, and what went before a run was resumed; not the pause."""
+    """Collectors, which may take long to start, and what went before a run was resumed; not the pause."""
     clock = SimpleNamespace(perf_counter=lambda: clock.now, now=500.0)
     for module in (curves, run):
         monkeypatch.setattr(module, "time", clock)
@@ -224,28 +223,3 @@ def test_a_training_that_cannot_write_ends_in_one_line(tmp_path: Path, monkeypat
     *_, line = capsys.readouterr().err.splitlines()
     assert (stop.value.code, line[:9]) == (2, "mine.py: ")
     assert ("No space left on device" if fault == "full disk" else "No such file or directory") in line
-
-
-# Several collecting processes
-
-
-def test_workers_fly_random_tasks_of_their_own() -> None:
-    """None of the tasks of the scenario file, of the validation or the test."""
-    config = recipe.Config(scenario=AZORES, num_envs=8, collectors=2)
-    assert config.load_scenario().tasks is not None
-    base = recipe.GeomagneticNavEnv(config.load_scenario().with_tasks(None))
-    env = recipe.worker_env(config, base.observation_view(), 0)
-    assert len(env.reset()["position"].unique(dim=0)) == 4
-    seeds = [worker_seed(seed, index) for seed in (0, 1, 1_999_999_999) for index in range(3)]
-    assert len(set(seeds)) == len(seeds)
-    assert all(0 <= seed < 2_000_000_000 for seed in seeds)
-
-
-def test_the_vehicles_of_all_workers_end_their_first_episodes_together(tmp_path: Path) -> None:
-    """The environment of the training has as many as they."""
-    with in_run(RunConfig(out=tmp_path / "run", wandb_mode="disabled")) as run:
-        env, collector = GeomagneticNavEnv(num_envs=8, seed=0, max_steps=5), SimpleNamespace(procs=[0, 1])
-        collector.shutdown = lambda: None
-        policy = FieldPolicy(PolicyConfig(env.observation_view(), (8,)))
-        run.start(policy=policy, validation=env, env=env, collector=collector)
-        assert run.statistics.first_cohort == 8 * 5
