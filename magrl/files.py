@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import safetensors.torch
 import torch
+from filelock import AcquireReturnProxy, FileLock, Timeout
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magrl.checks import check_type, short
+from magrl.checks import UsageError, check_type, short
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -372,3 +373,25 @@ def _json(text: str) -> Any:
         return content
 
     return json.loads(text, object_pairs_hook=unique)
+
+
+def locked(folder: Path) -> AcquireReturnProxy:
+    """Claim a run folder for this process until the end of the block of ``with``; a kill releases it too.
+
+    Raises:
+        UsageError: if another process writes it, or it cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, locked(Path(folder)):
+        ...     with locked(Path(folder)):  # doctest: +ELLIPSIS
+        ...         pass
+        Traceback (most recent call last):
+        magrl.checks.UsageError: another process is writing the run folder ...
+    """
+    try:
+        return FileLock(folder / ".lock").acquire(timeout=0)
+    except Timeout as error:
+        raise UsageError(f"another process is writing the run folder {folder}") from error
+    except OSError as error:
+        raise UsageError(f"the run folder {folder} cannot be written ({error.strerror})") from error

@@ -8,11 +8,11 @@ from magrl.navigators.geodesic import Geodesic as Geodesic
 from magrl.navigators.kalman import Anywhere as Anywhere
 from magrl.navigators.kalman import Declaring as Declaring
 from magrl.navigators.kalman import Kalman as Kalman
-from magrl.navigators.mean_jacobian import MeanJacobian as MeanJacobian
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
 from magrl.navigators.parallel import ParallelApproach as ParallelApproach
+from magrl.navigators.quasi_newton import MeanJacobian as MeanJacobian
 from magrl.navigators.quasi_newton import QuasiNewton as QuasiNewton
-from magrl.navigators.secant import Secant as Secant
+from magrl.navigators.quasi_newton import Secant as Secant
 
 _CLASSES: tuple[type[Navigator], ...] = (
     Kalman,

@@ -1,7 +1,11 @@
-"""Quasi-Newton navigation: steps by a Jacobian that a filter estimates along the vehicle's own track."""
+"""Quasi-Newton navigation: steps by a Jacobian that a filter estimates along the vehicle's own track.
+
+Its prior is none, after two probing legs (:class:`Secant`), or a map of twelve numbers (:class:`MeanJacobian`).
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,9 +14,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from magrl import tracking
-from magrl.checks import check_number, check_type
+from magrl.checks import check_number, check_numbers, check_tensor, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.elements import NAMES
+from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
 from magrl.navigators import filter as filtering
 from magrl.navigators.base import Navigator, element_indices
@@ -24,6 +29,8 @@ RANGE_KM = 1000.0
 """Prior standard deviation of the way to the destination along each axis [km]."""
 SLOW_SHARE = 0.25
 """Share of the variance of slow errors that counts as new in each reading; chosen on random planets."""
+SHORTEST_PROBE_KM = 0.5
+"""Length of a probing leg with perfect sensors [km]: the rounding of float32 readings does not matter there."""
 
 
 class QuasiNewton(Navigator):
@@ -213,3 +220,133 @@ def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
     """
     visited = tracking.visit(memory["visited"].double(), displacement(seen))
     memory["visited"] = torch.where((seen["elapsed_steps"] == 0).unsqueeze(-1), memory["visited"].double(), visited)
+
+
+def probe_length(noise: Sequence[float]) -> float:
+    """Return the length of a probing leg [km]: longer legs lengthen the path, shorter ones suffer more from noise.
+
+    The loss by both legs grows with their length p, the loss by the wrong direction with (noise / p)^2, the noise as in
+    :func:`magrl.tracking.sensor_length`; their sum is smallest for p proportional to noise^(2/3). The factor is from
+    simulations.
+
+    Args:
+        noise: standard deviations of D [deg], I [deg], B_H [nT].
+
+    Example:
+        >>> [round(probe_length(std), 1) for std in ((0, 0, 0), (0.02, 0.02, 2), (0.05, 0.05, 5), (0.1, 0.1, 10))]
+        [0.5, 6.1, 11.2, 17.7]
+    """
+    check_numbers(3, 0, noise=noise)
+    length = float(tracking.sensor_length(torch.tensor(noise, dtype=torch.float64)))
+    return max(SHORTEST_PROBE_KM, 5.0 * length ** (2 / 3))
+
+
+class Secant(QuasiNewton):
+    """Quasi-Newton navigation with a Jacobian estimated along the vehicle's own track: no map, no training, no oracle.
+
+    Two short legs across each other give a first Jacobian of the elements by north and east. From then on each move is
+    a quasi-Newton step to the destination's elements, and each reading corrects the Jacobian.
+
+    Args:
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+        probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest move.
+        elements: all three by default, each weighted by how well it determines the way; or two of them.
+        sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
+        **options: ``zeta`` and ``search`` of :class:`QuasiNewton`.
+
+    Raises:
+        ValueError: for a bound or a leg out of its range, fewer than two elements, or a negative standard deviation.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> env.rollout(2, Secant())["action"][0].round(decimals=2)
+        tensor([[0.5000, 0.0000],
+                [0.5000, 1.5700]])
+    """
+
+    def __init__(
+        self,
+        max_move_km: float = 50.0,
+        max_turn_rad: float = math.pi / 2,
+        probe_km: float | None = None,
+        elements: Sequence[str] = NAMES,
+        sensor_std: SensorStd | Sequence[float] = PERFECT,
+        **options: Any,
+    ) -> None:
+        super().__init__(max_move_km, max_turn_rad, elements, sensor_std, **options)
+        noise = SensorStd.of(sensor_std).noise
+        probe_km = min(probe_length(noise), self.max_move_km) if probe_km is None else probe_km
+        check_number(0, max_move_km, above=True, probe_km=probe_km)
+        self.probe_km, self.probe_turn = float(probe_km), min(math.pi / 2, self.max_turn_rad)
+
+    def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
+        std = reading.new_tensor([tracking.SLOPES[i] for i in self.elements]).unsqueeze(-1).expand(-1, 2)
+        return GradientPrior(torch.zeros_like(std), std)
+
+    def move(self, track: FieldTrack, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:
+        distance, turn = super().move(track, seen, memory)
+        decisions = memory["decisions"]
+        probing, probe_turn = decisions <= 2, torch.where(decisions == 2, self.probe_turn, 0.0)
+        return torch.where(probing, self.probe_km, distance), torch.where(probing, probe_turn, turn)
+
+    name = label = "secant"
+    description = "secant (quasi-Newton)"
+
+
+class MeanJacobian(QuasiNewton):
+    """Quasi-Newton navigation from the mean Jacobian of a region, without probing legs.
+
+    The map is twelve numbers: mean and standard deviation over the region of the gradients of D, I, B_H northward and
+    eastward. An agent that is trained in one region can learn as much.
+
+    Args:
+        field: field model, usually ``env.field``.
+        position: ``(..., 2)`` places to average over, latitude, longitude [deg], usually ``env.region.grid(21)``.
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn [rad].
+        **options: ``sensor_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
+
+    Raises:
+        ValueError: for a bound out of its range, fewer than two places, or a negative standard deviation.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> env.rollout(50, MeanJacobian(env.field, env.region.grid(21)))["next", "success"].any()
+        tensor(True)
+    """
+
+    needs = "a map of the region"
+
+    def __init__(
+        self,
+        field: FieldModel,
+        position: Tensor,
+        max_move_km: float = 50.0,
+        max_turn_rad: float = math.pi / 2,
+        **options: Any,
+    ) -> None:
+        super().__init__(max_move_km, max_turn_rad, **options)
+        if not hasattr(field, "value_and_gradient"):
+            raise ValueError(f"field must have value_and_gradient(latitude, longitude), got {field!r}")
+        check_tensor(2, position=position)
+        if position.numel() < 4:
+            raise ValueError(f"position must hold at least two places (..., 2), got shape {tuple(position.shape)}")
+        gradients = elements_gradient_at(field, position.reshape(-1, 2).double())
+        self.register_buffer("mean", gradients.mean(0))
+        self.register_buffer("std", gradients.std(0))
+
+    def prior(self, reading: Tensor, target: Tensor) -> GradientPrior:  # noqa: ARG002
+        return GradientPrior(self.mean, self.std)
+
+    name, label = "mean_jacobian", "mean Jacobian"
+    description = "mean Jacobian (quasi-Newton)"
+
+    @staticmethod
+    def env_options(env: GeomagneticNavEnv, sensor_std: SensorStd) -> dict[str, Any]:
+        if len(env.region) > 1:
+            raise ValueError(f"mean_jacobian needs a map of one region, and the scenario has {len(env.region)}")
+        options = {"field": env.field, "position": env.region.grid(21).to(env.device)}
+        return options | QuasiNewton.env_options(env, sensor_std)

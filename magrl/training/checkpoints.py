@@ -1,4 +1,4 @@
-"""Run folders with their lock, and checkpoints that resume a training exactly where it stopped.
+"""Run folders, and checkpoints that resume a training exactly where it stopped.
 
 A checkpoint is one file, written under another name, synchronized and renamed, so that it is either complete or absent.
 It holds tensors, numbers and text only.
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from filelock import AcquireReturnProxy, FileLock, Timeout
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -53,28 +52,6 @@ def create_run_folder(path: Path | str) -> Path:
     except OSError as error:
         raise UsageError(f"the run folder {path} cannot be made ({error.strerror}): choose another --out") from error
     return path
-
-
-def locked(folder: Path) -> AcquireReturnProxy:
-    """Claim a run folder for this process until the end of the block of ``with``; a kill releases it too.
-
-    Raises:
-        UsageError: if another process writes it, or it cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder, locked(Path(folder)):
-        ...     with locked(Path(folder)):  # doctest: +ELLIPSIS
-        ...         pass
-        Traceback (most recent call last):
-        magrl.checks.UsageError: another process is writing the run folder ...
-    """
-    try:
-        return FileLock(folder / ".lock").acquire(timeout=0)
-    except Timeout as error:
-        raise UsageError(f"another process is writing the run folder {folder}") from error
-    except OSError as error:
-        raise UsageError(f"the run folder {folder} cannot be written ({error.strerror})") from error
 
 
 class Stateful(Protocol):

@@ -32,9 +32,9 @@ from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.evaluation.flight import Flight
 from magrl.evaluation.metrics import episode_measures, summarize
 from magrl.evaluation.rollout import evaluation_rollout
-from magrl.files import write_json
+from magrl.files import locked, write_json
 from magrl.navigators import Anywhere
-from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder, locked
+from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RunConfig
 from magrl.training.curves import RETURN_TERMS, BestPolicy, RunLog, TrainingStatistics, selection_score
 from magrl.training.loggers import open_log

@@ -23,7 +23,7 @@ from magrl.evaluation.navigators import (
 )
 from magrl.evaluation.scenarios import choose_tasks, first_tasks
 from magrl.navigators import NAVIGATORS, Anywhere
-from magrl.navigators.secant import probe_length
+from magrl.navigators.quasi_newton import probe_length
 from magrl.sensor_std import SensorStd
 from magrl.tracking.network import pretrained
 from magrl.transforms import ReadingView

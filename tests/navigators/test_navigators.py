@@ -16,7 +16,7 @@ from magrl.field import elements_gradient_at
 from magrl.geodesy import steer
 from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant
 from magrl.navigators.base import displacement_to
-from magrl.navigators.secant import probe_length
+from magrl.navigators.quasi_newton import probe_length
 from magrl.transforms import Conditions, SensorErrors, with_conditions
 
 

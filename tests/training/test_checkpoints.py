@@ -12,10 +12,10 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from magrl.envs import GeomagneticNavEnv
-from magrl.files import save_tensors
+from magrl.files import locked, save_tensors
 from magrl.training import UsageError
 from magrl.training import checkpoints as module
-from magrl.training.checkpoints import PRIVATE, Checkpoints, RunningEpisodes, create_run_folder, locked, read_checkpoint
+from magrl.training.checkpoints import PRIVATE, Checkpoints, RunningEpisodes, create_run_folder, read_checkpoint
 
 # Run folders
 

@@ -16,8 +16,9 @@ from torchrl.collectors import Collector
 
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv
+from magrl.files import locked
 from magrl.training import Run, RunConfig, UsageError, command, curves, run
-from magrl.training.checkpoints import Checkpoints, create_run_folder, locked
+from magrl.training.checkpoints import Checkpoints, create_run_folder
 from magrl.training.config import CHANGEABLE, resumed_config
 from magrl.training.curves import TrainingStatistics
 from magrl.training.run import StopRequest, passes_paper

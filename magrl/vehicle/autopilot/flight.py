@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from magrl.checks import short
-from magrl.files import write_atomically
-from magrl.training.checkpoints import locked
+from magrl.files import locked, write_atomically
 from magrl.vehicle.autopilot.loop import LOG, Loop, Measurement, clock, tolerated
 from magrl.vehicle.onboard import Command
 
