@@ -41,7 +41,6 @@ from magrl.files import check_writable, write_json
 from magrl.sensor_std import PERFECT, Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
-from magrl.training.loggers import WandbMode, WandbRun, check_logger
 
 import torch
 import tyro
@@ -104,8 +103,6 @@ class Config(ScenarioOptions):
     """Random seed of metaheuristics, sensor noise and random start headings."""
     out: Path = field(default_factory=free_folder)
     """Folder of the results, new or empty; by default the first free one of runs/evaluation, runs/evaluation-2, ..."""
-    wandb_mode: WandbMode = "offline"
-    """Mode of wandb: offline needs no network and no login, disabled writes nothing."""
 
 
 @dataclass
@@ -160,7 +157,6 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
     if not config.navigators:
         raise UsageError("name at least one navigator, for example: secant")
     try:
-        check_logger("wandb", config.wandb_mode)
         if config.export:
             export.check_suffix(config.export)
         check_distinct(config.navigators)
@@ -235,16 +231,9 @@ def north(flight: Flight) -> str:
     return "magnetic" if flight.sensor_std.magnetic else "true"
 
 
-def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]) -> None:
-    """Write the files of the results, and the runs as a table in wandb."""
+def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
+    """Return what is written below a table: the errors of the vehicles, their rule of arrival, and notes."""
     env = flight.base
-    for name, rows in (("episodes", results.episodes), ("runs", results.runs), ("paths", results.paths)):
-        with (config.out / f"{name}.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-    write_json(config.out / "summary.json", results.summaries)
-    write_json(config.out / "settings.json", settings(config, flight))
     text, noisy = "{:g} deg, {:g} deg, {:g} nT".format, not isinstance(config.errors, str) and any(config.errors or ())
     lines = {
         "Arrival": env.arrival.rule != "objective" and f"{env.arrival.rule}, within {env.arrival.radius_km:g} km",
@@ -255,8 +244,21 @@ def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]
         "Known start, standard deviations of D, I, B_H": config.known_start and text(*config.known_start),
         "Standard deviations of the noise on D, I and B_H": noisy and text(*config.errors),
     }
-    below = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)
-    below += "".join(f"\nNote: {note}.\n" for note in notes)
+    told = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)
+    return told + "".join(f"\nNote: {note}.\n" for note in notes)
+
+
+def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]) -> None:
+    """Write the files of the results."""
+    env = flight.base
+    for name, rows in (("episodes", results.episodes), ("runs", results.runs), ("paths", results.paths)):
+        with (config.out / f"{name}.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    write_json(config.out / "summary.json", results.summaries)
+    write_json(config.out / "settings.json", settings(config, flight))
+    below = text_below(config, flight, notes)
     ahead = config.kilometers or env.arrival.rule != "objective"
     whole = comparison_table(results.summaries, published=not config.scenario, kilometers=ahead)
     (config.out / "table.md").write_text(whole + below)
@@ -265,9 +267,6 @@ def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]
     figure.savefig(config.out / "trajectories.png", dpi=120)
     if config.export:
         export.write_tracks(config.export, results.tracks)
-    run = WandbRun(config.out, config.wandb_mode, settings(config, flight), "evaluation", list(results.summaries))
-    run.table("eval/navigators", results.runs)
-    run.close()
 
 
 def main(args: Sequence[str] | None = None) -> None:

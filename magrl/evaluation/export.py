@@ -90,8 +90,7 @@ def to_geojson(tracks: Sequence[Track]) -> str:
     for track in tracks:
         properties = {"name": track.name, **json_ready(track.properties)}
         features.append({"type": "Feature", "geometry": _geometry(track), "properties": properties})
-    text = json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False)
-    return text.replace("<", "\\u003c") + "\n"  # no text can end a script element that holds the data
+    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
 
 
 def _geometry(track: Track) -> dict[str, Any]:

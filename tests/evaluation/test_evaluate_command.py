@@ -83,7 +83,6 @@ def test_settings_state_what_was_flown(results: Path) -> None:
     assert settings["navigators"] == ["gg_td3=noisy", "secant", "pso", "afsa"]
     expected = {"zeta": 0.02, "errors": list(NOISE), "start_heading": "random", "scenario": None, "tasks_seed": 0}
     assert settings.items() >= expected.items()
-    assert list((results / "wandb").glob("offline-run-*/files/media/table/eval/navigators*.json"))
 
 
 OWN = """date = 2026-07-01
@@ -101,7 +100,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     """The destination, seven degrees north of the region, needs a wider margin than the five of the default."""
     path, out, tracks = tmp_path / "own.toml", tmp_path / "out", tmp_path / "maps" / "tracks.geojson"
     path.write_text(OWN)
-    config = {"scenario": path, "out": out, "wandb_mode": "disabled", "export": tracks}
+    config = {"scenario": path, "out": out, "export": tracks}
     with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5 to at least 7\.5$"):
         evaluate.evaluate(evaluate.Config(("secant",), **config))
     options = {"margin_deg": 8.0, "max_steps": 20, "max_turn_deg": 120.0, "start_heading": "random"}
@@ -148,7 +147,7 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
 )
 def test_bad_usage_is_refused_before_anything_is_flown(navigators, options, message, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(evaluate.Flight, "fly", lambda *_: pytest.fail("something was flown"))
-    given = {"tasks": "figure-4-1", "out": tmp_path / "out", "wandb_mode": "disabled"} | options
+    given = {"tasks": "figure-4-1", "out": tmp_path / "out"} | options
     if "scenario" in options:
         given["tasks"] = None
     with pytest.raises(UsageError, match=message):

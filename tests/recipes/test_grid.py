@@ -288,7 +288,7 @@ def test_evaluations_are_tables_and_figures_of_section_4(tmp_path: Path, monkeyp
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("evaluate.trajectories_figure", lambda *_, **__: Figure())
     navigators = ["secant", "parallel"]
-    table = grid.evaluation(navigators, folder=Path("runs/comparison"), tasks=3, wandb_mode="disabled")
+    table = grid.evaluation(navigators, folder=Path("runs/comparison"), tasks=3)
     assert [list(episodes) for episodes in table.episodes] == [list(COLUMNS)]
     assert len(table.episodes[0]) == 6
     assert [row[0] for row in rows(table.text)[2:4]] == ["secant (quasi-Newton)", "parallel (true gradient, an oracle)"]
