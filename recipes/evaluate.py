@@ -14,7 +14,7 @@ are those of the training, from the file of the policy. If the runs differ in on
 below the table names the settings that an option overrides.
 Metaheuristics read the field at the end of every candidate leg for free (an oracle).
 
-Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, settings.json, table.md, short.md and
+Writes episodes.csv, runs.csv, paths.csv (the paper's example task), summary.json, settings.json, table.md and
 trajectories.png (the first tasks of each navigator).
 """
 
@@ -36,7 +36,7 @@ from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import check_distinct, label, training_settings
 from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
-from magrl.evaluation.tables import comparison_table, short_table
+from magrl.evaluation.tables import comparison_table
 from magrl.files import check_writable, write_json
 from magrl.sensor_std import PERFECT, Noise
 from magrl.training import UsageError, command, parse
@@ -258,11 +258,9 @@ def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]
             writer.writerows(rows)
     write_json(config.out / "summary.json", results.summaries)
     write_json(config.out / "settings.json", settings(config, flight))
-    below = text_below(config, flight, notes)
     ahead = config.kilometers or env.arrival.rule != "objective"
     whole = comparison_table(results.summaries, published=not config.scenario, kilometers=ahead)
-    (config.out / "table.md").write_text(whole + below)
-    (config.out / "short.md").write_text(short_table(results.summaries, kilometers=ahead) + below)
+    (config.out / "table.md").write_text(whole + text_below(config, flight, notes))
     figure = trajectories_figure(results.rollouts, env.field, env.region, names=env.scenario.names)
     figure.savefig(config.out / "trajectories.png", dpi=120)
     if config.export:

@@ -331,8 +331,7 @@ class Run:
         rollout = evaluation_rollout(test, self.policy)
         result = summarize(episode_measures(rollout)) | {"seed": self.config.seed, "tasks_seed": paper.TEST_SEED}
         result |= {key: getattr(self.statistics, key) for key in ("frames", "episodes", "updates")}
-        reached = next((row["seconds"] for row in self.log.rows if passes_paper(row)), math.nan)
-        result |= {"training_seconds": seconds, "seconds_to_97_sr_88_spl": reached}
+        result["training_seconds"] = seconds
         if len(test.region) == 1:
             shown = rollout if self._scenario_env is None else evaluation_rollout(self._scenario_env, self.policy)
             figure = maps.trajectories_figure(shown, test.field, test.region, names=self.scenario.names)
@@ -367,15 +366,3 @@ class Run:
                 "increase total_frames (and total_episodes), or reduce batch_size",
                 file=sys.stderr,
             )
-
-
-def passes_paper(row: dict[str, float]) -> bool:
-    """Return whether a row of curves reaches the paper's success rate and SPL.
-
-    Example:
-        >>> passes_paper({"eval_success_rate": 98.0, "eval_spl": 90.0})
-        True
-    """
-    published = paper.TABLE_2["gg_td3"]
-    rate, spl = (row.get(f"eval_{name}", 0.0) for name in ("success_rate", "spl"))
-    return rate >= published.success_rate and spl >= round(published.spl, 1)

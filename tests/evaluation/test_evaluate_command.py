@@ -62,8 +62,6 @@ def test_tables_have_the_papers_row_and_notes(results: Path) -> None:
     labels = [line.split("|")[1].strip() for line in lines[2:9]]
     assert labels[:2] == ["Gradient-Guided TD3, paper", "Gradient-Guided TD3"]
     assert lines[2].split("|")[5:9] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
-    short = (results / "short.md").read_text().splitlines()
-    assert [line.split("|")[1].strip() for line in short[2:6]] == [name for name in labels if ", paper" not in name]
     assert "Standard deviations of the noise on D, I and B_H: 0.05 deg, 0.05 deg, 5 nT." in lines
     assert (results / "trajectories.png").stat().st_size > 10_000
 
