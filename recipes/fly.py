@@ -80,7 +80,7 @@ class Config:
     zeta: float | None = None
     """Arrival threshold on the objective (Eq. 2-7); by default 0.01, and beyond 400 km less, for a radius of 25 km."""
     max_steps: int | None = None
-    """Maximum number of moves; by default 20 more than three times the shortest path at 50 km a move."""
+    """Maximum number of legs; by default 20 more than three times the shortest path at 50 km a leg."""
     start_heading: float | Literal["random"] = "random"
     """Heading at the start, from true north [deg]; random by default."""
     seed: int = 0

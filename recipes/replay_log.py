@@ -5,7 +5,7 @@
     python recipes/replay_log.py track.csv --declination dec_deg --horizontal H_nT --every-km 20
     python recipes/replay_log.py track.csv --north magnetic --noise 0 0.1 20     # as a vehicle without true north
 
-Each row of the log holds a reading of D [deg], I [deg], B_H [nT], and the heading [deg] and the length [km] of the move
+Each row of the log holds a reading of D [deg], I [deg], B_H [nT], and the heading [deg] and the length [km] of the leg
 since the row before; in the first row, the length is 0. The destination is that of the last row, unless --target gives
 its elements. With --north magnetic, D only converts the headings: the navigator gets I, B_H and headings from
 magnetic north, whatever the north of the log is. Where the log has positions, the estimates are compared with them; the
@@ -72,7 +72,7 @@ class Config:
     radius_km: float = 25.0
     """Arrival radius around the destination [km]."""
     every_km: float = 0.0
-    """Minimum length of a move [km]; readings of shorter moves are averaged."""
+    """Minimum length of a leg [km]; readings of shorter legs are averaged."""
     date: str | None = None
     """Date of the log, for IGRF; by default from the column of the time, if it has dates."""
     start_km: float | None = None
@@ -88,9 +88,9 @@ class Config:
     horizontal: str = "B_H"
     """Column of the horizontal intensity [nT]."""
     heading: str = "heading"
-    """Column of the heading of the move from the previous row [deg]."""
+    """Column of the heading of the leg from the previous row [deg]."""
     distance: str = "distance"
-    """Column of the length of the move from the previous row [km]."""
+    """Column of the length of the leg from the previous row [km]."""
     latitude: str = "latitude"
     """Column of the true latitude [deg]; optional, together with the longitude."""
     longitude: str = "longitude"

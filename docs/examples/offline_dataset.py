@@ -58,7 +58,7 @@ class Config(CheckedModel):
     distance_range_km: Rising = paper.DISTANCE_KM
     """Shortest and longest distance from start to destination [km]."""
     max_steps: Count = 50
-    """Moves after which an episode is truncated."""
+    """Legs after which an episode is truncated."""
     seed: Seed = 0
     """Random seed of regions, tasks, start headings, noise and random actions, below those of evaluations."""
     out: Path = Path("runs/minari")

@@ -152,7 +152,7 @@ class Command(nn.Module):
         self.limits, self.heads = (view.max_move_km, view.max_turn_rad), "heading" in view.keys
 
     def forward(self, estimate: Tensor, correction: Tensor, observation: Tensor) -> Tensor:
-        """``(..., 2)`` in units of the longest move."""
+        """``(..., 2)`` in units of the longest leg."""
         move = estimate + correction
         (ahead, aside), distance = move.unbind(-1), self.limits[0] * torch.linalg.vector_norm(move, dim=-1)
         now = observation[..., -1] if self.heads else torch.zeros_like(ahead)
@@ -178,7 +178,7 @@ class Spread(nn.Module):
 def make_memory(width: int) -> TensorDictSequential:
     """Return the network from observations to its memory and the estimated way ``(..., 2)``.
 
-    The estimate is 1 long where the destination is farther than the longest move. It is shorter where the direction is
+    The estimate is 1 long where the destination is farther than the longest leg. It is shorter where the direction is
     not known well, so that the vehicle starts with short moves.
     """
     keys = {"in_keys": ["encoded", "hidden"], "out_keys": ["memory", ("next", "hidden")]}

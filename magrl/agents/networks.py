@@ -56,7 +56,7 @@ def make_actor(
 ) -> TensorDictSequential:
     """Return a deterministic actor: ``observation`` ``(..., K)`` to ``logits`` and ``action`` ``(..., 2)``.
 
-    The action is the tanh of the logits. The output bias starts at zero: half the longest move, no turn.
+    The action is the tanh of the logits. The output bias starts at zero: half the longest leg, no turn.
 
     Args:
         observation_size: number of entries K of the observation.
@@ -83,7 +83,7 @@ class CorrectedMove(nn.Module):
     """The action of a plan and its correction, scaled to [-1, 1]; see :func:`magrl.tracking.corrected`.
 
     Args:
-        rules: limits of the move.
+        rules: limits of the leg.
 
     Example:
         >>> CorrectedMove(Rules(max_turn_rad=1.5))(torch.tensor([25.0, 0.0]), torch.zeros(1), torch.zeros(2))
@@ -107,7 +107,7 @@ def make_correcting_actor(network: nn.Module, rules: Rules) -> TensorDictSequent
 
     Args:
         network: from ``observation`` to a correction (:func:`magrl.tracking.correction_network`).
-        rules: limits of the move.
+        rules: limits of the leg.
 
     Example:
         >>> from magrl.tracking import correction_network

@@ -23,7 +23,7 @@ LEVELS: tuple[Noise, ...] = (PERFECT.noise, (0.05, 0.05, 5.0), (0.5, 0.1, 20.0))
 VEHICLES = ("aircraft", "ship", "underwater", "low-cost")
 """Conditions of vehicles with true north."""
 DRIFT_KM = 40.0
-"""How much farther than the longest move errors may carry a vehicle [km], for one environment under all conditions."""
+"""How much farther than the longest leg errors may carry a vehicle [km], for one environment under all conditions."""
 SEED = 3 * paper.FIRST_RESERVED_SEED
 """Seed of regions and tasks, beyond those of trainings and of frozen sets."""
 READINGS = (*PUBLIC_KEYS, "elapsed_steps")
@@ -50,7 +50,7 @@ class Track:
     distance_km: Sequence[float] = paper.DISTANCE_KM
     """Shortest and longest distance of a task [km]."""
     max_steps: int = 50
-    """Moves after which an episode ends."""
+    """Legs after which an episode ends."""
     within_km: float | None = None
     """Radius in which vehicles declare their arrival [km]; by default they get a signal, by the paper's rule."""
     confidence: float = 0.0

@@ -117,13 +117,12 @@ def _resampled(values: Tensor, resamples: int, generator: torch.Generator) -> Te
     return values.cpu().double()[draws]
 
 
-def wilson_interval(rate: float, count: int, z: float = 1.96) -> tuple[float, float]:
-    """Return Wilson's score interval of a proportion.
+def wilson_interval(rate: float, count: int) -> tuple[float, float]:
+    """Return Wilson's score 95 % interval of a proportion.
 
     Args:
         rate: observed proportion, in [0, 1].
         count: number of trials.
-        z: normal quantile; 1.96 for 95 %.
 
     Returns:
         Low and high end, in [0, 1].
@@ -140,6 +139,7 @@ def wilson_interval(rate: float, count: int, z: float = 1.96) -> tuple[float, fl
     """
     check_number(0, 1, rate=rate)
     check_number(1, whole=True, count=count)
+    z = 1.96  # normal quantile
     center = rate + z**2 / (2 * count)
     half = z * math.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
     scale = 1 + z**2 / count

@@ -92,13 +92,13 @@ def episode_measures(rollout: TensorDictBase) -> dict[str, Tensor]:
 
 
 def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Return distance [km] and direction [rad] of moves over the ground, ``(...)`` each, in float64.
+    """Return distance [km] and direction [rad] of legs over the ground, ``(...)`` each, in float64.
 
     They are what the policy commanded (``move``, ``heading``), unless errors of motion or of the north reference keep
     what is true.
 
     Args:
-        steps: what follows the moves, usually ``rollout["next"]``.
+        steps: what follows the legs, usually ``rollout["next"]``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -112,7 +112,7 @@ def moved(steps: TensorDictBase) -> tuple[Tensor, Tensor]:
 
 
 def _turns(heading: Tensor, moving: Tensor) -> Tensor:
-    """Return the turn between each move and the last move of nonzero length before it, ``(M, T)`` [deg] or NaN."""
+    """Return the turn between each leg and the last leg of nonzero length before it, ``(M, T)`` [deg] or NaN."""
     index = torch.arange(heading.shape[1], device=heading.device).expand_as(heading)
     latest = torch.where(moving, index, -1).cummax(1).values
     previous = torch.cat((torch.full_like(latest[:, :1], -1), latest[:, :-1]), 1)

@@ -160,7 +160,7 @@ def region_around(start: Tensor, target: Tensor, field: FieldModel, max_move_km:
         start: ``(2,)`` latitude, longitude [deg].
         target: ``(2,)`` latitude, longitude [deg].
         field: field model.
-        max_move_km: longest move, which may lead out of the box [km].
+        max_move_km: longest leg, which may lead out of the box [km].
 
     Raises:
         ValueError: if the declination jumps between them.

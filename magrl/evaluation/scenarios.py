@@ -35,11 +35,11 @@ class ScenarioOptions:
     radius_km: float | None = None
     """Arrival radius around the destination, for --arrival distance and declared [km]; 25 by default."""
     max_steps: int | None = None
-    """Maximum number of moves in an episode; 50 by default."""
+    """Maximum number of legs in an episode; 50 by default."""
     max_move_km: float | None = None
-    """Longest move [km]; 50 by default."""
+    """Longest leg [km]; 50 by default."""
     max_turn_deg: float | None = None
-    """Largest turn to either side before a move [deg]; 90 by default."""
+    """Largest turn to either side before a leg [deg]; 90 by default."""
     altitude_km: float | None = None
     """Altitude above the ellipsoid, negative for a depth [km]; 0 by default."""
     margin_deg: float | None = None

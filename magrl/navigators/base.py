@@ -65,13 +65,13 @@ class Navigator(TensorDictModuleBase):
     """Base class of untrained policies: action bounds, and a memory of each vehicle for the length of an episode.
 
     A subclass sets its ``in_keys``, returns the memory at the start of an episode (``elapsed_steps`` 0) in
-    :meth:`first_memory`, and chooses the next move in :meth:`decide`. :meth:`decide` is called once for each step of a
+    :meth:`first_memory`, and chooses the next leg in :meth:`decide`. :meth:`decide` is called once for each step of a
     vehicle, so that calling the navigator twice on one state changes nothing; if ``done`` is among the ``in_keys``, it
     is not called after the end of an episode. With the class attributes below, and a place in the list of
     :data:`magrl.navigators.NAVIGATORS`, commands, tables and figures know it by its name.
 
     Args:
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:

@@ -29,7 +29,7 @@ class DeadReckoning(Navigator):
     the arrival must be declared, it declares at the reckoned destination.
 
     Args:
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         declares: whether the action has a third number, which declares the arrival.
         chart: model of the Earth (:func:`magrl.tracking.earth_model`), of which it reads the declination.

@@ -16,7 +16,7 @@ class Geodesic(Navigator):
     """Fly the shortest path to the destination's position: an oracle, which needs no field.
 
     Args:
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
 
     Raises:

@@ -30,7 +30,7 @@ class ParallelApproach(Navigator):
 
     Args:
         field: field model or bank of them, usually ``env.field``.
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         pair: two elements whose errors shrink in proportion, ``("D", "I")`` in the paper; all three for None.
 

@@ -34,9 +34,9 @@ SHORTEST_PROBE_KM = 0.5
 
 
 class QuasiNewton(Navigator):
-    """Base class of quasi-Newton navigators: each move goes to where the estimated Jacobian predicts no error.
+    """Base class of quasi-Newton navigators: each leg goes to where the estimated Jacobian predicts no error.
 
-    The filter (:mod:`magrl.navigators.filter`) weighs each reading by its noise and the length of the move, and each
+    The filter (:mod:`magrl.navigators.filter`) weighs each reading by its noise and the length of the leg, and each
     element by how well it determines the way. Without noise, the first update is Broyden's. With ``search``, the way is
     that to the most probable destination, given that the episode has not ended at the places where the vehicle has been
     (:func:`~magrl.tracking.unvisited`).
@@ -44,7 +44,7 @@ class QuasiNewton(Navigator):
     A subclass returns the prior of the Jacobian in :meth:`prior`.
 
     Args:
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         elements: two or three of D, I, B_H.
         sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
@@ -149,7 +149,7 @@ class QuasiNewton(Navigator):
         return self.steer(seen, aim, aim.norm(dim=-1))
 
     def aim(self, track: FieldTrack, way: Way, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
-        """Return the way ``(N, 2)`` [km] to the most probable destination; remember the end of the last move."""
+        """Return the way ``(N, 2)`` [km] to the most probable destination; remember the end of the last leg."""
         visit_place(seen, memory)
         if not self.search:
             return way.displacement
@@ -158,7 +158,7 @@ class QuasiNewton(Navigator):
         return tracking.unvisited(way, memory["visited"], ellipse)
 
     def steer(self, seen: TensorDictBase, direction: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """Return distance [km] and turn [rad] of a move in a direction ``(N, 2)`` northward and eastward."""
+        """Return distance [km] and turn [rad] of a leg in a direction ``(N, 2)`` northward and eastward."""
         heading = seen["heading"].squeeze(-1).double()
         wanted = torch.atan2(direction[:, 1], direction[:, 0])
         return steer(heading, wanted, distance, self.max_move_km, self.max_turn_rad)
@@ -207,7 +207,7 @@ def first_places(seen: TensorDictBase, zeta: float) -> dict[str, Tensor]:
 
 
 def visit_place(seen: TensorDictBase, memory: TensorDictBase) -> None:
-    """Remember that the vehicle has been at the end of its last move.
+    """Remember that the vehicle has been at the end of its last leg.
 
     Example:
         >>> from tensordict import TensorDict
@@ -244,13 +244,13 @@ def probe_length(noise: Sequence[float]) -> float:
 class Secant(QuasiNewton):
     """Quasi-Newton navigation with a Jacobian estimated along the vehicle's own track: no map, no training, no oracle.
 
-    Two short legs across each other give a first Jacobian of the elements by north and east. From then on each move is
+    Two short legs across each other give a first Jacobian of the elements by north and east. From then on each leg is
     a quasi-Newton step to the destination's elements, and each reading corrects the Jacobian.
 
     Args:
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
-        probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest move.
+        probe_km: length of the two legs [km]; for None that of :func:`probe_length`, at most the longest leg.
         elements: all three by default, each weighted by how well it determines the way; or two of them.
         sensor_std: accuracy of the sensors; three numbers are white noise of D [deg], I [deg], B_H [nT].
         **options: ``zeta`` and ``search`` of :class:`QuasiNewton`.
@@ -304,7 +304,7 @@ class MeanJacobian(QuasiNewton):
     Args:
         field: field model, usually ``env.field``.
         position: ``(..., 2)`` places to average over, latitude, longitude [deg], usually ``env.region.grid(21)``.
-        max_move_km: longest move [km].
+        max_move_km: longest leg [km].
         max_turn_rad: largest turn [rad].
         **options: ``sensor_std``, ``zeta`` and ``search`` of :class:`QuasiNewton`.
 

@@ -145,7 +145,7 @@ class RunConfig(CheckedModel):
 
 
 class PlanetConfig(RunConfig):
-    """Settings of PPO recipes that train on random planets and learn corrections of moves.
+    """Settings of PPO recipes that train on random planets and learn corrections of legs.
 
     Example:
         >>> PlanetConfig(max_move_km=10.0, drift=0.1).limits
@@ -157,9 +157,9 @@ class PlanetConfig(RunConfig):
     final_learning_rate: Positive = 1e-5
 
     max_move_km: Positive = 50.0
-    """Longest move [km]."""
+    """Longest leg [km]."""
     max_turn_deg: Annotated[float, Field(gt=0, le=180)] = 90.0
-    """Largest turn to either side before a move [deg]."""
+    """Largest turn to either side before a leg [deg]."""
     drift: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Speed of a current relative to the vehicle's speed; its direction is random in each episode."""
     num_regions: Count = 1024
@@ -167,7 +167,7 @@ class PlanetConfig(RunConfig):
     distance_range_km: Rising = (300.0, 500.0)
     """Shortest and longest distance of a task [km]."""
     max_steps: Count = 50
-    """Moves after which an episode is truncated."""
+    """Legs after which an episode is truncated."""
     noise_exponent: Positive = 1.0
     """Exponent of the random noise levels; larger values give more noise (magrl.transforms.sensor_levels)."""
     steps_per_batch: Count = 32

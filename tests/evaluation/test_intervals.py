@@ -16,11 +16,6 @@ def test_wilson_interval() -> None:
         assert wilson_interval(rate, count) == pytest.approx(expected, abs=1e-4)
 
 
-def test_wilson_interval_of_half_a_standard_error() -> None:
-    """By hand: center 0.2125, half-width 0.06447, both over 1.025."""
-    assert wilson_interval(0.2, 10, z=0.5) == pytest.approx((0.14442, 0.27021), abs=1e-5)
-
-
 def test_wilson_interval_stays_within_all_and_nothing() -> None:
     assert all(wilson_interval(1.0, count)[1] <= 1 for count in range(1, 500))
     assert all(wilson_interval(0.0, count)[0] >= 0 for count in range(1, 500))
@@ -34,11 +29,6 @@ def test_bootstrap_interval_of_a_known_spread() -> None:
     assert low == pytest.approx(values.mean().item() - half, abs=0.005)
     assert high == pytest.approx(values.mean().item() + half, abs=0.005)
     assert bootstrap_interval(values) == bootstrap_interval(values, 1000, 0) == (low, high)
-
-
-def test_bootstrap_interval_of_one_draw_is_that_draw() -> None:
-    low, high = bootstrap_interval(torch.arange(10.0), resamples=1)
-    assert low == high
 
 
 def test_interquartile_mean_by_hand() -> None:
@@ -93,13 +83,6 @@ def test_stratified_bootstrap_shrinks_holds_the_mean_and_repeats() -> None:
     assert stratified_bootstrap([values], seed=1) != (low, high)
     assert all(0.3 < ratio < 0.75 for ratio in ratios), ratios  # four times the runs, half the width
     assert all(math.isnan(end) for end in stratified_bootstrap([torch.tensor([1.0, math.nan])]))
-
-
-def test_stratified_bootstrap_holds_the_truth() -> None:
-    """In 95 % of 300 experiments of 20 normal scores: 285, and 271 or more in all but one of 10 000 repetitions."""
-    draws = torch.randn(300, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ends = [stratified_bootstrap([row], resamples=500) for row in draws]
-    assert 271 <= sum(low <= 0 <= high for low, high in ends) <= 297
 
 
 @pytest.mark.parametrize(
