@@ -15,6 +15,8 @@ import pytest
 import torch
 from support.public_names import public_members
 
+from magrl.field import IGRF
+
 HOMES = ("geodesy", "guidance", "field", "transforms", "envs", "navigators")
 PLACES = torch.zeros(4)
 VALUES: dict[str, Any] = {
@@ -40,7 +42,7 @@ VALUES: dict[str, Any] = {
     "count": 1,
     "seed": 0,
 }
-BOX = (0.0, 10.0)
+OF_KIND = {"tuple[float, float]": (0.0, 10.0), "FieldModel": IGRF("2026-07-01")}
 UNCHECKED = {"weight", "offset", "gain", "max_episode_steps"}
 """Factors that may be any number, and a name for ``max_steps``."""
 SIGNED = {"seed", "field_low", "field_high"}
@@ -76,8 +78,8 @@ def cases() -> Iterator[Any]:
         if path.split(".")[0] not in HOMES or path == "envs.Regions":  # its boxes are no places
             continue
         required = [x for x in signature(member) if x.default is x.empty]
-        good = {x.name: BOX if kind(x) == "tuple[float, float]" else VALUES.get(x.name) for x in required}
-        sound = not any(good[x.name] is None or "FieldModel" in kind(x) for x in required)
+        good = {x.name: OF_KIND.get(kind(x), VALUES.get(x.name)) for x in required}
+        sound = not any(good[x.name] is None or "FieldModel |" in kind(x) for x in required)
         for parameter in signature(member) if sound else ():
             if kind(parameter) in WRONG and parameter.name not in UNCHECKED:
                 yield pytest.param(member, good, parameter, id=f"{path}-{parameter.name}")

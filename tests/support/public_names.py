@@ -12,7 +12,6 @@ PACKAGES = (
     "transforms",
     "envs",
     "navigators",
-    "navigators.metaheuristics",
     "agents",
     "vehicle.onboard",
     "vehicle.logs",
@@ -20,7 +19,7 @@ PACKAGES = (
     "training",
 )
 """Packages whose functions and classes are public."""
-MODULES = ("checks", "files", "geodesy", "guidance", "sensor_std", "envs.gymnasium")
+MODULES = ("checks", "files", "geodesy", "guidance", "sensor_std", "envs.gymnasium", "navigators.metaheuristics")
 """Modules whose functions and classes are public."""
 
 
