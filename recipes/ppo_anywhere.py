@@ -113,7 +113,9 @@ def make_env(base: GeomagneticNavEnv, config: Config) -> TransformedEnv:
     rules, known = rules_of(base, config), known_keys(env.observation_spec)
     declaration = [] if rules.signaled else [DeclareArrival(rules, known)]
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
-    highest = HighestSPL({"move": "true_move"} if config.drift else None)
+    keys = [*HighestSPL.default_in_keys]
+    keys[1] = "true_move" if config.drift else "move"
+    highest = HighestSPL(keys)
     privileged = [TrueWay(), scaled_way, highest, SPLReward(), RewardSum(["reward"])]
     for transform in (TrackField(rules, known), *declaration, MinMaxNorm(in_keys_inv=["action"]), *privileged):
         env.append_transform(transform)

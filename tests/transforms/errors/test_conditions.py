@@ -172,7 +172,7 @@ def test_agents_heed_all_errors_that_are_stated(kind: type[Kalman]) -> None:
 
 def test_evaluate_under_conditions(tmp_path: Path) -> None:
     out = tmp_path / "results"
-    config = evaluate.Config(("secant",), tasks=5, errors="ship", out=out, wandb_mode="disabled")
+    config = evaluate.Config(("secant",), tasks=5, errors="ship", out=out)
     config, (flight, _), navigators, _ = evaluate.prepare(config)
     assert {type(part) for part in flight.env.transform} >= {MotionError, NorthReferenceError}
     assert tuple(navigators[0][0].sensor_std[1].tolist()) == CONDITIONS["ship"].std.bias
