@@ -22,7 +22,7 @@ PARTS = {
     "optimizers": ("adam.py", "step"),
     "target networks": ("td3.py", "step"),
     "checks for non-finite values": ("checks.py", "check_finite"),
-    "evaluation": ("rollout.py", "evaluation_rollout"),
+    "evaluation": ("episodes.py", "evaluation_rollout"),
 }
 
 

@@ -31,10 +31,9 @@ from typing import Any, Literal
 
 from magrl.envs import load_scenario, named_tasks
 from magrl.evaluation import Flight, episode_measures, export, summarize
+from magrl.evaluation.episodes import first_episode_mask, with_true_field
 from magrl.evaluation.maps import trajectories_figure
-from magrl.evaluation.metrics import first_episode_mask
 from magrl.evaluation.navigators import check_distinct, label, training_settings
-from magrl.evaluation.rollout import with_true_field
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
 from magrl.evaluation.tables import comparison_table
 from magrl.files import check_writable, write_json

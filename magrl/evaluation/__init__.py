@@ -1,7 +1,7 @@
 """Evaluation: rollouts, measures and their intervals, tables, figures, and tracks for maps."""
 
+from magrl.evaluation.episodes import episode_measures as episode_measures
+from magrl.evaluation.episodes import evaluation_rollout as evaluation_rollout
+from magrl.evaluation.episodes import summarize as summarize
 from magrl.evaluation.flight import Flight as Flight
 from magrl.evaluation.flight import evaluate as evaluate
-from magrl.evaluation.metrics import episode_measures as episode_measures
-from magrl.evaluation.metrics import summarize as summarize
-from magrl.evaluation.rollout import evaluation_rollout as evaluation_rollout

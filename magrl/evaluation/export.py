@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from tensordict import TensorDictBase
 
 from magrl.checks import check_number
-from magrl.evaluation.metrics import episode_measures
+from magrl.evaluation.episodes import episode_measures
 from magrl.files import json_ready
 
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")

@@ -15,9 +15,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from magrl.checks import check_choice
 from magrl.envs import GeomagneticNavEnv, Scenario, Tasks, named_tasks
-from magrl.evaluation.metrics import episode_measures
+from magrl.evaluation.episodes import episode_measures, evaluation_rollout, next_rollout, restart
 from magrl.evaluation.navigators import fitted, make_navigator
-from magrl.evaluation.rollout import evaluation_rollout, next_rollout, restart
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import EarthModel, earth_model
 from magrl.transforms import Conditions, KnownPlace, conditions_named, with_conditions

@@ -26,7 +26,7 @@ from magrl.checks import check_number, check_tensor
 from magrl.envs import Region, Regions
 from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
-from magrl.evaluation.metrics import episode_measures, moved
+from magrl.evaluation.episodes import episode_measures, moved
 from magrl.field import FieldModel
 from magrl.geodesy import geodesic, move, polar
 from magrl.tracking import Way

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 
 from magrl import paper
-from magrl.evaluation.intervals import interquartile_mean, stratified_bootstrap
+from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
 from magrl.evaluation.navigators import NAVIGATOR_NAMES, label, needs, parse_navigator, trained_on
 
 Summary = Mapping[str, float | None]

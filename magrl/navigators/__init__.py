@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from magrl.navigators.base import Navigator as Navigator
 from magrl.navigators.dead_reckoning import DeadReckoning as DeadReckoning
-from magrl.navigators.geodesic import Geodesic as Geodesic
 from magrl.navigators.kalman import Anywhere as Anywhere
 from magrl.navigators.kalman import Declaring as Declaring
 from magrl.navigators.kalman import Kalman as Kalman
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
-from magrl.navigators.parallel import ParallelApproach as ParallelApproach
+from magrl.navigators.oracles import Geodesic as Geodesic
+from magrl.navigators.oracles import ParallelApproach as ParallelApproach
 from magrl.navigators.quasi_newton import MeanJacobian as MeanJacobian
 from magrl.navigators.quasi_newton import QuasiNewton as QuasiNewton
 from magrl.navigators.quasi_newton import Secant as Secant

@@ -29,9 +29,8 @@ from magrl import paper
 from magrl.agents import FieldPolicy, save_policy
 from magrl.checks import UsageError, check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.evaluation.episodes import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.flight import Flight
-from magrl.evaluation.metrics import episode_measures, summarize
-from magrl.evaluation.rollout import evaluation_rollout
 from magrl.files import locked, write_json
 from magrl.navigators import Anywhere
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder

@@ -15,7 +15,7 @@ from functools import cache
 from magrl import paper
 from magrl.envs.navigation import NAMED_ENVS
 from magrl.evaluation import episode_measures, evaluation_rollout
-from magrl.evaluation.metrics import first_episode_mask
+from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.tables import markdown_table
 from magrl.transforms.areas import NoGoAreas, distance_km, turned

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from magrl.benchmark.tracks import TRACKS, Track
+from magrl.benchmark import TRACKS, Track
 from magrl.evaluation import Flight, episode_measures, summarize
-from magrl.evaluation.metrics import first_episode_mask
+from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.tables import about, mean_of_runs
 from magrl.geodesy import geodesic, move_place
 from magrl.sensor_std import Noise

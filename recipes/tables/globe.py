@@ -10,8 +10,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 
-from magrl.benchmark import episode_table
-from magrl.benchmark.tracks import SEED
+from magrl.benchmark import SEED, episode_table
 from magrl.envs import GeomagneticNavEnv, Region, Regions, Scenario, Tasks
 from magrl.envs.specs import state_spec
 from magrl.envs.tasks import task_set

@@ -22,8 +22,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from magrl.benchmark import episode_table, write_episodes
-from magrl.benchmark.episodes import COLUMNS
+from magrl.benchmark import COLUMNS, episode_table, write_episodes
 from magrl.evaluation.navigators import check_distinct
 from magrl.evaluation.tables import ABOUT, markdown_table
 from magrl.files import check_writable, read_document

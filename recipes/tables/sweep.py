@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from magrl.envs.sb3 import BatchedVecEnv
-from magrl.evaluation.intervals import interquartile_mean, stratified_bootstrap
+from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
 from magrl.evaluation.tables import markdown_table
 from magrl.training import UsageError, command
 

@@ -24,7 +24,7 @@ from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from magrl.agents import FieldPolicy, export_policy, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluate
-from magrl.evaluation.rollout import evaluation_rollout
+from magrl.evaluation.episodes import evaluation_rollout
 from magrl.transforms import ReadingView, SensorErrors
 from magrl.vehicle.onboard import Onboard
 

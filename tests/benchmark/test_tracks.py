@@ -15,9 +15,9 @@ import pytest
 import torch
 
 import magrl  # noqa: F401 - registers the environments
-from magrl.benchmark.tracks import SEED, TRACKS, digest
+from magrl.benchmark import SEED, TRACKS, digest
 from magrl.envs import PUBLIC_KEYS, TASK_SETS, named_tasks
-from magrl.evaluation.rollout import next_rollout
+from magrl.evaluation.episodes import next_rollout
 from magrl.sensor_std import STD_KEYS
 
 NEW_VERSION = "published numbers would change: keep this track as it is, and make a new version for the change"

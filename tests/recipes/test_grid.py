@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from support.recipes import RECIPES
 from tensordict import TensorDict
 
-from magrl.benchmark import read_episodes, tracks
-from magrl.benchmark.episodes import COLUMNS
-from magrl.benchmark.tracks import LEVELS
+from magrl import benchmark
+from magrl.benchmark import COLUMNS, LEVELS, read_episodes
 from magrl.envs import Scenario, Tasks
 from magrl.field import IGRF
 from magrl.training import UsageError
@@ -96,9 +95,9 @@ def test_a_document_may_show_some_columns(tmp_path: Path) -> None:
 
 @pytest.fixture(autouse=True)
 def few_regions(monkeypatch) -> None:
-    earth = tracks.earth_scenario
+    earth = benchmark.earth_scenario
     monkeypatch.setattr(
-        tracks, "earth_scenario", lambda count, *rest, **options: earth(min(count, 4), *rest, **options)
+        benchmark, "earth_scenario", lambda count, *rest, **options: earth(min(count, 4), *rest, **options)
     )
 
 
@@ -122,7 +121,7 @@ def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> 
 
 
 def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setitem(tracks.TRACKS, "north-v1", replace(tracks.TRACKS["north-v1"], max_steps=14))
+    monkeypatch.setitem(benchmark.TRACKS, "north-v1", replace(benchmark.TRACKS["north-v1"], max_steps=14))
     grid.make(("north-declared",), navigators=("secant", "geodesic"), tasks=3, out=tmp_path)
     table, episodes = (
         rows((tmp_path / "north-declared.md").read_text()),
@@ -150,7 +149,7 @@ def test_tasks_of_the_box_are_frozen_and_start_northward() -> None:
     assert table[2][3] == "100.0 / 100.0"
     scenario = flights.Flights(box=True, tasks=3).scenario
     assert scenario.start_heading == "north"
-    assert scenario.tasks.start.tolist() == tracks.named_tasks("test-1000").start[:3].tolist()
+    assert scenario.tasks.start.tolist() == benchmark.named_tasks("test-1000").start[:3].tolist()
 
 
 def test_several_runs_have_the_range_of_their_spl(tmp_path: Path) -> None:

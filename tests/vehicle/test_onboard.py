@@ -20,8 +20,8 @@ from torchrl.envs import EnvBase, ObservationNorm, TransformedEnv
 
 from magrl.agents import FieldPolicy, PolicyConfig
 from magrl.envs import GeomagneticNavEnv
+from magrl.evaluation.episodes import restart
 from magrl.evaluation.navigators import fitted, make_navigator
-from magrl.evaluation.rollout import restart
 from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move, move_place
 from magrl.navigators import Anywhere, Navigator

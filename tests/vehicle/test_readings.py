@@ -1,14 +1,26 @@
-"""Readings as means of samples: their places, spikes, and the standard deviation of a mean of correlated noise."""
+"""Readings as means of samples, the standard deviation of a mean of correlated noise, and mistakes beside IGRF."""
 
 from __future__ import annotations
+
+from functools import cache
 
 import numpy as np
 import pandas
 import pytest
 import torch
 
+from magrl.field import IGRF, elements_at
+from magrl.geodesy import move
 from magrl.sensor_std import OUTAGE_STD
-from magrl.vehicle.logs import Calibration, Log, axes_of_elements, readings_of
+from magrl.vehicle.logs import (
+    Calibration,
+    Log,
+    axes_of_elements,
+    difference_from_igrf,
+    elements_of_axes,
+    mistakes,
+    readings_of,
+)
 
 
 def sailed(count: int = 6000, noise: np.ndarray | None = None, **columns) -> Log:
@@ -124,3 +136,98 @@ def test_a_log_that_lacks_something_is_refused() -> None:
     for options in ({"every_km": 0.0}, {"north": "grid"}):
         with pytest.raises(ValueError, match=next(iter(options))):
             readings_of(log, **options)
+
+
+DATE = "2026-06-30"
+
+
+@cache  # a frame that is not changed
+def log() -> pandas.DataFrame:
+    """Fifteen readings from Newfoundland, where D is -16 degrees, with the noise of sensors and of the crust."""
+    place, rows = torch.tensor([48.0, -50.0], dtype=torch.float64), []
+    noise = np.random.default_rng(0).normal(0, (0.1, 0.05, 50.0), (15, 3))
+    for row in range(15):
+        heading, distance = 70.0 + 10 * row, 20.0 if row else 0.0
+        turn = torch.deg2rad(torch.tensor(heading)).double()
+        place = torch.stack(move(*place, turn, torch.tensor(distance).double()))
+        d, i, b = (elements_at(IGRF(DATE), place).numpy() + noise[row]).tolist()
+        latitude, longitude = place.tolist()
+        rows.append({"D": d, "I": i, "B_H": b, "heading": heading, "distance": distance})
+        rows[-1] |= {"latitude": latitude, "longitude": longitude}
+    return pandas.DataFrame(rows)
+
+
+def test_a_log_without_mistake() -> None:
+    assert mistakes(log(), DATE) == []
+    assert mistakes(log().drop(columns="latitude"), DATE) == []
+    compass = log().assign(D=0.0, D_std=OUTAGE_STD, heading=log()["heading"] - log()["D"])
+    assert mistakes(compass, DATE) == []
+    drift = np.random.default_rng(0).normal(15, 8, 15)  # of currents, about as D
+    assert mistakes(log().assign(heading=log()["heading"] + drift), DATE) == []
+    assert difference_from_igrf(log(), DATE).mean(0).abs().lt(torch.tensor([0.1, 0.05, 40.0])).all()
+
+
+RADIANS = np.pi / 180
+
+
+@pytest.mark.parametrize(
+    ("change", "texts"),
+    [
+        (lambda t: t.assign(D=-t["D"]), ["15 of 15 readings do not fit IGRF, from row 1 on .*fits with -D"]),
+        (lambda t: t.assign(I=-t["I"]), ["fits with -I: the vertical axis points up"]),
+        (lambda t: t.assign(D=t["D"] * RADIANS), ["D fits in radians"]),
+        (lambda t: t.assign(D=t["D"] * RADIANS, I=t["I"] * RADIANS), ["fits in radians"]),
+        (
+            lambda t: t.assign(D=t["D"] + t["heading"] * (RADIANS - 1), heading=t["heading"] * RADIANS),
+            ["the heading fits in radians", "course"],
+        ),
+        (lambda t: t.assign(B_H=t["B_H"] / 1000), ["looks like microtesla"]),
+        (lambda t: t.assign(B_H=t["B_H"] / 1e5), ["looks like gauss"]),
+        (lambda t: t.assign(D=t["D"] * 0), ["D is 0: the heading is from magnetic north"]),
+        (lambda t: t.assign(heading=t["heading"] - t["D"]), ["as D is -16 deg: the heading is from magnetic north"]),
+        (lambda t: t.assign(heading=t["heading"] + 180), ["the heading is reciprocal, or the vehicle goes astern"]),
+        (lambda t: t.assign(heading=t["heading"] + 70), ["the course .* is -70 deg to the right.*check the compass"]),
+        (lambda t: t.assign(distance=t["distance"] * 3), ["0.333 times as far apart .*check the log and its unit"]),
+        (
+            lambda t: t.assign(D=t["D"].where(t.index != 3, 40.0)),
+            ["1 of 15 .*, from row 4 on .D deviates .*: spikes, or iron"],
+        ),
+        (lambda t: t.assign(B_H=t["B_H"] + 5000), ["no calibration, iron near the sensor, or a heading that is wrong"]),
+        (lambda t: t.assign(I=t["I"].where(t.index != 0, 0), B_H=t["B_H"].where(t.index != 0, 0)), ["1 of 15"]),
+    ],
+)
+def test_mistakes_are_named(change, texts: list[str]) -> None:
+    found = mistakes(change(log()), DATE)
+    assert len(found) == len(texts)
+    for text, pattern in zip(found, texts, strict=True):
+        assert pandas.Series([text]).str.contains(pattern).all(), text
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_iron_is_taken_for_no_mistake(seed: int) -> None:
+    """Hard iron of about 800 nT and soft iron of 2 % where D is 3 degrees, on few courses: -D would nearly fit."""
+    random, turn = np.random.default_rng(seed), torch.deg2rad(torch.tensor([290.0] * 3 + [335.0] * 3 + [310.0] * 4))
+    place = torch.stack((62.5 + 0.1 * torch.arange(10), 6.0 - 0.3 * torch.arange(10)), -1).double()
+    attitude = torch.nn.functional.pad(torch.rad2deg(turn)[:, None], (2, 0)).double()
+    axes = axes_of_elements(elements_at(IGRF(DATE), place), attitude)
+    axes = axes @ (torch.eye(3) + 0.02 * torch.tensor(random.normal(size=(3, 3)))) + torch.tensor(
+        random.normal(0, 800, 3)
+    )
+    table = pandas.DataFrame(elements_of_axes(axes, attitude).numpy(), columns=["D", "I", "B_H"])
+    table[["latitude", "longitude"]], table["heading"], table["distance"] = place.numpy(), attitude[:, 2].numpy(), 0.0
+    assert all(
+        text.endswith(("or a heading that is wrong", "iron near the vehicle there")) for text in mistakes(table, DATE)
+    )
+
+
+def test_the_altitude_counts() -> None:
+    """The field of a dipole falls by a sixth over 400 km."""
+    low, high = (difference_from_igrf(log().assign(altitude=km), DATE)[:, 2] for km in (0.0, 400.0))
+    assert (high - low).mean() == pytest.approx(log()["B_H"].mean() / 6, rel=0.1)
+
+
+def test_moves_are_compared_without_a_date() -> None:
+    wrong = log().assign(D=0.0, heading=log()["heading"] + 180)
+    assert [text.partition(": ")[2] for text in mistakes(wrong)] == [
+        "the heading is reciprocal, or the vehicle goes astern"
+    ]

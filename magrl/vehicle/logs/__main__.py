@@ -24,10 +24,9 @@ from magrl.field.elements import NAMES
 from magrl.files import check_writable
 from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration, calibrate
-from magrl.vehicle.logs.comparison import difference_from_igrf, mistakes
 from magrl.vehicle.logs.conventions import NORTHS
 from magrl.vehicle.logs.readers import read_log
-from magrl.vehicle.logs.readings import STD_NAMES, readings_of
+from magrl.vehicle.logs.readings import STD_NAMES, difference_from_igrf, mistakes, readings_of
 from magrl.vehicle.logs.samples import ATTITUDE, AXES, Log, total_intensity
 
 _DIGITS = {"time": 2, "D": 4, "I": 4, "B_H": 2, "heading": 3, "distance": 4, "latitude": 6, "longitude": 6}

@@ -1,15 +1,16 @@
-"""Parallel approach with the true gradient: an oracle."""
+"""Oracles, which know what no vehicle measures: both positions, or the true gradient."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from magrl import geodesy
 from magrl.envs import GeomagneticNavEnv
 from magrl.field.bank import FieldBank
 from magrl.field.elements import NAMES, element_difference
@@ -17,16 +18,44 @@ from magrl.field.model import FieldModel, elements_gradient_at
 from magrl.geodesy import steer
 from magrl.guidance import parallel_approach
 from magrl.navigators.base import Navigator, displacement_to, element_indices
-from magrl.navigators.filter import CURVATURE
+from magrl.navigators.quasi_newton import CURVATURE
 from magrl.sensor_std import SensorStd
+
+
+class Geodesic(Navigator):
+    """Fly the shortest path to the destination's position: an oracle, which needs no field.
+
+    Args:
+        max_move_km: longest leg [km].
+        max_turn_rad: largest turn [rad].
+
+    Raises:
+        ValueError: for a bound out of its range.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> env.rollout(50, Geodesic())["next", "success"].any()
+        tensor(True)
+    """
+
+    name = label = "geodesic"
+    description = "geodesic (both positions, an oracle)"
+    oracle, needs = True, "the position"
+    in_keys: ClassVar[list[str]] = ["position", "target_position", "heading", "elapsed_steps"]
+
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> tuple[Tensor, Tensor]:  # noqa: ARG002
+        distance, bearing = geodesy.geodesic(*seen["position"].unbind(-1), *seen["target_position"].unbind(-1))
+        now = seen["heading"].squeeze(-1).double()
+        return steer(now, bearing, distance, self.max_move_km, self.max_turn_rad)
 
 
 class ParallelApproach(Navigator):
     """Newton steps with the true gradient at the vehicle's position: an oracle.
 
     By default, each step closes the errors of all three elements by least squares, weighted by the inverse of
-    :data:`magrl.navigators.filter.CURVATURE`. With a pair, it is the paper's parallel approach (Eq. 3-15), which fails
-    where the gradients of the pair are nearly parallel.
+    :data:`magrl.navigators.quasi_newton.CURVATURE`. With a pair, it is the paper's parallel approach (Eq. 3-15), which
+    fails where the gradients of the pair are nearly parallel.
 
     Args:
         field: field model or bank of them, usually ``env.field``.

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from support.tracks import F64, f64, randn
 
-from magrl.navigators.filter import FieldTrack, GradientPrior, read, start, way_to, wrapped
+from magrl.navigators.quasi_newton import FieldTrack, GradientPrior, first_track, next_track, way_to, wrapped
 
 NONE = torch.zeros(3, dtype=F64)
 
@@ -21,9 +21,9 @@ def test_a_track_is_that_of_a_textbook_kalman_filter() -> None:
     """x = F x, P = F P F^T + Q; K = P H^T / S, x = x + K (z - H x), P = (1 - K H) P for each of two elements."""
     std, curvature, prior = f64(0.3, 2.0), f64(0.02, 0.01), GradientPrior(randn(4, 2, 2), randn(4, 2, 2, seed=1).abs())
     readings, moves, h = 10 * randn(6, 4, 2, seed=2), 5 * randn(6, 4, 2, seed=3), np.eye(3)[:1]
-    track = start(readings[0], prior, std)
+    track = first_track(readings[0], prior, std)
     for step in range(1, 6):
-        track = read(track, moves[step], readings[step], std, curvature, 0 * std)
+        track = next_track(track, moves[step], readings[step], std, curvature, 0 * std)
     for row, element in np.ndindex(4, 2):
         x = np.array([readings[0, row, element], *prior.gradient[row, element]])
         p = np.diag([std[element] ** 2, *(prior.std[row, element] ** 2)])
@@ -42,10 +42,10 @@ def test_a_track_is_that_of_a_textbook_kalman_filter() -> None:
 def test_exact_readings_correct_the_gradient_along_the_move_alone() -> None:
     """Broyden's update, and a declination that crosses 180 degrees."""
     gradient, truth, move = randn(3, 2), f64((1.0, 0.0), (2.0, -1.0), (0.0, 5.0)), f64(3.0, -4.0)
-    track = start(f64(179.0, 0.0, 0.0), GradientPrior(gradient, torch.ones(3, 2)), NONE)
+    track = first_track(f64(179.0, 0.0, 0.0), GradientPrior(gradient, torch.ones(3, 2)), NONE)
     periods = f64(360.0, 0.0, 0.0)
     after = wrapped(f64(179.0, 0.0, 0.0) + truth @ move, periods)
-    found = read(track, move, after, NONE, NONE, periods).mean[:, 1:]
+    found = next_track(track, move, after, NONE, NONE, periods).mean[:, 1:]
     expected = gradient + ((truth - gradient) @ move)[:, None] * move / 25
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
