@@ -112,7 +112,7 @@ class Results:
     runs: list[dict[str, Any]] = field(default_factory=list)
     episodes: list[dict[str, Any]] = field(default_factory=list)
     paths: list[dict[str, Any]] = field(default_factory=list)
-    tracks: list[export.Track] = field(default_factory=list)
+    tracks: list[export.Feature] = field(default_factory=list)
     rollouts: dict[str, TensorDictBase] = field(default_factory=dict)
 
 
