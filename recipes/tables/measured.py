@@ -39,7 +39,7 @@ PROBABILITIES = (0.5, 0.9, 0.95)
 
 
 @dataclass(frozen=True)
-class Track:
+class Survey:
     """Rows of a log ``(T, ...)``: readings, IGRF there, headings [rad], moves [km], positions [deg]."""
 
     field: Tensor
@@ -49,21 +49,21 @@ class Track:
     position: Tensor
 
 
-def read_track(path: Path, date: str | None = None) -> Track:
+def read_survey(path: Path, date: str | None = None) -> Survey:
     """Return the rows of a log, and IGRF at the altitude of each."""
     log = read_readings(path, dict(zip(NAMES, NAMES, strict=True)), "time")
     values = torch.tensor(log[list(NAMES)].to_numpy(float))
     model = measured_elements(IGRF(date or log.attrs["date"])(*values[:, 5:].unbind(-1)))
-    return Track(values[:, :3], model, torch.deg2rad(values[:, 3]), values[:, 4], values[:, 5:7])
+    return Survey(values[:, :3], model, torch.deg2rad(values[:, 3]), values[:, 4], values[:, 5:7])
 
 
-def pieces(track: Track, low_km: float, high_km: float) -> Tensor:
+def pieces(survey: Survey, low_km: float, high_km: float) -> Tensor:
     """Return the rows of all pieces of about the mean length, ``(P, T)``."""
-    rows = round((low_km + high_km) / 2 / track.distance[1:].mean().item()) + 1
-    return torch.arange(len(track.distance)).unfold(0, rows, 1)
+    rows = round((low_km + high_km) / 2 / survey.distance[1:].mean().item()) + 1
+    return torch.arange(len(survey.distance)).unfold(0, rows, 1)
 
 
-def flown(track: Track, rows: Tensor, noise: Tensor, target: Tensor, start: Tensor | None, range_km: float) -> Tensor:
+def flown(survey: Survey, rows: Tensor, noise: Tensor, target: Tensor, start: Tensor | None, range_km: float) -> Tensor:
     """Return for each reading ``(P, T - 1)`` the stated probability of the region whose border is at the destination,
     and the error of the estimated way [km], ``(P, T - 1, 2)``.
 
@@ -71,7 +71,7 @@ def flown(track: Track, rows: Tensor, noise: Tensor, target: Tensor, start: Tens
     uniform from 0 to 1.
 
     Args:
-        track: the log.
+        survey: the log.
         rows: pieces.
         noise: standard deviations of the white noise.
         target: elements of the destinations ``(P, 3)``.
@@ -79,7 +79,7 @@ def flown(track: Track, rows: Tensor, noise: Tensor, target: Tensor, start: Tens
         range_km: prior standard deviation of the way.
     """
     generator = torch.Generator().manual_seed(0)
-    reading = track.field[rows] + noise * torch.randn(*rows.shape, 3, generator=generator).double()
+    reading = survey.field[rows] + noise * torch.randn(*rows.shape, 3, generator=generator).double()
     std = noise.expand(len(rows), 3)
     errors = SensorStd(std, *(torch.tensor(x).double().expand_as(std) for x in (MODEL_STD, SLOW, (0.0,) * 3)))
     near = reading[:, 0] if start is None else start
@@ -88,11 +88,11 @@ def flown(track: Track, rows: Tensor, noise: Tensor, target: Tensor, start: Tens
     found = []
     for step in range(rows.shape[1] - 1):
         if step:
-            belief = moved(belief, track.distance[rows[:, step]], track.heading[rows[:, step]], errors)
+            belief = moved(belief, survey.distance[rows[:, step]], survey.heading[rows[:, step]], errors)
         belief = read(belief, reading[:, step], std)
         goal = destination(belief, target, range_km)
         places = posterior(goal, 1024)
-        here, there = (track.position[rows[:, index]].unbind(-1) for index in (step, -1))
+        here, there = (survey.position[rows[:, index]].unbind(-1) for index in (step, -1))
         left, bearing = geodesic(*here, *there)
         true = left.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
         density = [log_density(goal, points.double()) for points in (places.points, true.unsqueeze(-2))]
@@ -101,11 +101,11 @@ def flown(track: Track, rows: Tensor, noise: Tensor, target: Tensor, start: Tens
     return torch.stack(found, 1)
 
 
-def cells(track: Track, length: tuple[float, float], noise: Tensor, source: str, start: bool) -> list[str]:
+def cells(survey: Survey, length: tuple[float, float], noise: Tensor, source: str, start: bool) -> list[str]:
     """Return coverage and errors of all pieces of a length as text."""
-    rows, elements = pieces(track, *length), track.field if source == "measured" else track.model
+    rows, elements = pieces(survey, *length), survey.field if source == "measured" else survey.model
     first = elements[rows[:, 0]] if start else None
-    result = flown(track, rows, noise, elements[rows[:, -1]], first, RANGE_KM[length])
+    result = flown(survey, rows, noise, elements[rows[:, -1]], first, RANGE_KM[length])
     inside, error = result.unbind(-1)
     covered = [f"{100 * (inside <= p).double().mean():.0f}" for p in PROBABILITIES]
     halfway = error[:, rows.shape[1] // 2].median()
@@ -127,9 +127,9 @@ def make(
         date: Date of IGRF; by default that of the log.
         out: Folder of measured.md.
     """
-    track, std, table = read_track(log, date), torch.tensor(noise).double(), []
+    survey, std, table = read_survey(log, date), torch.tensor(noise).double(), []
     for length, source, start in itertools.product(RANGE_KM, ("measured", "IGRF"), (False, True)):
-        texts = cells(track, length, std, source, start)
+        texts = cells(survey, length, std, source, start)
         table.append(["{:g}–{:g} km".format(*length), source, "known" if start else "not known", *texts])
     heads = [*(f"in the {100 * p:.0f} % region, %" for p in PROBABILITIES), "error halfway, km", "error at the end, km"]
     text = markdown_table(["distance", "destination", "start", *heads], table)

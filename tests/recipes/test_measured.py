@@ -35,11 +35,11 @@ def write_log(path: Path) -> None:
 def test_a_known_start_removes_what_is_constant(tmp_path: Path) -> None:
     """The regions hold the destination, and errors are small where target and readings have the same difference."""
     write_log(tmp_path / "log.csv")
-    track = recipe.read_track(tmp_path / "log.csv")
-    torch.testing.assert_close(track.field - track.model, SHIFT.expand_as(track.field), atol=1e-6, rtol=0)
+    survey = recipe.read_survey(tmp_path / "log.csv")
+    torch.testing.assert_close(survey.field - survey.model, SHIFT.expand_as(survey.field), atol=1e-6, rtol=0)
     noise, found = torch.tensor([0.02, 0.02, 2.0]).double(), {}
     for source, start in (("measured", True), ("IGRF", False), ("IGRF", True)):
-        texts = recipe.cells(track, (300.0, 500.0), noise, source, start)
+        texts = recipe.cells(survey, (300.0, 500.0), noise, source, start)
         found[source, start] = int(texts[-1])
         assert min(map(int, texts[:3])) > 60
     assert found["IGRF", False] > 3 * found["IGRF", True]
