@@ -130,15 +130,12 @@ def read_readings(path: Path | str, names: Mapping[str, str], time: str | None =
             new = new_times(times)
             log.insert(1, "time", raw[time])
             log = log[new].reset_index(drop=True)
-            log.attrs = {"notes": _repeated(new), "date": date_of(float(times[0]))}
+            left = int((~new).sum())
+            notes = [f"{left} rows with the time of the row before left out"] if left else []
+            log.attrs = {"notes": notes, "date": date_of(float(times[0]))}
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
     return log
-
-
-def _repeated(new: NDArray[np.bool_]) -> list[str]:
-    left = int((~new).sum())
-    return [f"{left} rows with the time of the row before left out"] if left else []
 
 
 def _columns(raw: DataFrame, names: Mapping[str, str]) -> dict[str, Array]:
