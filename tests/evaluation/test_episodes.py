@@ -25,12 +25,10 @@ from magrl.envs.scenario import check_zeta
 from magrl.evaluation import episode_measures, evaluate, evaluation_rollout, summarize
 from magrl.evaluation.episodes import (
     bootstrap_interval,
-    episode_measures,
     first_episode_mask,
     interquartile_mean,
     moved,
     stratified_bootstrap,
-    summarize,
     wilson_interval,
 )
 from magrl.evaluation.navigators import fitted
@@ -407,10 +405,3 @@ def test_stratified_bootstrap_shrinks_holds_the_mean_and_repeats() -> None:
 def test_bad_values_are_refused(call, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
-
-
-def test_intervals_accept_their_bounds() -> None:
-    assert bootstrap_interval(torch.ones(1), 1, -1) == (1.0, 1.0)
-    for rate in (0.0, 1.0):
-        low, high = wilson_interval(rate, 1)
-        assert 0 <= low < high <= 1

@@ -125,14 +125,14 @@ def test_two_probing_legs_give_the_jacobian(turn: float) -> None:
     assert ((found[2] - truth) / size.unsqueeze(-1)).abs().max() < 0.003
 
 
-def test_parallel_flies_the_shortest_path(env) -> None:
-    navigator = ParallelApproach(env.field)
-    rollout = flight(env, navigator)
-    summary = summarize(episode_measures(rollout))
+@pytest.mark.parametrize(("name", "spl", "steps"), [("parallel", 99.8, 9), ("secant", 99.5, 11)])
+def test_a_navigator_flies_about_the_shortest_path(env, name: str, spl: float, steps: float) -> None:
+    navigator = NAVIGATORS[name].for_env(env)
+    summary = flown(env, navigator)
     assert summary["success_rate"] == 100
-    assert summary["spl"] > 99.8
-    assert summary["steps"] < 9
-    assert navigator.oracle
+    assert summary["spl"] > spl
+    assert summary["steps"] < steps
+    assert navigator.oracle == (name == "parallel")
     assert navigator.field_readings.tolist() == [0] * 100
 
 
@@ -145,16 +145,6 @@ def test_parallel_and_secant_arrive_where_the_papers_pair_fails() -> None:
     assert flown(sea, Secant(elements=("D", "I")))["success_rate"] < 90
     assert flown(sea, ParallelApproach(sea.field))["success_rate"] == 100
     assert flown(sea, Secant())["success_rate"] == 100
-
-
-def test_secant_navigates_by_its_track(env) -> None:
-    navigator = Secant()
-    summary = summarize(episode_measures(flight(env, navigator)))
-    assert summary["success_rate"] == 100
-    assert summary["spl"] >= 99.5
-    assert summary["steps"] < 11
-    assert not navigator.oracle
-    assert navigator.field_readings.tolist() == [0] * 100
 
 
 def test_secant_on_two_elements_and_narrow_turns() -> None:

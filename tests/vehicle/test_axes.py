@@ -22,12 +22,6 @@ def test_elements_to_axes_and_back() -> None:
     torch.testing.assert_close(found, elements, rtol=1e-9, atol=1e-9)
 
 
-def test_axes_are_forward_right_and_down() -> None:
-    """By hand: heading east, the field is north and down: to the left, and down."""
-    elements, attitude = torch.tensor([0.0, 45.0, 100.0]), torch.tensor([0.0, 0.0, 90.0])
-    assert axes_of_elements(elements, attitude).round().tolist() == [0, -100, 100]
-
-
 def test_the_error_model_of_the_simulation_is_the_same_geometry() -> None:
     """What a level vehicle with hard and soft iron reads in the simulation follows from its axes."""
     elements, attitude = cases()
