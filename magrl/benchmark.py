@@ -65,8 +65,6 @@ class Track:
     """Minimum probability at which vehicles declare their arrival."""
     north: str = "true"
     """North of the vehicles, ``"true"`` or ``"magnetic"``."""
-    known_start: Sequence[float] | None = None
-    """Standard deviations of the elements at the start, where the vehicles know them."""
     crust: bool = False
     """Whether the field is that of WMMHR, with crust, in place of IGRF-14."""
     box: bool = False
@@ -107,14 +105,15 @@ class Track:
             changes: options of :class:`~magrl.evaluation.Flight` in place of those of the track.
         """
         scenario = self.scenario if tasks is None else self.scenario.with_tasks(tasks)
-        options = {name: getattr(self, name) for name in ("north", "known_start", "confidence", "seed")}
+        options = {name: getattr(self, name) for name in ("north", "confidence", "seed")}
         return Flight(scenario, errors=errors, **options | changes)
 
     def record(self) -> dict[str, Any]:
         """Return the declaration of the track as plain data, and the digest of its tasks."""
         ends = self.scenario.tasks
         assert ends is not None
-        declared: dict[str, Any] = json.loads(json.dumps(asdict(self) | {"levels": self.levels or LEVELS}))
+        fixed = {"levels": self.levels or LEVELS, "known_start": None}  # a key of the first declarations
+        declared: dict[str, Any] = json.loads(json.dumps(asdict(self) | fixed))
         if not self.crust:  # as the first tracks were declared
             del declared["crust"]
         return declared | {"tasks_sha256": digest(torch.cat((*ends[:2], ends.region.unsqueeze(-1)), -1))}

@@ -86,9 +86,6 @@ class Config(ScenarioOptions):
     north: Literal["true", "magnetic"] = "true"
     """North of the vehicles: true (they measure D), or magnetic (a compass; they measure I and B_H alone). A boat, a
     drone and a phone have a compass in any case."""
-    known_start: Noise | None = None
-    """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
-    calibrated, with the errors of a real vehicle; by default the start is unknown."""
     model: str | None = None
     """Model of the Earth that vehicles carry, as of the date of the scenario: IGRF-14, IGRF-13, IGRF-2005, ...; none by
     default."""
@@ -162,7 +159,7 @@ def prepare(config: Config) -> tuple[Config, list[Flight], list[Pair], list[str]
         config, notes = with_training_settings(config)
         scenario = choose_tasks(config.scenario, config.tasks, config.tasks_seed, **config.changes())
         example = first_tasks(scenario, 1) if config.scenario else scenario.with_tasks(named_tasks("figure-4-1"))
-        told = ("errors", "north", "known_start", "model", "start_km", "confidence", "seed")
+        told = ("errors", "north", "model", "start_km", "confidence", "seed")
         flights = [Flight(tasks, **{key: getattr(config, key) for key in told}) for tasks in (scenario, example)]
         navigators = [tuple(flight.navigator(text) for flight in flights) for text in config.navigators]
         if config.export:
@@ -218,7 +215,7 @@ def settings(config: Config, flight: Flight) -> dict[str, Any]:
         "radius_km": env.arrival.radius_km,
         "max_turn_deg": round(math.degrees(env.max_turn_rad), 9),
         "north": north(flight),
-        **{key: getattr(config, key) for key in ("tasks", "known_start", "model", "start_km", "seed")},
+        **{key: getattr(config, key) for key in ("tasks", "model", "start_km", "seed")},
         "errors": Path(config.errors).name if isinstance(config.errors, str) else config.errors,
         **{key: getattr(env, key) for key in ("zeta", "max_steps", "max_move_km", "start_heading")},
         **{key: getattr(env.scenario, key) for key in ("altitude_km", "margin_deg")},
@@ -240,7 +237,6 @@ def text_below(config: Config, flight: Flight, notes: Sequence[str]) -> str:
         "Conditions": isinstance(config.errors, str) and config.errors,
         "Model of the Earth": config.model or "",
         "Error of the known start": "" if config.start_km is None else f"{config.start_km:g} km",
-        "Known start, standard deviations of D, I, B_H": config.known_start and text(*config.known_start),
         "Standard deviations of the noise on D, I and B_H": noisy and text(*config.errors),
     }
     told = "".join(f"\n{name}: {value}.\n" for name, value in lines.items() if value)

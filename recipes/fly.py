@@ -68,9 +68,6 @@ class Config:
     north: Literal["true", "magnetic"] = "true"
     """North of the vehicle: true (it measures D), or magnetic (a compass: it measures I and B_H alone). A boat, a drone
     and a phone have a compass in any case."""
-    known_start: tuple[float, float, float] | None = None
-    """Standard deviations of D [deg], I [deg], B_H [nT] at a known start, such as 0 0 0, where the sensors are
-    calibrated, with the errors of a real vehicle; by default the start is unknown."""
     model: str | None = None
     """Model of the Earth that the vehicle carries, as of the date: IGRF-14, IGRF-13, IGRF-2005; none by default."""
     start_km: float | None = None
@@ -164,7 +161,6 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
                 scenario,
                 errors=config.errors,
                 north=config.north,
-                known_start=config.known_start,
                 model=config.model,
                 start_km=config.start_km,
                 max_steps=round(3 * distance_km / 50) + 20 if config.max_steps is None else config.max_steps,

@@ -36,8 +36,6 @@ class Flight:
             conditions (:func:`magrl.transforms.load_conditions`).
         north: ``"true"``, or ``"magnetic"`` for vehicles that have no true north: they measure I and B_H, and steer by
             their compass (:class:`magrl.transforms.MagneticNorth`), whatever ``errors`` say of a north reference.
-        known_start: standard deviations of the elements at a known start, where the vehicles calibrate their sensors
-            (:class:`magrl.transforms.KnownStart`). With the errors of a real vehicle.
         model: model of the Earth that the vehicles carry, as of the date of the scenario
             (:func:`magrl.tracking.earth_model`): ``"IGRF-14"``, ``"IGRF-13"``, ``"IGRF-2005"``; None without one, as in
             the paper.
@@ -56,7 +54,7 @@ class Flight:
         sensor_std: accuracy of the sensors as the vehicles know it.
 
     Raises:
-        ValueError: for unknown conditions, a known start with white noise, or an option out of its range.
+        ValueError: for unknown conditions, or an option out of its range.
 
     Example:
         >>> flight = Flight(Scenario(), errors=(0.05, 0.05, 5.0), num_envs=3)
@@ -73,7 +71,6 @@ class Flight:
         *,
         errors: Errors = PERFECT.noise,
         north: str = "true",
-        known_start: Sequence[float] | None = None,
         model: EarthModel | str | None = None,
         start_km: float | None = None,
         target_km: float = 0.0,
@@ -91,16 +88,14 @@ class Flight:
         errors = conditions_named(str(errors)) if isinstance(errors, str | Path) else errors
         check_choice(NORTHS, north=north)
         if not isinstance(errors, Conditions):
-            if known_start is not None:
-                raise ValueError(f"known_start {known_start} needs conditions: white noise has nothing to calibrate")
             noise = SensorStd.of(errors).noise
             errors = Conditions("noise", sensors={"noise": noise} if any(noise) else {})
         if north == MAGNETIC:
             errors = replace(errors, north=MAGNETIC)
         drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
         self.base = self.env_class(scenario, **drift | options)
-        self.env = with_conditions(self.base, errors, seed, known_start)
-        self.sensor_std = errors.std_at(known_start)
+        self.env = with_conditions(self.base, errors, seed)
+        self.sensor_std = errors.std
         if model is not None:
             self.rules["model"] = earth_model(model, scenario.date, scenario.altitude_km)
         if start_km is not None:

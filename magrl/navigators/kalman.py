@@ -17,7 +17,7 @@ from magrl.navigators.base import Navigator
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking.network import load_pilot, pretrained
 from magrl.tracking.pilot import Reading, Rules, State, Track, act, advance, begin, blank, declaring, step
-from magrl.transforms.errors.known import PLACE_KEYS, START_KEYS
+from magrl.transforms.errors.known import PLACE_KEYS
 from magrl.transforms.track import READ_KEYS, reading_of
 
 
@@ -44,7 +44,7 @@ class Kalman(Navigator):
     label = "Kalman"
     description = "Kalman (dual control)"
     needs = "the field's spectrum"
-    optional_keys: ClassVar[tuple[str, ...]] = (*STD_KEYS, *START_KEYS, *PLACE_KEYS)
+    optional_keys: ClassVar[tuple[str, ...]] = (*STD_KEYS, *PLACE_KEYS)
 
     def __init__(self, rules: Rules | None = None, **changes: Any) -> None:
         chosen = (rules or Rules()).replace(**changes)

@@ -16,8 +16,6 @@ from magrl.transforms.errors.conditions import conditions_named as conditions_na
 from magrl.transforms.errors.conditions import load_conditions as load_conditions
 from magrl.transforms.errors.conditions import with_conditions as with_conditions
 from magrl.transforms.errors.known import KnownPlace as KnownPlace
-from magrl.transforms.errors.known import KnownStart as KnownStart
-from magrl.transforms.errors.known import calibration as calibration
 from magrl.transforms.errors.magnetic_north import MagneticNorth as MagneticNorth
 from magrl.transforms.errors.motion import MotionError as MotionError
 from magrl.transforms.errors.north import NORTH_REFERENCES as NORTH_REFERENCES

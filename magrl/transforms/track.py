@@ -28,12 +28,12 @@ from magrl.tracking import (
     observation,
 )
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, observed_spec, sorted_keys, with_state
-from magrl.transforms.errors.known import PLACE_KEYS, START_KEYS
+from magrl.transforms.errors.known import PLACE_KEYS
 
 READ_KEYS = ("field", "target_field", "move", "heading", "elapsed_steps")
 """Keys that a track reads at each step."""
-KNOWN_KEYS = (*STD_KEYS, *START_KEYS, *PLACE_KEYS, "step_price")
-"""Keys that it reads where an environment has them: the accuracy of readings, what is known at the start, a price."""
+KNOWN_KEYS = (*STD_KEYS, *PLACE_KEYS, "step_price")
+"""Keys that it reads where an environment has them: the accuracy of readings, known places, a price."""
 
 
 def reading_of(seen: TensorDictBase) -> Reading:
@@ -46,14 +46,13 @@ def reading_of(seen: TensorDictBase) -> Reading:
     """
     field, target, move, heading, step = (seen[key] for key in READ_KEYS)
     std = SensorStd(*(seen.get(key, torch.zeros_like(field)).double() for key in STD_KEYS))
-    error, known, known_std, bias = (seen.get(key, None) for key in START_KEYS)
     price = seen.get("step_price", None)
-    if error is not None:  # the reading as it was, and its accuracy before the calibration
-        field, std = field + error, std._replace(bias=bias.double())
-    price = None if price is None else price.squeeze(-1)
-    course = heading.squeeze(-1)
-    places = (seen.get(key, None) for key in PLACE_KEYS)
-    return Reading(field, target, move[..., 0], course, std, step.squeeze(-1), known, known_std, price, *places)
+    known = {
+        "price": None if price is None else price.squeeze(-1),
+        "place": seen.get("start_place", None),
+        "target_place": seen.get("target_place", None),
+    }
+    return Reading(field, target, move[..., 0], heading.squeeze(-1), std, step.squeeze(-1), **known)
 
 
 def track_of(record: TensorDictBase) -> Track:

@@ -95,7 +95,6 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
             ValueError,
             "conditions must be one of 'laboratory'",
         ),
-        (lambda: evaluate("secant", "figure-4-1", known_start=(0, 0, 0)), ValueError, "needs conditions"),
         (lambda: evaluate(agent, elsewhere), ValueError, "trained"),
         (lambda: evaluate(agent, "figure-4-1", max_turn_deg=20), ValueError, "up to 90°, the environment .* and 20°"),
         (lambda: evaluate(5, "figure-4-1"), TypeError, "policy must be callable"),

@@ -71,13 +71,6 @@ def test_every_navigator_declares(name: str) -> None:
     assert summary["spl"] > 80
 
 
-def test_where_the_start_is_known_more_declarations_are_right() -> None:
-    """It shows the constant errors of the sensors."""
-    options = {"arrival": "declared", "errors": "ship", "max_steps": 30}
-    unknown, known = (evaluate("kalman", tasks(50), known_start=std, **options) for std in (None, (0.0, 0.0, 0.0)))
-    assert known["success"].sum() > unknown["success"].sum() + 10
-
-
 def test_moves_stay_within_adapted_limits() -> None:
     env = GeomagneticNavEnv(num_envs=50, seed=0, start_heading="random")
     action = env.rollout(2, Anywhere().adapted(max_move_km=10.0, max_turn_rad=0.5))["action"]

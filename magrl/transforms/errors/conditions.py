@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,11 +12,10 @@ from typing import Any
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from magrl.checks import check_choice, check_number, check_numbers, check_type
+from magrl.checks import check_choice, check_number, check_type
 from magrl.files import read_document
 from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import TYPICAL_FIELD, EpisodeErrors
-from magrl.transforms.errors.known import KnownStart, calibration
 from magrl.transforms.errors.magnetic_north import MagneticNorth
 from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NORTH_REFERENCES, NorthReferenceError, north_reference
@@ -130,7 +129,8 @@ class Conditions:
         """Standard deviations of the errors of the readings, as a vehicle knows them, at :data:`TYPICAL_FIELD`."""
         field = torch.tensor(TYPICAL_FIELD, dtype=torch.float64)
         variances = sum(torch.stack(error.accuracy(field)).square() for error in self._errors)
-        return _rounded(SensorStd(*torch.as_tensor(variances).sqrt()))
+        rows = torch.as_tensor(variances).sqrt().tolist()
+        return SensorStd(*(tuple(round(std, 6) for std in row) for row in rows))
 
     @cached_property
     def motion_std(self) -> tuple[float, float]:
@@ -151,33 +151,10 @@ class Conditions:
         random = eddies + noise**2 / 2 * MOVE_KM
         return math.hypot(*shares) / math.sqrt(2), math.sqrt(random)
 
-    def std_at(self, known_start: Sequence[float] | None) -> SensorStd:
-        """Return the standard deviations with which a vehicle navigates, given what it knows at its start.
-
-        Args:
-            known_start: standard deviations of D [deg], I [deg], B_H [nT] at the start, where the vehicle knows these
-                and calibrates its sensors; None where it does not: :attr:`std`.
-
-        Example:
-            >>> ship = Conditions("ship", north={"constant_deg": 0.5, "random_deg": 0.1})
-            >>> ship.std_at(None).bias, [round(std, 3) for std in ship.std_at((0.0, 0.0, 0.0)).bias]
-            ((0.5, 0.0, 0.0), [0.098, 0.0, 0.0])
-        """
-        if known_start is None:
-            return self.std
-        check_numbers(3, 0, known_start=known_start)
-        reading, known_std, *std = torch.tensor((TYPICAL_FIELD, known_start, *self.std), dtype=torch.float64)
-        return _rounded(calibration(reading, reading, SensorStd(*std), known_std)[1])
-
 
 def _compass(seed: int) -> MagneticNorth:  # noqa: ARG001
     """Return a compass, which draws no random numbers."""
     return MagneticNorth()
-
-
-def _rounded(sensor_std: SensorStd) -> SensorStd:
-    """Return standard deviations as plain numbers."""
-    return SensorStd(*(tuple(round(number, 6) for number in std.tolist()) for std in sensor_std))
 
 
 def load_conditions(path: Path | str) -> Conditions:
@@ -241,17 +218,13 @@ def conditions_named(name: str) -> Conditions:
     return CONDITIONS[name]
 
 
-def with_conditions(
-    env: EnvBase, conditions: Conditions | str, seed: int = 0, known_start: Sequence[float] | None = None
-) -> EnvBase:
+def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -> EnvBase:
     """Return an environment under conditions, or the environment itself if they have no error.
 
     Args:
         env: navigation environment; errors of motion need ``drift_km=conditions.drift_km(max_move_km)``.
         conditions: conditions, or the name of a preset.
         seed: seed of the errors.
-        known_start: where the vehicle knows the elements at its start, their standard deviations: it then calibrates
-            its readings (:class:`~magrl.transforms.KnownStart`).
 
     Raises:
         ValueError: for an unknown preset, or an environment that does not allow the farthest move.
@@ -269,7 +242,6 @@ def with_conditions(
     check_type(EnvBase, env=env)
     if conditions.perfect:
         return env
-    calibration = [] if known_start is None else [KnownStart(conditions.std, known_start)]
-    env = TransformedEnv(env, Compose(*conditions.transforms(seed), *calibration))
+    env = TransformedEnv(env, Compose(*conditions.transforms(seed)))
     _ = env.action_spec  # an error before the first episode
     return env

@@ -17,11 +17,33 @@ from magrl.geodesy import wrap_angle
 from magrl.navigators import Secant
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import Reading
-from magrl.transforms import calibration
 from magrl.vehicle.onboard.journal import Options
 
 READS = {*PUBLIC_KEYS, *STD_KEYS, "elapsed_steps", "done"}
 """Keys that a vehicle knows."""
+
+
+def calibrated(reading: Reading, known: Tensor, known_std: Tensor) -> tuple[Tensor, SensorStd]:
+    """Return the constant errors of the sensors ``(3,)``, given a reading where the elements are known, and what is
+    left.
+
+    With ``c^2 = bias^2 - drift^2`` and ``m^2 = noise^2 + drift^2 + known_std^2``, the difference of reading and known
+    elements has the variance ``c^2 + m^2``. The error is ``c^2 / (c^2 + m^2)`` times the difference, and ``c^2 m^2 /
+    (c^2 + m^2) + drift^2`` is the variance that is left. An element whose bias is infinite is not measured.
+
+    Example:
+        >>> here, none = torch.tensor([8.0, -16.0, 35000.0]), torch.zeros(3)
+        >>> std = SensorStd(none, torch.tensor([0.5, 0.0, 0.0]), torch.tensor([0.3, 0.0, 0.0]))
+        >>> zero = torch.tensor(0.0)
+        >>> error, left = calibrated(Reading(here + std.bias, here, zero, zero, std, zero), here, none)
+        >>> error[0], left.bias[0]
+        (tensor(0.3200), tensor(0.3842))
+    """
+    noise, bias, slow = (std.square() for std in reading.std[:3])
+    constant, other = torch.where(bias < math.inf, bias - slow, 0.0).clamp_min(0), noise + slow + known_std.square()
+    gain = torch.where(constant > 0, constant / (constant + other), 0.0)
+    left = torch.where(bias < math.inf, gain * other + slow, math.inf).sqrt()
+    return gain * element_difference(reading.field, known), reading.std._replace(bias=left)
 
 
 class Other:
@@ -61,7 +83,7 @@ class Other:
         new = copy.deepcopy(self)
         new.left, new.course = reading.std, reading.heading
         if reading.known is not None and reading.known_std is not None:
-            new.error, new.left = calibration(reading.field, reading.known, reading.std, reading.known_std)
+            new.error, new.left = calibrated(reading, reading.known, reading.known_std)
         if self._secant:
             elements, std = NAMES[1:] if options.magnetic else NAMES, SensorStd(*(part.tolist() for part in new.left))
             new.navigator = Secant(options.max_move_km, options.max_turn_rad, elements=elements, sensor_std=std)

@@ -176,7 +176,7 @@ def test_evaluate_under_conditions(tmp_path: Path) -> None:
     config, (flight, _), navigators, _ = evaluate.prepare(config)
     assert {type(part) for part in flight.env.transform} >= {MotionError, NorthReferenceError}
     assert tuple(navigators[0][0].sensor_std[1].tolist()) == CONDITIONS["ship"].std.bias
-    assert evaluate.settings(config, flight.base)["errors"] == "ship"
+    assert evaluate.settings(config, flight)["errors"] == "ship"
 
 
 BOAT = Path(__file__).parent.parent.parent.parent / "docs" / "examples" / "boat.toml"

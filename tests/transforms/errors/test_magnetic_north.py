@@ -15,7 +15,7 @@ from magrl.envs import Scenario
 from magrl.evaluation import Flight, evaluate
 from magrl.geodesy import geodesic
 from magrl.sensor_std import SensorStd
-from magrl.transforms import KnownStart, MagneticNorth
+from magrl.transforms import MagneticNorth
 from magrl.transforms.errors.base import true_keys
 
 NOISE = (0.02, 0.02, 2.0)
@@ -60,7 +60,7 @@ def test_nothing_public_depends_on_declination() -> None:
     public = []
     for degrees in (0.0, 30.0):
         base = GeomagneticNavEnv(Scenario(field=Turned(degrees)), num_envs=3, seed=0)
-        states = flown(TransformedEnv(base, Compose(MagneticNorth(), KnownStart())), still)
+        states = flown(TransformedEnv(base, MagneticNorth()), still)
         privileged = {*true_keys(), "objective", "objective_weights", "reward_proximity"}
         public.append(states[-1].exclude(*privileged))
     heading = public[0]["heading"] - public[1]["heading"] - math.radians(30)
@@ -83,17 +83,6 @@ def test_navigators_fly_by_the_compass(navigator: str, noise: tuple[float, float
     scenario = Scenario(arrival="distance", start_heading="random", max_steps=60)
     scenario = scenario.with_tasks(scenario.random_tasks(16, 1))
     assert evaluate(navigator, scenario, errors=noise, north="magnetic")["success"].double().mean() > 0.8
-
-
-def test_a_vehicle_declares_and_calibrates_by_a_known_start() -> None:
-    scenario = Scenario(arrival="declared", start_heading="random", max_steps=60)
-    scenario = scenario.with_tasks(scenario.random_tasks(16, 1))
-    flight = Flight(scenario, errors="aircraft", north="magnetic", known_start=(0.0, 0.0, 0.0))
-    assert flight.sensor_std.magnetic
-    episodes = flight.fly("kalman")
-    assert episodes["start_field"][..., 0].eq(0).all()
-    assert episodes["start_error"][..., 0].eq(0).all()
-    assert episodes["next", "success"].any(1).double().mean() > 0.6
 
 
 def test_only_the_bias_of_declination_may_be_unlimited() -> None:
