@@ -15,7 +15,7 @@ from magrl.envs.scenario import Scenario
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import STEP_PRICE, Rules
 from magrl.transforms import (
-    SPEEDS_KM_H,
+    CONDITIONS,
     AlignmentReward,
     FieldGradient,
     GradientHeading,
@@ -183,7 +183,7 @@ def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     """
     drift: dict[str, Any] = {"drift": (0.1, 0.05, 20.0), "drift_length": 200.0}
     errors = (
-        MagneticWeather("college", speed_km_h=SPEEDS_KM_H["aircraft"], stated=PERFECT),
+        MagneticWeather("college", speed_km_h=CONDITIONS["aircraft"].speed_km_h, stated=PERFECT),
         SensorErrors(STORM_NOISE, **drift, stated=SensorStd(STORM_NOISE)),
         Spikes((2.0, 1.0, 200.0), rate=0.05),
     )

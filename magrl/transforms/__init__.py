@@ -25,7 +25,6 @@ from magrl.transforms.errors.sensors import SensorErrors as SensorErrors
 from magrl.transforms.errors.sensors import sensor_levels as sensor_levels
 from magrl.transforms.errors.spikes import Spikes as Spikes
 from magrl.transforms.errors.vector import VectorErrors as VectorErrors
-from magrl.transforms.errors.weather import SPEEDS_KM_H as SPEEDS_KM_H
 from magrl.transforms.errors.weather import MagneticWeather as MagneticWeather
 from magrl.transforms.rewards import DistanceCost as DistanceCost
 from magrl.transforms.rewards import EpisodeSum as EpisodeSum

@@ -120,11 +120,9 @@ class GradientHeading(ObservationTransform):
             parallel to determine a direction (the heading is 0 there).
         pair: two elements, by name (``"D"``, ``"I"``, ``"B_H"``) or by index; or ``"auto"``, where the values are D, I,
             B_H. The difference in D is wrapped.
-        min_crossing_deg: smallest angle at which the two gradients must cross [deg].
 
     Raises:
-        ValueError: for an unknown element, a pair of equal elements, a crossing angle outside [0, 90), or shapes that
-            do not match.
+        ValueError: for an unknown element, a pair of equal elements, or shapes that do not match.
 
     Example:
         >>> from tensordict import TensorDict
@@ -144,15 +142,10 @@ class GradientHeading(ObservationTransform):
         out_keys: Keys | None = None,
         *,
         pair: tuple[str | int, str | int] | str = ("D", "I"),
-        min_crossing_deg: float = 2.0,
     ) -> None:
         super().__init__(in_keys, out_keys)
-        check_number(0, 90, min_crossing_deg=min_crossing_deg)
-        if min_crossing_deg == 90:
-            raise ValueError(f"min_crossing_deg must be in [0, 90), got {min_crossing_deg}")
         self.pair = None if pair == "auto" else _pair_indices(pair)
         self.wrapped = [0] if pair == "auto" or "D" in pair else []
-        self.min_crossing = math.radians(min_crossing_deg)
 
     def _compute(self, values: list[Tensor]) -> tuple[Tensor, Tensor]:
         value, target, gradient = values
@@ -164,7 +157,7 @@ class GradientHeading(ObservationTransform):
         else:
             pair = guidance.best_pair(gradient)
             error, gradient = error.gather(-1, pair), gradient.gather(-2, pair.unsqueeze(-1).expand(*pair.shape, 2))
-        return guidance.parallel_approach(torch.zeros_like(error), error, gradient, self.min_crossing)
+        return guidance.parallel_approach(torch.zeros_like(error), error, gradient)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the heading, in [-pi, pi], and its mask."""

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from magrl.checks import check_number, check_numbers
 from magrl.counters import stream_uniform
 from magrl.transforms.errors.base import Episode, EpisodeNumbers
 
 ALONG, ACROSS_KM = (0.2, 0.8), 80.0
 """Centers lie at this share of the displacement from the destination to the start, and up to so far beside it [km]."""
+NUMBER, SEEN = 4, 3
+"""Discs of an episode, and those that are observed at once, nearest first."""
+RADIUS_KM, SIGHT_KM = (15.0, 40.0), 75.0
+"""Lowest and highest radius, and the distance from the edge within which a disc is seen [km]; chosen."""
 
 
 class NoGoAreas(EpisodeNumbers):
@@ -22,23 +22,16 @@ class NoGoAreas(EpisodeNumbers):
 
     A vehicle that steers straight at its destination must fail in some episodes, however well it knows the direction.
     Place this before the reward, which reads the success. Distances are those in the plane around the destination.
+    A radius is at most two thirds of the way from a center to either end of a task.
 
     Args:
-        number: discs of an episode.
-        radius_km: lowest and highest radius [km]; at most two thirds of the way from a center to either end of a task.
-        sight_km: distance from the edge within which a disc is seen [km].
-        seen: discs that are observed at once, nearest first.
         **options: ``in_keys``, ``out_keys`` and ``seed`` of :class:`~magrl.transforms.errors.base.EpisodeNumbers`. The
             keys read are the true displacement ``(..., 2)`` in the frame of the vehicle [km], heading ``(..., 1)``
             [rad], and the flags ``success``, ``terminated``, ``truncated`` and ``done`` ``(..., 1)``, which are also
-            written. ``areas`` ``(..., 3 * seen)`` has for each disc in sight 1 at its edge to 0 at the limit of sight,
+            written. ``areas`` ``(..., 9)`` has for each disc in sight 1 at its edge to 0 at the limit of sight,
             times the direction forward and to the right, and its radius as a share of the highest. The key
             ``no_go_areas`` is the state: north and east of the center from the destination and radius of each disc
             [km], then the vehicle's position. It is privileged.
-
-    Raises:
-        ValueError: for a number that is not a whole number above 0, a negative radius, a highest one of 0 or below
-            the lowest, or a sight that is not above 0.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
@@ -53,25 +46,8 @@ class NoGoAreas(EpisodeNumbers):
     numbers_key, stream_key = "no_go_areas", "no_go_stream"
     default_in_keys = ("true_way", "heading", "success", "terminated", "truncated", "done")
     default_out_keys = ("areas",)
-
-    def __init__(
-        self,
-        *,
-        number: int = 4,
-        radius_km: Sequence[float] = (15.0, 40.0),
-        sight_km: float = 75.0,
-        seen: int = 3,
-        **options: Any,
-    ) -> None:
-        super().__init__(**options)
-        check_number(1, whole=True, number=number, seen=seen)
-        check_number(0, above=True, sight_km=sight_km)
-        check_numbers(2, 0.0, radius_km=radius_km)
-        check_number(radius_km[0], above=not radius_km[0], highest_radius_km=radius_km[1])
-        self.number, self.seen, self.sight_km = number, min(seen, number), float(sight_km)
-        self.radius_km = tuple(map(float, radius_km))
-        self.size = 3 * number + 2
-        self.out_sizes = {"areas": (3 * self.seen,)}
+    out_sizes = {"areas": (3 * SEEN,)}
+    size = 3 * NUMBER + 2
 
     @staticmethod
     def discs(numbers: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,12 +74,12 @@ class NoGoAreas(EpisodeNumbers):
 
     def _placed(self, uniform: Tensor, start: Tensor) -> Tensor:
         """Return the discs of an episode that begins at ``start`` ``(..., 2)`` [km], and that place."""
-        share, across, radius = uniform[..., :-2].unflatten(-1, (self.number, 3)).unbind(-1)
+        share, across, radius = uniform[..., :-2].unflatten(-1, (NUMBER, 3)).unbind(-1)
         low, high = ALONG
         along, beside = (low + (high - low) * share).unsqueeze(-1), ACROSS_KM * (2 * across - 1).unsqueeze(-1)
         right = torch.stack((-start[..., 1], start[..., 0]), -1) / start.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         centers = along * start.unsqueeze(-2) + beside * right.unsqueeze(-2)
-        radii = self.radius_km[0] + (self.radius_km[1] - self.radius_km[0]) * radius
+        radii = RADIUS_KM[0] + (RADIUS_KM[1] - RADIUS_KM[0]) * radius
         ends_km = torch.minimum(centers.norm(dim=-1), (centers - start.unsqueeze(-2)).norm(dim=-1))
         radii = torch.minimum(radii, 2 / 3 * ends_km)  # both ends of a short task are free
         return torch.cat((torch.cat((centers, radii.unsqueeze(-1)), -1).flatten(-2), start), -1)
@@ -111,11 +87,11 @@ class NoGoAreas(EpisodeNumbers):
     def _seen(self, relative: Tensor, radii: Tensor, heading: Tensor) -> Tensor:
         """Return what is observed of discs at ``relative`` ``(..., number, 2)`` from the vehicle."""
         distance = relative.norm(dim=-1)
-        gap_km, nearest = (distance - radii).topk(self.seen, largest=False)
+        gap_km, nearest = (distance - radii).topk(SEEN, largest=False)
         ahead = turned(relative, -heading.unsqueeze(-2)) / distance.clamp_min(1e-6).unsqueeze(-1)
         ahead = ahead.take_along_dim(nearest.unsqueeze(-1), -2)
-        closeness = (1 - gap_km.clamp_min(0) / self.sight_km).clamp_min(0).unsqueeze(-1)
-        size = (radii.gather(-1, nearest) / self.radius_km[1]).unsqueeze(-1) * (closeness > 0)
+        closeness = (1 - gap_km.clamp_min(0) / SIGHT_KM).clamp_min(0).unsqueeze(-1)
+        size = (radii.gather(-1, nearest) / RADIUS_KM[1]).unsqueeze(-1) * (closeness > 0)
         return torch.cat((closeness * ahead, size), -1).flatten(-2)
 
 

@@ -43,7 +43,7 @@ def north_error(**options: object) -> NorthReferenceError:
 
 
 def motion_error(**options: object) -> MotionError:
-    errors = {"log_scale": 0.02, "log_noise": 0.01, "compass_deg": 3.0, "heading_noise_deg": 1.0}
+    errors = {"log_scale": 0.02, "log_noise": 0.01, "compass_deg": 3.0}
     return MotionError(**errors, current_km_h=2.0, eddies_km_h=0.5, speed_km_h=30.0, **options)
 
 

@@ -95,7 +95,7 @@ def test_declination_is_taken_the_short_way(here: float, there: float, degrees: 
     ids=["no gradient", "parallel", "on target"],
 )
 def test_no_direction_is_masked_and_not_nan(there: list[float], gradient: list[list[float]]) -> None:
-    assert heading_of([0.0, 0.0], there, gradient, pair=(0, 1), min_crossing_deg=0.0) == (0.0, False)
+    assert heading_of([0.0, 0.0], there, gradient, pair=(0, 1)) == (0.0, False)
 
 
 def guided() -> TransformedEnv:

@@ -21,7 +21,7 @@ from magrl.transforms.errors.motion import MotionError
 from magrl.transforms.errors.north import NORTH_REFERENCES, NorthReferenceError, north_reference
 from magrl.transforms.errors.sensors import SensorErrors
 from magrl.transforms.errors.vector import VectorErrors
-from magrl.transforms.errors.weather import SPEEDS_KM_H, MagneticWeather
+from magrl.transforms.errors.weather import MagneticWeather
 
 MAGNETIC = "magnetic"
 """North of a vehicle without a true-north reference."""
@@ -56,7 +56,7 @@ class Conditions:
     """
 
     name: str
-    speed_km_h: float = SPEEDS_KM_H["ship"]
+    speed_km_h: float = 24.0
     sensors: Mapping[str, Any] = field(default_factory=dict)
     north: str | Mapping[str, Any] | None = None
     motion: Mapping[str, Any] | None = None

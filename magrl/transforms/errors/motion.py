@@ -37,7 +37,6 @@ class MotionError(EpisodeErrors):
         log_scale: error of the log in an episode, as a share of the distance.
         log_noise: error of the log in a move, as a share of the distance.
         compass_deg: error of the compass in motion in an episode [deg].
-        heading_noise_deg: error of the compass in motion in a move [deg].
         current_km_h: speed of a current whose direction is random in each episode [km/h].
         eddies_km_h: root-mean-square speed of a field of eddies, another one in each episode [km/h]; see
             :func:`eddy_velocity`. Its value at the start of a move holds for all of it.
@@ -70,7 +69,7 @@ class MotionError(EpisodeErrors):
     true_keys = (*default_out_keys, DISPLACEMENT)
     numbers_key, stream_key = "motion_error", "motion_stream"
     in_sizes = {"move": (2,), "heading": (1,), "position": (2,)}
-    size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2
+    size, draws, step_draws = 3 + EDDIES, 3 + EDDIES, 2  # of a step, one is used: published numbers rest on the stride
 
     def __init__(
         self,
@@ -78,7 +77,6 @@ class MotionError(EpisodeErrors):
         log_scale: float = 0.0,
         log_noise: float = 0.0,
         compass_deg: float = 0.0,
-        heading_noise_deg: float = 0.0,
         current_km_h: float = 0.0,
         eddies_km_h: float = 0.0,
         eddy_km: float = 200.0,
@@ -89,11 +87,10 @@ class MotionError(EpisodeErrors):
         super().__init__(**options)
         self.in_keys_inv = self.out_keys_inv = ["action", self.in_keys[1]]
         check_number(-math.inf if fixed else 0, log_scale=log_scale, compass_deg=compass_deg)
-        check_number(0, log_noise=log_noise, heading_noise_deg=heading_noise_deg)
-        check_number(0, current_km_h=current_km_h, eddies_km_h=eddies_km_h)
+        check_number(0, log_noise=log_noise, current_km_h=current_km_h, eddies_km_h=eddies_km_h)
         check_number(0, above=True, eddy_km=eddy_km)
         check_number(0, above=True, optional=not (current_km_h or eddies_km_h), speed_km_h=speed_km_h)
-        self.log, self.compass, self.fixed = (log_scale, log_noise), (compass_deg, heading_noise_deg), fixed
+        self.log, self.compass_deg, self.fixed = (log_scale, log_noise), compass_deg, fixed
         self.current_km_h, self.speed_km_h = current_km_h, float(speed_km_h or 1.0)
         self.eddies_km_h, self.eddy_km = eddies_km_h, eddy_km
         shortest, _ = self._stretch
@@ -122,7 +119,7 @@ class MotionError(EpisodeErrors):
 
     def _constants(self, stream: Tensor) -> Tensor:
         uniform = stream_uniform(stream, self.draws)
-        sizes = uniform.new_tensor((self.log[0], self.compass[0]))
+        sizes = uniform.new_tensor((self.log[0], self.compass_deg))
         constants = sizes.expand_as(uniform[..., :2]) if self.fixed else sizes * normal_of(uniform[..., :2])
         return torch.cat((constants, 2 * math.pi * uniform[..., 2:]), -1)
 
@@ -141,9 +138,9 @@ class MotionError(EpisodeErrors):
         distance, turn = action[..., :2].double().unbind(-1)
         bow, errors = wrap_angle(heading[..., 0] + turn), errors.double()
         scale, compass, direction = errors[..., :3].unbind(-1)
-        stretch, swing = stream_normal(stream.squeeze(-1), 2).unbind(-1)
+        stretch = stream_normal(stream.squeeze(-1), 1).squeeze(-1)
         through = distance * (1 + scale + self.log[1] * stretch)
-        course = bow + torch.deg2rad(compass + self.compass[1] * swing)
+        course = bow + torch.deg2rad(compass)
         displacement = through.unsqueeze(-1) * _unit(course) - distance.unsqueeze(-1) * _unit(bow)
         hours = (distance / self.speed_km_h).unsqueeze(-1)
         displacement = displacement + hours * self.current_km_h * _unit(direction)

@@ -18,15 +18,8 @@ from magrl.field.records import WeatherRecord, weather_record
 from magrl.sensor_std import SensorStd
 from magrl.transforms.errors.base import Episode, ReadingErrors
 
-SPEEDS_KM_H = {"aircraft": 341.0, "ship": 24.0, "underwater": 6.1}
-"""Speeds of vehicles [km/h], with which 400 km take 1.2 h, 17 h and 66 h.
-
-- ``"aircraft"``: Cessna 208B Grand Caravan EX, 184 kn at 10 000 ft (manufacturer's figure).
-- ``"ship"``: RRS Sir David Attenborough, cruising speed of 13 kn (British Antarctic Survey).
-- ``"underwater"``: Kongsberg HUGIN Endurance, 2200 km in 15 days (manufacturer's figure).
-"""
-
-
+READING_S = 60.0
+"""Time that each step takes beside its move [s], so that standing still takes time; chosen."""
 WAY_KM = 500.0
 """Way whose weather a vehicle expects [km]."""
 
@@ -35,18 +28,17 @@ class MagneticWeather(ReadingErrors):
     """Add the variation of the field in time to what a vehicle measures, as an observatory recorded it.
 
     Each episode starts at a minute of the record that is a pure function of (seed, vehicle, episode). A step takes
-    ``distance / speed + reading_s``. The variation of the minute in which the step ends is added to the field vector;
-    between the minutes of the record nothing is interpolated. All vehicles of a batch are in the weather of the record,
-    wherever they are. ``bias_std`` and ``drift_std`` grow by the root mean square of the variation over the time of
-    :data:`WAY_KM`, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
+    ``distance / speed`` and :data:`READING_S`. The variation of the minute in which the step ends is added to the field
+    vector; between the minutes of the record nothing is interpolated. All vehicles of a batch are in the weather of the
+    record, wherever they are. ``bias_std`` and ``drift_std`` grow by the root mean square of the variation over the
+    time of :data:`WAY_KM`, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
     ``field`` becomes the measured field, and ``true_field`` the field without weather, from which the environment
     computes arrival, objective and reward. In ``Compose``, the weather stands before the errors of the sensors.
 
     Args:
         record: name in :data:`magrl.field.WEATHER`, or a record of one's own.
-        speed_km_h: speed of the vehicles [km/h], as in :data:`SPEEDS_KM_H`.
-        reading_s: time that each step takes beside its move [s], so that standing still takes time.
+        speed_km_h: speed of the vehicles [km/h].
         span_h: longest duration of an episode [h]: it starts where the record has no gap for that time; after it, the
             weather stays constant. By default the longest moves until the step
             limit, where the environment has ``max_steps`` and ``max_move_km``.
@@ -64,7 +56,7 @@ class MagneticWeather(ReadingErrors):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from magrl.envs import GeomagneticNavEnv
-        >>> weather = MagneticWeather("disturbed", speed_km_h=SPEEDS_KM_H["ship"], seed=1)
+        >>> weather = MagneticWeather("disturbed", speed_km_h=24.0, seed=1)
         >>> state = TransformedEnv(GeomagneticNavEnv(num_envs=1000, seed=0), weather).reset()
         >>> (state["field"] - state["true_field"])[:, 2].std().round()
         tensor(26.)
@@ -82,7 +74,6 @@ class MagneticWeather(ReadingErrors):
         record: str | WeatherRecord = "disturbed",
         *,
         speed_km_h: float,
-        reading_s: float = 60.0,
         span_h: float | None = None,
         **options: Any,
     ) -> None:
@@ -90,9 +81,8 @@ class MagneticWeather(ReadingErrors):
         self.record = weather_record(record) if isinstance(record, str) else record
         check_type(WeatherRecord, record=self.record)
         check_number(0, above=True, speed_km_h=speed_km_h)
-        check_number(0, reading_s=reading_s)
         check_number(0, optional=True, span_h=span_h)
-        self.speed_km_h, self.reading_s, self.span_h = float(speed_km_h), float(reading_s), span_h
+        self.speed_km_h, self.span_h = float(speed_km_h), span_h
         self._starts_by_span: dict[float, Tensor] = {}
         self.register_buffer("variation", self.record.variation, persistent=False)
         moments = self.record.second_moments(WAY_KM / self.speed_km_h)
@@ -111,7 +101,7 @@ class MagneticWeather(ReadingErrors):
                 "MagneticWeather needs span_h, the longest time that an episode takes [h]: there is no environment "
                 "with max_steps and max_move_km from which it follows, got span_h None"
             )
-        return float(steps) * (float(move_km) / self.speed_km_h + self.reading_s / 3600)
+        return float(steps) * (float(move_km) / self.speed_km_h + READING_S / 3600)
 
     def _starts(self) -> Tensor:
         """Return the minutes at which an episode can start, ``(S,)`` int64."""
@@ -128,7 +118,7 @@ class MagneticWeather(ReadingErrors):
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         (field, move), (start, minutes) = values, episode.numbers.unbind(-1)
         if not episode.first:
-            step_h = move[..., 0].double() / self.speed_km_h + self.reading_s / 3600
+            step_h = move[..., 0].double() / self.speed_km_h + READING_S / 3600
             minutes = (minutes + 60 * step_h).clamp(max=60 * self._longest_h())
         vector = field_vector(field.double()) + self.variation[(start + minutes).long()]
         self._measure(tensordict, field, measured_elements(vector).to(field.dtype))

@@ -14,10 +14,10 @@ from torchrl.envs import TransformedEnv
 
 from magrl.field import WEATHER, WeatherRecord, weather_record
 from magrl.field.elements import field_vector
-from magrl.transforms import SPEEDS_KM_H, MagneticWeather
+from magrl.transforms import CONDITIONS, MagneticWeather
 
 NAN = math.nan
-SHIP = SPEEDS_KM_H["ship"]
+SHIP = CONDITIONS["ship"].speed_km_h
 
 
 def ship(num_envs: int = 2, **options: object) -> TransformedEnv:
@@ -93,13 +93,13 @@ def test_errors_of_records() -> None:
 
 
 def test_the_variation_of_the_minute_is_added_to_the_vector() -> None:
-    """At 100 km/h, with 90 s for a reading: 10 km take 7.5 minutes, and standing still 1.5."""
+    """At 100 km/h, with 60 s for a reading: 10 km take 7 minutes, and standing still one."""
     record = ramp(12000)
-    env = ship(record=record, speed_km_h=100.0, reading_s=90.0)
+    env = ship(record=record, speed_km_h=100.0)
     actions = torch.tensor([[10.0, 0.1], [0.0, 0.0], [50.0, -0.2]]).unsqueeze(1).expand(-1, 2, -1)
     plain = flown(nav(), actions)
     start = None
-    for measured, true, minutes in zip(flown(env, actions), plain, (0, 7.5, 9.0, 40.5), strict=True):
+    for measured, true, minutes in zip(flown(env, actions), plain, (0, 7.0, 8.0, 39.0), strict=True):
         start = measured["weather_clock"][:, 0] if start is None else start
         assert torch.equal(measured["weather_clock"], torch.stack((start, torch.full((2,), minutes).double()), -1))
         minute = (start + minutes).floor()
@@ -123,9 +123,9 @@ def test_elements_by_hand() -> None:
 
 
 def test_the_clock_stops_at_the_span() -> None:
-    env = ship(record=ramp(61), speed_km_h=100.0, reading_s=0.0, span_h=1.0)
+    env = ship(record=ramp(61), speed_km_h=100.0, span_h=1.0)
     states = flown(env, torch.tensor([[40.0, 0.0]] * 4).unsqueeze(1).expand(-1, 2, -1))
-    assert [state["weather_clock"][0].tolist() for state in states] == [[0, 0], [0, 24], [0, 48], [0, 60], [0, 60]]
+    assert [state["weather_clock"][0].tolist() for state in states] == [[0, 0], [0, 25], [0, 50], [0, 60], [0, 60]]
 
 
 # Errors
@@ -137,7 +137,7 @@ def test_the_clock_stops_at_the_span() -> None:
         (lambda: MagneticWeather("college", speed_km_h=SHIP, span_h=24.1), r"24.1 h .*'college'.*23.9 h"),
         (lambda: MagneticWeather(speed_km_h=SHIP)(nav().reset()), "needs span_h"),
         # 50 moves of 50 km at 6.1 km/h take 411 h, and 13 days follow the disturbed one
-        (lambda: ship(speed_km_h=SPEEDS_KM_H["underwater"]).specs, r"410.6\d* h .*'disturbed'.* 237.1 h"),
+        (lambda: ship(speed_km_h=6.1).specs, r"410.6\d* h .*'disturbed'.* 237.1 h"),
     ],
 )
 def test_errors(make: Callable[[], object], says: str) -> None:
