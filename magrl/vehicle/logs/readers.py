@@ -10,10 +10,10 @@ import numpy as np
 from pandas import DataFrame
 
 from magrl.checks import UsageError, short
-from magrl.files import read_table, read_text
+from magrl.files import numbers, read_table, read_text
 from magrl.vehicle.logs.autopilots import read_ardupilot, read_bag, read_nmea, read_ulg
 from magrl.vehicle.logs.conventions import check_intensity, check_range, column_of
-from magrl.vehicle.logs.samples import AXES, Log, Recording, numbers, samples_of, times_of, total_intensity
+from magrl.vehicle.logs.samples import AXES, Log, Recording, samples_of, times_of, total_intensity
 
 
 def read_log(*paths: Path | str, sensor: str | None = None) -> Log:

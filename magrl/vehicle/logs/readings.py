@@ -17,12 +17,12 @@ from torch import Tensor
 from magrl.checks import check_choice, check_number, short
 from magrl.field import IGRF
 from magrl.field.elements import NAMES, element_difference, elements_jacobian, measured_elements
-from magrl.files import read_table, read_text
+from magrl.files import numbers, read_table, read_text
 from magrl.geodesy import geodesic
 from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration
 from magrl.vehicle.logs.conventions import COLUMNS, NORTHS, UNITS, axes_of_elements, check_range, rotation, unit_of
-from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Log, date_of, new_times, numbers, times_of
+from magrl.vehicle.logs.samples import ATTITUDE, AXES, Array, Log, date_of, new_times, times_of
 from magrl.vehicle.onboard.known import deviation, likely_mistake, model_std
 
 SPIKE_SIGMAS = 5.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame, Series
 
 from magrl.checks import short
-from magrl.files import numbers_of
+from magrl.files import numbers
 from magrl.vehicle.logs.conventions import COLUMNS, Array, check_range
 
 AXES, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "heading")
@@ -173,23 +173,6 @@ def _at(time: Array, name: str, times: Array, values: Array) -> Array:
     return (column + 180) % 360 - 180 if name in ("roll", "longitude") else column % 360 if turning else column
 
 
-def numbers(column: Series) -> Array:
-    """Return the numbers of a column, NaN for blank cells.
-
-    Raises:
-        ValueError: for a cell that is no finite number, with its row.
-
-    Example:
-        >>> numbers(Series(["1.5", None]))
-        array([1.5, nan])
-    """
-    wrong: list[str] = []
-    values = numbers_of(column, wrong)
-    if wrong:
-        raise ValueError(wrong[0])
-    return values
-
-
 def times_of(column: Series, factor: float = 1.0) -> Array:
     """Return times of numbers, or of texts in seconds since 1970, in UTC where they have no time zone.
 
@@ -204,12 +187,8 @@ def times_of(column: Series, factor: float = 1.0) -> Array:
         >>> times_of(Series(["2026-06-30T12:00:00"], name="time"))
         array([1.7828208e+09])
     """
-    wrong: list[str] = []
-    values = numbers_of(column, wrong)
-    if not wrong:
-        return factor * values
-    if np.isfinite(values).any():
-        raise ValueError(wrong[0])
+    if pandas.to_numeric(column, errors="coerce").notna().any() or column.isna().all():
+        return factor * numbers(column)
     parsed = pandas.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
     bad = parsed.isna() & column.notna()
     if bad.any():
