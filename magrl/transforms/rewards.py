@@ -17,6 +17,8 @@ from magrl.geodesy import geodesic
 from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, StepReward
 from magrl.transforms.errors.base import Episode, EpisodeNumbers
 
+SPL_REWARD = 10.0
+"""Reward for an SPL of 1."""
 UNIT_KM, ARRIVAL, PRICE = 50.0, 10.0, 0.1
 """Distance of a reward of 1 [km], the longest move by default; reward for the arrival; price of a step."""
 
@@ -140,16 +142,15 @@ class HighestSPL(StatefulTransform):
 class SPLReward(StepReward):
     """Write the change of :class:`HighestSPL` minus the price of a step: the return of an episode is its SPL.
 
-    It is ``scale`` times SPL minus 1, minus ``scale / 100`` times the prices of its steps. In place of the reward of
+    It is 10 times SPL minus 1, minus a tenth of the prices of its steps. In place of the reward of
     the environment. Privileged.
 
     Args:
         in_keys: highest SPL ``(..., 1)`` and price of a step ``(..., 1)`` [% of SPL].
         out_keys: one reward ``(..., 1)``.
-        scale: reward for an SPL of 1.
 
     Raises:
-        ValueError: for a scale that is not above 0, or another number of keys.
+        ValueError: for another number of keys.
 
     Example:
         >>> from tensordict import TensorDict
@@ -160,18 +161,13 @@ class SPLReward(StepReward):
 
     default_in_keys = ("highest_spl", "step_price")
 
-    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None, *, scale: float = 10.0) -> None:
-        super().__init__(in_keys, out_keys)
-        check_number(0, above=True, scale=scale)
-        self.scale = float(scale)
-
     @property
     def state_keys(self) -> list[NestedKey]:
         """Keys that a step reads from the TensorDict before it: the highest SPL."""
         return self.in_keys[:1]
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        tensordict.set(self.out_keys[0], self.scale * (values[0] - state[0] - values[1] / 100))
+        tensordict.set(self.out_keys[0], SPL_REWARD * (values[0] - state[0] - values[1] / 100))
 
 
 class RandomStepPrice(EpisodeNumbers):

@@ -17,7 +17,6 @@ from ppigrf.ppigrf import shc_fn_igrf13
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
 from torchrl.envs import (
     FrameSkipTransform,
     NoopResetEnv,
@@ -129,14 +128,6 @@ def test_a_collector_cuts_episodes() -> None:
     (data,) = collector
     assert torch.equal(data["elapsed_steps"], data["step_count"])  # the latter by TorchRL's StepCounter
     assert (data["next", "truncated"].cumsum(1)[:, -1] == 2).all()
-
-
-def test_a_prioritized_buffer_samples() -> None:
-    pytest.importorskip("torchrl._torchrl", reason="this TorchRL is built for another torch", exc_type=ImportError)
-    buffer = TensorDictPrioritizedReplayBuffer(alpha=1.0, beta=1.0, storage=LazyTensorStorage(20), batch_size=8)
-    buffer.extend(make(2).rollout(10).flatten())
-    buffer.update_priority(torch.arange(20), torch.arange(20) == 3)
-    assert (buffer.sample()["elapsed_steps"] == 3).all()
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -320,13 +311,6 @@ def test_a_flight_does_not_depend_on_the_size_of_the_batch() -> None:
     for key in positions:
         torch.testing.assert_close(small[key], large[key], rtol=0, atol=1e-12)
     assert small["next", "done"].sum() > 3 * few
-
-
-def test_starts_computed_ahead_are_dropped_by_a_move() -> None:
-    env = make(2)
-    env.reset(env.reset().set("_reset", torch.tensor([[False], [True]])))
-    assert env._ahead is not None
-    assert env.to("cpu:0")._ahead is None
 
 
 def test_starts_computed_ahead_do_not_change_with_what_a_reset_returned() -> None:

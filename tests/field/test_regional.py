@@ -109,20 +109,6 @@ def test_an_error_above_the_tolerance_raises(igrf, degree, tolerance_nt):
         RegionalField(igrf, (-10, 0), (160, 170), degree=degree, tolerance_nt=tolerance_nt)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"latitude": (0, -10)}, r"latitudes \(0, -10\)"),
-        ({"longitude": (170, -170)}, r"longitudes \(170, -170\).*\(170, 190\)"),
-        ({"degree": 0}, "degree .* got 0"),
-        ({"tolerance_nt": math.nan}, "tolerance_nt .* got nan"),
-    ],
-)
-def test_bad_boxes_and_settings_raise(igrf, options, message):
-    with pytest.raises(ValueError, match=message):
-        RegionalField(igrf, **{"latitude": (-10, 0), "longitude": (160, 170)} | options)
-
-
 def test_a_region_survives_a_state_dict(region):
     twin = RegionalField(IGRF(1950.0), *BOX)
     twin.load_state_dict(region.state_dict())

@@ -93,7 +93,7 @@ def declared() -> Transform:
 
 
 def pendulum() -> Transform:
-    return MinMaxNorm(["th", "thdot"], ["a", "b"], ["action"], ["torque"], interval=(0.0, 1.0))
+    return MinMaxNorm(["th", "thdot"], ["a", "b"], ["action"], ["torque"])
 
 
 ENV_CASES: dict[str, tuple[Callable[[], EnvBase], Callable[[], Transform]]] = {
