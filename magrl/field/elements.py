@@ -7,8 +7,6 @@ component makes every element and derivative that depends on it NaN.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -20,24 +18,6 @@ UNITS = ("deg", "deg", "nT")
 """Units of :data:`NAMES`."""
 FIELD_NT = {"nanotesla": 1.0, "milligauss": 100.0, "microtesla": 1e3, "gauss": 1e5, "millitesla": 1e6, "tesla": 1e9}
 """Units of a magnetic field [nT]."""
-
-
-class Elements(NamedTuple):
-    """The seven elements of Eq. 2-1, each ``(...)``: D, I [deg]; B_H, B_x, B_y, B_z, B_F [nT].
-
-    Example:
-        >>> elements = seven_elements(torch.tensor([3.0, 4.0, 12.0]))
-        >>> elements.B_H, elements.B_F
-        (tensor(5.), tensor(13.))
-    """
-
-    D: Tensor
-    I: Tensor  # noqa: E741 - the element's name in the field's literature
-    B_H: Tensor
-    B_x: Tensor
-    B_y: Tensor
-    B_z: Tensor
-    B_F: Tensor
 
 
 def element_index(name: str) -> int:
@@ -56,25 +36,6 @@ def element_index(name: str) -> int:
     if name not in NAMES:
         raise ValueError(f"unknown magnetic element {name!r}: choose from {', '.join(NAMES)}")
     return NAMES.index(name)
-
-
-def seven_elements(b_ned: Tensor) -> Elements:
-    """Return the seven elements of a field vector.
-
-    Args:
-        b_ned: ``(..., 3)`` north, east, down [nT].
-
-    Returns:
-        Seven tensors ``(...)``. D is in (-180, 180], I in [-90, 90]; at a magnetic pole, where B_H is zero, D is 0.
-
-    Example:
-        >>> e = seven_elements(torch.tensor([30000.0, 0.0, -40000.0]))
-        >>> float(e.B_F), round(float(e.I), 2)
-        (50000.0, -53.13)
-    """
-    declination, inclination, horizontal = measured_elements(b_ned).unbind(-1)
-    north, east, down = b_ned.unbind(-1)
-    return Elements(declination, inclination, horizontal, north, east, down, torch.hypot(horizontal, down))
 
 
 def measured_elements(b_ned: Tensor) -> Tensor:

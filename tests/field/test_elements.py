@@ -7,16 +7,11 @@ import torch
 from support.field_checks import f64
 
 from magrl.field.elements import (
-    NAMES,
-    UNITS,
-    Elements,
     element_difference,
-    element_index,
     elements_gradient,
     elements_jacobian,
     field_vector,
     measured_elements,
-    seven_elements,
 )
 
 SHAPES = ((), (3,), (2, 3), (0,))
@@ -33,13 +28,12 @@ def random_fields(*shape, seed=0):
 @pytest.mark.parametrize("east", [1, -1])
 @pytest.mark.parametrize("down", [1, -1])
 def test_signs_in_every_octant(north, declination_north, east, down):
-    """3, 4, 12: B_H is 5, B_F is 13; the angle from the north-south line is atan(4/3), the dip atan(12/5)."""
-    found = seven_elements(f64(3.0 * north, 4.0 * east, 12.0 * down))
+    """3, 4, 12: B_H is 5; the angle from the north-south line is atan(4/3), the dip atan(12/5)."""
+    found = measured_elements(f64(3.0 * north, 4.0 * east, 12.0 * down))
     from_axis = math.degrees(math.atan2(4, 3))
     declination = east * (from_axis if declination_north == 0 else 180 - from_axis)
     inclination = down * math.degrees(math.atan2(12, 5))
-    expected = (declination, inclination, 5.0, 3.0 * north, 4.0 * east, 12.0 * down, 13.0)
-    torch.testing.assert_close(torch.stack(found), f64(*expected), rtol=1e-14, atol=0)
+    torch.testing.assert_close(found, f64(declination, inclination, 5.0), rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -57,16 +51,7 @@ def test_signs_in_every_octant(north, declination_north, east, down):
 )
 def test_angles_on_the_axes(b_ned, declination, inclination):
     """D is in (-180, 180]: due south is +180, however its zero is signed; at a magnetic pole it is 0."""
-    found = seven_elements(f64(*b_ned))
-    assert float(found.D) == pytest.approx(declination, abs=1e-13)
-    assert float(found.I) == pytest.approx(inclination, abs=1e-13)
     assert measured_elements(f64(*b_ned))[:2].tolist() == pytest.approx([declination, inclination], abs=1e-13)
-
-
-def test_paper_example_has_a_negative_inclination():
-    """2 S, 162 E in the paper: D 8.019, I -16.150, B_H 35467.990."""
-    found = measured_elements(field_vector(f64(8.019, -16.150, 35467.990)))
-    torch.testing.assert_close(found, f64(8.019, -16.150, 35467.990), rtol=1e-13, atol=0)
 
 
 def test_differences_in_declination_are_wrapped_and_others_are_not_rounded():
@@ -114,26 +99,12 @@ def test_gradient_worked_by_hand():
     torch.testing.assert_close(found, expected, rtol=1e-14, atol=0)
 
 
-def test_measured_elements_are_the_first_three():
-    b_ned = random_fields(7, seed=6)
-    assert Elements._fields[:3] == NAMES
-    assert len(UNITS) == len(NAMES)
-    for index, name in enumerate(NAMES):
-        assert element_index(name) == index
-        assert torch.equal(measured_elements(b_ned)[:, index], getattr(seven_elements(b_ned), name))
-    with pytest.raises(ValueError, match="unknown magnetic element 'H': choose from D, I, B_H"):
-        element_index("H")
-
-
 def test_nan_in_a_component_is_nan_in_what_depends_on_it():
-    """B_H and D depend on north and east, I and B_F on all three; the derivatives of D and B_H downward are zero."""
+    """B_H and D depend on north and east, I on all three; the derivatives of D and B_H downward are zero."""
     for place in range(3):
         b_ned = torch.ones(3, dtype=torch.float64)
         b_ned[place] = math.nan
-        found, jacobian = seven_elements(b_ned), elements_jacobian(b_ned)
-        horizontal = place < 2
-        of_each = torch.stack((found.D, found.I, found.B_H, found.B_F)).isnan().tolist()
-        assert of_each == [horizontal, True, horizontal, True]
+        jacobian, horizontal = elements_jacobian(b_ned), place < 2
         assert measured_elements(b_ned).isnan().tolist() == [horizontal, True, horizontal]
         assert jacobian[1].isnan().all()
         assert (jacobian[[0, 2], :2].isnan() == horizontal).all()
@@ -141,7 +112,7 @@ def test_nan_in_a_component_is_nan_in_what_depends_on_it():
     assert elements_gradient(f64(1.0, 1.0, 1.0), torch.full((3, 2), math.nan, dtype=torch.float64)).isnan().all()
 
 
-@pytest.mark.parametrize("function", [seven_elements, measured_elements, elements_jacobian, field_vector])
+@pytest.mark.parametrize("function", [measured_elements, elements_jacobian, field_vector])
 def test_vectors_of_another_size_raise(function) -> None:
     with pytest.raises(ValueError, match=r"must have the shape \(\.\.\., 3\), got \(2,\)"):
         function(torch.zeros(2))
