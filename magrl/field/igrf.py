@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
 from functools import cache
 from numbers import Real
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from magrl.checks import short
 from magrl.field.spherical import SphericalHarmonicField
@@ -42,7 +41,7 @@ def parse_date(date: Date) -> datetime.datetime:
         except ValueError as error:
             raise ValueError(f"date {date!r} is not an ISO date such as '2022-01-01'") from error
     if isinstance(date, (np.datetime64, datetime.date)) and date != date:
-        raise ValueError(f"date {date!r} is missing: give a date for each place")
+        raise ValueError(f"date {date!r} is missing")
     if isinstance(date, np.datetime64):
         moment = date.astype("M8[us]").item()
         if not isinstance(moment, datetime.datetime):
@@ -59,32 +58,6 @@ def parse_date(date: Date) -> datetime.datetime:
     year = int(date)
     start, end = datetime.datetime(year, 1, 1), datetime.datetime(year + 1, 1, 1)
     return start + datetime.timedelta(seconds=float(date - year) * (end - start).total_seconds())
-
-
-def parse_dates(dates: Sequence[Date] | NDArray[Any]) -> NDArray[np.datetime64]:
-    """Return an array of dates in any of the accepted forms as naive UTC ``datetime64[us]``.
-
-    Args:
-        dates: list, array or pandas column ``(...)`` of dates as :func:`parse_date` takes them.
-
-    Returns:
-        ``(...)``.
-
-    Raises:
-        ValueError: for no date, or as :func:`parse_date`.
-
-    Example:
-        >>> parse_dates([2022.5, "2023-01-01"])
-        array(['2022-07-02T12:00:00.000000', '2023-01-01T00:00:00.000000'], dtype='datetime64[us]')
-    """
-    array = np.asarray(dates, dtype=object if isinstance(dates, (list, tuple)) else None)
-    if not array.size:
-        raise ValueError(f"dates must hold at least one date, got {dates!r}")
-    if array.dtype.kind == "M" and not np.isnat(array).any():
-        return array.astype("M8[us]")
-    rows = list(array.flat) if array.dtype.kind == "M" else array.ravel().tolist()
-    parsed = {date: parse_date(date) for date in dict.fromkeys(rows)}
-    return np.array([parsed[date] for date in rows], dtype="M8[us]").reshape(array.shape)
 
 
 @cache
@@ -122,41 +95,24 @@ def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:
         >>> round(float(igrf_coefficients("2020-01-01")[1, 0].real), 2)
         -29403.41
     """
-    tables, shares = _epochs_and_shares(np.array(parse_date(date), dtype="M8[us]"), generation)
-    return (shares.reshape(-1, 1, 1) * tables).sum(0)
-
-
-def _epochs_and_shares(dates: NDArray[np.datetime64], generation: int) -> tuple[Tensor, Tensor]:
-    """Return Gauss tables of the epochs around some dates, and the share of each epoch in the field of each date.
-
-    Returns:
-        Complex ``(E, 14, 14)`` and ``(E, ...)`` float64; the shares of a date are those of linear interpolation.
-    """
-    epochs, table = _igrf_tables(generation)
-    outside = dates[(dates < epochs[0]) | (dates > epochs[-1])]
-    if outside.size:
+    when, (epochs, tables) = np.datetime64(parse_date(date), "us"), _igrf_tables(generation)
+    if not epochs[0] <= when <= epochs[-1]:
         first, last = epochs[[0, -1]].astype("M8[D]")
         raise ValueError(
-            f"date {outside[0].item().isoformat()} is outside IGRF-{generation}, which is valid from {first} to {last}"
+            f"date {when.item().isoformat()} is outside IGRF-{generation}, which is valid from {first} to {last}"
         )
-    right = np.searchsorted(epochs, dates.ravel()).clip(1)
-    weight = (dates.ravel() - epochs[right - 1]) / (epochs[right] - epochs[right - 1])
-    share, column = np.zeros((len(epochs), dates.size)), np.arange(dates.size)
-    share[right - 1, column], share[right, column] = 1 - weight, weight
-    used = share.any(1)
-    return torch.from_numpy(table[used]), torch.from_numpy(share[used].reshape(-1, *dates.shape))
+    right = np.searchsorted(epochs, when).clip(1)
+    share = float((when - epochs[right - 1]) / (epochs[right] - epochs[right - 1]))
+    before, after = torch.from_numpy(tables[right - 1 : right + 1])
+    return (1 - share) * before + share * after
 
 
 class IGRF(SphericalHarmonicField):
-    """The International Geomagnetic Reference Field at one date, or at a date for each place.
-
-    With an array of dates, latitudes and longitudes broadcast with it: ``IGRF(dates)(latitude, longitude)`` of three
-    arrays ``(P,)`` is the field at P places, each at its date; dates ``(T, 1)`` give T fields at each place.
-    A field of many dates is for tables of positions; environments and expansions take one date.
+    """The International Geomagnetic Reference Field at one date.
 
     Args:
         date: ``datetime``, ``date``, ``numpy.datetime64``, ISO text or decimal year, from 1900.0 to the end of the
-            generation; or a list, an array or a pandas column of them.
+            generation.
         generation: 13 (to 2025) or 14 (to 2030). The paper's figures are those of 13 at 2022-01-01.
         altitude_km: default height above the ellipsoid [km], from -15 (15 km deep) to 1000.
 
@@ -177,42 +133,7 @@ class IGRF(SphericalHarmonicField):
     altitude_range_km: ClassVar[tuple[float, float]] = (-15.0, 1000.0)
     """Range of altitudes: from below the deepest trench to the height of satellites that measure the field [km]."""
     shown = ("date", "generation", "altitude_km")
-    share: Tensor | None
 
-    def __init__(
-        self, date: Date | Sequence[Date] | NDArray[Any], generation: int = 14, *, altitude_km: float = 0.0
-    ) -> None:
-        self.date: datetime.datetime | NDArray[np.datetime64]
-        if np.ndim(date):  # type: ignore[arg-type]
-            self.date = parse_dates(date)  # type: ignore[arg-type]
-            gauss, share = _epochs_and_shares(self.date, generation)
-        else:
-            self.date = parse_date(date)  # type: ignore[arg-type]
-            gauss, share = igrf_coefficients(self.date, generation).unsqueeze(0), None
-        super().__init__(gauss[0], altitude_km=altitude_km)
-        self.generation = generation
-        # Of many dates, this is the field of their first epoch; those of the others follow it.
-        self.others = nn.ModuleList(SphericalHarmonicField(table, altitude_km=altitude_km) for table in gauss[1:])
-        self.register_buffer("share", share, persistent=False)
-
-    def _evaluate(
-        self, rows: int, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None
-    ) -> Tensor:
-        """Return rows of the field as the parent class; for many dates, the sum over epochs weighted by share."""
-        if self.share is None:
-            return super()._evaluate(rows, latitude, longitude, altitude_km)
-        points = self._points(latitude, longitude, altitude_km)
-        try:
-            shape = torch.broadcast_shapes(points[0].shape, self.share.shape[1:])
-        except RuntimeError:
-            raise ValueError(
-                f"positions of shape {tuple(points[0].shape)} do not broadcast with dates of shape "
-                f"{tuple(self.share.shape[1:])}: give a date for each position"
-            ) from None
-        points = tuple(x.expand(shape).flatten() for x in points[: 2 if altitude_km is None else 3])
-        total = points[0].new_zeros(rows, points[0].numel())
-        for field, share in zip((self, *self.others), self.share, strict=True):
-            share = share.expand(shape).flatten()
-            used = share.nonzero().squeeze(-1)
-            total[:, used] += share[used] * SphericalHarmonicField._evaluate(field, rows, *(x[used] for x in points))
-        return total.reshape(rows, *shape)
+    def __init__(self, date: Date, generation: int = 14, *, altitude_km: float = 0.0) -> None:
+        super().__init__(igrf_coefficients(date, generation), altitude_km=altitude_km)
+        self.date, self.generation = parse_date(date), generation

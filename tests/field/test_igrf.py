@@ -1,7 +1,6 @@
 """IGRF against ppigrf and the paper, and dates in every form."""
 
 import math
-import re
 from datetime import date as calendar_date
 from datetime import datetime, timedelta, timezone
 
@@ -106,46 +105,6 @@ def test_dates_from_first_to_last_day_of_the_model(generation):
 def test_bad_dates_raise(date):
     with pytest.raises(ValueError, match="date"):
         IGRF(date)
-
-
-def test_each_of_many_dates_belongs_to_its_place():
-    """Against one model for each date, in every form of dates, with gradients; and on an epoch, first and last day."""
-    dates = ["1900-01-01", 1957.25, calendar_date(2019, 3, 4), np.datetime64("2020-01-01"), "2029-12-31", "2030-01-01"]
-    latitude, longitude = globe(len(dates), 11)
-    altitude_km = torch.linspace(-10, 500, len(dates), dtype=torch.float64)
-    many = IGRF(dates)
-    values, gradients = many.value_and_gradient(latitude, longitude, altitude_km)
-    for k, date in enumerate(dates):
-        value, gradient = IGRF(date).value_and_gradient(latitude[k], longitude[k], altitude_km[k])
-        torch.testing.assert_close(values[k], value, rtol=0, atol=ROUNDING_NT)
-        torch.testing.assert_close(gradients[k], gradient, rtol=0, atol=ROUNDING_NT)
-    for form in (many.date, many.date.astype("M8[ns]"), pandas.Series(many.date), pandas.DatetimeIndex(many.date)):
-        torch.testing.assert_close(IGRF(form)(latitude, longitude, altitude_km), values, rtol=0, atol=ROUNDING_NT)
-
-
-def test_dates_broadcast_with_positions():
-    latitude, longitude = globe(3, 12)
-    series = IGRF(np.array([[2000.0], [2021.0]]), altitude_km=100.5)
-    expected = torch.stack([IGRF(year, altitude_km=100.5)(latitude, longitude) for year in (2000.0, 2021.0)])
-    torch.testing.assert_close(series(latitude, longitude), expected, rtol=0, atol=ROUNDING_NT)
-    assert series.value_and_gradient(latitude, longitude)[1].shape == (2, 3, 3, 2)
-    assert IGRF([2020.0])(f64(1.0), f64(2.0)).shape == (1, 3)
-    with pytest.raises(ValueError, match=re.escape("shape (3,) do not broadcast with dates of shape (2,)")):
-        IGRF([2020.0, 2021.0])(latitude, longitude)
-
-
-@pytest.mark.parametrize(
-    ("dates", "message"),
-    [
-        ([2020.0, "May"], "date 'May' is not an ISO date"),
-        ([2020.0, "1850-01-01"], "date 1850-01-01T00:00:00 is outside IGRF-14"),
-        (np.array(["2020-01-01", "NaT"], dtype="M8[D]"), "date .*NaT.* is missing"),
-        ([np.datetime64(20000, "Y")], "is not in a year between"),
-    ],
-)
-def test_bad_dates_among_many_raise(dates, message):
-    with pytest.raises(ValueError, match=message):
-        IGRF(dates)
 
 
 @pytest.mark.parametrize("altitude_km", [5000.0, 1001.0, -16.0])
