@@ -3,13 +3,13 @@
 from collections.abc import Callable
 
 import torch
-from magrl.evaluation.metrics import first_episode_mask
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import CatTensors, Compose, TransformedEnv
 
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation import evaluation_rollout
+from magrl.evaluation.episodes import first_episode_mask
 from magrl.navigators import Geodesic
 from magrl.transforms import NorthReferenceError, SensorErrors
 
