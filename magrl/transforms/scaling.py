@@ -11,14 +11,14 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from magrl.checks import check_tensor, check_type
+from magrl.checks import check_numbers, check_tensor, check_type
 from magrl.transforms.base import Keys, ObservationTransform, key_list
 
 
 class MinMaxNorm(ObservationTransform):
-    """Scale entries from their bounds to [-1, 1], and actions back.
+    """Scale entries from their bounds to an interval, and actions back.
 
-    On the way out of the environment, ``in_keys`` are scaled from [low, high] to [-1, 1] and written to
+    On the way out of the environment, ``in_keys`` are scaled from [low, high] to ``interval`` and written to
     ``out_keys``. On the way in, the policy's ``out_keys_inv`` are scaled back and written to ``in_keys_inv``. Values
     beyond their bounds are scaled linearly too, not clamped. Bounds are given, or come from the specs of the
     environment that the transform is attached to; they have no batch dimensions, so that a state_dict fits any batch
@@ -31,10 +31,11 @@ class MinMaxNorm(ObservationTransform):
         out_keys_inv: names of those scaled entries; the same by default.
         bounds: (low, high) of each key of the environment, numbers or tensors of one shape, the last dimensions;
             other keys take theirs from the specs.
+        interval: image of the bounds.
 
     Raises:
         ValueError: for bounds that are not finite and rising, bounds of a key that is not used, bounds that are neither
-            given nor in a spec, or an in-place key that is part of the environment's state.
+            given nor in a spec, an empty interval, or an in-place key that is part of the environment's state.
 
     Example:
         >>> from tensordict import TensorDict
@@ -53,6 +54,7 @@ class MinMaxNorm(ObservationTransform):
         out_keys_inv: Keys | None = None,
         *,
         bounds: Mapping[NestedKey, tuple[Tensor | float, Tensor | float]] | None = None,
+        interval: tuple[float, float] = (-1.0, 1.0),
     ) -> None:
         in_keys, in_keys_inv = key_list(in_keys), key_list(in_keys_inv)
         super().__init__(
@@ -64,6 +66,10 @@ class MinMaxNorm(ObservationTransform):
         for ins, outs in ((self.in_keys, self.out_keys), (self.in_keys_inv, self.out_keys_inv)):
             if len(ins) != len(outs):
                 raise ValueError(f"{len(ins)} input keys {ins} do not pair with {len(outs)} output keys {outs}")
+        check_numbers(2, interval=interval)
+        if not interval[0] < interval[1]:
+            raise ValueError(f"interval must be two rising numbers, got {interval}")
+        self.interval = (float(interval[0]), float(interval[1]))
         self._bounded_keys = list(dict.fromkeys([*self.in_keys, *self.in_keys_inv]))
         for index in range(len(self._bounded_keys)):
             self.register_buffer(f"low_{index}", None)
@@ -137,17 +143,19 @@ class MinMaxNorm(ObservationTransform):
     # Data
 
     def normalize(self, key: NestedKey, value: Tensor) -> Tensor:
-        """Return a value of ``key`` scaled from its bounds to [-1, 1]: ``(...)`` to ``(...)``, floating point."""
+        """Return a value of ``key`` scaled from its bounds to the interval: ``(...)`` to ``(...)``, floating point."""
         value = _as_float(value)
         low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key, value.shape))
-        return -1.0 + 2.0 * ((value - low) / (high - low))
+        start, end = self.interval
+        return start + (end - start) * ((value - low) / (high - low))
 
     def denormalize(self, key: NestedKey, value: Tensor) -> Tensor:
-        """Return a value of ``key`` scaled from [-1, 1] back to its bounds: ``(...)`` to ``(...)``."""
+        """Return a value of ``key`` scaled from the interval back to its bounds: ``(...)`` to ``(...)``."""
         check_tensor(**{str(key): value})
         value = _as_float(value)
         low, high = (bound.to(value.device, value.dtype) for bound in self._bounds(key, value.shape))
-        return torch.lerp(low.expand_as(value), high.expand_as(value), (value + 1.0) / 2.0)
+        start, end = self.interval
+        return torch.lerp(low.expand_as(value), high.expand_as(value), (value - start) / (end - start))
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for key, scaled in zip(self.in_keys, self.out_keys, strict=True):

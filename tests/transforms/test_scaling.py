@@ -15,6 +15,8 @@ from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.envs.regions import Region
 from magrl.transforms import MinMaxNorm
 
+DTYPES = [torch.float32, torch.float64]
+
 
 def minmax_nav() -> MinMaxNorm:
     return MinMaxNorm(["field", "move"], ["f", "m"], ["action"])
@@ -68,12 +70,13 @@ def test_buffer_stores_physical_actions_and_samples_scaled_ones() -> None:
     assert torch.equal(sample["scaled"], scaled[sample["row"]])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_round_trip_is_exact_at_both_ends(dtype: torch.dtype) -> None:
+@pytest.mark.parametrize("interval", [(-1.0, 1.0), (0.0, 1.0), (-2.0, 6.0)])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_round_trip_is_exact_at_both_ends(dtype: torch.dtype, interval: tuple[float, float]) -> None:
     draws = torch.randn(1000, 2) * 10.0 ** torch.randint(-3, 5, (1000, 1))
     low, high = draws.amin(-1).to(dtype), draws.amax(-1).to(dtype)
-    norm = MinMaxNorm(["x"], bounds={"x": (low, high)})
-    for end, value in ((-1.0, low), (1.0, high)):
+    norm = MinMaxNorm(["x"], bounds={"x": (low, high)}, interval=interval)
+    for end, value in zip(interval, (low, high), strict=True):
         assert (norm.normalize("x", value) == end).all()
         assert torch.equal(norm.denormalize("x", torch.full_like(value, end)), value)
 
