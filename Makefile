@@ -86,7 +86,8 @@ figure-%: $(VENV)/.installed $$(addsuffix /eval.json,$$(addprefix runs/,$$(RUNS_
 	$(ONE)/tables/figures.py $*
 
 pictures: $(VENV)/.installed  ## animate the flight of the README
-	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors 0.05 0.05 5 --out runs/flight --animate docs/figures/flight.gif
+	$(RECIPE)/fly.py "60.4N 5.3E" "64.1N 21.9W" --errors 0.05 0.05 5 --title "Bergen → Reykjavik" --out runs/flight \
+		--animate docs/figures/flight.gif
 
 # Trainings: name of the run, recipe and options.
 define training

@@ -81,11 +81,11 @@ class Config(ScenarioOptions):
     """GeoJSON file for the tracks of all episodes (.geojson)."""
     errors: Noise | str | None = None
     """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
-    vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, phone, or a file (.toml or .json,
+    vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (.toml or .json,
     docs/results.md); by default the noise of the runs, or 0."""
     north: Literal["true", "magnetic"] = "true"
-    """North of the vehicles: true (they measure D), or magnetic (a compass; they measure I and B_H alone). A boat, a
-    drone and a phone have a compass in any case."""
+    """North of the vehicles: true (they measure D), or magnetic (a compass; they measure I and B_H alone). A boat and
+    a drone have a compass in any case."""
     model: str | None = None
     """Model of the Earth that vehicles carry, as of the date of the scenario: IGRF-14, IGRF-13, IGRF-2005, ...; none by
     default."""

@@ -63,11 +63,11 @@ class Config:
     recipes/evaluate.py."""
     errors: tuple[float, float, float] | str = (0.0, 0.0, 0.0)
     """Errors of the sensors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real
-    vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, phone, or a file (.toml or .json,
+    vehicle, which are laboratory, aircraft, ship, underwater, low-cost, boat, drone, or a file (.toml or .json,
     docs/results.md)."""
     north: Literal["true", "magnetic"] = "true"
-    """North of the vehicle: true (it measures D), or magnetic (a compass: it measures I and B_H alone). A boat, a drone
-    and a phone have a compass in any case."""
+    """North of the vehicle: true (it measures D), or magnetic (a compass: it measures I and B_H alone). A boat and a
+    drone have a compass in any case."""
     model: str | None = None
     """Model of the Earth that the vehicle carries, as of the date: IGRF-14, IGRF-13, IGRF-2005; none by default."""
     start_km: float | None = None
@@ -87,7 +87,9 @@ class Config:
     export: Path | None = None
     """GeoJSON file for the track (.geojson)."""
     animate: Path | None = None
-    """GIF file for an animation of the flight (.gif)."""
+    """GIF file for an animation of the flight without an arrival signal (.gif)."""
+    title: str | None = None
+    """Title of the flight in its pictures, such as "Bergen to Reykjavik"; start and destination by default."""
 
 
 class Watched(TensorDictModuleBase):
@@ -209,18 +211,19 @@ def draw(
     config: Config, steps: dict[str, TensorDictBase], measures: dict[str, dict[str, Any]], base: GeomagneticNavEnv
 ) -> None:
     """Write the picture and, where asked for, the tracks and the animation."""
-    navigator = config.navigator.partition("=")[0]
+    navigator, route = config.navigator.partition("=")[0], config.title or f"{config.start} to {config.destination}"
     titles = [
         f"{rule.replace('_', ' an arrival ')}: {values['outcome']}, {values['length_km']:.0f} km"
         for rule, values in measures.items()
     ]
-    title = titles[0] = f"{config.start} to {config.destination}: {navigator} {titles[0]}"
+    title = titles[0] = f"{route}: {navigator} {titles[0]}"
     figure = trajectories_figure(dict(zip(titles, steps.values(), strict=True)), base.field, base.region)
     figure.savefig(config.out / "flight.png", dpi=120)
     if config.export:
         export.write_tracks(config.export, export.tracks(steps["with_signal"], [title], navigator=navigator))
     if config.animate:
-        write_gif(config.animate, steps["with_signal"], base.field, base.region, title)
+        end = "{outcome}, {navigation_error_km:.1f} km from the destination".format(**measures["without_signal"])
+        write_gif(config.animate, steps["without_signal"], base.field, base.region, f"{route}: {end}")
 
 
 def fly(config: Config) -> dict[str, Any]:

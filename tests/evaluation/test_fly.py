@@ -46,9 +46,14 @@ def test_the_pretrained_agent_arrives_within_as_many_kilometers_at_every_distanc
 
 
 @pytest.mark.usefixtures("without_figure")
-def test_a_vehicle_without_a_signal_declares_its_arrival(tmp_path: Path) -> None:
-    config = recipe.Config("60.4N 5.3E", "60.2N 3.3E", errors="ship", navigator="secant", out=tmp_path)
+def test_a_vehicle_without_a_signal_declares_its_arrival_and_is_animated(tmp_path: Path, monkeypatch) -> None:
+    drawn, options = [], {"animate": tmp_path / "flight.gif", "title": "Out to sea", "out": tmp_path}
+    monkeypatch.setattr(recipe, "write_gif", lambda *arguments: drawn.append(arguments))
+    config = recipe.Config("60.4N 5.3E", "60.2N 3.3E", errors="ship", navigator="secant", **options)
     result = recipe.fly(config)["without_signal"]
+    ((_, flight, *_, title),) = drawn
+    assert flight["next", "declared"][0, -1]
+    assert title == f"Out to sea: {result['outcome']}, {result['navigation_error_km']:.1f} km from the destination"
     right = result["navigation_error_km"] <= 25
     assert result["outcome"] == "declared its arrival" + ("" if right else ", falsely")
 
