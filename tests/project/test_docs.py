@@ -15,6 +15,7 @@ from functools import cache
 from itertools import chain
 from pathlib import Path
 
+import gymnasium
 import pytest
 from support.recipes import load
 from torchrl.data import Composite
@@ -23,6 +24,7 @@ import magrl
 from magrl.agents import FieldPolicy, PolicyConfig, save_policy
 from magrl.benchmark import read_episodes
 from magrl.envs import PRIVILEGED_KEYS, PUBLIC_KEYS, GeomagneticNavEnv, Scenario, planet_scenario
+from magrl.transforms import CONDITIONS
 
 publish = load("tables/publish")
 ROOT = Path(__file__).parent.parent.parent
@@ -96,14 +98,20 @@ def reader(tmp_path_factory) -> Path:
     EXAMPLES,
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_python_examples_run(page: Path, code: str, reader: Path, monkeypatch) -> None:
+def test_python_examples_run_and_print_what_they_say(page: Path, code: str, reader: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(reader)
+    said = re.findall(r"^ *print\(.*\)  # (?!about)(.*)", code, re.MULTILINE) if page in TEXTS else []
+    block = TEXTS.get(page, "").partition(f"{code}```\n\n```text\n")[2].partition("```")[0]
+    long = any(setting in code for setting in BUDGET) or "runs/first" in code
     monkeypatch.setattr("magrl.envs.navigation._planets", lambda: planet_scenario(4, seed=0))
     if "stable_baselines3" in code:
         pytest.importorskip("stable_baselines3")
     for setting, small in BUDGET.items():
         code = code.replace(setting, small)
     exec(compile(code, str(page), "exec"), {})
+    printed = capsys.readouterr().out
+    assert long or printed.endswith(block)
+    assert all(any(line and line in text for line in printed.splitlines()) for text in said), printed
 
 
 def test_the_notebook_is_kept_without_outputs() -> None:
@@ -156,12 +164,23 @@ def test_scripts_options_and_targets_exist(page: Path) -> None:
 # Tables
 
 
-def rows(header: str, first: str) -> dict[str, list[str]]:
-    """Return the rows of the first table after a header of docs/environment.md, by their name in its first column."""
-    text = ENVIRONMENT[ENVIRONMENT.index(header) :]
+def rows(header: str, first: str, text: str = ENVIRONMENT) -> dict[str, list[str]]:
+    """Return the rows of the first table after a header of a page, by their name in its first column."""
+    text = text[text.index(header) :]
     table = text[text.index(f"| {first} |") :].partition("\n\n")[0]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
     return {row[0].strip("`"): row[1:] for row in cells}
+
+
+@each_page
+def test_tables_have_a_header_and_no_hole(page: Path) -> None:
+    text = re.sub(r"^( *)```.*?^\1```", "", TEXTS[page], flags=re.MULTILINE | re.DOTALL)
+    for table in re.findall(r"(?:^ *\|.*\n)+", text, re.MULTILINE):
+        header, rule, *body = ([cell.strip() for cell in line.split("|")] for line in table.splitlines())
+        assert {cell.strip(":-") for cell in rule} == {""}, f"no header: {table}"
+        assert all(rule[1:-1]), f"no header: {table}"
+        assert body, f"no row: {table}"
+        assert {len(row) for row in body} == {len(header)} == {len(rule)}, table
 
 
 @each_page
@@ -212,6 +231,23 @@ def test_options_of_the_environment_and_fields_of_the_scenario() -> None:
         assert list(documented) == list(defaults)
         for name in documented.keys() - {"scenario", "region", "date", "seed", "device"}:
             assert ast.literal_eval(documented[name][0].strip("`")) == defaults[name], name
+
+
+def test_references_are_of_one_agent() -> None:
+    scores, page = (ROOT / "docs/results/scores.md").read_text(), TEXTS[ROOT / "README.md"]
+    for name, (_, spl, earned) in rows("## Use", "id, after `magrl/GeomagneticNavigation`", page).items():
+        task = name.removesuffix("-v0").lower() or "box"
+        agent = "shortest path around the areas (oracle)" if task == "nogo" else "kalman"
+        assert re.search(rf"^\| {task} \| {re.escape(agent)} \|.*\| {spl} \|$", scores, re.MULTILINE), name
+        threshold = gymnasium.spec(f"magrl/GeomagneticNavigation{name}").reward_threshold
+        assert task == "nogo" or float(earned) == threshold, name
+
+
+def test_presets_and_their_speeds() -> None:
+    documented = rows("### Presets", "preset", TEXTS[ROOT / "docs/results.md"])
+    assert {name: float(speed) for name, (speed, *_) in documented.items()} == {
+        name: preset.speed_km_h for name, preset in CONDITIONS.items() if name != "laboratory"
+    }
 
 
 def all_specs(env) -> Composite:
