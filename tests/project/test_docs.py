@@ -233,14 +233,16 @@ def test_options_of_the_environment_and_fields_of_the_scenario() -> None:
             assert ast.literal_eval(documented[name][0].strip("`")) == defaults[name], name
 
 
-def test_references_are_of_one_agent() -> None:
+def test_references_are_of_one_agent_and_the_best_trained_one_is_beside() -> None:
     scores, page = (ROOT / "docs/results/scores.md").read_text(), TEXTS[ROOT / "README.md"]
-    for name, (_, spl, earned) in rows("## Use", "id, after `magrl/GeomagneticNavigation`", page).items():
+    for name, (_, spl, earned, trained) in rows("## Use", "id, after `magrl/GeomagneticNavigation`", page).items():
         task = name.removesuffix("-v0").lower() or "box"
         agent = "shortest path around the areas (oracle)" if task == "nogo" else "kalman"
         assert re.search(rf"^\| {task} \| {re.escape(agent)} \|.*\| {spl} \|$", scores, re.MULTILINE), name
         threshold = gymnasium.spec(f"magrl/GeomagneticNavigation{name}").reward_threshold
         assert task == "nogo" or float(earned) == threshold, name
+        runs = re.findall(rf"^\| {task} \| (\S+) \| \d.*\| (\S+) \(", scores, re.MULTILINE)
+        assert trained == " ".join(max(runs, key=lambda run: float(run[1])))
 
 
 def test_presets_and_their_speeds() -> None:
