@@ -137,9 +137,8 @@ def check_files(config: Config) -> None:
         export.check_suffix(config.export)
     if config.animate and config.animate.suffix != ".gif":
         raise ValueError(f"an animation must end in .gif, got {config.animate}")
-    for file in (config.out / "flight.png", config.out / "flight.json", config.export, config.animate):
-        if file:
-            check_writable(file)
+    for file in filter(None, (config.out / "flight.png", config.out / "flight.json", config.export, config.animate)):
+        check_writable(file)
 
 
 def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
