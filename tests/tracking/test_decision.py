@@ -11,14 +11,16 @@ from torch import Tensor
 
 from magrl import tracking
 from magrl.sensor_std import SensorStd
-from magrl.tracking import ArrivalDecision, Trip, approach, arrival_decision, decision
+from magrl.tracking import ArrivalDecision, DestinationPosterior, Trip, approach, arrival_decision, decision
 from magrl.tracking.belief import STATES
 
 RADIUS_KM, UNITS = 25.0, f64(1.0, 1.0, 100.0)
 HERE = f64(0.0, 60.0, 20000.0)
 
 
-def decide(north_km: float, noise: float, bias: float, left: int = 50) -> tuple[ArrivalDecision, Tensor]:
+def decide(
+    north_km: float, noise: float, bias: float, left: int = 50, *, path: float = 400.0, places: Tensor | None = None
+) -> tuple[ArrivalDecision, Tensor]:
     """The decision at a distance from the destination, with errors in units of degrees and 100 nT; and the gradient."""
     errors = SensorStd(noise * UNITS, bias * UNITS)
     belief = tracking.start(HERE, errors)
@@ -29,8 +31,11 @@ def decide(north_km: float, noise: float, bias: float, left: int = 50) -> tuple[
     belief = tracking.Belief(mean, belief.covariance - cross @ torch.linalg.solve(exact, cross.mT), belief.place)
     target = tracking.elements(tracking.moved(belief, f64(north_km)[0], f64(0.0)[0])).value
     goal = tracking.destination(belief, target, 300.0)
-    trip = Trip(f64(400.0)[0], f64(400.0, 0.0), torch.tensor(left), 0.5, 50.0)
-    decided = arrival_decision(goal, tracking.posterior(goal, 512), errors, trip, RADIUS_KM)
+    trip = Trip(f64(path)[0], f64(400.0, 0.0), torch.tensor(left), 0.5, 50.0)
+    posterior = tracking.posterior(goal, 512)
+    if places is not None:
+        posterior = DestinationPosterior(places, torch.full_like(places[:, 0], 1 / len(places)))
+    decided = arrival_decision(goal, posterior, errors, trip, RADIUS_KM)
     return decided, tracking.elements(belief).gradient
 
 
@@ -66,6 +71,18 @@ def test_fewer_steps_are_worth_less_and_without_any_it_declares() -> None:
     assert attainable[0] == decided[0].probability
     assert (worth.diff() > 0).all()
     assert (attainable.diff() > 0).all()
+
+
+def test_tails_of_the_posterior_and_the_price_on_a_detour_by_hand() -> None:
+    """Three of five places are 5 km ahead, and a reading there would be exact: (1 + 3/5) / 2 is attainable.
+
+    Steps cost more of the SPL of an arrival now where the path is twice as long as the straight line of 405 km.
+    """
+    places = f64((5.0, 0.0), (5.0, 0.0), (5.0, 0.0), (0.0, 100.0), (0.0, -100.0))
+    decided = decide(5.0, 1e-3, 0.0, path=810.0, places=places)[0]
+    assert decided.probability.item() == pytest.approx(0.6)
+    assert decided.attainable.item() == pytest.approx(0.8)
+    assert decided.worth.item() == pytest.approx(0.8 * (810 / 815 - 2 * 0.5 / 100 * (1 + 5 / 50)))
 
 
 def test_a_vehicle_near_the_border_goes_nearer_as_far_as_readings_there_help() -> None:
