@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from magrl.tracking import VISITED, Way, arrival_ellipse, unvisited, unvisited_yet, visit
@@ -37,6 +38,15 @@ def test_the_mean_is_the_way_until_the_vehicle_has_been_there() -> None:
         visited = unvisited_yet(torch.zeros(3))
         visited[5] = mean + torch.tensor([nearest, 0.0])
         assert torch.equal(unvisited(Way(mean, LONG), visited, ELLIPSE), mean) == expected
+
+
+@pytest.mark.parametrize("north", [1000.0, -1000.0])
+def test_of_places_as_probable_the_nearer_is_searched(north: float) -> None:
+    """The mean has been visited, and the estimate is wide along the way to it."""
+    mean, visited = torch.tensor([north, 0.0]), unvisited_yet(torch.zeros(3))
+    visited[0] = mean
+    found = unvisited(Way(mean, torch.diag(torch.tensor([400.0**2, 1.0]))), visited, ELLIPSE)
+    assert found.norm() < 1000 - 20
 
 
 def test_short_moves_do_not_fill_the_memory() -> None:
