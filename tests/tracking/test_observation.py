@@ -10,7 +10,8 @@ from support.tracks import STD, f64
 from torch import Tensor
 
 from magrl.sensor_std import STD_KEYS
-from magrl.tracking import OBSERVATION_SIZE, Rules, begin, observation, track_observation
+from magrl.tracking import OBSERVATION_SIZE, Reading, Rules, Track, begin, observation, track_observation
+from magrl.tracking.noise import DEAD_BAND
 from magrl.transforms.track import reading_of
 
 
@@ -27,6 +28,13 @@ def by_hand(**change: Tensor) -> Tensor:
         "price": f64(0.4),
     }
     return track_observation(**values | change)
+
+
+def started() -> tuple[Rules, Track, Reading]:
+    """The track of four vehicles after their first reading."""
+    rules, seen = Rules(), first_reading().set("elapsed_steps", torch.zeros(4, 1, dtype=torch.int64))
+    reading = reading_of(seen.update({STD_KEYS[0]: f64(*STD).expand(4, 3)}))
+    return rules, begin(rules, reading), reading
 
 
 def test_the_numbers_by_hand() -> None:
@@ -56,11 +64,17 @@ def test_numbers_at_the_extremes() -> None:
     assert (far[1], far[3]) == (-1.0, 2500 / 400 - 0.5)
 
 
+def test_the_noise_is_that_which_readings_show() -> None:
+    """A reading with three times the stated noise is one that states it."""
+    rules, track, reading = started()
+    shown = track._replace(state=track.state._replace(log_ratio=torch.full((4, 3), DEAD_BAND + 2 * math.log(3.0))))
+    stated = reading._replace(std=reading.std._replace(noise=3 * reading.std.noise))
+    torch.testing.assert_close(observation(rules, shown, reading), observation(rules, track, stated))
+
+
 def test_a_turn_of_world_and_vehicle_is_not_observed() -> None:
     """D turns with the world, and passes 180 degrees; a turn of the vehicle alone is observed."""
-    rules, seen = Rules(), first_reading().set("elapsed_steps", torch.zeros(4, 1, dtype=torch.int64))
-    reading = reading_of(seen.update({STD_KEYS[0]: f64(*STD).expand(4, 3)}))
-    track = begin(rules, reading)
+    rules, track, reading = started()
     plain, other = observation(rules, track, reading), reading._replace(heading=reading.heading + 3.0)
     assert not torch.allclose(observation(rules, track, other), plain)
     turn = f64((math.cos(3.0), -math.sin(3.0)), (math.sin(3.0), math.cos(3.0)))
