@@ -13,7 +13,20 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from magrl.sensor_std import SensorStd
-from magrl.tracking import ArrivalDecision, Reading, Rules, State, act, advance, begin, blank, declaring, pilot
+from magrl.tracking import (
+    ArrivalDecision,
+    Reading,
+    Rules,
+    State,
+    act,
+    advance,
+    begin,
+    blank,
+    declaring,
+    earth_model,
+    pilot,
+    start,
+)
 from magrl.tracking.pilot import step
 from magrl.transforms.track import reading_of
 
@@ -63,16 +76,28 @@ def test_vehicles_that_begin_do_not_touch_those_that_go_on(readings) -> None:
     assert [part.dtype for part in blank(readings[0])][:5] == [part.dtype for part in track.state][:5]
 
 
-def test_a_place_without_an_arrival_is_left() -> None:
-    """A vehicle that is told of its arrival, and has not arrived where the destination seems to be, aims elsewhere."""
-    seen = first_reading()
+def test_the_first_reading_counts_with_twice_its_noise(readings) -> None:
+    std = readings[0].std
+    wanted = start(readings[0].field, std._replace(noise=2 * std.noise), readings[0].heading, RULES.crust_nt)
+    torch.testing.assert_close(begin(RULES, readings[0]).state.belief, wanted, equal_nan=True)
+
+
+MODEL, PLACE = earth_model("IGRF-14", "2025-01-01"), f64(5.0, 20.0)
+KNOWN = {"model": MODEL, "start_km": 5.0, "target_km": 5.0}
+
+
+@pytest.mark.parametrize(("rule", "known"), [("distance", {}), ("declared", {}), ("distance", KNOWN)])
+def test_a_place_without_an_arrival_is_left(rule: str, known: dict[str, object]) -> None:
+    """A vehicle that is told of its arrival, and has not arrived where the destination seems to be, aims elsewhere; but
+    where the place of the destination is known."""
+    seen, rules, place = first_reading(), RULES.replace(arrival=rule, **known), PLACE.expand(4, 2)
+    seen["field"] = MODEL.elements(place)
     seen["target_field"] = seen["field"].clone()
     still = moved(seen, 0.1, 0.0, f64(0.0, 0.0, 0.0))
-    for rule in ("distance", "declared"):
-        rules = RULES.replace(arrival=rule)
-        track = advance(rules, begin(rules, reading(seen, 0)).state, reading(still, 1))
-        apart = (track.aim - track.way.displacement).norm(dim=-1)
-        assert (apart > 5).all() if rules.signaled else (apart == 0).all()
+    first, second = (reading(*one)._replace(place=place, target_place=place) for one in ((seen, 0), (still, 1)))
+    track = advance(rules, begin(rules, first).state, second)
+    apart = (track.aim - track.way.displacement).norm(dim=-1)
+    assert (apart > 5).all() if rules.signaled and not known else (apart == 0).all()
 
 
 def test_each_vehicle_may_have_its_own_price_of_a_step(readings) -> None:
