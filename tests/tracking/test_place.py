@@ -11,9 +11,9 @@ from torch import Tensor
 from magrl import IGRF, evaluate
 from magrl.envs import earth_scenario
 from magrl.field.elements import elements_jacobian, measured_elements
-from magrl.geodesy import geodesic, move
+from magrl.geodesy import geodesic, move, move_place
 from magrl.sensor_std import PERFECT, SensorStd
-from magrl.tracking import Motion, Rules, destination, earth_model, posterior, start
+from magrl.tracking import EarthModel, Motion, Rules, destination, earth, earth_model, posterior, start
 from magrl.tracking.belief import DRIFT, PLACE, at_place, moved, read
 from magrl.tracking.earth import secular_variance
 from magrl.tracking.local import slopes
@@ -50,6 +50,38 @@ def test_a_belief_follows_its_model() -> None:
     variance = belief.covariance[:, PLACE, PLACE].diagonal(dim1=-2, dim2=-1).sum(-1)
     expected = 5.0**2 + 2 * (200 * 0.01) ** 2 + 2 * 200 * 0.1**2  # start, drift, wander
     torch.testing.assert_close(variance, torch.full((4,), expected).double(), rtol=0.05, atol=0)  # meridians converge
+
+
+@pytest.mark.parametrize("latitude", [65.0, -65.0])
+def test_an_error_of_the_place_is_carried_as_geodesics_are(latitude: float) -> None:
+    """A move from 1 km to the north or to the east of the place, on the same course, ends where its error does."""
+    motion, none = Motion(earth_model("IGRF-14", "2025-01-01")), torch.zeros(4).double()
+    course, km = torch.tensor([0.0, 1.0, 2.5, 4.0]).double(), none + 100
+    place = torch.tensor([latitude, 20.0]).double().expand(4, 2)
+    after, ends = moved(at_place(place, math.sqrt(2), std_of(), motion), km, course, std_of(), motion), []
+    for bearing in (none, none + math.pi / 2):
+        end = move_place(move_place(place, bearing, none + 1), course, km)
+        apart, direction = geodesic(*after.place.unbind(-1), *end.unbind(-1))
+        ends.append(apart.unsqueeze(-1) * torch.stack((direction.cos(), direction.sin()), -1))
+    step = torch.stack(ends, -1)
+    torch.testing.assert_close(after.covariance[:, PLACE, PLACE], step @ step.mT, rtol=0, atol=3e-3)
+
+
+def test_a_model_without_an_error_leaves_none_of_the_field() -> None:
+    """After any move, where place and drift have none."""
+    motion = Motion(EarthModel("exact", IGRF("2025-01-01"), torch.zeros(14).double()))
+    after = moved(at_place(PLACES, 0.0, std_of(), motion), *torch.full((2, 4), 50.0), std_of(), motion)
+    assert not after.covariance.any()
+
+
+def test_places_that_are_not_known_have_a_model_of_20_years_at_least(monkeypatch) -> None:
+    monkeypatch.setattr(earth, "PLACES", 4)
+    five, twenty, forty = (
+        EarthModel("model", IGRF("2025-01-01"), secular_variance(years)).cells().covariance
+        for years in (5.0, 20.0, 40.0)
+    )
+    assert torch.equal(five, twenty)
+    assert not torch.equal(twenty, forty)
 
 
 def test_readings_correct_place_and_drift() -> None:
