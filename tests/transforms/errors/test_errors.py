@@ -15,8 +15,9 @@ from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from magrl.counters import advanced, counter_stream
 from magrl.envs.navigation import anywhere_env
 from magrl.envs.random_regions import planet_scenario
+from magrl.geodesy import geodesic
 from magrl.sensor_std import STD_KEYS
-from magrl.transforms import TRUE_KEYS, MagneticNorth, NorthReferenceError, SensorErrors
+from magrl.transforms import TRUE_KEYS, KnownPlace, MagneticNorth, NorthReferenceError, SensorErrors
 from magrl.transforms.errors.base import gauss_markov
 
 ERRORS = ("motion_error", "weather_clock", ("sensor_error", "bias"), "north_error")
@@ -92,6 +93,13 @@ def test_accuracy_adds_up_and_the_first_error_keeps_the_truth() -> None:
         assert torch.equal(state["true_field"], true["field"])
         error = state["field"] - true["field"] - torch.tensor([-0.4, 0.0, 0.0])
         torch.testing.assert_close(error.std(0), torch.tensor([0.5, 0.1, 5.0]), rtol=0.06, atol=0)
+
+
+def test_a_known_place_has_its_root_mean_square_error() -> None:
+    state = under(KnownPlace(5.0, 2.0), num_envs=4000).reset()
+    for end, expected in (("start", 5.0), ("target", 2.0)):
+        apart, _ = geodesic(*state[f"{end}_place"].mT, *state[f"{end}_position"].mT)
+        assert apart.square().mean().sqrt().item() == pytest.approx(expected, rel=0.03)
 
 
 def test_true_keys_are_those_that_are_written() -> None:
