@@ -13,7 +13,7 @@ from magrl.envs import GeomagneticNavEnv, Region, Scenario, task_set
 from magrl.evaluation import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.navigators import make_navigator
 from magrl.field import elements_gradient_at
-from magrl.geodesy import steer
+from magrl.geodesy import geodesic, steer
 from magrl.navigators import NAVIGATORS, Kalman, MeanJacobian, Navigator, ParallelApproach, Secant
 from magrl.navigators.base import displacement_to
 from magrl.navigators.quasi_newton import probe_length
@@ -74,6 +74,14 @@ def test_a_navigator_that_is_told_of_its_arrival_searches(name: str) -> None:
     assert rates[1] > 90 > 70 > rates[0]
     declared = GeomagneticNavEnv(num_envs=2, seed=0, arrival="declared")
     assert not make_navigator(name, declared).search
+
+
+def test_dead_reckoning_declares_at_the_reckoned_destination() -> None:
+    """Without errors, and so at the destination itself."""
+    env = GeomagneticNavEnv(num_envs=20, seed=0, arrival="declared")
+    end = evaluation_rollout(env, make_navigator("dead_reckoning", env))["next"][:, -1]
+    assert end["declared"].all()
+    assert geodesic(*end["position"].T, *end["target_position"].T)[0].max() < 0.5
 
 
 def test_steer_by_hand() -> None:
