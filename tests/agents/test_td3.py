@@ -15,7 +15,7 @@ CELLS = (16, 16)
 
 def make_loss(size: int = 13, *, policy_noise: float = 0.1) -> TD3Loss:
     actor, critic = make_actor(size, CELLS), make_critic(size, CELLS)
-    return updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=0.5))
+    return updated(TD3Loss(actor, critic, gamma=0.9, policy_noise=policy_noise, noise_clip=2.0))
 
 
 def updated(loss: StockTD3Loss) -> StockTD3Loss:
@@ -49,16 +49,19 @@ def test_target_policy_smoothing_is_clipped() -> None:
 
 
 def test_loss_is_that_of_torchrl() -> None:
-    """Values and gradients of both losses, to rounding, after updates of weights and targets."""
+    """Values and gradients of both losses, to rounding, after updates of weights and targets.
+
+    The noise is so large that it takes the action of the target actor out of its bounds, where it is clamped.
+    """
     torch.manual_seed(0)
-    ours = make_loss()
+    ours = make_loss(policy_noise=1.0)
     update = SoftUpdate(ours, tau=0.1)
     optimizer = torch.optim.Adam([*ours.actor_parameters(), *ours.critic_parameters()], lr=1e-2)
     for _ in range(3):
         batch = transitions()
         optimize(ours.value_loss(batch)[0] + ours.actor_loss(batch)[0], optimizer)
         update.step()
-    spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 0.1, "noise_clip": 0.5}
+    spec = {"action_spec": Bounded(-1.0, 1.0, (2,)), "loss_function": "l2", "policy_noise": 1.0, "noise_clip": 2.0}
     stock = updated(StockTD3Loss(make_actor(13, CELLS), make_critic(13, CELLS), deactivate_vmap=True, **spec))
     stock.make_value_estimator(gamma=0.9)
     stock.load_state_dict(ours.state_dict())
