@@ -30,6 +30,7 @@ from magrl.tracking import Rules, load_pilot, save_pilot
 from magrl.tracking.network import pretrained
 from magrl.transforms import MagneticNorth, SensorErrors
 from magrl.vehicle.onboard import Command, Onboard, check_earth_jump, check_earth_reading
+from magrl.vehicle.onboard.known import likely_mistake
 
 TARGET, HERE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0)
 SECOND = (3.49, 73.001, 14999.0, 290.0, 0.5)
@@ -140,6 +141,22 @@ def test_a_known_start_shows_constant_errors(name: str, tmp_path: Path) -> None:
             vehicle.restore(tmp_path / "state")
 
 
+def test_a_start_that_is_hardly_known_shows_no_constant_error() -> None:
+    """The commands are those without a start."""
+    target = (torch.tensor(HERE) + SLOPE @ torch.tensor([120.0, 90.0])).tolist()
+    told, untold = (
+        begun("secant", target, *start, sensor_std=SensorStd(bias=(0.5, 0.2, 40.0)))
+        for start in ((HERE, (50.0, 20.0, 5000.0)), ())
+    )
+    place = torch.zeros(2)
+    for way in ([0.0, 0.0], [30.0, 0.0], [0.0, 30.0], [20.0, 20.0]):
+        place, course = place + torch.tensor(way), math.degrees(math.atan2(way[1], way[0]))
+        reading = torch.tensor(HERE) + torch.tensor([0.9, 0.4, -80.0]) + SLOPE @ place
+        found, wanted = (vehicle.step(*reading.tolist(), course, math.hypot(*way)) for vehicle in (told, untold))
+        assert (found.stop, found.distance_km) == (None, pytest.approx(wanted.distance_km, abs=0.1))
+        assert math.remainder(found.heading_deg - wanted.heading_deg, 360) == pytest.approx(0, abs=0.1)
+
+
 @pytest.mark.parametrize("name", ["anywhere", "secant"])
 def test_missed_readings_are_the_outages_of_the_environment(name: str) -> None:
     """The vehicle gets None, the policy in the environment the last reading with a large standard deviation."""
@@ -237,6 +254,7 @@ def test_a_pilot_runs_without_torchrl_in_few_calls() -> None:
         ((65.0, 8.0, 30000.0), "D and I are swapped"),
         ((82.0, 65.0, 30000.0), "the horizontal axes are swapped"),
         ((8.0, 60.0, 30000.0), "check sensors, calibration"),
+        ((0.3, 65.2, 30050.0), "the heading is from magnetic north"),  # iron of 4200 nT explains all, as it always does
     ],
 )
 def test_a_first_reading_that_does_not_fit_the_start_is_refused(reading: Triple, cause: str) -> None:
@@ -246,6 +264,16 @@ def test_a_first_reading_that_does_not_fit_the_start_is_refused(reading: Triple,
     with pytest.raises(ValueError, match=rf"^the first reading, .* does not fit the start, .*: .*{cause}"):
         vehicle.step(*reading, heading=0.0)
     assert vehicle.step(*here, heading=0.0).stop is None
+
+
+@pytest.mark.parametrize(("flipped", "cause"), [(2, None), (3, "the vertical axis points up")])
+def test_a_mistake_explains_most_readings(flipped: int, cause: str | None) -> None:
+    """Of four; the others are of no place."""
+    there = torch.tensor([HERE]).double().expand(4, 3)
+    read = torch.tensor([[60.0, 20.0, 30000.0], [-120.0, 35.0, 42000.0]] * 2).double()
+    read[:flipped] = there[:flipped] * torch.tensor([1.0, -1.0, 1.0])
+    found = likely_mistake(read, there, torch.tensor(NOISE), torch.zeros(4).double())
+    assert found is None if cause is None else cause in found
 
 
 def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
@@ -258,6 +286,8 @@ def test_a_position_at_the_start_gives_the_elements_of_the_model() -> None:
     with pytest.raises(ValueError, match=r"\(I deviates by 80.75, where 3\.6. is likely\): check sensors, calibration"):
         vehicle.step(-8.0, -7.7, 35603.0, heading=0.0)
     assert vehicle.step(*at(59.1, 5.3), heading=0.0).reason == ""
+    vehicle.start(TARGET, (60.4, 5.3), start_km=100.0, date="2026-06-30")
+    assert vehicle.step(*at(58.5, 5.3), heading=0.0).reason == ""
     assert begun().step(*HERE, 290.0).reason == "the sign of D and the compass were not checked: give the start"
 
 
