@@ -36,6 +36,7 @@ from magrl.tracking.belief import (
     Motion,
     at_place,
     before,
+    displaced,
     elements,
     innovation,
     known,
@@ -147,6 +148,7 @@ class Reading(NamedTuple):
         price: ``(...)`` price of a step [% of SPL] of each vehicle; None for that of the rules.
         place: ``(..., 2)`` latitude, longitude [deg] of the start, where it is known; it counts at the first reading.
         target_place: ``(..., 2)`` the same of the destination.
+        leg_std: ``(..., 2)`` standard deviations of the move, along and across it, beside the drift of the rules [km].
     """
 
     field: Tensor
@@ -160,6 +162,7 @@ class Reading(NamedTuple):
     price: Tensor | None = None
     place: Tensor | None = None
     target_place: Tensor | None = None
+    leg_std: Tensor | None = None
 
 
 class State(NamedTuple):
@@ -272,6 +275,8 @@ def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tens
     seen = _true(reading, state.north)
     std, noise, heading, field = seen.std.noise, state.noise, seen.heading, reading.field
     belief = moved(state.belief, reading.distance, heading, seen.std, rules.motion, rules.crust_nt)
+    if reading.leg_std is not None:
+        belief = displaced(belief, _leg_covariance(reading.leg_std, heading))
     stated, scaled = innovation(belief, field, std, heading), std * (noise.log_ratio / 2).exp()
     wide = spike_factor(innovation(belief, field, scaled, heading), scaled)
     noise = noise_estimate(noise, innovation(belief, field, scaled * wide, heading), std * wide)
@@ -280,6 +285,13 @@ def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tens
     path, home, visited = state.path + reading.distance, state.home + move, visit(state.visited, move.to(state.visited))
     state = State(*after, *noise, visited, state.weights, path, home, _declination(after, reading))
     return state, stated.square() / belief.measured.sum(-1)
+
+
+def _leg_covariance(std: Tensor, heading: Tensor) -> Tensor:
+    """Return the covariance ``(..., 2, 2)`` northward and eastward of a move with errors along and across it."""
+    cos, sin = torch.cos(heading.double()), torch.sin(heading.double())
+    turn = torch.stack((cos, -sin, sin, cos), -1).unflatten(-1, (2, 2))
+    return turn @ torch.diag_embed(std.double().square()) @ turn.mT
 
 
 def _declination(belief: Belief, reading: Reading) -> Tensor:

@@ -120,11 +120,32 @@ class Step(Inputs):
     horizontal_intensity: float | None
     heading: float = Field(ge=-360, le=360)
     distance: float = Field(0.0, ge=0)
+    distance_std: float = Field(0.0, ge=0)
+    heading_std: float = Field(0.0, ge=0, le=180)
+
+    @property
+    def leg_std(self) -> tuple[float, float]:
+        """Standard deviations of the move, along and across it [km]."""
+        return self.distance_std, self.distance * math.radians(self.heading_std)
 
     @property
     def elements(self) -> tuple[float | None, float | None, float | None]:
         """D [deg], I [deg], B_H [nT]; None for one that was not read."""
         return self.declination, self.inclination, self.horizontal_intensity
+
+
+class Fix(Inputs):
+    """Hold the arguments of :meth:`~magrl.vehicle.onboard.Onboard.fix`.
+
+    Example:
+        >>> Fix(latitude=64.1, longitude=-21.9, std_km=0.0)
+        Traceback (most recent call last):
+        ValueError: std_km must be a finite number above 0, got 0.0
+    """
+
+    latitude: float = Field(ge=-90, le=90)
+    longitude: float = Field(ge=-360, le=360)
+    std_km: float = Field(gt=0)
 
 
 class Journal(Inputs):
@@ -136,7 +157,7 @@ class Journal(Inputs):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[13] = 13
+    format: Literal[14] = 14
     options: Annotated[Options, _LAX]
     target: Annotated[tuple[float, ...], _LAX]
     start: Annotated[tuple[float, ...], _LAX] | None = None
@@ -146,7 +167,7 @@ class Journal(Inputs):
     model: str | None = None
     start_km: float = Field(0.1, ge=0)
     target_km: float = Field(0.1, ge=0)
-    steps: Annotated[tuple[Annotated[Step, _LAX], ...], _LAX] = ()
+    steps: Annotated[tuple[Annotated[Step, _LAX] | Annotated[Fix, _LAX], ...], _LAX] = ()
 
     @classmethod
     def read(cls, path: Path) -> Journal:
@@ -181,6 +202,9 @@ class Command:
         place: estimated latitude and longitude [deg], where the vehicle knows its start; else None.
         place_covariance_km2: covariance of the place, northward and eastward.
         drift: estimated drift of dead reckoning, such as by a current, northward and eastward [share of the way].
+        drift_covariance: its covariance, by rows.
+        sensor_errors: estimated constant errors of D [deg], I [deg], B_H [nT], to be subtracted from readings.
+        sensor_errors_std: their standard deviations.
 
     Example:
         >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
@@ -199,6 +223,9 @@ class Command:
     place: tuple[float, float] | None = None
     place_covariance_km2: tuple[tuple[float, float], tuple[float, float]] | None = None
     drift: tuple[float, float] | None = None
+    drift_covariance: tuple[tuple[float, float], tuple[float, float]] | None = None
+    sensor_errors: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sensor_errors_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def error_km(self) -> float:

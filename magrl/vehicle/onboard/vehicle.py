@@ -21,10 +21,10 @@ from magrl.checks import check_type
 from magrl.files import write_atomically
 from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
-from magrl.tracking.belief import DRIFT, PLACE
+from magrl.tracking.belief import CONSTANT, DRIFT, PLACE, position_fix, updated
 from magrl.tracking.network import load_pilot, policy_content, pretrained
 from magrl.vehicle.onboard import limits
-from magrl.vehicle.onboard.journal import Command, Journal, Options, Step
+from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step
 from magrl.vehicle.onboard.known import Knowledge, check_first_reading
 
 USUAL: dict[str, Any] = {
@@ -40,6 +40,8 @@ LONGEST_WAY_KM = 2500.0
 LOST_SURPRISE = 20.0
 """Mean of the last surprises (:class:`~magrl.tracking.Track`) beyond which the readings contradict each other. With the
 right accuracy, it stayed below 7 in simulation, under the conditions of four vehicles."""
+FIX_SQUARE = 13.8
+"""Normalized square of the deviation of a fix in two axes that right ones exceed with a probability of .001."""
 _SURPRISES, _LEAST_SURPRISES = 8, 2
 _UNCHECKED = {
     "true": "the sign of D and the compass were not checked: give the start",
@@ -139,7 +141,7 @@ class Onboard:
         self._known = known.elements and (self._comparable(known.elements), known.std)
         self._rules = Rules(**{name: getattr(self.options, name) for name in Rules.model_fields} | known.rules)
         self._std = SensorStd(*(torch.tensor(std, dtype=torch.float64) for std in self.options.accuracy))
-        self._steps: tuple[Step, ...] = ()
+        self._steps: tuple[Step | Fix, ...] = ()
         self._state: State | None = None
         self._last: Any = None  # the last elements
         self._surprises: tuple[float, ...] = ()
@@ -153,6 +155,9 @@ class Onboard:
         horizontal_intensity: float | None,
         heading: float,
         distance: float = 0.0,
+        *,
+        distance_std: float = 0.0,
+        heading_std: float = 0.0,
     ) -> Command:
         """Return what to do after a move.
 
@@ -166,6 +171,9 @@ class Onboard:
             horizontal_intensity: B_H there [nT].
             heading: heading of the move [deg], -360 to 360; in the first step the heading at the start.
             distance: length of the move [km]; 0 in the first step.
+            distance_std: standard deviation of that length [km], beside the drift of the options, such as that of an
+                inertial navigation system.
+            heading_std: the same of the heading of the move [deg].
 
         Raises:
             RuntimeError: before :meth:`start`.
@@ -176,10 +184,41 @@ class Onboard:
         if self.options.magnetic and declination is not None:
             raise ValueError(f"declination {declination!r}: headings are from magnetic north, D is not measured: None")
         given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
-        step = Step(**given, heading=heading, distance=distance)
+        step = Step(**given, heading=heading, distance=distance, distance_std=distance_std, heading_std=heading_std)
         command = self._after(step)
         self._steps += (step,)
         return command
+
+    def fix(self, latitude: float, longitude: float, std_km: float) -> None:
+        """Take in a fix of the position, such as a bearing, a sounding or a moment of satellite navigation, which
+        counts from the next step on.
+
+        Args:
+            latitude: of the vehicle at the end of the last move [deg].
+            longitude: the same [deg].
+            std_km: root mean square error of the fix [km].
+
+        Raises:
+            RuntimeError: before the first :meth:`step`, or where the vehicle does not know its place.
+            ValueError: for a fix that does not fit the estimated place (p < 0.001).
+        """
+        fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km)
+        if self.target is None or self._state is None or self._rules.start_km is None:
+            raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
+        new = position_fix(self._state.belief, torch.tensor((latitude, longitude), dtype=torch.float64), std_km)
+        off_km, likely_km = new.residual.norm().item(), new.covariance[:2, :2].trace().sqrt().item()
+        if new.square().item() > FIX_SQUARE:
+            raise ValueError(
+                f"the fix is {off_km:.0f} km from the estimated place, where {likely_km:.0f} km is likely: check the "
+                "fix, or state a larger std_km"
+            )
+        self._state = self._state._replace(**updated(self._state.belief, new)._asdict())
+        self._steps += (fix,)
+
+    @property
+    def _number(self) -> int:
+        """Number of steps so far."""
+        return sum(isinstance(step, Step) for step in self._steps)
 
     def _after(self, step: Step) -> Command:
         """Return what to do after a new move."""
@@ -212,8 +251,9 @@ class Onboard:
         std = self._std._replace(noise=self._std.noise.masked_fill(missing, OUTAGE_STD))
         distance, heading = torch.tensor((step.distance, course), dtype=torch.float32)
         known, known_std = there or (None, None)
-        reading = Reading(field, target, distance, heading, std, torch.tensor(len(self._steps)), known, known_std)
-        return reading._replace(place=self._knowledge.place, target_place=self._knowledge.target_place)
+        reading = Reading(field, target, distance, heading, std, torch.tensor(self._number), known, known_std)
+        leg_std = torch.tensor(step.leg_std, dtype=torch.float64) if any(step.leg_std) else None
+        return reading._replace(place=self._knowledge.place, target_place=self._knowledge.target_place, leg_std=leg_std)
 
     def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
         """Return the action of the navigator, with its declaration, and the decision behind that."""
@@ -259,14 +299,18 @@ class Onboard:
         north, east = track.way.displacement.tolist()
         (nn, ne), (en, ee) = track.way.covariance.tolist()
         estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), stop, reason, radius
-        return Command(distance, math.degrees(turn), steer, *estimates, *self._place(track.state))
+        return Command(distance, math.degrees(turn), steer, *estimates, **self._estimates(track.state))
 
-    def _place(self, state: State) -> tuple[Any, ...]:
-        """Return the estimated place [deg], its covariance [km^2] and the drift, where the vehicle knows its place."""
-        if self._rules.start_km is None:
-            return ()
-        covariance = state.covariance[PLACE, PLACE].tolist()
-        return tuple(state.place.tolist()), tuple(map(tuple, covariance)), tuple(state.mean[DRIFT].tolist())
+    def _estimates(self, state: State) -> dict[str, Any]:
+        """Return the estimated constant errors of the sensors, and place and drift, where the vehicle knows its
+        place."""
+        found: dict[str, Any] = {"sensor_errors": tuple(state.mean[CONSTANT].tolist())}
+        found["sensor_errors_std"] = tuple(state.covariance[CONSTANT, CONSTANT].diagonal().sqrt().tolist())
+        if self._rules.start_km is not None:
+            found |= {"place": tuple(state.place.tolist()), "drift": tuple(state.mean[DRIFT].tolist())}
+            for name, part in {"place_covariance_km2": PLACE, "drift_covariance": DRIFT}.items():
+                found[name] = tuple(map(tuple, state.covariance[part, part].tolist()))
+        return found
 
     def _stop(self, track: Track, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""
@@ -284,7 +328,7 @@ class Onboard:
             probability = f"an estimated probability of {decision.probability.item():.2f}"
             return "arrived", f"within {options.radius_km:g} km with {probability}"
         near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"
-        if len(self._steps) >= options.max_steps - 1:
+        if self._number >= options.max_steps - 1:
             return "nearest", f"out of steps: {near}"
         if 0 < decision.attainable.item() < options.confidence:  # 0 where nothing is known yet
             return "nearest", f"as near as these sensors allow: {near}"
@@ -336,7 +380,7 @@ class Onboard:
         resumed = copy.copy(self)
         resumed.start(**{name: value for name, value in journal if name not in ("format", "options", "steps")})
         for step in journal.steps:
-            resumed.step(**dict(step))
+            (resumed.fix if isinstance(step, Fix) else resumed.step)(**dict(step))
         self.__dict__ = resumed.__dict__
 
 
