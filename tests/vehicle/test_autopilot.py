@@ -124,11 +124,50 @@ def test_a_vehicle_with_a_compass_arrives_by_the_heading_of_its_autopilot(tmp_pa
     assert flight.steer_deg == pytest.approx((commands[-1].heading_deg + declination - OFFSET) % 360, abs=0.5)
 
 
+class Silent(World):
+    """A vehicle that slows down to a third after 20 minutes; from then on for half an hour, it does not send some
+    quantities, or nothing (``""``), as to a suspended computer."""
+
+    unheard = "speed"
+
+    def messages(self) -> Iterator[Measurement]:
+        slow = 1200 < self.time < 3000
+        self.speed = SPEED / 3 if slow else SPEED
+        for message in super().messages():
+            if not slow or (self.unheard and getattr(message, self.unheard) is None):
+                yield message
+
+
+@pytest.mark.parametrize("unheard", ["speed", "heading", ""])
+def test_the_place_is_in_its_region_where_something_is_not_heard(unheard, tmp_path, caplog) -> None:
+    """But for 4.2 km, which are flown during a reading. Taking the last value as true, it is 16 to 67 km off at 3."""
+    board, world, errors = Onboard("kalman", sensor_std=(0.05, 0.05, 20.0), drift=0.01), Silent(noise=5.0), []
+    world.unheard = unheard
+    board.start(THERE, HERE, date="2026-01-01")
+    for command in fly(Loop(board, read_s=60.0), world, tmp_path):
+        distance = geodesic(*torch.tensor([*command.place, *world.place], dtype=torch.float64))[0].item()
+        (north, _), (_, east) = command.place_covariance_km2
+        errors.append((distance - 4.2, math.sqrt(north + east)))
+    assert all(off <= 1.73 * stated for off, stated in errors)  # 95 % of a normal distribution in two equal axes
+    assert max(stated for _, stated in errors) > 7 - 2.5 * (unheard == "speed")
+    assert command.stop == "arrived"
+    for name in [unheard] if unheard else ["speed", "heading"]:
+        assert f"no {name} for" in caplog.text
+
+
+def test_a_second_talker_takes_over(caplog) -> None:
+    sentences, said = Sentences(), []
+    for time, line in ((0, b"$HEHDT,290.0,T*24"), (10, b"$IIHDT,200.0,T*20"), (26, b"$IIHDT,201.0,T*21")):
+        said += [each.heading for each in sentences.measurements(line, float(time))]
+    assert said == [290.0, 201.0]
+    assert "heading from IIHDT, as HEHDT is silent" in caplog.text
+
+
 @pytest.fixture
 def steps(monkeypatch) -> list[tuple[Any, ...]]:
     """D, I, B_H, heading and distance of each step that a vehicle was told, also of those that it refused."""
     made, step = [], Onboard.step
-    monkeypatch.setattr(Onboard, "step", lambda self, *a: made.append(a) or step(self, *a))
+    monkeypatch.setattr(Onboard, "step", lambda self, *a, **b: made.append(a) or step(self, *a, **b))
     return made
 
 

@@ -27,6 +27,8 @@ FASTEST_M_S = 1000.0
 """A greater speed is an error of the message; chosen [m/s]."""
 STALE_S = 2.0
 """A sample of the field counts if the attitude is at most as old; chosen [s]."""
+SILENT_S = 15.0
+"""A speed or a heading that is older is not known any more; chosen [s]."""
 LATE_S, GAP_S = 60.0, 3600.0
 """A message may be as much earlier, and later, than the one before; beyond, the vehicle's clock was set; chosen [s]."""
 TURN_S = 120.0
@@ -126,8 +128,9 @@ class Loop:
     The loop integrates the moves from heading and speed. At the end of a move it averages the field over ``read_s``
     seconds, without spikes, and reports the mean of the field at the mean of its places: one step a move. A field that
     does not change in any digit, that is missing or that the vehicle rejects is reported as missing, and the vehicle
-    continues by dead reckoning. Messages may come late, twice or out of order. The time is that of the vehicle's clock;
-    where that was set, time goes on from the last message.
+    continues by dead reckoning. While speed or heading is not heard, or the computer was suspended, the last one is
+    taken, and the stated error of the leg grows. Messages may come late, twice or out of order. The time is that of the
+    vehicle's clock; where that was set, time goes on from the last message.
 
     The heading is from true north, or, where that of the vehicle is magnetic, of any reference that turns slowly: the
     loop measures its angle from magnetic north at each reading.
@@ -166,6 +169,7 @@ class Loop:
         self._place, self._origin, self._path = (0.0, 0.0), (0.0, 0.0), 0.0  # [km]; the origin is that of a reading
         self._offset = 0.0  # of the autopilot's north from that of the vehicle [deg]
         self._since = -math.inf  # time of the last command, or the start of the reading
+        self._unsure, self._fastest = [0.0, 0.0], 0.0  # of the leg, along and across [km]; of the flight [m/s]
         self._samples: list[tuple[float, ...]] | None = []
         self._shift = 0.0  # of the vehicle's clock, where it was set [s]
 
@@ -218,12 +222,19 @@ class Loop:
     def _advance(self, time: float) -> None:
         """Move on with the last heading and speed up to a time."""
         seconds, self.now = max(time - self.now, 0.0), max(time, self.now)
-        if seconds > LATE_S:
-            LOG.warning("no message for %.0f s: the vehicle is taken to have kept its heading and speed", seconds)
         if not self.missing:
+            self._doubt(seconds)
             length, course = self._value("speed") * seconds / 1000, math.radians(self._value("heading") - self._offset)
             self._place = self._place[0] + length * math.cos(course), self._place[1] + length * math.sin(course)
             self._path += length
+
+    def _doubt(self, seconds: float) -> None:
+        """Let the error of the leg grow where speed or heading is not heard, as if it were any that the vehicle had."""
+        self._fastest = max(self._fastest, self._value("speed"))
+        for axis, name in enumerate(("speed", "heading")):
+            if (age := self.now - self._latest[name][0]) > SILENT_S:
+                LOG.warning(f"no {name} for %.0f s: the last one is taken, and the error of the place grows", age)
+                self._unsure[axis] += self._fastest * seconds / 1000
 
     def _value(self, name: str) -> float:
         return self._latest[name][1]
@@ -250,7 +261,7 @@ class Loop:
             return None
         rows, self._samples = np.array(self._samples), None
         self.command = self._step(rows)
-        self._since, self._path = self.now, 0.0
+        self._since, self._path, self._unsure = self.now, 0.0, [0.0, 0.0]
         if self.command is None:
             self._samples = []
         return self.command
@@ -281,12 +292,15 @@ class Loop:
         while distance > LONGER * longest:
             self.vehicle.step(None, None, None, heading, longest)  # the reading at the end decides
             distance -= longest
+        along, across = self._unsure
+        turn = min(math.degrees(across / max(distance, _SHORT_KM)), 180.0)
+        unsure = {"distance_std": along, "heading_std": turn}
         declination, inclination, level = reading
         try:
-            return self.vehicle.step(declination, inclination, level, heading, distance)
+            return self.vehicle.step(declination, inclination, level, heading, distance, **unsure)
         except ValueError as error:
             self.note = str(error)
-        return None if self.command is None else self.vehicle.step(None, None, None, heading, distance)
+        return None if self.command is None else self.vehicle.step(None, None, None, heading, distance, **unsure)
 
     def _mean(self, rows: np.ndarray) -> tuple[Sequence[float | None], float, float, str]:
         """Return the reading, the heading, the angle of the autopilot's north from that of the vehicle, and a text that

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import socket
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from magrl.checks import check_choice
-from magrl.vehicle.autopilot.loop import Measurement, clock, patient
+from magrl.vehicle.autopilot.loop import LOG, SILENT_S, Measurement, clock, patient
 from magrl.vehicle.logs.autopilots import INVALID, nmea_values, package
 from magrl.vehicle.logs.samples import AXES
 from magrl.vehicle.onboard import Command
@@ -25,7 +27,7 @@ class Sentences:
         speed: ``"water"`` (VHW) or ``"ground"`` (VTG).
         level: whether roll and pitch are 0, as of a magnetometer in gimbals; otherwise they must come by XDR.
         sources: talkers and sentences that count, such as ``"HEHDT"``; by default all. Of each value, the first source
-            counts.
+            counts, and another one where that is silent.
 
     Raises:
         ImportError: without pynmeagps.
@@ -44,7 +46,7 @@ class Sentences:
         self._reader = package("pynmeagps", "pynmeagps").NMEAReader
         self._names = {name: name for name in _QUANTITIES} | {f"heading_{north}": "heading", f"speed_{speed}": "speed"}
         self._sources, self._tilt = sources, {"roll": 0.0, "pitch": 0.0} if level else {}
-        self._chosen: dict[str, str] = {}  # source of the quantities
+        self._chosen: dict[str, tuple[str, float]] = {}  # source of the quantities, and when it was heard
 
     def measurements(self, line: bytes, time: float) -> Iterator[Measurement]:
         """Yield the content of a sentence that came at a time [s]; nothing for a damaged one, or another kind."""
@@ -58,10 +60,21 @@ class Sentences:
         source = f"{message.talker}{message.msgID}"
         if self._sources and source not in self._sources:
             return
-        values = {name: value for name, value in found.items() if self._chosen.setdefault(name, source) == source}
+        values = {name: value for name, value in found.items() if self._counts(name, source, time)}
         axes = [name for name in AXES if name in values]
         if values and len(axes) in (0, len(AXES)):
             yield Measurement(time, **(self._tilt | values if axes else values))
+
+    def _counts(self, name: str, source: str, time: float) -> bool:
+        """Return whether a source of a quantity counts: the first one, or another one where that is silent."""
+        chosen, heard = self._chosen.get(name, ("", -math.inf))
+        if chosen != source:
+            if time - heard <= SILENT_S:
+                return False
+            silent = f", as {chosen} is silent" if chosen else ""
+            LOG.log(logging.WARNING if chosen else logging.INFO, f"{name} from {source}{silent}")
+        self._chosen[name] = source, time
+        return True
 
 
 class NmeaLink:
