@@ -33,7 +33,7 @@ from torch.nn.functional import pad
 
 from magrl.checks import check_tensor
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
-from magrl.geodesy import geodesic, move_place
+from magrl.geodesy import move_place
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking.earth import EarthModel
 from magrl.tracking.harmonics import UNIT_KM, arc, generators, turning
@@ -310,42 +310,6 @@ def _moved_by_model(
     wander = pad(lever @ lever.mT, (0, STATES - PLACE.stop) * 2) * (motion.wander_km**2 * far)
     covariance = step @ belief.covariance @ step.mT + spread * model.share + after.covariance + wander
     return settled(Belief(mean, covariance, end))
-
-
-def displaced(belief: Belief, covariance: Tensor) -> Belief:
-    """Return a belief after an unknown displacement, by which the vehicle is not where it has reckoned.
-
-    Args:
-        belief: that before it.
-        covariance: ``(..., 2, 2)`` of the displacement, northward and eastward [km^2].
-
-    Example:
-        >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
-        >>> (displaced(belief, 100 * torch.eye(2)).covariance - belief.covariance)[PLACE, PLACE].diagonal()
-        tensor([100., 100.], dtype=torch.float64)
-    """
-    slope = slopes(belief.mean[..., :COEFFICIENTS], belief.place)
-    lever = torch.cat((slope, torch.eye(2).to(slope).expand(*slope.shape[:-2], 2, 2)), -2)
-    return belief._replace(
-        covariance=belief.covariance + pad(lever @ covariance.to(lever) @ lever.mT, (0, STATES - PLACE.stop) * 2)
-    )
-
-
-def position_fix(belief: Belief, place: Tensor, std_km: float) -> Innovation:
-    """Return a fix of the position minus the estimated place, northward and eastward [km], as an innovation whose third
-    entry is missing.
-
-    Args:
-        belief: that of a vehicle that knows its place.
-        place: ``(..., 2)`` latitude, longitude [deg] of the fix.
-        std_km: its root mean square error [km].
-    """
-    distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
-    apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
-    rows = torch.zeros_like(belief.covariance[..., :3, :])
-    rows[..., :2, PLACE] = torch.eye(2).to(rows)
-    noise = torch.diag(rows.new_tensor((std_km**2 / 2, std_km**2 / 2, 1.0)))
-    return Innovation(pad(apart, (0, 1)), rows, rows @ belief.covariance @ rows.mT + noise)
 
 
 def settled(belief: Belief) -> Belief:

@@ -24,19 +24,21 @@ from typing import Annotated, Literal, NamedTuple
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
+from torch.nn.functional import pad
 
 from magrl.checks import CheckedModel
 from magrl.field.elements import element_difference
-from magrl.geodesy import steer
+from magrl.geodesy import geodesic, steer
 from magrl.sensor_std import SensorStd
 from magrl.tracking.belief import (
+    PLACE,
     STATES,
     Belief,
+    Innovation,
     LocalElements,
     Motion,
     at_place,
     before,
-    displaced,
     elements,
     innovation,
     known,
@@ -46,6 +48,7 @@ from magrl.tracking.belief import (
 from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
 from magrl.tracking.destination import RANGE_KM, Destination, destination, posterior
 from magrl.tracking.earth import EarthModel
+from magrl.tracking.local import COEFFICIENTS, slopes
 from magrl.tracking.noise import NoiseEstimate, noise_estimate, spike_factor
 from magrl.tracking.observation import track_observation, turned
 from magrl.tracking.planning import CAUTION, STEP_PRICE, corrected, planned_move, step_price
@@ -285,6 +288,37 @@ def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tens
     path, home, visited = state.path + reading.distance, state.home + move, visit(state.visited, move.to(state.visited))
     state = State(*after, *noise, visited, state.weights, path, home, _declination(after, reading))
     return state, stated.square() / belief.measured.sum(-1)
+
+
+def displaced(belief: Belief, covariance: Tensor) -> Belief:
+    """Return a belief after an unknown displacement, by which the vehicle is not where it has reckoned.
+
+    Args:
+        belief: that before it.
+        covariance: ``(..., 2, 2)`` of the displacement, northward and eastward [km^2].
+    """
+    slope = slopes(belief.mean[..., :COEFFICIENTS], belief.place)
+    lever = torch.cat((slope, torch.eye(2).to(slope).expand(*slope.shape[:-2], 2, 2)), -2)
+    return belief._replace(
+        covariance=belief.covariance + pad(lever @ covariance.to(lever) @ lever.mT, (0, STATES - PLACE.stop) * 2)
+    )
+
+
+def position_fix(belief: Belief, place: Tensor, std_km: float) -> Innovation:
+    """Return a fix of the position minus the estimated place, northward and eastward [km], as an innovation whose third
+    entry is missing.
+
+    Args:
+        belief: that of a vehicle that knows its place.
+        place: ``(..., 2)`` latitude, longitude [deg] of the fix.
+        std_km: its root mean square error [km].
+    """
+    distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
+    apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
+    rows = torch.zeros_like(belief.covariance[..., :3, :])
+    rows[..., :2, PLACE] = torch.eye(2).to(rows)
+    noise = torch.diag(rows.new_tensor((std_km**2 / 2, std_km**2 / 2, 1.0)))
+    return Innovation(pad(apart, (0, 1)), rows, rows @ belief.covariance @ rows.mT + noise)
 
 
 def _leg_covariance(std: Tensor, heading: Tensor) -> Tensor:

@@ -12,7 +12,8 @@ from magrl.field import IGRF, elements_at
 from magrl.geodesy import geodesic, move_place
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Motion, earth_model
-from magrl.tracking.belief import PLACE, at_place, displaced, moved, position_fix, read, updated
+from magrl.tracking.belief import PLACE, at_place, moved, read, updated
+from magrl.tracking.pilot import displaced, position_fix
 from magrl.vehicle.onboard import Command, Onboard
 
 BERGEN, REYKJAVIK = (60.4, 5.3), (64.1, -21.9)

@@ -17,7 +17,8 @@ from pydantic_core import from_json
 
 from magrl.checks import CheckedModel
 from magrl.sensor_std import OUTAGE_STD, PERFECT, SensorStd
-from magrl.tracking import Rules, Way
+from magrl.tracking import Rules, State, Way
+from magrl.tracking.belief import CONSTANT, DRIFT, PLACE
 
 LEAST_STD_NT = 0.2
 """Least standard deviation of B_H of a sensor that is not perfect, in any vehicle; chosen [nT]."""
@@ -122,11 +123,6 @@ class Step(Inputs):
     distance: float = Field(0.0, ge=0)
     distance_std: float = Field(0.0, ge=0)
     heading_std: float = Field(0.0, ge=0, le=180)
-
-    @property
-    def leg_std(self) -> tuple[float, float]:
-        """Standard deviations of the move, along and across it [km]."""
-        return self.distance_std, self.distance * math.radians(self.heading_std)
 
     @property
     def elements(self) -> tuple[float | None, float | None, float | None]:
@@ -238,3 +234,15 @@ class Command:
         direction of that axis [deg, 0 to 180]: a long ellipse is a line on which the destination is."""
         along, across, bearing = Way(torch.tensor(self.way_km), torch.tensor(self.way_covariance_km2)).axes()
         return along.item(), across.item(), bearing.item()
+
+
+def estimates_of(state: State, located: bool) -> dict[str, Any]:
+    """Return the values of a :class:`Command` that a state holds: the constant errors of the sensors, and place and
+    drift where the vehicle knows its place."""
+    found: dict[str, Any] = {"sensor_errors": tuple(state.mean[CONSTANT].tolist())}
+    found["sensor_errors_std"] = tuple(state.covariance[CONSTANT, CONSTANT].diagonal().sqrt().tolist())
+    if located:
+        found |= {"place": tuple(state.place.tolist()), "drift": tuple(state.mean[DRIFT].tolist())}
+        for name, part in {"place_covariance_km2": PLACE, "drift_covariance": DRIFT}.items():
+            found[name] = tuple(map(tuple, state.covariance[part, part].tolist()))
+    return found

@@ -13,8 +13,10 @@ from magrl.checks import check_number, check_numbers
 from magrl.field.elements import FIELD_NT, NAMES, element_difference, field_vector, measured_elements
 from magrl.field.igrf import parse_date
 from magrl.sensor_std import SensorStd
-from magrl.tracking import NEWEST, SLOPES, EarthModel, earth_model
-from magrl.vehicle.onboard.journal import Journal
+from magrl.tracking import NEWEST, SLOPES, EarthModel, State, earth_model
+from magrl.tracking.belief import updated
+from magrl.tracking.pilot import position_fix
+from magrl.vehicle.onboard.journal import Fix, Journal
 from magrl.vehicle.onboard.limits import check_earth_reading
 
 MODEL_STD = (0.26, 0.20, 133.0)
@@ -165,6 +167,26 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     cause = likely_mistake(read, there, std, torch.zeros(1).double())
     cause = cause or "check sensors, calibration, compass and place, or state a larger bias"
     raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({text}): {cause}")
+
+
+FIX_SQUARE = 13.8
+"""Normalized square of the deviation of a fix in two axes that right ones exceed with a probability of .001."""
+
+
+def fixed(state: State, fix: Fix) -> State:
+    """Return the state after a fix of the position.
+
+    Raises:
+        ValueError: for a fix that does not fit the estimated place.
+    """
+    new = position_fix(state.belief, torch.tensor((fix.latitude, fix.longitude), dtype=torch.float64), fix.std_km)
+    off_km, likely_km = new.residual.norm().item(), new.covariance[:2, :2].trace().sqrt().item()
+    if new.square().item() > FIX_SQUARE:
+        raise ValueError(
+            f"the fix is {off_km:.0f} km from the estimated place, where {likely_km:.0f} km is likely: check the fix, "
+            "or state a larger std_km"
+        )
+    return state._replace(**updated(state.belief, new)._asdict())
 
 
 def model_std(elements: Tensor) -> Tensor:

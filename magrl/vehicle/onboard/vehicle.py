@@ -21,11 +21,10 @@ from magrl.checks import check_type
 from magrl.files import write_atomically
 from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
-from magrl.tracking.belief import CONSTANT, DRIFT, PLACE, position_fix, updated
 from magrl.tracking.network import load_pilot, policy_content, pretrained
 from magrl.vehicle.onboard import limits
-from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step
-from magrl.vehicle.onboard.known import Knowledge, check_first_reading
+from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step, estimates_of
+from magrl.vehicle.onboard.known import Knowledge, check_first_reading, fixed
 
 USUAL: dict[str, Any] = {
     "arrival": "declared",
@@ -42,8 +41,6 @@ HIGHEST_LATITUDE = 85.0
 LOST_SURPRISE = 20.0
 """Mean of the last surprises (:class:`~magrl.tracking.Track`) beyond which the readings contradict each other. With the
 right accuracy, it stayed below 7 in simulation, under the conditions of four vehicles."""
-FIX_SQUARE = 13.8
-"""Normalized square of the deviation of a fix in two axes that right ones exceed with a probability of .001."""
 _SURPRISES, _LEAST_SURPRISES = 8, 2
 _UNCHECKED = {
     "true": "the sign of D and the compass were not checked: give the start",
@@ -144,6 +141,7 @@ class Onboard:
         self._rules = Rules(**{name: getattr(self.options, name) for name in Rules.model_fields} | known.rules)
         self._std = SensorStd(*(torch.tensor(std, dtype=torch.float64) for std in self.options.accuracy))
         self._steps: tuple[Step | Fix, ...] = ()
+        self._number = 0  # of steps without fixes
         self._state: State | None = None
         self._last: Any = None  # the last elements
         self._surprises: tuple[float, ...] = ()
@@ -188,7 +186,7 @@ class Onboard:
         given = {"declination": declination, "inclination": inclination, "horizontal_intensity": horizontal_intensity}
         step = Step(**given, heading=heading, distance=distance, distance_std=distance_std, heading_std=heading_std)
         command = self._after(step)
-        self._steps += (step,)
+        self._steps, self._number = (*self._steps, step), self._number + 1
         return command
 
     def fix(self, latitude: float, longitude: float, std_km: float) -> None:
@@ -207,20 +205,8 @@ class Onboard:
         fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km)
         if self.target is None or self._state is None or self._rules.start_km is None:
             raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
-        new = position_fix(self._state.belief, torch.tensor((latitude, longitude), dtype=torch.float64), std_km)
-        off_km, likely_km = new.residual.norm().item(), new.covariance[:2, :2].trace().sqrt().item()
-        if new.square().item() > FIX_SQUARE:
-            raise ValueError(
-                f"the fix is {off_km:.0f} km from the estimated place, where {likely_km:.0f} km is likely: check the "
-                "fix, or state a larger std_km"
-            )
-        self._state = self._state._replace(**updated(self._state.belief, new)._asdict())
+        self._state = fixed(self._state, fix)
         self._steps += (fix,)
-
-    @property
-    def _number(self) -> int:
-        """Number of steps so far."""
-        return sum(isinstance(step, Step) for step in self._steps)
 
     def _after(self, step: Step) -> Command:
         """Return what to do after a new move."""
@@ -254,7 +240,8 @@ class Onboard:
         distance, heading = torch.tensor((step.distance, course), dtype=torch.float32)
         known, known_std = there or (None, None)
         reading = Reading(field, target, distance, heading, std, torch.tensor(self._number), known, known_std)
-        leg_std = torch.tensor(step.leg_std, dtype=torch.float64) if any(step.leg_std) else None
+        leg = step.distance_std, step.distance * math.radians(step.heading_std)
+        leg_std = torch.tensor(leg, dtype=torch.float64) if any(leg) else None
         return reading._replace(place=self._knowledge.place, target_place=self._knowledge.target_place, leg_std=leg_std)
 
     def _act(self, track: Track, reading: Reading) -> tuple[Tensor, ArrivalDecision]:
@@ -301,18 +288,13 @@ class Onboard:
         north, east = track.way.displacement.tolist()
         (nn, ne), (en, ee) = track.way.covariance.tolist()
         estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), stop, reason, radius
-        return Command(distance, math.degrees(turn), steer, *estimates, **self._estimates(track.state))
-
-    def _estimates(self, state: State) -> dict[str, Any]:
-        """Return the estimated constant errors of the sensors, and place and drift, where the vehicle knows its
-        place."""
-        found: dict[str, Any] = {"sensor_errors": tuple(state.mean[CONSTANT].tolist())}
-        found["sensor_errors_std"] = tuple(state.covariance[CONSTANT, CONSTANT].diagonal().sqrt().tolist())
-        if self._rules.start_km is not None:
-            found |= {"place": tuple(state.place.tolist()), "drift": tuple(state.mean[DRIFT].tolist())}
-            for name, part in {"place_covariance_km2": PLACE, "drift_covariance": DRIFT}.items():
-                found[name] = tuple(map(tuple, state.covariance[part, part].tolist()))
-        return found
+        return Command(
+            distance,
+            math.degrees(turn),
+            steer,
+            *estimates,
+            **estimates_of(track.state, located=self._rules.start_km is not None),
+        )
 
     def _stop(self, track: Track, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""
