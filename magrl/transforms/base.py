@@ -228,6 +228,20 @@ class StatefulTransform(ObservationTransform):
         self._step(tensordict, tensordict["next"])
         return tensordict
 
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Check that nothing before it writes its state, and add what is written.
+
+        Raises:
+            ValueError: for a key of the state that is there already, as from another transform of the same class.
+        """
+        for key in self.state_keys:
+            if key in observation_spec.keys(True) and key not in self.in_keys:
+                raise ValueError(
+                    f"{type(self).__name__} keeps its state at {key!r}, which another transform or the environment "
+                    "writes, too: merge two transforms of one class into one, or give one of them other keys"
+                )
+        return super().transform_observation_spec(observation_spec)
+
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
         """Make the state part of the input, so that batched and parallel environments pass it to the next step."""
         input_spec = super().transform_input_spec(input_spec)

@@ -14,7 +14,7 @@ from torchrl.data import Composite
 from magrl.checks import check_number, check_numbers
 from magrl.counters import stream_uniform
 from magrl.geodesy import geodesic
-from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, StepReward
+from magrl.transforms.base import Keys, ObservationTransform, StatefulTransform, StepReward, key_list
 from magrl.transforms.errors.base import Episode, EpisodeNumbers
 
 SPL_REWARD = 10.0
@@ -191,11 +191,12 @@ class RandomStepPrice(EpisodeNumbers):
 
     default_in_keys = ("heading",)
     default_out_keys = ("step_price",)
-    numbers_key, stream_key = "step_price", "step_price_stream"
+    stream_key = "step_price_stream"
     size = draws = 1
 
     def __init__(self, price_range: Sequence[float], **options: Any) -> None:
         super().__init__(**options)
+        self.numbers_key = self.out_keys[0]
         check_numbers(2, price_range=price_range)
         low, high = map(float, price_range)
         if not 0 < low <= high:
@@ -227,8 +228,9 @@ class EpisodeSum(StatefulTransform):
         True
     """
 
-    def __init__(self, in_keys: Sequence[str]) -> None:
-        super().__init__(in_keys, [f"episode_{key}" for key in in_keys])
+    def __init__(self, in_keys: Keys) -> None:
+        parts = [key if isinstance(key, tuple) else (key,) for key in key_list(in_keys)]
+        super().__init__(in_keys, [(*path, f"episode_{name}") for *path, name in parts])
         self.out_sizes = dict.fromkeys(self.out_keys, (1,))
 
     @property

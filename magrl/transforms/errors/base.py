@@ -68,7 +68,7 @@ class EpisodeNumbers(StatefulTransform):
 
     channel: ClassVar[int] = 0
     """Second counter: it separates the numbers of a class from others of the same seed."""
-    numbers_key: ClassVar[str]
+    numbers_key: NestedKey
     """Key of the numbers of an episode ``(..., size)``, or of a record of them."""
     stream_key: ClassVar[str]
     """Key of the state of the random numbers ``(..., 1)``, int64. Privileged."""

@@ -67,6 +67,7 @@ class NorthReferenceError(ReadingErrors):
         in_keys: heading ``(..., 1)`` [rad], elements ``(..., 3)`` with D [deg] first, the last move, whose first number
             is the distance [km], and optionally the position ``(..., 2)``, latitude and longitude [deg]: b then grows
             with the secant of the latitude, as that of every gyrocompass does.
+        out_keys: the heading and the elements that the vehicle reads, in place by default.
         **options: ``seed`` of :class:`~magrl.transforms.errors.base.ReadingErrors`. The errors of the
             episode are constant part, drift and b itself [deg].
 
@@ -101,10 +102,11 @@ class NorthReferenceError(ReadingErrors):
         drift_length_km: float | None = None,
         fixed: bool = False,
         in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(in_keys, **options)
-        self.out_keys: list[NestedKey] = self.in_keys[:2]
+        super().__init__(in_keys, out_keys, **options)
+        self.out_keys: list[NestedKey] = self.in_keys[:2] if out_keys is None else self.out_keys
         self.in_keys_inv, self.out_keys_inv = self.in_keys[:1], [self.true_keys[1]]
         check_number(-math.inf if fixed else 0, constant_deg=constant_deg)
         check_number(0, drift_deg=drift_deg, random_deg=random_deg)
@@ -160,7 +162,8 @@ class NorthReferenceError(ReadingErrors):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what is true, the error and the state of the numbers; the elements are unbounded."""
         observation_spec = super().transform_observation_spec(observation_spec)
-        observation_spec[self.true_keys[1]] = observation_spec[self.in_keys[0]].clone()
+        for key in (self.true_keys[1], self.out_keys[0]):
+            observation_spec[key] = observation_spec[self.in_keys[0]].clone()
         return observation_spec
 
 

@@ -1,0 +1,192 @@
+"""Keys of all transforms: other names in a foreign environment of any batch, and states that belong to one instance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from support.environments import nested
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.testing import assert_close
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+
+import magrl.transforms
+from magrl.tracking import Rules
+from magrl.transforms import (
+    AlignmentReward,
+    AngleVector,
+    DeclareArrival,
+    DistanceCost,
+    EpisodeSum,
+    FieldGradient,
+    GradientHeading,
+    HighestSPL,
+    KnownPlace,
+    MagneticNorth,
+    MagneticWeather,
+    MinMaxNorm,
+    MotionError,
+    NoGoAreas,
+    NorthReferenceError,
+    ProgressReward,
+    RandomStepPrice,
+    ReadingObservation,
+    SensorErrors,
+    Spikes,
+    SPLReward,
+    TargetDifference,
+    TrackField,
+    TrueWay,
+)
+from magrl.transforms.base import StatefulTransform
+from magrl.transforms.track import READ_KEYS
+
+FLAGS = ("done", "terminated", "truncated")
+SIZES = {"field": 3, "target_field": 3, "move": 2, "heading": 1, "elapsed_steps": 1, "position": 2}
+SIZES |= {"target_position": 2, "start_position": 2, "true_way": 2, "highest_spl": 1, "step_price": 1}
+SIZES |= {"gradient_heading": 1, "number": 1, "field_gradient": 6} | dict.fromkeys(("success", *FLAGS), 1)
+LEAST = {"field": (5.0, -16.0, 35000.0), "target_field": (6.0, -20.0, 35500.0), "true_way": (300.0, 100.0)}
+LEAST |= {"position": (3.0, 160.0), "target_position": (6.0, 163.0), "start_position": (2.0, 159.0)}
+
+
+class Foreign(EnvBase):
+    """An environment of any batch with any keys, whose values depend on the number of the step alone."""
+
+    def __init__(self, batch: tuple[int, ...], names: list[str], key: Callable[[str], NestedKey], actions: int) -> None:
+        super().__init__(batch_size=torch.Size(batch))
+        self.names, self.key, self.count = names, key, 0
+        self.observation_spec = Composite(
+            displacement=Bounded(-99.0, 99.0, (*batch, 2), dtype=torch.float64), shape=batch
+        )
+        for name, value in self._values().items():
+            if name not in FLAGS:
+                self.observation_spec[key(name)] = Unbounded(value.shape, dtype=value.dtype)
+        self.action_spec = Composite(action=Bounded(-1.0, 1.0, (*batch, actions)), shape=batch)
+        reward = Composite(shape=batch)
+        reward[key("reward")] = Unbounded((*batch, 1))
+        self.reward_spec = reward
+        self.full_done_spec = Composite({flag: Binary(1, (*batch, 1), dtype=torch.bool) for flag in FLAGS}, shape=batch)
+
+    def _set_seed(self, seed: int | None) -> None: ...
+
+    def _values(self) -> dict[str, Tensor]:
+        draw, values = torch.Generator().manual_seed(self.count), {}
+        for name in self.names:
+            value = torch.rand(*self.batch_size, SIZES[name], generator=draw) + torch.tensor(LEAST.get(name, 0.0))
+            values[name] = value.to(torch.float64 if "position" in name else torch.float32)
+        flags = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("success", *FLAGS)}
+        values |= {name: flag for name, flag in flags.items() if name in self.names}
+        if "elapsed_steps" in values:
+            values["elapsed_steps"] = torch.full((*self.batch_size, 1), self.count)
+        if "field_gradient" in values:
+            values["field_gradient"] = values["field_gradient"].unflatten(-1, (3, 2))
+        return values
+
+    def _state(self) -> TensorDict:
+        td = TensorDict({flag: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for flag in FLAGS}, self.batch_size)
+        td["displacement"] = torch.zeros(*self.batch_size, 2, dtype=torch.float64)
+        for name, value in self._values().items():
+            td[self.key(name)] = value
+        return td
+
+    def _reset(self, tensordict: TensorDictBase | None) -> TensorDictBase:  # noqa: ARG002
+        self.count = 0
+        return self._state()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        self.count += 1
+        return self._state().set(self.key("reward"), torch.ones(*self.batch_size, 1))
+
+
+def waves(position: Tensor) -> Tensor:
+    return torch.stack((position[..., 0] * position[..., 1], torch.sin(position[..., 1])), -1)
+
+
+STD, RULES = (0.1, 0.1, 10.0), Rules(arrival="declared")
+MAKES: dict[type[Transform], Callable[..., Transform]] = {
+    AlignmentReward: AlignmentReward,
+    AngleVector: AngleVector,
+    DeclareArrival: lambda ins, outs: Compose(  # noqa: ARG005
+        TrackField(RULES, in_keys=ins, out_keys=["track", "seen"]), DeclareArrival(RULES, in_keys=ins)
+    ),
+    DistanceCost: lambda ins, outs: DistanceCost(0.1, ins, outs),
+    EpisodeSum: lambda ins, outs: EpisodeSum(ins),  # noqa: ARG005
+    FieldGradient: lambda ins, outs: FieldGradient(waves, ins, outs),
+    GradientHeading: GradientHeading,
+    HighestSPL: HighestSPL,
+    KnownPlace: lambda ins, outs: KnownPlace(5.0, 5.0, in_keys=ins, out_keys=outs),
+    MagneticNorth: lambda ins, outs: MagneticNorth(ins),  # noqa: ARG005
+    MagneticWeather: lambda ins, outs: MagneticWeather(speed_km_h=20, span_h=9, in_keys=ins, out_keys=outs),
+    MinMaxNorm: lambda ins, outs: MinMaxNorm(ins, outs, bounds={key: (-torch.ones(2), torch.ones(2)) for key in ins}),
+    MotionError: lambda ins, outs: MotionError(log_scale=0.1, in_keys=ins, out_keys=outs),
+    NoGoAreas: NoGoAreas,
+    NorthReferenceError: lambda ins, outs: NorthReferenceError(2.0, in_keys=ins, out_keys=outs),
+    ProgressReward: ProgressReward,
+    RandomStepPrice: lambda ins, outs: RandomStepPrice((0.1, 1.0), in_keys=ins, out_keys=outs),
+    ReadingObservation: ReadingObservation,
+    SensorErrors: lambda ins, outs: SensorErrors(STD, in_keys=ins, out_keys=outs),
+    Spikes: lambda ins, outs: Spikes(STD, rate=0.5, in_keys=ins, out_keys=outs),
+    SPLReward: SPLReward,
+    TargetDifference: TargetDifference,
+    TrackField: lambda ins, outs: TrackField(in_keys=ins, out_keys=outs),
+    TrueWay: TrueWay,
+}
+"""All transforms, from their keys."""
+IN_KEYS = {AngleVector: ["heading"], EpisodeSum: ["number"], MinMaxNorm: ["move"]}
+IN_KEYS |= {AlignmentReward: ["heading", "gradient_heading"], TrackField: READ_KEYS, DeclareArrival: READ_KEYS}
+OUT_KEYS = {AngleVector: ["course"], EpisodeSum: ["episode_number"], MinMaxNorm: ["scaled"]}
+
+
+def other(name: str) -> NestedKey:
+    return nested("episode_other_number" if name == "episode_number" else f"other_{name}")
+
+
+def flight(kind: type[Transform], batch: tuple[int, ...], key: Callable[[str], NestedKey]) -> list[TensorDict]:
+    """Return what a transform by the names of its keys leaves of a reset and two steps."""
+    torch.manual_seed(0)
+    ins, outs = list(IN_KEYS.get(kind) or kind.default_in_keys), OUT_KEYS.get(kind) or kind.default_out_keys
+    transform = MAKES[kind](*([key(name) for name in names] for names in (ins, outs)))
+    env = TransformedEnv(Foreign(batch, ins, key, 3 if kind is DeclareArrival else 2), transform)
+    states = [env.reset()]
+    for _ in range(2):
+        states.append(env.step(states[-1].clone().set("action", torch.zeros(*batch, 2)))["next"])
+    return [TensorDict({name: state[key(name)] for name in outs if key(name) in state.keys(True)}) for state in states]
+
+
+@pytest.mark.parametrize("kind", MAKES, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
+def test_every_key_may_be_renamed_in_a_foreign_environment(kind: type[Transform], batch: tuple[int, ...]) -> None:
+    """It then writes there what it writes at its own names."""
+    plain, renamed = (flight(kind, batch, key) for key in (str, other))
+    for one, two in zip(plain, renamed, strict=True):
+        assert_close(one.to_dict(), two.to_dict(), rtol=0, atol=0, equal_nan=True)
+    assert plain[-1].keys() or kind is DeclareArrival
+
+
+def test_the_list_of_transforms_is_complete() -> None:
+    public = [kind for kind in vars(magrl.transforms).values() if isinstance(kind, type)]
+    assert set(MAKES) == {kind for kind in public if issubclass(kind, Transform)}
+
+
+# States
+
+
+def made(kind: type[Transform]) -> Transform:
+    names = list(IN_KEYS.get(kind) or kind.default_in_keys), OUT_KEYS.get(kind) or kind.default_out_keys
+    return MAKES[kind](*names)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MAKES if issubclass(kind, StatefulTransform)])
+def test_two_of_a_class_never_share_their_state(kind: type[Transform]) -> None:
+    """Those of one name for it are refused."""
+    first, second = (made(kind) for _ in range(2))
+    env = TransformedEnv(Foreign((2,), first.in_keys, str, 2), Compose(first, second))
+    if set(first.state_keys) <= set(first.in_keys):  # it has none of its own
+        assert env.reset() is not None
+    else:
+        with pytest.raises(ValueError, match=f"{kind.__name__} keeps its state at .* merge two transforms of one"):
+            env.reset()
