@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
+from magrl.envs.navigation import guidance_pair
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RunConfig
@@ -138,7 +139,7 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
     keys = ["reward", "reward_alignment"]
     guidance = [
         FieldGradient(base.field),
-        GradientHeading(),
+        GradientHeading(pair=guidance_pair(base)),
         AlignmentReward(out_keys=keys, weight=config.alignment_weight, offset=config.alignment_offset),
     ]
     sensors = [SensorErrors(config.noise, seed=base.seed)] if any(config.noise) else []

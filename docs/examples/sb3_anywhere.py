@@ -15,6 +15,7 @@ from magrl.transforms import SensorErrors
 
 import gymnasium
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
@@ -24,7 +25,8 @@ total_timesteps, num_tasks = 400_000, 500
 name, reward = "magrl/GeomagneticNavigationAnywhere-v0", "spl"
 envs = gymnasium.make_vec(name, num_envs=512, autoreset_mode="SameStep", reward=reward)
 options = {"n_steps": 32, "batch_size": 2048, "n_epochs": 5, "learning_rate": 1e-3, "device": "cpu", "seed": 0}
-model = PPO("MlpPolicy", BatchedVecEnv(envs), **options, policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.0})
+vehicles = VecMonitor(BatchedVecEnv(envs))
+model = PPO("MlpPolicy", vehicles, **options, policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.0})
 model.learn(total_timesteps)
 
 

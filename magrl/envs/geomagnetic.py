@@ -337,12 +337,16 @@ class GeomagneticNavEnv(EnvBase):
         """
         return self._tracks.track(vehicle)
 
-    def render(self, vehicles: Sequence[int] | None = None, *, size_px: int = 700) -> np.ndarray:
+    def render(
+        self, vehicles: Sequence[int] | None = None, *, size_px: int = 700, outlines: Sequence[Tensor] = ()
+    ) -> np.ndarray:
         """Draw the running episodes over the field's contours.
 
         Args:
             vehicles: vehicles to draw; the first 16 by default.
             size_px: height and width [pixels].
+            outlines: of areas to draw, each ``(P, 2)`` latitude, longitude [deg], as of
+                :func:`magrl.transforms.areas.outlines`.
 
         Returns:
             ``(size_px, size_px, 3)`` uint8 RGB.
@@ -355,4 +359,4 @@ class GeomagneticNavEnv(EnvBase):
         targets, region = (values[list(chosen)].cpu() for values in self._tracks.latest[2:])
         boxes = Regions.of(self.region[index] for index in region.unique().tolist())
         field = partial(copy.deepcopy(self.field).cpu(), index=region[0]) if len(self.region) > 1 else self.field
-        return rgb_array(draw_tracks, size_px, field, boxes, paths, targets)
+        return rgb_array(draw_tracks, size_px, field, boxes, paths, targets, [ring.cpu() for ring in outlines])

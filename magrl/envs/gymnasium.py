@@ -30,6 +30,7 @@ from magrl.checks import check_choice
 from magrl.envs.measures import path_measures
 from magrl.envs.navigation import NAMED_ENVS
 from magrl.envs.specs import PUBLIC_KEYS
+from magrl.transforms.areas import outlines
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
 ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v0"
@@ -130,7 +131,8 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         self.torchrl_env = NAMED_ENVS[task](num_envs, render_mode=render_mode, **options)
         observation = options.get("observation", "flat")  # or another array, by default of the task
         self._flat = isinstance(observation, str) and observation != "dict"
-        keys = PUBLIC_KEYS if observation == "dict" else observation
+        areas = [key for key in ("areas",) if key in self.torchrl_env.observation_spec.keys()]  # noqa: SIM118
+        keys = (*PUBLIC_KEYS, *areas) if observation == "dict" else observation
         self._keys = ("observation",) if self._flat else tuple(keys)
         self.single_observation_space = _observation_space(self.torchrl_env, self._keys, flat=self._flat)
         self.single_action_space = _box(self.torchrl_env.action_spec)
@@ -215,7 +217,12 @@ class GeomagneticNavVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArra
         if self.render_mode is None:
             gymnasium.logger.warn(f"render() needs gymnasium.make({ENV_ID!r}, render_mode='rgb_array')")
             return None
-        return tuple(self.torchrl_env.base_env.render([vehicle]) for vehicle in range(self.num_envs))
+        areas = self._state.get("no_go_areas", None)
+        rings = None if areas is None else outlines(areas, self._state["target_position"])
+        return tuple(
+            self.torchrl_env.base_env.render([vehicle], outlines=() if rings is None else rings[vehicle])
+            for vehicle in range(self.num_envs)
+        )
 
 
 class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -245,6 +252,8 @@ class GeomagneticNavGymEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     spec = _SPEC
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+        if batched := sorted({"num_envs", "autoreset_mode"} & options.keys()):
+            raise TypeError(f"gymnasium.make makes one vehicle, without {batched[0]!r}: use gymnasium.make_vec")
         self._envs = GeomagneticNavVectorEnv(1, render_mode=render_mode, autoreset_mode="Disabled", **options)
         self.torchrl_env, self.render_mode = self._envs.torchrl_env, render_mode
         self.observation_space = self._envs.single_observation_space

@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
-from torchrl.envs import CatTensors, Compose, Transform, TransformedEnv
+from torchrl.envs import CatTensors, Compose, RenameTransform, Transform, TransformedEnv
 
 from magrl.checks import check_choice, check_type
 from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.envs.random_regions import planet_scenario
+from magrl.envs.regions import PAPER_REGION
 from magrl.envs.scenario import Scenario
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import STEP_PRICE, Rules
@@ -65,9 +66,9 @@ def navigation_env(
         transforms: added after the guidance: errors of sensors, estimates, rewards. They are cloned.
         reward: ``"progress"``, the default, is :class:`~magrl.transforms.ProgressReward`: kilometers nearer to the
             destination over 50, plus 10 at the arrival, minus 0.1 a step. ``"paper"`` is the paper's: decrease of the
-            objective, 200 at the arrival, and alignment with the theoretical heading by the true field, over several
-            regions by the pair of elements that crosses best. It has a trap: to stand still and turn to that heading
-            earns 117 in 50 steps. ``"base"`` is that without the alignment. ``"spl"`` is
+            objective, 200 at the arrival, and alignment with the theoretical heading by the true field, outside
+            the paper's region by the pair of elements that crosses best. It has a trap: to stand still and turn to that
+            heading earns 117 in 50 steps. ``"base"`` is that without the alignment. ``"spl"`` is
             :class:`~magrl.transforms.SPLReward`, in which each step costs 0.5 % of SPL.
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
         **options: of :class:`magrl.envs.GeomagneticNavEnv`.
@@ -92,8 +93,7 @@ def navigation_env(
     if reward == "progress":
         steps += [TrueWay(), ProgressReward()]
     elif reward == "paper":  # before errors of the sensors
-        heading = GradientHeading() if len(base.region) == 1 else GradientHeading(pair="auto")
-        steps += [FieldGradient(base.field), heading, AlignmentReward()]
+        steps += [FieldGradient(base.field), GradientHeading(pair=guidance_pair(base)), AlignmentReward()]
     elif reward == "spl":
         steps += [TrueWay(), HighestSPL(), RandomStepPrice((STEP_PRICE, STEP_PRICE)), SPLReward()]
     env = TransformedEnv(base, Compose(*steps, *(transform.clone() for transform in _parts(transforms))))
@@ -102,6 +102,16 @@ def navigation_env(
     if scale_actions:
         env.append_transform(MinMaxNorm(in_keys_inv=["action"]))
     return env
+
+
+def guidance_pair(env: GeomagneticNavEnv) -> tuple[str, str] | str:
+    """Return the pair of elements that guides: the paper's in its region, elsewhere the one that crosses best.
+
+    Example:
+        >>> guidance_pair(GeomagneticNavEnv(seed=0)), guidance_pair(GeomagneticNavEnv(planet_scenario(1, seed=0)))
+        (('D', 'I'), 'auto')
+    """
+    return ("D", "I") if env.scenario.region == PAPER_REGION else "auto"
 
 
 def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **options: Any) -> TransformedEnv:
@@ -197,8 +207,8 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
 
     Args:
         num_envs: vehicles in the batch.
-        **options: of :func:`navigation_env`, with ``max_steps=20`` by default. The observation
-            ``"flat"`` ends with the areas in sight (:class:`~magrl.transforms.NoGoAreas`).
+        **options: of :func:`navigation_env`, with ``max_steps=20`` by default. Every ``observation`` ends with the
+            areas in sight (:class:`~magrl.transforms.NoGoAreas`); ``"dict"`` has them as a key.
 
     Raises:
         ValueError: for a reward other than ``"progress"`` and ``"spl"``: it would pay for an arrival through an area.
@@ -210,8 +220,11 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
     check_choice(("progress", "spl"), reward=options.setdefault("reward", "progress"))
     env = navigation_env(num_envs, **{"max_steps": 20} | options)
     env.insert_transform(0, Compose(TrueWay(), NoGoAreas()))  # the reward reads the success that areas leave
-    for joined in [s for s in env.transform if isinstance(s, CatTensors) and s.out_keys == ["observation"]][-1:]:
-        env.append_transform(CatTensors([*joined.in_keys, "areas"], "observation", del_keys=False, sort=False))
+    for last in [step for step in env.transform if "observation" in step.out_keys][-1:]:
+        parts = last.in_keys if isinstance(last, CatTensors) else ["observation_without_areas"]
+        if not isinstance(last, CatTensors):
+            env.append_transform(RenameTransform(["observation"], parts))
+        env.append_transform(CatTensors([*parts, "areas"], "observation", del_keys=False, sort=False))
     return env
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 ELEMENT_COLORS = {"D": "#E69F00", "I": "#0072B2", "B_H": "#009E73"}
 ELEMENT_STYLES = {"D": "solid", "I": "dashed", "B_H": "solid"}
-PATH, START, TARGET = "#404040", "#D55E00", "#CC79A7"
+PATH, START, TARGET, AREA = "#404040", "#D55E00", "#CC79A7", "#808080"
 SYMBOLS = {"D": "D", "I": "I", "B_H": "$B_H$"}
 
 
@@ -109,7 +109,12 @@ def draw_contours(axes: Axes, field: FieldModel, region: Region) -> None:
 
 
 def draw_tracks(
-    axes: Axes, field: FieldModel, region: Region | Regions, paths: Sequence[Tensor], targets: Tensor
+    axes: Axes,
+    field: FieldModel,
+    region: Region | Regions,
+    paths: Sequence[Tensor],
+    targets: Tensor,
+    outlines: Sequence[Tensor] = (),
 ) -> None:
     """Draw episodes over the field's contours, each from its start (square) to its target (triangle).
 
@@ -119,6 +124,7 @@ def draw_tracks(
         region: region of the tasks; grown to contain all of the paths.
         paths: one ``(T, 2)`` latitude, longitude [deg] for each episode.
         targets: ``(len(paths), 2)`` [deg].
+        outlines: of areas, each ``(P, 2)`` [deg].
 
     Raises:
         ValueError: for an empty list of paths, or another number of targets.
@@ -138,6 +144,8 @@ def draw_tracks(
         raise ValueError(f"there must be one target for each path, got {len(paths)} and {tuple(targets.shape)}")
     unwrapped, ends = [region.unwrapped(path) for path in paths], region.unwrapped(targets)
     draw_contours(axes, field, region.holding(torch.cat([*unwrapped, ends])))
+    for ring in outlines:
+        axes.fill(*region.unwrapped(ring).flip(-1).T, color=AREA, alpha=0.3)
     for path, end in zip(unwrapped, ends, strict=True):
         axes.plot(*torch.stack((path[0], end)).flip(-1).T, ":", color=TARGET, lw=0.8)
         axes.plot(path[:, 1], path[:, 0], "-", color=PATH, lw=1, marker=".", ms=3, alpha=0.8)

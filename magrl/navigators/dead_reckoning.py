@@ -84,7 +84,8 @@ class DeadReckoning(Navigator):
         std = seen.get("bias_std", None)
         if self.chart is None or std is None:
             return heading
-        return heading + torch.where(std[..., 0].isinf(), torch.deg2rad(self.chart.elements(place)[..., 0]), 0.0)
+        declination = torch.deg2rad(self.chart.elements(place).to(place)[..., 0])
+        return heading + torch.where(std[..., 0].isinf(), declination, 0.0)
 
 
 def _known(seen: TensorDictBase, which: int) -> Tensor:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded, Composite
 
 from magrl.counters import stream_uniform
+from magrl.geodesy import move_place, polar
 from magrl.transforms.errors.base import Episode, EpisodeNumbers
 
 ALONG, ACROSS_KM = (0.2, 0.8), 80.0
@@ -46,7 +50,6 @@ class NoGoAreas(EpisodeNumbers):
     numbers_key, stream_key = "no_go_areas", "no_go_stream"
     default_in_keys = ("true_way", "heading", "success", "terminated", "truncated", "done")
     default_out_keys = ("areas",)
-    out_sizes = {"areas": (3 * SEEN,)}
     size = 3 * NUMBER + 2
 
     @staticmethod
@@ -92,7 +95,37 @@ class NoGoAreas(EpisodeNumbers):
         ahead = ahead.take_along_dim(nearest.unsqueeze(-1), -2)
         closeness = (1 - gap_km.clamp_min(0) / SIGHT_KM).clamp_min(0).unsqueeze(-1)
         size = (radii.gather(-1, nearest) / RADIUS_KM[1]).unsqueeze(-1) * (closeness > 0)
-        return torch.cat((closeness * ahead, size), -1).flatten(-2)
+        return torch.cat((closeness * ahead, size), -1).flatten(-2).clamp(-1, 1)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add what is observed, in [-1, 1], and the state."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        like = observation_spec[self.in_keys[0]]
+        shape = (*like.shape[:-1], 3 * SEEN)
+        observation_spec[self.out_keys[0]] = Bounded(-1.0, 1.0, shape, device=like.device, dtype=like.dtype)
+        return observation_spec
+
+
+def outlines(numbers: Tensor, target: Tensor, points: int = 61) -> Tensor:
+    """Return the outlines of the discs of an episode on the map.
+
+    Args:
+        numbers: ``(..., 14)`` the state ``no_go_areas``.
+        target: ``(..., 2)`` latitude, longitude of the destination [deg].
+        points: number of points of each.
+
+    Returns:
+        ``(..., number, points, 2)`` latitude, longitude [deg].
+
+    Example:
+        >>> outlines(torch.zeros(5, 14), torch.zeros(5, 2)).shape
+        torch.Size([5, 4, 61, 2])
+    """
+    centers, radii = NoGoAreas.discs(numbers)
+    angle = torch.linspace(0, 2 * math.pi, points, device=numbers.device)
+    ring = radii[..., None, None] * torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    distance, bearing = polar(centers.unsqueeze(-2) + ring)
+    return move_place(target[..., None, None, :].expand(*distance.shape, 2), bearing, distance)
 
 
 def turned(vector: Tensor, angle: Tensor) -> Tensor:

@@ -315,6 +315,8 @@ def test_bad_options() -> None:
     for options, message in (
         ({"observation": 5}, "observation must be a Sequence, got 5"),
         ({"observation": ("field", "wings")}, "observation names 'wings', which is not among the keys"),
+        ({"num_envs": 2}, "makes one vehicle, without 'num_envs': use gymnasium.make_vec"),
+        ({"autoreset_mode": "SameStep"}, "without 'autoreset_mode': use gymnasium.make_vec"),
         ({"transforms": [5]}, r"transforms\[0\] must be a Transform, got 5"),
         ({"task": "boxes"}, "task must be one of 'box', 'anywhere', 'readings', 'storm', 'nogo', got 'boxes'"),
     ):

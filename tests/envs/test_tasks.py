@@ -38,7 +38,8 @@ PLACES = {
 }
 
 
-FAR = {"half the globe away": (WORLD, (9000.0, 9010.0))}  # where a leg is kilometers off its geodesic
+FAR = {"corner to corner": (PAPER_REGION, (1410.0, 1560.0))}
+FAR |= {"half the globe away": (WORLD, (9000.0, 9010.0))}  # where a leg is kilometers off its geodesic
 
 
 @pytest.mark.parametrize("place", PLACES | FAR)
@@ -183,13 +184,14 @@ def test_log_uniform_distances():
 @pytest.mark.parametrize(
     ("distance_range_km", "law", "says"),
     [
+        ((200, 300), "area", r"no two points of Region\(latitude=\(0.0, 1.0\).* more than 157 km"),
+        ((100, 300), "log", r"no two points of Region\(latitude=\(0.0, 1.0\).* more than 157 km"),
         ((0, 300), "log", r"\(0, 300\) must be two rising numbers above 0 with distance_law 'log'"),
-        ((1600, 1700), "area", r"\(1600, 1700\): no two points of Region.*160.*170.*more than 1565 km"),
     ],
 )
 def test_bad_distances(distance_range_km, law, says):
     with pytest.raises(ValueError, match=says):
-        task_set(1, 0, PAPER_REGION, distance_range_km, law)
+        task_set(1, 0, Regions.of([PAPER_REGION, Region((0, 1), (0, 1))]), distance_range_km, law)
 
 
 def test_an_unknown_set():

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import CatTensors, Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.navigation import no_go_env
 from magrl.evaluation.navigators import make_navigator
+from magrl.geodesy import geodesic
 from magrl.transforms import NoGoAreas, TrueWay
-from magrl.transforms.areas import distance_km, turned
+from magrl.transforms.areas import distance_km, outlines, turned
 
 
 def flown(**options: object) -> TensorDict:
@@ -43,11 +47,53 @@ def test_areas_are_seen_only_from_nearby() -> None:
     torch.testing.assert_close(seen, expected)
 
 
-def test_observation_of_the_task() -> None:
-    env = no_go_env(8, seed=0)
-    state = env.rollout(3)
-    assert state["observation"].shape[-1] == 13 + state["areas"].shape[-1]
-    assert (state["observation"][..., 13:] == state["areas"]).all()
+@pytest.mark.parametrize("steps", [3, 5])
+def test_an_episode_that_meets_an_area_in_its_last_step_is_not_truncated(steps: int) -> None:
+    after = flown(max_steps=steps)
+    assert (after["terminated"] & (after["elapsed_steps"] == steps)).any()
+    assert not (after["terminated"] & after["truncated"]).any()
+    assert (after["done"] == after["terminated"] | after["truncated"]).all()
+
+
+def test_distance_is_that_from_a_leg_between_its_ends() -> None:
+    points = torch.tensor([[5.0, 4.0], [13.0, 4.0], [-3.0, 4.0]])
+    assert distance_km(points, torch.zeros(2), torch.tensor([10.0, 0.0])).tolist() == [4.0, 5.0, 5.0]
+
+
+@pytest.mark.parametrize(("observation", "size"), [("flat", 13), ("track", 19), ("readings", 20), ("dict", 0)])
+def test_every_observation_has_the_areas(observation: str, size: int) -> None:
+    """As its last numbers, within the bounds of the space."""
+    name = "magrl/GeomagneticNavigationNoGo-v0"
+    envs = gymnasium.make_vec(name, num_envs=32, observation=observation, autoreset_mode="SameStep")
+    envs.reset(seed=0)
+    for _ in range(3):
+        found, *_ = envs.step(np.tile(np.float32([[1, 0]]), (32, 1)))
+    areas = found["areas"] if observation == "dict" else found[:, size:]
+    space = envs.single_observation_space
+    space = space["areas"] if observation == "dict" else space
+    assert areas.any()
+    assert (
+        areas == envs.unwrapped.torchrl_env.observation_spec["areas"].project(torch.from_numpy(areas)).numpy()
+    ).all()
+    assert (space.low[-9:] == -1).all()
+    assert (space.high[-9:] == 1).all()
+    check_env_specs(no_go_env(2, observation=observation, seed=0))
+
+
+def test_pictures_show_the_areas() -> None:
+    """Their outlines are as far from the centers as their radius, and of another color than the map."""
+    env = gymnasium.make("magrl/GeomagneticNavigationNoGo-v0", render_mode="rgb_array").unwrapped
+    env.reset(seed=0)
+    state = env._envs._state
+    centers, radii = NoGoAreas.discs(state["no_go_areas"])
+    middle = outlines(
+        torch.cat((torch.cat((centers, 0 * radii.unsqueeze(-1)), -1).flatten(-2), torch.zeros(1, 2)), -1),
+        state["target_position"],
+    )
+    ring = outlines(state["no_go_areas"], state["target_position"])
+    apart, _ = geodesic(*middle.unbind(-1), *ring.unbind(-1))
+    torch.testing.assert_close(apart.float(), radii.unsqueeze(-1).expand(apart.shape), rtol=0.01, atol=0)
+    assert not np.array_equal(env.render(), env.torchrl_env.base_env.render([0]))
 
 
 def test_areas_join_the_observation_alone() -> None:
