@@ -111,7 +111,7 @@ def guidance_pair(env: GeomagneticNavEnv) -> tuple[str, str] | str:
         >>> guidance_pair(GeomagneticNavEnv(seed=0)), guidance_pair(GeomagneticNavEnv(planet_scenario(1, seed=0)))
         (('D', 'I'), 'auto')
     """
-    return ("D", "I") if env.scenario.region == PAPER_REGION else "auto"
+    return ("D", "I") if list(env.region) == [PAPER_REGION] else "auto"
 
 
 def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **options: Any) -> TransformedEnv:

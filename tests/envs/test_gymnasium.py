@@ -428,7 +428,7 @@ def test_stable_baselines3_makes_environments_without_a_map(monkeypatch) -> None
     image = np.zeros((2, 2, 3), dtype=np.uint8)
     monkeypatch.setattr(geomagnetic, "rgb_array", lambda *args: drawn.append(args[2:]) or image)
     assert len(vec_env.get_images()) == 2
-    for (field, boxes, paths, _), env in zip(drawn, vec_env.envs, strict=True):
+    for (field, boxes, paths, *_), env in zip(drawn, vec_env.envs, strict=True):
         state = env.unwrapped._envs._state
         assert list(boxes) == [env.unwrapped.torchrl_env.base_env.region[int(state["region"])]]
         torch.testing.assert_close(elements_at(field, paths[0][:1]).float(), state["true_field"])
