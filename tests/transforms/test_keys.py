@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from support.conformance import check_one_device
 from support.environments import nested
+from support.errors import nav
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -17,6 +19,7 @@ from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 import magrl.transforms
 from magrl.tracking import Rules
 from magrl.transforms import (
+    CONDITIONS,
     AlignmentReward,
     AngleVector,
     DeclareArrival,
@@ -41,6 +44,7 @@ from magrl.transforms import (
     TargetDifference,
     TrackField,
     TrueWay,
+    with_conditions,
 )
 from magrl.transforms.base import StatefulTransform
 from magrl.transforms.track import READ_KEYS
@@ -196,3 +200,26 @@ def test_two_of_a_class_never_share_their_state(kind: type[Transform]) -> None:
     else:
         with pytest.raises(ValueError, match=f"{kind.__name__} keeps its state at .* merge two transforms of one"):
             env.reset()
+
+
+# Devices
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MAKES if kind is not DeclareArrival], ids=str)
+def test_a_transform_stays_on_the_device_of_its_values(kind: type[Transform], monkeypatch) -> None:
+    """On fake tensors, which refuse to be mixed with those of the processor, whatever a branch asks."""
+    ins, outs = keys_of(kind)
+    base, transform = Foreign((4,), ins, str, 3), MAKES[kind](ins, outs)
+    env = TransformedEnv(base, transform)
+    state = env.reset()
+    after = env.step(state.clone().set("action", torch.zeros(4, 3)))["next"]
+    check_one_device(monkeypatch, transform, lambda move: transform._step(move(state), move(after)))
+    check_one_device(monkeypatch, transform, lambda move: transform._reset(move(state), move(state)))
+
+
+@pytest.mark.parametrize("name", [name for name, errors in CONDITIONS.items() if not errors.perfect])
+def test_a_preset_stays_on_the_device_of_its_values(name: str, monkeypatch) -> None:
+    env = with_conditions(nav(), CONDITIONS[name])
+    state = env.reset()
+    after = env.step(state.clone().set("action", torch.zeros(2, 2)))["next"]
+    check_one_device(monkeypatch, env.transform, lambda move: env.transform._step(move(state), move(after)))
