@@ -2,16 +2,18 @@
 
 from collections.abc import Callable
 
+import td3_gradient_guided as recipe
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import CatTensors, Compose, TransformedEnv
 
+from magrl.envs import PAPER_REGION, GeomagneticNavEnv, Region, Scenario
 from magrl.envs.navigation import navigation_env
 from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.navigators import Geodesic
-from magrl.transforms import NorthReferenceError, SensorErrors
+from magrl.transforms import GradientHeading, NorthReferenceError, SensorErrors
 
 
 def test_rewards() -> None:
@@ -20,6 +22,15 @@ def test_rewards() -> None:
     assert ["gradient_heading" in state for state in states] == [False, True, False, False]
     assert ["true_way" in state for state in states] == [True, False, False, True]
     assert all(torch.equal(states[0]["observation"], state["observation"]) for state in states)
+
+
+def test_the_papers_pair_guides_in_its_region_alone() -> None:
+    """Elsewhere the gradients of D and I may be parallel."""
+    for region, pair in ((PAPER_REGION, [0, 1]), (Region((4, 14), (66, 76)), None)):
+        base = GeomagneticNavEnv(Scenario(region=region), seed=0)
+        trained = recipe.make_env(base, base.observation_view(), recipe.Config())
+        for env in (trained, navigation_env(scenario=base.scenario, reward="paper")):
+            assert [step.pair for step in env.transform if isinstance(step, GradientHeading)] == [pair]
 
 
 def returns(env: TransformedEnv, policy: Callable[[TensorDict], TensorDict]) -> tuple[Tensor, Tensor]:

@@ -28,9 +28,7 @@ def test_a_navigator_stays_on_the_device_of_what_it_sees(name: str, monkeypatch)
     def decide(moved) -> None:
         there = moved(seen)
         step = there["elapsed_steps"].squeeze(-1)
-        memory = {"decided_at": step, "field_readings": step, "action": there["heading"]} | navigator.first_memory(
-            there
-        )
-        navigator.decide(there, TensorDict(memory, 2))
+        memory = {"decided_at": step, "field_readings": step, "action": there["heading"]}
+        navigator.decide(there, TensorDict(memory | navigator.first_memory(there), 2))
 
     check_one_device(monkeypatch, navigator, decide)

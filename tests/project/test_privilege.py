@@ -39,9 +39,10 @@ def base_env(seed: int = 5) -> GeomagneticNavEnv:
 @pytest.fixture(scope="module", params=["true", "magnetic"])
 def states(request: pytest.FixtureRequest) -> list[TensorDict]:
     torch.manual_seed(0)
-    env, magnetic = TransformedEnv(base_env(), every_error()), request.param == "magnetic"
-    rollout = (TransformedEnv(env, MagneticNorth(), auto_unwrap=True) if magnetic else env).rollout(6)
-    private = PRIVATE - (set() if magnetic else COMPASS)
+    magnetic = request.param == "magnetic"
+    *errors, north = every_error()  # a vehicle has one north
+    rollout = TransformedEnv(base_env(), Compose(*errors, MagneticNorth() if magnetic else north)).rollout(6)
+    private = PRIVATE - ({"north_error", "north_stream"} if magnetic else COMPASS)
     assert set(rollout.keys()) - {"action", "next"} == private | PUBLIC, "a key is in one of the lists"
     return list(rollout.exclude("action", "next").unbind(1))
 
