@@ -13,6 +13,8 @@ from magrl.checks import check_number, check_type
 from magrl.tracking import Rules, corrected, moving
 
 Device = torch.device | str | None
+MOST_LAYERS = 64
+"""Largest number of hidden layers."""
 
 
 def make_mlp(inputs: int, outputs: int, num_cells: Sequence[int], *, layer_norm: bool, device: Device = None) -> MLP:
@@ -34,7 +36,7 @@ def make_mlp(inputs: int, outputs: int, num_cells: Sequence[int], *, layer_norm:
     """
     check_number(1, 65536, whole=True, inputs=inputs, outputs=outputs)
     check_type(Sequence, num_cells=num_cells)
-    check_number(1, whole=True, hidden_layers=len(num_cells))
+    check_number(1, MOST_LAYERS, whole=True, hidden_layers=len(num_cells))
     for width in num_cells:
         check_number(1, 65536, whole=True, num_cells=width)
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": width} for width in num_cells]}

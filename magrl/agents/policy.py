@@ -279,8 +279,11 @@ def _reading(path: Path | str) -> Iterator[None]:
 
 
 def _rebuild(config: Any, weights: Any, training: Any = None) -> FieldPolicy:
+    rebuilt = _config(**config)
+    # Compares the shapes before anything is allocated: a few bytes may ask for any number of cells
+    rebuilt.make_actor("meta").load_state_dict(weights, assign=True)
     check_finite(weights.items(), "weights")
-    policy = FieldPolicy(_config(**config))
+    policy = FieldPolicy(rebuilt)
     policy.actor.load_state_dict(weights)
     policy.training = dict(training or {})
     return policy

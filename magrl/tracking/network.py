@@ -16,6 +16,8 @@ from magrl.tracking.pilot import Rules
 
 FILE_FORMAT = 4
 """Format of the files of policies."""
+MOST_LAYERS = 64
+"""Largest number of hidden layers."""
 _PRETRAINED = Path(__file__).parent.parent / "navigators" / "pretrained"
 
 
@@ -35,7 +37,7 @@ def correction_network(num_cells: Sequence[int], device: torch.device | str | No
         tensor([0., 0.], grad_fn=<SelectBackward0>)
     """
     check_type(Sequence, num_cells=num_cells)
-    check_number(1, whole=True, hidden_layers=len(num_cells))
+    check_number(1, MOST_LAYERS, whole=True, hidden_layers=len(num_cells))
     layers: list[nn.Module] = []
     width = OBSERVATION_SIZE
     for cells in num_cells:
