@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import errno
 import hashlib
 import io
 import json
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 MAX_FILE_BYTES = 10_000_000
 """Largest TOML or JSON file: a scenario with about fifty thousand tasks."""
+MAX_COLUMNS, MAX_CELLS = 1000, 10_000_000
+"""Most columns of a table, and most cells of a table that are blank because its rows are short."""
 
 
 class DamagedFileError(ValueError):
@@ -86,16 +90,85 @@ def write_atomically(path: Path, content: bytes) -> None:
         >>> path.read_bytes()
         b'content'
     """
-    aside = path.with_name(f".{uuid.uuid4().hex}.aside")  # of this call: another writer of the file has its own
+    write_with(path, Path.write_bytes, content)
+
+
+def write_with(path: Path, write: Callable[..., Any], *args: Any, **options: Any) -> None:
+    """Write a file by a function of another library, complete or not at all, as :func:`write_atomically` does.
+
+    Args:
+        path: path of the file; an existing file is replaced.
+        write: function that writes the file at its first argument, such as ``figure.savefig``.
+        args: its further arguments.
+        options: its options.
+
+    Raises:
+        OSError: naming the file and the reason.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "table.md"
+        >>> write_with(path, Path.write_text, "D [°]", encoding="utf-8")
+        >>> read_text(path)
+        'D [°]'
+    """
+    aside = path.with_name(f".{uuid.uuid4().hex}{path.suffix}")  # of this call: another writer of the file has its own
     try:
-        with aside.open("xb") as file:
-            file.write(content)
-            file.flush()
+        write(aside, *args, **options)
+        with aside.open("rb") as file:
             os.fsync(file.fileno())
         os.replace(aside, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise _not_written(path, error) from error
     finally:
         aside.unlink(missing_ok=True)
-    _sync_folder(path.parent)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8, atomically.
+
+    Raises:
+        OSError: naming the file and the reason.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "notes.txt"
+        >>> write_text(path, "60° N")
+        >>> path.read_bytes().decode("utf-8")
+        '60° N'
+    """
+    write_atomically(path, text.encode())
+
+
+def append(path: Path, record: bytes) -> None:
+    """Add a record to the end of a file, whole or not at all, also where the disk is full.
+
+    Raises:
+        OSError: naming the file and the reason.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "log.csv"
+        >>> append(path, b"1,2")
+        >>> path.read_bytes()
+        b'1,2'
+    """
+    try:
+        with path.open("ab", buffering=0) as file:
+            end = file.tell()
+            try:
+                if file.write(record) < len(record):  # the part that still had room
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            except OSError:
+                file.truncate(end)
+                raise
+    except OSError as error:
+        raise _not_written(path, error) from error
+
+
+def _not_written(path: Path, error: OSError) -> OSError:
+    return OSError(f"cannot write {path}: {error.strerror or error}")
 
 
 def load_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
@@ -237,7 +310,7 @@ def check_writable(path: Path) -> None:
         with path.open("ab"):
             pass
     except OSError as error:
-        raise OSError(f"cannot write {path}: {error.strerror}") from error
+        raise _not_written(path, error) from error
     if not existed:
         path.unlink()
 
@@ -272,16 +345,16 @@ def read_table(text: str, separator: str = ",", **options: Any) -> DataFrame:
         options: those of :func:`pandas.read_csv` for the values.
 
     Raises:
-        ValueError: for no row, a row of more cells than the header, or a quoted text that is not closed.
+        ValueError: for no row, too many columns or cells, two columns of one name, a row of more cells than the header,
+            or a quoted text that is not closed.
 
     Example:
         >>> read_table("time, x" + chr(10) + "0, 1")["x"].tolist()
         [1]
     """
+    _check_table(text.strip(), separator)
     import pandas  # where it is needed: it takes long to import
 
-    if "\n" not in text.strip():
-        raise ValueError("the table has no row")
     shape: dict[str, Any] = {"sep": separator, "skipinitialspace": True, "index_col": False, "low_memory": False}
     try:
         with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
@@ -290,6 +363,25 @@ def read_table(text: str, separator: str = ",", **options: Any) -> DataFrame:
         reason = "a row has more cells than the header, or a quoted text is not closed"
         raise ValueError(f"{reason}: {str(error).strip()}") from error
     return table.rename(columns=str.strip)
+
+
+def _check_table(text: str, separator: str) -> None:
+    """Raise before a table takes memory: a short text may hold very many blank cells."""
+    header, _, rows = text.partition("\n")
+    if not rows:
+        raise ValueError("the table has no row")
+    columns, cells = header.count(separator) + 1, (header.count(separator) + 1) * (rows.count("\n") + 1)
+    if columns > MAX_COLUMNS:
+        raise ValueError(f"the table has {columns} columns: keep those that are needed, at most {MAX_COLUMNS}")
+    if cells > MAX_CELLS + rows.count(separator):
+        raise ValueError(f"the table has {cells} cells, most of them blank: leave out columns that are not needed")
+    try:
+        (names,) = csv.reader([header], delimiter=separator, skipinitialspace=True)
+    except csv.Error as error:
+        raise ValueError(f"the header cannot be read: {error}") from error
+    for name, count in Counter(map(str.strip, names)).items():
+        if name and count > 1:
+            raise ValueError(f"{count} columns have the name {short(name)}: keep one of them")
 
 
 def numbers(column: Series) -> NDArray[np.float64]:

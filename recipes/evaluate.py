@@ -21,6 +21,7 @@ trajectories.png (the first tasks of each navigator).
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import math
 import time
@@ -36,7 +37,7 @@ from magrl.evaluation.maps import trajectories_figure
 from magrl.evaluation.navigators import check_distinct, label, training_settings
 from magrl.evaluation.scenarios import ScenarioOptions, TaskSet, choose_tasks, first_tasks, task_names
 from magrl.evaluation.tables import comparison_table
-from magrl.files import check_writable, write_json
+from magrl.files import check_writable, read_text, write_json, write_text, write_with
 from magrl.sensor_std import PERFECT, Noise
 from magrl.training import UsageError, command, parse
 from magrl.training.checkpoints import create_run_folder
@@ -247,17 +248,18 @@ def write(config: Config, flight: Flight, results: Results, notes: Sequence[str]
     """Write the files of the results."""
     env = flight.base
     for name, rows in (("episodes", results.episodes), ("runs", results.runs), ("paths", results.paths)):
-        with (config.out / f"{name}.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+        write_text(config.out / f"{name}.csv", text.getvalue())
     write_json(config.out / "summary.json", results.summaries)
     write_json(config.out / "settings.json", settings(config, flight))
     ahead = config.kilometers or env.arrival.rule != "objective"
     whole = comparison_table(results.summaries, published=not config.scenario, kilometers=ahead)
-    (config.out / "table.md").write_text(whole + text_below(config, flight, notes))
+    write_text(config.out / "table.md", whole + text_below(config, flight, notes))
     figure = trajectories_figure(results.rollouts, env.field, env.region, names=env.scenario.names)
-    figure.savefig(config.out / "trajectories.png", dpi=120)
+    write_with(config.out / "trajectories.png", figure.savefig, dpi=120)
     if config.export:
         export.write_tracks(config.export, results.tracks)
 
@@ -266,7 +268,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Read the command line, evaluate and print the table."""
     config = parse(Config, RECIPE, __doc__, args)
     evaluate(config)
-    print((config.out / "table.md").read_text(), f"Results are in {config.out}", sep="\n")
+    print(read_text(config.out / "table.md"), f"Results are in {config.out}", sep="\n")
 
 
 if __name__ == "__main__":

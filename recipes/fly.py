@@ -27,7 +27,7 @@ from magrl.evaluation import Flight, episode_measures, export, places
 from magrl.evaluation.maps import trajectories_figure, write_gif
 from magrl.evaluation.navigators import needs
 from magrl.field import IGRF
-from magrl.files import check_writable, write_json
+from magrl.files import check_writable, write_json, write_with
 from magrl.geodesy import geodesic
 from magrl.tracking import Rules, Way
 from magrl.training import UsageError, command, parse
@@ -217,12 +217,12 @@ def draw(
     ]
     title = titles[0] = f"{route}: {navigator} {titles[0]}"
     figure = trajectories_figure(dict(zip(titles, steps.values(), strict=True)), base.field, base.region)
-    figure.savefig(config.out / "flight.png", dpi=120)
+    write_with(config.out / "flight.png", figure.savefig, dpi=120)
     if config.export:
         export.write_tracks(config.export, export.tracks(steps["with_signal"], [title], navigator=navigator))
     if config.animate:
         end = "{outcome}, {navigation_error_km:.1f} km from the destination".format(**measures["without_signal"])
-        write_gif(config.animate, steps["without_signal"], base.field, base.region, f"{route}: {end}")
+        write_with(config.animate, write_gif, steps["without_signal"], base.field, base.region, f"{route}: {end}")
 
 
 def fly(config: Config) -> dict[str, Any]:

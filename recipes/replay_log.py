@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Literal
 
 from magrl.agents import load_policy
+from magrl.checks import printable
 from magrl.evaluation.tables import markdown_table
 from magrl.field.elements import NAMES
-from magrl.files import check_writable
+from magrl.files import check_writable, write_text, write_with
 from magrl.geodesy import check_positions, geodesic
 from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import Way
@@ -296,11 +297,12 @@ def main(args: Sequence[str] | None = None) -> None:
         warnings = log.attrs["notes"] + mistakes(checked, log.attrs["date"])
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
-    table.drop(columns="covariance").to_csv(config.out / "log.csv", index=False)
+    write_with(config.out / "log.csv", table.drop(columns="covariance").to_csv, index=False)
     lines = [markdown(table), "", *notes(table), *(f"Warning: {text}." for text in warnings), ""]
-    (config.out / "log.md").write_text("\n".join(lines))
-    figure(table, f"{config.log.name}: {config.navigator}").savefig(config.out / "log.png", dpi=110)
-    print((config.out / "log.md").read_text(), f"The picture is {config.out / 'log.png'}", sep="\n")
+    write_text(config.out / "log.md", "\n".join(lines))
+    drawn = figure(table, printable(f"{config.log.name}: {config.navigator}"))
+    write_with(config.out / "log.png", drawn.savefig, dpi=110)
+    print(*lines, f"The picture is {config.out / 'log.png'}", sep="\n")
 
 
 if __name__ == "__main__":

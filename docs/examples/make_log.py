@@ -25,7 +25,7 @@ def write(path: Path) -> None:
     """Write time [h], reading [deg, deg, nT], heading [deg], distance since the last row [km] and position [deg]."""
     place = torch.tensor([62.0, 3.0], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["time", "D", "I", "B_H", "heading", "distance", "latitude", "longitude"])
         for row, heading in enumerate([COURSES[0], *COURSES]):

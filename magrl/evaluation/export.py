@@ -15,7 +15,7 @@ from typing import Any
 from tensordict import TensorDictBase
 
 from magrl.evaluation.episodes import episode_measures
-from magrl.files import json_ready
+from magrl.files import json_ready, write_text
 
 MEASURES = ("success", "steps", "shortest_km", "length_km", "navigation_error_km", "spl")
 """Measures among the properties of each track."""
@@ -100,7 +100,7 @@ def write_tracks(path: Path | str, tracks: Sequence[Feature]) -> None:
     check_suffix(path)
     text = json.dumps({"type": "FeatureCollection", "features": tracks}, allow_nan=False)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text(text + "\n", encoding="utf-8")
+    write_text(Path(path), text + "\n")
 
 
 def cut(positions: Sequence[Position]) -> list[list[Position]]:

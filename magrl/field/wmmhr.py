@@ -31,7 +31,7 @@ EPOCH, END = datetime.datetime(2025, 1, 1), datetime.datetime(2030, 1, 1)
 @cache
 def _wmmhr_tables() -> tuple[Tensor, Tensor]:
     """Return the Gauss table at the epoch [nT] and its rate [nT/year], complex ``(134, 134)`` each."""
-    with gzip.open(Path(__file__).parent / "wmmhr2025.cof.gz", "rt") as file:
+    with gzip.open(Path(__file__).parent / "wmmhr2025.cof.gz", "rt", encoding="utf-8") as file:
         n, m, *columns = np.loadtxt(file, skiprows=1, comments="9" * 12).T
     tables = np.zeros((2, 134, 134), dtype=np.complex128)
     g, h, g_rate, h_rate = columns

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import time
 from collections import deque
@@ -15,7 +16,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from magrl.checks import check_number
-from magrl.files import write_json
+from magrl.files import append, write_json, write_text, write_with
 from magrl.training.loggers import CurveLog
 
 if TYPE_CHECKING:
@@ -186,13 +187,17 @@ class RunLog:
     def _open(self, rows: Sequence[Mapping[str, float]], wandb_id: str = "") -> None:
         """Open ``train.csv`` and the logger, and write some rows to both."""
         self._log = self._open_log(run_id=wandb_id)
-        aside = self.folder / "train.csv.aside"
-        self._file = aside.open("w", newline="")
-        self._writer = csv.DictWriter(self._file, self.columns, restval="", extrasaction="raise")
-        self._writer.writeheader()
+        written = [dict(zip(self.columns, self.columns, strict=True)), *rows]
+        write_text(self.folder / "train.csv", "".join(map(self._line, written)))
+        self.rows += map(dict, rows)
         for row in rows:
-            self.row(row)
-        aside.replace(self.folder / "train.csv")
+            self._log.row(row)
+
+    def _line(self, row: Mapping[str, Any]) -> str:
+        line = io.StringIO()
+        writer = csv.DictWriter(line, self.columns, restval="", extrasaction="raise")
+        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+        return line.getvalue()
 
     @property
     def seconds(self) -> float:
@@ -200,16 +205,15 @@ class RunLog:
         return time.perf_counter() - self._began
 
     def row(self, row: Mapping[str, float]) -> None:
-        """Add a row of curves and flush the file. ``frames`` is the step of the logger."""
+        """Add a row of curves to the file. ``frames`` is the step of the logger."""
         self.rows.append(dict(row))
-        self._writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-        self._file.flush()
+        append(self.folder / "train.csv", self._line(row).encode())
         self._log.row(row)
 
     def figure(self, name: str, figure: Figure) -> None:
         """Save a figure as ``<name>.png``."""
         path = self.folder / f"{name}.png"
-        figure.savefig(path, dpi=120)
+        write_with(path, figure.savefig, dpi=120)
         self._log.picture(name, path)
 
     def result(self, result: Mapping[str, float], navigator: str = "") -> None:
@@ -230,6 +234,5 @@ class RunLog:
         self._open(state_dict["rows"], str(state_dict["wandb_id"]))
 
     def close(self) -> None:
-        """Close the file and the logger."""
-        self._file.close()
+        """Close the logger."""
         self._log.close()

@@ -31,7 +31,7 @@ from magrl.checks import UsageError, check_finite, short
 from magrl.envs import GeomagneticNavEnv, Scenario
 from magrl.evaluation.episodes import episode_measures, evaluation_rollout, summarize
 from magrl.evaluation.flight import Flight
-from magrl.files import locked, write_json
+from magrl.files import locked, read_text, write_json
 from magrl.navigators import Anywhere
 from magrl.training.checkpoints import Checkpoints, RunningEpisodes, Stateful, create_run_folder
 from magrl.training.config import CHANGEABLE, WANDB_OPTIONS, RunConfig
@@ -124,7 +124,7 @@ class Run:
         if any(config.noise):
             self.name += "-noise-" + "-".join(f"{level:g}" for level in config.noise)
         if config.resume:  # its scenario file has another name there
-            self.name = json.loads((config.resume / "config.json").read_text()).get("name", self.name)
+            self.name = json.loads(read_text(config.resume / "config.json")).get("name", self.name)
         self.statistics, self.best, self.stop = TrainingStatistics(), BestPolicy(), StopRequest()
         self.folder = config.out or Path("runs") / f"{self.name}-seed{config.seed}"
         self._exits = contextlib.ExitStack()
@@ -184,7 +184,7 @@ class Run:
     def state_dict(self) -> dict[str, Any]:
         """Return the settings of the training, and the text of its scenario file."""
         state = {name: value for name, value in self.settings.items() if name not in CHANGEABLE}
-        return state | {"scenario": self.config.scenario and (self.folder / state["scenario"]).read_text()}
+        return state | {"scenario": self.config.scenario and read_text(self.folder / state["scenario"])}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Raise a ValueError unless these are the settings of this training."""

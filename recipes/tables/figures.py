@@ -23,7 +23,7 @@ from magrl.evaluation import Flight, evaluation_rollout
 from magrl.evaluation import figures as plots
 from magrl.evaluation.navigators import label
 from magrl.field import IGRF
-from magrl.files import check_writable
+from magrl.files import check_writable, read_text, write_text, write_with
 from magrl.sensor_std import PERFECT
 from magrl.tracking import Rules
 from magrl.training import UsageError, command
@@ -58,7 +58,7 @@ LOOKS = dict(zip(PILOTS, zip(("#0072B2", "#D55E00", "#009E73", "#000000"), "osvx
 def columns_by_navigator(path: Path) -> dict[str, dict[str, list[float]]]:
     """Return the columns of a file of recipes/evaluate.py for each navigator of :data:`SHOWN`, without failures."""
     columns: dict[str, dict[str, list[float]]] = {}
-    for row in csv.DictReader(path.read_text().splitlines()):
+    for row in csv.DictReader(read_text(path).splitlines()):
         name = row.pop("navigator")
         if name in SHOWN and row.pop("success", "True") == "True":
             for key, value in row.items():
@@ -85,7 +85,7 @@ def curves(name: str) -> Figures:
     """Return the learning curves of a figure in figures.toml."""
     options, values = declared(FILE)["curves"][name], {}
     for navigator, pattern in options["runs"].items():
-        texts = [(Path(run) / "train.csv").read_text().splitlines() for run in matching(pattern)]
+        texts = [read_text(Path(run) / "train.csv").splitlines() for run in matching(pattern)]
         columns = [
             [[float(row[key] or "nan") for row in csv.DictReader(text)] for key in ("frames", options["column"])]
             for text in texts
@@ -107,7 +107,7 @@ def one_error(lines: str, size: object = "") -> Conditions:
     """Return a size of an error in figures.toml, beside noise of the sensors of a ship."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "error.toml"
-        path.write_text(f"speed_km_h = 24.0\nsensors.noise = [0.05, 0.05, 5.0]\n{lines.replace('SIZE', str(size))}")
+        write_text(path, f"speed_km_h = 24.0\nsensors.noise = [0.05, 0.05, 5.0]\n{lines.replace('SIZE', str(size))}")
         return load_conditions(path)
 
 
@@ -215,7 +215,7 @@ def draw(figures: tyro.conf.Positional[tuple[str, ...]], tasks: int | None = Non
             made = FIGURES[name](**options) if name in FIGURES else curves(name)
             for file, figure in made.items():
                 check_writable(out / f"{file}.png")
-                figure.savefig(out / f"{file}.png", dpi=110)
+                write_with(out / f"{file}.png", figure.savefig, dpi=110)
                 print(out / f"{file}.png")
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error

@@ -25,7 +25,7 @@ from typing import Any
 from magrl.benchmark import COLUMNS, episode_table, write_episodes
 from magrl.evaluation.navigators import check_distinct
 from magrl.evaluation.tables import ABOUT, markdown_table
-from magrl.files import check_writable, read_document
+from magrl.files import check_writable, read_document, read_text, write_text
 from magrl.training import UsageError, command
 
 import torch
@@ -105,7 +105,7 @@ def evaluation(navigators: Sequence[str], *, folder: Path, **options: Any) -> Ta
     level = ", ".join(f"{std:g}" for std in read_document(folder / "settings.json")["errors"])
     episodes = read_csv(folder / "episodes.csv").rename(columns={"navigation_error_km": "final_distance_km"})
     added = {"track": "", "level": level, "region": 0, "seed": 0, "false_arrival": False}
-    return Table((folder / "table.md").read_text(), [episodes.assign(**added)[list(COLUMNS)]])
+    return Table(read_text(folder / "table.md"), [episodes.assign(**added)[list(COLUMNS)]])
 
 
 KINDS: Mapping[str, Callable[..., Table]] = {"flights": flights, "globe": globe.globe, "evaluation": evaluation}
@@ -114,7 +114,7 @@ KINDS: Mapping[str, Callable[..., Table]] = {"flights": flights, "globe": globe.
 
 def declared(file: Path = FILE) -> dict[str, dict[str, Any]]:
     """Return the kind and the options of each table in a file."""
-    return tomllib.loads(file.read_text())
+    return tomllib.loads(read_text(file))
 
 
 def make(
@@ -154,7 +154,7 @@ def make(
             print(made.text)
             continue
         check_writable(out / f"{name}.md")
-        (out / f"{name}.md").write_text(made.text.rstrip() + "\n")
+        write_text(out / f"{name}.md", made.text.rstrip() + "\n")
         track = specs[name].get("track", name)
         write_episodes(out / f"{name}.csv.gz", [episodes.assign(track=track) for episodes in made.episodes])
 

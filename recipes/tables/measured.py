@@ -17,6 +17,7 @@ from pathlib import Path
 from magrl.evaluation.tables import markdown_table
 from magrl.field import IGRF
 from magrl.field.elements import measured_elements
+from magrl.files import write_text
 from magrl.geodesy import geodesic
 from magrl.sensor_std import SensorStd
 from magrl.tracking import Belief, before, destination, known, moved, posterior, read
@@ -136,7 +137,7 @@ def make(
     if out is None:
         print(text)
         return
-    (out / "measured.md").write_text(text.rstrip() + "\n")
+    write_text(out / "measured.md", text.rstrip() + "\n")
 
 
 if __name__ == "__main__":

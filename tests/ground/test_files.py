@@ -5,7 +5,9 @@ import json
 import math
 import os
 import pickle
+import resource
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,12 +20,16 @@ from torch import nn
 
 from magrl.files import (
     DamagedFileError,
+    append,
     check_writable,
     json_ready,
     load_tensors,
+    read_table,
     save_tensors,
     write_atomically,
     write_json,
+    write_text,
+    write_with,
 )
 
 
@@ -155,6 +161,50 @@ def test_json_holds_no_infinity() -> None:
     assert json_ready({"a": [math.inf, (1.5, math.nan)], "b": "nan"}) == {"a": [None, [1.5, None]], "b": "nan"}
     with pytest.raises(TypeError, match="path must be a Path, got 'here'"):
         write_json("here", {})
+
+
+LEAST_BYTES = 2000
+LONG = "°" * LEAST_BYTES
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "bytes": lambda path: write_atomically(path, LONG.encode()),
+    "text": lambda path: write_text(path, LONG),
+    "JSON": lambda path: write_json(path, {"a": LONG}),
+    "tensors": lambda path: save_tensors(torch.ones(LEAST_BYTES), path),
+    "another library": lambda path: write_with(path, Path.write_text, LONG, encoding="utf-8"),
+    "record": lambda path: append(path, LONG.encode()),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_names_the_file_and_leaves_it_as_it_was(name: str, tmp_path: Path) -> None:
+    path, limits = tmp_path / "file.txt", resource.getrlimit(resource.RLIMIT_FSIZE)
+    path.write_text("old", encoding="utf-8")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (LEAST_BYTES // 2, limits[1]))  # the first part still has room
+    try:
+        with pytest.raises(OSError, match=f"^cannot write {path}: .*(large|space)"):
+            WRITERS[name](path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [each.read_text("utf-8") for each in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a," * 99_000 + "a\n1", "99001 columns: keep those that are needed, at most 1000"),
+        ("," * 900 + "a\n" + "1\n" * 20_000, "18020000 cells, most of them blank"),
+        ('a, b,"a"\n1,2,3', "2 columns have the name 'a': keep one of them"),
+        (f"a,{'b' * 200_000}\n1,2", "the header cannot be read"),
+    ],
+    ids=["columns", "cells", "doubled", "field"],
+)
+def test_a_table_is_refused_before_it_takes_memory(text: str, message: str) -> None:
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=message):
+        read_table(text)
+    assert tracemalloc.get_traced_memory()[1] < 20_000_000
+    tracemalloc.stop()
+    assert read_table(",a,,a.1\n1,2,3,4")["a.1"].tolist() == [4]
 
 
 def test_check_writable_makes_folders_and_keeps_files(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_rows_are_on_disk_when_written(tmp_path: Path) -> None:
     row = {"frames": 512, "return": 1.5, "eval_spl": 88.4, "return_alignment": -0.5}
     log = RunLog(tmp_path, list(row), lambda **_: CurveLog("none", None))
     log.row(row)
-    with (tmp_path / "train.csv").open() as file:
+    with (tmp_path / "train.csv").open(encoding="utf-8") as file:
         assert [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)] == [row]
     with pytest.raises(ValueError, match="unknown_column"):
         log.row({"unknown_column": 1.0})

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from magrl.field import IGRF, elements_at
+from magrl.files import append
 from magrl.geodesy import geodesic, move
 from magrl.vehicle.autopilot import Loop, Measurement, fly
 from magrl.vehicle.autopilot.__main__ import main, parser, vehicle
@@ -245,7 +246,7 @@ def full(*_: Any) -> None:
 
 def test_errors_of_the_system_do_not_end_the_steering(flown, tmp_path, caplog, monkeypatch) -> None:
     """The line fails and the disk is full now and then: the commands are the same."""
-    rng, lines, opened = random.Random(0), record(flown[2]), Path.open
+    rng, lines = random.Random(0), record(flown[2])
 
     class Broken(Played):
         def steer(self, *_: Any) -> None:
@@ -254,11 +255,8 @@ def test_errors_of_the_system_do_not_end_the_steering(flown, tmp_path, caplog, m
 
         report = steer
 
-    class Disk:
-        def __init__(self, file: Any) -> None:
-            self.write, self.close = lambda content: full() if rng.random() < 0.5 else file.write(content), file.close
-
-    monkeypatch.setattr(Path, "open", lambda *a, **k: Disk(opened(*a, **k)) if a[1:] == ("ab",) else opened(*a, **k))
+    sometimes = lambda *message: full() if rng.random() < 0.5 else append(*message)  # noqa: E731
+    monkeypatch.setattr("magrl.vehicle.autopilot.flight.append", sometimes)
     link = Broken(lines[1:])
     assert [*fly(loop(), link, tmp_path)] == flown[1]
     assert link.steered >= 2 * len(flown[1]) - 1

@@ -6,12 +6,11 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Protocol
 
 from magrl.checks import short
-from magrl.files import locked, write_atomically
+from magrl.files import append, locked, write_atomically
 from magrl.vehicle.autopilot.loop import LOG, Loop, Measurement, clock, tolerated
 from magrl.vehicle.onboard import Command
 
@@ -67,7 +66,8 @@ def fly(loop: Loop, link: Link, folder: Path | str) -> Iterator[Command]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder), closing(_Record(loop, folder)) as record:
+    with locked(folder):
+        record = _Record(loop, folder)
         if loop.command:
             yield loop.command
         if not (loop.command and loop.command.stop):
@@ -106,7 +106,6 @@ class _Record:
         if not self._path.exists():
             write_atomically(self._path, HEADER.format(north=loop.vehicle.options.north).encode())
         self._repeat()
-        self._file = self._path.open("ab", buffering=0)
 
     def _check_options(self, path: Path) -> None:
         """Write the options of a flight; raise where others are written already."""
@@ -133,12 +132,8 @@ class _Record:
         if skipped:
             LOG.warning("%d lines of %s are no messages and are skipped", skipped, self._path)
 
-    def close(self) -> None:
-        """Close the record."""
-        self._file.close()
-
     def write(self, measurement: Measurement) -> None:
         """Write a message."""
         cells = ("" if value is None else repr(float(value)) for value in measurement)
         with tolerated("a message is not recorded"):
-            self._file.write(",".join(cells).encode() + b"\n")
+            append(self._path, ",".join(cells).encode() + b"\n")

@@ -19,9 +19,9 @@ import numpy as np
 import pandas
 from pandas import DataFrame
 
-from magrl.checks import command
+from magrl.checks import command, printable
 from magrl.field.elements import NAMES
-from magrl.files import check_writable
+from magrl.files import check_writable, write_with
 from magrl.sensor_std import OUTAGE_STD
 from magrl.vehicle.logs.calibration import Calibration, calibrate
 from magrl.vehicle.logs.conventions import NORTHS
@@ -60,9 +60,9 @@ def main(args: Sequence[str] | None = None) -> None:
 def _main(options: argparse.Namespace) -> None:
     log = read_log(*options.log, sensor=options.sensor)
     notes = [*log.notes, *([] if options.calibrate else remarks(log, options))]
-    print("\n".join([*summary(log), *(f"note: {text}" for text in notes)]), flush=True)
+    print(*map(printable, (*summary(log), *(f"note: {text}" for text in notes))), sep="\n", flush=True)
     date = options.date or log.date
-    print("\n".join(swing(log, options, date) if options.calibrate else way(log, options, date)))
+    print(*map(printable, (swing if options.calibrate else way)(log, options, date)), sep="\n")
 
 
 def summary(log: Log) -> list[str]:
@@ -133,7 +133,8 @@ def _written(table: DataFrame, log: Log, options: argparse.Namespace, iron: Cali
     out = options.out or options.log[0].with_name(f"{options.log[0].stem}_readings.csv")
     check_writable(out)
     stamp = pandas.to_datetime(table["time"], unit="s", utc=True).dt.strftime("%Y-%m-%dT%H:%M:%SZ")
-    table.round(_DIGITS).assign(**({"time": stamp} if log.date else {})).to_csv(out, index=False)
+    rounded = table.round(_DIGITS).assign(**({"time": stamp} if log.date else {}))
+    write_with(out, rounded.to_csv, index=False)
     std = np.sqrt(np.square(table[list(STD_NAMES)]).mean()).replace(OUTAGE_STD, 0.0)  # of D that is not measured
     noise, bias = (" ".join(f"{value:.3g}" for value in values) for values in (std, iron.std if iron else np.zeros(3)))
     missing = "" if iron else "; no calibration: give --bias of your sensors"
