@@ -18,9 +18,11 @@ from magrl.evaluation import episode_measures, evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.tables import markdown_table
+from magrl.training import command
 from magrl.transforms.areas import NoGoAreas, distance_km, turned
 
 import torch
+import tyro
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 from tensordict import TensorDictBase
@@ -105,7 +107,8 @@ def draw_areas(axes: Axes, vehicle: int = 1) -> None:
     axes.legend(fontsize="x-small", loc="best")
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Fly all navigators and print the table."""
     rows = [
         [task, BARS[name], *(f"{value:.1f}" for value in bar(task, name).values())]
         for task in NAMED_ENVS
@@ -113,3 +116,7 @@ if __name__ == "__main__":
         for name in bars_of(task)
     ]
     print(markdown_table(["task", "navigator", "SR [%]", "SPL [%]", "steps", "return"], rows))
+
+
+if __name__ == "__main__":
+    command("bars.py", lambda: tyro.cli(main, prog="bars.py", description=__doc__))

@@ -10,13 +10,16 @@ of columns after the file, as in `<!-- table: docs/results/NAME.md | navigator |
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from magrl.evaluation.tables import markdown_table
+from magrl.files import read_text, write_text
 from magrl.training import UsageError, command
 
+import tyro
+
+Documents = tyro.conf.Positional[tuple[Path, ...]]
 BLOCK = re.compile(r"(<!-- table: ([^\s|]+)(?: \| (.*?))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -52,15 +55,15 @@ def publish(documents: Sequence[Path], root: Path = Path()) -> None:
     """
 
     def block(match: re.Match[str]) -> str:
-        return f"{match[1]}\n{selected((root / match[2]).read_text().strip(), match[3])}\n\n{match[4]}"
+        return f"{match[1]}\n{selected(read_text(root / match[2]).strip(), match[3])}\n\n{match[4]}"
 
     try:
-        texts = {document: BLOCK.sub(block, document.read_text()) for document in documents}
-    except OSError as error:
+        texts = {document: BLOCK.sub(block, read_text(document)) for document in documents}
+    except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
     for document, text in texts.items():
-        document.write_text(text)
+        write_text(document, text)
 
 
 if __name__ == "__main__":
-    command("publish.py", lambda: publish([Path(name) for name in sys.argv[1:]]))
+    command("publish.py", lambda: publish(tyro.cli(Documents, prog="publish.py", description=__doc__)))

@@ -5,19 +5,22 @@
     python recipes/tables/sweep.py --tasks box --algorithms PPO --seeds 0
     python recipes/tables/sweep.py --no-train                          # table and figure of the runs that exist
 
-A run that has ended is not repeated, so that the same command resumes a sweep. SR and SPL are of the first episode of
-200 vehicles (bars.py), without exploration. The settings of an algorithm are the same for all tasks.
+A run that has ended is not repeated, so that the same command resumes a sweep; a folder has one sweep at a time. SR and
+SPL are of the first episode of 200 vehicles (bars.py), without exploration. The settings of an algorithm are the same
+for all tasks.
 """
 
 from __future__ import annotations
 
 import csv
+import ctypes
 import hashlib
 import itertools
 import multiprocessing
 import os
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -32,6 +35,7 @@ from typing import Any, NamedTuple
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
 from magrl.evaluation.tables import markdown_table
+from magrl.files import check_writable, locked, read_text, write_text, write_with
 from magrl.training import UsageError, command
 
 import gymnasium
@@ -39,7 +43,6 @@ import numpy as np
 import torch
 import tyro
 from bars import BARS, SEED, VEHICLES, bar, bars_of, draw_areas
-from filelock import FileLock
 from matplotlib.figure import Figure
 from pandas import DataFrame, concat, read_csv
 from sb3_contrib import RecurrentPPO
@@ -156,14 +159,27 @@ def trained(task: str, name: str, seed: int) -> list[Row]:
     return curve.rows
 
 
+def die_with_parent() -> None:
+    """End this process when its parent ends, also by a kill (Linux), and quietly by Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
 def recipe(name: str, seed: int, folder: Path) -> list[Row]:
-    """Train by a recipe; return its learning curve on the validation tasks, and its score as the last point."""
+    """Train by a recipe; return its learning curve on the validation tasks, and its score as the last point.
+
+    Raises:
+        UsageError: with the last line that the recipe wrote, where it failed.
+    """
     task, script, *options = RECIPES[name]
     began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     options += ["--seed", str(seed), "--out", str(folder), "--wandb-mode", "disabled"]
-    subprocess.run([sys.executable, f"recipes/{script}", *options], check=True, capture_output=True)
-    with (folder / "train.csv").open() as file:
-        points = [row for row in csv.DictReader(file) if row["eval_spl"]]
+    command_line = [sys.executable, Path(__file__).parent.parent / script, *options]
+    done = subprocess.run(command_line, capture_output=True, preexec_fn=die_with_parent, check=False)
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        raise UsageError(f"{script} ended with status {done.returncode}: {(said or ['no message'])[-1]}")
+    points = [row for row in csv.DictReader(read_text(folder / "train.csv").splitlines()) if row["eval_spl"]]
     names = {"steps": "frames", "SR": "eval_success_rate", "SPL": "eval_spl"}
     rows = [{key: float(point[column]) for key, column in names.items()} for point in points]
     final = bar(task, str(next(folder.glob("policy.*"))))
@@ -174,16 +190,27 @@ def recipe(name: str, seed: int, folder: Path) -> list[Row]:
 def run(config: Config, task: str, name: str, seed: int) -> Path:
     """Train one run, unless its file exists; return the file."""
     path = config.out / f"{task}-{name}-seed{seed}.csv"
-    with FileLock(path.with_suffix(".lock")):  # of other sweeps in this folder
-        if not path.exists():
-            torch.set_num_threads(1)
-            shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
-            rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
-            about = {"task": task, "algorithm": name, "seed": seed}
-            unfinished = path.with_suffix(".part")
-            DataFrame([about | row for row in rows]).round(2).to_csv(unfinished, index=False)
-            unfinished.rename(path)
+    if not path.exists():
+        torch.set_num_threads(1)
+        shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
+        rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
+        about = {"task": task, "algorithm": name, "seed": seed}
+        write_with(path, DataFrame([about | row for row in rows]).round(2).to_csv, index=False)
     return path
+
+
+def train(config: Config, jobs: Sequence[tuple[str, str, int]]) -> None:
+    """Train runs in parallel; an error or Ctrl-C ends all of them."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(config.jobs, spawn, initializer=die_with_parent) as pool:
+        try:
+            for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
+                done.result()
+        except BaseException:
+            for worker in multiprocessing.active_children():
+                worker.kill()
+            raise
 
 
 def planned(config: Config) -> Iterator[tuple[str, str, int]]:
@@ -245,20 +272,19 @@ def main(args: Sequence[str] | None = None) -> None:
         if name not in (known := (*IDS, *ALGORITHMS, *RECIPES)):
             raise UsageError(f"unknown task or algorithm {name!r}: choose from {', '.join(known)}")
     config.out.mkdir(parents=True, exist_ok=True)
+    check_writable(config.results / "scores.csv")
     jobs = list(planned(config))
     if config.train:
-        os.environ["OMP_NUM_THREADS"] = "1"
-        with ProcessPoolExecutor(config.jobs, multiprocessing.get_context("spawn")) as pool:
-            for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
-                done.result()
+        with locked(config.out):
+            train(config, jobs)
     paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
     if not paths:
         raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
     curves = concat([read_csv(path) for path in paths])
-    curves.to_csv(config.results / "scores.csv", index=False)
-    (config.results / "scores.md").write_text(table(curves))
+    write_with(config.results / "scores.csv", curves.to_csv, index=False)
+    write_text(config.results / "scores.md", table(curves))
     about = {"Description": digest((config.results / "scores.csv").read_bytes())}  # a test compares them
-    figure(curves).savefig(config.results / "scores.png", dpi=130, metadata=about)
+    write_with(config.results / "scores.png", figure(curves).savefig, dpi=130, metadata=about)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
+import runpy
+import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from pandas import read_csv
 from support.recipes import RECIPES, load
 
 from magrl.envs import planet_scenario
+from magrl.files import locked
 from magrl.training import UsageError
 
 pytest.importorskip("sb3_contrib")
@@ -54,18 +57,52 @@ def test_an_interrupted_training_by_a_recipe_begins_again(tmp_path: Path, monkey
     assert read_csv(sweep.run(sweep.Config(out=tmp_path), "box", "GG-TD3", 0))["steps"].tolist() == [False]
 
 
-def test_two_sweeps_in_a_folder_train_a_run_once(tmp_path: Path, monkeypatch) -> None:
-    begun = []
+def test_a_second_sweep_in_a_folder_is_refused_at_once(tmp_path: Path) -> None:
+    with locked(tmp_path), pytest.raises(UsageError, match="another process is writing"):
+        sweep.main(["--out", str(tmp_path), "--results", str(tmp_path)])
 
-    def trained(*job: object) -> list[dict]:
-        begun.append(job)
-        time.sleep(0.3)
-        return [{"steps": 1}]
 
-    monkeypatch.setattr(sweep, "trained", trained)
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(lambda _: sweep.run(sweep.Config(out=tmp_path), "box", "PPO", 0), range(2)))
-    assert begun == [("box", "PPO", 0)]
+def test_a_results_folder_is_made_or_refused_before_anything_is_trained(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sweep, "train", lambda *_: None)
+    (tmp_path / "file").touch()
+    for results, message in (("new/folder", "none of the algorithms"), ("file/folder", "cannot write")):
+        with pytest.raises((UsageError, OSError), match=message):
+            sweep.main(["--out", str(tmp_path / "runs"), "--results", str(tmp_path / results)])
+    assert (tmp_path / "new" / "folder").is_dir()
+
+
+def test_a_recipe_that_fails_says_why_from_any_folder(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sweep.RECIPES, "GG-TD3", ("box", "tables/publish.py"))
+    with pytest.raises(UsageError, match=r"publish\.py ended with status 2: ."):
+        sweep.recipe("GG-TD3", 0, tmp_path)
+
+
+def test_no_process_is_left_after_a_kill() -> None:
+    """A worker, and the recipe that it runs, end with the parent."""
+    code = (
+        "import ctypes, signal, subprocess, sys, time\n"
+        f"{inspect.getsource(sweep.die_with_parent)}\n"
+        "child = subprocess.Popen(['sleep', '60'], preexec_fn=die_with_parent)\n"
+        "print(child.pid, flush=True)\n"
+        "time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, encoding="utf-8") as parent:
+        child = Path("/proc", parent.stdout.readline().strip())
+        assert child.exists()
+        parent.kill()
+    end = time.monotonic() + 5
+    while (state := child / "stat").exists() and state.read_text("utf-8").split()[2] != "Z" and time.monotonic() < end:
+        time.sleep(0.01)
+    assert not state.exists() or state.read_text("utf-8").split()[2] == "Z"
+
+
+@pytest.mark.parametrize("name", ["bars", "publish"])
+def test_help_is_printed(name: str, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(RECIPES / "tables" / f"{name}.py"), run_name="__main__")
+    assert "usage" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("options", [[], ["--tasks", "mars"]])
@@ -105,4 +142,4 @@ def test_the_table_has_the_middle_of_the_runs(monkeypatch) -> None:
     last = torch.tensor(chosen.groupby("seed")["SPL"].last().to_numpy()).sort().values
     (line,) = [line for line in sweep.table(chosen).splitlines() if "| PPO |" in line]
     assert f"{last[1:4].mean():.1f} (" in line
-    assert line.split(" (")[0] in (RESULTS / "scores.md").read_text()
+    assert line.split(" (")[0] in (RESULTS / "scores.md").read_text("utf-8")
