@@ -6,6 +6,7 @@ for an accelerator. :func:`check_finite` and :func:`require` do read values.
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import sys
@@ -14,8 +15,11 @@ from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from torch import Tensor
+
+LARGEST = 2.0**64
+"""Numbers of arguments and files are below: also float32 holds their squares."""
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -135,14 +139,21 @@ def check_number(
             start = "" if low == -math.inf else f" {'above' if above else 'from'} {low:g}"
             end = f" up to {high:g}" if high < math.inf else " on" if start and not above else ""
             hint = ": give its number, value.item()" if getattr(value, "shape", None) == () else ""
-            raise ValueError(f"{name} must be {kind}{start}{end}, got {value!r}{hint}")
+            raise ValueError(f"{name} must be {kind}{start}{end}, got {short(value)}{hint}")
 
 
 def _is_finite(value: object, kind: type = Real) -> bool:
-    """Return whether a value is a finite number of a kind, and not a bool."""
+    """Return whether a value is a number of a kind below :data:`LARGEST`, and not a bool."""
     if isinstance(value, bool) or not isinstance(value, kind):
         return False
-    return abs(value) < 1e308 if isinstance(value, int) else math.isfinite(value)  # type: ignore[arg-type]
+    return abs(value) < LARGEST  # type: ignore[arg-type, operator, no-any-return]
+
+
+def _too_large(value: object) -> bool:
+    """Return whether a number, or one of some numbers, is finite and not below :data:`LARGEST`."""
+    if isinstance(value, (list, tuple)):
+        return any(map(_too_large, value))
+    return isinstance(value, Real) and LARGEST <= abs(value) < math.inf  # type: ignore[operator]
 
 
 def check_numbers(count: int, low: float = -math.inf, /, **values: object) -> None:
@@ -234,6 +245,14 @@ class CheckedModel(BaseModel):
         except ValidationError as error:
             raise ValueError("; ".join(dict.fromkeys(map(self._sentence, error.errors())))) from None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _not_too_large(cls, values: Any) -> Any:
+        for name, value in values.items() if isinstance(values, dict) else ():
+            if _too_large(value):
+                raise ValueError(f"{name} must be below {LARGEST:.3g}, got {short(value)}")
+        return values
+
     def replace(self, **values: Any) -> Self:
         """Return a copy with other values, validated again; what was not given keeps its default."""
         return type(self)(**{name: getattr(self, name) for name in self.model_fields_set} | values)
@@ -288,8 +307,8 @@ class UsageError(ValueError):
 def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> None:
     """Run a program from the command line.
 
-    A :class:`UsageError` and an :class:`OSError`, such as that of a full disk, are printed in one line, with exit
-    status 2. Where the reader of the output ends first, as in ``command --help | head``, the command ends without a
+    What it prints is UTF-8 in every locale. A :class:`UsageError` and an :class:`OSError`, such as that of a full disk,
+    are printed in one line, with exit status 2; Ctrl-C ends it with status 130. Where the reader of the output ends first, as in ``command --help | head``, the command ends without a
     message, with status 141, as after ``SIGPIPE``.
 
     Args:
@@ -301,6 +320,9 @@ def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> Non
         >>> command("mine.py", lambda: None)
     """
     usage: tuple[type[Exception], ...] = (UsageError, OSError, *errors)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(encoding="utf-8")
     try:
         try:
             main()
@@ -309,6 +331,9 @@ def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> Non
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered is written at exit
         raise SystemExit(141) from None
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
     except usage as error:
         print(f"{name}: {printable(error)}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -11,9 +11,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import AfterValidator, Field
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
@@ -21,14 +22,16 @@ from torchrl.envs import Compose, EnvBase
 
 from magrl.agents.networks import Device, make_actor
 from magrl.agents.onnx_policy import OnnxNetwork, description_of, exported, with_description
-from magrl.checks import check_finite, check_type
+from magrl.checks import CheckedModel, check_finite, check_type
 from magrl.envs import GeomagneticNavEnv
+from magrl.envs.scenario import check_zeta
 from magrl.files import save_tensors, write_atomically
 from magrl.navigators import Anywhere, Navigator
 from magrl.tracking.network import FILE_FORMAT, policy_content, save_pilot
 from magrl.transforms import ObservationView, ReadingView
 
 View = ObservationView | ReadingView
+_Std = Annotated[float, Field(ge=0)]
 VIEWS: dict[str, type[View]] = {"region": ObservationView, "readings": ReadingView}
 """What policies observe, by the kind that their files name."""
 
@@ -69,6 +72,25 @@ class PolicyConfig:
                 f"num_cells must be the widths of the hidden layers with {type(self.view).__name__}, got None"
             )
         return make_actor(self.view.size, self.num_cells, layer_norm=self.layer_norm, device=device)
+
+
+class TrainingSettings(CheckedModel):
+    """Settings of a training that an evaluation shares, as the file of its policy holds them; see ``RunConfig``.
+
+    Raises:
+        ValueError: naming each setting that is wrong.
+
+    Example:
+        >>> TrainingSettings(noise=(-1.0, 0.0, 0.0))
+        Traceback (most recent call last):
+        ValueError: noise.0 must be greater than or equal to 0, got -1.0
+    """
+
+    guided: bool | None = None
+    scenario: str | None = None
+    zeta: Annotated[float, AfterValidator(check_zeta)] = 0.01
+    start_heading: Literal["north", "random"] = "north"
+    noise: Annotated[tuple[_Std, _Std, _Std], Field(strict=False)] = (0.0, 0.0, 0.0)
 
 
 class FieldPolicy(Navigator):
@@ -285,5 +307,5 @@ def _rebuild(config: Any, weights: Any, training: Any = None) -> FieldPolicy:
     check_finite(weights.items(), "weights")
     policy = FieldPolicy(rebuilt)
     policy.actor.load_state_dict(weights)
-    policy.training = dict(training or {})
+    policy.training = TrainingSettings(**training or {}).model_dump(exclude_unset=True)
     return policy

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from tensordict.nn import TensorDictModuleBase
 
 from magrl.agents import load_policy
-from magrl.checks import check_type
+from magrl.agents.policy import TrainingSettings
+from magrl.checks import check_type, printable
 from magrl.envs import GeomagneticNavEnv
 from magrl.navigators import NAVIGATORS, Anywhere, Declaring, Navigator
 from magrl.sensor_std import PERFECT, SensorStd
@@ -157,7 +158,9 @@ def training_settings(texts: Sequence[str], **chosen: Any) -> tuple[dict[str, An
                 values = f"{settings[name]} and {value} ({text})"
                 raise ValueError(f"trained with different {name}, {values}: choose with --{name.replace('_', '-')}")
             others.setdefault(name, []).append(f"{value} ({text})")
-    return settings, [f"{name} is {settings[name]}, in training {', '.join(other)}" for name, other in others.items()]
+    return settings, [
+        printable(f"{name} is {settings[name]}, in training {', '.join(other)}") for name, other in others.items()
+    ]
 
 
 def _trained_with(text: str) -> dict[str, Any]:
@@ -167,7 +170,7 @@ def _trained_with(text: str) -> dict[str, Any]:
     if name not in WITH_RUN or not source or path.suffix == ".onnx":
         return {}
     content = policy_content(path)
-    found = {"zeta": content["rules"]["zeta"]} if "rules" in content else dict(content.get("training", {}))
+    found = {"zeta": content["rules"]["zeta"]} if "rules" in content else _training(path, content)
     kinds = {True: "gg_td3", False: "td3"}
     kind = Anywhere.name if "rules" in content else kinds.get(found.pop("guided", None), OWN)
     if OWN not in (name, kind) and name.removesuffix("_noise") != kind:
@@ -179,9 +182,17 @@ def _trained_with(text: str) -> dict[str, Any]:
     return found
 
 
+def _training(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a training in the file of its policy, checked."""
+    try:
+        return TrainingSettings(**content.get("training") or {}).model_dump(exclude_unset=True)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} does not hold a valid policy: {error}") from error
+
+
 def _content(value: Any) -> Any:
     """Return a value for comparisons: of a scenario file, its text."""
-    return value.read_text() if isinstance(value, Path) and value.is_file() else value
+    return value.read_bytes() if isinstance(value, Path) and value.is_file() else value
 
 
 def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> TensorDictModuleBase:

@@ -86,7 +86,7 @@ class WeatherRecord:
         missing = torch.cat((torch.zeros(1, dtype=torch.int64), (~valid).long().cumsum(0)))  # before each minute
         end = torch.searchsorted(missing, missing[start], right=True) - 2  # the last minute before the next gap
         minutes = end - start
-        starts = start[minutes >= math.ceil(60 * span_h)]
+        starts = start[minutes >= math.ceil(min(60 * span_h, len(valid)))]
         if not len(starts):
             longest_h = math.floor(max(0, int(minutes.max())) / 6) / 10
             raise ValueError(
@@ -110,7 +110,7 @@ class WeatherRecord:
             (1.0, 5.0)
         """
         check_number(0, span_h=span_h)
-        last = None if self.last is None else self.last + 1 + math.ceil(60 * span_h)
+        last = None if self.last is None else self.last + 1 + math.ceil(min(60 * span_h, len(self.variation)))
         variation = self.variation[self.first : last].double()
         return (variation.unsqueeze(-1) * variation.unsqueeze(-2)).nanmean(0)
 

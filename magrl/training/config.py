@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from torchrl.envs import Transform
 
 from magrl import paper
-from magrl.checks import CheckedModel, UsageError, check_type
+from magrl.checks import CheckedModel, UsageError, printable, short
 from magrl.envs import Scenario, load_scenario
 from magrl.envs.scenario import check_zeta
 from magrl.files import read_document
@@ -319,7 +319,8 @@ def resumed_config(folder: Path, kind: type[Config], recipe: str) -> Config:
             raise ValueError("it is not of this version of magrl: start the training again in a new folder")
         if (begun := settings.pop("recipe")) != recipe:
             raise ValueError(f"the run was started by {begun}: resume it with that recipe")
-        check_type(str, name=settings.pop("name", ""))
+        if (name := settings.pop("name", "")) != printable(name):
+            raise ValueError(f"name must be a text of printable characters, got {short(name)}")
         if settings.get("scenario"):
             settings["scenario"] = folder / Path(settings["scenario"]).name
         settings = {key: tuple(x) if isinstance(x, list) else x for key, x in settings.items()}

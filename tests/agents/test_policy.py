@@ -10,6 +10,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from magrl.agents import FieldPolicy, PolicyConfig, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv, Scenario
+from magrl.evaluation.navigators import training_settings
 from magrl.files import load_tensors, save_tensors
 from magrl.transforms import ObservationView
 
@@ -83,6 +84,25 @@ def test_damaged_policy_is_refused(policy, tmp_path: Path, change, message: str)
     save_tensors(change(load_tensors(path)), path)
     with pytest.raises(ValueError, match=message) as error:
         load_policy(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("read", [load_policy, lambda path: training_settings([f"td3={path}"])], ids=["policy", "run"])
+@pytest.mark.parametrize(
+    ("training", "message"),
+    [
+        ({"noise": [0.0, -1.0, 0.0]}, "noise.1 must be greater than or equal to 0, got -1"),
+        ({"noise": [0.0, 1e308, 0.0]}, "noise must be below"),
+        ({"zeta": math.nan}, "zeta must be a finite number, got nan"),
+        ({"start_heading": "\x1b[2J"}, r"start_heading must be .*, got '\\x1b\[2J'"),
+    ],
+)
+def test_settings_of_a_training_are_checked(policy, tmp_path: Path, read: Callable, training, message: str) -> None:
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, policy)
+    save_tensors(load_tensors(path) | {"training": training}, path)
+    with pytest.raises(ValueError, match=message) as error:
+        read(path)
     assert str(path) in str(error.value)
 
 

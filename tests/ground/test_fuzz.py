@@ -16,10 +16,12 @@ from magrl.envs import GeomagneticNavEnv, Scenario, load_scenario
 from magrl.files import load_tensors, save_tensors
 from magrl.training.checkpoints import Checkpoints, read_checkpoint
 from magrl.training.config import resumed_config
-from magrl.transforms import ReadingView
-from magrl.vehicle.logs import read_log
+from magrl.transforms import ReadingView, load_conditions
+from magrl.vehicle.logs import Calibration, read_log
 
 MUTANTS = 200
+CALIBRATION = '{{"matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "offset_nt": [0, 0, {}], "method": "vector", '
+CALIBRATION += '"std": [0, 0, 0], "noise_nt": 1, "samples": 9, "outliers": 0, "here": [1, 2]}}'
 
 
 def mutant(whole: bytes, dice: random.Random) -> bytes:
@@ -108,6 +110,42 @@ def test_scenarios(tmp_path: Path, suffix: str) -> None:
     lines = ["\n".join(f"{key} = {json.dumps(value)}" for key, value in table.items()) for table in (content, region)]
     path.write_text("\n[region]\n".join(lines) if suffix == ".toml" else json.dumps(content | {"region": region}))
     fuzz(path, lambda: load_scenario(path), lambda found: isinstance(found, Scenario), 3)
+
+
+HUGE, LARGE = f"1{'0' * 400}", "1e308"
+NUMBERS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "conditions.toml": (load_conditions, "speed_km_h = {}"),
+    "conditions.json": (load_conditions, '{{"sensors": {{"noise": [0, 0, {}]}}}}'),
+    "bias.toml": (load_conditions, "sensors.bias = [{}, 0, 0]"),
+    "weather.toml": (load_conditions, "weather.span_h = {}"),
+    "vector.toml": (load_conditions, "sensors.vector.hard_iron_nt = [0, 0, {}]"),
+    "scenario.toml": (
+        load_scenario,
+        "date = 2026-07-01\nzeta = {}\nregion = {{latitude = [1, 2], longitude = [1, 2]}}",
+    ),
+    "region.toml": (load_scenario, "date = 2026-07-01\nregion = {{latitude = [1, 2], longitude = [1, {}]}}"),
+    "quay.json": (Calibration.load, CALIBRATION),
+    "log.csv": (read_log, "time,x,y,z\n0,0,0,{}"),
+}
+"""Readers of numbers, and a file of each with one number left open."""
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("number", [HUGE, LARGE, f"-{HUGE}"])
+def test_numbers_whose_squares_are_infinite_are_refused(name: str, number: str, tmp_path: Path) -> None:
+    """An infinite bias would mean a compass."""
+    (read, text), path = NUMBERS[name], tmp_path / name
+    path.write_text(text.format(number), encoding="utf-8")
+    with pytest.raises(ValueError, match=f"^(cannot read )?{path}"):
+        read(path)
+
+
+@pytest.mark.parametrize("key", ["in_keys", "out_keys", "seed"])
+def test_conditions_of_a_file_have_no_keys(key: str, tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(f'sensors.{key} = ["field"]', encoding="utf-8")
+    with pytest.raises(ValueError, match=f"^{path}: unknown key '{key}'"):
+        load_conditions(path)
 
 
 CSV = b"time,mag_x_uT,mag_y_uT,mag_z_uT,roll,heading_true_rad,speed_kn,lat,lon,alt_m\n"

@@ -1,6 +1,7 @@
 """Settings of runs, the command line, the settings of a run that is resumed, and how a command ends."""
 
 import importlib
+import io
 import json
 import sys
 from pathlib import Path
@@ -11,6 +12,8 @@ import td3_gradient_guided as recipe
 
 from magrl import paper
 from magrl.training import RunConfig, UsageError, command, parse_config
+from magrl.vehicle.autopilot.__main__ import main as autopilot
+from magrl.vehicle.logs.__main__ import main as logs
 
 ROOT = Path(__file__).parent.parent.parent
 OWN = "date = 2026-07-01\nregion = {latitude = [40, 50], longitude = [-30, -20]}\n"
@@ -83,7 +86,11 @@ MINE = '"recipe": "td3_gradient_guided.py"'
     [
         (None, "holds no config.json"),
         ("", "cannot resume"),
-        (f'{{{MINE}, "name": 5}}', "name must be a str, got 5"),
+        (f'{{{MINE}, "name": 5}}', "name must be a text of printable characters, got 5"),
+        (f'{{{MINE}, "name": "a\\u001b[2J"}}', r"name must be a text of printable characters, got 'a\\x1b"),
+        (f'{{{MINE}, "zeta": NaN}}', "zeta must be a finite number, got nan"),
+        (f'{{{MINE}, "noise": [0, 0, 1{"0" * 400}]}}', r"noise must be below 1\.84e\+19, got \(0, 0, 1000"),
+        (f'{{{MINE}, "noise": [0, 0, 1e308]}}', r"noise must be below 1\.84e\+19, got \(0, 0, 1e\+308"),
         ("[]", "not of this version of magrl: start the training again in a new folder"),
         ('{"recipe": "ppo.py"}', r"the run was started by ppo\.py: resume it with that recipe"),
         (f'{{{MINE}, "wings": 2}}', "unknown key 'wings'"),
@@ -146,5 +153,28 @@ def test_reader_that_ends_first_leaves_no_traceback(tmp_path: Path, monkeypatch,
         with pytest.raises(SystemExit) as stop:
             command("mine.py", lambda: print("help"))
     assert (stop.value.code, capsys.readouterr().err) == (141, "")
-    for script in [*ROOT.glob("recipes/*.py"), *(ROOT / f"recipes/tables/{name}.py" for name in ("grid", "figures"))]:
-        assert "    command(RECIPE, " in script.read_text(), script.name
+    for script in ROOT.glob("recipes/**/[!_]*.py"):
+        end = script.read_text("utf-8").partition('if __name__ == "__main__":\n')[2]
+        assert not end or end.startswith("    command("), script.name
+
+
+def test_ctrl_c_ends_every_command_without_a_traceback(capsys, monkeypatch, tmp_path: Path) -> None:
+    """Those of the library, and of recipes by the same function; what they print is UTF-8 in every locale."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    screen = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setattr("magrl.vehicle.logs.__main__.read_log", interrupted)
+    monkeypatch.setattr("magrl.vehicle.autopilot.__main__.fly", interrupted)
+    monkeypatch.setattr("magrl.vehicle.autopilot.__main__.link", lambda _: [])
+    monkeypatch.chdir(tmp_path)
+    steer = ["udp:0", "--nmea", "--target", "-11.6", "75.4", "13240", "--navigator", "secant", "--noise", "0", "0", "0"]
+    mains = lambda: logs(["log.csv"]), lambda: autopilot(steer), lambda: command("mine.py", interrupted)
+    for main in mains:
+        with pytest.raises(SystemExit, match="130"):
+            main()
+        assert capsys.readouterr().err.endswith(": interrupted\n")
+    command("mine.py", lambda: print("°"))
+    assert screen.buffer.getvalue().endswith("°\n".encode())

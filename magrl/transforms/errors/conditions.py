@@ -177,13 +177,16 @@ def load_conditions(path: Path | str) -> Conditions:
     path = Path(path)
     try:
         return _conditions(path.stem, read_document(path))
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, OverflowError) as error:
         raise ValueError(f"{path}: {error}") from error
 
 
 def _conditions(name: str, content: Mapping[str, Any]) -> Conditions:
     """Return the conditions that a table of a file holds."""
     content = {"name": name, **content}
+    for part in filter(lambda value: isinstance(value, dict), content.values()):
+        if keys := [key for key in ("in_keys", "out_keys", "seed") if key in part]:
+            raise ValueError(f"unknown key {keys[0]!r}: a program gives keys and seeds, not a file of conditions")
     sensors = dict(content.get("sensors", {}))
     if "vector" in sensors:
         sensors["vector"] = VectorErrors(**sensors["vector"])

@@ -81,6 +81,7 @@ def _main(options: argparse.Namespace) -> None:
             say(line(number, order, loop.note))
     except KeyboardInterrupt:
         say(f"interrupted; the same command continues the flight in {options.out}")
+        raise
 
 
 def vehicle(options: argparse.Namespace) -> Onboard:

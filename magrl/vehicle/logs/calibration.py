@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 from magrl.checks import CheckedModel, check_number, check_numbers, check_tensor
 from magrl.field import IGRF, elements_at
 from magrl.field.elements import elements_jacobian, field_vector
-from magrl.files import DamagedFileError, write_json
+from magrl.files import DamagedFileError, read_text, write_json
 from magrl.vehicle.logs.conventions import check_intensity, rotation
 from magrl.vehicle.onboard.known import known_elements
 
@@ -98,8 +98,8 @@ class Calibration(CheckedModel):
             DamagedFileError: naming the file and what is wrong with it.
         """
         try:
-            return cls(**json.loads(Path(path).read_text()))
-        except (ValueError, TypeError, OSError, RecursionError) as error:
+            return cls(**json.loads(read_text(Path(path))))
+        except (ValueError, TypeError, OSError, RecursionError, OverflowError) as error:
             raise DamagedFileError(f"{path} is not a calibration: {error}") from error
 
 
