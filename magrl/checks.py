@@ -146,7 +146,7 @@ def _is_finite(value: object, kind: type = Real) -> bool:
     """Return whether a value is a number of a kind below :data:`LARGEST`, and not a bool."""
     if isinstance(value, bool) or not isinstance(value, kind):
         return False
-    return abs(value) < LARGEST  # type: ignore[arg-type, operator, no-any-return]
+    return abs(value) < LARGEST  # type: ignore[arg-type]
 
 
 def _too_large(value: object) -> bool:
@@ -308,8 +308,8 @@ def command(name: str, main: Callable[[], Any], *errors: type[Exception]) -> Non
     """Run a program from the command line.
 
     What it prints is UTF-8 in every locale. A :class:`UsageError` and an :class:`OSError`, such as that of a full disk,
-    are printed in one line, with exit status 2; Ctrl-C ends it with status 130. Where the reader of the output ends first, as in ``command --help | head``, the command ends without a
-    message, with status 141, as after ``SIGPIPE``.
+    are printed in one line, with exit status 2; Ctrl-C ends it with status 130. Where the reader of the output ends
+    first, as in ``command --help | head``, the command ends without a message, with status 141, as after ``SIGPIPE``.
 
     Args:
         name: name of the program in the message.

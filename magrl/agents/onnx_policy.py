@@ -76,12 +76,24 @@ class OnnxNetwork(nn.Module):
 
 
 def with_description(content: bytes, description: Mapping[str, Any]) -> bytes:
-    """Return an ONNX file whose metadata describe its policy."""
+    """Return an ONNX file whose metadata describe its policy, without those of PyTorch on where it was exported."""
     onnx = _library("onnx")
     model = onnx.load_model_from_string(content)
+    for part in (model.graph, *model.functions):
+        _strip(part)
     entries = {entry.key: entry.value for entry in model.metadata_props}
     onnx.helper.set_model_props(model, entries | {DESCRIPTION: json.dumps({"format": FORMAT, **description})})
     return model.SerializeToString()
+
+
+def _strip(part: Any) -> None:
+    """Remove metadata and comments from a part of a model and all parts in it: they hold paths of a machine."""
+    for field, value in part.ListFields():
+        if field.name in ("metadata_props", "doc_string"):
+            part.ClearField(field.name)
+        elif field.message_type:
+            for each in [value] if hasattr(value, "ListFields") else value:
+                _strip(each)
 
 
 def description_of(content: bytes) -> dict[str, Any]:

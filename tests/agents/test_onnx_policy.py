@@ -7,6 +7,7 @@ import json
 import math
 import re
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 import torch
 from onnx import ModelProto, TensorProto
 from support.networks import network_file
+from support.paths import ROOT, with_paths
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
@@ -21,7 +23,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 
-from magrl.agents import FieldPolicy, export_policy, load_policy, save_policy
+from magrl.agents import FieldPolicy, PolicyConfig, export_policy, load_policy, save_policy
 from magrl.envs import GeomagneticNavEnv
 from magrl.evaluation import evaluate
 from magrl.evaluation.episodes import evaluation_rollout
@@ -64,6 +66,21 @@ def test_a_stochastic_actor_of_torchrl_flies_alike_after_saving(tmp_path: Path) 
     found = evaluation_rollout(plain_env(), policy)
     assert wanted["action"].std(0).min() > 1e-3
     torch.testing.assert_close(found["next", "position"], wanted["next", "position"], rtol=1e-5, atol=1e-4)
+
+
+def test_no_file_holds_a_path_of_a_machine(tmp_path: Path) -> None:
+    """Written: exports by this library and by PyTorch alone. Shipped: weights, records, results."""
+    network = nn.Sequential(nn.Linear(READINGS.size, 2), nn.Tanh()).eval()
+    save_policy(tmp_path / "own.onnx", network, READINGS)
+    names = {"input_names": ["observation"], "output_names": ["action"], "verbose": False}
+    sizes = {"dynamic_shapes": ({0: torch.export.Dim("N")},), "dynamo": True, **names}
+    with warnings.catch_warnings(action="ignore"):
+        program = torch.onnx.export(network, (torch.zeros(3, READINGS.size),), **sizes)
+    program.save(tmp_path / "raw.onnx")
+    assert with_paths(tmp_path) == [tmp_path / "raw.onnx"]
+    save_policy(tmp_path / "raw.onnx", tmp_path / "raw.onnx", READINGS)
+    save_policy(tmp_path / "policy.safetensors", FieldPolicy(PolicyConfig(READINGS, (8,))))
+    assert with_paths(tmp_path, ROOT / "magrl", ROOT / "docs" / "results", ROOT / "docs" / "figures") == []
 
 
 class Recurrent(nn.Module):
