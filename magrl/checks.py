@@ -149,13 +149,6 @@ def _is_finite(value: object, kind: type = Real) -> bool:
     return abs(value) < LARGEST  # type: ignore[arg-type]
 
 
-def _too_large(value: object) -> bool:
-    """Return whether a number, or one of some numbers, is finite and not below :data:`LARGEST`."""
-    if isinstance(value, (list, tuple)):
-        return any(map(_too_large, value))
-    return isinstance(value, Real) and LARGEST <= abs(value) < math.inf  # type: ignore[operator]
-
-
 def check_numbers(count: int, low: float = -math.inf, /, **values: object) -> None:
     """Raise unless each value consists of ``count`` finite numbers, each from ``low`` on.
 
@@ -248,8 +241,12 @@ class CheckedModel(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _not_too_large(cls, values: Any) -> Any:
-        for name, value in values.items() if isinstance(values, dict) else ():
-            if _too_large(value):
+        numbers = list(values.items()) if isinstance(values, dict) else []
+        while numbers:
+            name, value = numbers.pop()
+            if isinstance(value, (list, tuple)):
+                numbers += [(name, each) for each in value]
+            elif isinstance(value, Real) and LARGEST <= abs(value) < math.inf:  # type: ignore[operator]
                 raise ValueError(f"{name} must be below {LARGEST:.3g}, got {short(value)}")
         return values
 

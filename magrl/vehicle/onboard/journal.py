@@ -42,7 +42,9 @@ class Inputs(CheckedModel):
     @model_validator(mode="before")
     @classmethod
     def _plain_values(cls, values: Any) -> Any:
-        return {name: _plain(value) for name, value in values.items()} if isinstance(values, dict) else values
+        if not isinstance(values, dict):
+            return values
+        return {name: value.tolist() if hasattr(value, "tolist") else value for name, value in values.items()}
 
 
 def _accuracy(value: Any) -> SensorStd:
