@@ -81,13 +81,14 @@ def ulog(
     return b"".join(parts)
 
 
-def dataflash(use: tuple[float, float] = (1.0, 1.0), health: tuple[int, int] = (1, 1)) -> bytes:
+def dataflash(use: tuple[float, float] = (1.0, 1.0), health: tuple[int, int] = (1, 1), *, older: bool = False) -> bytes:
     """A DataFlash file: messages that describe the formats, and messages of these.
 
-    The second magnetometer has half of the field.
+    The second magnetometer has half of the field; in an older file, its messages have another name.
     """
     kinds = {"MAG": ("QBfffB", "TimeUS,I,MagX,MagY,MagZ,Health"), "ATT": ("QccC", "TimeUS,Roll,Pitch,Yaw")}
     kinds |= {"GPS": ("QBIHLL", "TimeUS,Status,GMS,GWk,Lat,Lng"), "PARM": ("QNf", "TimeUS,Name,Value")}
+    kinds |= {"MAG2": kinds["MAG"]}
     sizes = {"Q": 8, "f": 4, "c": 2, "C": 2, "B": 1, "I": 4, "H": 2, "L": 4, "N": 16}
     parts = [struct.pack("<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")]
     for number, (name, (form, columns)) in enumerate(kinds.items(), 1):
@@ -103,7 +104,9 @@ def dataflash(use: tuple[float, float] = (1.0, 1.0), health: tuple[int, int] = (
         parts.append(b"\xa3\x95\x03" + struct.pack("<QBIHii", time, *fix))
         for number, factor in enumerate((1.0, 0.5)):
             axes = (factor * axis for axis in field)
-            parts.append(b"\xa3\x95\x01" + struct.pack("<QBfffB", time, number, *axes, health[number]))
+            kind, number_here = (b"\x05", 0) if older and number else (b"\x01", number)
+            values = (time, number_here, *axes, health[number])
+            parts.append(b"\xa3\x95" + kind + struct.pack("<QBfffB", *values))
         roll, pitch, yaw = (round(100 * angle) for angle in angles)
         parts.append(b"\xa3\x95\x02" + struct.pack("<QhhH", time, roll, pitch, yaw % 36000))
     return b"".join(parts)

@@ -18,6 +18,7 @@ from magrl.sensor_std import SensorStd
 from magrl.vehicle.autopilot.__main__ import main as autopilot
 from magrl.vehicle.logs import axes_of_elements, calibrate, read_log, read_readings
 from magrl.vehicle.logs.__main__ import main as logs
+from magrl.vehicle.logs.conventions import check_intensity
 from magrl.vehicle.onboard import Onboard
 
 TARGET, HERE, NOISE = (-11.6, 75.4, 13240.0), (3.5, 73.0, 15000.0), (0.02, 0.02, 2.0)
@@ -50,7 +51,7 @@ def swing(change: Callable[[Any], Any] = lambda axes: axes, here: Any = HERE, **
 
 
 def written(*lines: str) -> Path:
-    Path("log.csv").write_text("\n".join(lines))
+    Path("log.csv").write_text("\n".join(lines), encoding="utf-8")
     return Path("log.csv")
 
 
@@ -119,6 +120,17 @@ MISTAKES: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] 
     (log, (CSV, f"1782813600000{ROW[1:]}"), {}, r"time 1\.78.* is not from .* s: check it and its unit, as in time_ms"),
     (log, (CSV, "0,0.15,0,0.48,0"), {}, r"intensity is 0\.50.*, which looks like gauss: name the columns mag_x_gauss"),
     (log, (CSV, "0,90,0,-4095,0"), {}, "is 4095.*, where about 48000 nT are expected: scale raw counts"),
+    (check_intensity, (48e9,), {}, "the topic of the field is in microtesla, where ROS states tesla: convert it"),
+    (
+        log,
+        (" Format                 IAGA-2002", " DATE"),
+        {},
+        "log.csv is a file of IAGA-2002, .*: write a CSV file with",
+    ),
+    (log, ("dbd_label:    DBD", "x"), {}, "log.csv is a log of a Slocum glider, which is not read: write a CSV file"),
+    (log, ("H Product:Blackbox flight data recorder", "x"), {}, "is a blackbox of INAV or .*: write a CSV file"),
+    (log, ("time,x,y,z,x", "0,1,1,1,1"), {}, "2 columns have the name 'x': keep one of them"),
+    (readings, (f"{READINGS},D", *["1,70,15000,0,0,1"] * 2), {}, "2 columns have the name 'D': keep one of them"),
     (log, (CSV, "noon,0,0,5e4,0"), {}, "row 1, time_s: 'noon' is no time such as"),
     (log, (CSV, "0,x,0,5e4,0"), {}, "row 1, mag_x_nT: 'x' is not a number"),
     (log, ("time,x,bx,y", "0,1,1,1"), {}, "'x' and 'bx' are both the x: keep one of them"),

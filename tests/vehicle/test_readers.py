@@ -21,6 +21,7 @@ from pymavlink.dialects.v20.ardupilotmega import (
     MAVLink_raw_imu_message,
     MAVLink_vfr_hud_message,
 )
+from pynmeagps import NMEAReader, calc_checksum
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -28,6 +29,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.logs import ATTITUDE, AXES, ELEMENTS, PLACE, UTC, dataflash, nmea, quaternions, ulog
 
 from magrl.vehicle.logs import Log, elements_of_axes, from_enu, read_log
+from magrl.vehicle.logs.autopilots import nmea_values
 
 
 def check(log: Log, *, date: str | None = "2026-06-30") -> None:
@@ -76,8 +78,9 @@ def test_px4_has_the_selected_healthy_magnetometer(tmp_path: Path, second: float
 
 def test_px4_truncated_and_no_log(tmp_path: Path) -> None:
     path = tmp_path / "log.ulg"
-    cut = read_log(written(path, ulog()[:-290]))
+    cut = read_log(written(path, ulog()[: len(ulog()) * 6 // 10]))
     assert len(cut.samples) < 12
+    assert "the file is damaged or truncated" in cut.notes
     with pytest.raises(ValueError, match=r"cannot read .*log.ulg"):
         read_log(written(path, b"ULog" * 9))
 
@@ -91,9 +94,11 @@ def test_ardupilot(tmp_path: Path) -> None:
     assert len(read_log(written(path, dataflash()[:-400])).samples) < 12
 
 
-@pytest.mark.parametrize("options", [{"use": (0.0, 1.0)}, {"health": (0, 1)}, {"sensor": "MAG:1"}])
-def test_ardupilot_has_the_magnetometer_that_is_used_and_healthy(tmp_path: Path, options) -> None:
-    sensor = options.pop("sensor", None)
+@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("options", [{"use": (0.0, 1.0)}, {"health": (0, 1)}, {"sensor": ("MAG:1", "MAG2")}])
+def test_ardupilot_has_the_magnetometer_that_is_used_and_healthy(tmp_path: Path, options, older: bool) -> None:
+    options = {"older": older, **options}
+    sensor = options.pop("sensor", (None, None))[older]
     log = read_log(written(tmp_path / "log.bin", dataflash(**options)), sensor=sensor)
     assert torch.allclose(log.tensor("x", "y", "z"), 0.5 * AXES, atol=1)
 
@@ -217,6 +222,21 @@ def test_nmea(tmp_path: Path) -> None:
     tagged = read_log(written(path, nmea(tag=True)))
     check(tagged)
     assert tagged.samples["time"].tolist() == pytest.approx(UTC + np.arange(12))
+
+
+@pytest.mark.parametrize(
+    ("body", "values"),
+    [
+        ("IIVBW,3.6,-0.4,A,-1.8,0.2,A", {"speed_water": 1.852, "speed_ground": -0.926}),
+        ("IIVBW,3.6,-0.4,V,-1.8,0.2,A,,V,,V", {"speed_ground": -0.926}),
+        ("IIXDR,A,2.5,D,PTCH-BOX,A,-1.0,D,Roll#2,A,9.0,D,ROLLER", {"pitch": 2.5, "roll": -1.0}),
+        ("IIXDR,A,2.5,D,PITCH_1,C,9.0,C,ROLL,A,3.0,D,RUDDER", {"pitch": 2.5}),
+    ],
+)
+def test_values_of_a_sentence(body: str, values: dict[str, float]) -> None:
+    """Transducers may have the name of a device after their own."""
+    message = NMEAReader.parse(f"${body}*{calc_checksum(body)}\r\n")
+    assert nmea_values(message) == pytest.approx(values)
 
 
 @pytest.mark.parametrize(

@@ -187,6 +187,14 @@ RADIANS = np.pi / 180
         (lambda t: t.assign(heading=t["heading"] - t["D"]), ["as D is -16 deg: the heading is from magnetic north"]),
         (lambda t: t.assign(heading=t["heading"] + 180), ["the heading is reciprocal, or the vehicle goes astern"]),
         (lambda t: t.assign(heading=t["heading"] + 70), ["the course .* is -70 deg to the right.*check the compass"]),
+        (
+            lambda t: t.assign(D=t["D"] - 30, heading=t["heading"] - 30, D_std=OUTAGE_STD),
+            ["D is -45 deg from the heading, that of IGRF -16: the compass is about -30 deg off; check its axes"],
+        ),
+        (
+            lambda t: t.assign(D=25.0, heading=t["heading"] - t["D"] + 25, D_std=OUTAGE_STD),
+            ["the compass is about 25 deg off; check its axes"],
+        ),
         (lambda t: t.assign(distance=t["distance"] * 3), ["0.333 times as far apart .*check the log and its unit"]),
         (
             lambda t: t.assign(D=t["D"].where(t.index != 3, 40.0)),

@@ -110,8 +110,8 @@ _TOPICS: Sequence[tuple[str, tuple[tuple[str, ...], Sequence[str], float]]] = (
 
 def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     """Read a log of PX4 (ULog) with pyulog. Times are UTC where GNSS gives it."""
-    with path.open("rb") as file:
-        log = package("pyulog", "pyulog").ULog(file)
+    content = path.read_bytes()
+    log = package("pyulog", "pyulog").ULog(io.BytesIO(content))
     instances = sorted(log.data_list, key=lambda item: item.multi_id)
     topics = {item.name: item.data for item in reversed(instances)}  # the first instance of each
     selected = topics.get("sensor_selection", {}).get("mag_device_id", [None])[-1]
@@ -131,9 +131,17 @@ def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     flags = topics.get("estimator_status_flags", {})
     gnss = np.mean(flags.get("cs_gnss_yaw", flags.get("cs_gps_yaw", 0))) > 0.5  # the heading of two antennas is used
     notes = [] if gnss else [MODEL_NORTH]
-    notes += ["the file is damaged or truncated"] if log.file_corruption else []
+    notes += ["the file is damaged or truncated"] if log.file_corruption or _is_cut(content) else []
     streams = {column: (time + offset / 1e6, values) for column, (time, values) in recording.streams.items()}
     return Recording(streams, recording.source, "true" if gnss else "model", [*notes, *recording.notes])
+
+
+def _is_cut(content: bytes) -> bool:
+    """Return whether the last message of a ULog file ends beyond the file: each follows a header with its size."""
+    place = 16
+    while place + 3 <= len(content):
+        place += 3 + int.from_bytes(content[place : place + 2], "little")
+    return place != len(content)
 
 
 # ArduPilot and MAVLink
@@ -149,9 +157,10 @@ _MESSAGES: dict[str, tuple[tuple[str, ...], Sequence[str], float]] = {
 }
 """Messages of DataFlash and of telemetry: columns, their fields, and their unit."""
 _RAW = dict.fromkeys(("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3"), ("xmag", "ymag", "zmag"))
-_MAGS = {"MAG": ("MagX", "MagY", "MagZ")} | _RAW
+_MAGS = dict.fromkeys(("MAG", "MAG2", "MAG3"), ("MagX", "MagY", "MagZ")) | _RAW  # with numbers before version 4.1
 _MESSAGES |= {name: (AXES, fields, FIELD_NT["milligauss"]) for name, fields in _MAGS.items()}
 _USE = {"MAG": "COMPASS_USE", "MAG:1": "COMPASS_USE2", "MAG:2": "COMPASS_USE3"}
+_USE |= {"MAG2": "COMPASS_USE2", "MAG3": "COMPASS_USE3"}
 """Magnetometers, and the parameter by which the vehicle uses them."""
 _KINDS = {
     b"\xa3": ("ArduPilot DataFlash", "DFReader", "DFReader_binary"),
@@ -263,8 +272,8 @@ _SENTENCES: Mapping[str, Sequence[tuple[str, str, float]]] = {
 }
 """Columns of each sentence: names, their fields, and units, of which the last one goes first."""
 _TRANSDUCER = ("tdrtype", "dataunit", "tdrid", "data")
-_TILT = {("A", "D", "ROLL"): ("roll", 1.0)} | dict.fromkeys([("A", "D", "PTCH"), ("A", "D", "PITCH")], ("pitch", 1.0))
-"""Columns and units of transducers that are angles in degrees, by kind, unit and name."""
+_TILT = re.compile(r"(?i)(ROLL)(?![a-z])|PI?TCH(?![a-z])")
+"""Names of transducers that are roll, or else pitch, also with that of a device: ``PTCH-BOX``."""
 _CHOICES = {"heading": ("heading_true", "heading_magnetic"), "speed": ("speed_water", "speed_ground")}
 INVALID = {"status": ("V",), "mi": ("V", "S", "M"), "posMode": ("N", "S", "M"), "quality": (0, 7, 8)}
 """Fields of a sentence whose values are not valid, or simulated, or entered by hand."""
@@ -327,7 +336,9 @@ def nmea_values(message: Any) -> dict[str, float]:
             values[name] = factor * value + _deviation(message)
     for number in range(1, 100 if message.msgID == "XDR" else 1):
         kind, unit, title, value = (getattr(message, f"{field}_{number:02}", "") for field in _TRANSDUCER)
-        column = _TILT.get((kind, unit, title)) or (column_of(title) if re.match("(?i)MAG_?[XYZ]", title) else None)
+        tilt = _TILT.match(title) if (kind, unit) == ("A", "D") else None
+        column = ("roll" if tilt[1] else "pitch", 1.0) if tilt else None
+        column = column_of(title) if re.match("(?i)MAG_?[XYZ]", title) else column
         if column and isinstance(value, (int, float)):
             values[column[0]] = column[1] * value
     return values

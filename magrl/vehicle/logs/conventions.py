@@ -129,7 +129,7 @@ def check_intensity(total: float, expected: float = EARTH_NT) -> None:
         expected: total intensity at its place [nT], by default that of the Earth.
 
     Raises:
-        ValueError: with the unit that it probably has.
+        ValueError: with the unit that it probably has, also where a format states tesla.
 
     Example:
         >>> check_intensity(48.0)
@@ -141,6 +141,11 @@ def check_intensity(total: float, expected: float = EARTH_NT) -> None:
     if unit == "nanotesla" or (not unit and 0.25 < ratio < 4):
         return
     looks = f"which looks like {unit}: name the columns mag_x_{unit}, ..."
+    meant = next((unit for unit, size in FIELD_NT.items() if 0.55 < ratio * size / FIELD_NT["tesla"] < 1.45), "")
+    if meant:
+        raise ValueError(
+            f"the topic of the field is in {meant}, where ROS states tesla: convert it to tesla in the bag"
+        )
     raw = f"where about {expected:.0f} nT are expected: scale raw counts to nanotesla"
     raise ValueError(f"the total intensity is {total:g}, {looks if unit else raw}")
 

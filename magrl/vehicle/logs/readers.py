@@ -61,6 +61,9 @@ def _recording(path: Path, sensor: str | None) -> Recording:
     if path.is_file():
         with path.open("rb") as file:
             start = file.read(4096)
+    if others := [name for form, name in _OTHERS.items() if re.match(form, start)]:
+        columns = "time, mag_x_nT, mag_y_nT, mag_z_nT, heading_true_deg"
+        raise ValueError(f"{path} is {others[0]}, which is not read: write a CSV file with the columns {columns}, ...")
     found = [reader for form, reader in _FORMATS if path.exists() and re.match(form, start, re.DOTALL)]
     if not found:
         raise ValueError(
@@ -128,3 +131,9 @@ _FORMATS: Sequence[tuple[bytes, Callable[..., Recording]]] = (
     (rb"(?!\s*[<\[{])[^\0]*\Z", read_csv),
 )
 """How the content of a file begins (a regular expression), and its reader."""
+_OTHERS = {
+    rb" ?Format +IAGA": "a file of IAGA-2002, of an observatory",
+    rb"dbd_label:": "a log of a Slocum glider",
+    rb"H Product: ?Blackbox": "a blackbox of INAV or Betaflight",
+}
+"""How logs begin that are not read."""

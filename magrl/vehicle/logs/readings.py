@@ -266,7 +266,7 @@ def _table(mean: DataFrame, covariance: Array, north: str) -> DataFrame:
 MOST_SPIKES = 0.2
 """Share of readings up to which those that do not fit are spikes, and not a mistake in all; chosen."""
 MOST_DRIFT, LEAST_TURN_DEG = 0.25, 20.0
-"""Share of a distance and angle of a course that currents explain; chosen."""
+"""Share of a distance and angle of a course that currents explain, also an error that no compass has; chosen."""
 _PLACE = "latitude", "longitude", "altitude"
 
 
@@ -310,6 +310,7 @@ def mistakes(readings: DataFrame, date: str | None = None) -> list[str]:
     expected = elements if date is None else _igrf_elements(place, date)
     texts = [] if date is None else _field_mistakes(readings, expected)
     if not _measured(readings):
+        texts += [] if date is None else _compass_mistakes(elements[:, 0], expected[:, 0])
         readings = readings.assign(heading=readings["heading"] + (expected - elements)[:, 0].numpy())
     return texts + _move_mistakes(readings, place[:, :2], expected[:, 0])
 
@@ -346,6 +347,16 @@ def _field_mistakes(readings: DataFrame, expected: Tensor) -> list[str]:
     heading = _tensor(readings, "heading")[wrong, 0]
     cause = likely_mistake(elements[wrong], expected[wrong], std[wrong], heading)
     return [f"{start}: {cause or 'no calibration, iron near the sensor, or a heading that is wrong'}"]
+
+
+def _compass_mistakes(declination: Tensor, expected: Tensor) -> list[str]:
+    """Return how far a compass is off: it has D 0, or that of a model which was added to it."""
+    off = torch.stack((declination, declination - expected)).add(180).remainder(360).sub(180)
+    least = off[off.abs().median(1).values.argmin()].median().item()
+    if abs(least) <= LEAST_TURN_DEG:
+        return []
+    shown = f"D is {declination.median():.0f} deg from the heading, that of IGRF {expected.median():.0f}"
+    return [f"{shown}: the compass is about {least:.0f} deg off; check its axes and its calibration"]
 
 
 def _measured(readings: DataFrame) -> bool:
