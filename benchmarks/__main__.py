@@ -87,9 +87,9 @@ class Report:
             raise SystemExit(f"nothing is published: {', '.join(missing)} was not measured")
         results = DOCS / "results"
         page = results / "performance.md"
-        _, heading, others = page.read_text().partition("\n## ")  # tables of other measurements
-        page.write_text(f"{table(self.rows)}\n{self.summary()}{heading}{others}")
-        (results / "profile.md").write_text(shares_table(self.content["profile"]))
+        _, heading, others = page.read_text(encoding="utf-8").partition("\n## ")  # tables of other measurements
+        page.write_text(f"{table(self.rows)}\n{self.summary()}{heading}{others}", encoding="utf-8")
+        (results / "profile.md").write_text(shares_table(self.content["profile"]), encoding="utf-8")
         cost_figure(self.content["vehicles"]).savefig(results / "cost-by-vehicles.png", dpi=110)
 
 

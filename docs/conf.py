@@ -14,7 +14,9 @@ project, author, version = "magrl", "The magrl developers", magrl.__version__
 project_copyright = author
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 
-linked = re.findall(r"\((results/[\w-]+\.md)\)", "".join(page.read_text() for page in ROOT.glob("docs/*.md")))
+linked = re.findall(
+    r"\((results/[\w-]+\.md)\)", "".join(page.read_text(encoding="utf-8") for page in ROOT.glob("docs/*.md"))
+)
 tables = {f"results/{path.name}" for path in ROOT.glob("docs/results/*.md")}
 exclude_patterns = sorted(tables - set(linked))  # tables inside pages
 

@@ -57,7 +57,7 @@ def outcome() -> Callable:
     from magrl.agents import load_policy
 
     def read(folder: Path) -> tuple[list[dict[str, str]], dict[str, Tensor]]:
-        with (folder / "train.csv").open() as file:
+        with (folder / "train.csv").open(encoding="utf-8") as file:
             rows = [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
         policy = load_policy(folder / "policy.safetensors")
         weights = getattr(policy, "actor", policy).state_dict()

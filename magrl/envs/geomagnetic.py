@@ -181,7 +181,7 @@ class GeomagneticNavEnv(EnvBase):
         options = self.max_move_km, self.max_turn_rad, len(self.region), self.arrival.declared, self.drift_km
         self.observation_spec = self._batched(specs.observation_spec(specs.Limits(bounds, *options)))
         self.state_spec = specs.state_spec(self.observation_spec)
-        self._constant_keys = [name for name, _ in self.state_spec.items() if specs.KEYS[name].constant]
+        self._constant_keys = [name for name, _ in self.state_spec.items() if specs.KEYS[name].constant]  # noqa: PERF102
         self.action_spec = self._batched(specs.float_bounds(self.action_low, self.action_high))
         self.reward_spec = self._batched(Unbounded((1,), dtype=torch.float32))
         self.full_done_spec = self._batched(Composite(dict.fromkeys(("done", "terminated", "truncated"), specs.FLAG)))

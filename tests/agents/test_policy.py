@@ -109,6 +109,6 @@ def test_settings_of_a_training_are_checked(policy, tmp_path: Path, read: Callab
 def test_missing_policy_and_foreign_file(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no policy file at .*none\.pt"):
         load_policy(tmp_path / "none.pt")
-    (tmp_path / "text.pt").write_text("not an archive")
+    (tmp_path / "text.pt").write_text("not an archive", encoding="utf-8")
     with pytest.raises(ValueError, match="no safetensors file"):
         load_policy(tmp_path / "text.pt")

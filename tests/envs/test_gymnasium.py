@@ -366,7 +366,7 @@ print(envs.reset(seed=0)[0].shape)
 envs.close()
 """
     command = {"args": [sys.executable, "-W", "ignore", "-c", code], "env": {**os.environ, "OMP_NUM_THREADS": "2"}}
-    done = subprocess.run(**command, capture_output=True, text=True, check=False, timeout=100)
+    done = subprocess.run(**command, capture_output=True, text=True, check=False, timeout=100, encoding="utf-8")
     assert done.stdout.splitlines() == ["[]", "None", "(1, 13)"], done.stderr
     assert type(make().unwrapped) is GeomagneticNavGymEnv
     assert type(make_vec(1)) is GeomagneticNavVectorEnv

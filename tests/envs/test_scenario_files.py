@@ -61,7 +61,7 @@ def test_a_file_holds_all_of_a_scenario(tmp_path: Path) -> None:
         ("azores.toml", TOML),
         ("AZORES.JSON", json.dumps(sound())),
     ):
-        (tmp_path / name).write_text(content)
+        (tmp_path / name).write_text(content, encoding="utf-8")
         scenario = load_scenario(tmp_path / name)
         assert scenario.region == AZORES
         assert (str(scenario.date)[:10], scenario.generation, scenario.altitude_km) == ("2026-07-01", 14, 10.0)
@@ -75,7 +75,7 @@ def test_a_file_holds_all_of_a_scenario(tmp_path: Path) -> None:
 
 def test_defaults_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "small.json"
-    path.write_text(json.dumps({"region": sound()["region"], "date": 2026.5}))
+    path.write_text(json.dumps({"region": sound()["region"], "date": 2026.5}), encoding="utf-8")
     scenario = load_scenario(str(path))
     assert (scenario.generation, scenario.altitude_km, scenario.margin_deg) == (14, 0.0, 5.0)
     assert scenario.distance_range_km == (300, 500)
@@ -99,7 +99,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 def test_a_scenario_holds_the_options_of_its_episodes(tmp_path) -> None:
-    (tmp_path / "deep.toml").write_text(TOML.replace("altitude_km = 10.0", "altitude_km = -3"))
+    (tmp_path / "deep.toml").write_text(TOML.replace("altitude_km = 10.0", "altitude_km = -3"), encoding="utf-8")
     env = GeomagneticNavEnv(load_scenario(tmp_path / "deep.toml"), num_envs=3, seed=0)
     assert (env.max_steps, env.max_move_km, env.zeta, env.start_heading) == (80, 20.0, 0.02, "random")
     assert (env.max_turn_rad, env.arrival.rule, env.arrival.radius_km) == (math.pi / 4, "distance", 30.0)
@@ -137,7 +137,7 @@ def test_bad_content_is_named_with_file_and_key(tmp_path: Path, value: object, t
     """Each part of a file, dropped or of another type; what may be so is taken."""
     path, found, said = tmp_path / "mine.json", set(), []
     for key, content in changed(sound(), value):
-        path.write_text(json.dumps(content))
+        path.write_text(json.dumps(content), encoding="utf-8")
         try:
             load_scenario(path)
             found.add(key)
@@ -150,7 +150,7 @@ def test_bad_content_is_named_with_file_and_key(tmp_path: Path, value: object, t
 
 
 def test_an_unknown_key_is_named_with_the_choices(tmp_path: Path) -> None:
-    (tmp_path / "mine.json").write_text(json.dumps(sound() | {"wings": 2}))
+    (tmp_path / "mine.json").write_text(json.dumps(sound() | {"wings": 2}), encoding="utf-8")
     with pytest.raises(ValueError, match="unknown key 'wings': choose from region, distance_range_km, distance_law,"):
         load_scenario(tmp_path / "mine.json")
 

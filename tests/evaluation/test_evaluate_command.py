@@ -41,12 +41,12 @@ def results(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    with path.open() as file:
+    with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def test_summary_is_that_of_the_episodes_of_the_same_tasks(results: Path) -> None:
-    summary = json.loads((results / "summary.json").read_text(), parse_constant=pytest.fail)
+    summary = json.loads((results / "summary.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
     episodes = rows(results / "episodes.csv")
     assert len(episodes) == 4 * 4
     ahead, secant = ([r for r in episodes if r["navigator"] == name] for name in ("pso", "secant"))
@@ -58,7 +58,7 @@ def test_summary_is_that_of_the_episodes_of_the_same_tasks(results: Path) -> Non
 
 
 def test_tables_have_the_papers_row_and_notes(results: Path) -> None:
-    lines = (results / "table.md").read_text().splitlines()
+    lines = (results / "table.md").read_text(encoding="utf-8").splitlines()
     labels = [line.split("|")[1].strip() for line in lines[2:9]]
     assert labels[:2] == ["Gradient-Guided TD3, paper", "Gradient-Guided TD3"]
     assert lines[2].split("|")[5:9] == [" 97.0 ", " 445564 ", " 88.41 ", " 21.76 "]
@@ -77,7 +77,7 @@ def test_paths_are_those_of_the_papers_example_with_the_true_field(results: Path
 
 def test_settings_state_what_was_flown(results: Path) -> None:
     """A run is flown as it was trained."""
-    settings = json.loads((results / "settings.json").read_text())
+    settings = json.loads((results / "settings.json").read_text(encoding="utf-8"))
     assert settings["navigators"] == ["gg_td3=noisy", "secant", "pso", "afsa"]
     expected = {"zeta": 0.02, "errors": list(NOISE), "start_heading": "random", "scenario": None, "tasks_seed": 0}
     assert settings.items() >= expected.items()
@@ -97,7 +97,7 @@ tasks = [
 def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Path) -> None:
     """The destination, seven degrees north of the region, needs a wider margin than the five of the default."""
     path, out, tracks = tmp_path / "own.toml", tmp_path / "out", tmp_path / "maps" / "tracks.geojson"
-    path.write_text(OWN)
+    path.write_text(OWN, encoding="utf-8")
     config = {"scenario": path, "out": out, "export": tracks}
     with pytest.raises(UsageError, match=r"own\.toml: tasks: .*: raise margin_deg from 5 to at least 7\.5$"):
         evaluate.evaluate(evaluate.Config(("secant",), **config))
@@ -106,17 +106,17 @@ def test_options_are_those_of_the_command_line_then_of_the_scenario(tmp_path: Pa
     run = make_run(
         tmp_path / "run", GeomagneticNavEnv(own), scenario="scenario.toml", zeta=0.02, start_heading="random"
     )
-    (run / "scenario.toml").write_text(OWN)
+    (run / "scenario.toml").write_text(OWN, encoding="utf-8")
     names = (f"gg_td3={run}", "secant")
     evaluate.evaluate(evaluate.Config(names, **config, **options))
-    settings = json.loads((out / "settings.json").read_text())
+    settings = json.loads((out / "settings.json").read_text(encoding="utf-8"))
     assert settings.items() >= (options | {"zeta": 0.02, "arrival": "distance", "num_tasks": 2}).items()
     arrived = [row for row in rows(out / "episodes.csv") if row["success"] == "True"]
     assert max(float(row["navigation_error_km"]) for row in arrived) <= 25
-    text = (out / "table.md").read_text()
+    text = (out / "table.md").read_text(encoding="utf-8")
     assert "paper" not in text
     assert "Arrival: distance, within 25 km." in text
-    flown = [feature["properties"] for feature in json.loads(tracks.read_text())["features"]]
+    flown = [feature["properties"] for feature in json.loads(tracks.read_text(encoding="utf-8"))["features"]]
     assert [(x["navigator"], x["name"]) for x in flown[1:3]] == [("gg_td3", "task 2"), ("secant", "far off")]
     for message, change in (
         (r"gg_td3=.*trained where D is", {"tasks": "figure-4-1", "scenario": None}),

@@ -22,14 +22,14 @@ def test_a_flight_writes_its_files(tmp_path: Path, capsys) -> None:
     options = ("--navigator", "secant", "--out", str(tmp_path), "--start-heading", "270")
     recipe.main(["-33.9 18.4", "-33.6, 18.9", *options, "--export", str(track), "--animate", str(movie)])
     assert "outcome         arrived\n" in capsys.readouterr().out
-    result = json.loads((tmp_path / "flight.json").read_text())
+    result = json.loads((tmp_path / "flight.json").read_text(encoding="utf-8"))
     assert result["start_position"] == pytest.approx([-33.9, 18.4])
     assert (result["zeta"], result["needs"]) == (0.01, "nothing")
     assert result["max_steps"] == round(3 * result["shortest_km"] / 50) + 20
     assert result["shortest_km"] <= result["length_km"] * 1.1 < 400
     assert result["navigation_error_km"] < 30
     assert (tmp_path / "flight.png").stat().st_size > 10_000
-    (feature,) = json.loads(track.read_text())["features"]
+    (feature,) = json.loads(track.read_text(encoding="utf-8"))["features"]
     (west, *_), (first, *_) = feature["geometry"]["coordinates"][:2]
     assert first < west  # the first move of secant leads ahead
     assert len(feature["geometry"]["coordinates"]) == result["steps"] + 1

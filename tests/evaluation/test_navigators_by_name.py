@@ -134,7 +134,7 @@ def trained(env: GeomagneticNavEnv, folder: Path, **settings: object) -> Path:
     folder.mkdir()
     save_policy(folder / "policy.safetensors", policy)
     if settings.get("scenario"):
-        (folder / "scenario.toml").write_text("date = 2026-07-01")
+        (folder / "scenario.toml").write_text("date = 2026-07-01", encoding="utf-8")
     return folder
 
 

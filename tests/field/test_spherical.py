@@ -38,7 +38,7 @@ def test_axial_dipole_worked_by_hand():
 def wmm2025(year):
     """The Gauss coefficients of the World Magnetic Model: lines of n, m, g, h [nT] and their rates [nT/year]."""
     gauss = torch.zeros(13, 13, dtype=torch.complex128)
-    for line in (DATA / "wmm2025.cof").read_text().splitlines()[1:-2]:
+    for line in (DATA / "wmm2025.cof").read_text(encoding="utf-8").splitlines()[1:-2]:
         n, m, g, h, g_rate, h_rate = map(float, line.split())
         gauss[int(n), int(m)] = complex(g + (year - 2025) * g_rate, -h - (year - 2025) * h_rate)
     return gauss

@@ -1,5 +1,6 @@
 """Files: written whole or not at all, and damage is named."""
 
+import ast
 import hashlib
 import json
 import math
@@ -31,6 +32,8 @@ from magrl.files import (
     write_text,
     write_with,
 )
+
+ROOT = Path(__file__).parent.parent.parent
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch) -> None:
@@ -163,6 +166,22 @@ def test_json_holds_no_infinity() -> None:
         write_json("here", {})
 
 
+def test_texts_name_their_encoding_and_files_are_written_whole() -> None:
+    """The library and the recipes write by magrl.files alone, and read no text in the encoding of the locale."""
+    direct = []
+    for path in (file for folder in ("magrl", "recipes") for file in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                own = {
+                    "write_text": True,
+                    "savefig": True,
+                    "to_csv": node.args,
+                    "read_text": not (node.args or node.keywords),
+                }
+                direct += [f"{path}:{node.lineno}"] if own.get(node.func.attr) else []
+    assert direct == []
+
+
 LEAST_BYTES = 2000
 LONG = "°" * LEAST_BYTES
 WRITERS: dict[str, Callable[[Path], None]] = {
@@ -208,9 +227,9 @@ def test_a_table_is_refused_before_it_takes_memory(text: str, message: str) -> N
 
 
 def test_check_writable_makes_folders_and_keeps_files(tmp_path: Path) -> None:
-    (tmp_path / "old.html").write_text("kept")
+    (tmp_path / "old.html").write_text("kept", encoding="utf-8")
     check_writable(tmp_path / "old.html")
-    assert (tmp_path / "old.html").read_text() == "kept"
+    assert (tmp_path / "old.html").read_text(encoding="utf-8") == "kept"
     check_writable(tmp_path / "new" / "page.html")
     assert list((tmp_path / "new").iterdir()) == []
     with pytest.raises(OSError, match=r"cannot write .*old\.html/page\.html"):

@@ -96,7 +96,7 @@ def test_settings_of_runs(tmp_path: Path) -> None:
     """A mutant may hold other settings, but then they are valid."""
     path = tmp_path / "config.json"
     settings = {key: value for key, value in vars(recipe.Config()).items() if key not in ("out", "resume")}
-    path.write_text(json.dumps({"recipe": recipe.RECIPE, **settings, "out": "run", "resume": None}))
+    path.write_text(json.dumps({"recipe": recipe.RECIPE, **settings, "out": "run", "resume": None}), encoding="utf-8")
     read = lambda: resumed_config(tmp_path, recipe.Config, recipe.RECIPE)  # noqa: E731
     fuzz(path, read, lambda found: isinstance(found, recipe.Config) and found.out == tmp_path, 2)
 
@@ -108,7 +108,9 @@ def test_scenarios(tmp_path: Path, suffix: str) -> None:
     content = {"date": "2026-07-01", "distance_range_km": [300, 500]}
     region = {"latitude": [40, 50], "longitude": [-30, -20]}
     lines = ["\n".join(f"{key} = {json.dumps(value)}" for key, value in table.items()) for table in (content, region)]
-    path.write_text("\n[region]\n".join(lines) if suffix == ".toml" else json.dumps(content | {"region": region}))
+    path.write_text(
+        "\n[region]\n".join(lines) if suffix == ".toml" else json.dumps(content | {"region": region}), encoding="utf-8"
+    )
     fuzz(path, lambda: load_scenario(path), lambda found: isinstance(found, Scenario), 3)
 
 

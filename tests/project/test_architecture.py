@@ -15,7 +15,7 @@ PACKAGE = ROOT / "magrl"
 
 def floors() -> dict[str, int]:
     """The floor of each part of the package, from the table of docs/architecture.md."""
-    page = (ROOT / "docs" / "architecture.md").read_text()
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     return {name: int(floor) for floor, name in re.findall(r"^\| (\d) \| `(\w+)` \| \w", page, re.MULTILINE)}
 
 
@@ -26,7 +26,7 @@ FLOOR = floors()
 def sources() -> dict[str, ast.Module]:
     """The modules by name, such as ``magrl.field.igrf``; a package is that of its ``__init__.py``."""
     paths = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in sorted(PACKAGE.rglob("*.py"))}
-    return {name.removesuffix(".__init__"): ast.parse(path.read_text()) for name, path in paths.items()}
+    return {name.removesuffix(".__init__"): ast.parse(path.read_text(encoding="utf-8")) for name, path in paths.items()}
 
 
 @cache
@@ -108,7 +108,9 @@ def test_what_counts_as_code() -> None:
 
 @pytest.mark.parametrize(("folder", "limit"), [("magrl", 250), ("recipes", 200)])
 def test_modules_and_functions_are_short(folder: str, limit: int) -> None:
-    found = {str(path.relative_to(ROOT)): sizes(path.read_text()) for path in (ROOT / folder).rglob("*.py")}
+    found = {
+        str(path.relative_to(ROOT)): sizes(path.read_text(encoding="utf-8")) for path in (ROOT / folder).rglob("*.py")
+    }
     assert found
     assert {name: size for name, (size, _) in found.items() if size > limit} == {}
     functions = {f"{name}::{x}": size for name, (_, inside) in found.items() for x, size in inside.items()}

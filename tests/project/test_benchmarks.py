@@ -54,7 +54,7 @@ def test_results_are_written(monkeypatch, tmp_path, capsys) -> None:
     monkeypatch.setattr(env, "rows", lambda: [Row("env", 1.0, 2.0, 2.0, 1.9, 2.1)])
     out = tmp_path / "new" / "bench.json"
     bench.main(["--only", "env", "--out", str(out)])
-    assert [row["what"] for row in json.loads(out.read_text())["rows"]] == ["env"]
+    assert [row["what"] for row in json.loads(out.read_text(encoding="utf-8"))["rows"]] == ["env"]
     assert "| env | 1 | 2 | 2.00 | 1.90–2.10 |  |" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="was not measured"):
         bench.main(["--only", "env", "--out", str(out), "--publish"])

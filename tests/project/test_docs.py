@@ -29,17 +29,17 @@ from magrl.transforms import CONDITIONS
 publish = load("tables/publish")
 ROOT = Path(__file__).parent.parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
-TEXTS = {page: page.read_text() for page in PAGES}
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 ENVIRONMENT = TEXTS[ROOT / "docs" / "environment.md"]
 NOTEBOOK = ROOT / "docs" / "tutorial.ipynb"
-CELLS = json.loads(NOTEBOOK.read_text())["cells"]
+CELLS = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = [(page, code) for page in PAGES for language, code in BLOCK.findall(TEXTS[page]) if language == "python"]
 SCRIPTS = [
     ROOT / "docs" / "examples" / name
     for name in ("ddpg_anywhere.py", "navigator.py", "sac.py", "sb3_anywhere.py", "turns.py")
 ]
-EXAMPLES += [(path, path.read_text()) for path in SCRIPTS]
+EXAMPLES += [(path, path.read_text(encoding="utf-8")) for path in SCRIPTS]
 EXAMPLES += [(NOTEBOOK, "\n".join("".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "code"))]
 BUDGET = {
     "total_frames = 60_000": "total_frames = 128",
@@ -57,7 +57,7 @@ BUDGET = {
 BUDGET |= {'(navigator, "paper-100"': '(navigator, "figure-4-1", max_steps=5'}
 BUDGET |= {"random_tasks(100, ": "random_tasks(2, ", "biscay, errors": "biscay, max_steps=5, errors"}
 """Numbers of frames and tasks in examples, and those of their tests."""
-MAKEFILE = (ROOT / "Makefile").read_text()
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 # Names and links
@@ -77,7 +77,7 @@ def test_every_page_is_in_the_index() -> None:
     index = TEXTS[ROOT / "docs" / "index.md"].splitlines()
     for page in {*ROOT.glob("docs/*.md"), NOTEBOOK} - {ROOT / "docs" / "index.md"}:
         assert page.stem in index
-    assert f"version: {magrl.__version__}" in (ROOT / "CITATION.cff").read_text().splitlines()
+    assert f"version: {magrl.__version__}" in (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
 
 
 # Examples and commands
@@ -187,7 +187,9 @@ def test_tables_have_a_header_and_no_hole(page: Path) -> None:
 def test_tables_are_those_that_were_measured(page: Path) -> None:
     for block in publish.BLOCK.finditer(TEXTS[page]):
         name, table = block[2], block[0].partition("\n")[2].removesuffix("<!-- end -->")
-        assert table.strip() == publish.selected((ROOT / name).read_text().strip(), block[3]).strip(), name
+        assert table.strip() == publish.selected((ROOT / name).read_text(encoding="utf-8").strip(), block[3]).strip(), (
+            name
+        )
         lines = re.findall(r"^\| \w.*", table, re.MULTILINE)
         assert len(set(lines)) == len(lines), f"{name} has a row twice"
 
@@ -201,7 +203,9 @@ def test_a_page_may_show_some_rows() -> None:
 
 
 def test_the_verdict_of_the_reproduction_has_the_numbers_that_were_measured() -> None:
-    results = publish.selected((ROOT / "docs/results/paper-run.md").read_text(), "navigator | SR % | SPL % | TNT steps")
+    results = publish.selected(
+        (ROOT / "docs/results/paper-run.md").read_text(encoding="utf-8"), "navigator | SR % | SPL % | TNT steps"
+    )
     lines = TEXTS[ROOT / "docs/reproduction.md"].partition("| steps |\n")[2].splitlines()[1:5]
     for line, result in zip(lines, results.splitlines()[2:], strict=True):
         name, *shown = (cell.strip() for cell in line.strip("|").split("|"))
@@ -212,7 +216,10 @@ def test_the_verdict_of_the_reproduction_has_the_numbers_that_were_measured() ->
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("docs/results/*.csv.gz")), ids=lambda path: path.name)
 def test_episodes_give_the_numbers_of_their_table(path: Path) -> None:
-    lines = [line.strip("| ").split(" | ") for line in path.with_name(f"{path.name[:-7]}.md").read_text().splitlines()]
+    lines = [
+        line.strip("| ").split(" | ")
+        for line in path.with_name(f"{path.name[:-7]}.md").read_text(encoding="utf-8").splitlines()
+    ]
     labels = [row[0] for row in lines[2:]]
     cells = {}
     for row in lines[2:]:  # of one label, a row is named by what it is given
@@ -234,7 +241,7 @@ def test_options_of_the_environment_and_fields_of_the_scenario() -> None:
 
 
 def test_references_are_of_one_agent_and_the_best_trained_one_is_beside() -> None:
-    scores, page = (ROOT / "docs/results/scores.md").read_text(), TEXTS[ROOT / "README.md"]
+    scores, page = (ROOT / "docs/results/scores.md").read_text(encoding="utf-8"), TEXTS[ROOT / "README.md"]
     for name, (_, spl, earned, trained) in rows("## Use", "id, after `magrl/GeomagneticNavigation`", page).items():
         task = name.removesuffix("-v0").lower() or "box"
         agent = "shortest path around the areas (oracle)" if task == "nogo" else "kalman"

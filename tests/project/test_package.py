@@ -67,7 +67,9 @@ follow_imports = skip
 def run(*command: object, cwd: Path) -> str:
     """Return the output of a command that runs without the tree on Python's path."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
-    done = subprocess.run([str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True, encoding="utf-8"
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -91,7 +93,7 @@ def python(wheel: Path, tmp_path_factory) -> Path:
     executable = folder / "venv" / "bin" / "python"
     site = Path(run(executable, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder).strip())
     # A path in a .pth file is searched last, and .pth files that lie there (such as this tree's own) are not read.
-    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
     options = ("--no-deps", "--no-index", "--disable-pip-version-check")
     run(sys.executable, "-m", "pip", "--python", executable, "install", *options, wheel, cwd=folder)
     return executable
@@ -121,8 +123,8 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
 
 
 def test_the_hook_before_a_commit_has_the_version_of_ruff() -> None:
-    (version,) = re.findall(r"^ruff==(.*)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
-    assert f"rev: v{version} " in (ROOT / ".pre-commit-config.yaml").read_text()
+    (version,) = re.findall(r"^ruff==(.*)", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    assert f"rev: v{version} " in (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -135,12 +137,17 @@ def test_wheel_works_without_the_tree(python: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_user_s_code_is_typed(python: Path, tmp_path: Path) -> None:
     """Under mypy --strict: a script that is right passes, one that is wrong does not, and no public name is Any."""
-    (tmp_path / "mypy.ini").write_text(MYPY.format(cache=tmp_path / "cache"))
+    (tmp_path / "mypy.ini").write_text(MYPY.format(cache=tmp_path / "cache"), encoding="utf-8")
     right = "import magrl\nrate: float = magrl.summarize(magrl.evaluate('secant', 'figure-4-1'))['success_rate']\n"
-    (tmp_path / "user.py").write_text(right + "".join(f"reveal_type(magrl.{name})\n" for name in magrl.__all__))
+    (tmp_path / "user.py").write_text(
+        right + "".join(f"reveal_type(magrl.{name})\n" for name in magrl.__all__), encoding="utf-8"
+    )
     check = (sys.executable, "-m", "mypy", "--config-file", "mypy.ini", "--python-executable", python)
     said = run(*check, "user.py", cwd=tmp_path)
     assert said.count("Revealed type is") == len(magrl.__all__)
     assert 'Revealed type is "Any"' not in said, said
     wrong = "import magrl\nmagrl.GeomagneticNavEnv(num_envs='four')\n"
-    assert "arg-type" in subprocess.run([*check, "-c", wrong], cwd=tmp_path, capture_output=True, text=True).stdout
+    assert (
+        "arg-type"
+        in subprocess.run([*check, "-c", wrong], cwd=tmp_path, capture_output=True, text=True, encoding="utf-8").stdout
+    )

@@ -49,7 +49,7 @@ def test_recurrent_ppo_trains(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(recurrent, "export_policy", checked)
     monkeypatch.setattr(recurrent, "save_policy", lambda *_: None)
     result = recurrent.train(recurrent.Config(**SIZES, observe_heading=False, out=tmp_path))
-    assert json.loads((tmp_path / "eval.json").read_text())["spl"] == result["spl"]
+    assert json.loads((tmp_path / "eval.json").read_text(encoding="utf-8"))["spl"] == result["spl"]
 
 
 @pytest.mark.slow  # the export takes most of the time

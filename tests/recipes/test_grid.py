@@ -70,22 +70,22 @@ def test_bad_usage(tables, changes: dict, message: str, tmp_path: Path, monkeypa
 
 def test_documents_are_filled_or_none_is(tmp_path: Path) -> None:
     page, other = tmp_path / "page.md", tmp_path / "other.md"
-    (tmp_path / "a.md").write_text("| 1 |\n")
-    page.write_text("x\n<!-- table: a.md -->\nold\n<!-- end -->\ny")
-    other.write_text("<!-- table: b.md -->\n<!-- end -->")
+    (tmp_path / "a.md").write_text("| 1 |\n", encoding="utf-8")
+    page.write_text("x\n<!-- table: a.md -->\nold\n<!-- end -->\ny", encoding="utf-8")
+    other.write_text("<!-- table: b.md -->\n<!-- end -->", encoding="utf-8")
     with pytest.raises(UsageError, match=r"No such file .*b\.md"):
         publish.publish((page, other), tmp_path)
-    assert "old" in page.read_text()
+    assert "old" in page.read_text(encoding="utf-8")
     publish.publish((page,), tmp_path)
-    assert page.read_text() == "x\n<!-- table: a.md -->\n\n| 1 |\n\n<!-- end -->\ny"
+    assert page.read_text(encoding="utf-8") == "x\n<!-- table: a.md -->\n\n| 1 |\n\n<!-- end -->\ny"
 
 
 def test_a_document_may_show_some_columns(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    (tmp_path / "a.md").write_text("| name | SPL % | steps |\n|---|---|---|\n| secant | 99.0 | 8 |\n")
-    page.write_text("<!-- table: a.md | steps | name -->\n<!-- end -->")
+    (tmp_path / "a.md").write_text("| name | SPL % | steps |\n|---|---|---|\n| secant | 99.0 | 8 |\n", encoding="utf-8")
+    page.write_text("<!-- table: a.md | steps | name -->\n<!-- end -->", encoding="utf-8")
     publish.publish((page,), tmp_path)
-    assert page.read_text().splitlines()[2:5] == ["| steps | name |", "|---|---|", "| 8 | secant |"]
+    assert page.read_text(encoding="utf-8").splitlines()[2:5] == ["| steps | name |", "|---|---|", "| 8 | secant |"]
     with pytest.raises(UsageError, match="no column SR %: choose from name, SPL %, steps"):
         publish.selected("| name | SPL % | steps |", "SR %")
 
@@ -115,7 +115,7 @@ def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> 
     far = rows(grid.flights([oracle], tasks=2, distance_km=(1200, 1300), max_steps=60).text)
     assert far[2][3] == "100.0 / 100.0"
     grid.make(("confidence",), navigators=(oracle,), tasks=2, out=tmp_path / "new")
-    head, _, row = rows((tmp_path / "new" / "confidence.md").read_text())
+    head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
     assert head == ["navigator", "trained on", "given", "aircraft", "ship", "underwater", "low-cost"]
     assert row[3] == "100.0 / 0.0"
 
@@ -124,7 +124,7 @@ def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path, monkeypatch) -
     monkeypatch.setitem(benchmark.TRACKS, "north-v1", replace(benchmark.TRACKS["north-v1"], max_steps=14))
     grid.make(("north-declared",), navigators=("secant", "geodesic"), tasks=3, out=tmp_path)
     table, episodes = (
-        rows((tmp_path / "north-declared.md").read_text()),
+        rows((tmp_path / "north-declared.md").read_text(encoding="utf-8")),
         read_episodes(tmp_path / "north-declared.csv.gz"),
     )
     assert set(episodes["track"]) == {"north-v1"}
@@ -275,7 +275,9 @@ def test_learning_curves_are_columns_of_the_runs(tmp_path: Path, monkeypatch) ->
     monkeypatch.chdir(tmp_path)
     for run, spl in (("td3_gradient_guided-paper-seed0", 90), ("td3-paper-seed0", 80)):
         (tmp_path / "runs" / run).mkdir(parents=True)
-        (tmp_path / "runs" / run / "train.csv").write_text(f"frames,eval_spl\n0,\n100,50\n200,{spl}\n")
+        (tmp_path / "runs" / run / "train.csv").write_text(
+            f"frames,eval_spl\n0,\n100,50\n200,{spl}\n", encoding="utf-8"
+        )
     (figure,) = figures.curves("paper-run").values()
     means = [line.get_ydata()[-1] for line in figure.axes[0].lines if line.get_label().startswith(("TD3", "Gradient"))]
     assert means == [90, 80]

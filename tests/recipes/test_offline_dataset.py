@@ -13,7 +13,6 @@ from tensordict import TensorDict
 from torchrl.data.datasets import MinariExperienceReplay
 
 import magrl.envs
-import magrl.transforms
 from magrl.envs import PUBLIC_KEYS
 from magrl.training import UsageError
 

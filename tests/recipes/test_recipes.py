@@ -60,7 +60,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     files = {"config.json", "train.csv", "policy.safetensors", "eval.json", "training.png"}
     assert files <= {path.name for path in whole.iterdir()} <= files | {".lock", "trajectories.png"}
     assert with_paths(whole) == []
-    written, config = (json.loads((whole / f"{name}.json").read_text()) for name in ("eval", "config"))
+    written, config = (json.loads((whole / f"{name}.json").read_text(encoding="utf-8")) for name in ("eval", "config"))
     assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 96)
     assert written["spl"] == result["spl"]
     assert (config["recipe"], config["noise"]) == (module.RECIPE, list(NOISE))

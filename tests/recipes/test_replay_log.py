@@ -20,7 +20,7 @@ NOISE = ["--noise", "0.02", "0.02", "2"]
 
 def test_the_example_is_what_its_command_writes(tmp_path: Path) -> None:
     runpy.run_path(str(ROOT / "docs" / "examples" / "make_log.py"))["write"](tmp_path / "log.csv")
-    assert (tmp_path / "log.csv").read_text() == LOG.read_text()
+    assert (tmp_path / "log.csv").read_text(encoding="utf-8") == LOG.read_text(encoding="utf-8")
 
 
 def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
@@ -32,7 +32,7 @@ def test_the_example_with_other_columns(tmp_path: Path, capsys) -> None:
     assert table["miss_km"].iloc[-5] < 0.4 * table["miss_km"].iloc[1]
     assert table["stop"].iloc[-1] == "arrived"
     said = capsys.readouterr().out
-    assert (tmp_path / "a" / "log.md").read_text() in said
+    assert (tmp_path / "a" / "log.md").read_text(encoding="utf-8") in said
     assert "Error of the estimated way at the end" in said
     assert (tmp_path / "a" / "log.png").stat().st_size > 10_000
     blind = pd.read_csv(LOG).drop(columns=["time", "latitude", "longitude"]).rename(columns={"D": "dec"})
@@ -63,7 +63,7 @@ def test_readings_of_short_moves_are_averaged(tmp_path: Path) -> None:
     """Each reading is at the mean of the places of its rows; the last move may have half the length."""
     path = tmp_path / "log.csv"
     rows = ["0,60,20000,0,0", "0,60,20010,0,3", "0,60,20020,90,4", "0,60,20030,90,2"]
-    path.write_text("\n".join(["D,I,B_H,heading,distance", *rows]))
+    path.write_text("\n".join(["D,I,B_H,heading,distance", *rows]), encoding="utf-8")
     log = recipe.read_log(recipe.Config(path))
     joined = recipe.joined(log, 4.0)
     assert joined["row"].tolist() == [1, 3]
@@ -74,9 +74,9 @@ def test_readings_of_short_moves_are_averaged(tmp_path: Path) -> None:
 
 
 def test_repeated_rows_do_not_double_the_way_and_mistakes_are_named(tmp_path: Path, capsys) -> None:
-    header, *rows = LOG.read_text().splitlines()[:8]
+    header, *rows = LOG.read_text(encoding="utf-8").splitlines()[:8]
     path = tmp_path / "log.csv"
-    path.write_text("\n".join([header, *(row for row in rows for _ in range(2))]))
+    path.write_text("\n".join([header, *(row for row in rows for _ in range(2))]), encoding="utf-8")
     recipe.main([str(path), *NOISE, "--date", "2025-01-01", "--out", str(tmp_path / "a")])
     said = capsys.readouterr().out
     assert "Warning: 7 rows with the time of the row before left out." in said
@@ -138,7 +138,10 @@ def test_the_altitude_counts(tmp_path: Path, capsys, km: float, warned: bool) ->
 )
 def test_errors_name_what_is_wrong(tmp_path: Path, change, arguments, message: str) -> None:
     path = tmp_path / "log.csv"
-    path.write_text(LOG.read_text().replace(*change, 1) if change[0] else LOG.read_text())
+    path.write_text(
+        LOG.read_text(encoding="utf-8").replace(*change, 1) if change[0] else LOG.read_text(encoding="utf-8"),
+        encoding="utf-8",
+    )
     with pytest.raises(UsageError, match=message):
         recipe.main([str(path), *arguments, "--out", str(tmp_path / "out")])
 

@@ -43,13 +43,13 @@ def test_bad_settings_of_a_run(bad: dict, message: str) -> None:
 
 def test_scenario_and_settings_must_agree(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(OWN + "zeta = 0.02\n")
+    path.write_text(OWN + "zeta = 0.02\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"zeta = 0\.02, the training 0\.01: add --zeta 0\.02"):
         RunConfig(scenario=path)
-    path.write_text(OWN + 'arrival = "declared"\n')
+    path.write_text(OWN + 'arrival = "declared"\n', encoding="utf-8")
     with pytest.raises(ValueError, match="only ppo_anywhere"):
         RunConfig(scenario=path)
-    path.write_text(OWN.replace("[40, 50]", "[75, 85]"))
+    path.write_text(OWN.replace("[40, 50]", "[75, 85]"), encoding="utf-8")
     with pytest.raises(ValueError, match=r"mine.toml: region.latitude \(75.0, 85.0\): with margin_deg 5"):
         RunConfig(scenario=path)
 
@@ -101,7 +101,7 @@ MINE = '"recipe": "td3_gradient_guided.py"'
 )
 def test_other_files_are_not_resumed(tmp_path: Path, content: str | None, message: str) -> None:
     if content is not None:
-        (tmp_path / "config.json").write_text(content)
+        (tmp_path / "config.json").write_text(content, encoding="utf-8")
     with pytest.raises(UsageError, match=message) as error:
         parse("--resume", str(tmp_path))
     assert str(tmp_path) in str(error.value)
@@ -109,7 +109,7 @@ def test_other_files_are_not_resumed(tmp_path: Path, content: str | None, messag
 
 def test_complete_run_and_other_options_are_refused(tmp_path: Path) -> None:
     for name in ("config.json", "eval.json"):
-        (tmp_path / name).write_text("{}")
+        (tmp_path / name).write_text("{}", encoding="utf-8")
     with pytest.raises(UsageError, match=r"is complete: its results are in .*eval\.json"):
         parse("--resume", str(tmp_path))
     with pytest.raises(UsageError, match=r"leave out --seed 1 --preset paper$"):
@@ -119,8 +119,8 @@ def test_complete_run_and_other_options_are_refused(tmp_path: Path) -> None:
 def test_resumed_settings_are_those_of_the_run(tmp_path: Path) -> None:
     """However the folder is written; paths are those of this machine."""
     settings = {"recipe": recipe.RECIPE, "seed": 7, "num_cells": [8, 8], "guided": False, "scenario": "scenario.toml"}
-    (tmp_path / "config.json").write_text(json.dumps(settings))
-    (tmp_path / "scenario.toml").write_text(OWN)
+    (tmp_path / "config.json").write_text(json.dumps(settings), encoding="utf-8")
+    (tmp_path / "scenario.toml").write_text(OWN, encoding="utf-8")
     for text in (f"--resume={tmp_path}", f"--resume {tmp_path}/."):
         config = parse(*text.split())
         assert (config.seed, config.num_cells, config.guided) == (7, (8, 8), False)
@@ -144,7 +144,7 @@ def test_bad_usage_is_one_line_and_bugs_keep_their_traceback(capsys) -> None:
 
 def test_reader_that_ends_first_leaves_no_traceback(tmp_path: Path, monkeypatch, capsys) -> None:
     """As in `command --help | head -1`."""
-    with (tmp_path / "out").open("w") as file, monkeypatch.context() as patch:
+    with (tmp_path / "out").open("w", encoding="utf-8") as file, monkeypatch.context() as patch:
 
         def broken(*_: object) -> None:
             raise BrokenPipeError

@@ -72,7 +72,7 @@ class Offline:
     def table(self, name: str) -> list[dict[str, Any]]:
         """Return the rows of a table."""
         (path,) = (row[f"{name}.path"] for row in self.history if f"{name}.path" in row)
-        table = json.loads((self.folder / "files" / path).read_text())
+        table = json.loads((self.folder / "files" / path).read_text(encoding="utf-8"))
         return [dict(zip(table["columns"], row, strict=True)) for row in table["data"]]
 
 
@@ -191,8 +191,8 @@ def test_the_same_curves_in_files(tmp_path: Path) -> None:
         log.result({"spl": 97.5, "steps": float("nan")})
         log.close()
     scalars = tmp_path / "csv" / "scalars"
-    assert (scalars / "train" / "return.csv").read_text().split() == ["512,1.5", "1024,9.0"]
-    assert (scalars / "final" / "spl.csv").read_text().split() == ["1024,97.5"]
+    assert (scalars / "train" / "return.csv").read_text(encoding="utf-8").split() == ["512,1.5", "1024,9.0"]
+    assert (scalars / "final" / "spl.csv").read_text(encoding="utf-8").split() == ["1024,97.5"]
     board = event_accumulator.EventAccumulator(str(tmp_path / "tensorboard"))
     board.Reload()
     found = {tag: [(event.step, event.value) for event in board.Scalars(tag)] for tag in board.Tags()["scalars"]}
@@ -228,7 +228,7 @@ def test_failing_loggers_are_reported_and_disabled(tmp_path: Path, monkeypatch, 
     def unwritable(*_: object) -> None:
         raise PermissionError("wandb folder")
 
-    (tmp_path / "csv").write_text("in the way")
+    (tmp_path / "csv").write_text("in the way", encoding="utf-8")
     for name, make, reason in (
         ("csv", broken, "File exists"),
         ("wandb", broken, "no attribute 'experiment'"),

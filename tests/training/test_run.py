@@ -54,10 +54,10 @@ def test_config_and_scenario_are_written_with_the_folder(tmp_path: Path) -> None
     config = RunConfig(out=tmp_path / "run", seed=4, wandb_mode="disabled", scenario=AZORES)
     with in_run(config) as run:
         assert {path.name for path in run.folder.iterdir()} == {".lock", "config.json", "scenario.toml"}
-        written = json.loads((run.folder / "config.json").read_text())
+        written = json.loads((run.folder / "config.json").read_text(encoding="utf-8"))
         assert (written["recipe"], written["seed"]) == ("mine.py", 4)
         assert (written["out"], written["resume"], written["scenario"]) == ("run", None, "scenario.toml")
-        assert (run.folder / "scenario.toml").read_text() == AZORES.read_text()
+        assert (run.folder / "scenario.toml").read_text(encoding="utf-8") == AZORES.read_text(encoding="utf-8")
         with pytest.raises(UsageError, match="another process"), locked(run.folder):
             pass
     with locked(run.folder):
@@ -84,7 +84,7 @@ def test_only_a_start_that_fails_removes_the_folder(tmp_path: Path) -> None:
 
 def test_second_process_is_kept_out(tmp_path: Path, capsys) -> None:
     folder = create_run_folder(tmp_path / "run")
-    (folder / "config.json").write_text(json.dumps({"recipe": recipe.RECIPE}))
+    (folder / "config.json").write_text(json.dumps({"recipe": recipe.RECIPE}), encoding="utf-8")
     with locked(folder), pytest.raises(SystemExit) as stop:
         command(recipe.RECIPE, lambda: recipe.main(["--resume", str(folder)]))
     message = f"td3_gradient_guided.py: another process is writing the run folder {folder}\n"
@@ -155,8 +155,8 @@ def test_training_seconds_count_from_the_start_of_the_run(tmp_path: Path, signal
         train(tmp_path)
     clock.now += 10_000.0
     train(tmp_path, resume=tmp_path)
-    assert json.loads((tmp_path / "eval.json").read_text())["training_seconds"] == 200.0
-    with (tmp_path / "train.csv").open() as file:
+    assert json.loads((tmp_path / "eval.json").read_text(encoding="utf-8"))["training_seconds"] == 200.0
+    with (tmp_path / "train.csv").open(encoding="utf-8") as file:
         assert [row["seconds"] for row in csv.DictReader(file)] == ["100", "200", "200"]
 
 
@@ -166,7 +166,7 @@ def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> N
     """The curves so far stay in their file."""
     with signalled(5, signal.SIGTERM), pytest.raises(SystemExit):
         train(tmp_path)
-    curves = (tmp_path / "train.csv").read_text()
+    curves = (tmp_path / "train.csv").read_text(encoding="utf-8")
     with pytest.raises(UsageError, match=r"cannot resume: .*checkpoint-\d+\.\w+: part does not fit this training"):
         train(tmp_path, width=2, resume=tmp_path)
     for file in tmp_path.glob("checkpoints/*.safetensors"):
@@ -174,7 +174,7 @@ def test_checkpoint_that_cannot_be_used_is_named(tmp_path: Path, signalled) -> N
     with pytest.raises(UsageError, match="cannot resume: there is no valid checkpoint in"):
         train(tmp_path, resume=tmp_path)
     assert len(curves.splitlines()) == 3
-    assert (tmp_path / "train.csv").read_text() == curves
+    assert (tmp_path / "train.csv").read_text(encoding="utf-8") == curves
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -183,7 +183,10 @@ def test_a_run_is_resumed_with_the_settings_of_its_checkpoint(tmp_path: Path, si
     with signalled(3, signal.SIGTERM), pytest.raises(SystemExit):
         train(tmp_path, scenario=AZORES)
     scenario = tmp_path / "scenario.toml"
-    written, text = json.loads((tmp_path / "config.json").read_text()), scenario.read_text()
+    written, text = (
+        json.loads((tmp_path / "config.json").read_text(encoding="utf-8")),
+        scenario.read_text(encoding="utf-8"),
+    )
     other = {"recipe": "other.py", "name": "other", "noise": (0.1, 0.0, 0.0), "num_cells": (8,), "total_episodes": 7}
     other |= {"scenario": text}
     other |= {name: value * 2 + 1 for name, value in written.items() if name not in other and name not in CHANGEABLE}

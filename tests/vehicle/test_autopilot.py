@@ -194,7 +194,7 @@ class Played(World):
 
 def record(folder: Path) -> list[str]:
     """The lines of a record, the header first."""
-    return (folder / "messages.csv").read_text().splitlines(keepends=True)
+    return (folder / "messages.csv").read_text(encoding="utf-8").splitlines(keepends=True)
 
 
 @pytest.mark.parametrize("number", range(3))
@@ -204,7 +204,7 @@ def test_a_killed_flight_continues_with_the_same_commands(flown, number, tmp_pat
     cut, other = sorted(random.Random(number).sample(range(2, len(lines)), 2))
     before = [*fly(loop(), Played(lines[1:cut]), tmp_path)]
     torn = (lines[cut][:7], "\0\0\0\n", f"{lines[cut].strip()},5.0\n")[number]
-    with (tmp_path / "messages.csv").open("a") as file:
+    with (tmp_path / "messages.csv").open("a", encoding="utf-8") as file:
         file.write(torn)
     assert [*fly(loop(), Played([]), tmp_path)] == before[-1:]
     after = [*fly(loop(), Played(lines[cut:other]), tmp_path), *[*fly(loop(), Played(lines[other:]), tmp_path)][1:]]

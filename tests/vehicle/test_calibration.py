@@ -139,6 +139,6 @@ def test_a_file_holds_all(tmp_path: Path) -> None:
     assert Calibration.load(tmp_path / "quay.json") == calibration
     assert calibration.here == (60.4, 5.3)
     assert calibration.date == "2026-06-30"
-    (tmp_path / "quay.json").write_text('{"matrix": 3}')
+    (tmp_path / "quay.json").write_text('{"matrix": 3}', encoding="utf-8")
     with pytest.raises(DamagedFileError, match=r"quay.json is not a calibration"):
         Calibration.load(tmp_path / "quay.json")

@@ -17,7 +17,7 @@ from magrl.vehicle.logs import Calibration
 from magrl.vehicle.logs.__main__ import main
 
 ROOT = Path(__file__).parent.parent.parent
-PAGE = (ROOT / "docs" / "logs.md").read_text()
+PAGE = (ROOT / "docs" / "logs.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"```sh\n(.*?)```", PAGE[PAGE.index("## From a raw log to a replay") :], re.DOTALL)[0]
 
 
@@ -84,7 +84,7 @@ def test_a_compass_calibrates_by_the_length_alone(folder: Path, capsys) -> None:
 
 
 def test_a_short_log_is_compared(folder: Path, capsys) -> None:
-    rows = (folder / "raw" / "way.csv").read_text().splitlines()[:200]
-    (folder / "short.csv").write_text("\n".join(rows))
+    rows = (folder / "raw" / "way.csv").read_text(encoding="utf-8").splitlines()[:200]
+    (folder / "short.csv").write_text("\n".join(rows), encoding="utf-8")
     main([str(folder / "short.csv")])
     assert "one reading: no file is written" in capsys.readouterr().out

@@ -236,7 +236,7 @@ for name in ("anywhere", "kalman"):
 
 
 def test_a_pilot_runs_without_torchrl_in_few_calls() -> None:
-    run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
+    run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, encoding="utf-8")
     rows = [line.split() for line in run.stdout.splitlines()]
     assert len(rows) == 2
     for functions, calls, *others in rows:
@@ -392,12 +392,12 @@ def test_a_changed_state_is_refused_and_changes_nothing(tmp_path: Path) -> None:
         each.step(*HERE, 290.0)
         each.step(*SECOND)
     vehicle.save(path)
-    whole = path.read_text()
+    whole = path.read_text(encoding="utf-8")
     jump = json.loads(whole)
     jump["steps"][1]["inclination"] = -73.0
     states = [*map(json.dumps, (*changed(json.loads(whole)), jump)), whole[:-1]]
     for content in states:
-        path.write_text(content)
+        path.write_text(content, encoding="utf-8")
         with pytest.raises(ValueError, match=r"state|date|another|inclination changed"):
             vehicle.restore(path)
     assert len(states) > 200

@@ -17,7 +17,7 @@ ROWS = ("0,15000,1000,48000,350", "1,15100,1100,48100,10", "2,15200,1200,48200,3
 
 def written(folder: Path, *rows: str, header: str = HEADER) -> Path:
     path = folder / "log.csv"
-    path.write_text("\n".join([header, *rows]))
+    path.write_text("\n".join([header, *rows]), encoding="utf-8")
     return path
 
 

@@ -218,7 +218,7 @@ def test_own_errors_in_a_file() -> None:
 )
 def test_files_of_errors_that_are_refused(tmp_path: Path, text: str | None, message: str) -> None:
     if text is not None:
-        (tmp_path / "mine.toml").write_text(text)
+        (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         conditions_named(str(tmp_path / "mine.toml"))
 
