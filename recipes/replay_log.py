@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Literal
 
 from magrl.agents import load_policy
-from magrl.checks import printable
 from magrl.evaluation.tables import markdown_table
 from magrl.field.elements import NAMES
 from magrl.files import check_writable, write_text, write_with
@@ -300,8 +299,7 @@ def main(args: Sequence[str] | None = None) -> None:
     write_with(config.out / "log.csv", table.drop(columns="covariance").to_csv, index=False)
     lines = [markdown(table), "", *notes(table), *(f"Warning: {text}." for text in warnings), ""]
     write_text(config.out / "log.md", "\n".join(lines))
-    drawn = figure(table, printable(f"{config.log.name}: {config.navigator}"))
-    write_with(config.out / "log.png", drawn.savefig, dpi=110)
+    write_with(config.out / "log.png", figure(table, f"{config.log.name}: {config.navigator}").savefig, dpi=110)
     print(*lines, f"The picture is {config.out / 'log.png'}", sep="\n")
 
 

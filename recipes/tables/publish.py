@@ -19,7 +19,6 @@ from magrl.training import UsageError, command
 
 import tyro
 
-Documents = tyro.conf.Positional[tuple[Path, ...]]
 BLOCK = re.compile(r"(<!-- table: ([^\s|]+)(?: \| (.*?))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -65,5 +64,10 @@ def publish(documents: Sequence[Path], root: Path = Path()) -> None:
         write_text(document, text)
 
 
+def main(documents: tyro.conf.Positional[tuple[Path, ...]]) -> None:
+    """Fill documents, such as README.md."""
+    publish(documents)
+
+
 if __name__ == "__main__":
-    command("publish.py", lambda: publish(tyro.cli(Documents, prog="publish.py", description=__doc__)))
+    command("publish.py", lambda: tyro.cli(main, prog="publish.py", description=__doc__))

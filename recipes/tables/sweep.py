@@ -16,7 +16,6 @@ import csv
 import ctypes
 import hashlib
 import itertools
-import multiprocessing
 import os
 import resource
 import shutil
@@ -29,6 +28,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -174,11 +174,10 @@ def recipe(name: str, seed: int, folder: Path) -> list[Row]:
     task, script, *options = RECIPES[name]
     began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     options += ["--seed", str(seed), "--out", str(folder), "--wandb-mode", "disabled"]
-    command_line = [sys.executable, Path(__file__).parent.parent / script, *options]
-    done = subprocess.run(command_line, capture_output=True, preexec_fn=die_with_parent, check=False)
+    line = [sys.executable, Path(__file__).parent.parent / script, *options]
+    done = subprocess.run(line, capture_output=True, encoding="utf-8", preexec_fn=die_with_parent, check=False)
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        raise UsageError(f"{script} ended with status {done.returncode}: {(said or ['no message'])[-1]}")
+        raise UsageError(f"{script} ended with status {done.returncode}: {done.stderr.strip().rpartition(chr(10))[2]}")
     points = [row for row in csv.DictReader(read_text(folder / "train.csv").splitlines()) if row["eval_spl"]]
     names = {"steps": "frames", "SR": "eval_success_rate", "SPL": "eval_spl"}
     rows = [{key: float(point[column]) for key, column in names.items()} for point in points]
@@ -191,26 +190,11 @@ def run(config: Config, task: str, name: str, seed: int) -> Path:
     """Train one run, unless its file exists; return the file."""
     path = config.out / f"{task}-{name}-seed{seed}.csv"
     if not path.exists():
-        torch.set_num_threads(1)
         shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
         rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
         about = {"task": task, "algorithm": name, "seed": seed}
         write_with(path, DataFrame([about | row for row in rows]).round(2).to_csv, index=False)
     return path
-
-
-def train(config: Config, jobs: Sequence[tuple[str, str, int]]) -> None:
-    """Train runs in parallel; an error or Ctrl-C ends all of them."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(config.jobs, spawn, initializer=die_with_parent) as pool:
-        try:
-            for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
-                done.result()
-        except BaseException:
-            for worker in multiprocessing.active_children():
-                worker.kill()
-            raise
 
 
 def planned(config: Config) -> Iterator[tuple[str, str, int]]:
@@ -275,8 +259,10 @@ def main(args: Sequence[str] | None = None) -> None:
     check_writable(config.results / "scores.csv")
     jobs = list(planned(config))
     if config.train:
-        with locked(config.out):
-            train(config, jobs)
+        os.environ["OMP_NUM_THREADS"] = "1"
+        with locked(config.out), ProcessPoolExecutor(config.jobs, get_context("spawn"), die_with_parent) as pool:
+            for done in tqdm(as_completed([pool.submit(run, config, *job) for job in jobs]), total=len(jobs)):
+                done.result()
     paths = [path for job in jobs if (path := config.out / "{}-{}-seed{}.csv".format(*job)).exists()]
     if not paths:
         raise UsageError(f"none of the algorithms {config.algorithms} is trained on {config.tasks}")
