@@ -222,7 +222,7 @@ def draw(
         export.write_tracks(config.export, export.tracks(steps["with_signal"], [title], navigator=navigator))
     if config.animate:
         end = "{outcome}, {navigation_error_km:.1f} km from the destination".format(**measures["without_signal"])
-        write_with(config.animate, write_gif, steps["without_signal"], base.field, base.region, f"{route}: {end}")
+        write_gif(config.animate, steps["without_signal"], base.field, base.region, f"{route}: {end}")
 
 
 def fly(config: Config) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from magrl.envs.regions import one_region
 from magrl.envs.rendering import PATH, START, TARGET, draw_contours
 from magrl.evaluation.episodes import episode_measures, moved
 from magrl.field import FieldModel
+from magrl.files import write_with
 from magrl.geodesy import geodesic, move, polar
 from magrl.tracking import Way
 
@@ -330,7 +331,7 @@ def write_gif(
     palette = Image.fromarray(sample).quantize(GIF_COLORS)  # one for all frames: unchanged pixels compress well
     start, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames)
     durations = [FRAME_MS] * len(others) + [LAST_FRAME_MS]
-    start.save(Path(path), "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+    write_with(Path(path), start.save, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
 
 
 def _frames(

@@ -110,8 +110,8 @@ _TOPICS: Sequence[tuple[str, tuple[tuple[str, ...], Sequence[str], float]]] = (
 
 def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     """Read a log of PX4 (ULog) with pyulog. Times are UTC where GNSS gives it."""
-    content = path.read_bytes()
-    log = package("pyulog", "pyulog").ULog(io.BytesIO(content))
+    with path.open("rb") as file:
+        log = package("pyulog", "pyulog").ULog(file)
     instances = sorted(log.data_list, key=lambda item: item.multi_id)
     topics = {item.name: item.data for item in reversed(instances)}  # the first instance of each
     selected = topics.get("sensor_selection", {}).get("mag_device_id", [None])[-1]
@@ -131,7 +131,7 @@ def read_ulg(path: Path, sensor: str | None = None) -> Recording:
     flags = topics.get("estimator_status_flags", {})
     gnss = np.mean(flags.get("cs_gnss_yaw", flags.get("cs_gps_yaw", 0))) > 0.5  # the heading of two antennas is used
     notes = [] if gnss else [MODEL_NORTH]
-    notes += ["the file is damaged or truncated"] if log.file_corruption or _is_cut(content) else []
+    notes += ["the file is damaged or truncated"] if log.file_corruption or _is_cut(path.read_bytes()) else []
     streams = {column: (time + offset / 1e6, values) for column, (time, values) in recording.streams.items()}
     return Recording(streams, recording.source, "true" if gnss else "model", [*notes, *recording.notes])
 
