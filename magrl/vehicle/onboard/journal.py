@@ -138,7 +138,7 @@ class Fix(Inputs):
     Example:
         >>> Fix(latitude=64.1, longitude=-21.9, std_km=0.0)
         Traceback (most recent call last):
-        raise ValueError("; ".join(dict.fromkeys(map(self._sentence, error.errors())))) from None
+        ValueError: std_km must be greater than 0, got 0.0
     """
 
     latitude: float = Field(ge=-90, le=90)
