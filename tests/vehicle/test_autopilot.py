@@ -141,7 +141,7 @@ class Silent(World):
 
 @pytest.mark.parametrize("unheard", ["speed", "heading", ""])
 def test_the_place_is_in_its_region_where_something_is_not_heard(unheard, tmp_path, caplog) -> None:
-    """But for 4.2 km, which are flown during a reading. Taking the last value as true, it is 16 to 67 km off at 3."""
+    """But for 4.2 km, which are flown during a reading. Taking the last speed as true, it is 35 to 67 km off at 3."""
     board, world, errors = Onboard("kalman", sensor_std=(0.05, 0.05, 20.0), drift=0.01), Silent(noise=5.0), []
     world.unheard = unheard
     board.start(THERE, HERE, date="2026-01-01")
