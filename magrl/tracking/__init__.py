@@ -32,10 +32,6 @@ from magrl.tracking.noise import NoiseEstimate as NoiseEstimate
 from magrl.tracking.noise import noise_estimate as noise_estimate
 from magrl.tracking.observation import OBSERVATION_SIZE as OBSERVATION_SIZE
 from magrl.tracking.observation import track_observation as track_observation
-from magrl.tracking.pilot import Reading as Reading
-from magrl.tracking.pilot import Rules as Rules
-from magrl.tracking.pilot import State as State
-from magrl.tracking.pilot import Track as Track
 from magrl.tracking.pilot import act as act
 from magrl.tracking.pilot import advance as advance
 from magrl.tracking.pilot import begin as begin
@@ -50,6 +46,10 @@ from magrl.tracking.planning import corrected as corrected
 from magrl.tracking.planning import planned_move as planned_move
 from magrl.tracking.planning import sensor_length as sensor_length
 from magrl.tracking.planning import step_price as step_price
+from magrl.tracking.records import Reading as Reading
+from magrl.tracking.records import Rules as Rules
+from magrl.tracking.records import State as State
+from magrl.tracking.records import Track as Track
 from magrl.tracking.search import VISITED as VISITED
 from magrl.tracking.search import arrival_ellipse as arrival_ellipse
 from magrl.tracking.search import arrival_weights as arrival_weights

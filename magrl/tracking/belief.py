@@ -138,23 +138,22 @@ class Innovation(NamedTuple):
         return (self.residual.unsqueeze(-2) @ inverse3(self.covariance) @ self.residual.unsqueeze(-1)).squeeze((-2, -1))
 
 
-def start(reading: Tensor, errors: SensorStd, heading: Tensor | None = None, crust_nt: float = 0.0) -> Belief:
+def start(reading: Tensor, errors: SensorStd, heading: Tensor | None = None) -> Belief:
     """Return the belief after a first reading.
 
     Args:
         reading: ``(..., 3)``: D [deg], I [deg], B_H [nT].
         errors: accuracy of the readings, tensors ``(..., 3)``.
         heading: ``(...)`` [rad, clockwise from true north]; None without errors that turn with the vehicle.
-        crust_nt: standard deviation of the crust's field in each axis [nT].
 
     Example:
         >>> start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.zeros(3))).covariance.shape
         torch.Size([28, 28])
     """
-    return read(before(reading, errors, crust_nt), reading, torch.as_tensor(errors.noise), heading)
+    return read(before(reading, errors), reading, torch.as_tensor(errors.noise), heading)
 
 
-def before(near: Tensor, errors: SensorStd, crust_nt: float = 0.0, model: EarthModel | None = None) -> Belief:
+def before(near: Tensor, errors: SensorStd, model: EarthModel | None = None) -> Belief:
     """Return the belief before any reading, where the elements are about ``near``; other arguments as :func:`start`.
 
     Where the constant error of D has no limit (infinite), the vehicle has no true north, and D does not count.
@@ -164,7 +163,6 @@ def before(near: Tensor, errors: SensorStd, crust_nt: float = 0.0, model: EarthM
     Args:
         near: ``(..., 3)``: D [deg], I [deg], B_H [nT].
         errors: accuracy of the readings, tensors ``(..., 3)``.
-        crust_nt: standard deviation of the crust's field in each axis [nT].
         model: model of the Earth, whose places are the prior; the spectrum of random planets without one.
 
     Example:
@@ -187,10 +185,10 @@ def before(near: Tensor, errors: SensorStd, crust_nt: float = 0.0, model: EarthM
     scale[..., -1] = torch.where(magnetic, 1.0, radii(latitude[..., 0])[0])  # radians of latitude to kilometers
     covariance = covariance * scale.unsqueeze(-1) * scale.unsqueeze(-2)
     place = torch.cat((latitude, torch.full_like(latitude, math.nan)), -1)
-    return _with_errors(mean[..., :-1], covariance, place, errors, crust_nt)
+    return _with_errors(mean[..., :-1], covariance, place, errors)
 
 
-def at_place(place: Tensor, place_km: float, errors: SensorStd, motion: Motion, crust_nt: float = 0.0) -> Belief:
+def at_place(place: Tensor, place_km: float, errors: SensorStd, motion: Motion) -> Belief:
     """Return the belief before any reading at a place that is known, by a model of the Earth.
 
     Args:
@@ -198,7 +196,6 @@ def at_place(place: Tensor, place_km: float, errors: SensorStd, motion: Motion, 
         place_km: its root mean square error [km].
         errors: accuracy of the readings, tensors ``(..., 3)``.
         motion: with a model.
-        crust_nt: standard deviation of the crust's field in each axis [nT].
     """
     assert motion.model is not None
     place = place.double()
@@ -209,13 +206,13 @@ def at_place(place: Tensor, place_km: float, errors: SensorStd, motion: Motion, 
     covariance = covariance + pad(motion.model.error.to(mean), (0, 2, 0, 2))
     drift = torch.eye(2).to(mean) * motion.drift**2
     joint = pad(covariance, (0, 2, 0, 2)) + pad(drift, (DRIFT.start, 0, DRIFT.start, 0))
-    return _with_errors(mean, joint, place, errors, crust_nt)
+    return _with_errors(mean, joint, place, errors)
 
 
-def _with_errors(mean: Tensor, covariance: Tensor, place: Tensor, errors: SensorStd, crust_nt: float) -> Belief:
+def _with_errors(mean: Tensor, covariance: Tensor, place: Tensor, errors: SensorStd) -> Belief:
     """Return a belief whose first states have a mean and a covariance, and the others those of the sensors."""
     constant, anomaly, iron = (
-        kind.expand(*mean.shape[:-1], 3, 3) for kind in lasting_covariances(mean[..., :3], errors, crust_nt)
+        kind.expand(*mean.shape[:-1], 3, 3) for kind in lasting_covariances(mean[..., :3], errors)
     )
     variances = sum(
         pad(kind, (part.start, STATES - part.stop) * 2)
@@ -231,7 +228,7 @@ def moved(
     course: Tensor,
     errors: SensorStd = PERFECT,
     motion: Motion = STILL,
-    crust_nt: float = 0.0,
+    crust_nt: Tensor | float = 0.0,
 ) -> Belief:
     """Return the belief after a move, before the reading at its end.
 
@@ -241,7 +238,7 @@ def moved(
         course: ``(...)`` at the start of the move [rad, clockwise from north].
         errors: accuracy of the readings, tensors ``(..., 3)``.
         motion: errors of dead reckoning, and the model of the Earth, where the place is known.
-        crust_nt: standard deviation of the crust's field in each axis [nT].
+        crust_nt: ``(...)`` standard deviation of the crust's field in each axis [nT].
 
     Example:
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd(torch.tensor([0.05, 0.05, 5.0])))
@@ -263,10 +260,11 @@ def moved(
     rise = turn.sin * cos - turn.cos * sin  # sine of the change of the latitude
     after = belief.latitude + torch.rad2deg(rise * (1 + rise * rise / 6))
     kept, ones = torch.exp(-distance / ANOMALY_KM).unsqueeze(-1), torch.ones_like(belief.mean)
-    parts = 0 * ones[..., :COEFFICIENTS], turn.rate.unsqueeze(-1), ones[..., COEFFICIENTS + 1 : ANOMALY.start]
-    step = torch.diag_embed(torch.cat((*parts, kept * ones[..., ANOMALY], ones[..., IRON]), -1))
+    step = torch.cat((0 * ones[..., :COEFFICIENTS], ones[..., COEFFICIENTS:]), -1)
+    step[..., COEFFICIENTS], step[..., ANOMALY] = turn.rate, kept.expand_as(step[..., ANOMALY])
+    step = torch.diag_embed(step)
     rest = STATES - COEFFICIENTS
-    step = step + pad(torch.cat((matrix, column), -1), (0, rest - 1, 0, rest))
+    step = step + pad(torch.cat((matrix.expand(*column.shape[:-1], COEFFICIENTS), column), -1), (0, rest - 1, 0, rest))
     spread = pad(closure().drift.to(step), (0, rest, 0, rest)) * (distance / UNIT_KM).square()[..., None, None]
     fresh = (1 - kept.square()).unsqueeze(-1) * lasting_covariances(belief.field, errors, crust_nt)[1]
     fresh = pad(fresh, (ANOMALY.start, STATES - ANOMALY.stop) * 2)
@@ -309,7 +307,7 @@ def _moved_by_model(
     lever = torch.cat((slope_end, torch.eye(2).to(slope_end).expand(*slope_end.shape[:-2], 2, 2)), -2)
     wander = pad(lever @ lever.mT, (0, STATES - PLACE.stop) * 2) * (motion.wander_km**2 * far)
     covariance = step @ belief.covariance @ step.mT + spread * model.share + after.covariance + wander
-    return settled(Belief(mean, covariance, end))
+    return Belief(mean, covariance, end)
 
 
 def settled(belief: Belief) -> Belief:
@@ -371,7 +369,7 @@ def innovation(
     rows = pad(jacobian, (0, COEFFICIENTS - 3))
     if errors:
         own, course = (
-            torch.diag_embed(present.double()),
+            torch.diag_embed(present.double()).expand_as(jacobian),
             torch.zeros_like(reading[..., 0]) if heading is None else heading,
         )
         turn = turning(torch.cos(course.double()), torch.sin(course.double()), 1)  # forward, right, down
@@ -396,7 +394,7 @@ def updated(belief: Belief, new: Innovation) -> Belief:
     gain = cross @ inverse3(new.covariance)
     mean = belief.mean + (gain @ new.residual.unsqueeze(-1)).squeeze(-1)
     covariance = belief.covariance - gain @ cross.mT
-    return settled(Belief(mean, (covariance + covariance.mT) / 2, belief.place))  # else, what is not symmetric grows
+    return Belief(mean, (covariance + covariance.mT) / 2, belief.place)  # else, what is not symmetric grows
 
 
 def read(belief: Belief, reading: Tensor, sensor_std: Tensor, heading: Tensor | None = None) -> Belief:
@@ -413,17 +411,17 @@ def read(belief: Belief, reading: Tensor, sensor_std: Tensor, heading: Tensor | 
         >>> read(belief, torch.tensor([3.0, 65.0, 18000.0]), torch.tensor([0.05, 0.05, 5.0])).field.round()
         tensor([17975.,   942., 38601.], dtype=torch.float64)
     """
-    return updated(belief, innovation(belief, reading, sensor_std, heading))
+    return settled(updated(belief, innovation(belief, reading, sensor_std, heading)))
 
 
-def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: float = 0.0) -> Belief:
+def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: Tensor | float = 0.0) -> Belief:
     """Return the belief given the true elements of the place, which have none of the errors of a reading.
 
     Args:
         belief: that before.
         elements: ``(..., 3)``: D [deg], I [deg], B_H [nT], of a map or a pier.
         std: ``(..., 3)`` their standard deviation.
-        crust_nt: standard deviation of the crust's field in each axis [nT], where the map has none.
+        crust_nt: ``(...)`` the same of the crust's field in each axis [nT], where the map has none.
 
     Example:
         >>> here = torch.tensor([3.0, 65.0, 18000.0])
@@ -433,7 +431,7 @@ def known(belief: Belief, elements: Tensor, std: Tensor, crust_nt: float = 0.0) 
         tensor([0.8000, -0.0000, 0.2000], dtype=torch.float64)
     """
     new = innovation(belief, elements, std, errors=False)
-    crust = crust_nt**2 * new.rows[..., :3] @ new.rows[..., :3].mT
+    crust = torch.as_tensor(crust_nt)[..., None, None].square() * new.rows[..., :3] @ new.rows[..., :3].mT
     return updated(belief, new._replace(covariance=new.covariance + crust))
 
 

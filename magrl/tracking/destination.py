@@ -22,10 +22,11 @@ from magrl.checks import check_number, check_tensor
 from magrl.field.elements import field_vector
 from magrl.geodesy import geodesic
 from magrl.sensor_std import PERFECT, SensorStd
+from magrl.tracking.anomalies import crust_correlation, crust_share
 from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief
 from magrl.tracking.harmonics import UNIT_KM, constant, powers, turning
-from magrl.tracking.local import COEFFICIENTS, inverse3, levers, monomial_rows, unturned
-from magrl.tracking.prior import DEGREE, HIGHEST, closure, lasting_covariances
+from magrl.tracking.local import COEFFICIENTS, levers, monomial_rows, unturned
+from magrl.tracking.prior import DEGREE, HIGHEST, closure
 from magrl.tracking.way import DestinationPosterior, Way
 
 RANGE_KM = 400.0
@@ -38,7 +39,6 @@ _LEAST_NT = 1.0  # horizontal field whose direction is north
 _LEAST_KM = 0.1  # standard deviation of the points around the mode
 _LEAST_WEIGHT = 1e-12  # below, products of weights would be denormal numbers, which are slow
 _STEPS = 5  # of the search for the mode
-_CRUST = 0.1  # correlation length of the crust's field [unit]
 _DIFFERENCE_KM = 1.0  # of the derivatives of the predicted field there
 
 
@@ -50,9 +50,9 @@ class Destination(NamedTuple):
             too, is part of the field.
         field: ``(..., 3)`` at the destination, in the axes there.
         range: prior standard deviation of the displacement along each axis.
-        noise: variance of the field in each axis that the belief does not know.
-        crust: standard deviation of the crust's field in each axis.
-        share: ``(..., 3, 3)`` of the anomaly that is crust; None without a crust.
+        noise: ``(...)`` variance of the field in each axis that the belief does not know, that of the given elements.
+        crust: ``(...)`` standard deviation of the crust's field in each axis.
+        share: ``(..., 3, 3)`` of the anomaly that is crust; 0 between places.
         between: displacement between the places of vehicle and destination, where both are known.
 
     Example:
@@ -63,26 +63,27 @@ class Destination(NamedTuple):
     belief: Belief
     field: Tensor
     range: float
-    noise: float
-    crust: float = 0.0
-    share: Tensor | None = None
+    noise: Tensor
+    crust: Tensor
+    share: Tensor
     between: Way | None = None
 
     def noise_at(self, square: Tensor) -> Tensor:
         """Return the variance of the field in each axis that the belief does not know, at squared distances [unit^2].
 
-        The crust's field there differs from that here by ``2 (1 - rho)`` of its variance, with the correlation ``rho =
-        exp(-d^2 / (2 * (100 km)^2))`` of WMMHR.
+        The crust's field there differs from that here by ``2 (1 - rho)`` of its variance, with their correlation rho.
         """
-        return self.noise + 2 * self.crust**2 * (1 - torch.exp(-square / (2 * _CRUST**2)))
+        noise, crust = (part.to(square).unsqueeze(-1) for part in (self.noise, 2 * self.crust.square()))
+        return noise + crust * (1 - crust_correlation(square))
 
 
 def destination(
     belief: Belief,
     elements: Tensor,
     range_km: float,
-    crust_nt: float = 0.0,
+    crust_nt: Tensor | float = 0.0,
     errors: SensorStd = PERFECT,
+    std: Tensor | None = None,
     place: Tensor | None = None,
     place_km: float = 0.0,
 ) -> Destination:
@@ -92,33 +93,44 @@ def destination(
         belief: what is known of the field.
         elements: ``(..., 3)``: D [deg], I [deg], B_H [nT] at the destination.
         range_km: prior standard deviation of the way along each axis [km].
-        crust_nt: standard deviation of the crust's field in each axis [nT].
+        crust_nt: ``(...)`` standard deviation of the crust's field in each axis [nT].
         errors: accuracy of the readings, tensors ``(..., 3)``.
+        std: ``(3,)`` standard deviations of the elements; 0 by default.
         place: ``(..., 2)`` latitude, longitude [deg] of the destination, where that is known and the vehicle knows its
-            own; the elements then do not count, as they would add the error of the model from which they are.
+            own; the elements count before (:func:`~magrl.tracking.survey.surveyed`).
         place_km: its root mean square error [km].
 
     Example:
         >>> from magrl.tracking.belief import start
         >>> belief = start(torch.tensor([3.0, 65.0, 18000.0]), SensorStd())
         >>> destination(belief, torch.tensor([3.0, 66.0, 17500.0]), 300.0).noise
-        4.0
+        tensor(4., dtype=torch.float64)
     """
     check_tensor(3, elements=elements)
     check_number(0, above=True, range_km=range_km)
-    share, between = None, None
+    field, crust, between = field_vector(elements.double()), torch.as_tensor(crust_nt).to(belief.mean), None
+    noise, share = torch.full_like(crust, MODEL_NT**2), torch.zeros_like(belief.covariance[..., :3, :3])
     if place is not None:
         distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
         apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
         between = Way(apart, belief.covariance[..., PLACE, PLACE] + torch.eye(2).to(apart) * (place_km**2 / 2))
-    elif crust_nt > 0:
-        share = crust_nt**2 * inverse3(lasting_covariances(belief.field, errors, crust_nt)[1])
+    else:
+        noise, share = noise + _variance(field, std), crust_share(belief.field, errors, crust)
         step = torch.diag_embed(torch.ones_like(belief.mean))
         step[..., :3, ANOMALY] = share
         mean = (step @ belief.mean.unsqueeze(-1)).squeeze(-1)
         belief = Belief(mean, step @ belief.covariance @ step.mT, belief.place)
-    field = field_vector(elements.double())
-    return Destination(belief, field, range_km / UNIT_KM, MODEL_NT**2, crust_nt, share, between)
+    return Destination(belief, field, range_km / UNIT_KM, noise, crust, share, between)
+
+
+def _variance(field: Tensor, std: Tensor | None) -> Tensor:
+    """Return the mean variance ``(...)`` of a field in its axes [nT^2] that is given by elements of an accuracy."""
+    if std is None:
+        return torch.zeros_like(field[..., 0])
+    x, y, z = field.unbind(-1)
+    level = x * x + y * y
+    d, i, h = (std.to(field).square() * std.new_tensor((math.pi / 180, math.pi / 180, 1)).to(field).square()).unbind(-1)
+    return (level * d + (level + z * z).square() / level * i + (1 + z * z / level) * h) / 3
 
 
 def log_density(goal: Destination, points: Tensor) -> Tensor:
@@ -296,9 +308,9 @@ def _around(count: int) -> tuple[Tensor, Tensor, Tensor]:
 def _log_density(goal: Destination, points: Tensor, moments: _Moments) -> Tensor:
     """Return :func:`log_density` at displacements ``(..., M, 2)`` [unit], given the moments there."""
     residual, covariance = _covariance(goal, points, moments)
-    inverse, volume = _inverse(covariance)
+    inverse, volume = _inverse(covariance, MODEL_NT**6)  # the least volume, but for rounding
     square = _quadratic(inverse, residual, residual) + points.square().sum(-1) / goal.range**2
-    return -(square + volume.clamp_min(goal.noise**3).log()) / 2  # the least volume, but for rounding
+    return -(square + volume.log()) / 2
 
 
 def _covariance(goal: Destination, points: Tensor, moments: _Moments) -> tuple[Tensor, list[Tensor]]:
@@ -338,7 +350,7 @@ def _without_declination(
     along = torch.hypot(*goal.field[..., :2].to(mean).unbind(-1)).unsqueeze(-1) - level
     other = cos * cos * xx + 2 * cos * sin * xy + sin * sin * yy, none, cos * xz + sin * yz
     magnetic = goal.belief.magnetic.unsqueeze(-1)
-    turned = [*other, none + goal.noise, none, zz]
+    turned = [*other, none + goal.noise.to(none).unsqueeze(-1), none, zz]
     residual = torch.where(magnetic.unsqueeze(-1), torch.stack((along, none, residual[..., 2, :]), -2), residual)
     return residual, [torch.where(magnetic, new, old) for new, old in zip(turned, covariance, strict=True)]
 
@@ -356,11 +368,11 @@ def _carried(goal: Destination, points: Tensor, heading: Tensor | None = None) -
     return torch.stack((x, y, z), -2), slope
 
 
-def _inverse(entries: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
-    """Return the six entries of the inverses of symmetric matrices, and their determinants."""
+def _inverse(entries: Sequence[Tensor], least: float = 0.0) -> tuple[list[Tensor], Tensor]:
+    """Return the six entries of the inverses of covariances, and their determinants, at least some number."""
     a, b, c, d, e, f = entries
     minors = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
-    determinant = a * minors[0] + b * minors[1] + c * minors[2]
+    determinant = (a * minors[0] + b * minors[1] + c * minors[2]).clamp_min(least)
     return [minor / determinant for minor in minors], determinant
 
 

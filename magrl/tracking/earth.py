@@ -28,6 +28,9 @@ SPREAD_YEARS = 20.0
 """Least age of a model in the prior of a vehicle that knows no place [years]: places far apart are joined to one normal
 distribution, which is too sure where the places that fit are few. Set on the tasks of table
 known, to the age of the model beside it."""
+LEAST_NT = 20.0
+"""Least standard deviation of the error of a model in each axis at the ground [nT]: currents above the Earth, and what
+the crust has at long wavelengths; chosen."""
 HIGHEST_LATITUDE = 78.0
 """Latitude up to which these are [deg]."""
 
@@ -163,6 +166,13 @@ NEWEST = "IGRF-14"
 _LAST = {"IGRF-13": 2020.0, "IGRF-14": 2025.0}  # epochs after which the change is predicted
 
 
+def _at_the_ground(variance: Tensor) -> Tensor:
+    """Return mean square errors of Gauss coefficients by degree, scaled so that the field's error is not below
+    :data:`LEAST_NT`."""
+    square = local_covariance(variance, DEGREE).diagonal()[:3].mean()
+    return variance * (LEAST_NT**2 / square).clamp_min(1)
+
+
 @lru_cache(maxsize=8)
 def _model(name: str, year: float, altitude_km: float) -> EarthModel:
     if name in _LAST:
@@ -172,10 +182,12 @@ def _model(name: str, year: float, altitude_km: float) -> EarthModel:
         return EarthModel(
             name,
             IGRF(year, generation=int(name[-2:]), altitude_km=altitude_km),
-            secular_variance(ahead, predicted=True),
+            _at_the_ground(secular_variance(ahead, predicted=True)),
         )
     date = float(name.removeprefix("IGRF-"))
-    return EarthModel(name, IGRF(date, altitude_km=altitude_km), secular_variance(max(year - date, 0.5)))
+    return EarthModel(
+        name, IGRF(date, altitude_km=altitude_km), _at_the_ground(secular_variance(max(year - date, 0.5)))
+    )
 
 
 def earth_model(model: EarthModel | str, date: Date, altitude_km: float = 0.0) -> EarthModel:
@@ -192,7 +204,7 @@ def earth_model(model: EarthModel | str, date: Date, altitude_km: float = 0.0) -
 
     Example:
         >>> [round(earth_model(name, "2025-01-01").error_nt) for name in ("IGRF-14", "IGRF-13", "IGRF-2005")]
-        [1, 110, 1601]
+        [35, 110, 1601]
     """
     if isinstance(model, EarthModel):
         return model

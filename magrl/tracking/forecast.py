@@ -10,7 +10,7 @@ from torch import Tensor
 
 from magrl.field.elements import elements_jacobian
 from magrl.sensor_std import SensorStd
-from magrl.tracking.belief import ANOMALY_KM, DRIFT, PLACE
+from magrl.tracking.belief import ANOMALY_KM, DRIFT, MODEL_NT, PLACE
 from magrl.tracking.destination import _DIFFERENCE_KM, _ENTRIES, Destination, _carried, _inverse, _with_latitude
 from magrl.tracking.harmonics import UNIT_KM, powers, turning
 from magrl.tracking.local import COEFFICIENTS, TERMS, inverse2, inverse3, levers, monomial_rows, slopes, unturned
@@ -124,15 +124,14 @@ def _readings(goal: Destination, moves: Tensor, errors: SensorStd, readings: Ten
     drift = (jacobian @ slope) * (distance * UNIT_KM)[..., None, None]
     kept = torch.exp(-distance * (UNIT_KM / ANOMALY_KM))[..., None, None]
     anomaly = kept * jacobian
-    if goal.share is not None:  # is part of the field
-        anomaly = anomaly - rows[..., :3] @ goal.share.to(moves).unsqueeze(-3)
+    anomaly = anomaly - rows[..., :3] @ goal.share.to(moves).unsqueeze(-3)  # is part of the field
     own = torch.diag_embed(present.to(rows)).unsqueeze(-3).expand(*rows.shape[:-1], 3)
     ahead = moves / (distance * count).clamp_min(1e-9).unsqueeze(-1)  # readings turn with the vehicle between them
     iron = jacobian @ turning(ahead[..., 0], ahead[..., 1], 1)
     white = torch.where(present, noise, 1.0).square().unsqueeze(-2) / count.unsqueeze(-1)
     new = lasting_covariances(belief.field, errors, goal.crust)[1].to(moves).unsqueeze(-3)
     fresh = (1 - kept.square()) * (jacobian @ new @ jacobian.mT)  # a missing element has none
-    noise = torch.diag_embed(white) + fresh + goal.noise * jacobian @ jacobian.mT
+    noise = torch.diag_embed(white) + fresh + MODEL_NT**2 * jacobian @ jacobian.mT
     place = torch.stack((turned, torch.zeros_like(turned)), -1)
     return torch.cat((rows, place, drift, own, anomaly, iron), -1), noise
 

@@ -62,7 +62,7 @@ def save_pilot(path: Path | str, rules: Rules, network: nn.Module | None) -> Non
         raise TypeError(f"the network of a pilot must be one of correction_network, got {type(network).__name__}")
     weights = {key: value for key, value in network.state_dict().items() if isinstance(value, Tensor)}
     num_cells = [layer.out_features for layer in network if isinstance(layer, nn.Linear)][:-1]
-    plain = rules.model_dump(exclude={"model", "start_km", "target_km"})
+    plain = rules.model_dump(exclude={"model", "start_km", "target_km", "target_std"})
     content = {"format": FILE_FORMAT, "rules": plain, "num_cells": num_cells, "weights": weights}
     save_tensors(content, Path(path))
 

@@ -3,10 +3,11 @@
 :func:`begin` and :func:`advance` keep the record, :func:`act` chooses the move, and all three are pure functions: the
 same ones run in simulation, on board and in training. A step in ten lines::
 
-    belief = moved(belief, distance, heading, std, motion)          # dead reckoning of the field and the place
-    new = innovation(belief, field, std.noise)                      # the reading minus its prediction
+    beliefs = moved(beliefs, distance, heading, std, motion)        # dead reckoning of the field and the place
+    new = innovation(beliefs, field, std.noise)                     # the reading minus its prediction
     noise = noise_estimate(noise, new, std.noise)                   # is the stated noise right, is this a spike?
-    belief = updated(belief, innovation(..., std.noise * noise.factor))
+    beliefs = updated(beliefs, innovation(..., std.noise * noise.factor))
+    belief = mixture(beliefs, reweighed(log_weight, new))           # how large are anomalies here?
     goal = destination(belief, target)                              # where are its elements, or its place?
     posterior = posterior(goal)
     aim = unvisited(posterior.way(), visited, ellipse)              # not where the vehicle has been
@@ -19,24 +20,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Literal, NamedTuple
 
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor
 from torch.nn.functional import pad
 
-from magrl.checks import CheckedModel
 from magrl.field.elements import element_difference
 from magrl.geodesy import geodesic, steer
 from magrl.sensor_std import SensorStd
+from magrl.tracking import anomalies
 from magrl.tracking.belief import (
     PLACE,
     STATES,
     Belief,
     Innovation,
-    LocalElements,
-    Motion,
     at_place,
     before,
     elements,
@@ -46,177 +43,21 @@ from magrl.tracking.belief import (
     updated,
 )
 from magrl.tracking.decision import ArrivalDecision, Trip, approach, arrival_decision
-from magrl.tracking.destination import RANGE_KM, Destination, destination, posterior
-from magrl.tracking.earth import EarthModel
+from magrl.tracking.destination import Destination, destination, posterior
 from magrl.tracking.local import COEFFICIENTS, slopes
 from magrl.tracking.noise import NoiseEstimate, noise_estimate, spike_factor
 from magrl.tracking.observation import track_observation, turned
-from magrl.tracking.planning import CAUTION, STEP_PRICE, corrected, planned_move, step_price
+from magrl.tracking.planning import corrected, planned_move, step_price
+from magrl.tracking.records import Reading, Rules, State, Track
 from magrl.tracking.search import VISITED, arrival_ellipse, arrival_weights, unvisited, unvisited_yet, visit
-from magrl.tracking.way import DestinationPosterior, Way
+from magrl.tracking.survey import surveyed
+from magrl.tracking.way import Way
 
 PRICE_KM = 300.0
 """Way that counts as 100 % in the price of a step [km]."""
 FIRST = 2.0
 """Factor of the noise of the first reading, from which latitude and slopes are expected: it may be a spike. Chosen on
 random planets, with 7 % of spikes and without."""
-FARTHEST_START_KM = 100.0
-"""Largest error of a known start [km]: over longer distances, the field is not linear in the place."""
-
-
-class Rules(CheckedModel):
-    """What a vehicle knows before it starts: its limits, the rule of arrival, and what it expects of the field.
-
-    Args:
-        max_move_km: longest move [km].
-        max_turn_rad: largest turn before a move [rad].
-        max_steps: step limit.
-        zeta: arrival threshold on the objective.
-        arrival: what ends the episode: the objective or the distance, with a signal at each step, or a declaration by
-            the vehicle.
-        radius_km: distance from the destination that counts as arrived, but by the objective [km].
-        confidence: least probability of a correct declaration; below it, episodes end without one.
-        range_km: prior standard deviation of the displacement to the destination along each axis [km].
-        crust_nt: standard deviation of the field of the crust in each axis [nT].
-        step_price: price of a step [% of SPL]: a higher one gives fewer steps and a longer path.
-        caution: weight of the uncertainty in the plan.
-        model: model of the Earth that the vehicle carries (:func:`~magrl.tracking.earth_model`); None for no other
-            knowledge than the spectrum of the Earth's field.
-        start_km: root mean square error of the place where it starts, with a model [km]; None where it does not know
-            its place.
-        target_km: the same of the destination's place; None where it knows the elements alone.
-        drift: constant drift of dead reckoning along each axis [share of the way].
-        wander_km: random part of it along each axis after 1 km [km].
-
-    Raises:
-        ValueError: for a value out of its range, or an unknown name.
-
-    Example:
-        >>> Rules(max_steps=80).replace(arrival="declared").signaled
-        False
-    """
-
-    max_move_km: Annotated[float, Field(gt=0)] = 50.0
-    max_turn_rad: Annotated[float, Field(gt=0, le=math.pi)] = math.pi / 2
-    max_steps: Annotated[int, Field(ge=1)] = 50
-    zeta: Annotated[float, Field(gt=0)] = 0.01
-    arrival: Literal["objective", "distance", "declared"] = "objective"
-    radius_km: Annotated[float, Field(gt=0)] = 25.0
-    confidence: Annotated[float, Field(ge=0, le=1)] = 0.0
-    range_km: Annotated[float, Field(gt=0)] = RANGE_KM
-    crust_nt: Annotated[float, Field(ge=0)] = 0.0
-    step_price: Annotated[float, Field(gt=0)] = STEP_PRICE
-    caution: Annotated[float, Field(ge=0)] = CAUTION
-    model: EarthModel | None = None
-    start_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
-    target_km: Annotated[float | None, Field(ge=0)] = None
-    drift: Annotated[float, Field(ge=0, le=1)] = 0.0
-    wander_km: Annotated[float, Field(ge=0)] = 0.0
-
-    @model_validator(mode="after")
-    def _check_places(self) -> Rules:
-        if self.start_km is not None and self.model is None:
-            raise ValueError(
-                f"start_km {self.start_km:g} needs a model of the Earth: model=earth_model('IGRF-14', date)"
-            )
-        if self.target_km is not None and self.start_km is None:
-            raise ValueError(
-                f"target_km {self.target_km:g} needs start_km: without its own place, a vehicle compares elements"
-            )
-        return self
-
-    @property
-    def motion(self) -> Motion:
-        """How place and field go on."""
-        return Motion(self.model if self.start_km is not None else None, self.drift, self.wander_km)
-
-    @property
-    def signaled(self) -> bool:
-        """Whether the vehicle is told of its arrival, so that the destination is not where it has been."""
-        return self.arrival != "declared"
-
-
-class Reading(NamedTuple):
-    """What a vehicle measures and knows at one step.
-
-    Args:
-        field: ``(..., 3)`` D [deg], I [deg], B_H [nT] as read; NaN for an element that is missing.
-        target: ``(..., 3)`` the same at the destination.
-        distance: ``(...)`` of the move before the reading [km].
-        heading: ``(...)`` [rad].
-        std: accuracy of the reading, tensors ``(..., 3)``.
-        step: ``(...)`` number of the step, 0 at the start.
-        known: ``(..., 3)`` elements at the start, where they are known; they count at the first reading.
-        known_std: ``(..., 3)`` their standard deviations.
-        price: ``(...)`` price of a step [% of SPL] of each vehicle; None for that of the rules.
-        place: ``(..., 2)`` latitude, longitude [deg] of the start, where it is known; it counts at the first reading.
-        target_place: ``(..., 2)`` the same of the destination.
-        leg_std: ``(..., 2)`` standard deviations of the move, along and across it, beside the drift of the rules [km].
-    """
-
-    field: Tensor
-    target: Tensor
-    distance: Tensor
-    heading: Tensor
-    std: SensorStd
-    step: Tensor
-    known: Tensor | None = None
-    known_std: Tensor | None = None
-    price: Tensor | None = None
-    place: Tensor | None = None
-    target_place: Tensor | None = None
-    leg_std: Tensor | None = None
-
-
-class State(NamedTuple):
-    """What a step needs of the one before, all tensors: the belief ``(..., S)``, ``(..., S, S)``, ``(..., 2)``; the
-    noise estimate ``(..., 3)`` twice; displacements to visited places ``(..., 24, 2)`` [km]; weights of the objective
-    ``(..., 3)``; the path flown ``(...)`` and the displacement from the start ``(..., 2)`` [km]; and the angle of north
-    ``(...)``, from that of the belief to that of the headings [rad]: D, where a compass and a place are known."""
-
-    mean: Tensor
-    covariance: Tensor
-    place: Tensor
-    log_ratio: Tensor
-    readings: Tensor
-    visited: Tensor
-    weights: Tensor
-    path: Tensor
-    home: Tensor
-    north: Tensor
-
-    @property
-    def belief(self) -> Belief:
-        """The belief of the field."""
-        return Belief(self.mean, self.covariance, self.place)
-
-    @property
-    def noise(self) -> NoiseEstimate:
-        """The noise over the stated one."""
-        return NoiseEstimate(self.log_ratio, self.readings)
-
-
-class Track(NamedTuple):
-    """What a vehicle knows after a reading.
-
-    Attributes:
-        state: what the next step needs.
-        posterior: of the displacement to the destination.
-        way: its mean and covariance [km].
-        local: elements and gradients at the vehicle.
-        aim: ``(..., 2)`` displacement to aim at [km]: the mean, or where it has not been.
-        plan: ``(..., 2)`` displacement of the next move as planned [km].
-        surprise: ``(...)`` normalized square of the innovation by the stated noise, over the number of elements; about
-            1 where all is right.
-    """
-
-    state: State
-    posterior: DestinationPosterior
-    way: Way
-    local: LocalElements
-    aim: Tensor
-    plan: Tensor
-    surprise: Tensor
 
 
 def begin(rules: Rules, reading: Reading) -> Track:
@@ -250,44 +91,70 @@ def step(rules: Rules, state: State, reading: Reading) -> Track:
 
     started, later = _started(rules, reading), _advanced(rules, state, reading)
     state = State(*map(chosen, started[0], later[0]))
-    return _estimated(rules, reading, state, chosen(started[1], later[1]))
+    return _estimated(rules, reading, state, *(chosen(*parts) for parts in zip(started[1:], later[1:], strict=True)))
 
 
-def _started(rules: Rules, reading: Reading) -> tuple[State, Tensor]:
-    """Return the state at the first reading, and no surprise."""
-    field, crust = reading.field, rules.crust_nt
-    none = torch.zeros_like(field, dtype=torch.float64)
+def _started(rules: Rules, reading: Reading) -> tuple[State, Tensor, Tensor]:
+    """Return the state at the first reading, no surprise, and the tail probability of the reading."""
+    field, none = reading.field, torch.zeros_like(reading.field, dtype=torch.float64)
+    beliefs, log_weight = _first_beliefs(rules, reading), anomalies.prior_weights(field)
+    north = _declination(anomalies.mixture(beliefs, log_weight), reading)
+    seen = _side_by_side(_true(reading, north))
+    first = FIRST * seen.std.noise
+    new = innovation(beliefs, seen.field, first, seen.heading)
+    wide = spike_factor(new, first)
+    beliefs = updated(beliefs, innovation(beliefs, seen.field, first * wide, seen.heading))
+    beliefs = anomalies.recentered(beliefs, log_weight)
+    weights, home, quiet = arrival_weights(field, reading.target, rules.zeta), none[..., :2], 0 * beliefs.mean[..., :3]
+    after, tail = anomalies.mixture(beliefs, log_weight), anomalies.tail(log_weight, new)
+    rest = quiet, quiet, unvisited_yet(field), weights, home[..., 0], home, _declination(after, reading)
+    return State(beliefs.mean, beliefs.covariance, after.place, log_weight, *rest), none[..., 0], tail
+
+
+def _first_beliefs(rules: Rules, reading: Reading) -> Belief:
+    """Return the beliefs before the first reading."""
     if rules.start_km is not None and rules.model is not None:
         if reading.place is None:
             raise ValueError(f"start_km {rules.start_km:g} needs the place of the start, as KnownPlace writes it")
-        belief = at_place(reading.place, rules.start_km, reading.std, rules.motion, crust)
-    elif reading.known is None or reading.known_std is None:
-        belief = before(field, reading.std, crust, rules.model)
-    else:
-        belief = before(reading.known, reading.std, crust, rules.model)
-        belief = known(belief, reading.known, reading.known_std, crust)
-    seen = _true(reading, _declination(belief, reading))
-    belief = updated(belief, innovation(belief, field, FIRST * seen.std.noise, seen.heading))
-    weights, home = arrival_weights(field, reading.target, rules.zeta), none[..., :2]
-    north = _declination(belief, reading)
-    return State(*belief, none, none, unvisited_yet(field), weights, home[..., 0], home, north), none[..., 0]
+        belief = at_place(reading.place, rules.start_km, reading.std, rules.motion)
+        return anomalies.side_by_side(belief, reading.std)
+    if reading.known is None or reading.known_std is None:
+        return anomalies.side_by_side(before(reading.field, reading.std, rules.model), reading.std)
+    beliefs = anomalies.side_by_side(before(reading.known, reading.std, rules.model), reading.std)
+    given = reading.known.unsqueeze(-2), reading.known_std.unsqueeze(-2)
+    return known(beliefs, *given, anomalies.sizes().to(beliefs.mean))
 
 
-def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tensor]:
-    """Return the state after a move and the reading at its end, and the surprise of that."""
-    seen = _true(reading, state.north)
-    std, noise, heading, field = seen.std.noise, state.noise, seen.heading, reading.field
-    belief = moved(state.belief, reading.distance, heading, seen.std, rules.motion, rules.crust_nt)
-    if reading.leg_std is not None:
-        belief = displaced(belief, _leg_covariance(reading.leg_std, heading))
-    stated, scaled = innovation(belief, field, std, heading), std * (noise.log_ratio / 2).exp()
-    wide = spike_factor(innovation(belief, field, scaled, heading), scaled)
-    noise = noise_estimate(noise, innovation(belief, field, scaled * wide, heading), std * wide)
-    after = updated(belief, innovation(belief, field, std * noise.factor * wide, heading))
+def _advanced(rules: Rules, state: State, reading: Reading) -> tuple[State, Tensor, Tensor]:
+    """Return the state after a move and the reading at its end, and the surprise and tail probability of that."""
+    one = _true(reading, state.north)
+    seen, own = _side_by_side(one), NoiseEstimate(state.log_ratio, state.readings)
+    std, heading, field, sizes = seen.std.noise, seen.heading, seen.field, anomalies.sizes().to(state.mean)
+    beliefs = moved(state.beliefs, seen.distance, heading, seen.std, rules.motion, sizes)
+    if seen.leg_std is not None:
+        beliefs = displaced(beliefs, _leg_covariance(seen.leg_std, heading))
+    stated, scaled = innovation(beliefs, field, std, heading), std * (own.log_ratio / 2).exp()
+    wide = spike_factor(innovation(beliefs, field, scaled, heading), scaled)
+    own = noise_estimate(own, innovation(beliefs, field, scaled * wide, heading), std * wide)
+    new = innovation(beliefs, field, std * own.factor * wide, heading)
+    log_weight, tail = anomalies.reweighed(state.log_weight, new), anomalies.tail(state.log_weight, new)
+    beliefs = anomalies.recentered(updated(beliefs, new), log_weight)
+    surprise = (state.log_weight.exp() * stated.square()).sum(-1) / beliefs.measured.squeeze(-2).sum(-1)
+    after, heading = anomalies.mixture(beliefs, log_weight), one.heading
     move = reading.distance.unsqueeze(-1) * torch.stack((torch.cos(heading), torch.sin(heading)), -1)
     path, home, visited = state.path + reading.distance, state.home + move, visit(state.visited, move.to(state.visited))
-    state = State(*after, *noise, visited, state.weights, path, home, _declination(after, reading))
-    return state, stated.square() / belief.measured.sum(-1)
+    rest = visited, state.weights, path, home, _declination(after, reading)
+    state = State(beliefs.mean, beliefs.covariance, after.place, log_weight, *own, *rest)
+    return state, surprise, tail
+
+
+def _side_by_side(reading: Reading) -> Reading:
+    """Return a reading with a dimension for beliefs side by side."""
+    std = SensorStd(*(torch.as_tensor(part).unsqueeze(-2) for part in reading.std))
+    distance, heading = reading.distance.unsqueeze(-1), reading.heading.unsqueeze(-1)
+    leg_std = None if reading.leg_std is None else reading.leg_std.unsqueeze(-2)
+    field = reading.field.unsqueeze(-2)
+    return reading._replace(field=field, distance=distance, heading=heading, std=std, leg_std=leg_std)
 
 
 def displaced(belief: Belief, covariance: Tensor) -> Belief:
@@ -314,7 +181,7 @@ def position_fix(belief: Belief, place: Tensor, std_km: float) -> Innovation:
         std_km: its root mean square error [km].
     """
     distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
-    apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1)
+    apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1) - belief.mean[..., PLACE]
     rows = torch.zeros_like(belief.covariance[..., :3, :])
     rows[..., :2, PLACE] = torch.eye(2).to(rows)
     noise = torch.diag(rows.new_tensor((std_km**2 / 2, std_km**2 / 2, 1.0)))
@@ -345,8 +212,9 @@ def _true(reading: Reading, north: Tensor) -> Reading:
 
 def blank(reading: Reading) -> State:
     """Return a state of the right shapes before the first reading, of zeros."""
-    like, shape = reading.field, reading.field.shape[:-1]
-    wide = {"mean": (STATES,), "covariance": (STATES, STATES), "place": (2,), "log_ratio": (3,), "readings": (3,)}
+    like, shape, count = reading.field, reading.field.shape[:-1], len(anomalies.SIZES_NT)
+    wide = {"mean": (count, STATES), "covariance": (count, STATES, STATES), "place": (2,), "log_weight": (count,)}
+    wide |= {"log_ratio": (count, 3), "readings": (count, 3)}
     zeros = {name: like.new_zeros(*shape, *size, dtype=torch.float64) for name, size in wide.items()}
     rest = {name: like.new_zeros(shape, dtype=torch.float64) for name in ("path", "north")}
     rest["home"] = like.new_zeros(*shape, 2, dtype=torch.float64)
@@ -354,9 +222,14 @@ def blank(reading: Reading) -> State:
 
 
 def _goal(rules: Rules, state: State, reading: Reading) -> Destination:
-    place = None if rules.target_km is None else reading.target_place
-    std = _true(reading, state.north).std
-    return destination(state.belief, reading.target, rules.range_km, rules.crust_nt, std, place, rules.target_km or 0.0)
+    belief, crust, errors = state.belief, state.crust_nt, _true(reading, state.north).std
+    std = None if rules.target_std is None else torch.tensor(rules.target_std, dtype=torch.float64)
+    if rules.target_km is None:
+        return destination(belief, reading.target, rules.range_km, crust, errors, std)
+    place = reading.target_place
+    if std is not None and rules.model is not None and place is not None:
+        belief = surveyed(belief, reading.target, std.to(place), place.double(), rules.model, crust, errors)
+    return destination(belief, reading.target, rules.range_km, crust, errors, place=place, place_km=rules.target_km)
 
 
 def _accuracy(state: State, reading: Reading) -> SensorStd:
@@ -365,7 +238,7 @@ def _accuracy(state: State, reading: Reading) -> SensorStd:
     return std._replace(noise=(std.noise * state.noise.factor).to(reading.target.dtype))
 
 
-def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor) -> Track:
+def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor, tail: Tensor) -> Track:
     """Return the track with the estimates and the plan that follow from a state."""
     goal, local, dtype = _goal(rules, state, reading), elements(state.belief), reading.target.dtype
     points = posterior(goal)
@@ -379,7 +252,7 @@ def _estimated(rules: Rules, reading: Reading, state: State, surprise: Tensor) -
     limits = rules.max_steps, rules.max_move_km
     price = step_price(percent, PRICE_KM, aim.double(), reading.step, std.noise, *limits)
     plan = planned_move(goal, points, aim.double(), std, price, rules.max_move_km, rules.caution).to(dtype)
-    return Track(state, points, way, local, aim, plan, surprise)
+    return Track(state, points, way, local, aim, plan, surprise, tail)
 
 
 def observation(rules: Rules, track: Track, reading: Reading) -> Tensor:

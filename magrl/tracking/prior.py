@@ -245,18 +245,20 @@ def _joined(field: Tensor, where: Cells) -> tuple[Tensor, Tensor]:
     return torch.cat((field, mean), -1), lever @ wide @ lever.mT + rest
 
 
-def lasting_covariances(field: Tensor, errors: SensorStd, crust_nt: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+def lasting_covariances(
+    field: Tensor, errors: SensorStd, crust_nt: Tensor | float = 0.0
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the covariances ``(..., 3, 3)`` of constant errors of D, I [deg], B_H [nT], of the anomaly [nT^2], and of
     iron along the vehicle's axes [nT^2].
 
     The stated drift contains the effect of the iron on the elements, as a mean over the headings. What is left is the
     effect of the anomaly, which has independent parts along magnetic north (that is the error of B_H), across it (B_H
-    times the error of D), and downward (what is left of the error of I), and the field of the crust in each axis.
+    times the error of D), and downward (what is left of the error of I), or that of the crust, where that is larger.
 
     Args:
         field: ``(..., 3)`` north, east, down [nT].
         errors: accuracy of the readings, tensors ``(..., 3)``.
-        crust_nt: standard deviation of the crust's field in each axis [nT].
+        crust_nt: ``(...)`` standard deviation of the crust's field in each axis [nT].
 
     Example:
         >>> errors = SensorStd(bias=torch.tensor([0.5, 0.0, 0.0]), drift=torch.tensor([0.3, 0.0, 0.0]))
@@ -276,5 +278,7 @@ def lasting_covariances(field: Tensor, errors: SensorStd, crust_nt: float = 0.0)
     down = (tilt - z * z / total * along).clamp_min(0) / (square / total).clamp_min(LEAST_COS**2)
     cos, sin, none = x / square.sqrt(), y / square.sqrt(), torch.zeros_like(along)
     turn = torch.stack((cos, -sin, none, sin, cos, none, none, none, none + 1), -1).unflatten(-1, (3, 3))
-    anomaly = turn @ torch.diag_embed(torch.stack((along, across, down), -1) + crust_nt**2) @ turn.mT
+    stated = torch.stack((along, across, down), -1)
+    crust = torch.as_tensor(crust_nt).to(stated).square().unsqueeze(-1)
+    anomaly = turn @ torch.diag_embed(torch.maximum(stated, crust)) @ turn.mT
     return torch.diag_embed((bias - drift).clamp_min(0)), anomaly, torch.diag_embed(iron)

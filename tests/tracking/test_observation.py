@@ -67,7 +67,7 @@ def test_numbers_at_the_extremes() -> None:
 def test_the_noise_is_that_which_readings_show() -> None:
     """A reading with three times the stated noise is one that states it."""
     rules, track, reading = started()
-    shown = track._replace(state=track.state._replace(log_ratio=torch.full((4, 3), DEAD_BAND + 2 * math.log(3.0))))
+    shown = track._replace(state=track.state._replace(log_ratio=torch.full((4, 3, 3), DEAD_BAND + 2 * math.log(3.0))))
     stated = reading._replace(std=reading.std._replace(noise=3 * reading.std.noise))
     torch.testing.assert_close(observation(rules, shown, reading), observation(rules, track, stated))
 

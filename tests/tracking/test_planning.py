@@ -27,7 +27,7 @@ SHIP = SensorStd(NOISE, f64(3.0, 0.5, 150.0), f64(2.9, 0.4, 140.0), f64(100.0, 1
 
 def track(reading: Tensor, errors: SensorStd, legs: int, crust_nt: float = 0.0) -> Belief:
     """A belief after some legs of 40 km."""
-    belief = tracking.start(reading, errors, f64(0.3)[0], crust_nt)
+    belief = tracking.start(reading, errors, f64(0.3)[0])
     for leg in range(legs):
         course = f64(0.3 + 1.2 * leg)[0]
         belief = tracking.moved(belief, KM, course, errors, crust_nt=crust_nt)
@@ -154,7 +154,8 @@ def test_a_sure_way_is_gone_and_a_batch_is_its_parts() -> None:
 
     def planned(index: slice | int) -> Tensor:
         belief = Belief(*(torch.stack(parts)[index] for parts in zip(sure.belief, goal.belief, strict=True)))
-        here = Destination(belief, goal.field.expand(2, 3)[index], goal.range, goal.noise)
+        field, noise, crust, share = (part.expand(2, *part.shape)[index] for part in (goal.field, *goal[3:6]))
+        here = Destination(belief, field, goal.range, noise, crust, share)
         points = aims[index].unsqueeze(-2) + apart + 100.0  # of which only the shape counts
         posterior = DestinationPosterior(points, torch.full(points.shape[:-1], 0.5, dtype=F64))
         return tracking.planned_move(here, posterior, aims[index], WHITE, prices[index], 50.0)

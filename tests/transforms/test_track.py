@@ -25,7 +25,7 @@ from magrl.transforms.track import KNOWN_KEYS, READ_KEYS, known_keys, reading_of
 
 BIAS = (0.5, 0.3, 60.0)
 close = partial(torch.testing.assert_close, equal_nan=True)
-RULES = Rules(range_km=350.0, crust_nt=20.0, max_steps=5)
+RULES = Rules(range_km=350.0, max_steps=5)
 
 
 def tracked(num_envs: int = 4, *errors, rules: Rules = RULES, **options: object) -> TransformedEnv:

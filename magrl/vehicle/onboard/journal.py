@@ -155,9 +155,11 @@ class Journal(Inputs):
         (-11.5, 75.5, 13240.0)
     """
 
-    format: Literal[14] = 14
+    format: Literal[15] = 15
     options: Annotated[Options, _LAX]
     target: Annotated[tuple[float, ...], _LAX]
+    target_elements: Triple | None = None
+    target_std: Triple = (0.0, 0.0, 0.0)
     start: Annotated[tuple[float, ...], _LAX] | None = None
     start_std: Triple | None = None
     date: str | None = None
@@ -203,6 +205,10 @@ class Command:
         drift_covariance: its covariance, by rows.
         sensor_errors: estimated constant errors of D [deg], I [deg], B_H [nT], to be subtracted from readings.
         sensor_errors_std: their standard deviations.
+        anomaly_weights: probabilities that anomalies here are as large as each of
+            :data:`~magrl.tracking.anomalies.SIZES_NT`.
+        fit: probability that readings as surprising as the first and the last ones occur if everything stated is true;
+            below :data:`~magrl.vehicle.onboard.doubt.LEAST_FIT`, a vehicle does not say that it has arrived.
 
     Example:
         >>> Command(30.0, -5.0, 355.0, (90.0, -12.0), ((9.0, 0.0), (0.0, 16.0)), 0.0).error_km
@@ -224,6 +230,8 @@ class Command:
     drift_covariance: tuple[tuple[float, float], tuple[float, float]] | None = None
     sensor_errors: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sensor_errors_std: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    anomaly_weights: tuple[float, ...] = ()
+    fit: float = 1.0
 
     @property
     def error_km(self) -> float:
@@ -239,12 +247,14 @@ class Command:
 
 
 def estimates_of(state: State, located: bool) -> dict[str, Any]:
-    """Return the values of a :class:`Command` that a state holds: the constant errors of the sensors, and place and
-    drift where the vehicle knows its place."""
-    found: dict[str, Any] = {"sensor_errors": tuple(state.mean[CONSTANT].tolist())}
-    found["sensor_errors_std"] = tuple(state.covariance[CONSTANT, CONSTANT].diagonal().sqrt().tolist())
+    """Return the values of a :class:`Command` that a state holds: sizes of anomalies, constant errors of the sensors,
+    and place and drift where the vehicle knows its place."""
+    mean, covariance, place = state.belief
+    found: dict[str, Any] = {"anomaly_weights": tuple(state.log_weight.exp().tolist())}
+    found["sensor_errors"] = tuple(mean[CONSTANT].tolist())
+    found["sensor_errors_std"] = tuple(covariance[CONSTANT, CONSTANT].diagonal().sqrt().tolist())
     if located:
-        found |= {"place": tuple(state.place.tolist()), "drift": tuple(state.mean[DRIFT].tolist())}
+        found |= {"place": tuple(place.tolist()), "drift": tuple(mean[DRIFT].tolist())}
         for name, part in {"place_covariance_km2": PLACE, "drift_covariance": DRIFT}.items():
-            found[name] = tuple(map(tuple, state.covariance[part, part].tolist()))
+            found[name] = tuple(map(tuple, covariance[part, part].tolist()))
     return found

@@ -14,6 +14,7 @@ from magrl.field.elements import FIELD_NT, NAMES, element_difference, field_vect
 from magrl.field.igrf import parse_date
 from magrl.sensor_std import SensorStd
 from magrl.tracking import NEWEST, SLOPES, EarthModel, State, earth_model
+from magrl.tracking.anomalies import recentered, reweighed
 from magrl.tracking.belief import updated
 from magrl.tracking.pilot import position_fix
 from magrl.vehicle.onboard.journal import Fix, Journal
@@ -111,18 +112,30 @@ class Knowledge(NamedTuple):
         """
         model = _carried_model(journal)
         elements_of = None if model is None else model.elements
-        target = known_elements(journal.target, "target", elements_of)
+        target = _destination(journal, elements_of)
         start = None if journal.start is None else known_elements(journal.start, "start", elements_of)
         elements, std = (start.elements, start.std) if start else (None, (0.0,) * 3)
         if journal.start_std is not None:
             check_numbers(3, 0, start_std=journal.start_std)
             std = journal.start_std
-        rules: dict[str, Any] = {} if model is None else {"model": model}
+        rules: dict[str, Any] = {"target_std": target.std} | ({} if model is None else {"model": model})
         if start is None or start.place is None:
             return cls(target.elements, elements, std, rules)
         d, i, h = (math.hypot(own, slope * journal.start_km) for own, slope in zip(std, SLOPES, strict=True))
         rules |= {"start_km": journal.start_km} | ({} if target.place is None else {"target_km": journal.target_km})
+        if journal.target_elements is None and target.place is not None:
+            rules["target_std"] = None
         return cls(target.elements, elements, (d, i, h), rules, start.place, target.place)
+
+
+def _destination(journal: Journal, model: Callable[[Tensor], Tensor] | None) -> Known:
+    """Return what is known of the destination, whose elements count as measured where they are given."""
+    target, measured = known_elements(journal.target, "target", model), journal.target_elements
+    if measured is None:
+        return target if target.place is not None else target._replace(std=journal.target_std)
+    if target.place is None:
+        raise ValueError(f"target_elements {measured} need the place of the target, got {journal.target}")
+    return known_elements(measured, "target_elements", None)._replace(std=journal.target_std, place=target.place)
 
 
 def _carried_model(journal: Journal) -> EarthModel | None:
@@ -169,6 +182,33 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({text}): {cause}")
 
 
+LEAST_TAIL = 0.01
+"""Tail probability below which a first reading does not fit the start. Most of it is that of large anomalies, which are
+rare: of 144 right starts, none was below it, nor of 144 in the field of a crust."""
+
+
+def check_first_innovation(tail: float, reading: Elements, elements: Elements) -> None:
+    """Raise if a first reading is too surprising, by the model and all stated errors.
+
+    Args:
+        tail: probability of a more surprising one.
+        reading: D [deg], I [deg], B_H [nT].
+        elements: D, I, B_H at the start.
+
+    Raises:
+        ValueError: with both.
+
+    Example:
+        >>> check_first_innovation(0.2, (3.4, 73.1, 14950.0), (3.5, 73.0, 15000.0))
+    """
+    if tail < LEAST_TAIL:
+        texts = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
+        raise ValueError(
+            f"the first reading, {texts[0]}, does not fit the start, {texts[1]} (p = {tail:.1g} by what is stated): "
+            "read again, and check place, date and calibration, or state a larger start_km"
+        )
+
+
 FIX_SQUARE = 13.8
 """Normalized square of the deviation of a fix in two axes that right ones exceed with a probability of .001."""
 
@@ -179,14 +219,18 @@ def fixed(state: State, fix: Fix) -> State:
     Raises:
         ValueError: for a fix that does not fit the estimated place.
     """
-    new = position_fix(state.belief, torch.tensor((fix.latitude, fix.longitude), dtype=torch.float64), fix.std_km)
+    place = torch.tensor((fix.latitude, fix.longitude), dtype=torch.float64)
+    new = position_fix(state.belief, place, fix.std_km)
     off_km, likely_km = new.residual.norm().item(), new.covariance[:2, :2].trace().sqrt().item()
     if new.square().item() > FIX_SQUARE:
         raise ValueError(
             f"the fix is {off_km:.0f} km from the estimated place, where {likely_km:.0f} km is likely: check the fix, "
             "or state a larger std_km"
         )
-    return state._replace(**updated(state.belief, new)._asdict())
+    new = position_fix(state.beliefs, place, fix.std_km)
+    log_weight = reweighed(state.log_weight, new)
+    mean, covariance, place = recentered(updated(state.beliefs, new), log_weight)
+    return state._replace(mean=mean, covariance=covariance, place=place.squeeze(-2), log_weight=log_weight)
 
 
 def model_std(elements: Tensor) -> Tensor:

@@ -23,8 +23,9 @@ from magrl.sensor_std import OUTAGE_STD, SensorStd
 from magrl.tracking import NEWEST, ArrivalDecision, Reading, Rules, State, Track
 from magrl.tracking.network import load_pilot, policy_content, pretrained
 from magrl.vehicle.onboard import limits
+from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
 from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step, estimates_of
-from magrl.vehicle.onboard.known import Knowledge, check_first_reading, fixed
+from magrl.vehicle.onboard.known import Knowledge, check_first_innovation, check_first_reading, fixed
 
 USUAL: dict[str, Any] = {
     "arrival": "declared",
@@ -38,10 +39,6 @@ LONGEST_WAY_KM = 2500.0
 """Estimated way beyond which an agent without a map is out of range: there its observation of the way saturates."""
 HIGHEST_LATITUDE = 85.0
 """Latitude beyond which a known place is out of range: its region of 90 % held 78 % of the places at 86 to 88° S."""
-LOST_SURPRISE = 20.0
-"""Mean of the last surprises (:class:`~magrl.tracking.Track`) beyond which the readings contradict each other. With the
-right accuracy, it stayed below 7 in simulation, under the conditions of four vehicles."""
-_SURPRISES, _LEAST_SURPRISES = 8, 2
 _UNCHECKED = {
     "true": "the sign of D and the compass were not checked: give the start",
     "magnetic": "the compass was not checked: give the start",
@@ -97,6 +94,8 @@ class Onboard:
         target: Sequence[float | None],
         start: Sequence[float] | None = None,
         *,
+        target_elements: Sequence[float | None] | None = None,
+        target_std: Sequence[float] = (0.0, 0.0, 0.0),
         start_std: Sequence[float] | None = None,
         date: str | None = None,
         model: str | None = NEWEST,
@@ -116,6 +115,9 @@ class Onboard:
             target: elements of the destination, D [deg], I [deg], B_H [nT]; or its latitude and longitude [deg]. D does
                 not count where the vehicle's north is magnetic, and may be None.
             start: latitude and longitude of the start [deg], with a date; or the elements there.
+            target_elements: D, I [deg], B_H [nT] that were measured at a target that is given by its place: where the
+                vehicle also knows its own, they show how far the model is off there.
+            target_std: standard deviations of elements that were measured at the destination.
             start_std: standard deviations of the elements at the start, 0 by default.
             date: date of the flight, such as ``"2026-06-30"``.
             model: model of the Earth that the vehicle carries (:func:`magrl.tracking.earth_model`); None for none.
@@ -128,7 +130,9 @@ class Onboard:
                 without a model; or a model that does not cover the date.
         """
         target = self._comparable(target) if len(target) == 3 else target
+        target_elements = target_elements and self._comparable(target_elements)
         given: dict[str, Any] = {"target": target, "start": start, "start_std": start_std, "date": date}
+        given |= {"target_elements": target_elements, "target_std": target_std}
         given |= {"model": model, "start_km": start_km, "target_km": target_km, "altitude_km": altitude_km}
         journal = Journal(options=self.options, **given)
         known = Knowledge.of(journal)
@@ -144,7 +148,7 @@ class Onboard:
         self._number = 0  # of steps without fixes
         self._state: State | None = None
         self._last: Any = None  # the last elements
-        self._surprises: tuple[float, ...] = ()
+        self._doubt = Doubt()
         self._unchanged: limits.Triple = (0.0, 0.0, 0.0)  # path since each element last changed [km]
         self._unread_km = 0.0  # path since the last complete reading
 
@@ -205,7 +209,7 @@ class Onboard:
         fix = Fix(latitude=latitude, longitude=longitude, std_km=std_km)
         if self.target is None or self._state is None or self._rules.start_km is None:
             raise RuntimeError("a fix corrects an estimated place: start with a place and a date, and step, before it")
-        self._state = fixed(self._state, fix)
+        self._state, self._doubt = fixed(self._state, fix), Doubt()
         self._steps += (fix,)
 
     def _after(self, step: Step) -> Command:
@@ -220,12 +224,14 @@ class Onboard:
         with torch.inference_mode():
             if self._state is None:
                 track = tracking.begin(self._rules, reading)
+                if self._known:
+                    check_first_innovation(track.tail.item(), elements, self._known[0])
                 self._other = self._other and self._other.begun(self.options, reading)
             else:
                 track = tracking.advance(self._rules, self._state, reading)
             action, decision = self._act(track, reading)
-        if self._state is not None and read[1:] != (None, None):
-            self._surprises = (*self._surprises, track.surprise.item())[-_SURPRISES:]
+        if (self._known or self._state is not None) and read[1:] != (None, None):
+            self._doubt = self._doubt.after(track, first=self._state is None)
         self._unchanged = limits.unchanged_km(self._unchanged, last, read, step.distance)
         self._unread_km = self._unread_km + step.distance if None in read else 0.0
         self._last, self._state = elements, track.state
@@ -288,18 +294,13 @@ class Onboard:
         north, east = track.way.displacement.tolist()
         (nn, ne), (en, ee) = track.way.covariance.tolist()
         estimates = (north, east), ((nn, ne), (en, ee)), decision.probability.item(), stop, reason, radius
-        return Command(
-            distance,
-            math.degrees(turn),
-            steer,
-            *estimates,
-            **estimates_of(track.state, located=self._rules.start_km is not None),
-        )
+        found = estimates_of(track.state, located=self._rules.start_km is not None)
+        return Command(distance, math.degrees(turn), steer, *estimates, fit=self._doubt.fit, **found)
 
     def _stop(self, track: Track, decision: ArrivalDecision, radius_km: float) -> tuple[str | None, str]:
         """Return the reason to stop, as a keyword and as a sentence."""
-        options, level = self.options, sum(self._surprises) / max(len(self._surprises), 1)
-        if text := self._lost(track, level):
+        options, doubt = self.options, self._doubt
+        if text := self._lost(track):
             return "lost", text
         if text := limits.out_of_range(self._range, self._last):
             return "out of range", text
@@ -308,10 +309,12 @@ class Onboard:
         way_km, error_km = track.way.displacement.norm().item(), track.way.covariance.trace().sqrt().item()
         if self._network and way_km - 2 * error_km > LONGEST_WAY_KM:
             return "out of range", f"the way is {way_km:.0f} ± {error_km:.0f} km, the policy's {LONGEST_WAY_KM:g} km"
-        if not decision.declare.item() or level > LOST_SURPRISE:
+        if not decision.declare.item() or doubt.level > LOST_SURPRISE:
             return None, ""
         if decision.probability.item() >= options.confidence:
             probability = f"an estimated probability of {decision.probability.item():.2f}"
+            if doubt.fit < LEAST_FIT:
+                return "nearest", f"{probability}, but readings do not fit what is stated (p = {doubt.fit:.1g})"
             return "arrived", f"within {options.radius_km:g} km with {probability}"
         near = f"within {radius_km:.0f} km with an estimated probability of {options.confidence:.2f}"
         if self._number >= options.max_steps - 1:
@@ -320,21 +323,16 @@ class Onboard:
             return "nearest", f"as near as these sensors allow: {near}"
         return None, ""
 
-    def _lost(self, track: Track, level: float) -> str:
-        """Return why readings or moves cannot be those of a vehicle, as text; empty if they can.
-
-        Args:
-            track: estimates after the reading.
-            level: mean of the last surprises.
-        """
+    def _lost(self, track: Track) -> str:
+        """Return why readings or moves cannot be those of a vehicle, as text; empty if they can."""
         useful = limits.measured(self.options.sensor_std.noise)
         useful = (useful[0] and not self.options.magnetic, *useful[1:])
         unchanged = [km * use for km, use in zip(self._unchanged, useful, strict=True)]
         if text := limits.stuck(unchanged, self.options.max_move_km):
             return text
-        if len(self._surprises) >= _LEAST_SURPRISES and level > LOST_SURPRISE:
+        if self._doubt.lost:
             causes = "the sign of I, its zero (from the horizontal), swapped elements, units, sensors and compass"
-            return f"readings deviate {level**0.5:.0f} times as much as expected: check {causes}"
+            return f"readings deviate {self._doubt.level**0.5:.0f} times as much as expected: check {causes}"
         inclination, local = self._last[1], track.local
         slope = local.gradient[1].norm() + 2 * local.covariance[1, 1:, 1:].trace().sqrt()
         if useful[1] and abs(inclination) <= math.pi / 2 and 100 * slope.item() < limits.EQUATOR_SLOPE_DEG:

@@ -1,0 +1,195 @@
+"""The records of a pilot: what it knows before it starts, a reading, the state between steps, and the track."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from magrl.checks import CheckedModel
+from magrl.sensor_std import SensorStd
+from magrl.tracking import anomalies
+from magrl.tracking.belief import Belief, LocalElements, Motion
+from magrl.tracking.destination import RANGE_KM
+from magrl.tracking.earth import EarthModel
+from magrl.tracking.noise import NoiseEstimate
+from magrl.tracking.planning import CAUTION, STEP_PRICE
+from magrl.tracking.way import DestinationPosterior, Way
+
+FARTHEST_START_KM = 100.0
+"""Largest error of a known start [km]: over longer distances, the field is not linear in the place."""
+_Std = Annotated[float, Field(ge=0)]
+
+
+class Rules(CheckedModel):
+    """What a vehicle knows before it starts: its limits, the rule of arrival, and what it expects of the field.
+
+    Args:
+        max_move_km: longest move [km].
+        max_turn_rad: largest turn before a move [rad].
+        max_steps: step limit.
+        zeta: arrival threshold on the objective.
+        arrival: what ends the episode: the objective or the distance, with a signal at each step, or a declaration by
+            the vehicle.
+        radius_km: distance from the destination that counts as arrived, but by the objective [km].
+        confidence: least probability of a correct declaration; below it, episodes end without one.
+        range_km: prior standard deviation of the displacement to the destination along each axis [km].
+        step_price: price of a step [% of SPL]: a higher one gives fewer steps and a longer path.
+        caution: weight of the uncertainty in the plan.
+        model: model of the Earth that the vehicle carries (:func:`~magrl.tracking.earth_model`); None for no other
+            knowledge than the spectrum of the Earth's field.
+        start_km: root mean square error of the place where it starts, with a model [km]; None where it does not know
+            its place.
+        target_km: the same of the destination's place; None where it knows the elements alone.
+        target_std: standard deviations of D, I [deg], B_H [nT] with which the elements at the destination were
+            measured, at its place; None where they are from the vehicle's own model, which they add nothing to.
+        drift: constant drift of dead reckoning along each axis [share of the way].
+        wander_km: random part of it along each axis after 1 km [km].
+
+    Raises:
+        ValueError: for a value out of its range, or an unknown name.
+
+    Example:
+        >>> Rules(max_steps=80).replace(arrival="declared").signaled
+        False
+    """
+
+    max_move_km: Annotated[float, Field(gt=0)] = 50.0
+    max_turn_rad: Annotated[float, Field(gt=0, le=math.pi)] = math.pi / 2
+    max_steps: Annotated[int, Field(ge=1)] = 50
+    zeta: Annotated[float, Field(gt=0)] = 0.01
+    arrival: Literal["objective", "distance", "declared"] = "objective"
+    radius_km: Annotated[float, Field(gt=0)] = 25.0
+    confidence: Annotated[float, Field(ge=0, le=1)] = 0.0
+    range_km: Annotated[float, Field(gt=0)] = RANGE_KM
+    step_price: Annotated[float, Field(gt=0)] = STEP_PRICE
+    caution: Annotated[float, Field(ge=0)] = CAUTION
+    model: EarthModel | None = None
+    start_km: Annotated[float | None, Field(ge=0, le=FARTHEST_START_KM)] = None
+    target_km: Annotated[float | None, Field(ge=0)] = None
+    target_std: Annotated[tuple[_Std, _Std, _Std], Field(strict=False)] | None = (0.0, 0.0, 0.0)
+    drift: Annotated[float, Field(ge=0, le=1)] = 0.0
+    wander_km: Annotated[float, Field(ge=0)] = 0.0
+
+    @model_validator(mode="after")
+    def _check_places(self) -> Rules:
+        if self.start_km is not None and self.model is None:
+            raise ValueError(
+                f"start_km {self.start_km:g} needs a model of the Earth: model=earth_model('IGRF-14', date)"
+            )
+        if self.target_km is not None and self.start_km is None:
+            raise ValueError(
+                f"target_km {self.target_km:g} needs start_km: without its own place, a vehicle compares elements"
+            )
+        return self
+
+    @property
+    def motion(self) -> Motion:
+        """How place and field go on."""
+        return Motion(self.model if self.start_km is not None else None, self.drift, self.wander_km)
+
+    @property
+    def signaled(self) -> bool:
+        """Whether the vehicle is told of its arrival, so that the destination is not where it has been."""
+        return self.arrival != "declared"
+
+
+class Reading(NamedTuple):
+    """What a vehicle measures and knows at one step.
+
+    Args:
+        field: ``(..., 3)`` D [deg], I [deg], B_H [nT] as read; NaN for an element that is missing.
+        target: ``(..., 3)`` the same at the destination.
+        distance: ``(...)`` of the move before the reading [km].
+        heading: ``(...)`` [rad].
+        std: accuracy of the reading, tensors ``(..., 3)``.
+        step: ``(...)`` number of the step, 0 at the start.
+        known: ``(..., 3)`` elements at the start, where they are known; they count at the first reading.
+        known_std: ``(..., 3)`` their standard deviations.
+        price: ``(...)`` price of a step [% of SPL] of each vehicle; None for that of the rules.
+        place: ``(..., 2)`` latitude, longitude [deg] of the start, where it is known; it counts at the first reading.
+        target_place: ``(..., 2)`` the same of the destination.
+        leg_std: ``(..., 2)`` standard deviations of the move, along and across it, beside the drift of the rules [km].
+    """
+
+    field: Tensor
+    target: Tensor
+    distance: Tensor
+    heading: Tensor
+    std: SensorStd
+    step: Tensor
+    known: Tensor | None = None
+    known_std: Tensor | None = None
+    price: Tensor | None = None
+    place: Tensor | None = None
+    target_place: Tensor | None = None
+    leg_std: Tensor | None = None
+
+
+class State(NamedTuple):
+    """What a step needs of the one before, all tensors: the beliefs side by side (:mod:`~magrl.tracking.anomalies`)
+    ``(..., H, S)``, ``(..., H, S, S)``, their place ``(..., 2)`` and the logarithms of their weights ``(..., H)``;
+    their noise estimates ``(..., H, 3)`` twice; displacements to visited places ``(..., 24, 2)`` [km]; weights of the
+    objective ``(..., 3)``; the path flown ``(...)`` and the displacement from the start ``(..., 2)`` [km]; and the
+    angle of north ``(...)``, from that of the belief to that of the headings [rad]: D, where a compass and a place are
+    known."""
+
+    mean: Tensor
+    covariance: Tensor
+    place: Tensor
+    log_weight: Tensor
+    log_ratio: Tensor
+    readings: Tensor
+    visited: Tensor
+    weights: Tensor
+    path: Tensor
+    home: Tensor
+    north: Tensor
+
+    @property
+    def belief(self) -> Belief:
+        """The belief of the field."""
+        return anomalies.mixture(self.beliefs, self.log_weight)
+
+    @property
+    def beliefs(self) -> Belief:
+        """Those with anomalies of each size."""
+        return Belief(self.mean, self.covariance, self.place.unsqueeze(-2))
+
+    @property
+    def noise(self) -> NoiseEstimate:
+        """The noise over the stated one."""
+        weight = self.log_weight.exp().unsqueeze(-1)
+        return NoiseEstimate((weight * self.log_ratio).sum(-2), (weight * self.readings).sum(-2))
+
+    @property
+    def crust_nt(self) -> Tensor:
+        """Expected size ``(...)`` of the anomaly [nT], the root of the mean of the squares."""
+        return (self.log_weight.exp() * anomalies.sizes().to(self.mean).square()).sum(-1).sqrt()
+
+
+class Track(NamedTuple):
+    """What a vehicle knows after a reading.
+
+    Attributes:
+        state: what the next step needs.
+        posterior: of the displacement to the destination.
+        way: its mean and covariance [km].
+        local: elements and gradients at the vehicle.
+        aim: ``(..., 2)`` displacement to aim at [km]: the mean, or where it has not been.
+        plan: ``(..., 2)`` displacement of the next move as planned [km].
+        surprise: ``(...)`` normalized square of the innovation by the stated noise, over the number of elements; about
+            1 where all is right.
+        tail: ``(...)`` probability of a reading that is more surprising, where everything stated is true.
+    """
+
+    state: State
+    posterior: DestinationPosterior
+    way: Way
+    local: LocalElements
+    aim: Tensor
+    plan: Tensor
+    surprise: Tensor
+    tail: Tensor

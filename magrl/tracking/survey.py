@@ -1,0 +1,78 @@
+"""What the measured elements of the destination say of the field, where its place is known, too.
+
+They show how far a model of the Earth is off there: a reading at a distance. It is a reading of the *difference* from
+the model, which varies more slowly than the field itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from magrl.field.elements import element_difference, elements_jacobian, measured_elements
+from magrl.geodesy import geodesic
+from magrl.sensor_std import SensorStd
+from magrl.tracking.anomalies import crust_correlation, crust_share
+from magrl.tracking.belief import ANOMALY, MODEL_NT, PLACE, Belief, Innovation, settled, updated
+from magrl.tracking.earth import EarthModel
+from magrl.tracking.harmonics import UNIT_KM
+from magrl.tracking.local import COEFFICIENTS, levers, slopes, unturned
+from magrl.tracking.prior import DEGREE, closure
+
+
+def surveyed(
+    belief: Belief,
+    elements: Tensor,
+    std: Tensor,
+    place: Tensor,
+    model: EarthModel,
+    crust_nt: Tensor,
+    errors: SensorStd,
+) -> Belief:
+    """Return the belief given the measured elements of the destination.
+
+    With the model's coefficients m at the estimated place, their slopes J, the error d of that place, the field H c at
+    the destination and the correlation rho of the anomaly, their difference from the model's is expected as
+    ``H (c - m - J d) + rho a``. By a compass, D does not count.
+
+    Args:
+        belief: of a vehicle that knows its place.
+        elements: ``(..., 3)``: D [deg], I [deg], B_H [nT] as measured; NaN for an element that is missing.
+        std: ``(3,)`` their standard deviations.
+        place: ``(..., 2)`` latitude, longitude [deg] of the destination.
+        model: that of the belief.
+        crust_nt: ``(...)`` standard deviation of the crust's field in each axis [nT].
+        errors: accuracy of the readings, tensors ``(..., 3)``.
+    """
+    there = model.field(*place.unbind(-1)).to(belief.mean)
+    rows, variance = _rows(belief, place, model, crust_nt, errors)
+    jacobian, expected = elements_jacobian(there), torch.zeros_like(belief.mean)
+    expected[..., :COEFFICIENTS] = model.coefficients(belief.place)
+    difference = element_difference(elements.double(), measured_elements(there))
+    present = ~difference.isnan()
+    present[..., 0] &= torch.as_tensor(errors.bias)[..., 0] < math.inf
+    rows = torch.where(present.unsqueeze(-1), jacobian @ rows, 0.0)
+    residual = torch.where(present, difference, 0.0) - (rows @ (belief.mean - expected).unsqueeze(-1)).squeeze(-1)
+    noise = variance[..., None, None] * jacobian @ jacobian.mT + torch.diag(std.to(there).square())
+    both = present.unsqueeze(-1) & present.unsqueeze(-2)
+    noise = torch.where(both, noise, torch.eye(3).to(noise))
+    return settled(updated(belief, Innovation(residual, rows, rows @ belief.covariance @ rows.mT + noise)))
+
+
+def _rows(
+    belief: Belief, place: Tensor, model: EarthModel, crust_nt: Tensor, errors: SensorStd
+) -> tuple[Tensor, Tensor]:
+    """Return the derivatives ``(..., 3, S)`` of the field's difference from the model at the destination with respect
+    to the state, in the axes there, and the variance ``(...)`` in each axis of what the state does not hold."""
+    distance, bearing = geodesic(*belief.place.unbind(-1), *place.to(belief.place).unbind(-1))
+    apart = distance.unsqueeze(-1) * torch.stack((torch.cos(bearing), torch.sin(bearing)), -1) / UNIT_KM
+    square, axes = apart.square().sum(-1), torch.eye(3).to(apart).expand(*apart.shape[:-1], 3, 3)
+    carried = torch.stack(unturned(axes, belief.latitude, apart.unsqueeze(-2).expand(*axes.shape[:-1], 2))[0], -1)
+    rows, rho = torch.zeros_like(belief.covariance[..., :3, :]), crust_correlation(square)
+    rows[..., :COEFFICIENTS] = carried @ levers(apart.unsqueeze(-2)).squeeze(-3)
+    rows[..., PLACE] = -rows[..., :COEFFICIENTS] @ slopes(model.coefficients(belief.place), belief.place)
+    rows[..., ANOMALY] = rho[..., None, None] * crust_share(belief.field, errors, crust_nt)
+    left_out = square**DEGREE * closure().left_out_nt ** 2 * model.share
+    return rows, left_out + MODEL_NT**2 + crust_nt.square() * (1 - rho.square())
