@@ -156,7 +156,8 @@ def prepare(config: Config) -> dict[str, tuple[TransformedEnv, Watched]]:
         start, target, distance_km = ends(config, field)
         region = places.region_around(start, target, field, 50.0 + drift_km)
         tasks = Tasks(start[None], target[None])
-        scenario = Scenario(region=region, margin_deg=0, field=field, tasks=tasks, date=config.date)
+        size = {"region": region, "margin_deg": 0, "distance_range_km": (0.0, distance_km)}
+        scenario = Scenario(**size, field=field, tasks=tasks, date=config.date)
         for name, arrival in RULES.items():
             flight = Flight(
                 scenario,

@@ -33,7 +33,8 @@ class Flight:
         scenario: scenario.
         errors: standard deviations of white noise on D [deg], I [deg], B_H [nT]; or the errors of a real vehicle:
             :class:`~magrl.transforms.Conditions`, a name of :data:`magrl.transforms.CONDITIONS`, or a file of
-            conditions (:func:`magrl.transforms.load_conditions`).
+            conditions (:func:`magrl.transforms.load_conditions`). The stated weather is that of the longest distance of
+            the scenario.
         north: ``"true"``, or ``"magnetic"`` for vehicles that have no true north: they measure I and B_H, and steer by
             their compass (:class:`magrl.transforms.MagneticNorth`), whatever ``errors`` say of a north reference.
         model: model of the Earth that the vehicles carry, as of the date of the scenario
@@ -92,6 +93,9 @@ class Flight:
             errors = Conditions("noise", sensors={"noise": noise} if any(noise) else {})
         if north == MAGNETIC:
             errors = replace(errors, north=MAGNETIC)
+        if errors.weather is not None:
+            way_km = max(500.0, scenario.distance_range_km[1])
+            errors = replace(errors, weather={"way_km": way_km, **errors.weather})
         drift = {"drift_km": errors.drift_km(options.get("max_move_km", scenario.max_move_km))}
         self.base = self.env_class(scenario, **drift | options)
         self.env = with_conditions(self.base, errors, seed)

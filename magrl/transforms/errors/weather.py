@@ -20,8 +20,6 @@ from magrl.transforms.errors.base import Episode, ReadingErrors
 
 READING_S = 60.0
 """Time that each step takes beside its move [s], so that standing still takes time; chosen."""
-WAY_KM = 500.0
-"""Way whose weather a vehicle expects [km]."""
 
 
 class MagneticWeather(ReadingErrors):
@@ -31,7 +29,7 @@ class MagneticWeather(ReadingErrors):
     ``distance / speed`` and :data:`READING_S`. The variation of the minute in which the step ends is added to the field
     vector; between the minutes of the record nothing is interpolated. All vehicles of a batch are in the weather of the
     record, wherever they are. ``bias_std`` and ``drift_std`` grow by the root mean square of the variation over the
-    time of :data:`WAY_KM`, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
+    time of ``way_km``, at :data:`~magrl.transforms.errors.base.TYPICAL_FIELD`.
 
     ``field`` becomes the measured field, and ``true_field`` the field without weather, from which the environment
     computes arrival, objective and reward. In ``Compose``, the weather stands before the errors of the sensors.
@@ -42,6 +40,7 @@ class MagneticWeather(ReadingErrors):
         span_h: longest duration of an episode [h]: it starts where the record has no gap for that time; after it, the
             weather stays constant. By default the longest moves until the step
             limit, where the environment has ``max_steps`` and ``max_move_km``.
+        way_km: distance of a trip, whose weather a vehicle expects [km].
         in_keys: D [deg], I [deg], B_H [nT] ``(..., 3)``, and the last move ``(..., K)``, whose first number is the
             distance [km].
         out_keys: the measured elements ``(..., 3)``, in place by default.
@@ -49,7 +48,7 @@ class MagneticWeather(ReadingErrors):
             episode, float64, are the minute of the record in which it started, and the minutes since then.
 
     Raises:
-        ValueError: for a speed that is not positive, another option out of its range, an unknown record, a record that
+        ValueError: for a speed or distance that is not positive, another option out of its range, an unknown record, a record that
             is too short for the episode, or an episode without a longest time.
         KeyError: for a step from a TensorDict without the state.
 
@@ -75,17 +74,18 @@ class MagneticWeather(ReadingErrors):
         *,
         speed_km_h: float,
         span_h: float | None = None,
+        way_km: float = 500.0,
         **options: Any,
     ) -> None:
         super().__init__(**options)
         self.record = weather_record(record) if isinstance(record, str) else record
         check_type(WeatherRecord, record=self.record)
-        check_number(0, above=True, speed_km_h=speed_km_h)
+        check_number(0, above=True, speed_km_h=speed_km_h, way_km=way_km)
         check_number(0, optional=True, span_h=span_h)
         self.speed_km_h, self.span_h = float(speed_km_h), span_h
         self._starts_by_span: dict[float, Tensor] = {}
         self.register_buffer("variation", self.record.variation, persistent=False)
-        moments = self.record.second_moments(WAY_KM / self.speed_km_h)
+        moments = self.record.second_moments(way_km / self.speed_km_h)
         self.register_buffer("_moments", moments, persistent=False)
         self._set_accuracy()
         if span_h is not None:

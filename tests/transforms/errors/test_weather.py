@@ -12,9 +12,11 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from magrl.envs import Scenario, named_tasks
+from magrl.evaluation import Flight
 from magrl.field import WEATHER, WeatherRecord, weather_record
 from magrl.field.elements import field_vector
-from magrl.transforms import CONDITIONS, MagneticWeather
+from magrl.transforms import CONDITIONS, Conditions, MagneticWeather
 
 NAN = math.nan
 SHIP = CONDITIONS["ship"].speed_km_h
@@ -128,6 +130,19 @@ def test_the_clock_stops_at_the_span() -> None:
     assert [state["weather_clock"][0].tolist() for state in states] == [[0, 0], [0, 25], [0, 50], [0, 60], [0, 60]]
 
 
+# What a vehicle knows
+
+
+def test_the_stated_weather_is_that_of_the_longest_trip() -> None:
+    """From the quiet day on, a storm comes after two days: 12 nT over 500 km as a ship, 32 nT over 1800 km."""
+    stated = []
+    for longest, own in ((300.0, {}), (500.0, {}), (1800.0, {}), (1800.0, {"way_km": 500.0})):
+        ship = Conditions("ship", SHIP, weather={"record": "quiet", "span_h": 200.0, **own})
+        scenario = Scenario(distance_range_km=(100.0, longest), tasks=named_tasks("figure-4-1"))
+        stated.append(Flight(scenario, errors=ship).sensor_std.drift[2])
+    assert stated == pytest.approx([12, 12, 32, 12], abs=0.5)
+
+
 # Errors
 
 
@@ -136,6 +151,7 @@ def test_the_clock_stops_at_the_span() -> None:
     [
         (lambda: MagneticWeather("college", speed_km_h=SHIP, span_h=24.1), r"24.1 h .*'college'.*23.9 h"),
         (lambda: MagneticWeather(speed_km_h=SHIP)(nav().reset()), "needs span_h"),
+        (lambda: MagneticWeather(speed_km_h=SHIP, way_km=0), "way_km must be .* above 0, got 0"),
         # 50 moves of 50 km at 6.1 km/h take 411 h, and 13 days follow the disturbed one
         (lambda: ship(speed_km_h=6.1).specs, r"410.6\d* h .*'disturbed'.* 237.1 h"),
     ],
