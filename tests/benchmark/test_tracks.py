@@ -25,7 +25,7 @@ RECORDS = {
     "box-v2": "e532e868b7a49993",
     "earth-v2": "49f64964da2779f5",
     "alone-v2": "9d5691e12866b3c3",
-    "vehicles-v1": "a956d9a08616de62",
+    "vehicles-v2": "c293a315e0fae9c6",
     "north-v1": "e35c4d00c50322a3",
     "sequences-v2": "0097b5789b370ad7",
 }
@@ -33,7 +33,7 @@ READINGS = {
     "box-v2": "7d90bc3d86e67637",
     "earth-v2": "a537f2dd64984e7e",
     "alone-v2": "a537f2dd64984e7e",
-    "vehicles-v1": "7ab8483ada0f53bf",
+    "vehicles-v2": "b0b36fb1cd06ae5e",
     "north-v1": "2eec445c2d5edf17",
     "sequences-v2": "a537f2dd64984e7e",
 }

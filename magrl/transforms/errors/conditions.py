@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -204,7 +204,8 @@ def conditions_named(name: str) -> Conditions:
     """Return a preset of :data:`CONDITIONS`, or the conditions of a file; see :func:`load_conditions`.
 
     Args:
-        name: name of a preset, or path of a file that ends in .toml or .json.
+        name: name of a preset, perhaps with a record of :data:`magrl.field.WEATHER` in which it travels; or path of a
+            file that ends in .toml or .json.
 
     Raises:
         ValueError: for an unknown name, listing those known, or a file that is wrong.
@@ -212,13 +213,17 @@ def conditions_named(name: str) -> Conditions:
     Example:
         >>> conditions_named("aircraft").north
         'fiber-optic'
+        >>> conditions_named("ship, disturbed").weather
+        {'record': 'disturbed', 'span_h': 200.0}
     """
     if isinstance(name, str) and name.endswith((".toml", ".json")):
         return load_conditions(name)
-    if name not in CONDITIONS:
+    vehicle, _, record = name.partition(", ")
+    if vehicle not in CONDITIONS:
         names = ", ".join(map(repr, CONDITIONS))
         raise ValueError(f"conditions must be one of {names}, or a file that ends in .toml or .json, got {name!r}")
-    return CONDITIONS[name]
+    chosen = CONDITIONS[vehicle]
+    return replace(chosen, name=name, weather={**(chosen.weather or {}), "record": record}) if record else chosen
 
 
 def with_conditions(env: EnvBase, conditions: Conditions | str, seed: int = 0) -> EnvBase:
