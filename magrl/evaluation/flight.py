@@ -42,7 +42,9 @@ class Flight:
             the paper.
         start_km: root mean square error of the place where they start [km]; None where they do not know it.
         target_km: the same of the destination, where they know the start.
-        rules: further values of :class:`magrl.tracking.Rules`, such as ``crust_nt``.
+        target_std: standard deviations of D [deg], I [deg], B_H [nT] with which the elements of the destination are
+            measured, where they know the start; None where these are from their own model.
+        rules: further values of :class:`magrl.tracking.Rules`, such as ``step_price``.
         confidence: minimum probability at which navigators declare an arrival, with arrival ``"declared"``.
         num_envs: number of vehicles; by default one for each task of the scenario, and one without tasks.
         seed: random seed of the errors, random start headings and metaheuristics.
@@ -75,6 +77,7 @@ class Flight:
         model: EarthModel | str | None = None,
         start_km: float | None = None,
         target_km: float = 0.0,
+        target_std: Sequence[float] | None = (0.0, 0.0, 0.0),
         rules: Mapping[str, Any] | None = None,
         confidence: float = 0.0,
         num_envs: int | None = None,
@@ -103,8 +106,8 @@ class Flight:
         if model is not None:
             self.rules["model"] = earth_model(model, scenario.date, scenario.altitude_km)
         if start_km is not None:
-            names = ("start_km", "target_km", "drift", "wander_km")
-            told = dict(zip(names, (start_km, target_km, *errors.motion_std), strict=True))
+            told = {"start_km": start_km, "target_km": target_km, "target_std": target_std}
+            told |= dict(zip(("drift", "wander_km"), errors.motion_std, strict=True))
             self.rules |= told if model is not None else {}
             self.env = TransformedEnv(self.env, KnownPlace(start_km, target_km, seed=seed), auto_unwrap=True)
 

@@ -26,8 +26,10 @@ Spec = str | Mapping[str, Any]
 """Navigator: a text, as recipes/evaluate.py takes it, or a ``name`` with options of its own."""
 MEASURES = ("success_rate", "spl")
 """Measures in a cell of a table."""
-OWN_OPTIONS = ("north", "confidence", "model", "start_km", "rules")
+OWN_OPTIONS = ("north", "confidence", "model", "start_km", "target_std")
 """Options of flights that a navigator may have by itself."""
+OWN_MODEL = "model"
+"""``target_std`` in a file, where the elements of the destination are from the vehicle's own model."""
 
 
 class Table(NamedTuple):
@@ -48,7 +50,7 @@ class Flights(Track):
     def fly(self, navigator: Spec, errors: Errors) -> TensorDictBase:
         """Return an episode of each task."""
         own = navigator if isinstance(navigator, Mapping) else {"name": navigator}
-        options = {key: own[key] for key in OWN_OPTIONS if key in own}
+        options = {key: None if own[key] == OWN_MODEL else own[key] for key in OWN_OPTIONS if key in own}
         return flown(self.flight(errors, **options), {key: own[key] for key in own if key not in options})
 
     def episodes(self, navigator: Spec, errors: Errors) -> list[Measures]:
@@ -158,11 +160,15 @@ def cell(runs: Sequence[Measures], measures: Sequence[str]) -> str:
 def names(navigator: Spec) -> list[str]:
     """Return the label of a navigator, with its options, what it was trained on, and what it is given.
 
-    What a vehicle knows of the Earth and its start is what it is given.
+    What a vehicle knows of the Earth, its start and its destination is what it is given. Elements of its own model
+    tell it nothing of its destination.
     """
     options = dict(navigator) if isinstance(navigator, Mapping) else {"name": navigator}
     text, trained, given = about(options.pop("name").partition("=")[0])
-    model, start_km, _ = (options.pop(key, None) for key in ("model", "start_km", "rules"))
-    told = [*([model] if model else []), *([f"start ± {start_km:g} km"] if start_km is not None else [])]
+    model, start_km, target_std = (options.pop(key, None) for key in ("model", "start_km", "target_std"))
+    told = [] if model is None else [model]
+    if start_km is not None:
+        told.append(f"start ± {start_km:g} km")
+        told += [] if target_std == OWN_MODEL else ["elements measured at the destination"]
     label = ", ".join([text, *(f"{key.replace('_', ' ')} {value}" for key, value in options.items())])
-    return [label, trained, " and ".join(told) or given]
+    return [label, trained, (", " if len(told) > 2 else " and ").join(told) or given]

@@ -54,10 +54,12 @@ def flights(
 ) -> Table:
     """Return a row for each navigator, and a column for each level of noise, or each of some conditions.
 
-    A cell has the ``measures``. The last rows are differences of SPL between the first navigator and those that it is
-    compared ``against``. The other options are those of :meth:`Flights.of`.
+    A cell has the ``measures``. The last rows are differences between the first navigator and those that it is compared
+    ``against``, of SPL where cells have it, of correct arrivals otherwise. The other options are those of
+    :meth:`Flights.of`.
     """
-    made, rows, spl, tables = Flights.of(**options), [], {}, []
+    made, rows, shares, tables = Flights.of(**options), [], {}, []
+    share, measure = ("spl", "SPL") if "spl" in measures else ("success", "correct arrivals")
     region = made.scenario.tasks.region
     labels = [names(navigator)[0] for navigator in navigators]
 
@@ -70,15 +72,15 @@ def flights(
     for navigator in navigators:
         name = title(navigator)
         episodes = {level: next(cells) for level in made.errors}
-        spl[name] = [runs[0]["spl"] for runs in episodes.values()]
+        shares[name] = [runs[0][share].double() for runs in episodes.values()]
         rows.append([*names(navigator), *(cell(runs, measures) for runs in episodes.values())])
         for level, runs in episodes.items():
             about = {"navigator": name, "level": level, "seed": made.seed}
             tables += [episode_table(run, region, run=number, **about) for number, run in enumerate(runs)]
     first = title(navigators[0])
-    for other in [name for name in map(title, against) if name in spl]:
-        differences = (paired_difference(*pair, region) for pair in zip(spl[first], spl[other], strict=True))
-        rows.append([f"{first} − {other}, SPL", "—", "—", *differences])
+    for other in [name for name in map(title, against) if name in shares]:
+        differences = (paired_difference(*pair, region) for pair in zip(shares[first], shares[other], strict=True))
+        rows.append([f"{first} − {other}, {measure}", "—", "—", *differences])
     return Table(markdown_table([*ABOUT, *made.errors], rows), tables)
 
 
@@ -132,7 +134,7 @@ def make(
         tables: Names of tables in tables.toml; all by default.
         navigators: Navigators in place of those of the table, as in recipes/evaluate.py.
         tasks: Number of tasks in place of that of the table.
-        confidence: Minimum probability at which vehicles declare their arrival; 0 by default.
+        confidence: Minimum probability at which vehicles declare their arrival, in place of that of the table.
         jobs: Processes that fly, with one thread each; of tables of the kind flights.
         out: Folder of the tables and their episodes, which are replaced; by default tables are printed.
 

@@ -114,10 +114,34 @@ def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> 
     assert rows(grid.flights([oracle], tasks=2, max_steps=1).text)[2][3] == "0.0 / 0.0"
     far = rows(grid.flights([oracle], tasks=2, distance_km=(1200, 1300), max_steps=60).text)
     assert far[2][3] == "100.0 / 100.0"
-    grid.make(("confidence",), navigators=(oracle,), tasks=2, out=tmp_path / "new")
+    grid.make(("confidence",), navigators=(oracle,), tasks=2, confidence=0.0, out=tmp_path / "new")
     head, _, row = rows((tmp_path / "new" / "confidence.md").read_text(encoding="utf-8"))
     assert head == ["navigator", "trained on", "given", "aircraft", "ship", "underwater", "low-cost"]
     assert row[3] == "100.0 / 0.0"
+
+
+def test_a_column_says_whether_the_destination_was_measured(monkeypatch) -> None:
+    """Elements of the vehicle's own model tell it nothing of its destination, and do not count as measured."""
+    told, made = {"model": "IGRF-13", "start_km": 5.0}, flights.Flights(tasks=2, max_steps=2)
+    measured, own = {"name": "secant", **told}, {"name": "secant", **told, "target_std": flights.OWN_MODEL}
+    given = [flights.names(spec)[2] for spec in (measured, own, {"name": "kalman", "model": "IGRF-13"}, "kalman")]
+    assert given == [
+        "IGRF-13, start ± 5 km, elements measured at the destination",
+        "IGRF-13 and start ± 5 km",
+        "IGRF-13",
+        "the field's spectrum",
+    ]
+    monkeypatch.setattr(flights, "flown", lambda flight, _: flight.rules["target_std"])
+    assert [made.fly(spec, LEVELS[0]) for spec in (measured, own)] == [(0.0, 0.0, 0.0), None]
+
+
+def test_differences_are_of_correct_arrivals_where_cells_are() -> None:
+    options = {"tasks": 2, "within_km": 25, "max_steps": 12, "levels": [(0, 0, 0)], "against": ["secant"]}
+    measures = ("success_rate", "false_arrival_rate")
+    table = rows(grid.flights(["geodesic", "secant"], measures=measures, **options).text)
+    assert table[4][0].endswith("secant (quasi-Newton), correct arrivals")
+    difference = float(table[2][3].split(" / ")[0]) - float(table[3][3].split(" / ")[0])
+    assert float(table[4][3].strip("*").split(" ")[0]) == difference
 
 
 def test_episodes_beside_a_table_give_its_numbers(tmp_path: Path, monkeypatch) -> None:
