@@ -101,7 +101,8 @@ def few_regions(monkeypatch) -> None:
     )
 
 
-def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path) -> None:
+def test_a_table_has_a_row_for_each_navigator_and_difference(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(benchmark.TRACKS, "vehicles-v2", replace(benchmark.TRACKS["vehicles-v2"], max_steps=20))
     oracle, old = "geodesic", {"name": "kalman", "step_price": 30.0}
     table = rows(
         grid.flights([oracle, old], against=[old], levels=[(0, 0, 0), (0.5, 0.1, 20)], tasks=4, max_steps=12).text
