@@ -48,8 +48,8 @@ class MagneticWeather(ReadingErrors):
             episode, float64, are the minute of the record in which it started, and the minutes since then.
 
     Raises:
-        ValueError: for a speed or distance that is not positive, another option out of its range, an unknown record, a record that
-            is too short for the episode, or an episode without a longest time.
+        ValueError: for a speed or distance that is not positive, another option out of its range, an unknown record, a
+            record that is too short for the episode, or an episode without a longest time.
         KeyError: for a step from a TensorDict without the state.
 
     Example:
