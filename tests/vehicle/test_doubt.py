@@ -30,7 +30,7 @@ def begun(**known: Any) -> Onboard:
 
 def test_a_start_that_is_off_is_refused_and_the_next_reading_may_be_right() -> None:
     vehicle = begun(start_km=1.0)
-    with pytest.raises(ValueError, match=r"does not fit the start, .* \(p = .* by what is stated\): read again"):
+    with pytest.raises(ValueError, match=r"does not fit the start, .* \(p = .* by what is stated\): check sensors"):
         vehicle.step(*at(-100.0), heading=0.0)
     assert vehicle.step(*at(0.0), heading=0.0).fit > 0.1
     assert begun(start_km=100.0).step(*at(-100.0), heading=0.0).stop is None

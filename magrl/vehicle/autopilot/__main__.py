@@ -25,6 +25,7 @@ from magrl.vehicle.autopilot.mavlink import MavlinkLink
 from magrl.vehicle.autopilot.nmea import NmeaLink
 from magrl.vehicle.logs import Calibration
 from magrl.vehicle.onboard import Command, Onboard
+from magrl.vehicle.onboard.doubt import LEAST_FIT
 
 
 def parser() -> argparse.ArgumentParser:
@@ -35,6 +36,8 @@ def parser() -> argparse.ArgumentParser:
     add("address", help="MAVLink: an address of pymavlink; NMEA: udp:PORT; or a serial port and its rate, PORT,RATE")
     place = "latitude and longitude, or D, I, B_H"
     add("--target", type=float, nargs="+", required=True, help=f"destination: {place}")
+    add("--target-elements", type=float, nargs=3, help="D, I, B_H measured at a target given by its place")
+    add("--target-std", type=float, nargs=3, default=(0, 0, 0), help="errors of measured D, I, B_H there; default 0")
     add("--start", type=float, nargs="+", help=f"start, where it is known: {place}")
     add("--start-km", type=float, default=0.1, help="error of the place of the start [km]; default 0.1")
     add("--date", help="date of the flight, such as 2026-06-30, for the model of the Earth")
@@ -90,6 +93,7 @@ def vehicle(options: argparse.Namespace) -> Onboard:
     settings |= {"drift": options.drift}
     board = Onboard(options.navigator, sensor_std=SensorStd(options.noise, options.bias), **settings)
     told = {"date": options.date, "model": options.model, "start_km": options.start_km}
+    told |= {"target_elements": options.target_elements, "target_std": options.target_std}
     board.start(options.target, options.start, **told, altitude_km=options.altitude)
     return board
 
@@ -111,7 +115,8 @@ def link(options: argparse.Namespace) -> Link:
 def line(number: int, order: Command, note: str) -> str:
     """Return a command as text."""
     north, east = order.way_km
-    texts = f"stop: {order.stop}, {order.reason}" if order.stop else order.reason, note
+    doubt = f"readings hardly fit what is stated (p = {order.fit:.1g})" if order.fit < LEAST_FIT else ""
+    texts = f"stop: {order.stop}, {order.reason}" if order.stop else order.reason, doubt, note
     return (
         f"{number}: steer {order.heading_deg:.0f} deg for {order.distance_km:.1f} km; to go {north:.0f} km north, "
         f"{east:.0f} km east, within {order.error_radius_km:.0f} km" + "".join(f"; {text}" for text in texts if text)

@@ -31,6 +31,9 @@ MOST_SIGMAS = 5.0
 """Deviation of a first reading beyond which it does not fit the known elements, in standard deviations."""
 SLACK_NT = 100.0
 """Deviation of the field vector that always fits; chosen [nT]."""
+LEAST_TAIL = 0.01
+"""Tail probability below which a first reading does not fit the start. Most of it is that of large anomalies, which are
+rare: of 144 right starts, none was below it, nor of 144 in the field of a crust."""
 IRON_NT = 2000.0
 """Standard deviation of the iron of a vehicle along each of its axes, before a calibration; chosen [nT]."""
 IRON_COST = 15.0
@@ -149,7 +152,7 @@ def _carried_model(journal: Journal) -> EarthModel | None:
 
 
 def check_first_reading(
-    reading: Elements, elements: Elements, sensor_std: SensorStd, elements_std: Sequence[float]
+    reading: Elements, elements: Elements, sensor_std: SensorStd, elements_std: Sequence[float], tail: float = 1.0
 ) -> None:
     """Raise unless the first reading fits the elements at the start.
 
@@ -158,6 +161,7 @@ def check_first_reading(
         elements: D, I, B_H at the start.
         sensor_std: accuracy of the sensors.
         elements_std: standard deviations of the elements.
+        tail: probability of a reading that is more surprising, by the model of the Earth and all that is stated.
 
     Raises:
         ValueError: with the element that does not fit, and the mistake that would explain it, if one is known.
@@ -174,39 +178,13 @@ deviates by 146.1, where 0.612 is likely): it fits with -I: the vertical axis po
     parts = torch.tensor([sensor_std.noise, sensor_std.bias, elements_std], dtype=torch.float64)
     std = parts.norm(dim=0)
     text = deviation(read, there, std)[0]
-    if text is None:
+    if text is None and tail >= LEAST_TAIL:
         return
     texts = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
-    cause = likely_mistake(read, there, std, torch.zeros(1).double())
-    cause = cause or "check sensors, calibration, compass and place, or state a larger bias"
+    cause = likely_mistake(read, there, std, torch.zeros(1).double()) if text else None
+    cause = cause or "check sensors, calibration, compass and place, state a larger error, or read again"
+    text = text or f"p = {tail:.1g} by what is stated"
     raise ValueError(f"the first reading, {texts[0]}, does not fit the start, {texts[1]} ({text}): {cause}")
-
-
-LEAST_TAIL = 0.01
-"""Tail probability below which a first reading does not fit the start. Most of it is that of large anomalies, which are
-rare: of 144 right starts, none was below it, nor of 144 in the field of a crust."""
-
-
-def check_first_innovation(tail: float, reading: Elements, elements: Elements) -> None:
-    """Raise if a first reading is too surprising, by the model and all stated errors.
-
-    Args:
-        tail: probability of a more surprising one.
-        reading: D [deg], I [deg], B_H [nT].
-        elements: D, I, B_H at the start.
-
-    Raises:
-        ValueError: with both.
-
-    Example:
-        >>> check_first_innovation(0.2, (3.4, 73.1, 14950.0), (3.5, 73.0, 15000.0))
-    """
-    if tail < LEAST_TAIL:
-        texts = [f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (reading, elements)]
-        raise ValueError(
-            f"the first reading, {texts[0]}, does not fit the start, {texts[1]} (p = {tail:.1g} by what is stated): "
-            "read again, and check place, date and calibration, or state a larger start_km"
-        )
 
 
 FIX_SQUARE = 13.8

@@ -25,7 +25,7 @@ from magrl.tracking.network import load_pilot, policy_content, pretrained
 from magrl.vehicle.onboard import limits
 from magrl.vehicle.onboard.doubt import LEAST_FIT, LOST_SURPRISE, Doubt
 from magrl.vehicle.onboard.journal import Command, Fix, Journal, Options, Step, estimates_of
-from magrl.vehicle.onboard.known import Knowledge, check_first_innovation, check_first_reading, fixed
+from magrl.vehicle.onboard.known import Knowledge, check_first_reading, fixed
 
 USUAL: dict[str, Any] = {
     "arrival": "declared",
@@ -225,7 +225,8 @@ class Onboard:
             if self._state is None:
                 track = tracking.begin(self._rules, reading)
                 if self._known:
-                    check_first_innovation(track.tail.item(), elements, self._known[0])
+                    there, std = self._known
+                    check_first_reading(elements, there, self.options.accuracy, std, track.tail.item())
                 self._other = self._other and self._other.begun(self.options, reading)
             else:
                 track = tracking.advance(self._rules, self._state, reading)
@@ -276,8 +277,6 @@ class Onboard:
             return
         if step.distance != 0:
             raise ValueError(f"distance must be 0 in the first step, which is at the start, got {step.distance!r}")
-        if self._known:
-            check_first_reading(elements, self._known[0], self.options.accuracy, self._known[1])
         if text := limits.out_of_range(self._range, elements):
             raise ValueError(f"the reading at the start: {text}")
         longest = LONGEST_WAY_KM if self._network else self.options.max_steps * self.options.max_move_km
