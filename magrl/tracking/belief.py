@@ -272,7 +272,8 @@ def moved(
     place = torch.stack((after, belief.place[..., 1]), -1)
     if motion.model is not None:
         return _moved_by_model(belief, Belief(mean, fresh, place), matrix, spread, distance, course, motion)
-    return _to_magnetic_north(Belief(mean, step @ belief.covariance @ step.mT + spread + fresh, place))
+    further = Belief(mean, step @ belief.covariance @ step.mT + spread + fresh, place)
+    return _to_magnetic_north(further) if torch.compiler.is_compiling() or belief.magnetic.any() else further
 
 
 def _moved_by_model(
