@@ -2,14 +2,16 @@
 
 The field of the crust, and magnetic weather that nobody stated, have a size that a vehicle does not know. So it holds a
 belief for each of some sizes. Each takes in every move and reading, and has a weight, which changes by the likelihood
-of its innovations, N(r; 0, S). What the vehicle believes is their mixture, as one normal distribution with its moments.
+of its innovations, N(r; 0, S); now and then the size changes. What the vehicle believes is their mixture, as one normal
+distribution with its moments.
 
 All beliefs share one reference place: their estimates of the place differ by their states :data:`PLACE
 <magrl.tracking.belief.PLACE>`.
 
 Source:
     D. T. Magill, Optimal adaptive estimation of sampled stochastic processes, IEEE Transactions on Automatic Control 10
-    (1965).
+    (1965). The weights change between readings as those of H. A. P. Blom and Y. Bar-Shalom, The interacting multiple
+    model algorithm, IEEE Transactions on Automatic Control 33 (1988); the beliefs do not.
 """
 
 from __future__ import annotations
@@ -31,6 +33,9 @@ SIZES_NT = (0.0, 30.0, 90.0)
 """Sizes of the anomaly, standard deviations in each axis [nT]; chosen on random planets with a crust and without."""
 PRIOR = (0.6, 0.3, 0.1)
 """Their probabilities at the start; chosen likewise."""
+CHANGES = 0.003
+"""Share of legs after which the size is another one, with these probabilities; chosen. Without it, a vehicle that has
+flown long in a quiet field would not find that it has come to another."""
 CRUST_KM = 100.0
 """Correlation length of the field of the crust at the ground [km], of WMMHR: its correlation at a distance d is
 ``exp(-d^2 / (2 * CRUST_KM^2))``."""
@@ -111,13 +116,15 @@ def recentered(beliefs: Belief, log_weight: Tensor) -> Belief:
 
 
 def reweighed(log_weight: Tensor, new: Innovation) -> Tensor:
-    """Return the logarithms ``(..., H)`` of the weights after a reading.
+    """Return the logarithms ``(..., H)`` of the weights after a reading, and before the next, for which the
+    surroundings may change.
 
     Args:
         log_weight: those before.
         new: innovation of each belief.
     """
-    return torch.log_softmax(log_weight - (new.square() + torch.logdet(new.covariance)) / 2, -1)
+    after = torch.log_softmax(log_weight - (new.square() + torch.logdet(new.covariance)) / 2, -1)
+    return torch.logaddexp(after + math.log1p(-CHANGES), prior_weights(after) + math.log(CHANGES))
 
 
 def tail(log_weight: Tensor, new: Innovation) -> Tensor:
