@@ -28,7 +28,7 @@ def __getattr__(name: str) -> object:
     return getattr(gymnasium, name)
 
 
-for _ending, _threshold in {"": 16.8, "Anywhere": 16.0, "Readings": 16.0, "Storm": 14.6, "NoGo": 16.0}.items():
+for _ending, _threshold in {"": 16.8, "Anywhere": 16.1, "Readings": 16.1, "Storm": 15.0, "NoGo": 16.0}.items():
     if f"magrl/GeomagneticNavigation{_ending}-v0" not in _gymnasium.registry:
         _gymnasium.register(
             f"magrl/GeomagneticNavigation{_ending}-v0",
