@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -78,3 +79,37 @@ def test_a_destination_by_coordinates_has_the_errors_of_the_model() -> None:
     by_place, by_elements = begun(start=None), begun(start=None, target=tuple(elements_at(FIELD, f64(*NEAR)).tolist()))
     near, exact = (vehicle.step(*at(0.0), heading=0.0).error_km for vehicle in (by_place, by_elements))
     assert near > exact + 5
+
+
+def test_measured_elements_of_a_destination_must_fit_its_place() -> None:
+    place = (61.4, 9.3)
+    d, i, h = elements_at(FIELD, f64(*place)).tolist()
+    std = (0.5, 0.1, 20.0)
+    with pytest.raises(ValueError, match=r"target_elements .* do not fit the target, .*: it fits with -I"):
+        begun(target=place, target_elements=(d, -i, h), target_std=std)
+    with pytest.raises(ValueError, match=r"do not fit the target, .*: check elements and place"):
+        begun(target=place, target_elements=at(-1500.0), target_std=std)
+    for model in ("IGRF-14", "IGRF-1990"):
+        begun(target=place, target_elements=(d, i, h + 150.0), target_std=std, model=model)
+    begun(target=place, target_elements=f64(d, i, h))
+    with pytest.raises(ValueError, match=r"target_std .* needs the target_elements"):
+        begun(target=place, target_std=std)
+
+
+def test_a_rejected_start_changes_nothing(tmp_path: Path) -> None:
+    vehicle = begun()
+    command = vehicle.step(*at(0.0), heading=0.0)
+    with pytest.raises(ValueError, match="start_km must be less"):
+        vehicle.start((61.4, 9.3), BERGEN, date=DATE, start_km=200.0)
+    vehicle.save(tmp_path / "state.json")
+    vehicle.restore(tmp_path / "state.json")
+    assert vehicle.target == begun().target
+    assert vehicle.step(*at(0.0), heading=0.0).place == pytest.approx(command.place, abs=0.01)
+
+
+def test_only_the_first_reading_of_a_known_start_counts_for_the_whole_flight() -> None:
+    for known, count in (({}, 1), ({"start": None}, 0)):
+        vehicle = begun(**known)
+        for number in range(10):
+            vehicle.step(*at(5.0 * number), heading=0.0, distance=5.0 * (number > 0))
+        assert (len(vehicle._doubt.start), len(vehicle._doubt.tails)) == (count, 8)

@@ -16,7 +16,7 @@ _LAST, _LEAST = 8, 2
 
 
 class Doubt(NamedTuple):
-    """The last surprises, the tail probabilities of the first reading, where the start is known, and of the last ones,
+    """The last surprises, the tail probability of the first reading, where the start is known, those of the last ones,
     and the least fit so far: a doubt stays until a fix of the position.
 
     Example:
@@ -25,6 +25,7 @@ class Doubt(NamedTuple):
     """
 
     surprises: tuple[float, ...] = ()
+    start: tuple[float, ...] = ()
     tails: tuple[float, ...] = ()
     fit: float = 1.0
 
@@ -40,6 +41,7 @@ class Doubt(NamedTuple):
 
     def after(self, track: Track, *, first: bool) -> Doubt:
         """Return the doubt after a reading."""
-        tails = (*self.tails[:1], *self.tails[1:][1 - _LAST :], track.tail.item())
+        tail = (track.tail.item(),)
+        start, tails = (tail, ()) if first else (self.start, (*self.tails, *tail)[-_LAST:])
         surprises = self.surprises if first else (*self.surprises, track.surprise.item())[-_LAST:]
-        return Doubt(surprises, tails, min(self.fit, joint_tail(tails)))
+        return Doubt(surprises, start, tails, min(self.fit, joint_tail(start + tails)))

@@ -115,7 +115,7 @@ class Knowledge(NamedTuple):
         """
         model = _carried_model(journal)
         elements_of = None if model is None else model.elements
-        target = _destination(journal, elements_of)
+        target = _destination(journal, model)
         start = None if journal.start is None else known_elements(journal.start, "start", elements_of)
         elements, std = (start.elements, start.std) if start else (None, (0.0,) * 3)
         if journal.start_std is not None:
@@ -131,14 +131,43 @@ class Knowledge(NamedTuple):
         return cls(target.elements, elements, (d, i, h), rules, start.place, target.place)
 
 
-def _destination(journal: Journal, model: Callable[[Tensor], Tensor] | None) -> Known:
+def _destination(journal: Journal, model: EarthModel | None) -> Known:
     """Return what is known of the destination, whose elements count as measured where they are given."""
-    target, measured = known_elements(journal.target, "target", model), journal.target_elements
+    target = known_elements(journal.target, "target", None if model is None else model.elements)
+    measured = journal.target_elements
+    if measured is None and target.place is None:
+        return target._replace(std=journal.target_std)
     if measured is None:
-        return target if target.place is not None else target._replace(std=journal.target_std)
+        if any(journal.target_std):
+            raise ValueError(f"target_std {journal.target_std} needs the target_elements that have these errors")
+        return target
     if target.place is None:
         raise ValueError(f"target_elements {measured} need the place of the target, got {journal.target}")
-    return known_elements(measured, "target_elements", None)._replace(std=journal.target_std, place=target.place)
+    given = known_elements(measured, "target_elements", None)._replace(std=journal.target_std, place=target.place)
+    assert model is not None
+    _check_measured(given, target, model.error_nt, journal.options.magnetic)
+    return given
+
+
+def _check_measured(given: Known, modeled: Known, error_nt: float, magnetic: bool) -> None:
+    """Raise unless measured elements are possible at their place, by a model with an error.
+
+    Raises:
+        ValueError: with the element that does not fit, and the mistake that would explain it, if one is known.
+    """
+    read, there = torch.tensor([[given.elements], [modeled.elements]], dtype=torch.float64)
+    if magnetic:  # D is not measured
+        read[..., 0] = there[..., 0]
+    level, total = there[..., 2], field_vector(there).norm(dim=-1)
+    shift = torch.stack((torch.rad2deg(error_nt / level), torch.rad2deg(error_nt / total), error_nt + 0 * level), -1)
+    std = torch.cat((shift, torch.tensor([given.std, modeled.std], dtype=torch.float64))).norm(dim=0)
+    if text := deviation(read, there, std)[0]:
+        texts = [
+            f"D {values[0]:g}, I {values[1]:g}, B_H {values[2]:g}" for values in (given.elements, modeled.elements)
+        ]
+        cause = likely_mistake(read, there, std, torch.zeros(1).double())
+        cause = cause or "check elements and place, or state a larger target_std"
+        raise ValueError(f"target_elements {texts[0]} do not fit the target, {texts[1]} by the model ({text}): {cause}")
 
 
 def _carried_model(journal: Journal) -> EarthModel | None:

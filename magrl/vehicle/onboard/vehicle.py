@@ -130,7 +130,7 @@ class Onboard:
                 without a model; or a model that does not cover the date.
         """
         target = self._comparable(target) if len(target) == 3 else target
-        target_elements = target_elements and self._comparable(target_elements)
+        target_elements = None if target_elements is None else self._comparable(target_elements)
         given: dict[str, Any] = {"target": target, "start": start, "start_std": start_std, "date": date}
         given |= {"target_elements": target_elements, "target_std": target_std}
         given |= {"model": model, "start_km": start_km, "target_km": target_km, "altitude_km": altitude_km}
@@ -139,10 +139,10 @@ class Onboard:
         limits.check_earth_reading(*known.target, what="the target")
         if text := limits.out_of_range(self._range, known.target):
             raise ValueError(f"the target: {text}")
-        self._journal, self._knowledge = journal, known
+        rules = Rules(**{name: getattr(self.options, name) for name in Rules.model_fields} | known.rules)
+        self._journal, self._knowledge, self._rules = journal, known, rules
         self.target = self._comparable(known.target)
         self._known = known.elements and (self._comparable(known.elements), known.std)
-        self._rules = Rules(**{name: getattr(self.options, name) for name in Rules.model_fields} | known.rules)
         self._std = SensorStd(*(torch.tensor(std, dtype=torch.float64) for std in self.options.accuracy))
         self._steps: tuple[Step | Fix, ...] = ()
         self._number = 0  # of steps without fixes
