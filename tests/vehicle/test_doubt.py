@@ -64,7 +64,7 @@ def test_the_elements_of_the_destination_count_where_they_are_given() -> None:
     """With a model of 2020, what is measured at the destination tells a vehicle more of the field on its way."""
     place, given = (61.4, 9.3), elements_at(FIELD, f64(61.4, 9.3)).tolist()
     ways = []
-    for more in ({}, {"target_elements": given, "target_std": (0.02, 0.02, 2.0)}, {"target_elements": given}):
+    for more in ({}, {"target_elements": given, "target_std": (0.02, 0.02, 2.0)}):
         vehicle = begun(target=place, start_km=5.0, model="IGRF-2020", **more)
         vehicle.step(*at(0.0), heading=60.0)
         ways.append(vehicle.step(*at(10.0, 17.3), heading=60.0, distance=20.0).confidence)
@@ -91,7 +91,9 @@ def test_measured_elements_of_a_destination_must_fit_its_place() -> None:
         begun(target=place, target_elements=at(-1500.0), target_std=std)
     for model in ("IGRF-14", "IGRF-1990"):
         begun(target=place, target_elements=(d, i, h + 150.0), target_std=std, model=model)
-    begun(target=place, target_elements=f64(d, i, h))
+    begun(target=place, target_elements=f64(d, i, h), target_std=std)
+    with pytest.raises(ValueError, match=r"target_elements need target_std, .* such as \(0\.2"):
+        begun(target=place, target_elements=(d, i, h))
     with pytest.raises(ValueError, match=r"target_std .* needs the target_elements"):
         begun(target=place, target_std=std)
 

@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     place = "latitude and longitude, or D, I, B_H"
     add("--target", type=float, nargs="+", required=True, help=f"destination: {place}")
     add("--target-elements", type=float, nargs=3, help="D, I, B_H measured at a target given by its place")
-    add("--target-std", type=float, nargs=3, default=(0, 0, 0), help="errors of measured D, I, B_H there; default 0")
+    add("--target-std", type=float, nargs=3, help="errors of measured D, I, B_H there, with the crust")
     add("--start", type=float, nargs="+", help=f"start, where it is known: {place}")
     add("--start-km", type=float, default=0.1, help="error of the place of the start [km]; default 0.1")
     add("--date", help="date of the flight, such as 2026-06-30, for the model of the Earth")

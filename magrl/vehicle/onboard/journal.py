@@ -159,7 +159,7 @@ class Journal(Inputs):
     options: Annotated[Options, _LAX]
     target: Annotated[tuple[float, ...], _LAX]
     target_elements: Triple | None = None
-    target_std: Triple = (0.0, 0.0, 0.0)
+    target_std: Triple | None = None
     start: Annotated[tuple[float, ...], _LAX] | None = None
     start_std: Triple | None = None
     date: str | None = None

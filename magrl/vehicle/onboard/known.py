@@ -136,13 +136,17 @@ def _destination(journal: Journal, model: EarthModel | None) -> Known:
     target = known_elements(journal.target, "target", None if model is None else model.elements)
     measured = journal.target_elements
     if measured is None and target.place is None:
-        return target._replace(std=journal.target_std)
+        return target._replace(std=journal.target_std or target.std)
     if measured is None:
-        if any(journal.target_std):
+        if journal.target_std is not None:
             raise ValueError(f"target_std {journal.target_std} needs the target_elements that have these errors")
         return target
     if target.place is None:
         raise ValueError(f"target_elements {measured} need the place of the target, got {journal.target}")
+    if journal.target_std is None:
+        raise ValueError(
+            "target_elements need target_std, their errors with the field of the crust there, such as (0.2, 0.1, 60)"
+        )
     given = known_elements(measured, "target_elements", None)._replace(std=journal.target_std, place=target.place)
     assert model is not None
     _check_measured(given, target, model.error_nt, journal.options.magnetic)

@@ -95,7 +95,7 @@ class Onboard:
         start: Sequence[float] | None = None,
         *,
         target_elements: Sequence[float | None] | None = None,
-        target_std: Sequence[float] = (0.0, 0.0, 0.0),
+        target_std: Sequence[float] | None = None,
         start_std: Sequence[float] | None = None,
         date: str | None = None,
         model: str | None = NEWEST,
@@ -117,7 +117,8 @@ class Onboard:
             start: latitude and longitude of the start [deg], with a date; or the elements there.
             target_elements: D, I [deg], B_H [nT] that were measured at a target that is given by its place: where the
                 vehicle also knows its own, they show how far the model is off there.
-            target_std: standard deviations of elements that were measured at the destination.
+            target_std: standard deviations of elements that were measured at the destination, with the crust there; 0
+                by default for elements without a place.
             start_std: standard deviations of the elements at the start, 0 by default.
             date: date of the flight, such as ``"2026-06-30"``.
             model: model of the Earth that the vehicle carries (:func:`magrl.tracking.earth_model`); None for none.
