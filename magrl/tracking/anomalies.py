@@ -30,9 +30,10 @@ from magrl.tracking.local import inverse3
 from magrl.tracking.prior import lasting_covariances
 
 SIZES_NT = (0.0, 30.0, 90.0)
-"""Sizes of the anomaly, standard deviations in each axis [nT]; chosen on random planets with a crust and without."""
+"""Sizes of the anomaly, standard deviations in each axis [nT]; chosen: the crust of WMMHR has 26 to 42. For sizes
+between them, stated errors are too small."""
 PRIOR = (0.6, 0.3, 0.1)
-"""Their probabilities at the start; chosen likewise."""
+"""Their probabilities at the start; chosen."""
 CHANGES = 0.003
 """Share of legs after which the size is another one, with these probabilities; chosen. Without it, a vehicle that has
 flown long in a quiet field would not find that it has come to another."""
