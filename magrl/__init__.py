@@ -28,12 +28,13 @@ def __getattr__(name: str) -> object:
     return getattr(gymnasium, name)
 
 
-for _ending, _threshold in {"": 16.8, "Anywhere": 16.1, "Readings": 16.1, "Storm": 15.0, "NoGo": 16.0}.items():
-    if f"magrl/GeomagneticNavigation{_ending}-v0" not in _gymnasium.registry:
+_TASKS = {"-v0": 16.8, "Anywhere-v1": 16.1, "Readings-v1": 16.1, "Storm-v1": 15.0, "NoGo-v0": 16.0}
+for _id, _threshold in _TASKS.items():
+    if f"magrl/GeomagneticNavigation{_id}" not in _gymnasium.registry:
         _gymnasium.register(
-            f"magrl/GeomagneticNavigation{_ending}-v0",
+            f"magrl/GeomagneticNavigation{_id}",
             entry_point="magrl:GeomagneticNavGymEnv",
             vector_entry_point="magrl:GeomagneticNavVectorEnv",
             reward_threshold=_threshold,
-            kwargs={"task": _ending.lower() or "box"},
+            kwargs={"task": _id.split("-")[0].lower() or "box"},
         )

@@ -22,7 +22,7 @@ from torch import Tensor
 total_timesteps, num_tasks = 400_000, 500
 
 # Training on random planets, with random noise of the sensors
-name, reward = "magrl/GeomagneticNavigationAnywhere-v0", "spl"
+name, reward = "magrl/GeomagneticNavigationAnywhere-v1", "spl"
 envs = gymnasium.make_vec(name, num_envs=512, autoreset_mode="SameStep", reward=reward)
 options = {"n_steps": 32, "batch_size": 2048, "n_epochs": 5, "learning_rate": 1e-3, "device": "cpu", "seed": 0}
 vehicles = VecMonitor(BatchedVecEnv(envs))

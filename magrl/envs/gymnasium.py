@@ -1,7 +1,7 @@
 """The environment for Gymnasium: one vehicle as an ``Env``, a batch of them as a ``VectorEnv``.
 
 ``import magrl`` registers the named tasks: ``magrl/GeomagneticNavigation-v0``, which is *Box*, and with the endings
-``Anywhere-v0``, ``Readings-v0``, ``Storm-v0`` and ``NoGo-v0``. The classes run the
+``Anywhere-v1``, ``Readings-v1``, ``Storm-v1`` and ``NoGo-v0``. The classes run the
 TorchRL environments of :data:`magrl.envs.navigation.NAMED_ENVS`, and only convert tensors to arrays: the same seed and
 the same actions give the same bits.
 """
@@ -33,7 +33,7 @@ from magrl.envs.specs import PUBLIC_KEYS
 from magrl.transforms.areas import outlines
 
 ENV_ID = "magrl/GeomagneticNavigation-v0"
-ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v0"
+ANYWHERE_ID = "magrl/GeomagneticNavigationAnywhere-v1"
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 VectorStep = tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
 # A forked process lacks the threads of its parent, and would wait for them.

@@ -13,6 +13,7 @@ from magrl.envs.geomagnetic import GeomagneticNavEnv
 from magrl.envs.random_regions import planet_scenario
 from magrl.envs.regions import PAPER_REGION
 from magrl.envs.scenario import Scenario
+from magrl.field import WeatherRecord
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking import STEP_PRICE, Rules
 from magrl.transforms import (
@@ -34,12 +35,15 @@ from magrl.transforms import (
     TrueWay,
     sensor_levels,
 )
+from magrl.transforms.sequences import ACCURACY_KEYS
 from magrl.transforms.track import known_keys
 
 OBSERVATIONS = ("flat", "track", "readings", "dict")
 REWARDS = ("progress", "paper", "base", "spl")
 STORM_NOISE = (0.05, 0.05, 5.0)
 """White noise of the task *Storm*, which the data sheet states: D [deg], I [deg], B_H [nT]."""
+STORMS = 256
+"""Storms of the trainings of *Storm*."""
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
 
@@ -59,7 +63,7 @@ def navigation_env(
         num_envs: vehicles in the batch.
         observation: ``"flat"`` adds ``observation``, ``(N, 13)``, scaled to the region: the input of the recipes'
             networks. ``"track"`` adds ``observation``, ``(N, 19)``, the estimates of the own track
-            (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 20)``, readings without estimates
+            (:class:`~magrl.transforms.TrackField`), and ``"readings"``, ``(N, 26)``, readings without estimates
             (:class:`~magrl.transforms.ReadingObservation`), in any number of regions. ``"dict"`` leaves the public
             keys in physical units, and so does a list of keys, which the Gymnasium interface observes. The view of
             ``"flat"`` is the ``view`` of the environment, for :func:`magrl.save_policy`.
@@ -122,7 +126,7 @@ def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **optio
         scenario: scenario of any number of regions; by default :data:`PLANET_REGIONS` of random planets, with
             destinations 300 to 500 km away.
         **options: of :func:`navigation_env`, with other defaults: ``observation="track"``, ``start_heading="random"``
-            unless the scenario states one, and errors of its sensors of random size
+            and ``arrival="distance"`` unless the scenario states them, and errors of its sensors of random size
             (:func:`magrl.transforms.sensor_levels`).
 
     Raises:
@@ -133,8 +137,9 @@ def anywhere_env(num_envs: int = 1, *, scenario: Scenario | None = None, **optio
         torch.Size([4, 3, 19])
     """
     scenario = _planets() if scenario is None else scenario
-    heading = scenario.given("start_heading") or "random"
-    defaults: dict[str, Any] = {"observation": "track", "start_heading": heading}
+    defaults: dict[str, Any] = {"observation": "track"}
+    for name, value in {"start_heading": "random", "arrival": "distance"}.items():
+        defaults[name] = scenario.given(name) or value
     defaults["transforms"] = [SensorErrors(levels=sensor_levels)]
     return navigation_env(num_envs, scenario=scenario, **defaults | options)
 
@@ -155,7 +160,11 @@ def _observation(env: TransformedEnv, observation: str | Sequence[str]) -> list[
         return env.view.observation_transforms()
     if observation == "track":
         return [TrackField(Rules(**base.limits), known_keys(env.observation_spec))]
-    return [ReadingObservation()] if observation == "readings" else []
+    if observation == "readings":
+        keys = list(env.observation_spec.keys())
+        known = [key for key in ACCURACY_KEYS if key in keys]
+        return [ReadingObservation([*ReadingObservation.default_in_keys, *known])]
+    return []
 
 
 def _parts(transforms: Iterable[Transform]) -> Iterator[Transform]:
@@ -173,15 +182,16 @@ def readings_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
 
     Example:
         >>> readings_env(4, seed=0).rollout(3)["observation"].shape
-        torch.Size([4, 3, 20])
+        torch.Size([4, 3, 26])
     """
     return anywhere_env(num_envs, **{"observation": "readings"} | options)
 
 
 def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
-    """Return the environment *Readings* with errors that no data sheet states, in an aircraft.
+    """Return the environment *Readings* with errors that no data sheet states, in an aircraft (:func:`storm_errors`).
 
-    They are magnetic weather of the auroral zone, a drift, and spikes in 5 % of the readings. The sizes are chosen.
+    With a seed below :data:`magrl.paper.FIRST_RESERVED_SEED`, an episode has one of :data:`STORMS` storms with the
+    spectrum of the record and random phases; with the seeds from there on, it is in the record.
 
     Args:
         num_envs: vehicles in the batch.
@@ -191,13 +201,29 @@ def storm_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
         >>> storm_env(4, seed=0).reset()["sensor_std"][0]
         tensor([0.0500, 0.0500, 5.0000])
     """
-    drift: dict[str, Any] = {"drift": (0.1, 0.05, 20.0), "drift_length": 200.0}
-    errors = (
-        MagneticWeather("college", speed_km_h=CONDITIONS["aircraft"].speed_km_h, stated=PERFECT),
-        SensorErrors(STORM_NOISE, **drift, stated=SensorStd(STORM_NOISE)),
+    return readings_env(num_envs, **{"transforms": storm_errors()} | options)
+
+
+def storm_errors(record: str | WeatherRecord = "college", *, stated: bool = False) -> list[Transform]:
+    """Return the errors of *Storm*: magnetic weather of the auroral zone, a drift, and spikes in 5 % of the readings.
+
+    The sizes are chosen.
+
+    Args:
+        record: another record of the weather.
+        stated: whether the vehicle knows the size of each error, beside that of the white noise.
+
+    Example:
+        >>> [type(error).__name__ for error in storm_errors()]
+        ['MagneticWeather', 'SensorErrors', 'Spikes']
+    """
+    speed_km_h, drift = CONDITIONS["aircraft"].speed_km_h, (0.1, 0.05, 20.0)
+    none, noise = (None, None) if stated else (PERFECT, SensorStd(STORM_NOISE))
+    return [
+        MagneticWeather(record, speed_km_h=speed_km_h, surrogates=STORMS, stated=none),
+        SensorErrors(STORM_NOISE, drift=drift, stated=noise),
         Spikes((2.0, 1.0, 200.0), rate=0.05),
-    )
-    return readings_env(num_envs, **{"transforms": errors} | options)
+    ]
 
 
 def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:

@@ -114,6 +114,43 @@ class WeatherRecord:
         variation = self.variation[self.first : last].double()
         return (variation.unsqueeze(-1) * variation.unsqueeze(-2)).nanmean(0)
 
+    def surrogates(self, number: int, seed: int = 0) -> Tensor:
+        """Return variations with the spectra and cross-spectra of the record, and random phases.
+
+        One phase a frequency turns all three components, so that they vary together as they did.
+
+        Args:
+            number: number of variations, from 1 on.
+            seed: seed of the phases.
+
+        Returns:
+            ``(number, T, 3)`` north, east, down [nT].
+
+        Raises:
+            ValueError: for a record with gaps.
+
+        Source:
+            D. Prichard and J. Theiler, Generating surrogate data for time series with several simultaneously measured
+            variables, Physical Review Letters 73 (1994).
+
+        Example:
+            >>> record = weather_record("college")
+            >>> drawn = record.surrogates(2)
+            >>> drawn.shape, torch.allclose(drawn.square().mean(1), record.variation.square().mean(0), rtol=1e-3)
+            (torch.Size([2, 1440, 3]), True)
+        """
+        check_number(1, whole=True, number=number)
+        if not torch.isfinite(self.variation).all():
+            raise ValueError(f"surrogates need a record without gaps, {self.name!r} has some")
+        length, spectrum = len(self.variation), torch.fft.rfft(self.variation.double(), dim=0)
+        phase = 2 * math.pi * torch.rand(number, len(spectrum), 1, generator=torch.Generator().manual_seed(seed))
+        turned = torch.polar(torch.ones_like(phase), phase)
+        real = turned.real.sign().to(turned)  # the mean and, of an even number, the highest frequency stay real
+        turned[:, 0] = real[:, 0]
+        if length % 2 == 0:
+            turned[:, -1] = real[:, -1]
+        return torch.fft.irfft(spectrum * turned, n=length, dim=1).to(self.variation)
+
 
 WEATHER = {
     "quiet": ("boulder-2016-01", 18, 18),

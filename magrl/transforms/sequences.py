@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -10,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from magrl.field.elements import element_difference
+from magrl.sensor_std import STD_KEYS
 from magrl.transforms.base import StatefulTransform
 
 _MOVE_KM = 50.0
@@ -20,6 +22,13 @@ _LEAST_NT = 1000.0  # of the horizontal intensity; below, small angles no longer
 _FARTHEST = 6.0  # a feature; beyond, it is as at this value
 _FIELD_NT, _FIELD_RANGE_NT = (25_000.0, 45_000.0), (12_000.0, 15_000.0)  # of B_H and of the total intensity
 _FAR_NT = 1500.0  # unit of the difference to the target
+_NOISE_NT = 5.0  # unit of the accuracy, that of good sensors
+
+
+READING_SIZE = 26
+"""Numbers of the observation of a reading."""
+ACCURACY_KEYS = STD_KEYS[:2]
+"""Keys of the accuracy that is observed: of errors that are new in each reading, and of all others."""
 
 
 class ReadingObservation(StatefulTransform):
@@ -30,11 +39,10 @@ class ReadingObservation(StatefulTransform):
 
     Args:
         in_keys: reading and target ``(..., 3)``: D [deg], I [deg], B_H [nT]; last move ``(..., 2)`` with the distance
-            [km] first and the turn [rad] second; and the heading ``(..., 1)`` [rad], or no fourth key for a vehicle
-            without a compass.
-        out_keys: one observation ``(..., 20)``: reading and remaining differences (:func:`features`, 12), the change of
-            D, I, B_H per kilometer of the last move (3), how far along it the differences would be least, and how well
-            it fits them (2), cosine and sine of the heading, or else of the last turn, and the distance of the move.
+            [km] first and the turn [rad] second; heading ``(..., 1)`` [rad]; and the accuracy that the vehicle knows
+            ``(..., 3)`` each, of errors that are new in each reading and of all others, or no such keys with perfect
+            sensors.
+        out_keys: one observation ``(..., 26)``; see :func:`observed_reading`.
 
     Raises:
         ValueError: for another number of keys.
@@ -44,13 +52,13 @@ class ReadingObservation(StatefulTransform):
         >>> from torchrl.envs import TransformedEnv
         >>> env = TransformedEnv(GeomagneticNavEnv(num_envs=2, seed=0), ReadingObservation())
         >>> env.rollout(3)["observation"].shape
-        torch.Size([2, 3, 20])
+        torch.Size([2, 3, 26])
     """
 
     default_in_keys = ("field", "target_field", "move", "heading")
     default_out_keys = ("observation",)
-    optional_in_keys = ("heading",)
-    out_sizes = {"observation": (20,)}
+    optional_in_keys = ACCURACY_KEYS
+    out_sizes = {"observation": (READING_SIZE,)}
 
     @property
     def state_keys(self) -> list[NestedKey]:
@@ -61,23 +69,50 @@ class ReadingObservation(StatefulTransform):
         self._advance(tensordict, values, values[:1])
 
     def _advance(self, tensordict: TensorDictBase, values: list[Tensor], state: list[Tensor]) -> None:
-        (reading, target, move, *heading), (before,) = values, state
-        moved, angle = move[..., :1], heading[0] if heading else move[..., 1:2]
-        unit = per_nanotesla(reading)
-        left = element_difference(target, reading) / unit / _DIFFERENCE_NT
-        rate = element_difference(reading, before) / unit / moved.clamp_min(_LEAST_MOVE_KM) / _RATE
-        along, steep, far = ((a * b).sum(-1, keepdim=True) for a, b in ((left, rate), (rate, rate), (left, left)))
-        fit = along / (steep * far + 1e-6).sqrt()
-        observed = (
-            features(reading, target),
-            torch.asinh(rate),
-            torch.asinh(4 * along / (steep + 1e-2)),
-            fit,
-            torch.cos(angle),
-            torch.sin(angle),
-            moved / _MOVE_KM,
-        )
-        tensordict.set(self.out_keys[0], torch.cat(observed, -1))
+        reading, target, move, heading, *accuracy = values
+        stds = accuracy or [torch.zeros_like(reading)] * len(ACCURACY_KEYS)
+        observed = observed_reading(reading, target, move[..., :1], heading, stds, state[0])
+        tensordict.set(self.out_keys[0], observed)
+
+
+def observed_reading(
+    reading: Tensor, target: Tensor, moved: Tensor, heading: Tensor, accuracy: Sequence[Tensor], before: Tensor
+) -> Tensor:
+    """Return the observation of a reading and the one before it, scaled.
+
+    Args:
+        reading: ``(..., 3)`` D [deg], I [deg], B_H [nT].
+        target: ``(..., 3)`` those at the destination.
+        moved: ``(..., 1)`` distance of the last move [km].
+        heading: ``(..., 1)`` direction of that move [rad].
+        accuracy: standard deviations at :data:`ACCURACY_KEYS`, ``(..., 3)`` each.
+        before: ``(..., 3)`` reading before the move.
+
+    Returns:
+        ``(..., 26)``: reading and remaining differences (:func:`features`, 12), the change of D, I, B_H per kilometer
+        of the last move (3), how far along it the differences would be least, and how well it fits them (2), cosine and
+        sine of the heading, the distance of the move, and the accuracy (6).
+
+    Example:
+        >>> reading, moved = torch.tensor([0.0, 60.0, 25000.0]), torch.tensor([20.0])
+        >>> observed_reading(reading, reading, moved, moved, [torch.zeros(3)] * 2, reading).shape
+        torch.Size([26])
+    """
+    unit = per_nanotesla(reading)
+    left = element_difference(target, reading) / unit / _DIFFERENCE_NT
+    rate = element_difference(reading, before) / unit / moved.clamp_min(_LEAST_MOVE_KM) / _RATE
+    along, steep, far = ((a * b).sum(-1, keepdim=True) for a, b in ((left, rate), (rate, rate), (left, left)))
+    observed = (
+        features(reading, target),
+        torch.asinh(rate),
+        torch.asinh(4 * along / (steep + 1e-2)),
+        along / (steep * far + 1e-6).sqrt(),
+        torch.cos(heading),
+        torch.sin(heading),
+        moved / _MOVE_KM,
+        *(torch.asinh(std / unit / _NOISE_NT).clamp(max=_FARTHEST) for std in accuracy),
+    )
+    return torch.cat(observed, -1)
 
 
 def features(reading: Tensor, target: Tensor) -> Tensor:

@@ -15,13 +15,13 @@ GRADIENT = torch.tensor([[0.01, -0.002], [0.004, 0.008], [3.0, -5.0]])  # D, I [
 START, WAY = torch.tensor([3.0, 60.0, 20000.0]), torch.tensor([120.0, -200.0])
 
 
-def flight(heading: float, km: float, keys: slice = slice(None)) -> TensorDict:
+def flight(heading: float, km: float, **accuracy: Tensor) -> TensorDict:
     """The observations at a start and after a move."""
-    there = {"target_field": (START + GRADIENT @ WAY)[None], "heading": torch.tensor([[heading]])}
+    there = {"target_field": (START + GRADIENT @ WAY)[None], "heading": torch.tensor([[heading]]), **accuracy}
     displacement = km * torch.tensor([math.cos(heading), math.sin(heading)])
     first = TensorDict(field=START[None], move=torch.zeros(1, 2), **there, batch_size=1)
     after = TensorDict(field=(START + GRADIENT @ displacement)[None], move=torch.tensor([[km, 0.3]]), **there)
-    observe = ReadingObservation(ReadingObservation.default_in_keys[keys])
+    observe = ReadingObservation([*ReadingObservation.default_in_keys, *accuracy])
     return observe(observe(first).set("next", after))
 
 
@@ -43,7 +43,7 @@ def test_a_start_has_no_change() -> None:
     first = flight(0.5, 20.0)["observation"][0]
     assert torch.equal(first[:12], features(START, START + GRADIENT @ WAY))
     assert not first[12:17].any()
-    torch.testing.assert_close(first[17:], torch.tensor([math.cos(0.5), math.sin(0.5), 0.0]))
+    torch.testing.assert_close(first[17:20], torch.tensor([math.cos(0.5), math.sin(0.5), 0.0]))
 
 
 def test_the_change_of_the_reading_is_along_the_move() -> None:
@@ -57,13 +57,17 @@ def test_the_change_of_the_reading_is_along_the_move() -> None:
         torch.testing.assert_close(seen[16], torch.nn.functional.cosine_similarity(rate, left, 0), rtol=1e-2, atol=0)
         nearest_km = torch.dot(rate, left) / rate.square().sum()
         torch.testing.assert_close(400 * torch.sinh(seen[15]), nearest_km, rtol=0.05, atol=0)
-        torch.testing.assert_close(seen[17:], torch.tensor([*direction, 0.4]))
+        torch.testing.assert_close(seen[17:20], torch.tensor([*direction, 0.4]))
 
 
-def test_without_a_compass_the_last_turn_takes_the_place_of_the_heading() -> None:
-    with_heading, without = (flight(0.5, 20.0, keys)["next", "observation"][0] for keys in (slice(4), slice(3)))
-    assert torch.equal(without[:17], with_heading[:17])
-    torch.testing.assert_close(without[17:], torch.tensor([math.cos(0.3), math.sin(0.3), 0.4]))
+def test_the_accuracy_is_observed_in_nanotesla() -> None:
+    """5 nT across, along and in the meridian are 1 unit; sensors that are not described are perfect."""
+    assert not flight(0.5, 20.0)["observation"][:, 20:].any()
+    unit = 5 / nanotesla(torch.ones(3), START)
+    noise, bias = unit[None], torch.tensor([[0.0, 0.0, 1e4]])
+    seen = flight(0.5, 20.0, sensor_std=noise, bias_std=bias)["observation"][0, 20:]
+    expected = torch.tensor([*[math.asinh(1)] * 3, 0.0, 0.0, 6.0])
+    torch.testing.assert_close(seen, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_another_distance_has_the_same_rate() -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torchrl.data import Composite
 
+from magrl import paper
 from magrl.checks import check_number, check_type
 from magrl.counters import stream_uniform
 from magrl.field.elements import elements_jacobian, field_vector, measured_elements
@@ -41,6 +42,10 @@ class MagneticWeather(ReadingErrors):
             weather stays constant. By default the longest moves until the step
             limit, where the environment has ``max_steps`` and ``max_move_km``.
         way_km: distance of a trip, whose weather a vehicle expects [km].
+        surrogates: number of variations with the spectrum of the record and random phases
+            (:meth:`~magrl.field.WeatherRecord.surrogates`), one of which each episode of a training gets: with an
+            environment of a seed below :data:`magrl.paper.FIRST_RESERVED_SEED`. Evaluations, with the seeds from there
+            on, get the record itself, which no training has seen.
         in_keys: D [deg], I [deg], B_H [nT] ``(..., 3)``, and the last move ``(..., K)``, whose first number is the
             distance [km].
         out_keys: the measured elements ``(..., 3)``, in place by default.
@@ -75,16 +80,19 @@ class MagneticWeather(ReadingErrors):
         speed_km_h: float,
         span_h: float | None = None,
         way_km: float = 500.0,
+        surrogates: int = 0,
         **options: Any,
     ) -> None:
         super().__init__(**options)
         self.record = weather_record(record) if isinstance(record, str) else record
         check_type(WeatherRecord, record=self.record)
+        check_number(0, whole=True, surrogates=surrogates)
         check_number(0, above=True, speed_km_h=speed_km_h, way_km=way_km)
         check_number(0, optional=True, span_h=span_h)
         self.speed_km_h, self.span_h = float(speed_km_h), span_h
         self._starts_by_span: dict[float, Tensor] = {}
-        self.register_buffer("variation", self.record.variation, persistent=False)
+        drawn = self.record.surrogates(surrogates).flatten(0, 1) if surrogates else self.record.variation[:0]
+        self.register_buffer("variation", torch.cat((self.record.variation, drawn)), persistent=False)
         moments = self.record.second_moments(way_km / self.speed_km_h)
         self.register_buffer("_moments", moments, persistent=False)
         self._set_accuracy()
@@ -111,8 +119,14 @@ class MagneticWeather(ReadingErrors):
         return self._starts_by_span[span_h]
 
     def _constants(self, stream: Tensor) -> Tensor:
-        """Return the minute of the record in which an episode starts, and 0 minutes since then, ``(..., 2)``."""
-        starts = self._starts().to(stream.device)
+        """Return the minute at which an episode starts, and 0 minutes since then, ``(..., 2)``.
+
+        The minutes of the surrogates come after those of the record.
+        """
+        starts, length = self._starts().to(stream.device), len(self.record.variation)
+        if getattr(self.parent, "seed", paper.FIRST_RESERVED_SEED) < paper.FIRST_RESERVED_SEED:
+            later = torch.arange(length, len(self.variation), length, device=stream.device)
+            starts = (later.unsqueeze(-1) + starts).flatten() if len(later) else starts
         return pad(starts[(stream_uniform(stream, 1) * len(starts)).long()].double(), (0, 1))
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from magrl import paper
 from magrl.envs import Scenario, named_tasks
 from magrl.evaluation import Flight
 from magrl.field import WEATHER, WeatherRecord, weather_record
@@ -159,3 +160,34 @@ def test_the_stated_weather_is_that_of_the_longest_trip() -> None:
 def test_errors(make: Callable[[], object], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         make()
+
+
+# Surrogates
+
+
+def test_surrogates_have_the_spectra_of_the_record_and_other_phases() -> None:
+    """Of each component and of their products; an odd length has no highest frequency that is real."""
+    for variation in (weather_record("college").variation, weather_record("college").variation[:-1]):
+        record = WeatherRecord(variation)
+        drawn = record.surrogates(8, seed=1).double()
+        spectrum, found = torch.fft.rfft(variation.double(), dim=0), torch.fft.rfft(drawn, dim=1)
+        expected = spectrum.unsqueeze(-1) * spectrum.conj().unsqueeze(-2)
+        found = found.unsqueeze(-1) * found.conj().unsqueeze(-2)
+        torch.testing.assert_close(found, expected.expand_as(found), rtol=1e-3, atol=1.0)
+        correlations = torch.corrcoef(torch.cat((variation.T.double()[:1], drawn[..., 0])))
+        assert correlations[~torch.eye(9, dtype=torch.bool)].abs().max() < 0.7
+    with pytest.raises(ValueError, match="surrogates need a record without gaps, 'own record' has some"):
+        WeatherRecord(torch.tensor([[0.0, 0.0, NAN]])).surrogates(1)
+
+
+def test_trainings_get_surrogates_and_evaluations_the_record() -> None:
+    """By the seed of the environment, also where it is set later."""
+    env, record = ship(64, surrogates=3), weather_record("disturbed")
+    length = len(record.variation)
+    for seed, training in ((7, True), (paper.FIRST_RESERVED_SEED, False), (8, True)):
+        env.set_seed(seed)
+        start = env.reset()["weather_clock"][:, 0]
+        assert ((start >= length) == training).all()
+        assert ((start % length >= record.first) & (start % length <= record.last)).all()
+        assert len((start // length).unique()) == (3 if training else 1)
+    assert len(ship(1).transform.variation) == length

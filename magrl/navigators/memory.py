@@ -1,0 +1,145 @@
+"""The agent with a memory: a recurrent network over readings, without a map, a filter or a model of errors."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from magrl.checks import check_finite, check_number
+from magrl.files import save_tensors
+from magrl.geodesy import polar, steer
+from magrl.navigators.base import Navigator
+from magrl.tracking.network import FILE_FORMAT, correction_network, policy_content, pretrained
+from magrl.transforms.sequences import ACCURACY_KEYS, READING_SIZE, observed_reading
+
+LIMITS = {"max_move_km": 50.0, "max_turn_rad": math.pi / 2}
+"""Longest leg, the unit of the outputs, and largest turn, in training."""
+
+
+class MemoryNetwork(nn.Module):
+    """A gated recurrent unit (GRU), an estimate of the displacement to the destination, and its correction.
+
+    Args:
+        size: width of the memory and of the hidden layers.
+        device: device of the parameters.
+
+    Example:
+        >>> network = MemoryNetwork(8)
+        >>> leg, hidden = network(torch.zeros(5, READING_SIZE), torch.zeros(5, 1, 8))
+        >>> leg.shape, hidden.shape
+        (torch.Size([5, 2]), torch.Size([5, 1, 8]))
+    """
+
+    def __init__(self, size: int = 128, device: torch.device | str | None = None) -> None:
+        super().__init__()
+        check_number(1, 65536, whole=True, size=size)
+        self.size = size
+        self.encode = nn.Sequential(nn.Linear(READING_SIZE, size, device=device), nn.SiLU())
+        self.gru = nn.GRU(size, size, batch_first=True, device=device)
+        self.estimate = correction_network((size,), device, inputs=size + READING_SIZE)
+        self.correct = correction_network((size,), device, inputs=size + READING_SIZE + 2)
+
+    def forward(self, observation: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the next leg, northward and eastward in longest legs ``(N, 2)``, and the next memory.
+
+        Args:
+            observation: ``(N, 26)``; see :func:`magrl.transforms.sequences.observed_reading`.
+            hidden: ``(N, 1, size)`` memory, 0 at the start of an episode.
+        """
+        output, after = self.gru(self.encode(observation).unsqueeze(1), hidden.transpose(0, 1).contiguous())
+        known = torch.cat((output.squeeze(1), observation), -1)
+        estimate = self.estimate(known)
+        return estimate + self.correct(torch.cat((known, estimate), -1)), after.transpose(0, 1)
+
+
+def action_of(leg: Tensor, heading: Tensor, max_move_km: float, max_turn_rad: float) -> Tensor:
+    """Return distance [km] and turn [rad] of a leg.
+
+    Args:
+        leg: ``(..., 2)`` northward and eastward [longest legs of the training].
+        heading: ``(..., 1)`` [rad].
+        max_move_km: longest leg [km].
+        max_turn_rad: largest turn [rad].
+
+    Example:
+        >>> action_of(torch.tensor([0.5, 0.0]), torch.zeros(1), 50.0, 1.5)
+        tensor([25.,  0.])
+    """
+    distance, bearing = polar(leg)
+    limits = max_move_km, max_turn_rad
+    return torch.stack(steer(heading.squeeze(-1), bearing, LIMITS["max_move_km"] * distance, *limits), -1)
+
+
+class Memory(Navigator):
+    """The agent with a memory, which ``recipes/ppo_memory.py`` trains on random planets.
+
+    It reads what its sensors measure, their stated accuracy, and its own legs.
+
+    Args:
+        source: file of :meth:`save`, or a network; the pretrained agent by default, of *Storm*.
+        limits: longest leg [km] and largest turn [rad]: at most those of the training.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for a file of another kind, or a limit out of its range.
+
+    Example:
+        >>> from magrl.envs import GeomagneticNavEnv
+        >>> env = GeomagneticNavEnv(num_envs=2, seed=0)
+        >>> env.rollout(3, Memory(MemoryNetwork(8)))["action"].shape
+        torch.Size([2, 3, 2])
+    """
+
+    name = "memory"
+    label = "memory"
+    description = "memory (recurrent PPO)"
+    trained_on = "random planets"
+    optional_keys = ACCURACY_KEYS
+
+    def __init__(self, source: nn.Module | Path | str | None = None, **limits: float) -> None:
+        super().__init__(**{name: min(limits.get(name, limit), limit) for name, limit in LIMITS.items()})
+        self.in_keys = ["field", "target_field", "move", "heading", "elapsed_steps"]
+        self.network = source if isinstance(source, nn.Module) else self._read(source or pretrained(self.name))
+
+    @staticmethod
+    def _read(path: Path | str) -> MemoryNetwork:
+        content = policy_content(path)
+        try:
+            size, weights = content["memory"]["size"], content["weights"]
+            # Compares the shapes before anything is allocated: a few bytes may ask for any size
+            network = MemoryNetwork(size, "meta")
+            network.load_state_dict(weights, assign=True)
+            check_finite(weights.items(), "weights")
+        except Exception as error:  # whatever foreign content raises
+            raise ValueError(f"{path} does not hold a valid memory: {' '.join(str(error).split())}") from error
+        return network.float().requires_grad_(False).eval()
+
+    def save(self, path: Path | str) -> None:
+        """Write the network, for the argument ``source``.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        content: dict[str, Any] = {"format": FILE_FORMAT, "memory": {"size": self.network.size}}
+        save_tensors(content | {"weights": dict(self.network.state_dict())}, Path(path))
+
+    def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
+        """Return an empty memory, and the first reading."""
+        hidden = torch.zeros(len(seen), 1, self.network.size, device=seen.device)
+        return {"hidden": hidden, "before": seen["field"].clone()}
+
+    def decide(self, seen: TensorDictBase, memory: TensorDictBase) -> Tensor:
+        """Return distance [km] and turn [rad]."""
+        reading, heading = seen["field"], seen["heading"]
+        accuracy = [seen.get(key, torch.zeros_like(reading)) for key in ACCURACY_KEYS]
+        observed = observed_reading(
+            reading, seen["target_field"], seen["move"][..., :1], heading, accuracy, memory["before"]
+        )
+        leg, hidden = self.network(observed, memory["hidden"])
+        memory.update({"hidden": hidden, "before": reading})
+        return action_of(leg, heading, self.max_move_km, self.max_turn_rad)

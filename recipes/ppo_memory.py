@@ -1,0 +1,216 @@
+"""PPO with a memory: train on random planets an agent without a map, a filter or a model of its sensors' errors.
+
+    python recipes/ppo_memory.py                     # task storm, preset standard: ten million steps, 20 minutes
+    python recipes/ppo_memory.py --task readings
+    python recipes/ppo_memory.py --preset fast       # one million steps, two minutes
+    python recipes/ppo_memory.py --preset large --device cuda
+    python recipes/ppo_memory.py --resume RUN        # resume an interrupted run exactly
+
+The agent observes what its sensors measure and its own legs, step by step. A gated recurrent unit (GRU) estimates the
+displacement to the destination, and is trained to predict the true one. PPO learns the legs, given the memory, as
+corrections of that estimate. The test tasks are on Earth, in regions that no training sees. On *Storm* their weather is
+the record, which no training sees either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, Self
+
+from magrl import paper
+from magrl.agents import optimize
+from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
+from magrl.envs import Scenario, earth_scenario, planet_scenario
+from magrl.envs.navigation import NAMED_ENVS
+from magrl.navigators.memory import LIMITS, Memory, MemoryNetwork, action_of
+from magrl.training import Run, command, parse_config
+from magrl.training.config import Count, PlanetConfig, Positive, Widths
+from magrl.training.run import make_collector
+from magrl.transforms.areas import turned
+from magrl.transforms.sequences import READING_SIZE
+
+import torch
+from pydantic import model_validator
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torch.optim import Adam
+from torchrl.data import Unbounded
+from torchrl.envs import EnvBase, InitTracker, ObservationNorm, RewardSum, TensorDictPrimer, TransformedEnv
+from torchrl.modules import GRUModule, ValueOperator, set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+RECIPE = "ppo_memory.py"
+LOSSES = ("loss_memory", "loss_critic", "loss_actor", "kl_approx", "clip_fraction", "explained_variance")
+KNOWN = ("memory", "observation", "estimate")
+JUDGED = ("observation", "true_way_scaled", "highest_spl")
+TRANSITION = (*KNOWN, *JUDGED[1:], "correction", "correction_log_prob")
+TRANSITION += tuple(("next", key) for key in (*JUDGED, "reward", "done", "terminated"))
+SEQUENCE = ("observation", "hidden", "is_init", "true_way", "heading")
+
+
+class Config(PlanetConfig):
+    """Settings of a training; the defaults are those of the preset."""
+
+    preset: Literal["standard", "fast", "large"] = "standard"
+    """Source of the defaults: ten million steps, one million, or a hundred million for a GPU."""
+    task: Literal["storm", "readings"] = "storm"
+    """Named task, which sets the errors of the sensors."""
+
+    # Own defaults of shared settings
+    total_frames: Count = 9_994_240
+    num_envs: Count = 1024
+    epochs: Count = 2
+    batch_size: Count = 4096
+    gamma: float = 0.99
+    exploration: Positive = 0.3
+    critic_cells: Widths = (128, 128)
+    eval_tasks_small: Count = 500
+
+    memory_size: Count = 128
+    """Width of the memory."""
+    memory_batches: Count = 20
+    """Collected batches before the first update of the legs; until then, the vehicle follows its estimate."""
+    sequences: Count = 128
+    """Sequences per gradient step of the memory."""
+
+    @model_validator(mode="after")
+    def _of_the_task(self) -> Self:
+        if any(self.noise) or self.drift:
+            raise ValueError(f"noise and drift are those of the task, got {self.noise} and {self.drift}")
+        return self
+
+
+STANDARD = Config()
+FAST = Config(preset="fast", total_frames=1_015_808, memory_batches=5)
+LARGE = Config(preset="large", total_frames=100_663_296, num_envs=16_384, batch_size=65_536, sequences=2048)
+PRESETS = {"standard": STANDARD, "fast": FAST, "large": LARGE}
+
+
+def make_env(planets: Scenario, config: Config) -> TransformedEnv:
+    """Return the task with an empty memory, and the privileged inputs of critic and reward, for training only."""
+    env = task_env(planets, config, num_envs=config.num_envs, seed=config.seed, reward="spl")
+    scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
+    memory = TensorDictPrimer({"hidden": Unbounded((1, config.memory_size))}, expand_specs=True)
+    for transform in (InitTracker(), memory, scaled_way, RewardSum(["reward"])):
+        env.append_transform(transform)
+    return env
+
+
+def task_env(scenario: Scenario, config: Config, **options: Any) -> TransformedEnv:
+    """Return the environment of the task over the regions of a scenario."""
+    return NAMED_ENVS[config.task](scenario=scenario, max_steps=config.max_steps, device=config.device, **options)
+
+
+def evaluation_env(scenario: Scenario, num_tasks: int, tasks_seed: int, seed: int, config: Config) -> EnvBase:
+    """Return an environment of random tasks of a scenario, drawn once, in physical units."""
+    tasks = scenario.with_tasks(scenario.random_tasks(num_tasks, tasks_seed))
+    return task_env(tasks, config, num_envs=num_tasks, seed=seed, observation="dict", scale_actions=False)
+
+
+class Leg(nn.Module):
+    """The action in [-1, 1] of an estimate and its correction."""
+
+    def forward(self, estimate: Tensor, correction: Tensor, heading: Tensor) -> Tensor:
+        """Return ``(..., 2)``."""
+        distance, turn = action_of(estimate + correction, heading, **LIMITS).unbind(-1)
+        return torch.stack((2 * distance / LIMITS["max_move_km"] - 1, turn / LIMITS["max_turn_rad"]), -1)
+
+
+class Joined(nn.Module):
+    """A network that is fed with several values, joined."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, *values: Tensor) -> Tensor:
+        """Return what the network makes of them."""
+        return self.network(torch.cat(values, -1))
+
+
+def make_memory(network: MemoryNetwork) -> TensorDictSequential:
+    """Return the part of the network from observations to its memory and the estimate ``(..., 2)``."""
+    return TensorDictSequential(
+        TensorDictModule(network.encode, ["observation"], ["encoded"]),
+        GRUModule(gru=network.gru, in_keys=["encoded", "hidden"], out_keys=["memory", ("next", "hidden")]),
+        TensorDictModule(Joined(network.estimate), ["memory", "observation"], ["estimate"]),
+    )
+
+
+def loss_memory(sequences: TensorDictBase, memory: TensorDictSequential) -> Tensor:
+    """Return the mean squared error of the estimates along sequences ``(N, T)``: of directions where the destination is
+    farther than the longest leg."""
+    with set_recurrent_mode(True):
+        memory(sequences)
+    way = turned(sequences["true_way"], sequences["heading"])
+    wanted = way / way.norm(dim=-1, keepdim=True).clamp_min(LIMITS["max_move_km"])
+    return (sequences["estimate"] - wanted).square().sum(-1).mean()
+
+
+def train(config: Config) -> dict[str, float]:
+    """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
+    torch.manual_seed(config.seed)
+    with Run(config, recipe=RECIPE, name=f"ppo_memory-{config.task}-{config.preset}", losses=LOSSES) as run:
+        # Environments: the validation has storms of the training, not the record
+        env = make_env(planet_scenario(config.num_regions, seed=config.seed, **config.regions), config)
+        others = planet_scenario(256, seed=paper.VALIDATION_SEED, **config.regions)
+        seeds = paper.VALIDATION_SEED, paper.VALIDATION_SEED - paper.FIRST_RESERVED_SEED
+        validation = evaluation_env(others, config.eval_tasks_small, *seeds, config)
+        earth = earth_scenario(128, seed=paper.TEST_SEED, **config.regions)
+        test = evaluation_env(earth, config.eval_tasks, paper.TEST_SEED, paper.TEST_SEED, config)
+
+        # Networks: the critic reads the true way and the SPL that can still be reached, the actor never does
+        network, spread = MemoryNetwork(config.memory_size, config.device), Spread(config.exploration).to(env.device)
+        memory = make_memory(network)
+        mean = TensorDictModule(Joined(network.correct), list(KNOWN), ["mean"])
+        correction = make_drawn_correction(mean, spread)
+        leg = TensorDictModule(Leg(), ["estimate", "correction", "heading"], ["action"])
+        value = make_mlp(READING_SIZE + 3, 1, config.critic_cells, layer_norm=True, device=env.device)
+        critic = ValueOperator(value, in_keys=list(JUDGED))
+
+        # Advantages and loss with a clipped probability ratio
+        advantage = GAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=critic, deactivate_vmap=True)
+        clipped = {"entropy_bonus": False, "normalize_advantage": True, "loss_critic_type": "smooth_l1"}
+        loss = ClipPPOLoss(correction, critic, clip_epsilon=config.clip_epsilon, **clipped)
+        loss.set_keys(action="correction", sample_log_prob="correction_log_prob")
+        corrects = list(network.correct.parameters())
+        remembers = list(memory.parameters())
+        memory_optimizer = Adam(remembers, lr=0.0, fused=True)
+        optimizer = Adam([{"params": group, "lr": 0.0} for group in (corrects, critic.parameters())], fused=True)
+
+        frames = {"frames_per_batch": config.num_envs * config.steps_per_batch, "total_frames": config.total_frames}
+        collector = make_collector(env, TensorDictSequential(memory, correction, leg), **frames)
+        parts = {"loss": loss, "optimizer": optimizer, "memory_optimizer": memory_optimizer, "spread": spread}
+        policy = Memory(network)
+        run.start(policy=policy, validation=validation, env=env.base_env, collector=collector, memory=memory, **parts)
+        stats, clip = run.statistics, config.clip_gradient
+        for batch in run.batches():
+            spread.std.fill_(config.linear("exploration", run.remaining))
+            rates = [config.linear(name, run.remaining) for name in ("learning_rate", "critic_learning_rate")]
+            rates[0] *= stats.iterations > config.memory_batches
+            groups = optimizer.param_groups + memory_optimizer.param_groups
+            for group, rate in zip(groups, (*rates, rates[1]), strict=True):
+                group["lr"] = rate
+            with torch.no_grad():
+                transitions = advantage(batch.select(*TRANSITION)).reshape(-1)
+            for _ in range(config.epochs):
+                for rows in torch.randperm(len(batch), device=env.device).split(config.sequences):
+                    stats.losses["loss_memory"] = loss_memory(batch[rows].select(*SEQUENCE), memory)
+                    optimize(stats.losses["loss_memory"], memory_optimizer, clip=remembers, max_norm=clip)
+                for rows in torch.randperm(len(transitions), device=env.device).split(config.batch_size):
+                    losses = loss(transitions[rows]).rename_key_("loss_objective", "loss_actor")
+                    optimize(losses["loss_actor"] + losses["loss_critic"], optimizer, clip=corrects, max_norm=clip)
+                    stats.updates += 1
+            stats.losses |= losses.select(*LOSSES[1:]).to_dict()
+        return run.finish(test)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Read the command line and train."""
+    train(parse_config(Config, PRESETS, RECIPE, __doc__, args))
+
+
+if __name__ == "__main__":
+    command(RECIPE, main)
