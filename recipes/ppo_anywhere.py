@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from magrl import Anywhere, paper
 from magrl.agents import make_correcting_actor, optimize
-from magrl.agents.networks import make_mlp
+from magrl.agents.networks import Spread, make_drawn_correction, make_mlp
 from magrl.envs import GeomagneticNavEnv, Scenario, earth_scenario, planet_scenario
 from magrl.tracking import OBSERVATION_SIZE, RANGE_KM, Rules, correction_network
 from magrl.training import Run, command, parse_config
@@ -42,10 +42,9 @@ from magrl.transforms.track import known_keys
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
 from torch.optim import Adam
 from torchrl.envs import Compose, ObservationNorm, RewardSum, Transform, TransformedEnv
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -129,32 +128,10 @@ def evaluation_env(scenario: Scenario, num_tasks: int, seed: int, config: Config
     return TransformedEnv(base, Compose(*errors(config, seed)))
 
 
-class Spread(nn.Module):
-    """The standard deviation of corrections, the same for all: a buffer that the training sets."""
-
-    def __init__(self, std: float) -> None:
-        super().__init__()
-        self.register_buffer("std", torch.tensor(std))
-
-    def forward(self, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation."""
-        return mean, self.std.expand_as(mean)
-
-
 def make_stochastic_actor(actor: TensorDictSequential, spread: Spread) -> TensorDictSequential:
     """Return the actor of the training: normal corrections around those of ``actor``, and the moves that follow."""
     network, corrected_move = actor.module
-    drawn = ProbabilisticActor(
-        TensorDictSequential(
-            TensorDictModule(network.module, ["observation"], ["mean"]),
-            TensorDictModule(spread, ["mean"], ["loc", "scale"]),
-        ),
-        in_keys=["loc", "scale"],
-        out_keys=["correction"],
-        distribution_class=IndependentNormal,
-        distribution_kwargs={"tanh_loc": False},
-        return_log_prob=True,
-    )
+    drawn = make_drawn_correction(TensorDictModule(network.module, ["observation"], ["mean"]), spread)
     return TensorDictSequential(drawn, corrected_move)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.modules import MLP, TanhModule, ValueOperator
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhModule, ValueOperator
 
 from magrl.checks import check_number, check_type
 from magrl.tracking import Rules, corrected, moving
@@ -118,6 +118,45 @@ def make_correcting_actor(network: nn.Module, rules: Rules) -> TensorDictSequent
     return TensorDictSequential(
         TensorDictModule(network, ["observation"], ["correction"]),
         TensorDictModule(CorrectedMove(rules), keys, ["action"]),
+    )
+
+
+class Spread(nn.Module):
+    """The standard deviation of corrections, the same for all: a buffer that a training sets.
+
+    Example:
+        >>> Spread(0.3)(torch.zeros(2))[1]
+        tensor([0.3000, 0.3000])
+    """
+
+    def __init__(self, std: float) -> None:
+        super().__init__()
+        self.register_buffer("std", torch.tensor(std))
+
+    def forward(self, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation."""
+        return mean, self.std.expand_as(mean)
+
+
+def make_drawn_correction(mean: TensorDictModuleBase, spread: Spread) -> ProbabilisticActor:
+    """Return the policy of PPO: normal corrections, to ``correction`` and ``correction_log_prob``.
+
+    Args:
+        mean: module that writes ``mean``.
+        spread: their standard deviation.
+
+    Example:
+        >>> mean = TensorDictModule(nn.Linear(3, 2), ["observation"], ["mean"])
+        >>> make_drawn_correction(mean, Spread(0.3)).in_keys
+        ['observation']
+    """
+    return ProbabilisticActor(
+        TensorDictSequential(mean, TensorDictModule(spread, ["mean"], ["loc", "scale"])),
+        in_keys=["loc", "scale"],
+        out_keys=["correction"],
+        distribution_class=IndependentNormal,
+        distribution_kwargs={"tanh_loc": False},
+        return_log_prob=True,
     )
 
 

@@ -26,7 +26,7 @@ from magrl.checks import CheckedModel, check_finite, check_type
 from magrl.envs import GeomagneticNavEnv
 from magrl.envs.scenario import check_zeta
 from magrl.files import save_tensors, write_atomically
-from magrl.navigators import Anywhere, Navigator
+from magrl.navigators import Anywhere, Memory, Navigator
 from magrl.tracking.network import FILE_FORMAT, policy_content, save_pilot
 from magrl.transforms import ObservationView, ReadingView
 
@@ -211,7 +211,8 @@ def save_policy(
 
     Args:
         path: path of the file: ``.onnx`` for a network of any algorithm or library; an existing file is replaced.
-        policy: :class:`FieldPolicy`, :class:`~magrl.Anywhere`, or a network, as :func:`export_policy` takes it.
+        policy: :class:`FieldPolicy`, :class:`~magrl.Anywhere`, :class:`~magrl.navigators.Memory`, or a network, as
+            :func:`export_policy` takes it.
         view: what such a network observes.
         memory: its memory.
 
@@ -232,6 +233,9 @@ def save_policy(
         assert isinstance(policy.network, nn.Sequential)
         save_pilot(path, policy.rules, policy.network)
         return
+    if isinstance(policy, Memory):
+        policy.save(path)
+        return
     if not isinstance(policy, FieldPolicy):
         if view is None:
             raise TypeError(f"{policy!r:.80} is saved with what it observes: save_policy('policy.onnx', network, view)")
@@ -250,7 +254,7 @@ def save_policy(
     save_tensors(content, Path(path))
 
 
-def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy | Anywhere:
+def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPolicy | Anywhere | Memory:
     """Read a policy that :func:`save_policy` wrote. Reading a file runs no code from it.
 
     Args:
@@ -272,6 +276,8 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu") -> FieldPo
     content = policy_content(path)
     if "rules" in content:
         return Anywhere(source=path).to(device).eval()
+    if "memory" in content:
+        return Memory(path).to(device).eval()
     with _reading(path):
         return _rebuild(**content).to(device).eval()
 

@@ -12,7 +12,7 @@ from magrl.agents import load_policy
 from magrl.agents.policy import TrainingSettings
 from magrl.checks import check_type, printable
 from magrl.envs import GeomagneticNavEnv
-from magrl.navigators import NAVIGATORS, Anywhere, Declaring, Navigator
+from magrl.navigators import NAVIGATORS, Anywhere, Declaring, Memory, Navigator
 from magrl.sensor_std import PERFECT, SensorStd
 from magrl.tracking.network import policy_content
 
@@ -38,12 +38,17 @@ TRAINED = {
     OWN: TrainedAgent("own policy", "own policy", "tasks of its own"),
 }
 """Agents of one region, which take a run folder, and policies of other algorithms."""
-WITH_RUN = (*TRAINED, Anywhere.name)
+PRETRAINED = (Anywhere.name, Memory.name)
+"""Agents that come with the library; a run folder or a file takes their place."""
+WITH_RUN = (*TRAINED, *PRETRAINED)
 """Names that take a run folder or a file."""
 
 KINDS: dict[str, TrainedAgent | type[Navigator]] = {**TRAINED, **NAVIGATORS}
 NAVIGATOR_NAMES = {name: kind.label for name, kind in KINDS.items()}
 """Label of each navigator in figures."""
+
+KEPT: dict[str, type[Anywhere | Memory]] = {"rules": Anywhere, "memory": Memory}
+"""Agents by the entry that marks their files."""
 
 
 class NavigatorText(NamedTuple):
@@ -112,7 +117,7 @@ def make_navigator(
     if name in TRAINED and (not option or name == OWN):
         return _load(text, env, options)
     kind = NAVIGATORS.get(name)
-    if kind is None or (source and kind is not Anywhere) or option:
+    if kind is None or (source and name not in PRETRAINED) or option:
         trained = [f"{agent}=RUN" for agent in WITH_RUN if agent != OWN]
         names = [*trained, "policy:NAME=FILE", *NAVIGATORS]
         raise ValueError(f"unknown navigator {text!r}: choose from {', '.join(names)}")
@@ -172,7 +177,8 @@ def _trained_with(text: str) -> dict[str, Any]:
     content = policy_content(path)
     found = {"zeta": content["rules"]["zeta"]} if "rules" in content else _training(path, content)
     kinds = {True: "gg_td3", False: "td3"}
-    kind = Anywhere.name if "rules" in content else kinds.get(found.pop("guided", None), OWN)
+    kept = [kind.name for mark, kind in KEPT.items() if mark in content]
+    kind = kept[0] if kept else kinds.get(found.pop("guided", None), OWN)
     if OWN not in (name, kind) and name.removesuffix("_noise") != kind:
         raise ValueError(f"{source} was trained as {kind}, not {name}: write {kind}={source}")
     if "noise" in found:
@@ -202,8 +208,10 @@ def _load(text: str, env: GeomagneticNavEnv, options: Mapping[str, Any]) -> Tens
         file = " or the file of a policy" if name == OWN else ""
         raise ValueError(f"{name} needs the folder of a finished run{file}: {name}=RUN")
     path = policy_file(source)
-    if path.suffix != ".onnx" and "rules" in policy_content(path):
-        return Anywhere.for_env(env, source=path, **options).to(env.device)
+    kept = {} if path.suffix == ".onnx" else policy_content(path)
+    for mark, kind in KEPT.items():
+        if mark in kept:
+            return kind.for_env(env, source=path, **options).to(env.device)
     if options:
         raise TypeError(f"{text} is trained and takes no options, got {', '.join(options)}")
     try:
@@ -302,6 +310,6 @@ def check_distinct(texts: Sequence[str]) -> None:
         key = Path(source).resolve() if source else (name, option)
         if key in seen:
             raise ValueError(f"{text} is given twice: the same episodes again are no spread over runs")
-        if source and name == Anywhere.name and name in texts:
+        if source and name in PRETRAINED and name in texts:
             raise ValueError(f"{text} has the name of the pretrained {name}: write policy:LABEL={source}")
         seen.add(key)

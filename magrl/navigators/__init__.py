@@ -7,6 +7,7 @@ from magrl.navigators.dead_reckoning import DeadReckoning as DeadReckoning
 from magrl.navigators.kalman import Anywhere as Anywhere
 from magrl.navigators.kalman import Declaring as Declaring
 from magrl.navigators.kalman import Kalman as Kalman
+from magrl.navigators.memory import Memory as Memory
 from magrl.navigators.metaheuristics import ArtificialFishSwarm, GeneticAlgorithm, ParticleSwarm
 from magrl.navigators.oracles import Geodesic as Geodesic
 from magrl.navigators.oracles import ParallelApproach as ParallelApproach
@@ -25,6 +26,7 @@ _CLASSES: tuple[type[Navigator], ...] = (
     MeanJacobian,
     Geodesic,
     DeadReckoning,
+    Memory,
 )
 NAVIGATORS = {navigator.name: navigator for navigator in _CLASSES}
 """Classes by the names that commands take. Figures color them in this order: add a new one at the end."""

@@ -21,13 +21,16 @@ MOST_LAYERS = 64
 _PRETRAINED = Path(__file__).parent.parent / "navigators" / "pretrained"
 
 
-def correction_network(num_cells: Sequence[int], device: torch.device | str | None = None) -> nn.Sequential:
-    """Return a perceptron from an observation ``(..., 19)`` to a correction ``(..., 2)`` of the plan, which is 0 at
+def correction_network(
+    num_cells: Sequence[int], device: torch.device | str | None = None, *, inputs: int = OBSERVATION_SIZE
+) -> nn.Sequential:
+    """Return a perceptron from an observation ``(..., K)`` to a correction ``(..., 2)`` of the plan, which is 0 at
     first.
 
     Args:
         num_cells: width of each hidden layer, with layer normalization and ReLU.
         device: device of the parameters.
+        inputs: size K of the observation.
 
     Raises:
         ValueError: for a size that is not a whole number from 1 to 65536.
@@ -39,7 +42,7 @@ def correction_network(num_cells: Sequence[int], device: torch.device | str | No
     check_type(Sequence, num_cells=num_cells)
     check_number(1, MOST_LAYERS, whole=True, hidden_layers=len(num_cells))
     layers: list[nn.Module] = []
-    width = OBSERVATION_SIZE
+    width = inputs
     for cells in num_cells:
         check_number(1, 65536, whole=True, num_cells=cells)
         layers += [nn.Linear(width, cells, device=device), nn.LayerNorm(cells, device=device), nn.ReLU()]

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import ppo_anywhere
+import ppo_memory
 import pytest
 import td3_gradient_guided as recipe
 import torch
@@ -24,7 +25,7 @@ from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
 from magrl.transforms import SensorErrors
 
-RECIPES = (recipe, ppo_anywhere)
+RECIPES = (recipe, ppo_anywhere, ppo_memory)
 NOISE = (0.05, 0.05, 5.0)
 
 
@@ -46,9 +47,10 @@ def test_the_return_is_the_sum_of_its_terms() -> None:
 def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled, same_outcome, outcome, capsys) -> None:
     """With networks, optimizers, running episodes and the noise of their sensors; the run folder is complete."""
     whole, run = tmp_path / "whole", tmp_path / "run"
-    frames = {"steps_per_batch": 2, "total_frames": 96, "noise": NOISE, "eval_every": 3}
+    noise = (0.0, 0.0, 0.0) if module is ppo_memory else NOISE  # the task has errors of its own
+    frames = {"steps_per_batch": 2, "total_frames": 96, "noise": noise, "eval_every": 3}
     result = module.train(small(module, whole, **frames))
-    with signalled(4, signal.SIGINT), pytest.raises(SystemExit) as stop:
+    with signalled(2, signal.SIGINT), pytest.raises(SystemExit) as stop:
         module.train(small(module, run, **frames))
     assert stop.value.code == 130
     assert f"To resume: --resume {run}" in capsys.readouterr().err
@@ -63,7 +65,7 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     written, config = (json.loads((whole / f"{name}.json").read_text(encoding="utf-8")) for name in ("eval", "config"))
     assert (written["num_tasks"], written["tasks_seed"], written["frames"]) == (6, paper.TEST_SEED, 96)
     assert written["spl"] == result["spl"]
-    assert (config["recipe"], config["noise"]) == (module.RECIPE, list(NOISE))
+    assert (config["recipe"], config["noise"]) == (module.RECIPE, list(noise))
     rows, weights = outcome(whole)
     assert result["updates"] == int(rows[-1]["updates"]) > 0
     losses = getattr(module, "LOSSES", ("loss_critic", "loss_actor"))

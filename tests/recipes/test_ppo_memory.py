@@ -1,0 +1,99 @@
+"""The recipe of the agent with a memory: its environment, what its estimate learns, and that it acts as trained."""
+
+from __future__ import annotations
+
+import ppo_memory as recipe
+import pytest
+import torch
+from support.recipes import small
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs.utils import check_env_specs
+
+from magrl.agents import load_policy
+from magrl.envs import planet_scenario
+from magrl.navigators.memory import Memory, MemoryNetwork
+from magrl.transforms.sequences import READING_SIZE
+
+CONFIG = recipe.Config(num_envs=6, memory_size=8, steps_per_batch=4, batch_size=8)
+
+
+def training_env(task: str = "storm"):
+    planets = planet_scenario(8, seed=3, **CONFIG.regions)
+    return recipe.make_env(planets, CONFIG.replace(task=task, seed=5))
+
+
+def network() -> MemoryNetwork:
+    """One whose outputs are not 0, as a trained one."""
+    torch.manual_seed(0)
+    made = MemoryNetwork(8)
+    for weight in made.parameters():
+        torch.nn.init.normal_(weight, std=0.3)
+    return made
+
+
+@pytest.mark.parametrize("task", ["storm", "readings"])
+def test_specs_of_the_training_environment(task: str) -> None:
+    env = training_env(task)
+    check_env_specs(env, break_when_any_done="both")
+    assert env.observation_spec["observation"].shape == (6, READING_SIZE)
+    assert recipe.JUDGED == ("observation", "true_way_scaled", "highest_spl")
+
+
+def test_an_agent_acts_as_it_was_trained() -> None:
+    """The parts that a training runs, without exploration, and the policy that is saved move alike."""
+    trained = network()
+    mean = TensorDictModule(recipe.Joined(trained.correct), list(recipe.KNOWN), ["correction"])
+    leg = TensorDictModule(recipe.Leg(), ["estimate", "correction", "heading"], ["action"])
+    env = training_env()
+    moves = env.rollout(6, TensorDictSequential(recipe.make_memory(trained), mean, leg), break_when_any_done=False)
+    plain = recipe.task_env(env.base_env.scenario, CONFIG, num_envs=6, seed=5, observation="dict", scale_actions=False)
+    flown = plain.rollout(6, Memory(trained), break_when_any_done=False)
+    assert moves["action"].std() > 0.1
+    torch.testing.assert_close(flown["next", "field"], moves["next", "field"], rtol=1e-4, atol=1e-2)
+    torch.testing.assert_close(flown["next", "move"], moves["next", "move"], rtol=1e-4, atol=1e-2)
+
+
+def test_the_estimate_of_the_true_way_has_no_loss() -> None:
+    """Wherever the vehicles head; a way that is shorter than the longest leg is its own length."""
+    env, memory = training_env(), recipe.make_memory(network())
+    sequences = env.rollout(4, break_when_any_done=False)
+    sequences["true_way"][:3] /= 100
+
+    def exact(td: TensorDict) -> None:
+        way, heading = td["true_way"].double(), td["heading"].double()
+        turned = torch.view_as_real(torch.view_as_complex(way) * torch.exp(1j * heading.squeeze(-1)))
+        td["estimate"] = (turned / turned.norm(dim=-1, keepdim=True).clamp_min(50.0)).float()
+
+    assert recipe.loss_memory(sequences, exact) < 1e-10
+    assert sequences["estimate"][:3].norm(dim=-1).max() < 0.2
+    torch.testing.assert_close(sequences["estimate"][3:].norm(dim=-1), torch.ones(3, 4))
+    loss = recipe.loss_memory(sequences, memory)
+    loss.backward()
+    assert loss > 0.01
+    assert all(weight.grad.any() for weight in memory.parameters())
+
+
+def test_a_vehicle_moves_along_its_estimate() -> None:
+    """Northward and eastward; a correction is added to it; what is too far or behind is cut."""
+    estimate, correction = torch.tensor([[0.0, 0.5], [0.0, 0.5], [2.0, 0.0], [-1.0, 0.1]]), torch.zeros(4, 2)
+    correction[1] = torch.tensor([0.5, 0.0])
+    heading = torch.tensor([[0.25 * torch.pi], [0.0], [0.0], [0.0]])
+    expected = torch.tensor([[0.0, 0.5], [2 * 0.5**0.5 - 1, 0.5], [1.0, 0.0], [-1.0, 1.0]])
+    torch.testing.assert_close(recipe.Leg()(estimate, correction, heading), expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_a_training_writes_its_agent(tmp_path) -> None:
+    """Both of its optimizers have changed weights, and the file holds them."""
+    sizes = {"num_envs": 8, "total_frames": 64, "memory_size": 8, "sequences": 4, "memory_batches": 1, "batch_size": 8}
+    recipe.train(small(recipe, tmp_path / "run", task="readings", **sizes))
+    saved = load_policy(tmp_path / "run" / "policy.safetensors")
+    assert isinstance(saved, Memory)
+    for part in (saved.network.correct, saved.network.estimate):
+        assert all(weight.any() for weight in part[-1].parameters())
+
+
+def test_errors_are_those_of_the_task() -> None:
+    with pytest.raises(ValueError, match=r"noise and drift are those of the task, got \(0\.1, 0\.0, 0\.0\)"):
+        recipe.Config(noise=(0.1, 0.0, 0.0))
