@@ -16,6 +16,7 @@ from .evaluation import Flight as Flight
 from .evaluation import episode_measures as episode_measures
 from .evaluation import evaluate as evaluate
 from .evaluation import evaluation_rollout as evaluation_rollout
+from .evaluation import score as score
 from .evaluation import summarize as summarize
 from .field import IGRF as IGRF
 from .field import RegionalField as RegionalField

@@ -109,6 +109,11 @@ def description_of(content: bytes) -> dict[str, Any]:
     return found
 
 
+def has_view(content: bytes) -> bool:
+    """Return whether an ONNX file says what its policy observes; if not, the network takes ``observation`` as it is."""
+    return '"kind"' in _session(content).get_modelmeta().custom_metadata_map.get(DESCRIPTION, "")
+
+
 def exported(actor: nn.Module, size: int, memory: Mapping[str, Sequence[int]]) -> OnnxNetwork:
     """Return a network as ONNX, compared with the original on random observations; the original stays as it is.
 

@@ -5,3 +5,4 @@ from magrl.evaluation.episodes import evaluation_rollout as evaluation_rollout
 from magrl.evaluation.episodes import summarize as summarize
 from magrl.evaluation.flight import Flight as Flight
 from magrl.evaluation.flight import evaluate as evaluate
+from magrl.evaluation.scores import score as score

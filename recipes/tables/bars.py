@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 from functools import cache
 
-from magrl import paper
 from magrl.envs.navigation import NAMED_ENVS
-from magrl.evaluation import episode_measures, evaluation_rollout
+from magrl.evaluation import evaluation_rollout, score
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
+from magrl.evaluation.scores import SEED
 from magrl.evaluation.tables import markdown_table
 from magrl.training import command
 from magrl.transforms.areas import NoGoAreas, distance_km, turned
@@ -30,7 +30,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-SEED, VEHICLES = paper.FIRST_RESERVED_SEED + 69, 200
+VEHICLES = 200
+COLUMNS = ("SR", "SPL", "steps", "return")
 BARS = {"secant": "secant", "kalman": "kalman", "anywhere": "anywhere (pretrained)"}
 BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around the areas (oracle)"}
 
@@ -75,17 +76,14 @@ def flown(task: str, navigator: str) -> tuple[EnvBase, TensorDictBase]:
 
 @cache
 def bar(task: str, navigator: str) -> dict[str, float]:
-    """Return success rate and SPL [%], steps, and the mean return of the default reward.
+    """Return the score of a navigator (:func:`magrl.score`).
 
     Args:
         task: name of the task.
         navigator: one of :data:`BARS`, or the file of a policy.
     """
-    _, rollout = flown("anywhere" if task == "readings" else task, navigator)
-    measures, after = episode_measures(rollout), rollout["next"]
-    earned = (after["reward"].squeeze(-1) * first_episode_mask(after["done"])).sum(1).mean().item()
-    success, spl, steps = (measures[name].double().mean().item() for name in ("success", "spl", "steps"))
-    return {"SR": 100 * success, "SPL": 100 * spl, "steps": steps, "return": earned}
+    agent = Detour() if navigator == "detour" else navigator
+    return score(agent, "anywhere" if task == "readings" else task, episodes=VEHICLES)
 
 
 def bars_of(task: str) -> list[str]:
@@ -110,7 +108,7 @@ def draw_areas(axes: Axes, vehicle: int = 1) -> None:
 def main() -> None:
     """Fly all navigators and print the table."""
     rows = [
-        [task, BARS[name], *(f"{value:.1f}" for value in bar(task, name).values())]
+        [task, BARS[name], *(f"{bar(task, name)[key]:.1f}" for key in COLUMNS)]
         for task in NAMED_ENVS
         if task != "readings"
         for name in bars_of(task)

@@ -5,9 +5,9 @@
     python recipes/tables/sweep.py --tasks box --algorithms PPO --seeds 0
     python recipes/tables/sweep.py --no-train                          # table and figure of the runs that exist
 
-A run that has ended is not repeated, so that the same command resumes a sweep; a folder has one sweep at a time. SR and
-SPL are of the first episode of 200 vehicles (bars.py), without exploration. The settings of an algorithm are the same
-for all tasks.
+A run that has ended is not repeated, so that the same command resumes a sweep; a folder has one sweep at a time. Scores
+are those of :func:`magrl.score`. The settings of an algorithm are the same for all tasks. The agent of the run with the
+median SPL is kept in docs/results/agents, for agents.py.
 """
 
 from __future__ import annotations
@@ -32,17 +32,20 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from magrl import score
+from magrl.envs.gymnasium import GeomagneticNavVectorEnv
+from magrl.envs.navigation import NAMED_ENVS
 from magrl.envs.sb3 import BatchedVecEnv
 from magrl.evaluation.episodes import interquartile_mean, stratified_bootstrap
 from magrl.evaluation.tables import markdown_table
 from magrl.files import check_writable, locked, read_text, write_text, write_with
 from magrl.training import UsageError, command
 
-import gymnasium
 import numpy as np
 import torch
 import tyro
-from bars import BARS, SEED, VEHICLES, bar, bars_of, draw_areas
+from agents import keep_agents, save_agent
+from bars import BARS, VEHICLES, bar, bars_of, draw_areas
 from matplotlib.figure import Figure
 from pandas import DataFrame, concat, read_csv
 from sb3_contrib import RecurrentPPO
@@ -51,9 +54,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from tqdm import tqdm
 
-IDS = {"box": "", "anywhere": "Anywhere", "readings": "Readings", "storm": "Storm", "nogo": "NoGo"}
 POINTS = 10
 """Points of a learning curve."""
+SCORES = ("SR", "SPL", "return")
+"""Columns of scores."""
 Row = dict[str, Any]
 
 
@@ -95,7 +99,7 @@ RECIPES = {
 class Config:
     """What to train, and where."""
 
-    tasks: tuple[str, ...] = tuple(IDS)
+    tasks: tuple[str, ...] = tuple(NAMED_ENVS)
     """Named tasks."""
     algorithms: tuple[str, ...] = (*ALGORITHMS, *RECIPES)
     """Algorithms; each is trained on its own tasks among these."""
@@ -111,19 +115,10 @@ class Config:
     """Folder of table, data and figure."""
 
 
-def score(act: Callable[..., Any], task: str) -> Row:
-    """Return success rate and SPL [%] of the first episode of each vehicle."""
-    envs = gymnasium.make_vec(f"magrl/GeomagneticNavigation{IDS[task]}-v0", num_envs=VEHICLES)
-    (observations, _), state, first = envs.reset(seed=SEED), None, np.ones(VEHICLES, dtype=bool)
-    ended = {name: np.full(VEHICLES, np.nan) for name in ("success", "spl")}
-    while np.isnan(ended["spl"]).any():
-        actions, state = act(observations, state, first, deterministic=True)
-        observations, _, terminated, truncated, info = envs.step(actions)
-        first = terminated | truncated
-        new = first & np.isnan(ended["spl"])
-        for name, values in ended.items():
-            values[new] = info[name][new] if new.any() else values[new]
-    return {"SR": 100 * ended["success"].mean(), "SPL": 100 * ended["spl"].mean()}
+def scores_of(agent: Any, task: str) -> Row:
+    """Return the scores of an agent that a curve shows."""
+    scores = score(agent, task, episodes=VEHICLES)
+    return {key: scores[key] for key in SCORES}
 
 
 class Curve(BaseCallback):
@@ -137,7 +132,7 @@ class Curve(BaseCallback):
         """Add a point."""
         paused = time.process_time()
         row = {"steps": self.num_timesteps, "cpu_s": paused - self.began}
-        self.rows.append(row | score(self.model.predict, self.task))
+        self.rows.append(row | scores_of(self.model, self.task))
         self.began += time.process_time() - paused
 
     def _on_step(self) -> bool:
@@ -146,16 +141,15 @@ class Curve(BaseCallback):
         return True
 
 
-def trained(task: str, name: str, seed: int) -> list[Row]:
-    """Train an algorithm of another library; return its learning curve."""
+def trained(task: str, name: str, seed: int, agent: Path) -> list[Row]:
+    """Train an algorithm of another library, and write its agent; return its learning curve."""
     chosen = ALGORITHMS[name]
-    envs = gymnasium.make_vec(
-        f"magrl/GeomagneticNavigation{IDS[task]}-v0", num_envs=chosen.num_envs, autoreset_mode="SameStep"
-    )
+    envs = GeomagneticNavVectorEnv(chosen.num_envs, task=task, autoreset_mode="SameStep")
     model = chosen.make(BatchedVecEnv(envs), seed=seed, device="cpu", **deepcopy(chosen.settings))
     curve = Curve(task, 1000 * chosen.thousands[task])
     model.learn(curve.steps, callback=curve)
     curve.point()  # after the last update
+    save_agent(agent, model.policy, task)
     return curve.rows
 
 
@@ -181,9 +175,9 @@ def recipe(name: str, seed: int, folder: Path) -> list[Row]:
     points = [row for row in csv.DictReader(read_text(folder / "train.csv").splitlines()) if row["eval_spl"]]
     names = {"steps": "frames", "SR": "eval_success_rate", "SPL": "eval_spl"}
     rows = [{key: float(point[column]) for key, column in names.items()} for point in points]
-    final = bar(task, str(next(folder.glob("policy.*"))))
+    final = scores_of(next(folder.glob("policy.*")), task)
     cpu_s = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - began
-    return [*rows, rows[-1] | {"cpu_s": cpu_s, "SR": final["SR"], "SPL": final["SPL"]}]
+    return [*rows, rows[-1] | {"cpu_s": cpu_s} | final]
 
 
 def run(config: Config, task: str, name: str, seed: int) -> Path:
@@ -191,7 +185,8 @@ def run(config: Config, task: str, name: str, seed: int) -> Path:
     path = config.out / f"{task}-{name}-seed{seed}.csv"
     if not path.exists():
         shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
-        rows = recipe(name, seed, path.with_suffix("")) if name in RECIPES else trained(task, name, seed)
+        folder, agent = path.with_suffix(""), path.with_suffix(".onnx")
+        rows = recipe(name, seed, folder) if name in RECIPES else trained(task, name, seed, agent)
         about = {"task": task, "algorithm": name, "seed": seed}
         write_with(path, DataFrame([about | row for row in rows]).round(2).to_csv, index=False)
     return path
@@ -204,10 +199,16 @@ def planned(config: Config) -> Iterator[tuple[str, str, int]]:
         yield from ((task, name, seed) for task in tasks if task in config.tasks)
 
 
+def ends(curves: DataFrame) -> Iterator[tuple[tuple[str, str], DataFrame]]:
+    """Yield task and algorithm, and the last points of their runs."""
+    last = curves.groupby(["task", "algorithm", "seed"], sort=False).last().reset_index()
+    yield from last.groupby(["task", "algorithm"], sort=False)
+
+
 def table(curves: DataFrame) -> str:
     """Return the Markdown table of final scores and of the bars: interquartile means, with intervals over seeds."""
-    last, rows = curves.groupby(["task", "algorithm", "seed"], sort=False).last().reset_index(), []
-    for (task, name), runs in last.groupby(["task", "algorithm"], sort=False):
+    rows = []
+    for (task, name), runs in ends(curves):
         low, high = stratified_bootstrap([torch.tensor(runs["SPL"].to_numpy())])
         rate, spl = (interquartile_mean(torch.tensor(runs[key].to_numpy())).item() for key in ("SR", "SPL"))
         size = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k"
@@ -217,14 +218,14 @@ def table(curves: DataFrame) -> str:
         for name in bars_of(task):
             scores = bar(task, name)
             rows.append([task, BARS[name], "—", "—", f"{scores['SR']:.1f}", f"{scores['SPL']:.1f}"])
-    order = list(IDS)
+    order = list(NAMED_ENVS)
     rows.sort(key=lambda row: order.index(row[0]))
     return markdown_table(["task", "agent", "seeds × steps", "CPU", "SR %", "SPL %"], rows)
 
 
 def figure(curves: DataFrame) -> Figure:
     """Return SPL over steps: medians over seeds, bands from the least to the highest, and the bars of the tasks."""
-    tasks = [task for task in IDS if task in set(curves["task"])]
+    tasks = [task for task in NAMED_ENVS if task in set(curves["task"])]
     drawn = Figure(figsize=(10, 6.2), layout="constrained")
     for axes, task in zip(drawn.subplots(2, 3).flat, tasks, strict=False):
         for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
@@ -253,7 +254,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Train what is missing, and write table, data and figure."""
     config = tyro.cli(Config, description=__doc__, args=args)
     for name in (*config.tasks, *config.algorithms):
-        if name not in (known := (*IDS, *ALGORITHMS, *RECIPES)):
+        if name not in (known := (*NAMED_ENVS, *ALGORITHMS, *RECIPES)):
             raise UsageError(f"unknown task or algorithm {name!r}: choose from {', '.join(known)}")
     config.out.mkdir(parents=True, exist_ok=True)
     check_writable(config.results / "scores.csv")
@@ -269,6 +270,7 @@ def main(args: Sequence[str] | None = None) -> None:
     curves = concat([read_csv(path) for path in paths])
     write_with(config.results / "scores.csv", curves.to_csv, index=False)
     write_text(config.results / "scores.md", table(curves))
+    keep_agents(ends(curves), config.out, config.results / "agents")
     about = {"Description": digest((config.results / "scores.csv").read_bytes())}  # a test compares them
     write_with(config.results / "scores.png", figure(curves).savefig, dpi=130, metadata=about)
 

@@ -14,6 +14,7 @@ import torch
 from pandas import read_csv
 from support.recipes import RECIPES, load
 
+from magrl import score
 from magrl.envs import planet_scenario
 from magrl.files import locked
 from magrl.training import UsageError
@@ -46,6 +47,8 @@ def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monk
     assert rows[["task", "algorithm", "seed"]].drop_duplicates().to_numpy().tolist() == [[task, name, 0]]
     assert rows[["SR", "SPL"]].to_numpy().min() >= 0
     assert rows["cpu_s"].is_monotonic_increasing
+    kept = score(tmp_path / f"{task}-{name}-seed0.onnx", task, episodes=4)
+    assert rows[["SPL", "return"]].iloc[-1].tolist() == pytest.approx([kept["SPL"], kept["return"]], abs=0.02)
     monkeypatch.setattr(sweep, "trained", None)
     assert len(read_csv(sweep.run(config, task, name, 0))) == len(rows)
 

@@ -1,0 +1,172 @@
+"""Scores of any agent on the named tasks: navigators, files, and policies of any library, in the same episodes."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import nn
+from torchrl.envs import InitTracker, TransformedEnv
+
+from magrl import paper
+from magrl.agents.onnx_policy import OnnxNetwork, has_view
+from magrl.checks import check_choice, short
+from magrl.envs.navigation import NAMED_ENVS
+from magrl.evaluation.episodes import episode_measures, evaluation_rollout, first_episode_mask, summarize
+from magrl.evaluation.navigators import OWN, fitted, make_navigator, parse_navigator, policy_file
+from magrl.navigators import NAVIGATORS
+
+SEED = paper.FIRST_RESERVED_SEED + 69
+"""Reserved seed of the episodes: ``envs.reset(seed=SEED)`` of as many vehicles starts the same ones."""
+FAR_KM = 50
+"""Distance from the destination beyond which the end of a success is far [km]: the longest move of the paper."""
+Act = Callable[[NDArray[np.float32], Any, NDArray[np.bool_]], tuple[Any, Any]]
+"""From observations, state, and whether episodes start, to actions and the next state."""
+
+
+def score(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **options: Any) -> dict[str, float]:
+    """Return the score of an agent on a named task: the first episode of each vehicle, without exploration.
+
+    Args:
+        agent: one of
+
+            - a name or a file, as :func:`magrl.evaluation.navigators.make_navigator` takes it, or the folder of a run:
+              ``"kalman"``, ``"policy.onnx"``, ``"runs/gg_td3"``; also an ONNX file without a view, as of
+              :class:`magrl.agents.onnx_policy.OnnxNetwork`;
+            - a TensorDict module that reads ``observation`` and writes ``action`` in [-1, 1], also with recurrent
+              modules of TorchRL, or another module of PyTorch from the one to the other;
+            - any other TensorDict module, such as a navigator: it reads raw keys, and writes ``action`` in km and rad;
+            - a model of stable-baselines3 or sb3-contrib, or what else has their ``predict``;
+            - a function of arrays: ``act(observations)`` returns actions in [-1, 1], ``(N, K)`` to ``(N, 2)``; or
+              ``act(observations, state)`` returns actions and the next state, which is None at the start. It gets no
+              other key.
+        task: name in :data:`magrl.envs.navigation.NAMED_ENVS`: ``"box"``, ``"anywhere"``, ``"readings"``, ``"storm"``,
+            ``"nogo"``.
+        episodes: vehicles, each with one episode.
+        seed: seed of the episodes; the default is reserved for evaluations.
+        options: of the function there. The score is then not that of the task.
+
+    Returns:
+        ``SR``, success rate [%]; ``SPL`` [%] with its bootstrap 95 % interval over episodes, ``SPL_low`` and
+        ``SPL_high``; ``return``, the mean return of the task's reward; ``steps``, their mean; ``beyond_50km``, share of
+        successes that end more than 50 km from the destination [%], NaN without a success.
+
+    Raises:
+        TypeError: for an agent of another kind.
+        ValueError: for an unknown task or navigator, or actions of another shape or that are not finite.
+
+    Example:
+        >>> def straight(observations):
+        ...     return np.zeros((len(observations), 2))
+        >>> [score(agent, "box", episodes=8)["SR"] for agent in ("secant", straight)]
+        [100.0, 0.0]
+    """
+    return scored(flown(agent, task, episodes=episodes, seed=seed, **options))
+
+
+def flown(agent: Any, task: str, *, episodes: int = 200, seed: int = SEED, **options: Any) -> TensorDict:
+    """Return the rollout of :func:`score`, as :func:`magrl.evaluation.episode_measures` takes it."""
+    check_choice(NAMED_ENVS, task=task)
+    policy, make = _policy(agent), partial(NAMED_ENVS[task], episodes, seed=seed, **options)
+    if isinstance(policy, str) or "observation" not in policy.in_keys:
+        env = make(observation="dict", scale_actions=False)
+        policy = make_navigator(policy, env.base_env) if isinstance(policy, str) else policy
+        return evaluation_rollout(env, fitted(policy, env.base_env))
+    env = make()
+    if "observation" not in env.observation_spec.keys():  # noqa: SIM118 - a Composite is no mapping
+        raise ValueError(f"the agent reads 'observation', which observation={options['observation']!r} leaves out")
+    return evaluation_rollout(_with_memory(env, policy), policy)
+
+
+def scored(rollout: TensorDictBase) -> dict[str, float]:
+    """Return the score of a rollout of :func:`flown`."""
+    measures, after = episode_measures(rollout), rollout["next"]
+    summary, far = summarize(measures), measures["navigation_error_km"][measures["success"]] > FAR_KM
+    earned = (after["reward"].squeeze(-1) * first_episode_mask(after["done"])).sum(1)
+    return {
+        "SR": summary["success_rate"],
+        **{f"SPL{end}": summary[f"spl{end}"] for end in ("", "_low", "_high")},
+        "return": earned.mean().item(),
+        "steps": measures["steps"].double().mean().item(),
+        f"beyond_{FAR_KM}km": 100 * far.double().mean().item() if len(far) else math.nan,
+    }
+
+
+def _policy(agent: Any) -> TensorDictModuleBase | str:
+    """Return an agent as a policy, or the text of a navigator, which is made for an environment."""
+    if isinstance(agent, str | Path):
+        return _of_text(str(agent))
+    if isinstance(agent, TensorDictModuleBase):
+        return agent
+    if hasattr(agent, "predict"):
+        return _Arrays(lambda seen, state, first: agent.predict(seen, state, first, deterministic=True))
+    if isinstance(agent, nn.Module):
+        return TensorDictModule(agent, ["observation"], ["action"])
+    if not callable(agent):
+        wanted = "the name or file of a navigator, a module, a model with predict, or a function of observations"
+        raise TypeError(f"agent must be {wanted}, got {short(agent)}")
+    if _takes_state(agent):
+        return _Arrays(lambda seen, state, _: agent(seen, state))
+    return _Arrays(lambda seen, *_: (agent(seen), None))
+
+
+def _takes_state(act: Callable[..., Any]) -> bool:
+    """Return whether a function has two arguments without a default."""
+    given = inspect.signature(act).parameters.values()
+    return sum(x.default is x.empty and x.kind in (x.POSITIONAL_ONLY, x.POSITIONAL_OR_KEYWORD) for x in given) == 2
+
+
+def _of_text(text: str) -> TensorDictModuleBase | str:
+    """Return the network of an ONNX file without a view as a policy; otherwise the text of a navigator."""
+    text = f"{OWN}={text}" if text not in NAVIGATORS and Path(text).is_dir() else text
+    source = parse_navigator(text).source
+    path = policy_file(source) if source else Path()
+    if path.suffix != ".onnx" or not path.is_file() or has_view(content := path.read_bytes()):
+        return text
+
+    def act(seen: NDArray[np.float32], state: Any, _: object) -> tuple[Any, Any]:
+        network, memory = state or (OnnxNetwork(content, seen.shape[-1]), None)
+        memory = dict.fromkeys(network.shapes, torch.zeros(1)) if memory is None else memory
+        actions, *after = network.run(torch.from_numpy(seen), memory)
+        return actions, (network, dict(zip(network.shapes, after, strict=True)))
+
+    return _Arrays(act)
+
+
+class _Arrays(TensorDictModuleBase):
+    """A function of arrays as a policy, which passes it the observation and no other key."""
+
+    in_keys, out_keys = ["observation", "elapsed_steps"], ["action"]
+
+    def __init__(self, act: Act) -> None:
+        super().__init__()
+        self.act, self.state = act, None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        seen, first = (np.array(tensordict[key].cpu().numpy()) for key in self.in_keys)
+        actions, self.state = self.act(seen, self.state, first[:, 0] == 0)
+        array, count = np.asarray(actions), len(seen)
+        if array.shape not in [(count, 2), (count, 3)] or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+            wanted = f"finite numbers of shape ({count}, 2), a vehicle per row"
+            raise ValueError(f"actions must be {wanted}, got {array.dtype} {array.shape}: {short(array.tolist())}")
+        return tensordict.set("action", torch.from_numpy(array.astype(np.float32)).to(tensordict.device))
+
+
+def _with_memory(env: TransformedEnv, policy: TensorDictModuleBase) -> TransformedEnv:
+    """Return an environment with the memory of the recurrent modules of a policy."""
+    if "is_init" in policy.in_keys:
+        env.append_transform(InitTracker())
+    for module in policy.modules():
+        if hasattr(module, "make_tensordict_primer"):
+            env.append_transform(module.make_tensordict_primer())
+    return env

@@ -1,0 +1,162 @@
+"""Scores of agents of all kinds on the named tasks."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.episodes import episode, point
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import LSTMModule
+
+from magrl import load_policy, save_policy, score
+from magrl.agents.onnx_policy import exported
+from magrl.envs import planet_scenario
+from magrl.envs.gymnasium import GeomagneticNavVectorEnv
+from magrl.envs.navigation import NAMED_ENVS, navigation_env
+from magrl.evaluation.scores import SEED, scored
+from magrl.navigators import Secant
+
+SIZE = NAMED_ENVS["box"]().observation_spec["observation"].shape[-1]
+
+
+class Toward(nn.Module):
+    """Turns to where D and I are those of the destination, taking D for east and I for north: arrives mostly."""
+
+    def forward(self, observation: Tensor) -> Tensor:
+        east, north, cosine, sine = observation[..., [8, 9, 11, 12]].unbind(-1)
+        turn = torch.atan2(east / 2, north) - torch.atan2(sine, cosine)
+        turn = torch.atan2(turn.sin(), turn.cos()) * 2 / math.pi
+        return torch.stack((torch.full_like(turn, -0.2), turn.clamp(-1, 1)), -1)
+
+
+def toward(observations: np.ndarray) -> np.ndarray:
+    return Toward()(torch.from_numpy(observations)).numpy()
+
+
+class Predicting:
+    """A model with the interface of stable-baselines3 and a state."""
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False):
+        assert deterministic
+        assert episode_start.all() if state is None else not episode_start.any()
+        return toward(observation), (state or 0) + 1
+
+
+def with_state(observations: np.ndarray, state: int | None) -> tuple[np.ndarray, int]:
+    """Stands still until it has a state."""
+    return toward(observations) * (state is not None) - np.array([state is None, 0]), (state or 0) + 1
+
+
+def agent(kind: str, folder: Path) -> Any:
+    view = navigation_env().view
+    if kind == "network":
+        (folder / "network.onnx").write_bytes(exported(Toward(), SIZE, {}).content)
+        return folder / "network.onnx"
+    save_policy(folder / "policy.onnx", Toward(), view)
+    kinds = {
+        "text": str(folder / "policy.onnx"),
+        "folder": str(folder),
+        "navigator": load_policy(folder / "policy.onnx"),
+        "policy": TensorDictModule(Toward(), ["observation"], ["action"]),
+        "module": Toward(),
+        "model": Predicting(),
+    }
+    return kinds[kind]
+
+
+@pytest.mark.parametrize("kind", ["network", "text", "folder", "navigator", "policy", "module", "model"])
+def test_all_kinds_of_an_agent_have_the_same_score(kind: str, tmp_path: Path) -> None:
+    wanted = score(toward, "box", episodes=16)
+    assert score(agent(kind, tmp_path), "box", episodes=16) == pytest.approx(wanted, rel=1e-3)
+    assert 50 < wanted["SR"] < 100
+    assert 0 < wanted["beyond_50km"] < 100
+    assert wanted["SPL_low"] < wanted["SPL"] < wanted["SPL_high"]
+
+
+def test_a_navigator_has_the_score_of_its_name() -> None:
+    assert score("secant", "nogo", episodes=8) == score(Secant(), "nogo", episodes=8)
+
+
+def test_the_episodes_are_those_of_the_seed_in_gymnasium() -> None:
+    envs, found = GeomagneticNavVectorEnv(16, task="box"), {}
+    observations, _ = envs.reset(seed=SEED)
+    earned, running = np.zeros(16), np.ones(16, dtype=bool)
+    while running.any():
+        observations, rewards, terminated, truncated, info = envs.step(toward(observations))
+        earned += rewards * running
+        for vehicle in np.flatnonzero((terminated | truncated) & running):
+            found[vehicle] = [info[name][vehicle] for name in ("success", "spl", "steps")]
+        running &= ~(terminated | truncated)
+    success, spl, steps = np.mean(list(found.values()), axis=0)
+    wanted = {"SR": 100 * success, "SPL": 100 * spl, "return": earned.mean(), "steps": steps}
+    scores = score(toward, "box", episodes=16)
+    assert {key: scores[key] for key in wanted} == pytest.approx(wanted, rel=1e-5)
+
+
+def test_the_state_of_a_function_is_passed_on() -> None:
+    late, wanted = score(with_state, "box", episodes=8), score(toward, "box", episodes=8)
+    assert late["steps"] == wanted["steps"] + 1
+    assert late["SPL"] == pytest.approx(wanted["SPL"], rel=1e-3)
+
+
+def test_a_recurrent_policy_of_torchrl_keeps_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("magrl.envs.navigation._planets", lambda: planet_scenario(4, seed=0))
+    torch.manual_seed(0)
+    size = NAMED_ENVS["readings"]().observation_spec["observation"].shape[-1]
+    memory = LSTMModule(size, 8, in_key="observation", out_key="seen")
+    head = nn.Sequential(nn.Linear(8, 2), nn.Tanh())
+    policy = TensorDictSequential(memory, TensorDictModule(head, ["seen"], ["action"]))
+
+    def act(observations: np.ndarray, state: Any) -> tuple[np.ndarray, Any]:
+        with torch.no_grad():
+            seen, state = memory.lstm(torch.from_numpy(observations)[:, None], state)
+            return head(seen[:, 0]).numpy(), state
+
+    scores = score(policy, "readings", episodes=4, max_steps=5)
+    assert scores["return"] == pytest.approx(score(act, "readings", episodes=4, max_steps=5)["return"], rel=1e-5)
+
+
+def test_successes_that_end_far_away_are_counted() -> None:
+    """Of three successes, one ends 60 km from the destination; a failure ends farther away."""
+    ends = [(160.0, True), (110.0, True), (100.0, True), (300.0, False)]
+    rollout = torch.cat([episode([(50.0, 0.0), (50.0, 0.0)], point(far, 0.0), good, 2) for far, good in ends])
+    rollout["next", "reward"] = torch.ones(4, 2, 1)
+    scores = scored(rollout)
+    assert scores["beyond_50km"] == pytest.approx(100 / 3)
+    assert (scores["SR"], scores["return"], scores["steps"]) == (75.0, 2.0, 2.0)
+    assert math.isnan(scored(rollout[3:])["beyond_50km"])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "task", "message"),
+    [
+        ("secant", "mars", "task must be one of 'box', .*, got 'mars'"),
+        ("sekant", "box", "unknown navigator 'sekant'"),
+        (5, "box", "agent must be the name or file of .*, got 5"),
+        (SimpleNamespace(), "box", "agent must be"),
+        (lambda observations: observations, "box", r"actions must be finite numbers of shape \(2, 2\)"),
+        (lambda observations: np.nan * observations[:, :2], "box", "actions must be finite"),
+        (lambda observations: 0 * observations[:, :2] + 3, "box", "out of bounds"),
+    ],
+)
+def test_what_is_wrong_is_named(wrong: Any, task: str, message: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=message):
+        score(wrong, task, episodes=2)
+
+
+def test_an_array_that_is_left_out_is_named() -> None:
+    with pytest.raises(ValueError, match="observation='dict' leaves out"):
+        score(toward, "box", episodes=2, observation="dict")
+
+
+def test_a_file_in_the_folder_is_not_taken_for_a_navigator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "policy.onnx").touch()
+    monkeypatch.chdir(tmp_path)
+    assert score("secant", "box", episodes=2)["SR"] == 100
