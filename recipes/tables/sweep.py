@@ -1,7 +1,7 @@
 """Learning curves on the named tasks: algorithms of stable-baselines3 and sb3-contrib, and the recipes of this library.
 
     pip install -c constraints.txt -e '.[bench]'
-    python recipes/tables/sweep.py                                     # everything: about three hours on two cores
+    python recipes/tables/sweep.py                                     # everything: about six hours on two cores
     python recipes/tables/sweep.py --tasks box --algorithms PPO --seeds 0
     python recipes/tables/sweep.py --no-train                          # table and figure of the runs that exist
 
@@ -89,10 +89,12 @@ ALGORITHMS = {
         partial(RecurrentPPO, "MlpLstmPolicy"), 256, {"readings": 300, "storm": 300}, ON_POLICY | MEMORY
     ),
 }
-RECIPES = {
-    "GG-TD3": ("box", "td3_gradient_guided.py"),
-    "ppo_anywhere": ("anywhere", "ppo_anywhere.py", "--preset", "fast"),
+RECIPES: dict[str, dict[str, tuple[str, ...]]] = {
+    "GG-TD3": {"box": ("td3_gradient_guided.py",)},
+    "ppo_anywhere": {"anywhere": ("ppo_anywhere.py", "--preset", "fast")},
+    "ppo_memory": {task: ("ppo_memory.py", "--task", task) for task in ("readings", "storm")},
 }
+"""Recipes: file and options by task."""
 
 
 @dataclass(frozen=True)
@@ -159,13 +161,13 @@ def die_with_parent() -> None:
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
-def recipe(name: str, seed: int, folder: Path) -> list[Row]:
+def recipe(task: str, name: str, seed: int, folder: Path) -> list[Row]:
     """Train by a recipe; return its learning curve on the validation tasks, and its score as the last point.
 
     Raises:
         UsageError: with the last line that the recipe wrote, where it failed.
     """
-    task, script, *options = RECIPES[name]
+    script, *options = RECIPES[name][task]
     began = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     options += ["--seed", str(seed), "--out", str(folder), "--wandb-mode", "disabled"]
     line = [sys.executable, Path(__file__).parent.parent / script, *options]
@@ -186,7 +188,7 @@ def run(config: Config, task: str, name: str, seed: int) -> Path:
     if not path.exists():
         shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # of a recipe that was interrupted
         folder, agent = path.with_suffix(""), path.with_suffix(".onnx")
-        rows = recipe(name, seed, folder) if name in RECIPES else trained(task, name, seed, agent)
+        rows = recipe(task, name, seed, folder) if name in RECIPES else trained(task, name, seed, agent)
         about = {"task": task, "algorithm": name, "seed": seed}
         write_with(path, DataFrame([about | row for row in rows]).round(2).to_csv, index=False)
     return path
@@ -195,7 +197,7 @@ def run(config: Config, task: str, name: str, seed: int) -> Path:
 def planned(config: Config) -> Iterator[tuple[str, str, int]]:
     """Yield task, algorithm and seed of all runs, in the order of their seeds."""
     for seed, name in itertools.product(config.seeds, config.algorithms):
-        tasks = [RECIPES[name][0]] if name in RECIPES else ALGORITHMS[name].thousands
+        tasks = RECIPES.get(name) or ALGORITHMS[name].thousands
         yield from ((task, name, seed) for task in tasks if task in config.tasks)
 
 

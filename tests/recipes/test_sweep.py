@@ -56,7 +56,7 @@ def test_a_run_is_trained_once_and_scored_at_several_points(tmp_path: Path, monk
 def test_an_interrupted_training_by_a_recipe_begins_again(tmp_path: Path, monkeypatch) -> None:
     """The recipe refuses the folder of a run."""
     (tmp_path / "box-GG-TD3-seed0").mkdir()
-    monkeypatch.setattr(sweep, "recipe", lambda name, seed, folder: [{"steps": folder.exists()}])  # noqa: ARG005
+    monkeypatch.setattr(sweep, "recipe", lambda *about: [{"steps": about[-1].exists()}])
     assert read_csv(sweep.run(sweep.Config(out=tmp_path), "box", "GG-TD3", 0))["steps"].tolist() == [False]
 
 
@@ -75,9 +75,9 @@ def test_a_results_folder_is_made_or_refused_before_anything_is_trained(tmp_path
 
 def test_a_recipe_that_fails_says_why_from_any_folder(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sweep.RECIPES, "GG-TD3", ("box", "tables/publish.py"))
+    monkeypatch.setitem(sweep.RECIPES, "GG-TD3", {"box": ("tables/publish.py",)})
     with pytest.raises(UsageError, match=r"publish\.py ended with status 2: ."):
-        sweep.recipe("GG-TD3", 0, tmp_path)
+        sweep.recipe("box", "GG-TD3", 0, tmp_path)
 
 
 def test_no_process_is_left_after_a_kill() -> None:
@@ -118,7 +118,7 @@ def test_jobs_of_one_seed_come_first() -> None:
     assert [seed for *_, seed in jobs] == sorted(seed for *_, seed in jobs)
     names = {"PPO", "SAC", "TD3", "GG-TD3"}
     assert {(task, name) for task, name, seed in jobs if seed == 4} == {("box", name) for name in names} | {
-        ("storm", name) for name in ("PPO", "RecurrentPPO")
+        ("storm", name) for name in ("PPO", "RecurrentPPO", "ppo_memory")
     }
 
 
