@@ -61,11 +61,9 @@ GUIDED := $(addprefix td3_gradient_guided-fast-one-thread-seed,$(FIVE) 5 6 7 8 9
 PLAIN := $(addprefix td3-fast-seed,$(FIVE))
 NOISY := $(GUIDED) $(addprefix td3_gradient_guided-fast-noise-0.05-0.05-5-seed,$(FIVE))
 WHOLE := td3_gradient_guided-paper-seed0 td3-paper-seed0
-MEMORY := $(foreach name,ppo_recurrent ppo_recurrent-short,$(addprefix $(name)-seed,0 1 2))
 RUNS_table-comparison := $(GUIDED) $(PLAIN)
 RUNS_table-noise := $(NOISY)
 RUNS_table-paper-run := $(WHOLE)
-RUNS_table-sequences := $(MEMORY)
 RUNS_figure-learning-return := $(GUIDED) $(PLAIN)
 RUNS_figure-learning-success := $(GUIDED) $(PLAIN)
 RUNS_figure-paper-run := $(WHOLE)
@@ -100,8 +98,6 @@ $(eval $(call training,td3_gradient_guided-fast-noise-0.05-0.05-5,td3_gradient_g
 $(eval $(call training,td3-fast,td3_gradient_guided.py --preset td3-fast))
 $(eval $(call training,td3_gradient_guided-paper,td3_gradient_guided.py --preset paper))
 $(eval $(call training,td3-paper,td3_gradient_guided.py --preset td3-paper))
-$(eval $(call training,ppo_recurrent,../docs/examples/ppo_recurrent.py))
-$(eval $(call training,ppo_recurrent-short,../docs/examples/ppo_recurrent.py --total-frames 1998848))
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## /  \1\t/p' $(MAKEFILE_LIST) | expand -t 14

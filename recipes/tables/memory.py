@@ -1,7 +1,7 @@
 """What a memory has learned: agents of ppo_memory.py and filters, on the task of a training and under other errors.
 
-    for seed in 0 1 2; do python recipes/ppo_memory.py --seed $seed --out runs/ppo_memory-storm-seed$seed; done
-    python recipes/tables/memory.py    # five minutes
+    python recipes/tables/sweep.py --algorithms ppo_memory    # the agents
+    python recipes/tables/memory.py                           # five minutes
 
 Cells are the SPL [%] of the 200 episodes of a named task (:func:`magrl.evaluation.score`), of several agents the mean
 and the range. *Storm* is in the record of its weather, and in four others; *Readings* also has the errors of a ship and
@@ -14,11 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from magrl import paper
+from magrl.envs import planet_scenario
 from magrl.envs.navigation import storm_errors
 from magrl.evaluation import score
 from magrl.evaluation.tables import markdown_table
 from magrl.field import WeatherRecord, weather_record
 from magrl.files import write_text
+from magrl.navigators.memory import LIMITS
 from magrl.training import UsageError, command
 from magrl.transforms import CONDITIONS
 
@@ -35,8 +38,8 @@ TOLD = "kalman, told the size of each error"
 class Config:
     """Agents and results."""
 
-    runs: Path = Path("runs")
-    """Folder of the runs ppo_memory-TASK-seed*."""
+    runs: Path = Path("runs/sweep")
+    """Folder of the sweep."""
     episodes: int = 200
     """Episodes of a cell."""
     out: Path = Path("docs/results/memory.md")
@@ -62,7 +65,16 @@ def columns() -> dict[str, tuple[str, dict[str, Any]]]:
     tasks["readings"] = ("readings", {})
     for name in ("ship", "low-cost"):
         vehicle = CONDITIONS[name]
-        tasks[name] = ("readings", {"transforms": vehicle.transforms(), "drift_km": vehicle.drift_km(50.0)})
+        drift_km = vehicle.drift_km(LIMITS["max_move_km"])
+        planets = planet_scenario(
+            256,
+            seed=0,
+            max_latitude=70,
+            distance_range_km=paper.DISTANCE_KM,
+            max_move_km=LIMITS["max_move_km"] + drift_km,
+        )
+        options = {"scenario": planets, "transforms": vehicle.transforms(), "drift_km": drift_km}
+        tasks[name] = ("readings", options)
     return tasks
 
 
@@ -77,23 +89,28 @@ def cell(agents: list[str], task: str, options: dict[str, Any], episodes: int) -
     return f"{found.mean():.1f}" + f" ({found.min():.1f}–{found.max():.1f})" * (len(agents) > 1)
 
 
+def trained(runs: Path, task: str) -> list[str]:
+    """Return the agents of the sweep on a task."""
+    return [f"memory={path}" for path in sorted(runs.glob(f"{task}-ppo_memory-seed*/policy.safetensors"))]
+
+
 def main(config: Config) -> None:
     """Fly all agents and write the table."""
-    agents = {
-        label: [f"memory={run}" for run in sorted(config.runs.glob(f"ppo_memory-{task}-seed*"))]
-        for task, label in TRAINED.items()
+    agents = {label: trained(config.runs, task) for task, label in TRAINED.items()}
+    if not any(agents.values()):
+        raise UsageError(f"{config.runs} has no agents: python recipes/tables/sweep.py --algorithms ppo_memory")
+    agents |= {label: [name] for name, label in OTHERS.items()}
+    tasks = columns()
+    cells = {
+        label: [cell(names, *column, config.episodes) for column in tasks.values()]
+        for label, names in agents.items()
+        if names
     }
-    if not agents[TRAINED["storm"]]:
-        raise UsageError(f"{config.runs} has no run ppo_memory-storm-seed*: train it by recipes/ppo_memory.py")
-    agents = {label: runs for label, runs in agents.items() if runs} | {label: [name] for name, label in OTHERS.items()}
-    tasks, rows = columns(), []
-    for label, names in agents.items():
-        rows.append([label, str(len(names)), *(cell(names, *column, config.episodes) for column in tasks.values())])
-    known = [
+    cells[TOLD] = [
         cell(["kalman"], task, told(options), config.episodes) if task == "storm" else "—"
         for task, options in tasks.values()
     ]
-    rows.append([TOLD, "1", *known])
+    rows = [[label, str(len(agents.get(label, [TOLD]))), *row] for label, row in cells.items()]
     write_text(config.out, markdown_table(["agent", "seeds", *tasks], rows))
 
 

@@ -27,7 +27,6 @@ RECORDS = {
     "alone-v2": "9d5691e12866b3c3",
     "vehicles-v2": "c293a315e0fae9c6",
     "north-v1": "e35c4d00c50322a3",
-    "sequences-v2": "0097b5789b370ad7",
 }
 READINGS = {
     "box-v2": "7d90bc3d86e67637",
@@ -35,7 +34,6 @@ READINGS = {
     "alone-v2": "a537f2dd64984e7e",
     "vehicles-v2": "b0b36fb1cd06ae5e",
     "north-v1": "2eec445c2d5edf17",
-    "sequences-v2": "a537f2dd64984e7e",
 }
 SETS = {
     "test-1000": "a86aacd1afedb688",

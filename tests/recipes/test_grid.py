@@ -53,7 +53,7 @@ def test_tables_and_errors_declare_options_that_exist() -> None:
         (("mars",), {}, "declares no table mars: choose from"),
         (("earth",), {"navigators": ("dowsing",), "tasks": 2}, "earth: unknown navigator 'dowsing'"),
         (("globe",), {"confidence": 0.9}, "globe: .* unexpected keyword argument 'confidence'"),
-        (("sequences",), {}, "there is no runs/.*: train it by make tables"),
+        (("noise",), {}, "there is no runs/.*: train it by make tables"),
     ],
 )
 def test_bad_usage(tables, changes: dict, message: str, tmp_path: Path, monkeypatch) -> None:
