@@ -124,10 +124,16 @@ class MagneticWeather(ReadingErrors):
         The minutes of the surrogates come after those of the record.
         """
         starts, length = self._starts().to(stream.device), len(self.record.variation)
-        if getattr(self.parent, "seed", paper.FIRST_RESERVED_SEED) < paper.FIRST_RESERVED_SEED:
+        if len(self.variation) > length and self._trains():
             later = torch.arange(length, len(self.variation), length, device=stream.device)
-            starts = (later.unsqueeze(-1) + starts).flatten() if len(later) else starts
+            starts = (later.unsqueeze(-1) + starts).flatten()
         return pad(starts[(stream_uniform(stream, 1) * len(starts)).long()].double(), (0, 1))
+
+    def _trains(self) -> bool:
+        """Return whether the seed of the environment, or the seeds of several, are of a training."""
+        seeds = getattr(self.parent, "seed", None)
+        seeds = seeds if isinstance(seeds, list) else [seeds]
+        return all(seed is not None and seed < paper.FIRST_RESERVED_SEED for seed in seeds)
 
     def _disturb(self, tensordict: TensorDictBase, values: list[Tensor], episode: Episode) -> Tensor:
         (field, move), (start, minutes) = values, episode.numbers.unbind(-1)
