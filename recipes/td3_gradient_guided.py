@@ -3,6 +3,7 @@
     python recipes/td3_gradient_guided.py                     # preset fast, about a minute on two cores
     python recipes/td3_gradient_guided.py --preset td3-fast   # the baseline without guidance
     python recipes/td3_gradient_guided.py --preset paper      # Table 1 and three additions; hours on a CPU
+    python recipes/td3_gradient_guided.py --task nogo         # around no-go areas; six minutes
     python recipes/td3_gradient_guided.py --resume RUN        # resume an interrupted run exactly
 
 See docs/start.md.
@@ -17,7 +18,7 @@ from typing import Annotated, Literal
 from magrl import paper
 from magrl.agents import FieldPolicy, PolicyConfig, SoftUpdate, TD3Loss, make_critic, optimize, saturation_penalty
 from magrl.envs import GeomagneticNavEnv
-from magrl.envs.navigation import guidance_pair
+from magrl.envs.navigation import NO_GO_STEPS, guidance_pair
 from magrl.envs.specs import REWARD_TERMS
 from magrl.training import Run, command, parse_config
 from magrl.training.config import Count, NonNegative, Positive, PositiveShare, RunConfig
@@ -28,8 +29,11 @@ from magrl.transforms import (
     EpisodeSum,
     FieldGradient,
     GradientHeading,
+    NoGoAreas,
     ObservationView,
+    ProgressReward,
     SensorErrors,
+    TrueWay,
 )
 
 import torch
@@ -38,7 +42,7 @@ from tensordict.nn import TensorDictSequential
 from torch.optim import Adam
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, RewardScaling, RewardSum, TransformedEnv
+from torchrl.envs import Compose, RewardScaling, RewardSum, Transform, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
 
 RECIPE = "td3_gradient_guided.py"
@@ -50,8 +54,10 @@ ENV_OPTIONS = {"zeta", "start_heading", "objective_limit", "device"}
 class Config(RunConfig):
     """Settings of a training; the defaults are those of the preset."""
 
-    preset: Literal["fast", "paper", "td3-fast", "td3-paper"] = "fast"
-    """Source of the defaults: tuned for two cores, or the paper's Table 1; td3- without guidance."""
+    preset: Literal["fast", "paper", "td3-fast", "td3-paper", "nogo"] = "fast"
+    """Source of the defaults: tuned for two cores, or the paper's Table 1; td3- without guidance; nogo for the task."""
+    task: Literal["box", "nogo"] = "box"
+    """Named task: the paper's, or around no-go areas, with a reward for progress that pays the paper's 200 at last."""
     guided: bool = True
     """Gradient guidance: the theoretical heading and its alignment reward."""
 
@@ -131,7 +137,27 @@ PAPER = Config(
 )
 PRESETS = {"fast": Config(distance_cost=0.1), "paper": PAPER}
 PRESETS["td3-fast"] = Config(preset="td3-fast", guided=False)
+PRESETS["nogo"] = Config(
+    preset="nogo",
+    task="nogo",
+    guided=False,
+    distance_cost=0.1,
+    learning_rate=1.5e-3,
+    final_learning_rate=2e-5,
+    tau=0.03,
+    final_exploration_noise=0.05,
+    policy_noise=0.05,
+    noise_clip=0.15,
+    total_frames=563_200,
+    updates_per_batch=24,
+    batch_size=256,
+)
 PRESETS["td3-paper"] = PAPER.replace(preset="td3-paper", guided=False)
+
+
+def areas(config: Config) -> list[Transform]:
+    """Return no-go areas and the reward for progress that stops at them, in the unit of the paper's; none on *Box*."""
+    return [TrueWay(), NoGoAreas(), ProgressReward(), RewardScaling(0.0, 20.0)] if config.task == "nogo" else []
 
 
 def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> TransformedEnv:
@@ -144,9 +170,11 @@ def make_env(base: GeomagneticNavEnv, view: ObservationView, config: Config) -> 
     ]
     sensors = [SensorErrors(config.noise, seed=base.seed)] if any(config.noise) else []
     scaling = [*view.observation_transforms(), view.action_transform()]
-    sums = [RewardSum(), EpisodeSum([*REWARD_TERMS, *(keys[1:] if config.guided else ())])]
+    terms = [*(REWARD_TERMS if config.task == "box" else ()), *(keys[1:] if config.guided else ())]
+    sums = [RewardSum(), *([EpisodeSum(terms)] if terms else [])]
     rewards = [*sums, DistanceCost(config.distance_cost), RewardScaling(loc=0.0, scale=config.reward_scale)]
-    return TransformedEnv(base, Compose(*(guidance if config.guided else []), *sensors, *scaling, *rewards))
+    guided = guidance if config.guided else []
+    return TransformedEnv(base, Compose(*areas(config), *guided, *sensors, *scaling, *rewards))
 
 
 def make_collection(
@@ -176,12 +204,14 @@ def train(config: Config) -> dict[str, float]:
     """Train, evaluate and write the run folder; return the content of its ``eval.json``."""
     torch.manual_seed(config.seed)
     name = f"td3_gradient_guided-{config.preset}" if config.guided else f"td3-{config.preset.removeprefix('td3-')}"
+    name += "-nogo" if config.task == "nogo" != config.preset else ""
     with Run(config, recipe=RECIPE, name=name, losses=LOSSES) as run:
         # Environments
-        options = config.model_dump(include=ENV_OPTIONS)
+        options = config.model_dump(include=ENV_OPTIONS) | ({"max_steps": NO_GO_STEPS} if config.task == "nogo" else {})
         base = GeomagneticNavEnv(run.scenario.with_tasks(None), num_envs=config.num_envs, seed=config.seed, **options)
-        validation, test = run.evaluation_envs(**options)
-        view = base.observation_view(**config.model_dump(include={"observe_heading", "observe_difference"}))
+        validation, test = run.evaluation_envs(*areas(config), **options)
+        observed = config.model_dump(include={"observe_heading", "observe_difference"})
+        view = base.observation_view(**observed, observe_areas=config.task == "nogo")
         env = make_env(base, view, config)
 
         # Networks

@@ -127,6 +127,12 @@ class FieldPolicy(Navigator):
         self.act = config.view.action_transform(declared=self.declares)
         self.training: dict[str, Any] = {}
 
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``; raise a ValueError in an environment without the areas that the policy observes."""
+        if "areas" in self.in_keys and "areas" not in tensordict.keys():  # noqa: SIM118
+            raise ValueError("the policy observes no-go areas, the environment has none: fly it in no_go_env")
+        return super().forward(tensordict)
+
     def first_memory(self, seen: TensorDictBase) -> dict[str, Tensor]:
         """Return the memory of a network at the start of an episode: zeros."""
         shapes = getattr(self.actor, "shapes", {}).items()

@@ -155,7 +155,8 @@ class GeomagneticNavEnv(EnvBase):
         """Return what an agent observes of this environment, scaled to the range of the field over the region.
 
         Args:
-            **observed: ``observe_heading`` and ``observe_difference`` of :class:`~magrl.transforms.ObservationView`.
+            **observed: ``observe_heading``, ``observe_difference`` and ``observe_areas`` of
+                :class:`~magrl.transforms.ObservationView`.
 
         Raises:
             ValueError: over several regions, which have no range in common.

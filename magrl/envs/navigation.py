@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -46,6 +47,8 @@ STORMS = 256
 """Storms of the trainings of *Storm*."""
 PLANET_REGIONS = 1024
 """Regions of random planets of :func:`anywhere_env`."""
+NO_GO_STEPS = 20
+"""Deadline of :func:`no_go_env`; chosen."""
 
 
 def navigation_env(
@@ -244,13 +247,15 @@ def no_go_env(num_envs: int = 1, **options: Any) -> TransformedEnv:
         torch.Size([4, 3, 22])
     """
     check_choice(("progress", "spl"), reward=options.setdefault("reward", "progress"))
-    env = navigation_env(num_envs, **{"max_steps": 20} | options)
+    env = navigation_env(num_envs, **{"max_steps": NO_GO_STEPS} | options)
     env.insert_transform(0, Compose(TrueWay(), NoGoAreas()))  # the reward reads the success that areas leave
     for last in [step for step in env.transform if "observation" in step.out_keys][-1:]:
         parts = last.in_keys if isinstance(last, CatTensors) else ["observation_without_areas"]
         if not isinstance(last, CatTensors):
             env.append_transform(RenameTransform(["observation"], parts))
         env.append_transform(CatTensors([*parts, "areas"], "observation", del_keys=False, sort=False))
+    if options.get("observation", "flat") == "flat":
+        env.view = replace(env.view, observe_areas=True)
     return env
 
 

@@ -233,7 +233,7 @@ def parse_config(
 
     Args:
         kind: class of the settings.
-        presets: settings by name, the first of which is the default.
+        presets: settings by name; the default is that of the name of ``--task``, or else the first.
         recipe: file name of the recipe.
         description: text of ``--help``.
         args: command line; that of this process by default.
@@ -249,14 +249,15 @@ def parse_config(
     first = argparse.ArgumentParser(prog=recipe, add_help=False, allow_abbrev=False)
     first.add_argument("--resume", type=Path)
     first.add_argument("--preset", choices=list(presets))
+    first.add_argument("--task")
     args = sys.argv[1:] if args is None else list(args)
     chosen, others = first.parse_known_args(args)
     if chosen.resume and not {"-h", "--help"} & set(args):
-        others += ["--preset", chosen.preset] if chosen.preset else []
+        others += [f"--{name} {value}" for name, value in vars(chosen).items() if value and name != "resume"]
         if others:
             raise UsageError(f"--resume takes its settings from the run: leave out {' '.join(others)}")
         return resumed_config(chosen.resume, kind, recipe)
-    default = presets[chosen.preset or next(iter(presets))]
+    default = presets[chosen.preset or (chosen.task if chosen.task in presets else next(iter(presets)))]
     return parse(kind, recipe, description, args, default=default)
 
 

@@ -22,7 +22,7 @@ from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from tqdm import tqdm
 
 from magrl import paper
@@ -162,15 +162,18 @@ class Run:
         source = self.config.scenario
         return settings | {"out": self.folder.name, "resume": None, "scenario": source and f"scenario{source.suffix}"}
 
-    def evaluation_envs(self, **options: Any) -> tuple[EnvBase, EnvBase]:
+    def evaluation_envs(self, *transforms: Transform, **options: Any) -> tuple[EnvBase, EnvBase]:
         """Return the environments of the validation tasks and of the test tasks, with the sensor noise of the run.
 
         Args:
+            transforms: further transforms of the task, such as its no-go areas; they are cloned.
             options: options of :class:`magrl.envs.GeomagneticNavEnv`.
         """
 
         def make(scenario: Scenario, seed: int) -> EnvBase:
-            return Flight(scenario, errors=self.config.noise, seed=seed, **options).env
+            env = Flight(scenario, errors=self.config.noise, seed=seed, **options).env
+            task = Compose(*(transform.clone() for transform in transforms))
+            return TransformedEnv(env, task, auto_unwrap=True) if transforms else env
 
         if self.scenario.tasks is not None:
             self._scenario_env = make(self.scenario, paper.TEST_SEED)

@@ -14,6 +14,7 @@ from torchrl.envs import CatTensors, Transform
 from magrl.checks import check_number, check_numbers, check_type
 from magrl.field import FieldBank, FieldModel, elements_range
 from magrl.field.elements import NAMES
+from magrl.transforms.areas import SEEN
 from magrl.transforms.base import Keys, ObservationTransform
 from magrl.transforms.scaling import MinMaxNorm
 
@@ -131,6 +132,7 @@ class ObservationView(_View):
         observe_heading: whether cosine and sine of the heading are observed. Without them the state is that of Eq. 3-1,
             from which a policy without memory cannot tell the direction of its next move.
         observe_difference: whether target elements minus measured elements are observed.
+        observe_areas: whether no-go areas in sight are observed (:class:`~magrl.transforms.NoGoAreas`).
         field_low: D [deg], I [deg], B_H [nT] that are scaled to -1.
         field_high: D [deg], I [deg], B_H [nT] that are scaled to 1.
         max_move_km: longest move [km].
@@ -149,6 +151,7 @@ class ObservationView(_View):
 
     observe_heading: bool = True
     observe_difference: bool = True
+    observe_areas: bool = False
     field_low: tuple[float, float, float]
     field_high: tuple[float, float, float]
 
@@ -157,17 +160,19 @@ class ObservationView(_View):
         check_numbers(3, field_low=self.field_low, field_high=self.field_high)
         if not all(low < high for low, high in zip(self.field_low, self.field_high, strict=True)):
             raise ValueError(f"field_low {self.field_low} must lie below field_high {self.field_high}")
-        check_type(bool, observe_heading=self.observe_heading, observe_difference=self.observe_difference)
+        switches = ("observe_heading", "observe_difference", "observe_areas")
+        check_type(bool, **{name: getattr(self, name) for name in switches})
 
     @property
     def in_keys(self) -> tuple[str, ...]:
         """Keys of the environment that are observed."""
-        return ("field", "target_field", "move", *(("heading",) if self.observe_heading else ()))
+        switched = (*(("heading",) if self.observe_heading else ()), *(("areas",) if self.observe_areas else ()))
+        return ("field", "target_field", "move", *switched)
 
     @property
     def size(self) -> int:
         """Number of entries of ``observation``."""
-        return 8 + 3 * self.observe_difference + 2 * self.observe_heading
+        return 8 + 3 * self.observe_difference + 2 * self.observe_heading + 3 * SEEN * self.observe_areas
 
     def observation_transforms(self) -> list[Transform]:
         """Return the transforms from the public keys to ``observation`` ``(..., size)``."""
@@ -185,6 +190,7 @@ class ObservationView(_View):
         if self.observe_heading:
             scaled.append("heading_vector")
             steps.append(AngleVector("heading", "heading_vector"))
+        scaled += ["areas"] * self.observe_areas
         return [*steps, CatTensors(scaled, "observation", del_keys=False, sort=False)]
 
     @property

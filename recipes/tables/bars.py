@@ -3,8 +3,9 @@
     python recipes/tables/bars.py    # a minute; prints them with their returns
 
 The seed is reserved for evaluations: ``envs.reset(seed=SEED)`` of 200 vehicles starts the same episodes. Oracles are
-the true bearing, which knows where vehicle and destination are, and the shortest path around all no-go areas. The
-episodes of *Readings* are those of *Anywhere*: only what a policy observes is different.
+the true bearing, which knows where vehicle and destination are, and the shortest paths around no-go areas, all or those
+seen so far. The rule around the areas in sight reads public keys alone. The episodes of *Readings* are those of
+*Anywhere*: only what a policy observes is different.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
 from magrl.evaluation.scores import SEED
 from magrl.evaluation.tables import markdown_table
+from magrl.geodesy import steer
+from magrl.navigators import Navigator, Secant
 from magrl.training import command
-from magrl.transforms.areas import NoGoAreas, distance_km, turned
+from magrl.transforms.areas import RADIUS_KM, SEEN, SIGHT_KM, NoGoAreas, distance_km, turned
 
 import torch
 import tyro
@@ -33,6 +36,8 @@ from torchrl.envs import EnvBase
 VEHICLES = 200
 COLUMNS = ("SR", "SPL", "steps", "return")
 BARS = {"secant": "secant", "kalman": "kalman", "anywhere": "anywhere (pretrained)"}
+BARS |= {"around": "secant, least turn around the areas in sight"}
+BARS |= {"sighted": "shortest path around the areas seen so far (oracle in direction)"}
 BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around the areas (oracle)"}
 
 
@@ -45,12 +50,16 @@ class Detour(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         heading, numbers = tensordict["heading"], tensordict["no_go_areas"]
-        centers, radii = NoGoAreas.discs(numbers)
+        centers, radii = self._known(tensordict)
         leg = self._next(numbers[..., -2:], centers, radii)
         ahead = turned(leg, -heading)
         turn = torch.atan2(ahead[..., 1], ahead[..., 0])
         length = torch.where(turn.abs() > math.pi / 2, 0.0, leg.norm(dim=-1).clamp(max=50.0))
         return tensordict.set("action", torch.stack((length, turn.clamp(-math.pi / 2, math.pi / 2)), -1))
+
+    def _known(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return centers and radii of the areas that it goes around."""
+        return NoGoAreas.discs(tensordict["no_go_areas"])
 
     def _next(self, place: Tensor, centers: Tensor, radii: Tensor) -> Tensor:
         """Return the first leg of the shortest path, ``(..., 2)`` [km]."""
@@ -68,10 +77,65 @@ class Detour(TensorDictModuleBase):
         return nodes[torch.arange(len(nodes)), first] - place
 
 
+class Sighted(Detour):
+    """Follow the shortest path around the no-go areas seen so far: an oracle in direction alone."""
+
+    FAR_KM = 1e4
+
+    def _known(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        centers, radii = super()._known(tensordict)
+        gap_km = (centers - tensordict["no_go_areas"][..., None, -2:]).norm(dim=-1) - radii
+        seen = (gap_km < SIGHT_KM) & (gap_km <= gap_km.kthvalue(SEEN, keepdim=True).values)
+        self.seen = torch.where(tensordict["elapsed_steps"] > 0, seen | getattr(self, "seen", seen), seen)
+        return torch.where(self.seen.unsqueeze(-1), centers, self.FAR_KM), radii
+
+
+class Around(TensorDictModuleBase):
+    """Turn the leg of a navigator by the least angle that clears the no-go areas in sight: a rule on public keys.
+
+    Args:
+        navigator: navigator that knows nothing of areas, with its ``max_move_km`` and ``max_turn_rad``.
+    """
+
+    out_keys = ["action"]
+    BESIDE_KM, STEADY, ANGLES = 1.0, 0.3, 721
+    """Width of a strip beside each area [km], cost of a change of course by that of a deviation, angles tried; chosen
+    on other episodes."""
+
+    def __init__(self, navigator: Navigator) -> None:
+        super().__init__()
+        self.navigator, self.in_keys = navigator, [*navigator.in_keys, "areas"]
+        self.limits = navigator.max_move_km, navigator.max_turn_rad
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        length, turn = self.navigator(tensordict)["action"].unbind(-1)
+        offset = torch.linspace(-math.pi, math.pi, self.ANGLES)
+        angle = turn.unsqueeze(-1) + offset
+        reach = torch.where(length < self.limits[0] - 1e-3, length, math.inf)  # a whole leg has another behind it
+        inside_km = self._inside(tensordict["areas"], angle, reach[:, None, None])
+        cost = offset.abs() + self.STEADY * angle.abs()
+        best = (inside_km + cost / 10).argmin(-1, keepdim=True)  # no turn is worth half a kilometer inside
+        chosen = angle.gather(-1, best).squeeze(-1)
+        return tensordict.set("action", torch.stack(steer(torch.zeros_like(turn), chosen, length, *self.limits), -1))
+
+    def _inside(self, areas: Tensor, angle: Tensor, reach: Tensor) -> Tensor:
+        """Return how far ways at angles ``(N, A)`` enter areas and the strip beside them, ``(N, A)`` [km]."""
+        forward, right, size = (part.unsqueeze(-2) for part in areas.unflatten(-1, (SEEN, 3)).unbind(-1))
+        radius = RADIUS_KM[1] * size
+        center_km = radius + SIGHT_KM * (1 - torch.hypot(forward, right))
+        away = torch.atan2(right, forward) - angle.unsqueeze(-1)
+        along, across = center_km * torch.cos(away), center_km * torch.sin(away)
+        beside = torch.hypot(along - torch.minimum(along.clamp_min(0), reach), across)
+        return ((radius + self.BESIDE_KM - beside).clamp_min(0) * (size > 0)).amax(-1)
+
+
 def flown(task: str, navigator: str) -> tuple[EnvBase, TensorDictBase]:
     """Return the environment of a task, and the first episode of each vehicle; arguments as of :func:`bar`."""
     env = NAMED_ENVS[task](VEHICLES, observation="dict", scale_actions=False, seed=SEED)
-    return env, evaluation_rollout(env, Detour() if navigator == "detour" else make_navigator(navigator, env.base_env))
+    rules = {"detour": Detour, "sighted": Sighted, "around": lambda: Around(Secant.for_env(env.base_env))}
+    policy = rules[navigator]() if navigator in rules else make_navigator(navigator, env.base_env)
+    return env, evaluation_rollout(env, policy)
 
 
 @cache
@@ -88,7 +152,7 @@ def bar(task: str, navigator: str) -> dict[str, float]:
 
 def bars_of(task: str) -> list[str]:
     """Return the bars of a task, the oracle last."""
-    return ["secant", "kalman", "anywhere", "detour" if task == "nogo" else "geodesic"]
+    return ["secant", "kalman", "anywhere", *(["around", "sighted", "detour"] if task == "nogo" else ["geodesic"])]
 
 
 def draw_areas(axes: Axes, vehicle: int = 1) -> None:

@@ -236,7 +236,7 @@ def figure(curves: DataFrame) -> Figure:
             color = f"C{[*ALGORITHMS, *RECIPES].index(name)}"
             axes.plot(steps, spl.median(), color=color, label=name)
             axes.fill_between(steps, spl.min(), spl.max(), color=color, alpha=0.2, lw=0)
-        for name, style in zip(bars_of(task)[1:], (":", "--", "-"), strict=True):
+        for name, style in zip(bars_of(task)[:0:-1], ("-", "--", ":", "-.", (0, (1, 4))), strict=False):  # oracle first
             axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
         axes.set(title=task, xscale="log", xlabel="steps", ylabel="SPL [%]", ylim=(0, 102), xlim=(5e3, None))
         axes.legend(fontsize="x-small", loc="best")

@@ -18,9 +18,11 @@ from support.paths import with_paths
 from support.recipes import small
 from tensordict import TensorDict
 
-from magrl import paper
+from magrl import evaluate, paper
 from magrl.agents import load_policy
 from magrl.envs import GeomagneticNavEnv
+from magrl.envs.navigation import no_go_env
+from magrl.evaluation import evaluation_rollout
 from magrl.training import command, parse_config
 from magrl.training.curves import RETURN_TERMS
 from magrl.transforms import SensorErrors
@@ -73,6 +75,42 @@ def test_interrupted_training_resumes_exactly(module, tmp_path: Path, signalled,
     policy = load_policy(run / "policy.safetensors")
     assert GeomagneticNavEnv(num_envs=3, seed=0).rollout(2, policy)["action"].isfinite().all()
     assert all(weight.isfinite().all() for weight in weights.values())
+
+
+def test_a_task_takes_its_preset_unless_another_is_given() -> None:
+    found = [
+        parse_config(recipe.Config, recipe.PRESETS, recipe.RECIPE, None, ["--task", "nogo", *args])
+        for args in ([], ["--preset", "fast"])
+    ]
+    assert found == [recipe.PRESETS["nogo"], recipe.PRESETS["fast"].replace(task="nogo")]
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_training_around_no_go_areas(tmp_path: Path, signalled, same_outcome, outcome, capsys) -> None:
+    """It resumes exactly; its policy sees areas in training and evaluation, and flies where there are some."""
+    options = {"task": "nogo", "total_frames": 400, "eval_every": 5}
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    recipe.train(small(recipe, whole, **options))
+    with signalled(4, signal.SIGINT), pytest.raises(SystemExit):
+        recipe.train(small(recipe, run, **options))
+    recipe.main(["--resume", str(run)])
+    assert "td3_gradient_guided-fast-nogo" in capsys.readouterr().err
+    assert same_outcome(run, whole)
+    rows, _ = outcome(whole)
+    assert all(math.isnan(float(rows[-1][f"return_{term}"])) for term in RETURN_TERMS[:2])  # not parts of the reward
+
+    policy = load_policy(run / "policy.safetensors")
+    env = no_go_env(8, observation="dict", scale_actions=False, seed=1)
+    seen = next(state for state in evaluation_rollout(env, policy).unbind(1) if state["areas"].any())
+    blind = seen.select(*policy.in_keys).set("areas", torch.zeros_like(seen["areas"]))
+    policy.memory = None
+    assert not torch.equal(policy(blind)["action"], seen["action"])
+    flat = no_go_env(8, seed=1)
+    assert policy.view == flat.view
+    dicts = no_go_env(8, observation="dict", seed=1)
+    assert torch.equal(policy.observe(dicts.reset())["observation"], flat.reset()["observation"])
+    with pytest.raises(ValueError, match="observes no-go areas, the environment has none: fly it in no_go_env"):
+        evaluate(policy, "paper-100")
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import runpy
 import subprocess
 import sys
@@ -13,10 +14,12 @@ import pytest
 import torch
 from pandas import read_csv
 from support.recipes import RECIPES, load
+from tensordict import TensorDict
 
 from magrl import score
 from magrl.envs import planet_scenario
 from magrl.files import locked
+from magrl.navigators import Secant
 from magrl.training import UsageError
 
 pytest.importorskip("sb3_contrib")
@@ -130,6 +133,27 @@ def test_the_oracle_goes_around_the_areas(monkeypatch) -> None:
     assert around["SR"] == 100.0
     assert around["SPL"] > 95
     assert straight["SR"] < 50
+
+
+def test_the_rule_turns_as_little_as_clears_the_area_ahead() -> None:
+    """From 60 km before the edge of a disc of 20 km, slightly to the left: to the right of it, and no further."""
+    rule = bars.Around(Secant())
+    rule.navigator.forward = lambda state: state.set("action", torch.tensor([[50.0, 0.0], [30.0, 0.0]]))
+    angle, closeness = math.radians(-5.0), 1 - 60 / bars.SIGHT_KM
+    disc = torch.tensor([closeness * math.cos(angle), closeness * math.sin(angle), 20 / bars.RADIUS_KM[1]])
+    whole, short = rule(TensorDict(areas=torch.cat((disc, torch.zeros(6))).expand(2, 9), batch_size=2))["action"]
+    tangent = angle + math.asin((20 + rule.BESIDE_KM) / 80)
+    torch.testing.assert_close(whole, torch.tensor([50.0, tangent]), atol=0.01, rtol=0)
+    assert short.tolist() == [30.0, 0.0]  # the destination is before the disc
+
+
+def test_references_around_areas_keep_their_order(monkeypatch) -> None:
+    monkeypatch.setattr(bars, "VEHICLES", 60)
+    bars.bar.cache_clear()
+    rule, sighted, all_known = (bars.bar("nogo", name) for name in ("around", "sighted", "detour"))
+    bars.bar.cache_clear()
+    assert 93 < rule["SPL"] < sighted["SPL"] < all_known["SPL"]
+    assert min(rule["SR"], sighted["SR"]) > 95
 
 
 def test_the_figure_shows_the_published_scores() -> None:

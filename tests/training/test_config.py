@@ -114,6 +114,8 @@ def test_complete_run_and_other_options_are_refused(tmp_path: Path) -> None:
         parse("--resume", str(tmp_path))
     with pytest.raises(UsageError, match=r"leave out --seed 1 --preset paper$"):
         parse("--preset", "paper", "--resume", str(tmp_path), "--seed", "1")
+    with pytest.raises(UsageError, match=r"leave out --task nogo$"):
+        parse("--task", "nogo", "--resume", str(tmp_path))
 
 
 def test_resumed_settings_are_those_of_the_run(tmp_path: Path) -> None:
