@@ -83,14 +83,15 @@ ALGORITHMS = {
         {"box": 1000, "nogo": 1000, "anywhere": 200, "readings": 500, "storm": 500},
         ON_POLICY | WIDE,
     ),
-    "SAC": Algorithm(partial(SAC, "MlpPolicy"), 64, {"box": 50}, OFF_POLICY),
-    "TD3": Algorithm(partial(TD3, "MlpPolicy"), 64, {"box": 50}, OFF_POLICY | EXPLORED),
+    "SAC": Algorithm(partial(SAC, "MlpPolicy"), 64, {"box": 50, "nogo": 50}, OFF_POLICY),
+    "TD3": Algorithm(partial(TD3, "MlpPolicy"), 64, {"box": 50, "nogo": 50}, OFF_POLICY | EXPLORED),
     "RecurrentPPO": Algorithm(
         partial(RecurrentPPO, "MlpLstmPolicy"), 256, {"readings": 300, "storm": 300}, ON_POLICY | MEMORY
     ),
 }
 RECIPES: dict[str, dict[str, tuple[str, ...]]] = {
     "GG-TD3": {"box": ("td3_gradient_guided.py",)},
+    "TD3-magrl": {"nogo": ("td3_gradient_guided.py", "--task", "nogo")},
     "ppo_anywhere": {"anywhere": ("ppo_anywhere.py", "--preset", "fast")},
     "ppo_memory": {task: ("ppo_memory.py", "--task", task) for task in ("readings", "storm")},
 }

@@ -114,6 +114,8 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
         "transforms/errors/presets.toml",
         "navigators/pretrained/anywhere.safetensors",
         "navigators/pretrained/anywhere.md",
+        "navigators/pretrained/memory.safetensors",
+        "navigators/pretrained/memory.md",
     }
     assert {path for path in held if path.parts[0] == "magrl"} == library | {Path("magrl") / name for name in data}
     others = {path.parts[0] for path in held} - {"magrl"}
