@@ -68,6 +68,8 @@ class Config(PlanetConfig):
     critic_cells: Widths = (128, 128)
     eval_tasks_small: Count = 500
 
+    step_price: Positive = 0.5
+    """Price of a step in the reward [% of SPL]."""
     memory_size: Count = 128
     """Width of the memory."""
     memory_batches: Count = 20
@@ -90,7 +92,9 @@ PRESETS = {"standard": STANDARD, "fast": FAST, "large": LARGE}
 
 def make_env(planets: Scenario, config: Config) -> TransformedEnv:
     """Return the task with an empty memory, and the privileged inputs of critic and reward, for training only."""
-    env = task_env(planets, config, num_envs=config.num_envs, seed=config.seed, reward="spl")
+    env = task_env(
+        planets, config, num_envs=config.num_envs, seed=config.seed, reward="spl", step_price=config.step_price
+    )
     scaled_way = ObservationNorm(0.0, 1 / 200, ["true_way"], ["true_way_scaled"])
     memory = TensorDictPrimer({"hidden": Unbounded((1, config.memory_size))}, expand_specs=True)
     for transform in (InitTracker(), memory, scaled_way, RewardSum(["reward"])):

@@ -56,6 +56,7 @@ def navigation_env(
     *,
     observation: str | Sequence[str] = "flat",
     reward: str = "progress",
+    step_price: float = STEP_PRICE,
     transforms: Sequence[Transform] = (),
     scale_actions: bool = True,
     **options: Any,
@@ -76,7 +77,8 @@ def navigation_env(
             objective, 200 at the arrival, and alignment with the theoretical heading by the true field, outside
             the paper's region by the pair of elements that crosses best. It has a trap: to stand still and turn to that
             heading earns 117 in 50 steps. ``"base"`` is that without the alignment. ``"spl"`` is
-            :class:`~magrl.transforms.SPLReward`, in which each step costs 0.5 % of SPL.
+            :class:`~magrl.transforms.SPLReward`, in which each step costs ``step_price``.
+        step_price: price of a step of that reward [% of SPL].
         scale_actions: whether actions are in [-1, 1] instead of in km and rad.
         **options: of :class:`magrl.envs.GeomagneticNavEnv`.
 
@@ -102,7 +104,7 @@ def navigation_env(
     elif reward == "paper":  # before errors of the sensors
         steps += [FieldGradient(base.field), GradientHeading(pair=guidance_pair(base)), AlignmentReward()]
     elif reward == "spl":
-        steps += [TrueWay(), HighestSPL(), RandomStepPrice((STEP_PRICE, STEP_PRICE)), SPLReward()]
+        steps += [TrueWay(), HighestSPL(), RandomStepPrice((step_price, step_price)), SPLReward()]
     env = TransformedEnv(base, Compose(*steps, *(transform.clone() for transform in _parts(transforms))))
     for transform in _observation(env, observation):
         env.append_transform(transform)
