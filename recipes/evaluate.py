@@ -68,9 +68,9 @@ class Config(ScenarioOptions):
     """Settings of an evaluation."""
 
     navigators: tyro.conf.Positional[tuple[str, ...]]
-    """Navigators: anywhere, kalman, dead_reckoning, secant, mean_jacobian, parallel, geodesic, ga, pso, afsa; trained
-    agents by run folder: gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN; policies of any algorithm by file:
-    FILE, or policy:LABEL=FILE with a label."""
+    """Navigators: anywhere, memory, kalman, dead_reckoning, secant, mean_jacobian, parallel, geodesic, ga, pso, afsa;
+    trained agents by run folder: gg_td3=RUN, gg_td3_noise=RUN, td3=RUN, anywhere=RUN, memory=RUN; policies of any
+    algorithm by file: FILE, or policy:LABEL=FILE with a label."""
     tasks: TaskSet | int | None = None
     """Frozen task set, or number of random tasks; by default the scenario's own tasks, or test-1000."""
     tasks_seed: int | None = None

@@ -157,7 +157,7 @@ def test_a_start_that_is_hardly_known_shows_no_constant_error() -> None:
         assert math.remainder(found.heading_deg - wanted.heading_deg, 360) == pytest.approx(0, abs=0.1)
 
 
-@pytest.mark.parametrize("name", ["anywhere", "secant"])
+@pytest.mark.parametrize("name", ["anywhere", "secant", "memory"])
 def test_missed_readings_are_the_outages_of_the_environment(name: str) -> None:
     """The vehicle gets None, the policy in the environment the last reading with a large standard deviation."""
     base = nav()
@@ -336,7 +336,7 @@ def test_a_way_that_is_longer_than_a_move_is_reported_in_parts() -> None:
 # State
 
 
-@pytest.mark.parametrize("name", ["anywhere", "secant"])
+@pytest.mark.parametrize("name", ["anywhere", "secant", "memory"])
 def test_a_restored_vehicle_goes_on_bit_for_bit(name: str, tmp_path: Path) -> None:
     """From each step on, also after a missed reading, whatever kind of number was given."""
     first, path = Onboard(name, sensor_std=np.float32(NOISE), max_steps=np.int64(50)), tmp_path / "state"
@@ -423,7 +423,7 @@ def test_readings_all_over_the_earth_are_taken() -> None:
 # Stops
 
 
-@pytest.mark.parametrize("name", ["anywhere", "secant"])
+@pytest.mark.parametrize("name", ["anywhere", "secant", "memory"])
 def test_a_log_in_radians_at_middle_latitudes_is_never_an_arrival(name: str) -> None:
     """A reading of 0.66 is possible at the magnetic equator; that it hardly changes along the way is not."""
     place, heading = [26.0, 30.0], 0.0

@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     add("--model", default=NEWEST, help=f"model of the Earth: IGRF-14, IGRF-13, IGRF-2005, ...; default {NEWEST}")
     add("--drift", type=float, default=0.03, help="errors of log and current [share of the way]; default 0.03")
     add("--altitude", type=float, default=0.0, help="altitude of the flight, for the model [km]; default 0")
-    add("--navigator", default="anywhere", help="anywhere, kalman, secant, or a policy file; default anywhere")
+    add("--navigator", default="anywhere", help="anywhere, kalman, memory, secant, or a policy file; default anywhere")
     add("--north", choices=("true", "magnetic"), default="true", help="north of the vehicle; default true")
     add("--noise", type=float, nargs=3, required=True, help="standard deviations of readings [deg deg nT]")
     add("--bias", type=float, nargs=3, help="those of constant errors [deg deg nT]; default those of --calibration")

@@ -14,7 +14,7 @@ from magrl.agents import load_policy
 from magrl.envs import PUBLIC_KEYS
 from magrl.field.elements import NAMES, element_difference
 from magrl.geodesy import wrap_angle
-from magrl.navigators import Secant
+from magrl.navigators import Memory, Secant
 from magrl.sensor_std import STD_KEYS, SensorStd
 from magrl.tracking import Reading
 from magrl.vehicle.onboard.journal import Options
@@ -50,7 +50,7 @@ class Other:
     """Another navigator: from readings to moves.
 
     Args:
-        navigator: ``"secant"``, a file of :func:`magrl.save_policy`, a policy, or a navigator.
+        navigator: ``"secant"``, ``"memory"``, a file of :func:`magrl.save_policy`, a policy, or a navigator.
 
     Raises:
         ValueError: for an unknown name, or a navigator that reads more than a vehicle knows.
@@ -63,10 +63,10 @@ class Other:
     def __init__(self, navigator: str | nn.Module) -> None:
         if isinstance(navigator, str) and navigator.endswith(".safetensors"):
             navigator = load_policy(navigator)
+        navigator = Memory() if navigator == Memory.name else navigator
         if isinstance(navigator, str) and navigator != Secant.name:
-            raise ValueError(
-                f"unknown navigator {navigator!r}: choose anywhere, kalman, secant or a file ending in .safetensors"
-            )
+            names = "anywhere, kalman, memory, secant or a file ending in .safetensors"
+            raise ValueError(f"unknown navigator {navigator!r}: choose {names}")
         self.navigator: Any = Secant() if isinstance(navigator, str) else copy.deepcopy(navigator).cpu()
         self.error, self.left, self.course = torch.zeros(3), SensorStd(), torch.zeros(())
         self._secant, self.name = isinstance(navigator, str), type(self.navigator).__name__
