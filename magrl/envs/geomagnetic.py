@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from magrl import guidance
+from magrl import guidance, paper
 from magrl.checks import check_choice, check_number, check_type
 from magrl.counters import counter_stream
 from magrl.envs import specs
@@ -53,7 +53,7 @@ class GeomagneticNavEnv(EnvBase):
         proximity_weight: reward per unit of the objective, zeta_2.
         objective_limit: upper bound on the objective in that reward; None, as in the paper.
         render_mode: ``"rgb_array"`` to keep the tracks that :meth:`render` draws, or None.
-        seed: seed of tasks and start headings; random if None.
+        seed: seed of tasks and start headings; a random one of those for trainings if None.
         device: device of the batch.
         **changes: fields of :class:`Scenario` that replace those of the scenario, such as ``max_steps``,
             ``max_move_km``, ``max_turn_deg``, ``zeta``, ``arrival``, ``radius_km`` or ``start_heading``.
@@ -123,7 +123,7 @@ class GeomagneticNavEnv(EnvBase):
         self.register_buffer("episode", torch.zeros(num_envs, dtype=torch.int64, device=self.device))
         self._ahead: TensorDict | None = None
         self._make_specs(self.edge.reachable(self.max_move_km + self.drift_km))
-        self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+        self.set_seed(int(torch.randint(paper.FIRST_RESERVED_SEED, ())) if seed is None else seed)
 
     def _place(self, scenario: Scenario) -> None:
         """Keep the rules of a scenario, and its regions, tasks and field on the device of the batch."""
