@@ -22,7 +22,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from magrl.envs import PUBLIC_KEYS, GeomagneticNavEnv, Scenario, Tasks, geomagnetic, planet_scenario
 from magrl.envs.gymnasium import ANYWHERE_ID, ENV_ID, GeomagneticNavGymEnv, GeomagneticNavVectorEnv
-from magrl.envs.navigation import anywhere_env
+from magrl.envs.navigation import NAMED_ENVS, anywhere_env
 from magrl.evaluation import episode_measures
 from magrl.field import elements_at
 from magrl.tracking import OBSERVATION_SIZE
@@ -150,12 +150,21 @@ def test_tasks_have_a_score_to_reach_and_a_step_limit() -> None:
     assert [env.step(action(-1, 0))[3] for _ in range(60)] == [False] * 59 + [True]
 
 
+def test_tasks_on_planets_end_by_distance() -> None:
+    """Unless a scenario says otherwise; those of the paper's region end by its rule."""
+    planets = planet_scenario(1, seed=0)
+    for task, make_env in NAMED_ENVS.items():
+        options = {} if task in ("box", "nogo") else {"scenario": planets}
+        assert make_env(1, **options).arrival.rule == ("distance" if options else "objective")
+    assert NAMED_ENVS["storm"](1, scenario=planets.replace(arrival="objective")).arrival.rule == "objective"
+
+
 @pytest.mark.parametrize("task", ["readings", "storm"])
 def test_tasks_for_a_memory_show_readings_alone(task: str) -> None:
     """Those of Storm are farther from the truth than what the vehicle is told."""
     planets = planet_scenario(3, seed=0)
-    envs = gymnasium.make_vec(f"magrl/GeomagneticNavigation{task.title()}-v0", num_envs=300, scenario=planets)
-    assert envs.reset(seed=0)[0].shape == (300, 20)
+    envs = gymnasium.make_vec(f"magrl/GeomagneticNavigation{task.title()}-v1", num_envs=300, scenario=planets)
+    assert envs.reset(seed=0)[0].shape == (300, 26)
     state = envs.unwrapped.torchrl_env.rollout(20, break_when_any_done=False)
     assert not {"way", "planned_move", "belief_mean"} & set(state.keys())
     error = (state["field"] - state["true_field"])[..., 2]
