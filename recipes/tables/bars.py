@@ -13,11 +13,11 @@ from __future__ import annotations
 import math
 from functools import cache
 
-from magrl.envs.navigation import NAMED_ENVS
-from magrl.evaluation import evaluation_rollout, score
+from magrl.envs.navigation import NAMED_ENVS, storm_errors
+from magrl.evaluation import evaluation_rollout
 from magrl.evaluation.episodes import first_episode_mask
 from magrl.evaluation.navigators import make_navigator
-from magrl.evaluation.scores import SEED
+from magrl.evaluation.scores import SEED, scored
 from magrl.evaluation.tables import markdown_table
 from magrl.geodesy import steer
 from magrl.navigators import Navigator, Secant
@@ -36,6 +36,7 @@ from torchrl.envs import EnvBase
 VEHICLES = 200
 COLUMNS = ("SR", "SPL", "steps", "return")
 BARS = {"secant": "secant", "kalman": "kalman", "anywhere": "anywhere (pretrained)"}
+BARS |= {"told": "kalman, told the size of each error"}
 BARS |= {"around": "secant, least turn around the areas in sight"}
 BARS |= {"sighted": "shortest path around the areas seen so far (oracle in direction)"}
 BARS |= {"geodesic": "true bearing (oracle)", "detour": "shortest path around the areas (oracle)"}
@@ -132,27 +133,29 @@ class Around(TensorDictModuleBase):
 
 def flown(task: str, navigator: str) -> tuple[EnvBase, TensorDictBase]:
     """Return the environment of a task, and the first episode of each vehicle; arguments as of :func:`bar`."""
-    env = NAMED_ENVS[task](VEHICLES, observation="dict", scale_actions=False, seed=SEED)
+    errors = {"transforms": storm_errors(stated=True)} if navigator == "told" else {}
+    env = NAMED_ENVS[task](VEHICLES, observation="dict", scale_actions=False, seed=SEED, **errors)
     rules = {"detour": Detour, "sighted": Sighted, "around": lambda: Around(Secant.for_env(env.base_env))}
-    policy = rules[navigator]() if navigator in rules else make_navigator(navigator, env.base_env)
+    name = "kalman" if navigator == "told" else navigator
+    policy = rules[name]() if name in rules else make_navigator(name, env.base_env)
     return env, evaluation_rollout(env, policy)
 
 
 @cache
 def bar(task: str, navigator: str) -> dict[str, float]:
-    """Return the score of a navigator (:func:`magrl.score`).
+    """Return the score of a navigator, as :func:`magrl.score`.
 
     Args:
         task: name of the task.
         navigator: one of :data:`BARS`, or the file of a policy.
     """
-    agent = Detour() if navigator == "detour" else navigator
-    return score(agent, "anywhere" if task == "readings" else task, episodes=VEHICLES)
+    return scored(flown("anywhere" if task == "readings" else task, navigator)[1])
 
 
 def bars_of(task: str) -> list[str]:
     """Return the bars of a task, the oracle last."""
-    return ["secant", "kalman", "anywhere", *(["around", "sighted", "detour"] if task == "nogo" else ["geodesic"])]
+    others = {"nogo": ["around", "sighted", "detour"], "storm": ["told", "geodesic"]}
+    return ["secant", "kalman", "anywhere", *others.get(task, ["geodesic"])]
 
 
 def draw_areas(axes: Axes, vehicle: int = 1) -> None:

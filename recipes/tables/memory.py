@@ -27,11 +27,12 @@ from magrl.transforms import CONDITIONS
 
 import torch
 import tyro
+from bars import BARS
 from torch import Tensor
 
 TRAINED = {"storm": "memory, trained on storm", "readings": "memory, trained on readings"}
-OTHERS = {"kalman": "kalman", "anywhere": "anywhere (pretrained)", "secant": "secant"}
-TOLD = "kalman, told the size of each error"
+OTHERS = {name: BARS[name] for name in ("kalman", "anywhere", "secant")}
+TOLD = BARS["told"]
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import csv
 import ctypes
 import hashlib
 import itertools
+import math
 import os
 import resource
 import shutil
@@ -216,14 +217,16 @@ def table(curves: DataFrame) -> str:
         rate, spl = (interquartile_mean(torch.tensor(runs[key].to_numpy())).item() for key in ("SR", "SPL"))
         size = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k"
         minutes = f"{runs['cpu_s'].median() / 60:.1f} min"
-        rows.append([task, name, size, minutes, f"{rate:.1f}", f"{spl:.1f} ({low:.1f}–{high:.1f})"])
+        earned = runs["return"].median() if "return" in runs else math.nan
+        returned = "—" if math.isnan(earned) else f"{earned:.1f}"
+        rows.append([task, name, size, minutes, returned, f"{rate:.1f}", f"{spl:.1f} ({low:.1f}–{high:.1f})"])
     for task in curves["task"].unique():
         for name in bars_of(task):
             scores = bar(task, name)
-            rows.append([task, BARS[name], "—", "—", f"{scores['SR']:.1f}", f"{scores['SPL']:.1f}"])
+            rows.append([task, BARS[name], "—", "—", *(f"{scores[key]:.1f}" for key in ("return", "SR", "SPL"))])
     order = list(NAMED_ENVS)
     rows.sort(key=lambda row: order.index(row[0]))
-    return markdown_table(["task", "agent", "seeds × steps", "CPU", "SR %", "SPL %"], rows)
+    return markdown_table(["task", "agent", "seeds × steps", "CPU", "return", "SR %", "SPL %"], rows)
 
 
 def figure(curves: DataFrame) -> Figure:
