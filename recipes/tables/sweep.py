@@ -16,7 +16,6 @@ import csv
 import ctypes
 import hashlib
 import itertools
-import math
 import os
 import resource
 import shutil
@@ -215,11 +214,9 @@ def table(curves: DataFrame) -> str:
     for (task, name), runs in ends(curves):
         low, high = stratified_bootstrap([torch.tensor(runs["SPL"].to_numpy())])
         rate, spl = (interquartile_mean(torch.tensor(runs[key].to_numpy())).item() for key in ("SR", "SPL"))
-        size = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k"
-        minutes = f"{runs['cpu_s'].median() / 60:.1f} min"
-        earned = runs["return"].median() if "return" in runs else math.nan
-        returned = "—" if math.isnan(earned) else f"{earned:.1f}"
-        rows.append([task, name, size, minutes, returned, f"{rate:.1f}", f"{spl:.1f} ({low:.1f}–{high:.1f})"])
+        about = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k", f"{runs['cpu_s'].median() / 60:.1f} min"
+        earned = f"{runs['return'].median():.1f}".replace("nan", "—")  # old runs have none
+        rows.append([task, name, *about, earned, f"{rate:.1f}", f"{spl:.1f} ({low:.1f}–{high:.1f})"])
     for task in curves["task"].unique():
         for name in bars_of(task):
             scores = bar(task, name)
