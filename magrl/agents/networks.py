@@ -129,6 +129,8 @@ class Spread(nn.Module):
         tensor([0.3000, 0.3000])
     """
 
+    std: Tensor
+
     def __init__(self, std: float) -> None:
         super().__init__()
         self.register_buffer("std", torch.tensor(std))

@@ -81,7 +81,7 @@ class Memory(Navigator):
     It reads what its sensors measure, their stated accuracy, and its own legs.
 
     Args:
-        source: file of :meth:`save`, or a network; the pretrained agent by default, of *Storm*.
+        source: file of :meth:`save`, or a :class:`MemoryNetwork`; the pretrained agent by default, of *Storm*.
         limits: longest leg [km] and largest turn [rad]: at most those of the training.
 
     Raises:
@@ -101,10 +101,10 @@ class Memory(Navigator):
     trained_on = "random planets"
     optional_keys = ACCURACY_KEYS
 
-    def __init__(self, source: nn.Module | Path | str | None = None, **limits: float) -> None:
+    def __init__(self, source: MemoryNetwork | Path | str | None = None, **limits: float) -> None:
         super().__init__(**{name: min(limits.get(name, limit), limit) for name, limit in LIMITS.items()})
         self.in_keys = ["field", "target_field", "move", "heading", "elapsed_steps"]
-        self.network = source if isinstance(source, nn.Module) else self._read(source or pretrained(self.name))
+        self.network = source if isinstance(source, MemoryNetwork) else self._read(source or pretrained(self.name))
 
     @staticmethod
     def _read(path: Path | str) -> MemoryNetwork:

@@ -10,9 +10,10 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs.utils import check_env_specs
 
-from magrl.agents import load_policy
+from magrl.agents import load_policy, save_policy
 from magrl.envs import planet_scenario
 from magrl.navigators.memory import Memory, MemoryNetwork
+from magrl.tracking.network import pretrained
 from magrl.transforms.sequences import READING_SIZE
 
 CONFIG = recipe.Config(num_envs=6, memory_size=8, steps_per_batch=4, batch_size=8)
@@ -97,3 +98,19 @@ def test_a_training_writes_its_agent(tmp_path) -> None:
 def test_errors_are_those_of_the_task() -> None:
     with pytest.raises(ValueError, match=r"noise and drift are those of the task, got \(0\.1, 0\.0, 0\.0\)"):
         recipe.Config(noise=(0.1, 0.0, 0.0))
+
+
+def test_a_file_of_an_agent_holds_its_network_and_no_other(tmp_path) -> None:
+    saved = network()
+    save_policy(tmp_path / "memory.safetensors", Memory(saved))
+    for weight, found in zip(
+        saved.parameters(), Memory(tmp_path / "memory.safetensors").network.parameters(), strict=True
+    ):
+        assert torch.equal(weight, found)
+    with pytest.raises(ValueError, match=r"anywhere\.safetensors does not hold a valid memory"):
+        Memory(pretrained("anywhere"))
+    with torch.no_grad():
+        saved.gru.weight_hh_l0[0, 0] = torch.nan
+    save_policy(tmp_path / "broken.safetensors", Memory(saved))
+    with pytest.raises(ValueError, match=r"broken\.safetensors does not hold a valid memory: .*weight_hh_l0"):
+        Memory(tmp_path / "broken.safetensors")
