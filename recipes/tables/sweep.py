@@ -216,20 +216,20 @@ def table(curves: DataFrame) -> str:
         rate, spl = (interquartile_mean(torch.tensor(runs[key].to_numpy())).item() for key in ("SR", "SPL"))
         about = f"{len(runs)} × {runs['steps'].max() / 1000:.0f} k", f"{runs['cpu_s'].median() / 60:.1f} min"
         earned = f"{runs['return'].median():.1f}".replace("nan", "—")  # old runs have none
-        rows.append([task, name, *about, earned, f"{rate:.1f}", f"{spl:.1f} ({low:.1f}–{high:.1f})"])
+        interval = f" ({low:.1f}–{high:.1f})" * (len(runs) > 1)
+        rows.append([task, name, *about, earned, f"{rate:.1f}", f"{spl:.1f}{interval}"])
     for task in curves["task"].unique():
         for name in bars_of(task):
             scores = bar(task, name)
             rows.append([task, BARS[name], "—", "—", *(f"{scores[key]:.1f}" for key in ("return", "SR", "SPL"))])
-    order = list(NAMED_ENVS)
-    rows.sort(key=lambda row: order.index(row[0]))
+    rows.sort(key=lambda row: list(NAMED_ENVS).index(row[0]))
     return markdown_table(["task", "agent", "seeds × steps", "CPU", "return", "SR %", "SPL %"], rows)
 
 
 def figure(curves: DataFrame) -> Figure:
     """Return SPL over steps: medians over seeds, bands from the least to the highest, and the bars of the tasks."""
     tasks = [task for task in NAMED_ENVS if task in set(curves["task"])]
-    drawn = Figure(figsize=(10, 6.2), layout="constrained")
+    drawn = Figure(figsize=(10, 7.5), layout="constrained")
     for axes, task in zip(drawn.subplots(2, 3).flat, tasks, strict=False):
         for name, runs in curves[curves["task"] == task].groupby("algorithm", sort=False):
             points = runs.assign(point=runs.groupby("seed").cumcount()).groupby("point")
@@ -240,7 +240,7 @@ def figure(curves: DataFrame) -> Figure:
         for name, style in zip(bars_of(task)[:0:-1], ("-", "--", ":", "-.", (0, (1, 4))), strict=False):  # oracle first
             axes.axhline(bar(task, name)["SPL"], color="gray", ls=style, lw=1, label=BARS[name].partition(" (")[0])
         axes.set(title=task, xscale="log", xlabel="steps", ylabel="SPL [%]", ylim=(0, 102), xlim=(5e3, None))
-        axes.legend(fontsize="x-small", loc="best")
+        axes.legend(fontsize="xx-small", loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     if len(tasks) < len(drawn.axes):
         draw_areas(drawn.axes[len(tasks)])
     for axes in drawn.axes[len(tasks) + 1 :]:
