@@ -1,8 +1,8 @@
 """PPO with a memory: train on random planets an agent without a map, a filter or a model of its sensors' errors.
 
-    python recipes/ppo_memory.py                     # task storm, preset standard: ten million steps, 20 minutes
+    python recipes/ppo_memory.py                     # task storm, preset standard: ten million steps, half an hour
     python recipes/ppo_memory.py --task readings
-    python recipes/ppo_memory.py --preset fast       # one million steps, two minutes
+    python recipes/ppo_memory.py --preset fast       # one million steps, four minutes
     python recipes/ppo_memory.py --preset large --device cuda
     python recipes/ppo_memory.py --resume RUN        # resume an interrupted run exactly
 
