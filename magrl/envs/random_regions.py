@@ -129,11 +129,13 @@ def region_scenario(
     *lower, highest = range(lowest, 3 * lowest, 4) if degree is None else [degree]
     draw = partial(_drawn_regions, seed, half_size_deg, max_latitude)
 
-    def expand(regions: Regions, planet: Tensor, tolerance_nt: float) -> tuple[Regions, FieldBank]:
+    def expand(regions: Regions, planet: Tensor, tolerance_nt: float | None = None) -> tuple[Regions, FieldBank]:
         boxes = regions.expanded(margin_deg).reachable(max_move_km)
         build = partial(FieldBank.build, gauss, planet, boxes.latitude, boxes.longitude)
+        if tolerance_nt is None:  # to choose places
+            return boxes, build(degree=[*lower, highest][0], tolerance_nt=None)
         for tried in lower:
-            bank = build(degree=tried, tolerance_nt=_ANY_ERROR)
+            bank = build(degree=tried, tolerance_nt=1e9)
             if bank.error_nt.max() <= tolerance_nt:
                 return boxes, bank
         return boxes, build(degree=highest, tolerance_nt=tolerance_nt)
@@ -145,7 +147,7 @@ def region_scenario(
 
 def _placed_regions(
     draw: Callable[[Tensor, int], Regions],
-    expand: Callable[[Regions, Tensor, float], tuple[Regions, FieldBank]],
+    expand: Callable[[Regions, Tensor], tuple[Regions, FieldBank]],
     planet: Tensor,
     min_intensity_nt: float,
 ) -> Regions:
@@ -153,7 +155,7 @@ def _placed_regions(
     edges, waiting = torch.empty(len(planet), 4, dtype=torch.float64), torch.arange(len(planet))
     for attempt in range(MAX_TRIES):
         regions = draw(waiting, attempt)
-        boxes, bank = expand(regions, planet[waiting], _ANY_ERROR)
+        boxes, bank = expand(regions, planet[waiting])
         declination = region_elements(bank, boxes, points=11)[..., 0]
         strong = region_elements(bank, regions, points=11)[..., 2].amin(1) >= min_intensity_nt
         good = strong & (declination.amax(1) - declination.amin(1) <= 180)
@@ -165,9 +167,6 @@ def _placed_regions(
         f"no place was found in {MAX_TRIES} tries for region {int(waiting[0])} on planet {int(planet[waiting[0]])} "
         f"with min_intensity_nt {min_intensity_nt:g}: take smaller regions or a lower limit of the intensity"
     )
-
-
-_ANY_ERROR = 1e9  # of an expansion by which places are chosen [nT]; that of the scenario is checked
 
 
 def _drawn_regions(seed: int, half_size_deg: float, max_latitude: float, number: Tensor, attempt: int) -> Regions:

@@ -28,6 +28,7 @@ from magrl.field import (
     igrf_coefficients,
     parse_date,
 )
+from magrl.field.elements import elements_gradient
 from magrl.files import read_document
 from magrl.geodesy import geodesic
 
@@ -165,9 +166,12 @@ def _expanded_igrf(box: Region, date: datetime.datetime, generation: int, altitu
 def _mean_changes(field: FieldModel | FieldBank, region: Regions) -> Tensor:
     """Return the mean change of each element over :data:`FLOOR_KM` in each region ``(K, 3)``; kept, as it takes most of
     the time in which an environment over many regions is made."""
-    index = torch.arange(len(region)).reshape(-1, 1, 1)
-    slopes = elements_gradient_at(field, region.grid(21), index).norm(dim=-1)
-    return FLOOR_KM * slopes.flatten(1, 2).mean(1)
+    grid = region.grid(21)
+    if isinstance(field, FieldBank):
+        slopes = elements_gradient(*field.on_grids(grid))
+    else:
+        slopes = elements_gradient_at(field, grid)
+    return FLOOR_KM * slopes.norm(dim=-1).flatten(1, 2).mean(1)
 
 
 class Scenario(CheckedModel):

@@ -13,6 +13,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from magrl.checks import check_tensor, require
 from magrl.envs.regions import Regions
 from magrl.field import FieldBank, FieldModel, elements_at
+from magrl.field.elements import measured_elements
 from magrl.transforms.errors.base import DISPLACEMENT, EPISODE_STREAM
 
 REWARD_TERMS = ("reward_destination", "reward_proximity")
@@ -153,8 +154,9 @@ def field_bounds(field: FieldModel | FieldBank, boxes: Regions) -> tuple[Tensor,
 
 def region_elements(field: FieldModel | FieldBank, regions: Regions, points: int) -> Tensor:
     """Return the elements on an even grid of each region: ``(K, points², 3)``, D [deg], I [deg], B_H [nT]."""
-    index = torch.arange(len(regions), device=regions.latitude.device)
-    return elements_at(field, regions.grid(points).flatten(1, 2), index.unsqueeze(-1))
+    grid = regions.grid(points)
+    values = measured_elements(field.on_grids(grid)[0]) if isinstance(field, FieldBank) else elements_at(field, grid)
+    return values.flatten(1, 2)
 
 
 def observation_spec(limits: Limits) -> Composite:

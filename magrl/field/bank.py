@@ -76,7 +76,7 @@ class FieldBank(Float64Module):
         longitude: Tensor,
         *,
         degree: int = 12,
-        tolerance_nt: float = 1e-3,
+        tolerance_nt: float | None = 1e-3,
     ) -> Self:
         """Expand the fields of planets on boxes, and measure the error of each expansion.
 
@@ -87,7 +87,8 @@ class FieldBank(Float64Module):
             latitude: ``(K, 2)`` southern and northern edges [deg], within [-90, 90].
             longitude: ``(K, 2)`` western and eastern edges [deg], rising; may cross the antimeridian (170 to 190).
             degree: degree of the expansions in each direction.
-            tolerance_nt: largest error allowed [nT], at points four times as dense as the nodes, corners included.
+            tolerance_nt: largest error allowed [nT], at points four times as dense as the nodes, corners included; None
+                to leave the error unknown.
 
         Returns:
             The bank, with the error of each expansion in ``error_nt``.
@@ -98,17 +99,20 @@ class FieldBank(Float64Module):
                 reversed box, or an error above the tolerance, naming the worst box.
         """
         check_number(1, whole=True, degree=degree)
-        check_number(0, above=True, tolerance_nt=tolerance_nt)
+        check_number(0, above=True, optional=True, tolerance_nt=tolerance_nt)
         edges = torch.stack(checked_boxes(latitude, longitude), 1).cpu()
         gauss = checked_gauss(gauss, batch=True).cpu()
         check_index(planet_index, len(gauss), "planet_index")
         if planet_index.shape != edges.shape[:1]:
             raise ValueError(f"planet_index must have the shape ({len(edges)},), got {tuple(planet_index.shape)}")
-        planet_index, weights = planet_index.cpu(), _surface_weights(gauss)
+        used, planet_index = planet_index.cpu().unique(return_inverse=True)
+        weights = _surface_weights(gauss[used])
         boxes = list(zip(planet_index.split(_BOXES), edges.split(_BOXES), strict=True))
         angles, from_nodes = chebyshev_nodes(degree + 1)
         samples = (_synthesis(weights[k], *inside_box(angles.cos(), box)) for k, box in boxes)
         bank = cls(torch.cat([from_nodes @ x @ from_nodes.T for x in samples]), latitude, longitude)
+        if tolerance_nt is None:
+            return bank
         unit = torch.linspace(-1, 1, 4 * degree + 1, dtype=torch.float64)
         polynomials = chebyshev(unit, degree + 1)
         errors = []
@@ -117,7 +121,7 @@ class FieldBank(Float64Module):
             errors.append((expanded - _synthesis(weights[k], *inside_box(unit, box))).abs().amax((1, 2, 3)))
         bank.error_nt.copy_(torch.cat(errors))
         worst = int(bank.error_nt.nan_to_num(torch.inf).argmax())
-        place = f"box {worst}, of planet {planet_index[worst]}"
+        place = f"box {worst}, of planet {used[planet_index[worst]]}"
         check_expansion(degree, bank.error_nt[worst].item(), tolerance_nt, edges[worst].tolist(), place)
         return bank
 
@@ -162,6 +166,25 @@ class FieldBank(Float64Module):
         rows = in_chunks(self._value_and_gradient, points, 9, self.CHUNK).reshape(9, *shape)
         return rows[:3].movedim(0, -1), rows[3:].unflatten(0, (2, 3)).movedim((1, 0), (-2, -1))
 
+    def on_grids(self, grids: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the field vector and its gradient on a grid of each box, faster than :meth:`value_and_gradient`.
+
+        Args:
+            grids: ``(K, U, U, 2)`` latitude, longitude [deg], as of :meth:`magrl.envs.Regions.grid`.
+
+        Returns:
+            ``(K, U, U, 3)`` [nT] and ``(K, U, U, 3, 2)`` [nT/km] northward and eastward at sea level.
+        """
+        latitude = grids[:, :, 0, 0]
+        scaling = self.scaling.movedim(0, -1).unsqueeze(-1)
+        polynomials = chebyshev(in_half_spans(torch.stack((latitude, grids[:, 0, :, 1])), scaling), self.degree + 1)
+        slopes = torch.einsum("ij,jaku->iaku", self.slopes, polynomials) * scaling[:, 1]
+        (along, across), (north, east) = polynomials.unbind(1), slopes.unbind(1)
+        table = self.coefficients.unflatten(2, (-1, 3))
+        pairs = (along, across), (north, across), (along, east)
+        rows = [torch.einsum("knmc,nku,mkv->kuvc", table, *pair) for pair in pairs]
+        return rows[0], torch.stack(rows[1:], -1) * _degrees_per_km(latitude).movedim(0, -1)[:, :, None, None]
+
     def _points(self, latitude: Tensor, longitude: Tensor, index: Tensor) -> tuple[torch.Size, list[Tensor]]:
         """Return the shape of the positions, positions ``(2, P)`` and indices ``(P,)``."""
         check_tensor(latitude=latitude, longitude=longitude)
@@ -184,9 +207,7 @@ class FieldBank(Float64Module):
         terms = self._sum_latitude(index.repeat(2), latitude).unflatten(-1, (2, -1))
         east = (terms[:, :, 0] * slopes[:, 1:]).sum(0)
         value, north = (terms * polynomials[:, 1:].unsqueeze(1)).sum(0).unbind(1)
-        meridian, prime_vertical = curvature_radii(position[0])
-        radius_km = torch.stack((meridian, prime_vertical * torch.cos(torch.deg2rad(position[0]))))
-        per_km = torch.rad2deg(scaling[:, 1] / radius_km)
+        per_km = scaling[:, 1] * _degrees_per_km(position[0])
         return torch.cat((value, north * per_km[0], east * per_km[1]))
 
     def _sum_latitude(self, index: Tensor, polynomials: Tensor) -> Tensor:
@@ -200,7 +221,7 @@ class FieldBank(Float64Module):
 
 
 _BOXES = 64
-"""Boxes expanded at a time, and planets prepared at a time: at degree 13, about 30 MB of temporary memory."""
+"""Boxes expanded at a time: at degree 13, about 30 MB of temporary memory."""
 
 
 def check_index(index: Tensor, count: int, name: str = "index") -> None:
@@ -229,9 +250,17 @@ def checked_boxes(latitude: Tensor, longitude: Tensor) -> tuple[Tensor, Tensor]:
         shapes = f"{tuple(latitude.shape)} and {tuple(longitude.shape)}"
         raise ValueError(f"latitude and longitude must have the shape (K, 2) with K >= 1, got {shapes}")
     latitude, longitude = latitude.double(), longitude.double()
-    for k, (parallels, meridians) in enumerate(zip(latitude.tolist(), longitude.tolist(), strict=True)):
-        check_box(tuple(parallels), tuple(meridians), f" of box {k}")
+    (south, north), (west, east) = latitude.T, longitude.T
+    sound = (south >= -90) & (south < north) & (north <= 90) & (west < east) & (east <= west + 360)
+    for k in (~sound).nonzero().flatten().tolist():
+        check_box(tuple(latitude[k].tolist()), tuple(longitude[k].tolist()), f" of box {k}")
     return latitude, longitude
+
+
+def _degrees_per_km(latitude: Tensor) -> Tensor:
+    """Return degrees of latitude and of longitude per kilometer at sea level: ``(2, ...)``."""
+    meridian, prime_vertical = curvature_radii(latitude)
+    return torch.rad2deg(1 / torch.stack((meridian, prime_vertical * torch.cos(torch.deg2rad(latitude)))))
 
 
 def _slopes(terms: int) -> Tensor:
@@ -248,11 +277,8 @@ def _surface_weights(gauss: Tensor) -> Tensor:
     degree = gauss.shape[-1]
     angles, _ = chebyshev_nodes(degree + 12)
     axis, _, z = to_ecef(90 - torch.rad2deg(angles), torch.zeros_like(angles)).unbind(-1)
-    parts = []
-    for some in gauss.split(max(1, _BOXES * 14**3 // degree**3)):  # temporary memory grows with the cube of the degree
-        tables = harmonics.separate(harmonics.field_table(some).flatten(0, 1), degree)
-        parts.append(harmonics.on_surface(tables, axis, z).unflatten(0, (-1, 3)))
-    return torch.cat(parts)
+    tables = harmonics.field_table(gauss).flatten(0, 1)
+    return harmonics.on_surface(tables, axis, z, degree).unflatten(0, (-1, 3))
 
 
 def _synthesis(weights: Tensor, latitude: Tensor, longitude: Tensor) -> Tensor:

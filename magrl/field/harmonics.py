@@ -214,15 +214,16 @@ def separate(weights: Tensor, degree: int) -> Tensor:
     return torch.cat(parts, -1).flatten(1, 2)[:, 1:]
 
 
-def on_surface(weights: Tensor, axis_km: Tensor, z_km: Tensor) -> Tensor:
-    """Restrict separated weights to a surface of revolution, where the latitude determines radius and colatitude.
+def on_surface(weights: Tensor, axis_km: Tensor, z_km: Tensor, degree: int) -> Tensor:
+    """Restrict weights over :func:`basis` to a surface of revolution, where the latitude determines the radius.
 
     There an order is a function of the latitude alone, and its expansion is shorter.
 
     Args:
-        weights: ``(R, 2 * degree + 1, F)`` from :func:`separate`.
+        weights: ``(R, (degree + 1) * (degree + 2))`` float64, for example a :func:`field_table`.
         axis_km: ``(K,)`` distance from the axis where the sine of the latitude is a Chebyshev node [km].
         z_km: ``(K,)`` height above the equatorial plane there [km].
+        degree: degree of the basis.
 
     Returns:
         ``(R, 2 * degree + 1, K)`` weights over T_k(sin latitude), for :func:`waves` with lift cos(latitude).
@@ -230,15 +231,16 @@ def on_surface(weights: Tensor, axis_km: Tensor, z_km: Tensor) -> Tensor:
     Example:
         >>> angles, _ = chebyshev_nodes(6)  # a sphere
         >>> sphere = REFERENCE_RADIUS_KM * torch.stack((angles.sin(), angles.cos()))
-        >>> on_surface(separate(torch.ones(3, 12, dtype=torch.float64), 2), *sphere).shape
+        >>> on_surface(torch.ones(3, 12, dtype=torch.float64), *sphere, degree=2).shape
         torch.Size([3, 5, 6])
     """
-    degree = weights.shape[1] // 2
+    _, order = torch.tril_indices(degree + 1, degree + 1, device=weights.device)
     angles, to_coefficients = chebyshev_nodes(len(z_km), weights.device)
-    features, lift = products(axis_km, z_km, degree)
-    sums = weights @ features
-    order = torch.cat((torch.arange(1, degree + 1), torch.arange(degree + 1))).to(weights.device)
-    return (sums * (lift / angles.sin()) ** (order % 2).unsqueeze(-1)) @ to_coefficients.T
+    legendre = basis(torch.stack((axis_km, torch.zeros_like(z_km), z_km), -1), degree)[::2]
+    expansion = legendre / angles.sin() ** (order % 2).unsqueeze(-1) @ to_coefficients.T
+    parts = weights.unflatten(1, (-1, 2)).mT.flip(1)  # sines and cosines
+    sums = torch.stack([parts[..., order == m] @ expansion[order == m] for m in range(degree + 1)], 2)
+    return sums.flatten(1, 2)[:, 1:]
 
 
 def chebyshev(x: Tensor, count: int) -> Tensor:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import datetime
 from functools import cache
+from importlib.util import find_spec
 from numbers import Real
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -60,19 +62,23 @@ def parse_date(date: Date) -> datetime.datetime:
     return start + datetime.timedelta(seconds=float(date - year) * (end - start).total_seconds())
 
 
+GENERATIONS = 13, 14
+"""Generations of IGRF."""
+
+
 @cache
 def _igrf_tables(generation: int) -> tuple[NDArray[np.datetime64], NDArray[np.complex128]]:
     """Return epochs ``(E,)`` and complex Gauss tables ``(E, N + 1, N + 1)`` of one IGRF generation, from ppigrf."""
-    from ppigrf import ppigrf  # imports pandas, so only where it is needed
-
-    files = {13: ppigrf.shc_fn_igrf13, 14: ppigrf.shc_fn_igrf14}
-    if not isinstance(generation, int) or generation not in files:
-        raise ValueError(f"IGRF generation {generation!r} is not available: choose from {sorted(files)}")
-    g, h = ppigrf.read_shc(files[generation])
-    n, m = np.array(list(g.columns)).T
-    table = np.zeros((len(g), n.max() + 1, n.max() + 1), dtype=np.complex128)
-    table[:, n, m] = g.to_numpy() - 1j * h.to_numpy()
-    return g.index.to_numpy("M8[us]"), table
+    if not isinstance(generation, int) or generation not in GENERATIONS:
+        raise ValueError(f"IGRF generation {generation!r} is not available: choose from {list(GENERATIONS)}")
+    path = Path(find_spec("ppigrf").origin).with_name(f"IGRF{generation}.shc")  # type: ignore[union-attr, arg-type]
+    text = path.read_text(encoding="utf-8")  # by hand, as ppigrf imports pandas
+    _, years, *rows = (line for line in text.splitlines() if not line.startswith("#"))
+    numbers = np.loadtxt(rows)
+    (n, m), table = numbers[:, :2].astype(int).T, np.zeros((numbers.shape[1] - 2, 14, 14), dtype=np.complex128)
+    for sign, unit in ((m >= 0, 1), (m < 0, -1j)):
+        table[:, n[sign], abs(m[sign])] += unit * numbers[sign, 2:].T
+    return np.array([f"{float(year):.0f}-01-01" for year in years.split()], "M8[us]"), table
 
 
 def igrf_coefficients(date: Date, generation: int = 14) -> Tensor:

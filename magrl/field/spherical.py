@@ -58,7 +58,7 @@ class SphericalHarmonicField(Float64Module):
             # One row at a time: at degree 133 a row of temporary arrays takes 40 MB.
             weights = torch.cat([harmonics.separate(row, degree) for row in table.split(1)])
             self.register_buffer(f"{name}_weights", weights)
-            self.register_buffer(f"level_{name}_weights", _at_altitude(weights, self.altitude_km))
+            self.register_buffer(f"level_{name}_weights", _at_altitude(table, degree, self.altitude_km))
 
     def forward(self, latitude: Tensor, longitude: Tensor, altitude_km: Tensor | float | None = None) -> Tensor:
         """Return the field vector.
@@ -190,15 +190,15 @@ def _points_in_cache(weights: Tensor) -> int:
     return max(1, 180_000 // weights[..., 0].numel()) if weights.device.type == "cpu" else 2**62
 
 
-def _at_altitude(weights: Tensor, altitude_km: float) -> Tensor:
+def _at_altitude(table: Tensor, degree: int, altitude_km: float) -> Tensor:
     """Return weights over Chebyshev polynomials of the sine of the latitude, for points of one altitude.
 
     The ellipsoid is close to a sphere, so 12 polynomials more than the degree leave an error of 1e-9 nT on IGRF.
     """
-    angles, _ = harmonics.chebyshev_nodes(weights.shape[1] // 2 + 12, weights.device)
+    angles, _ = harmonics.chebyshev_nodes(degree + 12, table.device)
     latitude = 90 - torch.rad2deg(angles)
     place = _place(latitude, torch.zeros_like(latitude), torch.full_like(latitude, altitude_km))
-    return harmonics.on_surface(weights, place.across_km * place.cosines[0], place.z_km)
+    return harmonics.on_surface(table, place.across_km * place.cosines[0], place.z_km, degree)
 
 
 def _frame_turning(b_ned: Tensor, place: _Place) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import torch
@@ -129,12 +130,8 @@ class TrackField(StatefulTransform):
         """Add the track and the observation."""
         observation_spec = super().transform_observation_spec(observation_spec)
         like = self._leaf(observation_spec, self.in_keys[0])
-        shape, one = like.shape[:-1], torch.ones(1, 3, dtype=like.dtype)
-        zero = one[:, 0]
-        reading = Reading(one, one, zero, zero, SensorStd(*(0 * one.double() for _ in STD_KEYS)), zero)
-        plain = self.rules.replace(model=None, start_km=None, target_km=None)
-        leaves = _record(begin(plain, reading), torch.Size([1]))[0]
-        observation_spec[self.out_keys[0]] = _spec(leaves, observation_spec.shape, shape, like.device)
+        leaves = _leaves(like.dtype)
+        observation_spec[self.out_keys[0]] = _spec(leaves, observation_spec.shape, like.shape[:-1], like.device)
         self._add(observation_spec, like, self.out_keys[1], OBSERVATION_SIZE)
         return observation_spec
 
@@ -145,6 +142,14 @@ class TrackField(StatefulTransform):
             return input_spec
         observed = self.transform_observation_spec(observed_spec(self).clone())
         return with_state(input_spec, {key: observed[key] for key in self.state_keys})
+
+
+@cache
+def _leaves(dtype: torch.dtype) -> TensorDict:
+    """Return the track of one vehicle that reads elements of a type."""
+    one = torch.ones(1, 3, dtype=dtype)
+    std, zero = SensorStd(*(0 * one.double() for _ in STD_KEYS)), one[:, 0]
+    return _record(begin(Rules(), Reading(one, one, zero, zero, std, zero)), torch.Size([1]))[0]
 
 
 def _record(track: Track, batch: torch.Size) -> TensorDict:

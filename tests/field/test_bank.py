@@ -168,3 +168,13 @@ def test_bad_planets_and_boxes_raise(changes: dict, message: str, planets: Tenso
     good = {"gauss": planets, "planet_index": torch.tensor([0, 0]), "latitude": latitude, "longitude": longitude}
     with pytest.raises((TypeError, ValueError), match=message):
         FieldBank.build(**good | changes)
+
+
+def test_grids_have_the_values_of_their_positions(planets: Tensor) -> None:
+    bank = FieldBank.build(planets, PLANET, *BOXES)
+    units = f64(-1.0, 0.3, 1.0), f64(0.9, -0.2, 1.0)
+    latitude, longitude = (torch.lerp(*ends.split(1, 1), (1 + x) / 2) for ends, x in zip(BOXES, units, strict=True))
+    grids = torch.stack(torch.broadcast_tensors(latitude.unsqueeze(2), longitude.unsqueeze(1) - 360), -1)
+    expected = bank.value_and_gradient(grids[..., 0], grids[..., 1], torch.arange(len(bank)).reshape(-1, 1, 1))
+    for found, exact in zip(bank.on_grids(grids), expected, strict=True):
+        torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
