@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 RECIPE := $(RUN)/python recipes
 
-.PHONY: train fly anywhere test coverage test-slow test-newest matrix check format docs bench mutate tables figures pictures help clean
+.PHONY: train fly anywhere test coverage test-slow test-newest matrix check format docs docs-slow bench mutate tables figures pictures help clean
 
 train: $(VENV)/.installed  ## train Gradient-Guided TD3; about a minute on two cores
 	$(RECIPE)/td3_gradient_guided.py $(ARGS)
@@ -44,8 +44,14 @@ format: $(VENV)/.installed-dev  ## format the code
 	$(RUN)/ruff format .
 	$(RUN)/ruff check --fix .
 
-docs: $(VENV)/.installed-docs  ## build the documentation in build/docs
-	$(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet docs build/docs
+SPHINX := $(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going --quiet
+
+docs: $(VENV)/.installed-docs  ## build the documentation in build/docs, without the outputs of the notebook
+	$(SPHINX) -D nb_execution_mode=off docs build/docs
+	@echo "Open build/docs/index.html"
+
+docs-slow: $(VENV)/.installed-docs  ## build it with the outputs of the notebook; two minutes
+	$(SPHINX) docs build/docs
 	@echo "Open build/docs/index.html"
 
 bench: $(VENV)/.installed-dev  ## run the benchmarks; about four minutes on two cores
@@ -105,17 +111,20 @@ help:  ## list the targets
 clean:  ## remove .venv and build outputs
 	rm -rf $(VENV) build .coverage *.egg-info .pytest_cache .ruff_cache .mypy_cache
 
-# Install torch first, so that no other package installs another build of it.
+# Install torch first, so that no other package installs another build of it. Modules are compiled at their first import.
+PIP := $(RUN)/pip install -qq --no-compile --disable-pip-version-check
+
 $(VENV)/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(RUN)/pip install --quiet --disable-pip-version-check $$(grep '^torch==' constraints.txt)
-	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[recipes]'
+	@echo "Installing torch, TorchRL and what the recipes need in $(VENV): one to three minutes"
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) $$(grep '^torch==' constraints.txt)
+	@$(PIP) -c constraints.txt -e '.[recipes]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@$(PIP) -c constraints.txt -e '.[dev]'
 	touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.installed
-	$(RUN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@$(PIP) -c constraints.txt -e '.[docs]'
 	touch $@
